@@ -1,1 +1,1 @@
-"""From a diagnosis to exactly one well-behaved alarm: setpoints, states, and who is told what."""
+"""From diagnoses to alarms: setpoints, states, and exactly one event for each change."""

@@ -54,7 +54,7 @@ class ChatterWatch:
         self.chattering = False
 
     def resume(self, *, chattering: bool) -> None:
-        """Go on from before a restart; times begin anew."""
+        """Resume after a restart; the times start again."""
         self.chattering = chattering and self._raises > 0
 
     def raised(self, t_ns: int) -> bool:
@@ -97,7 +97,7 @@ class ChatterWatch:
 
 
 CHANGES_NS = 5 * NS_PER_S
-"""Whoever doubts a sensor may have another reason each time: that is told no more often than this."""
+"""A doubt about a sensor may have another reason each time: that makes an event no more often than this."""
 
 FINDINGS = frozenset(
     {EventKind.RAISED, EventKind.ESCALATED, EventKind.LOWERED, EventKind.CHANGED, EventKind.RECURRED}
@@ -131,7 +131,7 @@ class Alarm:
         self._seen_doubts: tuple[Doubt, ...] = ()
         """Those of the last event, or of a change since that a person could not tell from it."""
         self._last_message = ""
-        """The message by which the finding that stands was told; empty if nobody knows."""
+        """The message that published the present finding; empty if it is not known."""
         self._identity = identity
         self._latching = latching
         self._new_occurrence = new_occurrence
@@ -210,7 +210,7 @@ class Alarm:
         self._since, self._message = since, event.message
 
     def withdraw(self, reason: str, cause: Diagnosis, at: ClockReading) -> AlarmEvent:
-        """Return to normal, from whatever state, because nobody will judge the alarm any more."""
+        """Return to normal, from any state, because no rule judges the alarm any more."""
         before = self._shown
         self._holds, self._shelved_until_ns, self.doubts = set(), None, ()
         self._chatter.resume(chattering=False)
@@ -246,7 +246,7 @@ class Alarm:
     def waits(self, finding: RuleFinding, at: ClockReading) -> bool:
         """Whether a finding of a quality alarm has nothing new but its reason, and the last is too recent.
 
-        Apply it again later, then: the reason that stands by that time is told.
+        Then apply it again later: the reason at that time is published.
         """
         return (
             self._state.is_active
@@ -262,7 +262,7 @@ class Alarm:
         not_ok, told_not_ok = (
             {d.detector for d in those if d.not_ok} for those in (self.doubts, self._told_doubts)
         )
-        # That nobody lacks samples any more the next good statement after a restart says, too.
+        # The next good statement after a restart also says that no detector lacks samples any more.
         if not_ok == told_not_ok:
             return []
         # A sensor that flickers must not be an event each time; that it was not OK is on the safe side.
@@ -348,7 +348,7 @@ class Alarm:
         Args:
             until_ns: when it uncovers itself.
             request: who asks.
-            nothing: stands in for the cause of an alarm that has never been judged.
+            nothing: the cause if the alarm has never been judged.
         """
         before = self._cover(Hold.SHELVED)
         self._shelved_until_ns = until_ns

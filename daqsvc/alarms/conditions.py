@@ -41,7 +41,7 @@ def statement(machine: str, condition: str, level: Level, at: ClockReading) -> D
 
 
 def no_statement(machine: str, at: ClockReading) -> Diagnosis:
-    """Stands in for the cause of an alarm that nobody has judged yet."""
+    """The cause of an alarm that no detector has judged yet."""
     return _statement(machine, UNDETERMINED, Level.NORMAL, at)
 
 

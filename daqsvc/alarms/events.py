@@ -41,7 +41,7 @@ class EventKind(StrEnum):
     ACKNOWLEDGED = "acknowledged"
     RESET = "reset"
     SUPPRESSED = "suppressed"
-    """A sensor that the alarm rests on is not OK: the alarm cannot speak."""
+    """A sensor that the alarm rests on is not OK: the alarm is suppressed."""
     UNSUPPRESSED = "unsuppressed"
     """Its sensors are good again: the alarm goes on from where it was."""
     SHELVED = "shelved"

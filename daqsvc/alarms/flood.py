@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 
 
 MOST_FIRST_OUT = 5
-"""Alarms that stood first in their groups and are named: nobody reads a sentence that names a hundred."""
+"""First-out alarms that the message names at most: a sentence with a hundred names is not read."""
 
 
 class FloodWatch:
-    """Counts what calls for a person, by the monotonic clock; a flood is told, nothing is dropped.
+    """Counts the alarms that call for a person. A flood is reported; no alarm is dropped.
 
     Args:
         handling: says how many alarms may call for a person within which time (ISA-18.2 and EEMUA 191 say 10
@@ -100,8 +100,8 @@ class FirstOut:
         """Go on from before a restart.
 
         Args:
-            events: the last event of each alarm, in the order in which they were told: of several that claim
-                the mark the latest is right, the others' groups have been normal since.
+            events: the last event of each alarm, in the order in which they were published: of several
+                that claim the mark the latest is right, the others' groups have been normal since.
         """
         for event in events:
             group = self._groups.get(event.alarm)

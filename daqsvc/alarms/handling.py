@@ -48,7 +48,7 @@ def shelving_ns(command: AlarmCommand, longest_s: float) -> int:
 class ShelvingEnds:
     """The ends of shelving, by the monotonic clock, soonest first.
 
-    An alarm that is uncovered before its time may stay in it: whoever asks looks at the alarm itself.
+    An alarm that is uncovered before its time may stay in it: the caller looks at the alarm itself.
     """
 
     def __init__(self) -> None:

@@ -58,7 +58,7 @@ class AlarmManager:
     - Not OK suppresses every alarm that rests on the sensor, until a good statement comes.
     - Missing holds every state. It never clears anything. Where a statement says between what bounds its
       values lie all the same, they may raise an alarm.
-    - Shelved and out of service cover an alarm, which goes on behind the cover and is told of.
+    - Shelved and out of service cover an alarm. Its state still changes behind the cover, with events.
 
     Not thread-safe: one task takes the diagnoses of a machine in their order.
 
@@ -96,7 +96,7 @@ class AlarmManager:
         self._conditions: set[str] = set()
         self._doubts = SensorHealth()
         self._waiting: dict[str, Diagnosis] = {}
-        """By quality alarm, the statement whose reason is still to be told: see `Alarm.waits`."""
+        """By quality alarm, the statement whose reason is still to be published: see `Alarm.waits`."""
         self._start_up = StartUpSignal(self._handling.start_up)
         self._flood = FloodWatch(self._handling)
         self._first_out = FirstOut({rule.alarm: rule.group for rule in rules})
@@ -208,7 +208,7 @@ class AlarmManager:
         anew.
 
         Args:
-            events: the last event of each alarm, in the order in which they were told.
+            events: the last event of each alarm, in the order in which they were published.
             active_detectors: the detectors that will make statements, with the sensors that these rest on.
             conditions: names of what the service will say of itself by `condition`.
 
@@ -302,7 +302,7 @@ class AlarmManager:
                 ruled.alarm.hold()
 
     def _quality(self, names: Iterable[str], diagnosis: Diagnosis, at: ClockReading) -> Iterator[AlarmEvent]:
-        """Raise, change or return the quality alarms that the diagnosis bears on."""
+        """Raise, change or return the quality alarms that the diagnosis is about."""
         for name in names:
             doubts = self._doubts.of(name)
             if name not in self._alarms:
@@ -405,7 +405,7 @@ class AlarmManager:
         raise CommandNotAllowedError(f"no alarm is named {name!r}; {there_are}")
 
     def _resumed(self, event: AlarmEvent, active_detectors: Mapping[str, Sequence[str]]) -> bool:
-        """Go on with the alarm of ``event``; False if it stands and nobody will judge it any more."""
+        """Resume the alarm of ``event``; False if it is active and no rule judges it any more."""
         ours, name = event.identity == self._identity, event.alarm
         ruled = self._ruled.named(name)
         if ours and ruled is not None:
@@ -430,9 +430,9 @@ class AlarmManager:
     def _excuse(self, events: Sequence[AlarmEvent]) -> None:
         """Take back that a sensor was not OK where later events show that this was over.
 
-        Whoever says good while others have not spoken since a restart changes nothing that a person could
-        tell, and neither does whoever then says "not OK" again: the last event of the quality alarm still has
-        the first doubt. The alarms that it bears on know better; the last of them to speak counts.
+        After a restart, a detector may state "good" while others have stated nothing yet. That makes no event
+        of the quality alarm, nor does a later "not OK" of it: its last event still has the first doubt. The
+        alarms that rest on the sensor do have events of this; the last of them counts.
         """
         ours = [event for event in events if event.identity == self._identity]
         place = {event.alarm: number for number, event in enumerate(ours)}
@@ -468,7 +468,7 @@ class AlarmManager:
         return alarm.withdraw("the machine file no longer has it", event.cause, self._now())
 
     def _since(self, wall_ns: int) -> ClockReading:
-        """An instant before the restart, by its label: the monotonic clock may have begun anew."""
+        """A time before the restart, by its wall-clock label: the monotonic clock may have restarted."""
         return ClockReading(self._clock.monotonic_ns() - self._clock.wall_ns() + wall_ns, wall_ns)
 
     def _add(self, name: str, *, latching: bool) -> Alarm:
@@ -493,7 +493,7 @@ class AlarmManager:
 
 
 def _bears_on(doubt: Doubt, ruled: Ruled, event: AlarmEvent) -> bool:
-    """Whether an alarm could not speak while a doubt stood, by the sensors that its last event rests on."""
+    """Whether an alarm was suppressed by a doubt, by the sensors that its last event rests on."""
     rested_on = ruled.rule.sensors or event.cause.sensors or ruled.sensors
     blamed = doubt.sensors if len(doubt.sensors) == 1 else ()
     return ruled.rule.spare == 0 and (
@@ -502,7 +502,7 @@ def _bears_on(doubt: Doubt, ruled: Ruled, event: AlarmEvent) -> bool:
 
 
 class _Statuses(Mapping[str, "AlarmStatus"]):
-    """How each alarm stands when it is asked for, so that nobody pays for those that nobody asks for."""
+    """The status of each alarm, made when it is asked for: those that nobody reads cost nothing."""
 
     def __init__(self, alarms: Mapping[str, Alarm], first_out: FirstOut) -> None:
         self._alarms = alarms

@@ -27,7 +27,7 @@ PREFIXES = ("sensor-ok/", "detector-ok/")
 
 
 def quality_alarm(detector: str, sensors: Sequence[str]) -> str:
-    """The quality alarm that a statement of ``detector`` bears on."""
+    """The quality alarm that a statement of ``detector`` is about."""
     if len(sensors) == 1:
         return f"sensor-ok/{sensors[0]}"
     return f"detector-ok/{detector}"
@@ -45,15 +45,15 @@ GOOD_NS = 3 * NS_PER_S
 
 
 UNHEARD_NS = 30 * NS_PER_S
-"""After a restart a quality alarm waits so long, at most, for each detector of its sensor to speak."""
+"""After a restart a quality alarm waits at most so long for a statement of each of its detectors."""
 
 
 class Touched(NamedTuple):
-    """What a statement bears on.
+    """What a statement is about.
 
     Attributes:
         alarms: names of quality alarms.
-        sensors: those of which it says, or takes back, that they are not OK.
+        sensors: those that it states, or no longer states, to be not OK.
     """
 
     alarms: tuple[str, ...]
@@ -80,7 +80,7 @@ class _Patience:
 
 
 class _Shortage:
-    """What share of its samples a detector has lacked of late.
+    """The share of its samples that a detector has lacked in the last seconds.
 
     While frames are lost at random one window can be judged, and the next cannot: a quality alarm that went
     by each would come and go many times a second.
@@ -147,7 +147,7 @@ class SensorHealth:
         return self._blamed.keys()
 
     def update(self, diagnosis: Diagnosis) -> Touched:
-        """Take in a statement; what it bears on."""
+        """Take in a statement; returns what it is about."""
         detector = diagnosis.detector
         name = quality_alarm(detector, diagnosis.sensors)
         before = self._forget(detector)
@@ -248,7 +248,7 @@ class SensorHealth:
         return sorted({before[0] for before in forgotten if before is not None})
 
     def unsettle(self, rule: Rule) -> None:
-        """Whoever found a sensor of ``rule`` not OK is gone; now its own detectors must find them good."""
+        """The detector that found a sensor of ``rule`` not OK is gone: now its own must find them good."""
         self._unsettled[rule.alarm] = set(rule.detectors)
         for detector in rule.detectors:
             self._unsettled_by[detector].add(rule.alarm)
@@ -269,7 +269,7 @@ class SensorHealth:
         return RuleFinding(Level.ALERT, parts, lambda: in_words(name, doubts))
 
     def silences(self, rule: Rule, sensors: frozenset[str]) -> str | None:
-        """Why the alarm of ``rule`` cannot speak while it rests on ``sensors``; None if it can.
+        """Why the alarm of ``rule`` is suppressed while it rests on ``sensors``; None if it is not.
 
         Its own detector says that a sensor is not OK, without saying which, or more of its sensors are blamed
         than it can spare.
@@ -325,7 +325,7 @@ def _worst(doubts: Sequence[Doubt]) -> Doubt:
 
 
 def _blames(doubt: Doubt) -> set[str]:
-    """The sensor that a doubt is about, if it is one and not OK: of several nobody knows which it is."""
+    """The sensor that a doubt blames, if it is a single one: of several it is not known which is not OK."""
     return {doubt.sensors[0]} if doubt.not_ok and len(doubt.sensors) == 1 else set()
 
 

@@ -33,7 +33,7 @@ class Ruled:
 class RuledAlarms:
     """All alarms that have a rule, in the order in which they were added.
 
-    A diagnosis costs what it bears on, however many other alarms there are.
+    A diagnosis costs only the alarms that it is about, however many others there are.
     """
 
     def __init__(self) -> None:

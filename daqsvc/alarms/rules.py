@@ -71,7 +71,7 @@ class RuleFinding(NamedTuple):
 
 
 class Circumstances(NamedTuple):
-    """What else bears on a judgement.
+    """What else a judgement depends on.
 
     Attributes:
         starting: whether the machine starts up.
@@ -115,7 +115,7 @@ class Rule(Protocol):
         group: the first-out group that it competes in.
         detectors: the detectors whose diagnoses feed it.
         sensors: the sensors that it rests on before any diagnosis has named them.
-        spare: how many of these may be not OK before the alarm cannot speak.
+        spare: how many of these may be not OK before the alarm is suppressed.
     """
 
     @property
@@ -170,7 +170,7 @@ class LevelRule:
 
     @property
     def spare(self) -> int:
-        """None: without its sensor the alarm cannot speak."""
+        """None: without its sensor the alarm is suppressed."""
         return 0
 
     def watch(self) -> Watch:
@@ -218,7 +218,7 @@ class DiagnosisRule:
 
 
 def decision_evidence(diagnosis: Diagnosis) -> float | None:
-    """How much speaks for the decision, in nats; None if the detector does not say.
+    """The evidence for the decision, in nats; None if the detector states none.
 
     A detector that follows the lead of its decision over every other mode (``lead.M``) has the evidence of
     the narrowest lead over a mode outside the group; while it only knows that the mode has been left, what
@@ -411,7 +411,7 @@ def _figures(diagnosis: Diagnosis) -> Iterator[str]:
 
 
 def _identity(decision: str, group: tuple[str, ...]) -> str:
-    """What is found, with what it is not told apart from; what a change may be is settled by its name."""
+    """The decision with all that it cannot be told apart from; the name of a change stands for its group."""
     if decision == DEPARTURE:
         return decision
     return "|".join([decision, *sorted(set(group) - {decision})])

@@ -150,11 +150,11 @@ class SetpointMonitor:
         return max(beyond, default=Level.NORMAL)
 
     def resume(self, level: Level, *, lower: bool | None = None) -> None:
-        """Go on from a level that was reached before a restart; the delays begin anew.
+        """Resume at a level that was reached before a restart; the delays start again.
 
         Args:
             level: the level.
-            lower: whether at a lower limit; None if nobody knows: then the value must be clear of both.
+            lower: whether at a lower limit; None if that is not known: then the value must be clear of both.
         """
         for comparator in self._comparators:
             side = lower is None or comparator.limit.lower is lower

@@ -129,7 +129,7 @@ class _VotingWatch:
     def resume(self, level: Level, event: AlarmEvent) -> str:  # noqa: ARG002  a level has one cause only
         self._level = level
         for watch in self._watches.values():
-            # Which sensors had reached it is not told: each must be below the deadband to say it has not.
+            # Which sensors had reached it is not known: each counts until it is below the deadband.
             watch.monitor.resume(level)
         return ""
 

@@ -223,5 +223,5 @@ def _aligned(titles: list[str], rows: list[list[str]]) -> str:
 
 
 def _harmless(text: str) -> str:
-    """Text that does to a terminal nothing but stand there, whoever has put what into a message."""
+    """The text without control characters, which could change the state of a terminal."""
     return "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)

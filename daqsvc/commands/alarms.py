@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from daqsvc.commands.store_argument import Load
 
 HISTORY = 20
-"""Events that ``--history`` shows if nobody says how many."""
+"""Events that ``--history`` shows by default."""
 SLOW_DISK_S = 0.5
 
 

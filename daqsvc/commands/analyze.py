@@ -169,7 +169,7 @@ def _outcomes(
 def _tell(outcomes: Iterable[Outcome], *, as_json: bool) -> int:
     code = EXIT_OK
     for outcome in outcomes:
-        # Whoever reads a pipe wants each line when it is there.
+        # The reader of a pipe gets each line at once.
         print(json.dumps(outcome.json) if as_json else outcome.text, flush=True)  # noqa: T201
         if outcome.refused:
             code = EXIT_REFUSED
@@ -195,7 +195,7 @@ def _cannot_plot(directory: Path) -> str:
 
 
 def _figure_names(recordings: list[str], directory: Path | None) -> list[str | None]:
-    """What each recording's figures begin with; recordings of one name are told apart by a number."""
+    """The prefix of each recording's figures; recordings of one name get a number."""
     if directory is None:
         return [None] * len(recordings)
     names: list[str | None] = []

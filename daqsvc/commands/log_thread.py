@@ -1,4 +1,4 @@
-"""The log of a service, written by a thread: whoever reads it slowly, or never, holds up nothing else."""
+"""The log of a service, written by a thread: a slow reader, or none, delays nothing else."""
 
 from __future__ import annotations
 

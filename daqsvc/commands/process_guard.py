@@ -39,7 +39,7 @@ STUCK_TURNS = 300
 """Turns that the event loop may stand still."""
 
 SAY_S = 0.2
-"""What the last words may take: whoever reads them may hang, too."""
+"""Time to write the last line: its reader may hang, too."""
 
 LINGER_S = 1.0
 """What threads of others may take to end when all else has."""
@@ -128,7 +128,7 @@ class ProcessGuard:
         """From now on the event loop turns; one that stands still is ended.
 
         Args:
-            say_after_s: after so long it is said, as whoever watches the process from outside may end it
+            say_after_s: after so long it is logged, since a supervisor outside may end the process
                 before the guard does.
         """
         self._turns_said = None if say_after_s is None else max(1, round(say_after_s / TURN_S))
@@ -141,7 +141,7 @@ class ProcessGuard:
             self._on_stopping()
 
     def lose_terminal(self, reason: str) -> None:
-        """Stop because whoever watched the process is gone; from any thread."""
+        """Stop because the terminal or supervisor of the process is gone; from any thread."""
         if not self._outlives_terminal:
             self._ask_to_stop(f"{reason}; the service stops")
 

@@ -1,7 +1,7 @@
 """The options of `analyze` and `calibrate`, and what is wrong with them together.
 
 They go by what is measured: probes on a rotor, accelerometers against a healthy run (orders), accelerometers
-on bearings. One of these stands in place of a machine file.
+on bearings. One of these replaces a machine file.
 """
 
 from __future__ import annotations
@@ -211,7 +211,7 @@ def fault_orders(text: str) -> dict[str, float]:
 
 
 def _add_rotor_of_analyze(parser: argparse.ArgumentParser) -> None:
-    """Options that stand in for a machine file."""
+    """Options that replace a machine file."""
     rotor = parser.add_argument_group("without a machine file")
     _add_rotor(
         rotor.add_argument,

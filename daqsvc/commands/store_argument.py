@@ -28,7 +28,7 @@ class BadFileError(Exception):
 
 
 def store_directory(machine: MachineFile) -> Path:
-    """Where the journal lives if nobody says otherwise.
+    """The default place of the journal.
 
     The machine file's own word first, then systemd's, then the user's state directory (XDG).
 

@@ -54,7 +54,7 @@ async def calibrate_live(
         clock: the service's clock.
         revolutions: usable revolutions to wait for.
         timeout_s: how long to wait for them.
-        progress: told the revolutions seen and to see, now and then.
+        progress: called now and then with the revolutions seen and the revolutions wanted.
 
     Raises:
         NotCalibratableError: the machine is not steady, not healthy as far as can be seen, or silent.

@@ -149,7 +149,7 @@ class Runner:
         Args:
             recording: the file, a CAN log, or a folder of CAN logs.
             figures: what the names of its figures begin with; None: no figures.
-            progress: told the samples done and to do.
+            progress: called with the samples done and the samples in all.
         """
         try:
             loaded = self.load(recording)
@@ -443,7 +443,7 @@ def _prepare(judge: Judge, limits: ResourceLimits, compiling: Lock) -> None:
     Args:
         judge: judges the recordings.
         limits: of reading them.
-        compiling: whoever has it says that kernels are compiled.
+        compiling: the process that acquires it says that kernels are compiled.
     """
     _judges.append(judge)
     signal.signal(signal.SIGINT, signal.SIG_IGN)

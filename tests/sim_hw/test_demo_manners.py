@@ -248,7 +248,7 @@ def test_a_closed_pipe_ends_it_quietly(tmp_path: Path) -> None:
         assert running.stderr is not None
         assert json.loads(running.stdout.readline())["type"]
         running.stdout.close()
-        # A host that starves it is told of, which is no matter of the pipe.
+        # A busy host makes warnings of its own, which have nothing to do with the pipe.
         assert without_delays(running.stderr.read()) == []
         assert running.wait() == 0
     assert left_behind(tmp_path) == []
