@@ -71,6 +71,8 @@ class CheckCommand:
         from daqsvc.detectors.make import check_files  # noqa: PLC0415
         from daqsvc.publish.make import check_outputs  # noqa: PLC0415
         from daqsvc.settings import describe  # noqa: PLC0415 - each verb imports only what it needs
+        from daqsvc.settings.checks import failure  # noqa: PLC0415
+        from daqsvc.settings.error_messages import dotted  # noqa: PLC0415
         from daqsvc.settings.hooks import collecting  # noqa: PLC0415
 
         check_files(machine)
@@ -78,7 +80,7 @@ class CheckCommand:
         with collecting() as failures:
             print(describe(machine))  # noqa: T201 - this is what the verb is for
         for failed in failures:
-            failed.file = machine.path
+            failed.file, failed.table = machine.path, dotted(failure(machine, failed).path)
             print(failed, file=sys.stderr)  # noqa: T201
         return EXIT_USAGE if failures else EXIT_OK
 

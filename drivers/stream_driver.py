@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from abc import ABC, abstractmethod
+from inspect import isawaitable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -103,7 +104,10 @@ class StreamDriver(ABC):
         before = self._frames
         ticking = asyncio.create_task(self._tick(), name=f"tick of {self.link.name}")
         try:
-            reason = await self.read()
+            reading = self.read()
+            if not isawaitable(reading):
+                raise BrokenContractError(self.read, "it is not async")
+            reason = await reading
             if not isinstance(reason, str):
                 raise BrokenContractError(self.read, f"it returns {reason!r:.60}, not why the link was lost")
         except CannotOpenError:

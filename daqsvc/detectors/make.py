@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, cast
 
-from daqsvc.settings.hooks import failing_in
+from daqsvc.settings.failures import BrokenContractError
+from daqsvc.settings.hooks import PluginFailedError, failing_in
 from daqsvc.settings.plugins import configured
 from daqsvc.settings.problems import AssemblyError
 
@@ -35,9 +36,15 @@ def detectors(machine: MachineFile, store: Path | None = None) -> list[Detector]
             detector under a name that no alarm can follow.
     """
     made: dict[str, Detector] = {}
+    streams = {*machine.streams, *(grid.name for grid in machine.grids)}
     for plugin, settings in plugins(machine):
         with failing_in(machine.path):
             built = list(plugin.build(machine, settings, store))
+            for detector in built:
+                if detector.stream not in streams or detector.block < 1:
+                    takes = f"its {detector.name} takes {detector.block} samples of {detector.stream!r}"
+                    words = f"{takes}; have it take 1 or more of a stream: {', '.join(sorted(streams))}"
+                    raise PluginFailedError(plugin, "build", BrokenContractError(None, words))
         for detector in built:
             if detector.name in made:
                 raise AssemblyError(f"two detectors are named {detector.name!r}; have the plugin number them")

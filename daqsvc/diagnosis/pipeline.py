@@ -22,7 +22,7 @@ from daqsvc.acquisition.ring import RingClosed, RingReader
 from daqsvc.acquisition.standing import StreamState
 from daqsvc.diagnosis.record import Diagnosis, silence_reason
 from daqsvc.dsp.quality.missing import Patience
-from daqsvc.settings.failures import BrokenContractError
+from daqsvc.settings.failures import BrokenContractError, error_text
 from daqsvc.supervision import Progress, Supervisor, over
 from daqsvc.threads import ThreadLostError, call_in_thread
 
@@ -474,7 +474,7 @@ class Pipeline:
         except Exception as error:  # noqa: BLE001 - said and counted
             counters.failures += 1
             self._supervisor.failed(_part(detector), error, "it goes on with the next window")
-            reason = f"detector {detector.name} has failed: {type(error).__name__}: {error}"
+            reason = f"detector {detector.name} has failed: {error_text(error)}"
             with self._supervisor.sparing_others(_part(detector), "nothing is said of that window"):
                 return [
                     replace(held, quality="missing", reason=reason)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from numbers import Real
 from typing import TYPE_CHECKING, get_args
@@ -14,7 +15,7 @@ from daqsvc.settings.failures import BrokenContractError
 from daqsvc.settings.problems import AssemblyError, choice
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from daqsvc.acquisition.samples import Samples
     from daqsvc.diagnosis.detector import Window
@@ -35,7 +36,7 @@ class Judgement:
         thresholds: what the statistics were held against, by name.
 
     Raises:
-        ValueError: there is no such severity, or a statistic or threshold is not a number.
+        ValueError: there is no such severity, or a figure, unit or decision is of another kind.
     """
 
     severity: Severity
@@ -47,6 +48,12 @@ class Judgement:
     def __post_init__(self) -> None:
         if self.severity not in get_args(Severity):
             raise ValueError(f"there is no severity {self.severity!r}; {choice('', get_args(Severity))}")
+        for name in ("statistics", "units", "thresholds"):
+            if not isinstance(getattr(self, name), Mapping):
+                raise ValueError(f"its {name} are {getattr(self, name)!r:.60}; give them by name, as a dict")  # noqa: TRY004 - likewise
+        for name, text in (("decision", self.decision), *self.units.items()):
+            if not isinstance(text, str):
+                raise ValueError(f"{name} is {text!r:.60}, which is not a text")  # noqa: TRY004 - of the value
         for name, value in (*self.statistics.items(), *self.thresholds.items()):
             if not isinstance(value, Real):
                 raise ValueError(f"{name} is {value!r}, which is not a number")  # noqa: TRY004 - of the value

@@ -82,24 +82,30 @@ def check_outputs(machine: MachineFile) -> None:
     with failing_in(machine.path):
         for path, _, settings in configured_outputs(machine):
             tuple(output_plugins()[path].conditions(settings))
-        watched(machine)
+        watched(machine, spared=False)
 
 
-def watched(machine: MachineFile, conditions: Iterable[str] = ()) -> Watched:
+def watched(machine: MachineFile, conditions: Iterable[str] = (), *, spared: bool = True) -> Watched:
     """What there is to tell of a machine.
 
     Args:
         machine: the machine file.
         conditions: names of what the service may say of itself.
+        spared: whether a detector's plugin that fails is said and left out, and the others are asked.
+
+    Raises:
+        AssemblyError: one fails, and is not spared.
     """
     return Watched(
         machine.machine.name,
         machine.machine.description,
         alarms=tuple(alarm.name for alarm in machine.alarms),
-        services=tuple(_services(machine, conditions)),
-        readings=tuple(
-            one for plugin, settings in plugins(machine) for one in plugin.readings(machine, settings)
+        services=(
+            *_asked(machine, "quality_alarms", spared=spared),
+            *handling_conditions(machine.alarm_handling),
+            *conditions,
         ),
+        readings=tuple(_asked(machine, "readings", spared=spared)),
         findings=machine.detectors,
         rests_on={alarm.name: tuple(_rests_on(alarm)) for alarm in machine.alarms},
     )
@@ -113,9 +119,12 @@ def _rests_on(alarm: Alarm) -> Iterator[str]:
         yield from (f"sensor-ok/{sensor}" for sensor in alarm.watched)
 
 
-def _services(machine: MachineFile, conditions: Iterable[str]) -> Iterator[str]:
-    """The alarms that are there by themselves: about sensors, detectors, all alarms and the service."""
+def _asked(machine: MachineFile, hook: str, *, spared: bool) -> Iterator[Any]:
+    """What the plugins of a machine's detectors say at a hook."""
     for plugin, settings in plugins(machine):
-        yield from plugin.quality_alarms(machine, settings)
-    yield from handling_conditions(machine.alarm_handling)
-    yield from conditions
+        try:
+            yield from getattr(plugin, hook)(machine, settings)
+        except PluginFailedError as failed:
+            if not spared:
+                raise
+            log.error("%s; the service goes on without", failed)  # noqa: TRY400

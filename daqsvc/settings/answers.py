@@ -14,6 +14,7 @@ from numbers import Real
 from types import NoneType, UnionType
 from typing import Any, ClassVar, ForwardRef, Literal, TypeVar, Union, get_args, get_origin
 
+_LONGEST = 60
 _ACCEPTED: Mapping[Any, type[Any]] = {
     # Whoever writes a list where one by one would do is understood.
     **dict.fromkeys((tuple, list, Sequence), Sequence),
@@ -73,7 +74,8 @@ def shown(wanted: Any) -> str:
 
 def short(value: object) -> str:
     """A value as an author knows it, on one short line."""
-    return f"{re.sub(r' object at 0x[0-9a-f]+', '', repr(value)):.60}"
+    text = " ".join(re.sub(r" object at 0x[0-9a-f]+", "", repr(value)).split())
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 4]} ..."
 
 
 def _no(value: object, wanted: Any) -> str:
@@ -124,7 +126,7 @@ def _lacking(value: object, protocol: Any) -> str:
             members[name] = part.fget.__annotations__["return"] if isinstance(part, property) else "object"
     for name, annotation in members.items():
         if not hasattr(value, name):
-            return f"{short(value)} has no {name}"
+            return f"{short(value)} lacks {name} of {protocol.__name__}"
         words = misfit(getattr(value, name), meaning(annotation, protocol.__module__), inside=True)
         if words:
             return f"in its {name}, {words}"

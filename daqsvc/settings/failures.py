@@ -23,7 +23,7 @@ class BrokenContractError(TypeError):
     """Code of a plugin has not raised, but done something else than its contract says.
 
     Args:
-        hook: the function, method or property.
+        hook: the function, method or property; None for the one that was asked.
         words: what it has done.
     """
 
@@ -68,8 +68,7 @@ def failure(error: BaseException, kind: type[Any], part: str) -> Failure:
     foreign = foreign_failure(error)
     if foreign is not None and not _is_foreign(kind.__module__):
         return foreign
-    hook = error.hook if isinstance(error, BrokenContractError) else getattr_static(kind, part, None)
-    code = _code(hook)
+    code = _code(getattr(error, "hook", None) or getattr_static(kind, part, None))
     homes = {getattr(sys.modules.get(kind.__module__), "__file__", None), code and code.co_filename}
     places = [(frame.f_code.co_filename, line) for frame, line in walk_tb(error.__traceback__)]
     own = [place for place in places if place[0] in homes]
@@ -143,7 +142,8 @@ def in_words(error: BaseException) -> str:
 def error_text(error: BaseException) -> str:
     """The kind of an error and what it says, on one line."""
     said = " ".join(f"{error}".split())
-    return ": ".join(word for word in (type(error).__name__, said) if word)
+    name = "" if isinstance(error, BrokenContractError) else type(error).__name__
+    return ": ".join(word for word in (name, said) if word)
 
 
 def authors_of(module: str) -> str:
@@ -157,10 +157,9 @@ def authors_of(module: str) -> str:
 
 
 def _failure(error: BaseException, part: str, place: tuple[str, int], module: str) -> Failure:
-    said = " ".join(f"{error}".split()) if isinstance(error, BrokenContractError) else error_text(error)
     where = f"{Path(place[0]).name}, line {place[1]}"
     cause = (type(error).__name__, part, where)
-    return Failure(f"{part} has failed: {said} ({where})", authors_of(module), cause)
+    return Failure(f"{part} has failed: {error_text(error)} ({where})", authors_of(module), cause)
 
 
 def _part(code: CodeType, module: str) -> str:

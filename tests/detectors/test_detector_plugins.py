@@ -35,7 +35,7 @@ class Kurtosis(Section):
 class Knocks:
     """A detector, as far as this needs one."""
 
-    stream = "motor"
+    stream = "drive-end"
     block = 1
     warm = process = silent = print
 
@@ -140,11 +140,30 @@ class Twice(KurtosisPlugin):
         return Knocks(given.sensor), Knocks(given.sensor)
 
 
+class Nowhere(KurtosisPlugin):
+    def build(self, machine, given, store):
+        made = Knocks(given.sensor)
+        made.stream = "nowhere"
+        return [made]
+
+
+class Standing(KurtosisPlugin):
+    def build(self, machine, given, store):
+        made = Knocks(given.sensor)
+        made.block = 0
+        return [made]
+
+
 @pytest.mark.parametrize(
     ("plugin", "words"),
     [
         ("Misnamed", "the plugin of 'kurtosis' makes a detector 'kurt', which no alarm follows"),
         ("Twice", "two detectors are named 'kurtosis'"),
+        ("Nowhere", "Nowhere has failed: its kurtosis takes 1 samples of 'nowhere'; have it take"),
+        (
+            "Standing",
+            "Standing has failed: its kurtosis takes 0 samples of 'drive-end'; have it",
+        ),
     ],
 )
 def test_detectors_that_no_alarm_can_tell_are_refused(installed, plugin, words):
@@ -180,6 +199,12 @@ def test_a_judgement_that_nobody_can_read_is_refused():
         Judgement("WARNING")
     with pytest.raises(ValueError, match="peak is 'much', which is not a number"):
         Judgement("alert", {"peak": "much"})
+    with pytest.raises(ValueError, match="its units are 3; give them by name, as a dict"):
+        Judgement("alert", {"peak": 1.0}, units=3)
+    with pytest.raises(ValueError, match="peak is 3, which is not a text"):
+        Judgement("alert", {"peak": 1.0}, units={"peak": 3})
+    with pytest.raises(ValueError, match="decision is 7, which is not a text"):
+        Judgement("alert", decision=7)
     machine = parse_machine_file(text(), EXAMPLE)
     made = Peak(machine, "peak", ["accel-de"], 0.5)
     made.answer = None

@@ -415,6 +415,37 @@ def test_words_that_fail_are_named_in_their_place(
     assert "128 bytes, 30 x 2 samples, 32 bit count" in text
 
 
+@pytest.mark.parametrize("hook", ["readings", "quality_alarms"])
+def test_figures_that_cannot_be_asked_for_do_not_keep_the_service_from_its_work(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture, hook: str
+) -> None:
+    failed = break_(monkeypatch, "crest.CrestPlugin", hook)
+    service = Service(parse_machine_file(TABLES, MACHINE), tmp_path)
+    assert [detector.name for detector in service.pipeline.detectors] == ["crest"]
+    assert failed in caplog.text
+    assert (
+        "have the authors of daqsvc-crest 1.0 mend it, or remove [pipeline.crest]; the service" in caplog.text
+    )
+
+
+def test_words_that_fail_end_check_with_an_error(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "machine.toml"
+    file.write_text(TABLES)
+    for owner, hook, table in (
+        ("crest.CrestPlugin", "describe", "pipeline.crest"),
+        ("tcp_frames.LoggerBus", "summary", "buses.logger"),
+    ):
+        with monkeypatch.context() as patch:
+            failed = break_(patch, owner, hook)
+            assert main(["check", str(file)]) == 2
+        said = capsys.readouterr()
+        assert said.err.startswith(f"{file}: {table}: {failed}")
+        assert said.err.endswith(f" mend it, or remove [{table}]\n")
+        assert "128 bytes, 30 x 2 samples" in " ".join(said.out.split())
+
+
 def test_a_driver_that_cannot_be_made_is_named_with_its_bus(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(class_at("tcp_frames.LoggerDriver"), "__init__", failing)
     machine = parse_machine_file(MACHINE.read_text(), MACHINE)
