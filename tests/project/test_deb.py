@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
@@ -10,6 +11,8 @@ from pathlib import Path
 
 import pytest
 from support.paths import ROOT
+
+import daqsvc
 
 pytestmark = [pytest.mark.integration, pytest.mark.long, pytest.mark.sources, pytest.mark.timeout(600)]
 
@@ -78,3 +81,64 @@ def test_every_library_has_a_wheel_for_aarch64(tmp_path: Path) -> None:
     if "connection" in listed.stderr.lower() or "timed out" in listed.stderr:
         pytest.skip("PyPI cannot be reached")
     assert listed.returncode == 0, listed.stderr
+
+
+IN_A_BOX_OF_ITS_OWN = """
+set -e
+mount -t tmpfs -o size=3g tmpfs "$1" 2>/dev/null || exit 77
+mkdir "$1/upper" "$1/work" "$1/root"
+mount -t overlay overlay -o "lowerdir=/,upperdir=$1/upper,workdir=$1/work" "$1/root" 2>/dev/null || exit 77
+mount -t proc proc "$1/root/proc"
+mkdir -p "$1/root/debs" && cp "$2" "$1/root/debs/old.deb" && cp "$3" "$1/root/debs/new.deb"
+exec env --ignore-environment PATH=/usr/sbin:/usr/bin:/sbin:/bin HOME=/root DEBIAN_FRONTEND=noninteractive \\
+    chroot "$1/root" sh -ec '
+        get() { apt-get -o APT::Sandbox::User=root -qq -y --no-install-recommends "$@" 2>&1; }
+        cd /debs
+        get install ./old.deb
+        echo "first: $(dpkg-query -W -f "\\${Version}" daqsvc), $(daqsvc --version), $(id -un daqsvc)"
+        daqsvc example laval-rig --out /etc/daqsvc/pump.toml
+        install -d /var/lib/daqsvc/pump /var/cache/daqsvc/kernels
+        daqsvc check /etc/daqsvc/pump.toml >/dev/null
+        systemd-analyze verify /lib/systemd/system/daqsvc@.service
+        get install ./new.deb
+        echo "upgraded: $(dpkg-query -W -f "\\${Version}" daqsvc), $(ls /etc/daqsvc /var/lib/daqsvc | xargs)"
+        get install --allow-downgrades ./old.deb
+        echo "gone back: $(dpkg-query -W -f "\\${Version}" daqsvc)"
+        get remove daqsvc
+        cd /
+        left() { ls -d "$@" etc/daqsvc/* var/lib/daqsvc/* 2>/dev/null | xargs; }
+        echo "removed: $(left usr/lib/daqsvc usr/bin/daqsvc)"
+        get purge daqsvc
+        echo "purged: $(left var/cache/daqsvc)"
+    '
+"""
+
+
+def test_it_is_installed_upgraded_taken_back_and_removed(package: Path, tmp_path: Path) -> None:
+    """By apt, on this machine's files under a layer that is thrown away."""
+    if os.geteuid() != 0:
+        pytest.skip("only root may mount the layer that keeps this machine clean")
+    old = package.name.split("_")[1]
+    subprocess.run(["dpkg-deb", "--raw-extract", package, tmp_path / "new"], check=True, timeout=100)
+    control = tmp_path / "new" / "DEBIAN" / "control"
+    control.write_text(control.read_text().replace(f"Version: {old}\n", f"Version: {old}.1\n"))
+    subprocess.run(
+        ["dpkg-deb", "-Znone", "--build", tmp_path / "new", tmp_path / "new.deb"], check=True, timeout=100
+    )
+    (tmp_path / "box").mkdir()
+    done = subprocess.run(
+        ["unshare", "--mount", "sh", "-c", IN_A_BOX_OF_ITS_OWN, "sh",
+         tmp_path / "box", package, tmp_path / "new.deb"],
+        check=False, capture_output=True, text=True, timeout=400,
+    )  # fmt: skip
+    if done.returncode == 77:
+        pytest.skip("this machine does not let a layer be mounted over its files")
+    assert done.returncode == 0, done.stdout + done.stderr
+    steps = re.findall(r"^(?:first|upgraded|gone back|removed|purged): .*", done.stdout, re.MULTILINE)
+    assert steps == [
+        f"first: {old}, daqsvc {daqsvc.__version__}, daqsvc",
+        f"upgraded: {old}.1, /etc/daqsvc: pump.toml /var/lib/daqsvc: pump",
+        f"gone back: {old}",
+        "removed: etc/daqsvc/pump.toml var/lib/daqsvc/pump",
+        "purged: etc/daqsvc/pump.toml var/lib/daqsvc/pump",
+    ]
