@@ -6,12 +6,12 @@ import logging
 import math
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
 import numpy as np
 
 from sim_hw.plants.rotor import RotorEscapeError
-from sim_hw.scenario import Scenario
+from sim_hw.scenario import BearingScenario, Scenario, ScenarioRun
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from daqsvc.recording.recording import Recording
     from daqsvc.settings import MachineFile
     from daqsvc.settings.sensors import BaseSensor
-    from sim_hw.scenario import BearingScenario, ScenarioRun
 
 
 logger = logging.getLogger(__name__)
@@ -45,30 +44,40 @@ class Signals(Protocol):
         ...
 
 
-class RotorSignals:
-    """Proximity probes and keyphasor of a rotor; probes without an angle point to +x, then to +y.
+ScenarioT = TypeVar("ScenarioT")
+RunT = TypeVar("RunT")
+
+
+class _ScenarioSignals(Generic[ScenarioT, RunT]):
+    """A scenario, simulated once for each sampling rate.
 
     Args:
-        scenario: what happens to the rotor.
+        scenario: what happens to the machine.
         duration_s: length of the run, instead of the scenario's.
         seed: instead of the scenario's.
-        snr_db: instead of the scenario's.
+        snr_db: instead of that of the scenario, or of its plant.
     """
 
     def __init__(
         self,
-        scenario: Scenario,
+        scenario: ScenarioT,
         duration_s: float | None = None,
         seed: int | None = None,
         snr_db: float | None = None,
     ) -> None:
-        self._scenario = scenario
-        self._revolutions = (
-            scenario.revolutions if duration_s is None else duration_s * scenario.plant.speed_rpm / 60.0
-        )
-        self._seed, self._snr_db = seed, snr_db
-        self._runs: dict[float, dict[str, NDArray[np.float64]]] = {}
-        self._angles_deg: dict[str, float] = {}
+        self._scenario, self._duration_s, self._seed, self._snr_db = scenario, duration_s, seed, snr_db
+        self._runs: dict[float, RunT] = {}
+        self._seen: list[str] = []
+
+    def _place(self, sensor: BaseSensor) -> int:
+        """The place of a sensor in the order in which they were asked for, from 0."""
+        if sensor.name not in self._seen:
+            self._seen.append(sensor.name)
+        return self._seen.index(sensor.name)
+
+
+class RotorSignals(_ScenarioSignals[Scenario, "dict[str, NDArray[np.float64]]"]):
+    """Proximity probes and keyphasor of a rotor; probes without an angle point to +x, then to +y."""
 
     def of(self, sensor: BaseSensor, rate_hz: float) -> NDArray[np.float64]:
         """See `Signals.of`."""
@@ -87,27 +96,27 @@ class RotorSignals:
         channels = self._run(rate_hz)
         if kind == "keyphasor":
             return channels["keyphasor_v"]
-        stated = getattr(sensor, "angle_deg", None)
-        angle_deg = self._angles_deg.setdefault(
-            sensor.name, 90.0 * (len(self._angles_deg) % 2) if stated is None else stated
-        )
-        angle = math.radians(angle_deg)
+        place, stated = self._place(sensor), getattr(sensor, "angle_deg", None)
+        angle = math.radians(90.0 * (place % 2) if stated is None else stated)
         displacement_um = math.cos(angle) * channels["x_um"] + math.sin(angle) * channels["y_um"]
         return displacement_um * _PER_UM[getattr(sensor, "unit", "um")]
 
     def _run(self, rate_hz: float) -> dict[str, NDArray[np.float64]]:
         if rate_hz not in self._runs:
             speed_hz = self._scenario.plant.speed_rpm / 60.0
+            revolutions = self._scenario.revolutions
+            if self._duration_s is not None:
+                revolutions = self._duration_s * self._scenario.plant.speed_rpm / 60.0
             onsets = tuple(
                 onset
                 for onset in self._scenario.onset
-                if onset.at_rev + self._scenario.dither_rev < self._revolutions
+                if onset.at_rev + self._scenario.dither_rev < revolutions
             )
             run = Scenario.model_validate(
                 {
                     **self._scenario.model_dump(),
                     "samples_per_rev": rate_hz / speed_hz,
-                    "revolutions": self._revolutions,
+                    "revolutions": revolutions,
                     "onset": [onset.model_dump() for onset in onsets],
                 }
             )
@@ -118,29 +127,8 @@ class RotorSignals:
         return self._runs[rate_hz]
 
 
-class BearingSignals:
-    """Accelerometers of a machine with a bearing: the first one on the rotor's side, others on the housing.
-
-    Args:
-        scenario: what happens to the bearing.
-        duration_s: length of the run, instead of the scenario's.
-        seed: instead of the scenario's.
-        snr_db: instead of the plant's.
-    """
-
-    def __init__(
-        self,
-        scenario: BearingScenario,
-        duration_s: float | None = None,
-        seed: int | None = None,
-        snr_db: float | None = None,
-    ) -> None:
-        if duration_s is not None:
-            kept = tuple(damage for damage in scenario.damage if damage.at_s < duration_s)
-            scenario = scenario.model_copy(update={"duration_s": duration_s, "damage": kept})
-        self._scenario, self._seed, self._snr_db = scenario, seed, snr_db
-        self._runs: dict[float, ScenarioRun] = {}
-        self._seen: list[str] = []
+class BearingSignals(_ScenarioSignals[BearingScenario, ScenarioRun]):
+    """Accelerometers of a machine with a bearing: the first on the rotor's side, others on the housing."""
 
     def of(self, sensor: BaseSensor, rate_hz: float) -> NDArray[np.float64]:
         """See `Signals.of`."""
@@ -151,11 +139,12 @@ class BearingSignals:
                 "choose the streams that hold those with --stream, or play a --recording"
             )
         if rate_hz not in self._runs:
-            self._runs[rate_hz] = self._scenario.accelerations(rate_hz, self._seed, self._snr_db)
-        run = self._runs[rate_hz]
-        if sensor.name not in self._seen:
-            self._seen.append(sensor.name)
-        on_rotor = self._seen.index(sensor.name) == 0
+            scenario, duration_s = self._scenario, self._duration_s
+            if duration_s is not None:
+                kept = tuple(damage for damage in scenario.damage if damage.at_s < duration_s)
+                scenario = scenario.model_copy(update={"duration_s": duration_s, "damage": kept})
+            self._runs[rate_hz] = scenario.accelerations(rate_hz, self._seed, self._snr_db)
+        run, on_rotor = self._runs[rate_hz], self._place(sensor) == 0
         return (run.rotor_m_s2 if on_rotor else run.housing_m_s2) * _PER_M_S2[getattr(sensor, "unit", "m/s2")]
 
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from daqsvc.detectors.rotor_bank.detector import KeyphasorProbe, Probe, RotorBankDetector
 from daqsvc.detectors.rotor_bank.modes import RotorMode, bank_modes
 from daqsvc.rotor import kernels
 from daqsvc.rotor.discretise import discretise
@@ -85,6 +86,29 @@ TWELVE_PLANTS: dict[str, dict[str, float]] = {
     "K1": {"stiffness": 0.95},
     "K2": {"stiffness": 0.90},
 }
+
+
+def damping_bank(
+    rate_hz: float,
+    noise_um: float,
+    *,
+    angles: Sequence[float] = (0.0, 90.0),
+    speed_rpm: float = 600.0,
+    **options: Any,
+) -> RotorBankDetector:
+    """The detector of the paper's modes on two probes and a keyphasor; columns as of `shaft_channels`."""
+    return RotorBankDetector(
+        machine="rig",
+        stream="shaft",
+        rate_hz=rate_hz,
+        speed_rpm=speed_rpm,
+        probes=(Probe("probe-x", 0, angles[0]), Probe("probe-y", 1, angles[1])),
+        keyphasor=KeyphasorProbe("keyphasor", 2, -6.0),
+        rotor=ROTOR,
+        modes=PAPER_MODES,
+        noise_um=noise_um,
+        **options,
+    )
 
 
 def seeds(default: int) -> int:

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from support.rotor_runs import damping_bank
 from support.shaft_channels import (
     FIRST,
     channels_of,
@@ -18,44 +19,18 @@ from support.shaft_channels import (
     no_keyphasor,
 )
 
-from daqsvc.detectors.rotor_bank.detector import KeyphasorProbe, Probe, RotorBankDetector, RotorMode
 from daqsvc.diagnosis.detector import Window
 from daqsvc.rotor.decision import DecisionRules
-from daqsvc.rotor.model import RotorParameters
 from sim_hw.plants import rotor as plant
 
 PER_REV = 64
 RATE_HZ = 640.0
 PERIOD_NS = 1e9 / RATE_HZ
 NOISE_UM = 19.6
-ROTOR = RotorParameters(
-    natural_frequency_hz=10.0,
-    damping_ratio=0.18,
-    eccentricity_um=10.0,
-    clearance_um=100.0,
-    static_sag_um=10.0,
-)
-MODES = (
-    RotorMode("N", 0.18),
-    RotorMode("F1", 0.10, "alert"),
-    RotorMode("F1L2", 0.06, "alert"),
-    RotorMode("F1L3", 0.02, "danger", rub=True),
-)
 
 
-def detector(*, angles=(0.0, 90.0), speed_rpm=600.0, **options):
-    return RotorBankDetector(
-        machine="rig",
-        stream="shaft",
-        rate_hz=RATE_HZ,
-        speed_rpm=speed_rpm,
-        probes=(Probe("probe-x", 0, angles[0]), Probe("probe-y", 1, angles[1])),
-        keyphasor=KeyphasorProbe("keyphasor", 2, -6.0),
-        rotor=ROTOR,
-        modes=MODES,
-        noise_um=NOISE_UM,
-        **options,
-    )
+def detector(**options):
+    return damping_bank(RATE_HZ, NOISE_UM, **options)
 
 
 def channels(changes=(), *, revolutions=20.0, w=1.0, angles=(0.0, 90.0), seed=0, noise_um=NOISE_UM):

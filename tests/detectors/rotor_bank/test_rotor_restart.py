@@ -6,14 +6,14 @@ import asyncio
 
 import numpy as np
 import pytest
+from support.rotor_runs import damping_bank
 from support.shaft_channels import channels_of
 
 from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.ring import RingReader, SampleRing
 from daqsvc.acquisition.samples import Quality, SampleBlock
-from daqsvc.detectors.rotor_bank.detector import KeyphasorProbe, Probe, RotorBankDetector, RotorMode
+from daqsvc.detectors.rotor_bank.detector import KeyphasorProbe, Probe
 from daqsvc.detectors.rotor_synchronous.revolutions import RevolutionStream
-from daqsvc.rotor.model import RotorParameters
 from sim_hw.plants import rotor as plant
 
 PER_REV = 64
@@ -29,30 +29,7 @@ LATE_REV = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9]
 
 
 def bank():
-    rotor = RotorParameters(
-        natural_frequency_hz=10.0,
-        damping_ratio=0.18,
-        eccentricity_um=10.0,
-        clearance_um=100.0,
-        static_sag_um=10.0,
-    )
-    modes = (
-        RotorMode("N", 0.18),
-        RotorMode("F1", 0.10, "alert"),
-        RotorMode("F1L2", 0.06, "alert"),
-        RotorMode("F1L3", 0.02, "danger", rub=True),
-    )
-    return RotorBankDetector(
-        machine="rig",
-        stream="shaft",
-        rate_hz=RATE_HZ,
-        speed_rpm=600.0,
-        probes=PROBES,
-        keyphasor=KEYPHASOR,
-        rotor=rotor,
-        modes=modes,
-        noise_um=NOISE_UM,
-    )
+    return damping_bank(RATE_HZ, NOISE_UM)
 
 
 def blocks_of(samples, late_rev):
