@@ -35,6 +35,7 @@ import itertools
 
 import numpy as np
 
+from daqsvc.api import BusCounters, Link
 from daqsvc.api import Bus, DetectorPlugin, DriverPlugin, PackedLayout, Section, StreamDriver, WindowDetector
 
 
@@ -61,11 +62,21 @@ class MishapDriver(StreamDriver):
                 return None
 
 
+class OwnDriver:
+    def __init__(self, how, port):
+        self.name, self.link, self.counters, self.streams = port.name, Link(port.name), BusCounters(), {}
+        self.how = how
+
+    async def run(self):
+        if self.how == "own raises":
+            raise KeyError("it was here")
+
+
 class MishapDriverPlugin(DriverPlugin[MishapBus]):
     buses, layouts = (MishapBus,), (PackedLayout,)
 
     def build(self, bus, port):
-        return MishapDriver(bus.how, port)
+        return (OwnDriver if bus.how.startswith("own") else MishapDriver)(bus.how, port)
 
 
 class Mishap(Section):
@@ -203,3 +214,18 @@ async def test_a_driver_and_a_detector_that_fail_are_named_once_and_the_rest_goe
         assert line.endswith(f"; have the authors of daqsvc-mishap 2.1 mend it; {then}")
     assert len(said) == 2
     assert not any(record.exc_info for record in caplog.records if record.levelno > logging.INFO)
+
+
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [("own raises", "KeyError: 'it was here'"), ("own ends", "it has ended by itself")],
+)
+async def test_a_driver_with_a_run_of_its_own_is_named_once_and_started_again(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, how: str, said: str
+) -> None:
+    text = MACHINE.partition("[pipeline.mishap]")[0] + STREAM.format(name="bad", how=how)
+    async with running(parse_machine_file(text, tmp_path / "machine.toml"), tmp_path / "store") as service:
+        await eventually(lambda: service.supervisor.failures["driver bad"] >= 3, "it was started again")
+    [line] = [record.getMessage() for record in caplog.records if record.levelno >= logging.ERROR]
+    assert line.startswith(f"driver bad: run of mishap.OwnDriver has failed: {said} (mishap.py, line ")
+    assert line.endswith("have the authors of daqsvc-mishap 2.1 mend it; it is started again")
