@@ -1,7 +1,7 @@
 # make demo   the whole service against a simulated machine, live in the terminal
 # make test   the tests; make test ROOM=rotor those of one room, a folder of tests/
 # make test-long  the long ones: statistics over hundreds of runs, soak, fuzz; of one room likewise
-# make hil    tests on real CAN interfaces (vcan), in a guest kernel where this one has none; as root
+# make hil    tests on real CAN interfaces (vcan), and of the unit under systemd, in a guest kernel; as root
 # make check  formatting, lint, types, layers
 # make bench  speed, as ratios measured in one run
 # make dist   what a release consists of, in dist/: wheel, and a CycloneDX list of everything it is installed with

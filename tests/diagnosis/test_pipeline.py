@@ -102,6 +102,34 @@ async def test_a_detector_that_is_too_slow_learns_exactly_what_it_missed() -> No
     assert pipeline.counters["slow"].samples_skipped == 125
 
 
+async def test_only_a_detector_with_samples_can_be_found_to_stand_still() -> None:
+    ring = SampleRing("s", ("a",), 50)
+    quick, hung = Listener("quick", 10), Listener("hung", 10)
+    pipeline = Pipeline({"s": ring}, [quick, hung], lambda _: None, CLOCK)
+    running = asyncio.create_task(pipeline.run())
+    assert {part: progress.step for part, progress in pipeline.progress().items()} == {
+        "detector quick": None,
+        "detector hung": None,
+    }
+    hung.go_on.clear()
+    write(ring, 10)
+    await eventually(lambda: pipeline.counters["quick"].windows == 1, "it has its window")
+    await asyncio.sleep(0.05)
+    before = pipeline.progress()
+    assert before["detector quick"].step is None, "it waits for samples"
+    assert before["detector hung"].step is not None
+    assert before["detector hung"].thread is not None
+    write(ring, 30)
+    await asyncio.sleep(0.05)
+    assert pipeline.progress()["detector hung"] == before["detector hung"]
+    hung.go_on.set()
+    await eventually(lambda: pipeline.counters["hung"].samples == 40, "it has caught up")
+    await asyncio.sleep(0.05)
+    assert pipeline.progress()["detector hung"].step is None
+    ring.close()
+    await running
+
+
 async def test_an_outage_longer_than_the_ring_is_no_fault_of_the_detector(
     caplog: pytest.LogCaptureFixture,
 ) -> None:

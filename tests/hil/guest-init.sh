@@ -40,6 +40,10 @@ hostname hil-guest
 echo 100000 >/proc/sys/net/core/netdev_max_backlog
 ip link set lo up
 
+if [ "${HIL_MODE:-}" = systemd ]; then
+    . "$HIL_LIB/guest-systemd.sh"
+    exec /lib/systemd/systemd --show-status=false --log-target=journal
+fi
 HOME=/root TERM=dumb LANG=C.UTF-8 sh "$HIL_OUT/command" </dev/null >"$HIL_OUT/console" 2>&1
 echo $? >"$HIL_OUT/exit-code.new"
 mv "$HIL_OUT/exit-code.new" "$HIL_OUT/exit-code"

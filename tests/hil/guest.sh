@@ -1,7 +1,9 @@
 #!/bin/bash
 # guest.sh - run a command in a throw-away User-Mode Linux guest with SocketCAN, on this machine's files.
 #
-#   guest.sh COMMAND [ARGUMENT ...]      exit: the command's; 124 too late; 125 the guest was lost
+#   guest.sh [--systemd] COMMAND [ARGUMENT ...]   exit: the command's; 124 too late; 125 the guest was lost
+#
+# With --systemd that is the guest's first process, and the command runs beside it.
 #
 # The guest sees this machine's files read-only under a layer in memory: what the command writes is gone
 # when it ends, but for its output and what it puts into $HIL_OUT. This keeps the machine clean; it is no
@@ -10,6 +12,8 @@
 set -uo pipefail
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 limit_s=${HIL_LIMIT_S:-300}
+mode=plain
+[ "${1:-}" != --systemd ] || { mode=systemd; shift; }
 out=${HIL_OUT:-$(mktemp -d "${TMPDIR:-/tmp}/hil.XXXXXX")}
 mkdir -p "$out"
 case "$here$out$PWD" in *' '*) echo "guest.sh: paths travel on a kernel's command line: no spaces, please" >&2; exit 2;; esac
@@ -33,7 +37,7 @@ sockets=$(mktemp -d "${TMPDIR:-/tmp}/uml.XXXXXX")
 unshare --pid --fork --kill-child -- taskset -c "$cpu" linux.uml \
     mem="${HIL_MEMORY:-1500M}" umid=hil uml_dir="$sockets" con=null con0=null,fd:1 ssl=null panic=-1 loglevel=4 \
     root=/dev/root rootfstype=hostfs rootflags=/ ro init="$here/guest-init.sh" \
-    HIL_GUEST=1 HIL_OUT="$out" HIL_MODULES=/usr/lib/uml/modules </dev/null >"$out/kernel.log" 2>&1 &
+    HIL_GUEST=1 HIL_MODE=$mode HIL_LIB="$here" HIL_OUT="$out" HIL_MODULES=/usr/lib/uml/modules </dev/null >"$out/kernel.log" 2>&1 &
 guest=$!
 trap 'kill -KILL $guest 2>/dev/null; rm -rf "$sockets"' EXIT
 trap 'exit 130' INT TERM

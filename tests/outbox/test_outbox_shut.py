@@ -106,6 +106,8 @@ async def test_without_room_the_alarms_are_watched_at_once_and_stored_later(disk
     async with desk_in(store, NO_BALLAST) as desk:
         assert desk.outbox.counters.shut == 1
         await eventually(lambda: "cannot be opened" in caplog.text, "it is said")
+        step = desk.outbox.progress.step
+        await eventually(lambda: desk.outbox.progress.step != step, "the writer gets on: no watchdog bites")
         if before:
             assert state(desk, "rotor-fault").is_latched, "what stood is known all the same"
         find(desk, "bearing-fault", "danger")
