@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from support.brokers import free_port
 from support.machine_files import LAVAL
-from support.waiting import PATIENCE_S
+from support.waiting import PATIENCE_S, eventually_blocking
 
 from daqsvc.commands import process_guard
 
@@ -39,6 +39,7 @@ HANGS_S = 240.0
 
 MAIN = """
 import asyncio, os, sys, threading, time
+from pathlib import Path
 import daqsvc.service
 from daqsvc.cli import main
 from daqsvc.commands import process_guard
@@ -52,17 +53,23 @@ def once_ready(do):
         await before(self, stop, first)
     Service._until_stopped = until_stopped
 
+def when_asked(hang):
+    asked = Path(sys.argv[sys.argv.index("--store") + 1]).with_name("hang")
+    def look():
+        if asked.exists():
+            asked.rename(asked.with_name("hangs"))
+            hang()
+        asyncio.get_running_loop().call_later(0.02, look)
+    once_ready(lambda self: look())
+
 process_guard.STOP_TURNS = {turns}
 {fault}
 sys.exit(main(sys.argv[1:]))
 """
 
 FAULTS = {
-    "loop": "once_ready(lambda self: asyncio.get_running_loop().call_later(0.3, time.sleep, 60))",
-    "busy loop": (
-        "def spin():\n    while True: pass\n"
-        "once_ready(lambda self: asyncio.get_running_loop().call_later(0.3, spin))"
-    ),
+    "loop": "when_asked(lambda: time.sleep(60))",
+    "busy loop": "def spin():\n    while True: pass\nwhen_asked(spin)",
     "task": (
         "async def deaf(self):\n"
         "    while True:\n"
@@ -126,6 +133,12 @@ def service(
         process.stderr.close()
 
 
+def let_hang(tmp_path: Path) -> None:
+    """Have the event loop hang now, and not before the test has seen that the service is ready."""
+    (tmp_path / "hang").touch()
+    eventually_blocking((tmp_path / "hangs").exists, "the event loop hangs")
+
+
 def rest_of(process: subprocess.Popen[str]) -> str:
     assert process.stderr is not None
     return process.stderr.read()
@@ -140,7 +153,8 @@ def closed(tmp_path: Path) -> bool:
 @pytest.mark.parametrize("hangs", ["loop", "task", *(_long(name) for name in ("busy loop", "thread"))])
 def test_a_stop_is_obeyed_whatever_hangs_and_the_journal_is_closed(hangs: str, tmp_path: Path) -> None:
     with service(tmp_path, FAULTS[hangs], process_guard.STOP_TURNS) as process:
-        time.sleep(0.5)
+        if "loop" in hangs:
+            let_hang(tmp_path)
         begun_s = time.monotonic()
         process.send_signal(signal.SIGTERM)
         said = rest_of(process)
@@ -191,6 +205,7 @@ def test_a_call_that_hangs_in_a_thread_does_not_delay_the_end(tmp_path: Path) ->
 
 def test_an_event_loop_that_stands_still_ends_the_process(tmp_path: Path) -> None:
     with service(tmp_path, f"process_guard.STUCK_TURNS = 10\n{FAULTS['loop']}") as process:
+        let_hang(tmp_path)
         said = rest_of(process)
         assert process.wait(PATIENCE_S) == 5, said
     assert "the event loop has stood still for 1 s: the event loop is in " in said
