@@ -44,7 +44,7 @@ _LABELS: dict[Level, Severity] = {
 
 
 class AlarmState(StrEnum):
-    """What is published about an alarm."""
+    """What a consumer is told about an alarm."""
 
     NORMAL = "normal"
     ACTIVE_UNACKNOWLEDGED = "active_unacknowledged"
