@@ -33,7 +33,7 @@ def detectors(machine: MachineFile, store: Path | None = None) -> list[Detector]
 
     Raises:
         AssemblyError: a calibration that the machine file names cannot be used, or a plugin fails, or makes a
-            detector under a name that no alarm can follow.
+            detector under a name that no alarm can follow, or none although an alarm follows it.
     """
     made: dict[str, Detector] = {}
     streams = {*machine.streams, *(grid.name for grid in machine.grids)}
@@ -45,6 +45,12 @@ def detectors(machine: MachineFile, store: Path | None = None) -> list[Detector]
                     takes = f"its {detector.name} takes {detector.block} samples of {detector.stream!r}"
                     words = f"{takes}; have it take 1 or more of a stream: {', '.join(sorted(streams))}"
                     raise PluginFailedError(plugin, "build", BrokenContractError(None, words))
+        followed = [one.name for one in machine.alarms if getattr(one, "detector", None) == plugin.detector]
+        if not built and plugin.detector is not None and followed:
+            raise AssemblyError(
+                f"the plugin of {plugin.detector!r} makes no detector, and alarm {followed[0]!r} follows it; "
+                "remove the alarm, or have the plugin make one"
+            )
         for detector in built:
             if detector.name in made:
                 raise AssemblyError(f"two detectors are named {detector.name!r}; have the plugin number them")

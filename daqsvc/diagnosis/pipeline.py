@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.ring import RingClosed, RingReader
 from daqsvc.acquisition.standing import StreamState
-from daqsvc.diagnosis.record import Diagnosis, silence_reason
+from daqsvc.diagnosis.record import Diagnosis, is_text, silence_reason
 from daqsvc.dsp.quality.missing import Patience
 from daqsvc.settings.failures import BrokenContractError, error_text
 from daqsvc.supervision import Progress, Supervisor, over
@@ -176,6 +176,9 @@ LOOK_NS = NS_PER_S // 2
 MOST_HELD = 4096
 """Statements of a stream that wait for its rate to be known, at most; the oldest are dropped."""
 
+MOST_WORDS = 2000
+"""Characters of what an exception of a detector says, at most."""
+
 HANG_S = 30.0
 """A window that takes longer to process hangs; its detector is left alone with it, and the others go on."""
 
@@ -249,6 +252,8 @@ class Pipeline:
         self._clock = clock
         self._supervisor = supervisor or Supervisor()
         self._threads = threads
+        self._names: dict[str, frozenset[str]] = {}
+        """By detector, the names that its statements may have."""
         self._under_way: dict[str, Job[Sequence[Diagnosis]]] = {}
         """By detector, the window that is being processed: it outlives the task that has begun it."""
 
@@ -316,7 +321,7 @@ class Pipeline:
     def _compile_all(self) -> None:
         for detector in self.detectors:
             with self._supervisor.sparing_others(_part(detector), "it compiles when samples come"):
-                detector.warm()
+                _asked(detector.warm)
 
     async def run(self) -> None:
         """Process until every ring is closed and every whole block in it is processed.
@@ -461,6 +466,25 @@ class Pipeline:
                 hangs = f"it has computed on one window for {HANG_S:g} s"
                 self._supervisor.failed(_part(detector), hangs, "the other detectors go on without it")
 
+    def _see_names(self, detector: Detector, said: Sequence[Diagnosis], t_ns: int) -> None:
+        """See that a detector speaks for itself only: what its `silent` speaks for, or its own name.
+
+        Raises:
+            BrokenContractError: it speaks under another name, which an alarm of another detector may follow.
+        """
+        if all(one.detector == detector.name for one in said):
+            return
+        if detector.name not in self._names:
+            names = (one.detector for one in _said(detector.silent, 0.0, t_ns))
+            self._names[detector.name] = frozenset({detector.name, *names})
+        known = self._names[detector.name]
+        for one in said:
+            if one.detector not in known:
+                words = (
+                    f"it returns a statement of {one.detector!r:.60}; name it {' or '.join(sorted(known))}"
+                )
+                raise BrokenContractError(detector.process, words)
+
     def _process(self, detector: Detector, window: Window) -> Sequence[Diagnosis]:
         """What a detector says of a window; on a kernel thread.
 
@@ -470,7 +494,8 @@ class Pipeline:
         # The kernels' load on the host is a matter of the host's clock, whatever clock the samples have.
         begun_ns = time.perf_counter_ns()
         try:
-            return _said(detector.process, window)
+            said = _said(detector.process, window)
+            self._see_names(detector, said, window.t_end_ns)
         except Exception as error:  # noqa: BLE001 - said and counted
             counters.failures += 1
             self._supervisor.failed(_part(detector), error, "it goes on with the next window")
@@ -481,6 +506,8 @@ class Pipeline:
                     for held in _said(detector.silent, 0.0, window.t_end_ns)
                 ]
             return []
+        else:
+            return said
         finally:
             counters.windows += 1
             counters.samples += len(window.samples)
@@ -493,10 +520,36 @@ def _said(say: Callable[..., Sequence[Diagnosis]], *of: Any) -> Sequence[Diagnos
     Raises:
         BrokenContractError: these are no statements.
     """
-    said = say(*of)
+    said = _asked(say, *of)
     if not isinstance(said, Sequence) or not all(isinstance(one, Diagnosis) for one in said):
         raise BrokenContractError(say, f"it returns {said!r:.60}, not Sequence[Diagnosis]")
     return said
+
+
+def _asked(hook: Callable[..., T], *of: Any) -> T:
+    """What a detector answers; whatever ends its code is a failure like any other, with words to be said.
+
+    Raises:
+        Exception: it has failed.
+    """
+    try:
+        return hook(*of)
+    except BaseException as error:
+        words = _words(error)
+        if isinstance(error, Exception) and words is not None:
+            raise
+        kind = type(error).__name__
+        told = "" if words is None else f": {words}" if words else ""
+        raise RuntimeError(f"it raises {kind}{told}").with_traceback(error.__traceback__) from None
+
+
+def _words(error: BaseException) -> str | None:
+    """What an exception of a detector says; None if it cannot be said, sent or written down."""
+    try:
+        words = str(error)
+        return words if is_text(words, MOST_WORDS) else None
+    except BaseException:  # noqa: BLE001 - that is what None says
+        return None
 
 
 def _part(detector: Detector) -> str:

@@ -83,3 +83,10 @@ class Diagnosis:
 def silence_reason(stream: str, silence_s: float) -> str:
     """Why a statement about a silent stream is not good."""
     return f"no samples of {stream} for {silence_s:.1f} s; check bus and device"
+
+
+def is_text(value: object, longest: int) -> bool:
+    """Whether something is a text that can be sent and written down: UTF-8 without NUL, not too long."""
+    if not isinstance(value, str) or len(value) > longest or "\0" in value:
+        return False
+    return not any("\ud800" <= character <= "\udfff" for character in value)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from numbers import Real
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING, Any, cast, get_args
 
 import numpy as np
 
-from daqsvc.diagnosis.record import Diagnosis, Severity
+from daqsvc.diagnosis.record import Diagnosis, Severity, is_text
 from daqsvc.settings.failures import BrokenContractError
 from daqsvc.settings.problems import AssemblyError, choice
 
@@ -21,6 +22,15 @@ if TYPE_CHECKING:
     from daqsvc.diagnosis.detector import Window
     from daqsvc.dsp.quality import Quality
     from daqsvc.settings.models import MachineFile, Sensor
+
+
+MOST_FIGURES = 1000
+"""Statistics, and thresholds, of a judgement at most."""
+MOST_CHARACTERS = 200
+"""Length of a name, a unit and a decision at most."""
+_TEXT = f"give a text of {MOST_CHARACTERS} characters at most, without NUL and surrogates"
+_RING_WINDOWS = 2
+"""Windows that a ring must hold at least."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +46,8 @@ class Judgement:
         thresholds: what the statistics were held against, by name.
 
     Raises:
-        ValueError: there is no such severity, or a figure, unit or decision is of another kind.
+        ValueError: there is no such severity, a figure, unit or decision is of another kind, a figure is not
+            finite, a text cannot be sent, or there are too many of them.
     """
 
     severity: Severity
@@ -49,14 +60,28 @@ class Judgement:
         if self.severity not in get_args(Severity):
             raise ValueError(f"there is no severity {self.severity!r}; {choice('', get_args(Severity))}")
         for name in ("statistics", "units", "thresholds"):
-            if not isinstance(getattr(self, name), Mapping):
-                raise ValueError(f"its {name} are {getattr(self, name)!r:.60}; give them by name, as a dict")  # noqa: TRY004 - likewise
+            _see_names(name, getattr(self, name))
         for name, text in (("decision", self.decision), *self.units.items()):
             if not isinstance(text, str):
                 raise ValueError(f"{name} is {text!r:.60}, which is not a text")  # noqa: TRY004 - of the value
+            if not is_text(text, MOST_CHARACTERS):
+                raise ValueError(f"{name} is {text!r:.60}; {_TEXT}")
         for name, value in (*self.statistics.items(), *self.thresholds.items()):
             if not isinstance(value, Real):
-                raise ValueError(f"{name} is {value!r}, which is not a number")  # noqa: TRY004 - of the value
+                raise ValueError(f"{name} is {value!r:.60}, which is not a number")  # noqa: TRY004 - of the value
+            if not _is_finite(value):
+                raise ValueError(f"{name} is {value!s:.60}; give a finite number, or leave it out")
+
+
+def _see_names(what: str, named: object) -> None:
+    """See that figures or units are there by names that can be told."""
+    if not isinstance(named, Mapping):
+        raise ValueError(f"its {what} are {named!r:.60}; give them by name, as a dict")  # noqa: TRY004 - of the value
+    if len(named) > MOST_FIGURES:
+        raise ValueError(f"it has {len(named)} {what}; give {MOST_FIGURES} at most")
+    for key in named:
+        if not is_text(key, MOST_CHARACTERS):
+            raise ValueError(f"{key!r:.60} in its {what} is no name; {_TEXT}")
 
 
 class WindowDetector(ABC):
@@ -69,7 +94,8 @@ class WindowDetector(ABC):
         window_s: length of a window.
 
     Raises:
-        AssemblyError: there is no such sensor, or they are not all in one stream.
+        AssemblyError: there is no such sensor, they are not all in one stream, or the ring does not hold two
+            windows.
     """
 
     def __init__(self, machine: MachineFile, name: str, sensors: Sequence[str], window_s: float) -> None:
@@ -79,6 +105,13 @@ class WindowDetector(ABC):
             raise AssemblyError(
                 f"detector {name} takes samples of one stream together, and its sensors "
                 f"{', '.join(sensors)} are in {', '.join(sorted(streams)) or 'none'}; give it sensors of one"
+            )
+        ring_s = machine.pipeline.ring_s
+        length: Any = window_s if isinstance(cast("object", window_s), Real) else math.nan
+        if not 0.0 < length <= ring_s / _RING_WINDOWS:  # NaN is not, either
+            raise AssemblyError(
+                f"detector {name}: window_s is {window_s!r:.60}; make it a number above 0 and at most "
+                f"{ring_s / _RING_WINDOWS:g}, so that a ring of {ring_s:g} s holds {_RING_WINDOWS} windows"
             )
         self.name = name
         self.stream = resolved[0].stream
@@ -142,6 +175,13 @@ class WindowDetector(ABC):
             changed=changed,
         )
         return self._held
+
+
+def _is_finite(value: Any) -> bool:
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an integer beyond what a float holds
+        return False
 
 
 def _sensor(machine: MachineFile, name: str, sensor: str) -> Sensor:

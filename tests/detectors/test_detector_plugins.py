@@ -154,9 +154,15 @@ class Standing(KurtosisPlugin):
         return [made]
 
 
+class Nobody(KurtosisPlugin):
+    def build(self, machine, given, store):
+        return []
+
+
 @pytest.mark.parametrize(
     ("plugin", "words"),
     [
+        ("Nobody", "the plugin of 'kurtosis' makes no detector, and alarm 'impacts' follows it; remove the"),
         ("Misnamed", "the plugin of 'kurtosis' makes a detector 'kurt', which no alarm follows"),
         ("Twice", "two detectors are named 'kurtosis'"),
         ("Nowhere", "Nowhere has failed: its kurtosis takes 1 samples of 'nowhere'; have it take"),
@@ -210,6 +216,37 @@ def test_a_judgement_that_nobody_can_read_is_refused():
     made.answer = None
     with pytest.raises(TypeError, match="it returns None, not Judgement"):
         one_window(made, machine)
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"statistics": {"peak": np.nan}}, "peak is nan; give a finite number"),
+        ({"statistics": {"peak": np.float32(-np.inf)}}, "peak is -inf; give a finite number"),
+        ({"statistics": {"peak": 10**400}}, "peak is 1000.*; give a finite number"),
+        ({"thresholds": {"peak.alert": np.inf}}, "peak.alert is inf; give a finite number"),
+        ({"statistics": {5: 1.0}}, "5 in its statistics is no name; give a text of 200"),
+        ({"statistics": {"a\0": 1.0}}, r"'a.x00' in its statistics is no name"),
+        ({"thresholds": {"\ud800": 1.0}}, "in its thresholds is no name"),
+        ({"units": {"peak": "\ud800"}}, "peak is '.ud800'; give a text of 200"),
+        ({"decision": "a" * 201}, "decision is 'aaa.*; give a text of 200"),
+        ({"statistics": {f"k{k}": 1.0 for k in range(1001)}}, "it has 1001 statistics; give 1000 at most"),
+    ],
+)
+def test_a_judgement_that_cannot_be_sent_or_held_against_a_limit_is_refused(fields, words):
+    with pytest.raises(ValueError, match=words):
+        Judgement("alert", **fields)
+
+
+@pytest.mark.parametrize("window_s", [0, -1.0, np.nan, np.inf, 1e5, "one", None])
+def test_a_window_that_no_ring_holds_is_refused(window_s):
+    machine = parse_machine_file(text(), EXAMPLE)
+    most_s = machine.pipeline.ring_s / 2
+    with pytest.raises(AssemblyError) as refused:
+        Peak(machine, "peak", ["accel-de"], window_s)
+    bounds = f"window_s is {window_s!r}; make it a number above 0 and at most {most_s:g}, so"
+    assert str(refused.value).startswith(f"detector peak: {bounds}")
+    Peak(machine, "peak", ["accel-de"], most_s)
 
 
 def test_sensors_that_are_not_sampled_together_are_refused():

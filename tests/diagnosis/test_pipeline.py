@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -188,6 +189,68 @@ async def test_one_that_raises_each_time_is_in_doubt_all_the_time() -> None:
     await running
     assert {d.quality for d in said} == {"missing"}
     assert supervisor.failures["detector broken"] == 3
+
+
+class UnsayableError(Exception):
+    def __str__(self) -> str:
+        raise RuntimeError("nested")
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (SystemExit(0), "it raises SystemExit: 0"),
+        (KeyboardInterrupt(), "it raises KeyboardInterrupt"),
+        (GeneratorExit(), "it raises GeneratorExit"),
+        (asyncio.CancelledError(), "it raises CancelledError"),
+        (UnsayableError(), "it raises UnsayableError"),
+        (ValueError("\ud800"), "it raises ValueError"),
+    ],
+)
+async def test_whatever_ends_a_detector_is_one_failed_window(
+    error: BaseException, words: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    ring = SampleRing("s", ("a",), 50)
+    broken = Listener("broken", 10)
+
+    def fail(*_: object) -> list[Diagnosis]:
+        raise error
+
+    judge, broken.process = broken.process, fail  # type: ignore[method-assign]
+    said: list[Diagnosis] = []
+    pipeline = Pipeline({"s": ring}, [broken], said.append, CLOCK)
+    broken.warm = fail  # type: ignore[method-assign,assignment]
+    await pipeline.warm()
+    running = asyncio.create_task(pipeline.run())
+    for count in range(1, 4):
+        write(ring, 10)
+        await eventually(lambda count=count: len(said) == count, "the window has failed")
+    broken.process = judge  # type: ignore[method-assign]
+    write(ring, 10)
+    await eventually(lambda: len(said) == 4, "the window is judged")
+    ring.close()
+    await running
+    assert [d.quality for d in said] == ["missing"] * 3 + ["good"]
+    assert {d.reason for d in said[:3]} == {f"detector broken has failed: RuntimeError: {words}"}
+    assert pipeline.counters["broken"].failures == 3
+    errors = [r.getMessage() for r in caplog.records if r.levelno >= logging.ERROR]
+    assert all(f"detector broken: failed with RuntimeError: {words}" in line for line in errors)
+
+
+async def test_a_statement_in_the_name_of_another_detector_is_a_failure() -> None:
+    ring = SampleRing("s", ("a",), 50)
+    broken = Listener("broken", 10)
+    own = broken.process
+    broken.process = lambda window: [replace(one, detector="levels") for one in own(window)]  # type: ignore[method-assign]
+    said: list[Diagnosis] = []
+    pipeline = Pipeline({"s": ring}, [broken], said.append, CLOCK)
+    running = asyncio.create_task(pipeline.run())
+    write(ring, 10)
+    await eventually(lambda: len(said) == 1, "the window has failed")
+    ring.close()
+    await running
+    words = "detector broken has failed: it returns a statement of 'levels'; name it broken"
+    assert [(d.detector, d.quality, d.reason) for d in said] == [("broken", "missing", words)]
 
 
 def always_failing(window: Window) -> list[Diagnosis]:
