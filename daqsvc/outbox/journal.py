@@ -43,9 +43,9 @@ from daqsvc.outbox.sequence import SequenceMark, place_of
 from daqsvc.outbox.tables import (
     FILL_LATEST,
     SCHEMA_VERSION,
-    UNLIKELY_VERSION,
-    are_of_this_version,
     bring_up_to_date,
+    newer_writer,
+    version_of,
 )
 from daqsvc.outbox.unwritten import Unwritten
 from daqsvc.outbox.written_by import note_version, written_by
@@ -458,16 +458,12 @@ class Journal:
 
     def _prepare(self, connection: sqlite3.Connection) -> int | None:
         """Bring the tables up to date; the highest number that the file knows, None if it is new."""
-        version = pragma(connection, "user_version")
-        if not 0 <= version < UNLIKELY_VERSION:
-            raise corruption(f"schema version {version}")
-        if version > SCHEMA_VERSION and are_of_this_version(connection):
-            raise corruption(f"schema version {version} with the tables of {SCHEMA_VERSION}")
+        writer = written_by(self.path)
+        version = version_of(connection, writer)
         if version > SCHEMA_VERSION:
-            writer = written_by(self.path) or "a newer version"
             raise NewerOutboxError(
-                f"outbox {self.path} has schema version {version}, written by daqsvc {writer}; this is "
-                f"daqsvc {__version__}, which knows {SCHEMA_VERSION}: install that version again, or give "
+                f"outbox {self.path} has schema version {version}, written by {newer_writer(writer)}; this "
+                f"is daqsvc {__version__}, which knows {SCHEMA_VERSION}: install that version again, or give "
                 f"the service another store"
             )
         if version < SCHEMA_VERSION:

@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 from urllib.parse import quote
 
-from daqsvc.outbox.files import FileError, pragma, remedy
+from daqsvc.outbox.files import FileError, remedy
 from daqsvc.outbox.messages import OutboxError, is_sound
 from daqsvc.outbox.safety import refuse_link
-from daqsvc.outbox.tables import SCHEMA_VERSION
+from daqsvc.outbox.tables import SCHEMA_VERSION, newer_writer, version_of
 from daqsvc.outbox.written_by import written_by
 
 if TYPE_CHECKING:
@@ -174,7 +174,8 @@ def _read_once(path: Path, query: Callable[[sqlite3.Connection], _T]) -> _T:
 
 
 def _check_version(path: Path, connection: sqlite3.Connection) -> None:
-    version = pragma(connection, "user_version")
+    writer = written_by(path)
+    version = version_of(connection, writer)
     if not version and not connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
         raise OutboxError(
             f"the journal {path} is empty: the service has not been able to write anything to it yet; "
@@ -184,7 +185,7 @@ def _check_version(path: Path, connection: sqlite3.Connection) -> None:
         raise OutboxError(
             f"the journal {path} has schema version {version}, this program reads {SCHEMA_VERSION}; "
             + (
-                f"use the program that the service runs, daqsvc {written_by(path) or 'of a newer version'}"
+                f"use the program that the service runs, {newer_writer(writer)}"
                 if version > SCHEMA_VERSION
                 else "start the service once"
             )

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, TypeAlias
 
+from daqsvc import __version__
+from daqsvc.outbox.files import corruption, pragma
 from daqsvc.outbox.messages import checksum, is_sound
 
 if TYPE_CHECKING:
@@ -13,9 +15,6 @@ Row: TypeAlias = tuple[int, str, bytes, int, int, int, int]
 """Number, topic, payload, whether it is retained, whether it is sent, ns since the Unix epoch, checksum."""
 
 SCHEMA_VERSION = 2
-
-UNLIKELY_VERSION = 1000
-"""From here on a version is damage, not progress."""
 
 _SCHEMA = """
 CREATE TABLE messages (
@@ -48,12 +47,45 @@ INSERT INTO latest SELECT topic, max(sequence) FROM messages WHERE retain GROUP 
 """
 
 
-_COLUMNS = ["sequence", "topic", "payload", "retain", "sent", "wall_ns", "checksum"]
+_PARTS = {
+    ("messages", "sequence,topic,payload,retain,sent,wall_ns,checksum"),
+    ("latest", "topic,sequence"),
+    ("unsent", None),
+    ("sent", None),
+}
+"""Names of tables and indexes, with the columns of the former."""
+
+_FOUND = """
+SELECT name, (SELECT group_concat(name) FROM pragma_table_info(parts.name)) FROM sqlite_master AS parts
+WHERE name NOT LIKE 'sqlite\\_%' ESCAPE '\\'
+"""
 
 
-def are_of_this_version(connection: sqlite3.Connection) -> bool:
-    """Whether the tables are those of `SCHEMA_VERSION`, whatever number the file gives for itself."""
-    return [row[1] for row in connection.execute("PRAGMA table_info(messages)")] == _COLUMNS
+def version_of(connection: sqlite3.Connection, writer: str) -> int:
+    """The version that the file gives for its tables; 0 for a new one.
+
+    Another number than `SCHEMA_VERSION` is damage if the tables are of `SCHEMA_VERSION` to the last column
+    and nobody says that another program has written them: no version changes the number alone.
+
+    Args:
+        connection: to the file.
+        writer: the version of the program that has written it last; empty if that is not known.
+
+    Raises:
+        sqlite3.DatabaseError: the number is damaged.
+    """
+    version = pragma(connection, "user_version")
+    if version == SCHEMA_VERSION:
+        return version
+    is_ours = version < SCHEMA_VERSION or writer in {"", __version__}
+    if version < 0 or (is_ours and set(connection.execute(_FOUND)) == _PARTS):
+        raise corruption(f"schema version {version} with the tables of {SCHEMA_VERSION}")
+    return version
+
+
+def newer_writer(writer: str) -> str:
+    """Who has written a file with newer tables, as far as that is known."""
+    return "a newer version of daqsvc" if writer in {"", __version__} else f"daqsvc {writer}"
 
 
 def bring_up_to_date(connection: sqlite3.Connection, version: int, wall_ns: int) -> None:

@@ -285,7 +285,7 @@ async def test_what_cannot_be_used_is_said_with_a_remedy(tmp_path):
     newer = sqlite3.connect(tmp_path / "newer.sqlite")
     newer.execute("PRAGMA user_version = 99")
     newer.close()
-    with pytest.raises(OutboxError, match="schema version 99, written by daqsvc a newer version"):
+    with pytest.raises(OutboxError, match="schema version 99, written by a newer version of daqsvc"):
         await opened(tmp_path / "newer.sqlite")
     (tmp_path / "newer.sqlite.version").write_text("9.9.0\n")
     with pytest.raises(NewerOutboxError, match=r"written by daqsvc 9\.9\.0; .* install that version again"):

@@ -14,13 +14,15 @@ from pathlib import Path
 import pytest
 from support.journal_commits import commit
 
+import daqsvc
 from daqsvc.outbox import files, sequence
 from daqsvc.outbox import journal as journal_module
 from daqsvc.outbox.ballast import Ballast
 from daqsvc.outbox.files import ASIDE_KEPT, free_bytes
 from daqsvc.outbox.journal import TRIM_EVERY, Journal
 from daqsvc.outbox.limits import MIB, NS_PER_DAY, OutboxLimits
-from daqsvc.outbox.messages import Draft, OutboxAwayError
+from daqsvc.outbox.messages import Draft, NewerOutboxError, OutboxAwayError, OutboxError
+from daqsvc.outbox.reading import read_journal
 
 SIZE = 1000
 
@@ -385,15 +387,60 @@ def test_ballast_is_taken_where_there_is_room_and_thrown_off_once(tmp_path):
     assert not (tmp_path / "ballast").exists()
 
 
-def test_a_damaged_version_number_costs_no_message_and_no_start(tmp_path, wall):
+@pytest.mark.parametrize("version", [-1, 0, 1, 99, 258, 1 << 25])
+@pytest.mark.parametrize("names_the_version", [True, False])
+def test_a_damaged_version_number_costs_no_message_and_no_start(tmp_path, wall, version, names_the_version):
     path = tmp_path / "outbox.sqlite"
     journal = opened(path, wall)
     numbers = append(journal, 3)
     journal.close()
+    if not names_the_version:
+        path.with_name("outbox.sqlite.version").unlink()
     with sqlite3.connect(path) as damaged:
-        damaged.execute("PRAGMA user_version = 258")
+        damaged.execute(f"PRAGMA user_version = {version}")
     damaged.close()
+    with pytest.raises(
+        OutboxError, match=f"schema version {version} .* the service sets a corrupt one aside"
+    ):
+        read_journal(tmp_path)
     journal = opened(path, wall)
     assert journal.quarantined == 1
     journal.close()
     assert kept(path) == numbers
+
+
+NEWER = {
+    "nothing but the number": "SELECT 1",
+    "a table": "CREATE TABLE shifts (begun_ns INTEGER)",
+    "an index": "CREATE INDEX by_time ON messages (wall_ns)",
+    "a column of the messages": "ALTER TABLE messages ADD COLUMN author TEXT",
+    "a column of the latest": "ALTER TABLE latest ADD COLUMN author TEXT",
+}
+
+
+@pytest.mark.parametrize(
+    ("more", "writer"),
+    [
+        ("nothing but the number", "9.9.0"),
+        *itertools.product(list(NEWER)[1:], ["9.9.0", daqsvc.__version__, ""]),
+    ],
+)
+def test_a_journal_of_a_newer_version_is_refused_and_stays_as_it_is(tmp_path, wall, more, writer):
+    """Also one whose version file was lost, or was put back."""
+    path = tmp_path / "outbox.sqlite"
+    journal = opened(path, wall)
+    numbers = append(journal, 3)
+    journal.close()
+    path.with_name("outbox.sqlite.version").write_text(writer)
+    with sqlite3.connect(path) as newer:
+        newer.executescript(f"{NEWER[more]}; PRAGMA user_version = 99")
+    newer.close()
+    by = "daqsvc 9.9.0" if writer == "9.9.0" else "a newer version of daqsvc"
+    with pytest.raises(OutboxError, match=f"has schema version 99, .* use the program .* runs, {by}"):
+        read_journal(tmp_path)
+    refused = Journal(path, wall, OutboxLimits(ballast_bytes=0))
+    with pytest.raises(NewerOutboxError, match=f"has schema version 99, written by {by}; .* install that"):
+        refused.open()
+    refused.close()
+    assert kept(path) == numbers
+    assert not [*tmp_path.glob("*.corrupt-*")]
