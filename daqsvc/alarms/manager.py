@@ -412,12 +412,14 @@ class AlarmManager:
             self._resume_ruled(ruled, event)
         elif event.own_state is AlarmState.NORMAL and not event.holds:
             return True
-        elif ours and name in self._expected.quality:
+        elif ours and (
+            name in self._expected.quality or name.removeprefix("detector-ok/") in active_detectors
+        ):
             self._resume_unruled(event)
             doubts = [doubt for doubt in event.doubts if doubt.detector in active_detectors]
             t_ns = self._clock.monotonic_ns()
             self._doubts.resume(doubts, t_ns, event.finding)
-            self._doubts.expect(name, self._expected.quality[name], t_ns)
+            self._doubts.expect(name, self._expected.quality.get(name, {}), t_ns)
         elif ours and is_condition(event) and (name != ALARM_FLOOD or self._handling.flood_alarms):
             self._resume_unruled(event)
             self._conditions.add(name)

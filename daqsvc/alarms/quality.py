@@ -27,7 +27,7 @@ PREFIXES = ("sensor-ok/", "detector-ok/")
 
 
 def quality_alarm(detector: str, sensors: Sequence[str]) -> str:
-    """The quality alarm that a statement of ``detector`` is about."""
+    """The quality alarm that a statement of ``detector`` is about; one that has failed names no sensors."""
     if len(sensors) == 1:
         return f"sensor-ok/{sensors[0]}"
     return f"detector-ok/{detector}"
@@ -152,11 +152,16 @@ class SensorHealth:
         name = quality_alarm(detector, diagnosis.sensors)
         before = self._forget(detector)
         self._unheard.discard(detector)
+        # Of missing samples and a failure neither takes back the other: what is raised stays until good.
+        sensors = tuple(diagnosis.sensors)
+        if before is not None and diagnosis.quality != "not_ok" and not (before[1].sensors and sensors):
+            name, sensors = before[0], before[1].sensors
         touched: set[str] = set() if before is None else _blames(before[1])
         if diagnosis.quality == "good" or diagnosis.partial:
             for alarm in self._unsettled_by.pop(detector, ()):
                 self._unsettled[alarm].discard(detector)
         if (doubt := self._doubt(diagnosis, None if before is None else before[1])) is not None:
+            doubt = doubt._replace(sensors=sensors)
             self._remember(name, doubt)
             touched |= _blames(doubt)
             if diagnosis.quality == "missing" and diagnosis.end_index == diagnosis.first_index:

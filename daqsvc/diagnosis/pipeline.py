@@ -488,7 +488,7 @@ class Pipeline:
     def _process(self, detector: Detector, window: Window) -> Sequence[Diagnosis]:
         """What a detector says of a window; on a kernel thread.
 
-        One that raises has judged nothing: what it said before is held, and its sensors are in doubt.
+        One that raises has judged nothing: what it said before is held, and nothing is said of its sensors.
         """
         counters = self.counters[detector.name]
         # The kernels' load on the host is a matter of the host's clock, whatever clock the samples have.
@@ -502,7 +502,13 @@ class Pipeline:
             reason = f"detector {detector.name} has failed: {error_text(error)}"
             with self._supervisor.sparing_others(_part(detector), "nothing is said of that window"):
                 return [
-                    replace(held, quality="missing", reason=reason)
+                    # One that speaks for each of its sensors is judged by them; any other blames itself.
+                    replace(
+                        held,
+                        quality="missing",
+                        reason=reason,
+                        sensors=() if held.detector == detector.name else held.sensors,
+                    )
                     for held in _said(detector.silent, 0.0, window.t_end_ns)
                 ]
             return []

@@ -37,6 +37,28 @@ def test_a_doubt_moves_with_its_detector():
     ]
 
 
+@pytest.mark.parametrize("restarted", [False, True])
+@pytest.mark.parametrize(
+    ("first", "then", "name"),
+    [
+        ((), ("accel-de",), "detector-ok/bearing"),
+        (("accel-de",), (), "sensor-ok/accel-de"),
+        ((), (), "detector-ok/bearing"),
+    ],
+)
+def test_a_failure_and_missing_samples_take_back_nothing_of_each_other(first, then, name, restarted):
+    rig = AlarmRig(BEARING)
+    rig.mode("F1", "alert", "good", ("accel-de",), detector="bearing")
+    assert kinds(bearing(rig, "missing", first, "it has failed")) == [(name, "raised")]
+    if restarted:
+        rig = rig.restarted({"bearing": ("accel-de",)})
+    assert "returned" not in str(kinds(bearing(rig, "missing", then, "no samples")))
+    assert rig.status(name).state.is_active
+    assert rig.status("bearing-damage").state.is_active
+    assert (name, "returned") in kinds(bearing(rig, "good", ("accel-de",)))
+    assert not rig.status(name).state.is_active
+
+
 def test_every_doubter_is_told_and_the_worst_is_heard_first():
     rig = AlarmRig(LEVEL)
     (raised,) = bearing(rig, "missing", ("probe-x",), "no samples")
