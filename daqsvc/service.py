@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import deque
-from dataclasses import asdict
+from dataclasses import asdict, fields, is_dataclass
 from functools import partial
+from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,10 +28,11 @@ from daqsvc.publish.make import output_plugins, output_set
 from daqsvc.publish.output import output_name
 from daqsvc.publish.payloads import Figures
 from daqsvc.self_check import BusHealth, conditions
+from daqsvc.settings.failures import authors_of
 from daqsvc.settings.streams import Grid
 from daqsvc.supervision import EssentialLostError, Progress, Supervisor, over, stop_all
 from daqsvc.threads import CallThreads
-from drivers.base import DeviceAbsentError
+from drivers.base import BusCounters, DeviceAbsentError
 from drivers.make import bus_drivers, bus_self_checks
 
 if TYPE_CHECKING:
@@ -326,15 +328,36 @@ class Service:
     def _bus_health(self) -> dict[str, BusHealth]:
         health: dict[str, BusHealth] = {}
         for driver in self.drivers:
-            counters = driver.counters
+            counters = self._counters_of(driver)
             health[driver.name] = BusHealth(
                 counters.overruns,
                 counters.bus_off,
                 counters.controller_state,
                 counters.frames_unrecorded,
-                _has_heard(driver),
+                _has_heard(driver, counters),
             )
         return health
+
+    def _counters_of(self, driver: Driver) -> BusCounters:
+        """What a driver counts; nothing if that is no count, so that one driver's figures spoil no others."""
+        odd: dict[str, object] = {}
+        try:
+            counters = driver.counters
+            if is_dataclass(counters):
+                counted = {name: getattr(counters, name) for name in _COUNTS}
+                odd = {name: count for name, count in counted.items() if not isinstance(count, Integral)}
+            else:
+                odd = {"counters": counters}
+        except Exception as error:  # noqa: BLE001  said and counted below
+            odd = {"counters": error}
+        if not odd:
+            return counters
+        kind = type(driver)
+        name, value = next(iter(odd.items()))
+        said = f"{name} of {kind.__module__}.{kind.__qualname__} is {value!r:.60}, not a count"
+        said += f"; {authors_of(kind.__module__)}"
+        self.supervisor.failed(f"driver {driver.name}", said, "the counts of its bus are missing")
+        return BusCounters()
 
     def awaited(self, *, patient: bool = True) -> dict[str, str]:
         """The buses that keep the service from being ready, and what each is waited for.
@@ -381,7 +404,7 @@ class Service:
         streams: dict[str, Mapping[str, float | str]] = {}
         buses: dict[str, Mapping[str, Any]] = {}
         for driver in self.drivers:
-            counted = asdict(driver.counters)
+            counted = asdict(self._counters_of(driver))
             up = int(driver.link.state == "up")
             buses[driver.name] = {"up": up, "losses": driver.link.losses, **counted}
             for name, (counters, base) in driver.streams.items():
@@ -424,6 +447,10 @@ class Service:
         return figures
 
 
+_COUNTS = ["overruns", "frames_unrecorded", *(f.name for f in fields(BusCounters) if f.default == 0)]
+"""What every driver counts, each a whole number."""
+
+
 def _ring(machine: MachineFile, grid: Grid, detectors: Sequence[Detector]) -> SampleRing:
     wanted = round(machine.pipeline.ring_s * grid.rate_hz)
     # However short a ring is asked for, a detector must find its block in it, and some time to come for it.
@@ -432,9 +459,8 @@ def _ring(machine: MachineFile, grid: Grid, detectors: Sequence[Detector]) -> Sa
     return SampleRing(grid.name, grid.channel_names, max(wanted, needed))
 
 
-def _has_heard(driver: Driver) -> bool:
+def _has_heard(driver: Driver, counters: BusCounters) -> bool:
     """Whether anything has come from the bus of ``driver``, if only an error."""
-    counters = driver.counters
     others = counters.frames_unknown + counters.frames_remote + counters.frames_error
     return others > 0 or any(stream.frames_received for stream, _ in driver.streams.values())
 

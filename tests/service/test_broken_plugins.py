@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from support.example_packages import installed
@@ -11,6 +11,7 @@ from support.live_service import running
 from support.waiting import eventually
 
 from daqsvc.settings import parse_machine_file
+from drivers.base import BusCounters
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -229,3 +230,26 @@ async def test_a_driver_with_a_run_of_its_own_is_named_once_and_started_again(
     [line] = [record.getMessage() for record in caplog.records if record.levelno >= logging.ERROR]
     assert line.startswith(f"driver bad: run of mishap.OwnDriver has failed: {said} (mishap.py, line ")
     assert line.endswith("have the authors of daqsvc-mishap 2.1 mend it; it is started again")
+
+
+@pytest.mark.parametrize("spoilt", ["none", "text"])
+async def test_counters_that_are_none_are_named_once_and_spare_the_other_buses(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, spoilt: str
+) -> None:
+    text = MACHINE.partition("[pipeline.mishap]")[0]
+    text += "".join(STREAM.format(name=name, how="") for name in ("good", "bad"))
+    async with running(parse_machine_file(text, tmp_path / "machine.toml"), tmp_path / "store") as service:
+        bad: Any = next(one for one in service.drivers if one.name == "bad")
+        if spoilt == "none":
+            bad.counters = None
+        else:
+            bad.counters.frames_unknown = "many"
+        for _ in range(3):
+            service.alarms.tick()
+            assert set(service.figures()["buses"]) == {"good", "bad"}
+        bad.counters = BusCounters()
+    [line] = [record.getMessage() for record in caplog.records if record.levelno >= logging.ERROR]
+    odd = "counters of mishap.MishapDriver is None" if spoilt == "none" else "is 'many'"
+    assert line.startswith("driver bad: ")
+    assert f"{odd}, not a count; " in line
+    assert "have the authors of daqsvc-mishap 2.1 mend it; the counts of its bus are missing" in line
