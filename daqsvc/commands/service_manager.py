@@ -21,6 +21,10 @@ log = logging.getLogger(__name__)
 
 VARIABLES = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
 US_PER_S = 1_000_000
+LONGEST_US = 20
+"""Digits of what systemd counts to."""
+LEAST_WATCH_S = 3.0
+"""What parts are held to at least: sound ones take a second or so now and then."""
 SEND_S = 0.1
 """What a datagram may take: systemd takes them at once, unless it is being replaced by a new version."""
 
@@ -64,8 +68,17 @@ class ServiceManager:
         if not address.startswith(("/", "@")):
             return cls()
         ours = watchdog_pid in {"", f"{os.getpid()}"}
-        watched = ours and watchdog_us.isdecimal() and int(watchdog_us) > 0
-        return cls(address, int(watchdog_us) / US_PER_S if watched else None)
+        if not (ours and watchdog_us):
+            return cls(address)
+        if not (watchdog_us.isdecimal() and len(watchdog_us) <= LONGEST_US and int(watchdog_us)):
+            odd = "WatchdogSec= is ignored: WATCHDOG_USEC is %.40r, not a number of microseconds"
+            log.warning(odd, watchdog_us)
+            return cls(address)
+        watchdog_s = int(watchdog_us) / US_PER_S
+        if watchdog_s < LEAST_WATCH_S:
+            short = "WatchdogSec= is %g s, and parts are held to %g s: write that much at least"
+            log.warning(short, watchdog_s, LEAST_WATCH_S)
+        return cls(address, watchdog_s)
 
     def close(self) -> None:
         """Tell nothing more."""
@@ -112,7 +125,7 @@ class _Follower:
         self._watch: StallWatch | None = None
         if manager.watchdog_s is not None:
             then = "the service manager is told nothing more, and starts the service again"
-            self._watch = StallWatch(manager.watchdog_s, then)
+            self._watch = StallWatch(max(manager.watchdog_s, LEAST_WATCH_S), then)
         self._begun_s: float | None = None
         self._serving_since_s = 0.0
         self._is_ready = False

@@ -84,3 +84,28 @@ def test_a_process_that_was_suspended_or_starved_has_not_stalled(monkeypatch: py
     waited = iter(range(100))
     monkeypatch.setattr("daqsvc.supervision.kept_waiting_s", lambda _: float(next(waited)))
     assert not any(stalls([1] * 20, thread=threading.current_thread())), "it waits for a processor"
+
+
+@pytest.mark.parametrize(
+    ("told", "watchdog_s", "warning"),
+    [
+        ("300000", 0.3, "WatchdogSec= is 0.3 s, and parts are held to 3 s"),
+        ("3000000", 3.0, ""),
+        *[(odd, None, f"WATCHDOG_USEC is '{odd}', not a number") for odd in ("0", "-5", "abc", "1e20")],
+    ],
+)
+def test_a_watchdog_that_is_too_short_or_no_number_is_warned_of_once(
+    told: str,
+    watchdog_s: float | None,
+    warning: str,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setenv("NOTIFY_SOCKET", "/nowhere")
+    monkeypatch.setenv("WATCHDOG_USEC", told)
+    monkeypatch.delenv("WATCHDOG_PID", raising=False)
+    manager = ServiceManager.of_environment()
+    manager.close()
+    assert manager.watchdog_s == watchdog_s
+    assert len(caplog.records) == bool(warning)
+    assert warning in caplog.text
