@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.link import Backoff, SaidOnce
-from daqsvc.settings.failures import BrokenContractError, cause_of, in_words
+from daqsvc.settings.failures import BrokenContractError, ExitRaisedError, cause_of, error_text, in_words
 from daqsvc.threads import kept_waiting_s, where_is
 
 if TYPE_CHECKING:
@@ -190,7 +190,10 @@ class Part:
 
     async def _run(self) -> None:
         # Here, so that a call that fails before there is a coroutine is a failure of the part, too.
-        await self._work()
+        try:
+            await self._work()
+        except SystemExit as error:  # out of a task it would end the event loop, and all other parts with it
+            raise ExitRaisedError(error_text(error)).with_traceback(error.__traceback__) from None
 
     def _ended(self, task: asyncio.Task[None]) -> None:
         self._task = None

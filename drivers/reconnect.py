@@ -11,7 +11,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar
 
 from daqsvc.acquisition.link import Backoff
-from daqsvc.settings.failures import BrokenContractError
+from daqsvc.settings.failures import BrokenContractError, said_by
 from daqsvc.threads import call_in_thread
 from drivers.base import DeviceAbsentError
 
@@ -46,7 +46,7 @@ class Attempt(NamedTuple):
     present: bool
     useful: bool
     reason: str
-    error: Exception | None = None
+    error: BaseException | None = None
 
 
 class CannotOpenError(Exception):
@@ -97,15 +97,15 @@ async def _outcome(attempt: Callable[[], Awaitable[Attempt | None]]) -> Attempt 
         outcome = await attempt()
     except CannotOpenError as error:
         return Attempt(present=False, useful=False, reason=f"{error}")
-    except Exception as error:  # noqa: BLE001 - said by the link
+    except (Exception, SystemExit) as error:  # noqa: BLE001 - said by the link
         return _failed(error)
     if outcome is None or isinstance(outcome, Attempt):
         return outcome
     return _failed(BrokenContractError(attempt, f"it returns {outcome!r:.60}, not Attempt | None"))
 
 
-def _failed(error: Exception) -> Attempt:
-    reason = f"its driver failed: {error or type(error).__name__}"
+def _failed(error: BaseException) -> Attempt:
+    reason = f"its driver failed: {said_by(error) or type(error).__name__}"
     return Attempt(present=True, useful=False, reason=reason, error=error)
 
 
@@ -186,7 +186,7 @@ def words(error: BaseException) -> str:
     """An error as a person should read it."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
-    return f"{error}" or type(error).__name__
+    return said_by(error) or type(error).__name__
 
 
 Call: TypeAlias = "tuple[Callable[..., object], tuple[Any, ...]]"

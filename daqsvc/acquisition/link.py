@@ -168,7 +168,7 @@ class Link:
             self._said_down = True
         self.state, self.reason = "down", reason
 
-    def fail(self, reason: str, error: Exception) -> None:
+    def fail(self, reason: str, error: BaseException) -> None:
         """The driver has failed in a way that nobody has foreseen, and begins again; said once an hour."""
         if self.state == "up":
             self.losses += 1

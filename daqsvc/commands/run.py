@@ -89,6 +89,7 @@ class RunCommand:
 
 def _run(machine: MachineFile, store: Path | None, guard: ProcessGuard, manager: ServiceManager) -> int:
     from daqsvc.outbox.messages import NewerOutboxError, OutboxError  # noqa: PLC0415
+    from daqsvc.settings.failures import in_words  # noqa: PLC0415
     from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415 - each verb imports only what it needs
     from daqsvc.supervision import EssentialLostError  # noqa: PLC0415
     from drivers.base import DeviceAbsentError  # noqa: PLC0415
@@ -102,6 +103,11 @@ def _run(machine: MachineFile, store: Path | None, guard: ProcessGuard, manager:
     except (DeviceAbsentError, OutboxError, StoreNotFoundError) as error:
         log.critical("%s", error)
         return EXIT_FAILED
+    except SystemExit as error:  # out of a task of a plugin: systemd must not take that for an orderly end
+        log.critical(
+            "something in its process ended the service (%s); it must be started again", in_words(error)
+        )
+        return EXIT_LOST
     except EssentialLostError as error:
         log.critical("%s; the service ends, and must be started again", error)
         return EXIT_LOST

@@ -32,6 +32,10 @@ class BrokenContractError(TypeError):
         self.hook = hook
 
 
+class ExitRaisedError(Exception):
+    """A part of the service has raised SystemExit, which is not for a part to decide."""
+
+
 class Failure(NamedTuple):
     """What code of a plugin has failed at.
 
@@ -100,7 +104,7 @@ def import_failure(error: BaseException, module: str) -> Failure:
         module: that its entry point names.
     """
     again = "install the package that brings it again"
-    said = " ".join(f"{error}".split())
+    said = " ".join(said_by(error).split())
     missing = error.name if isinstance(error, ModuleNotFoundError) else None
     if missing is not None and f"{module}.".startswith(f"{missing}."):
         return Failure(said, again, said)
@@ -126,7 +130,7 @@ def in_words(error: BaseException) -> str:
     foreign = foreign_failure(error)
     if foreign is not None:
         return str(foreign)
-    first_line = next(iter(f"{error}".splitlines()), "")
+    first_line = next(iter(said_by(error).splitlines()), "")
     if isinstance(error, BrokenContractError):
         return first_line
     kind = type(error).__name__
@@ -139,10 +143,18 @@ def in_words(error: BaseException) -> str:
     return f"failed with {what}{place}"
 
 
+def said_by(error: BaseException) -> str:
+    """What an error says; empty if that fails, too."""
+    try:
+        return f"{error}"
+    except Exception:  # noqa: BLE001 - the words of an error must not be another one
+        return ""
+
+
 def error_text(error: BaseException) -> str:
     """The kind of an error and what it says, on one line."""
-    said = " ".join(f"{error}".split())
-    name = "" if isinstance(error, BrokenContractError) else type(error).__name__
+    said = " ".join(said_by(error).split())
+    name = "" if isinstance(error, BrokenContractError | ExitRaisedError) else type(error).__name__
     return ": ".join(word for word in (name, said) if word)
 
 

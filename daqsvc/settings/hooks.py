@@ -88,7 +88,7 @@ class PluginFailedError(AssemblyError, UnusableValueError):
         table: what it was asked about, as people write it; empty if it is not known.
     """
 
-    def __init__(self, by: Hooks, hook: str, error: Exception, at: KeyPath | None = None) -> None:
+    def __init__(self, by: Hooks, hook: str, error: BaseException, at: KeyPath | None = None) -> None:
         self.by, self.hook, self.at = by, hook, at
         self.failure = failure(error, type(by), hook)
         self.file: Path | None = None
@@ -214,7 +214,7 @@ def _guarded(by: Hooks, name: str, at: KeyPath | None = None) -> Iterator[None]:
         yield
     except UnusableValueError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         if isinstance(error, _declared(by, name).may_raise):
             raise
         failed = PluginFailedError(by, name, error, at)

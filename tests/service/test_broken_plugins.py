@@ -59,6 +59,8 @@ class MishapDriver(StreamDriver):
             await asyncio.sleep(0.005)
             if self.how == "raises":
                 raise KeyError("it was here")
+            if self.how == "exits":
+                raise SystemExit(0)
             if self.how == "returns":
                 return None
 
@@ -71,6 +73,8 @@ class OwnDriver:
     async def run(self):
         if self.how == "own raises":
             raise KeyError("it was here")
+        if self.how == "own exits":
+            raise SystemExit(0)
 
 
 class MishapDriverPlugin(DriverPlugin[MishapBus]):
@@ -155,6 +159,7 @@ def line_of(words: str) -> int:
     return SOURCE.splitlines().index(words) + 1
 
 
+EXITED = line_of("                raise SystemExit(0)")
 READ = line_of("    async def read(self):")
 RAISED = line_of('                raise KeyError("it was here")')
 TAKEN = line_of('            self.take(self.port.streams[0], frame if self.how != "takes" else None)')
@@ -170,6 +175,12 @@ PROCESS = line_of("            self.process = lambda window: [1]")
             "raises",
             "raises",
             f"read of mishap.MishapDriver has failed: KeyError: 'it was here' (mishap.py, line {RAISED})",
+            f"(mishap.py, line {JUDGED})",
+        ),
+        (
+            "exits",
+            "raises",
+            f"read of mishap.MishapDriver has failed: SystemExit: 0 (mishap.py, line {EXITED})",
             f"(mishap.py, line {JUDGED})",
         ),
         (
@@ -219,7 +230,11 @@ async def test_a_driver_and_a_detector_that_fail_are_named_once_and_the_rest_goe
 
 @pytest.mark.parametrize(
     ("how", "said"),
-    [("own raises", "KeyError: 'it was here'"), ("own ends", "it has ended by itself")],
+    [
+        ("own raises", "KeyError: 'it was here'"),
+        ("own exits", "SystemExit: 0"),
+        ("own ends", "it has ended by itself"),
+    ],
 )
 async def test_a_driver_with_a_run_of_its_own_is_named_once_and_started_again(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, how: str, said: str

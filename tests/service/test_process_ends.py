@@ -261,6 +261,15 @@ def test_what_cannot_be_started_again_ends_the_process_with_its_own_code(why: st
     assert said.splitlines()[-1].endswith(why)
 
 
+def test_a_task_that_ends_the_process_is_no_orderly_end(tmp_path: Path) -> None:
+    """Of a plugin that makes tasks of its own: systemd starts again what has not ended with 0."""
+    fault = "async def leave(): sys.exit(0)\nonce_ready(lambda self: setattr(self, 'leaves', asyncio.create_task(leave())))"
+    with service(tmp_path, fault) as process:
+        said = rest_of(process)
+        assert process.wait(PATIENCE_S) == 3, said
+    assert "the service was ended by something in it (failed with SystemExit: 0" in said
+
+
 def test_signals_that_do_not_stop_the_service_are_ignored_and_said(tmp_path: Path) -> None:
     with service(tmp_path) as process:
         for _ in range(2):

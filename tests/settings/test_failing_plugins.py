@@ -127,12 +127,34 @@ def failing(*_: Any, **__: Any) -> Never:
     raise KeyError("no such thing")
 
 
-def break_(monkeypatch: pytest.MonkeyPatch, owner: str, hook: str) -> str:
+def exiting(*_: Any, **__: Any) -> Never:
+    raise SystemExit(0)
+
+
+class UnsayableError(Exception):
+    def __str__(self) -> str:
+        raise ValueError
+
+
+def unsayable(*_: Any, **__: Any) -> Never:
+    raise UnsayableError
+
+
+RAISING = {
+    failing: "KeyError: 'no such thing'",
+    exiting: "SystemExit: 0",
+    unsayable: "UnsayableError",
+}
+
+
+def break_(
+    monkeypatch: pytest.MonkeyPatch, owner: str, hook: str, how: Callable[..., Never] = failing
+) -> str:
     """Have a hook raise; returns how that is said."""
     kind = class_at(owner)
     is_property = isinstance(inspect.getattr_static(kind, hook), property)
-    monkeypatch.setattr(kind, hook, property(failing) if is_property else failing)
-    return f"{hook} of {owner} has failed: KeyError: 'no such thing' ("
+    monkeypatch.setattr(kind, hook, property(how) if is_property else how)
+    return f"{hook} of {owner} has failed: {RAISING[how]} ("
 
 
 def all_said(
@@ -158,6 +180,10 @@ def all_said(
     return f"{said.out}\n{said.err}\n{more.out}\n{more.err}\n{log.text}"
 
 
+@pytest.mark.parametrize(
+    "how",
+    [failing, *(pytest.param(how, marks=pytest.mark.long) for how in (exiting, unsayable))],
+)
 @pytest.mark.parametrize(("owner", "hook"), EVERY_HOOK)
 def test_a_hook_that_fails_is_named_with_who_can_mend_it(
     monkeypatch: pytest.MonkeyPatch,
@@ -166,15 +192,27 @@ def test_a_hook_that_fails_is_named_with_who_can_mend_it(
     caplog: pytest.LogCaptureFixture,
     owner: str,
     hook: str,
+    how: Callable[..., Never],
 ) -> None:
     file = tmp_path / "machine.toml"
     file.write_text(WHOLE)
-    failed = break_(monkeypatch, owner, hook)
+    failed = break_(monkeypatch, owner, hook, how)
     said = " ".join(all_said(file, tmp_path, capsys, caplog).split())
     if (owner, hook) not in NOT_ASKED:
         assert failed in said
         assert f"have the authors of {BROUGHT[owner]} mend it" in said
     assert "Traceback" not in said
+
+
+def test_a_hook_that_would_end_the_process_ends_check_in_words(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The short form of the above."""
+    file = tmp_path / "machine.toml"
+    file.write_text(WHOLE)
+    failed = break_(monkeypatch, "crest.CrestPlugin", "checks", exiting)
+    assert main(["check", str(file)]) == 2
+    assert failed in " ".join(capsys.readouterr().err.split())
 
 
 def wrong(wanted: Any) -> Iterator[Callable[..., Any]]:
