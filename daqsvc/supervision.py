@@ -94,7 +94,7 @@ class Supervisor:
         """Let no exception out of a piece of work, on which others depend that have nothing to do with it."""
         try:
             yield
-        except Exception as error:  # noqa: BLE001 - said and counted there
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - said and counted there
             self.failed(name, error, then)
 
     @property

@@ -212,6 +212,7 @@ class SensorHealth:
             if doubt.quality == "missing":
                 self._lacked_at_restart[doubt.detector] = t_ns
             self._forget(doubt.detector)
+            self._unheard.discard(doubt.detector)
             self._remember(quality_alarm(doubt.detector, doubt.sensors), doubt)
 
     def not_ok(self) -> list[tuple[str, Doubt]]:
@@ -237,7 +238,8 @@ class SensorHealth:
         if not doubts:
             return
         worst = _worst(doubts)
-        for detector in speakers.keys() - {doubt.detector for doubt in doubts}:
+        # Of a detector that stands in the journal it is known what it doubts.
+        for detector in speakers.keys() - self._by_detector.keys():
             self._unheard.add(detector)
             sensors = tuple(speakers[detector])
             # That it has silenced alarms, too, is not assumed.

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import logging
 import os
 import queue
+import sys
 import threading
 import time
 from typing import TYPE_CHECKING
@@ -36,7 +38,6 @@ class LogThread(logging.Handler):
         self._fd = fd
         self._lines: queue.Queue[str | None] = queue.Queue(MOST_LINES)
         self._left_out = 0
-        self._writing = threading.Lock()
         self._thread = threading.Thread(target=self._write_on, name="log", daemon=True)
         self._thread.start()
 
@@ -48,7 +49,9 @@ class LogThread(logging.Handler):
             self._left_out += 1
         except Exception:  # noqa: BLE001 - of whoever logs what cannot be formatted
             self.handleError(record)
-        if not self._thread.is_alive():
+        if sys.is_finalizing():  # then no thread runs any more, and to start one would hang
+            self.end_of_process()
+        elif not self._thread.is_alive():
             self._thread = threading.Thread(target=self._write_on, name="log", daemon=True)
             self._thread.start()
 
@@ -62,6 +65,12 @@ class LogThread(logging.Handler):
         """Have the thread end when it has written what waits; another line starts another thread."""
         self._lines.put(None)
         self._thread.join()
+
+    def end_of_process(self) -> None:
+        """Write what waits on the calling thread; for when no other runs any more."""
+        with contextlib.suppress(queue.Empty):
+            while True:
+                self._write(self._lines.get_nowait() or "")
 
     def _write_on(self) -> None:
         while True:

@@ -8,7 +8,7 @@ import logging
 import os
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from daqsvc import kernel_cache
 from daqsvc.commands.arguments import EXIT_FAILED, EXIT_HUNG, EXIT_LOST, EXIT_OK, EXIT_STUCK, EXIT_USAGE
@@ -19,7 +19,7 @@ from daqsvc.commands.store_argument import StoreNotFoundError, store_directory
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Callable
+    from collections.abc import Callable, Coroutine
 
     from daqsvc.settings import MachineFile
 
@@ -89,32 +89,43 @@ class RunCommand:
 
 def _run(machine: MachineFile, store: Path | None, guard: ProcessGuard, manager: ServiceManager) -> int:
     from daqsvc.outbox.messages import NewerOutboxError, OutboxError  # noqa: PLC0415
-    from daqsvc.settings.failures import in_words  # noqa: PLC0415
     from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415 - each verb imports only what it needs
     from daqsvc.supervision import EssentialLostError  # noqa: PLC0415
     from drivers.base import DeviceAbsentError  # noqa: PLC0415
     from drivers.frames import LayoutError  # noqa: PLC0415
 
     try:
-        asyncio.run(_run_until_stopped(machine, store or store_directory(machine), guard, manager))
+        _run_loop(_run_until_stopped(machine, store or store_directory(machine), guard, manager))
     except (AssemblyError, LayoutError, NewerOutboxError) as error:
         log.critical("%s", error)
         return EXIT_USAGE
     except (DeviceAbsentError, OutboxError, StoreNotFoundError) as error:
         log.critical("%s", error)
         return EXIT_FAILED
-    except SystemExit as error:  # out of a task of a plugin: systemd must not take that for an orderly end
-        log.critical(
-            "something in its process ended the service (%s); it must be started again", in_words(error)
-        )
-        return EXIT_LOST
     except EssentialLostError as error:
         log.critical("%s; the service ends, and must be started again", error)
+        return EXIT_LOST
+    except SystemExit:
+        log.critical("the service was ended by something in its process, and must be started again")
         return EXIT_LOST
     except asyncio.CancelledError:
         log.critical("the service was cancelled by something in its process, and must be started again")
         return EXIT_LOST
     return EXIT_OK
+
+
+def _run_loop(work: Coroutine[Any, Any, None]) -> None:
+    """Run the event loop until ``work`` is done, also if a task of a plugin would end the process."""
+    with asyncio.Runner() as runner:
+        loop = runner.get_loop()
+        running = loop.create_task(work)
+        while not running.done():
+            try:
+                loop.run_until_complete(running)
+            except (SystemExit, KeyboardInterrupt) as error:
+                message = "a task would have ended the process"
+                loop.call_exception_handler({"message": message, "exception": error})
+        running.result()
 
 
 async def _run_until_stopped(

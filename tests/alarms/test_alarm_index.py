@@ -64,20 +64,24 @@ class WalkingDoubts(SensorHealth):
         self.unsettled = {}
 
     def update(self, diagnosis):
-        detector, name = diagnosis.detector, quality_alarm(diagnosis.detector, diagnosis.sensors)
+        detector, sensors = diagnosis.detector, diagnosis.sensors
+        name = quality_alarm(detector, sensors)
         before = self.table.pop(detector, None) or self.assumed.pop(detector, None)
+        if before is not None and diagnosis.quality != "not_ok" and not (sensors and before[1].sensors):
+            name, sensors = before[0], before[1].sensors
         if diagnosis.quality == "good":
             for detectors in self.unsettled.values():
                 detectors.discard(detector)
         else:
             not_ok = diagnosis.quality == "not_ok" or (before is not None and before[1].not_ok)
-            doubt = Doubt(detector, diagnosis.quality, not_ok, diagnosis.reason, diagnosis.sensors)
+            doubt = Doubt(detector, diagnosis.quality, not_ok, diagnosis.reason, sensors)
             self.table[detector] = (name, doubt)
         names = (name,) if before is None or before[0] == name else (before[0], name)
         return Touched(names, frozenset())
 
     def resume(self, doubts, t_ns, found=""):
         for doubt in doubts:
+            self.assumed.pop(doubt.detector, None)
             self.table[doubt.detector] = (quality_alarm(doubt.detector, doubt.sensors), doubt)
 
     def expect(self, name, speakers, t_ns):

@@ -5,10 +5,13 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import subprocess
+import sys
 import threading
 from typing import TYPE_CHECKING
 
 import pytest
+from support.waiting import PATIENCE_S
 
 from daqsvc.commands import log_thread
 from daqsvc.commands.log_thread import LogThread
@@ -81,3 +84,26 @@ def test_the_thread_is_replaced_when_it_is_gone(pipe: tuple[int, int]) -> None:
     handler.flush_within(20.0)
     assert os.read(pipe[0], 100) == b"still here\n"
     handler.end()
+
+
+LATE = """
+import logging
+from daqsvc.commands.log_thread import LogThread
+
+class Task:
+    def __init__(self):
+        self.error = logging.getLogger("n").error
+    def __del__(self):
+        self.error("of a task that nobody waited for")
+
+logging.basicConfig(handlers=[LogThread(2)])
+kept_to_the_end = Task()
+"""
+
+
+def test_a_line_at_the_very_end_of_the_process_is_written_and_hangs_nothing() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", LATE], capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
+    assert done.returncode == 0
+    assert "of a task that nobody waited for" in done.stderr

@@ -233,6 +233,13 @@ LOSSES = {
         "    ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(writer.ident), error)\n"
         "once_ready(kill)"
     ),
+    "the service was ended by something in its process, and must be started again": (
+        "before = Service._until_stopped\n"
+        "async def leave(self, stop, first=None):\n"
+        "    if first is None: await asyncio.sleep(0.5); sys.exit(0)\n"
+        "    await before(self, stop, first)\n"
+        "Service._until_stopped = leave"
+    ),
     "the service was cancelled by something in its process, and must be started again": (
         "def cancel(self):\n"
         "    next(t for t in asyncio.all_tasks() if t.get_name() == 'service').cancel()\n"
@@ -261,13 +268,19 @@ def test_what_cannot_be_started_again_ends_the_process_with_its_own_code(why: st
     assert said.splitlines()[-1].endswith(why)
 
 
-def test_a_task_that_ends_the_process_is_no_orderly_end(tmp_path: Path) -> None:
-    """Of a plugin that makes tasks of its own: systemd starts again what has not ended with 0."""
-    fault = "async def leave(): sys.exit(0)\nonce_ready(lambda self: setattr(self, 'leaves', asyncio.create_task(leave())))"
+def test_a_task_of_a_plugin_that_exits_ends_nothing(tmp_path: Path) -> None:
+    fault = "async def leave(): sys.exit(0)\nwhen_asked(lambda: asyncio.create_task(leave()))"
     with service(tmp_path, fault) as process:
+        let_hang(tmp_path)
+        assert process.stderr is not None
+        until_said = iter(process.stderr.readline, "")
+        assert any(
+            "a task would have ended the process: failed with SystemExit: 0" in line for line in until_said
+        )
+        process.send_signal(signal.SIGTERM)
         said = rest_of(process)
-        assert process.wait(PATIENCE_S) == 3, said
-    assert "the service was ended by something in it (failed with SystemExit: 0" in said
+        assert process.wait(PATIENCE_S) == 0, said
+    assert closed(tmp_path)
 
 
 def test_signals_that_do_not_stop_the_service_are_ignored_and_said(tmp_path: Path) -> None:
