@@ -61,6 +61,7 @@ class BearingBaseline:
         residuals: innovations of one accelerometer, or of several together, by their names.
         races: lines and levels of each bearing, by the name of its accelerometer.
         pairs: what accelerometers on rotor and housing show together, by their names in that order.
+        units: in which it was learnt, by the names of the accelerometers; empty if not known.
         source: the recording it comes from.
         written: label of the date, ISO 8601; empty if not known.
     """
@@ -70,6 +71,7 @@ class BearingBaseline:
     residuals: Mapping[tuple[str, ...], HealthyResidual]
     races: Mapping[str, RaceBaseline]
     pairs: Mapping[tuple[str, ...], HealthyPair] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
     source: str = ""
     written: str = ""
 
@@ -82,6 +84,7 @@ def learn_baseline(
     together: Sequence[tuple[str, ...]],
     *,
     pairs: Mapping[tuple[str, ...], PairModel] | None = None,
+    units: Mapping[str, str] | None = None,
     highest: float = HIGHEST,
     source: str = "",
 ) -> BearingBaseline:
@@ -94,6 +97,7 @@ def learn_baseline(
         bearings: fault orders of the bearing at each accelerometer that has one.
         together: accelerometers whose innovations are modelled together.
         pairs: bearings with an accelerometer on rotor and housing, by the names of these in that order.
+        units: of the samples, by the names of the accelerometers.
         highest: where the bands of the innovations end, as a part of the sampling rate.
         source: what the recording is called.
 
@@ -122,6 +126,7 @@ def learn_baseline(
         residuals=residuals,
         races=races,
         pairs=healthy_pairs,
+        units=units or {},
         source=source,
     )
 
@@ -317,6 +322,7 @@ class _File(_FileTable):
     source: str = ""
     rate_hz: Positive
     speed_rpm: Positive
+    units: Mapping[str, str] = {}
     residual: Annotated[list[_ResidualTable], Field(min_length=1)]
     race: list[_Race] = []
     pair: list[_Pair] = []
@@ -338,6 +344,7 @@ def load_bearing_baseline(path: Path | str) -> BearingBaseline:
             residuals={tuple(one.channels): one.made(table.rate_hz) for one in table.residual},
             races={one.channel: one.made() for one in table.race},
             pairs={tuple(one.channels): one.made(table.rate_hz) for one in table.pair},
+            units=table.units,
             source=table.source,
             written=table.written,
         )
@@ -392,6 +399,9 @@ def _lines(baseline: BearingBaseline) -> Iterator[str]:
     yield f"source = {_value(baseline.source)}"
     yield f"rate_hz = {_value(float(baseline.rate_hz))}"
     yield f"speed_rpm = {_value(float(baseline.speed_rpm))}"
+    if baseline.units:
+        units = ", ".join(f"{_value(name)} = {_value(unit)}" for name, unit in baseline.units.items())
+        yield f"units = {{ {units} }}"
     for channels, residual in baseline.residuals.items():
         yield "\n[[residual]]"
         yield f"channels = {_value(list(channels))}"

@@ -195,6 +195,7 @@ def baseline():
         SPEED_RPM,
         {"a": orders, "b": orders},
         [("a",), ("a", "b")],
+        units={"a": "g", "b": "m/s2"},
         source='x"y\n',
     )
 
@@ -203,7 +204,7 @@ def test_a_baseline_comes_back_from_its_file_to_the_last_bit(baseline, tmp_path)
     save_bearing_baseline(baseline, tmp_path / "b.toml")
     again = load_bearing_baseline(tmp_path / "b.toml")
     assert (again.rate_hz, again.speed_rpm, again.source) == (RATE_HZ, SPEED_RPM, 'x"y\n')
-    assert again.races == baseline.races
+    assert (again.races, again.units) == (baseline.races, {"a": "g", "b": "m/s2"})
     assert list(again.residuals) == [("a",), ("a", "b")]
     for names, before in baseline.residuals.items():
         after = again.residuals[names]

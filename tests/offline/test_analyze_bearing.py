@@ -384,7 +384,7 @@ def test_what_calibrate_wrote_is_the_healthy_machine(verb: Run, tmp_path: Path) 
     # A rate that is not the calibration's is refused, recording by recording.
     code, (found,), _ = verb("analyze", machine, tmp_path / "loud.npz", "--fs", 10_000, "--calibration", out)
     assert code == 3
-    assert "sampled at 12000 Hz, not sampled at 10000 Hz" in found["refused"]
+    assert "was learnt at 12000 Hz, and the samples to be judged come at 10000 Hz" in found["refused"]
 
 
 def test_what_calibrate_wrote_by_options_is_read_by_options(verb: Run, tmp_path: Path) -> None:
@@ -404,8 +404,22 @@ def test_what_calibrate_wrote_by_options_is_read_by_options(verb: Run, tmp_path:
     for option, value, said in (
         ("--channels", "fe,de", "holds nothing of fe and de together; calibrate with --channels fe,de"),
         ("--channels", "other", "has no channel 'other'"),
-        ("--fs", "10000", "is sampled at 12000 Hz, not sampled at 10000 Hz; calibrate as it is watched"),
-        ("--speed-rpm", "900", "is of a machine at 1797 rpm, not of a machine at 900 rpm"),
+        (
+            "--fs",
+            "10000",
+            "was learnt at 12000 Hz, and the samples to be judged come at 10000 Hz; calibrate at 10000 Hz",
+        ),
+        (
+            "--unit",
+            "m/s2",
+            "was learnt at de in g, and the samples to be judged are in m/s2; calibrate in m/s2",
+        ),
+        ("--unit", "V", "was learnt at de in g, and the samples to be judged are in V"),
+        (
+            "--speed-rpm",
+            "900",
+            "was learnt at 1797 rpm, and the machine turns at 900 rpm; calibrate at 900 rpm",
+        ),
         ("--bearing", "6203", "of another bearing (6205) than is watched there (6203 or 6204"),
     ):
         code, (found,), _ = verb("analyze", run, *both, option, value, "--calibration", out)

@@ -199,7 +199,7 @@ def test_what_is_refused_with_a_machine_file_has_the_keys_of_a_bearing(verb: Run
     _, judged, _ = verb("analyze", machine, path, "--fs", 12_000, "--calibration", out)
     code, found, _ = verb("analyze", machine, path, "--fs", 10_000, "--calibration", out)
     assert code == 3
-    assert "sampled at 12000 Hz, not sampled at 10000 Hz" in found["refused"]
+    assert "was learnt at 12000 Hz, and the samples to be judged come at 10000 Hz" in found["refused"]
     assert found.keys() == judged.keys()
     assert found["channels"]["drive-end"]["refused"] == found["refused"]
 

@@ -125,7 +125,8 @@ def _housed(machine: MachineFile, index: int, settings: WatchedBearing) -> House
     sensor = machine.sensor(settings.sensor)
     column = machine.streams[sensor.stream].layout.channel_names.index(sensor.channel)
     two = _two_sensors(machine, settings, index)
-    return HousedBearing(settings.name, settings.sensor, column, orders_of(settings, index), two)
+    units = {name: machine.sensor(name).unit for name in settings.sensors}
+    return HousedBearing(settings.name, settings.sensor, column, orders_of(settings, index), two, units)
 
 
 def _two_sensors(machine: MachineFile, settings: WatchedBearing, index: int) -> TwoSensors | None:
@@ -215,17 +216,42 @@ def _fitting(
         raise BaselineFileError(
             f"{path}: holds nothing of {', '.join(lacking)}, but of {known}; calibrate with all of them"
         )
-    for what, value, wanted, tolerance in (
-        ("sampled at {:g} Hz", baseline.rate_hz, rate_hz, SAME_RATE),
-        ("of a machine at {:g} rpm", baseline.speed_rpm, abs(speed_rpm or baseline.speed_rpm), SAME_SPEED),
+    for what, unit, value, wanted, tolerance in (
+        ("the samples to be judged come at", "Hz", baseline.rate_hz, rate_hz, SAME_RATE),
+        ("the machine turns at", "rpm", baseline.speed_rpm, abs(speed_rpm or baseline.speed_rpm), SAME_SPEED),
     ):
         if abs(value / wanted - 1.0) > tolerance:
             raise BaselineFileError(
-                f"{path}: is {what.format(value)}, not {what.format(wanted)}; calibrate as it is watched"
+                f"{path}: was learnt at {value:g} {unit}, and {what} {wanted:g} {unit}; "
+                f"calibrate at {wanted:g} {unit}"
             )
     for bearing in bearings:
         _refuse_other_bearing(path, baseline, bearing)
+    _refuse_other_units(path, baseline, bearings)
     return baseline
+
+
+def _refuse_other_units(path: Path, baseline: BearingBaseline, bearings: list[HousedBearing]) -> None:
+    """Refuse the healthy machine of a file whose levels are in other units than the samples.
+
+    Raises:
+        BaselineFileError: an accelerometer's unit is another one.
+    """
+    units = {name: unit for bearing in bearings for name, unit in bearing.units.items()}
+    unknown = [name for name in units if name not in baseline.units]
+    if unknown:
+        log.warning(
+            "%s: does not say in which unit it was learnt at %s; calibrate again, and that is checked",
+            path,
+            ", ".join(unknown),
+        )
+    for name, unit in units.items():
+        learnt = baseline.units.get(name, unit)
+        if learnt != unit:
+            raise BaselineFileError(
+                f"{path}: was learnt at {name} in {learnt}, and the samples to be judged are in {unit}; "
+                f"calibrate in {unit}, or correct the unit"
+            )
 
 
 def _refuse_other_bearing(path: Path, baseline: BearingBaseline, bearing: HousedBearing) -> None:

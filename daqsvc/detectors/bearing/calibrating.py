@@ -52,7 +52,8 @@ def calibrate_bearings(
     groups = [tuple(bearing.sensors) for bearing in settings.bearings]
     if together and len(groups) > 1:
         groups.append(settings.sensors)
-    return _learn(recording, rate_hz, speed_rpm, orders, groups, pair_models(machine, settings))
+    units = {name: machine.sensor(name).unit for name in settings.sensors}
+    return _learn(recording, rate_hz, speed_rpm, orders, groups, pair_models(machine, settings), units)
 
 
 def _learn(
@@ -62,6 +63,7 @@ def _learn(
     orders: Mapping[str, BearingOrders],
     groups: Sequence[tuple[str, ...]],
     pairs: Mapping[tuple[str, ...], PairModel] | None = None,
+    units: Mapping[str, str] | None = None,
 ) -> BearingBaseline:
     samples, highest = resampled(recording.samples, recording.rate_hz, rate_hz)
     samples = np.where(np.isfinite(samples), samples, np.nan)
@@ -72,6 +74,7 @@ def _learn(
         orders,
         groups,
         pairs=pairs,
+        units=units,
         highest=highest,
         source=str(recording.source),
     )

@@ -108,6 +108,7 @@ class HealthyGathering:
                 {bearing.sensor: bearing.orders for bearing in self._bearings},
                 [bearing.sensors for bearing in self._bearings],
                 pairs={b.sensors: b.two.model for b in self._bearings if b.two is not None},
+                units={name: unit for b in self._bearings for name, unit in b.units.items()},
                 source="the running service",
             )
         except NotIdentifiableError as error:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from daqsvc.bearing.geometry import BearingOrders
     from daqsvc.detectors.bearing.direction import TwoSensors
 
@@ -20,6 +22,7 @@ class HousedBearing:
         column: its column in the stream.
         orders: fault orders.
         two: the accelerometer on the rotor and the bearing's masses, if its races are also told by direction.
+        units: of the accelerometers that it is judged by, by their names; empty if not known.
     """
 
     name: str
@@ -27,6 +30,7 @@ class HousedBearing:
     column: int
     orders: BearingOrders
     two: TwoSensors | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def sensors(self) -> tuple[str, ...]:

@@ -255,7 +255,8 @@ ORDERS = {
 def baseline(rate_hz, speed_rpm, *sensors):
     samples = dict(zip(sensors, (healthy(8.0, seed, rate_hz=rate_hz) for seed in (1, 2)), strict=False))
     orders = {name: ORDERS[name] for name in sensors}
-    return learn_baseline(samples, rate_hz, speed_rpm, orders, [(name,) for name in sensors])
+    units = dict.fromkeys(sensors, "g")
+    return learn_baseline(samples, rate_hz, speed_rpm, orders, [(name,) for name in sensors], units=units)
 
 
 @pytest.fixture(scope="module")
@@ -274,8 +275,18 @@ def test_a_calibration_that_fits_is_taken(right, tmp_path) -> None:
     ("rate_hz", "speed_rpm", "sensors", "said"),
     [
         (25_600.0, 1772.0, ("accel-de",), "holds nothing of accel-fe, but of accel-de"),
-        (12_800.0, 1772.0, ("accel-de", "accel-fe"), "sampled at 12800 Hz, not sampled at 25600 Hz"),
-        (25_600.0, 3000.0, ("accel-de", "accel-fe"), "3000 rpm, not of a machine at 1772 rpm"),
+        (
+            12_800.0,
+            1772.0,
+            ("accel-de", "accel-fe"),
+            "at 12800 Hz, and the samples to be judged come at 25600 Hz",
+        ),
+        (
+            25_600.0,
+            3000.0,
+            ("accel-de", "accel-fe"),
+            "at 3000 rpm, and the machine turns at 1772 rpm; calibrate",
+        ),
     ],
 )
 def test_a_calibration_that_does_not_fit_stops_it(tmp_path, rate_hz, speed_rpm, sensors, said) -> None:
@@ -303,6 +314,25 @@ def test_a_calibration_of_another_bearing_stops_it_and_one_that_names_none_is_ta
     path.write_text("\n".join(line for line in lines if not line.startswith("orders = ")))
     assert detector(machine((TYPE, 'type = "6206-2RS"'), named)).baseline.races["accel-fe"].orders is None
     assert "motor.toml: does not say of which bearing it was learnt at accel-de" in caplog.text
+
+
+def test_a_calibration_in_another_unit_stops_it_and_one_that_names_none_is_taken(
+    right, tmp_path, caplog
+) -> None:
+    path = tmp_path / "motor.toml"
+    save_bearing_baseline(right, path)
+    named = ("calibrate_s = 30.0", f'calibration = "{path}"')
+    other = ('channel = "fe"\nunit = "g"', 'channel = "fe"\nunit = "m/s2"')
+    with pytest.raises(
+        AssemblyError,
+        match=r"learnt at accel-fe in g, and the samples to be judged are in m/s2; cal",
+    ):
+        detector(machine(other, named))
+    assert not caplog.text
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join(line for line in lines if not line.startswith("units = ")))
+    assert detector(machine(other, named)).baseline.races == right.races
+    assert "does not say in which unit it was learnt at accel-de, accel-fe" in caplog.text
 
 
 def test_a_kept_state_is_taken_up_or_learnt_anew(right, tmp_path, caplog) -> None:
