@@ -42,6 +42,8 @@ pytestmark = [
 ]
 UNIT = "daqsvc@pump"
 STORE = Path("/var/lib/daqsvc/pump")
+LATE = "daqsvc@late"
+"""Whose bus, broker, disk and time are not there at the start."""
 KERNELS = Path("/var/cache/daqsvc/kernels")
 INSTALLED = Path("/opt/hil")
 """Not where it lies on the host: that may be below /root or /tmp, which the sandbox hides."""
@@ -52,6 +54,7 @@ READY_S, STOP_S = 3.0, 2.0
 NOMINAL_S = 0.8
 """What `reference_s` is on such a machine."""
 RATE_HZ = 640
+FIRST_OF_2000_S = 946_684_800.0
 BROKEN = "schema_version = 1\nsite = 5\n"
 
 
@@ -103,15 +106,15 @@ def started_again(before: dict[str, str]) -> dict[str, str]:
     return now
 
 
-def alarm(name: str) -> dict[str, Any] | None:
+def alarm(name: str, store: Path = STORE) -> dict[str, Any] | None:
     """How an alarm stands, by the journal, which its own account may read."""
-    os.seteuid(STORE.stat().st_uid)
+    os.seteuid(store.stat().st_uid)
     try:
-        payloads = [json.loads(message.payload) for message in read_journal(STORE, history=0).latest]
+        payloads = [json.loads(message.payload) for message in read_journal(store, history=0).latest]
     finally:
         os.seteuid(0)
     stands = next((one for one in payloads if one.get("alarm") == name), None)
-    return stands and {key: stands[key] for key in ("state", "level", "occurrence")}
+    return stands and {key: stands[key] for key in ("state", "level", "occurrence", "time")}
 
 
 class Shaft(threading.Thread):
@@ -167,7 +170,7 @@ def install() -> None:
     shutil.copy(config / "daqsvc.sysusers.conf", "/etc/sysusers.d/daqsvc.conf")
     sh("systemd-sysusers", "/etc/sysusers.d/daqsvc.conf")
     shutil.copy(config / "daqsvc@.service", "/etc/systemd/system/")
-    for unit in (UNIT, "daqsvc@broken"):
+    for unit in (UNIT, LATE, "daqsvc@broken"):
         changes = Path(f"/etc/systemd/system/{unit}.service.d")
         changes.mkdir()
         (changes / "quicker.conf").write_text(f"[Service]\nWatchdogSec={WATCHDOG_S}\nRestartSec=200ms\n")
@@ -281,6 +284,56 @@ def test_whatever_ends_it_it_is_started_again_and_its_alarms_stand_as_they_did(u
     assert "the event loop has stood still for 3 s: the event loop is in look (unit_main.py" in said
     assert said.count("Watchdog timeout (limit 6s)!") == 2, said
     assert "gets on again" not in said
+
+
+def boot_without_time(unit: str) -> None:
+    """As on a box without a battery clock, which gets the time after the start."""
+    away_s = time.time() - FIRST_OF_2000_S
+    time.clock_settime(time.CLOCK_REALTIME, FIRST_OF_2000_S)
+    try:
+        sh("systemctl", "start", unit)
+    finally:
+        time.clock_settime(time.CLOCK_REALTIME, time.time() + away_s)
+
+
+def test_without_bus_broker_disk_and_time_it_starts_and_goes_on_when_they_come(unit: str) -> None:
+    others = shown(unit)
+    link = VcanLink()
+    link.remove()
+    file, store = Path("/etc/daqsvc/late.toml"), STORE.with_name("late")
+    text = Path("/etc/daqsvc/pump.toml").read_text().replace(str(STORE), str(store))
+    text = re.sub(r'channel = "vcan\w+"', f'channel = "{link.name}"', text)
+    file.write_text(text.replace('start = "error"', 'start = "retry"'))
+    store.mkdir()
+    sh("mount", "-t", "tmpfs", "-o", "size=32m", "late", store)
+    filler = store / "filler"
+    with contextlib.suppress(OSError), filler.open("wb", buffering=0) as file_of_zeros:
+        while file_of_zeros.write(bytes(1 << 16)):
+            pass
+    boot_without_time(LATE)
+    started = shown(LATE)
+    assert started["ActiveState"] == "active"
+    assert "0 of 1 buses up" in started["StatusText"]
+    until(lambda: "make room on the disk" in journal(LATE), "it says that the disk is full")
+    assert not (store / "outbox.sqlite").exists()
+
+    filler.unlink()
+    link.add()
+    shaft = Shaft(file, link)
+    shaft.start()
+    try:
+        until(lambda: "1 of 1 buses up" in shown(LATE)["StatusText"], "the bus is up")
+        stands = until(lambda: alarm("shaft-vibration-x", store), "an alarm is in the journal")
+    finally:
+        shaft.stop()
+        link.close()
+    assert stands["time"] > "2026"
+    for before, now in ((started, shown(LATE)), (others, shown(unit))):
+        assert [now[key] for key in ("MainPID", "NRestarts")] == [
+            before[key] for key in ("MainPID", "NRestarts")
+        ]
+    sh("systemctl", "stop", LATE)
+    assert shown(LATE)["Result"] == "success"
 
 
 def test_a_wrong_machine_file_is_not_tried_again_and_again() -> None:

@@ -92,7 +92,7 @@ def probe() -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["run"] and "STATE_DIRECTORY" in os.environ and len(sys.argv) == 3:
+    if sys.argv[1:] == ["run", "/etc/daqsvc/pump.toml"] and "STATE_DIRECTORY" in os.environ:
         probe()
         arrange_to_hang()
     sys.exit(main())
