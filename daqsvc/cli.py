@@ -68,6 +68,7 @@ class CheckCommand:
         if machine is None:
             return EXIT_USAGE
         kernel_cache.prepare()
+        from daqsvc.commands.store_argument import store_doubts  # noqa: PLC0415
         from daqsvc.detectors.make import check_files  # noqa: PLC0415
         from daqsvc.publish.make import check_outputs  # noqa: PLC0415
         from daqsvc.settings import describe  # noqa: PLC0415 - each verb imports only what it needs
@@ -77,8 +78,9 @@ class CheckCommand:
 
         check_files(machine)
         check_outputs(machine)
+        doubts = list(store_doubts(machine))
         with collecting() as failures:
-            print(describe(machine))  # noqa: T201 - this is what the verb is for
+            print(describe(machine, doubts))  # noqa: T201 - this is what the verb is for
         for failed in failures:
             failed.file, failed.table = machine.path, dotted(failure(machine, failed).path)
             print(failed, file=sys.stderr)  # noqa: T201

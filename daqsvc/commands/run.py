@@ -88,7 +88,7 @@ class RunCommand:
 
 
 def _run(machine: MachineFile, store: Path | None, guard: ProcessGuard, manager: ServiceManager) -> int:
-    from daqsvc.outbox.messages import NewerOutboxError, OutboxError  # noqa: PLC0415
+    from daqsvc.outbox.messages import NewerOutboxError, OutboxError, StorePathError  # noqa: PLC0415
     from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415 - each verb imports only what it needs
     from daqsvc.supervision import EssentialLostError  # noqa: PLC0415
     from drivers.base import DeviceAbsentError  # noqa: PLC0415
@@ -96,10 +96,10 @@ def _run(machine: MachineFile, store: Path | None, guard: ProcessGuard, manager:
 
     try:
         _run_loop(_run_until_stopped(machine, store or store_directory(machine), guard, manager))
-    except (AssemblyError, LayoutError, NewerOutboxError) as error:
+    except (AssemblyError, LayoutError, NewerOutboxError, StoreNotFoundError, StorePathError) as error:
         log.critical("%s", error)
         return EXIT_USAGE
-    except (DeviceAbsentError, OutboxError, StoreNotFoundError) as error:
+    except (DeviceAbsentError, OutboxError) as error:
         log.critical("%s", error)
         return EXIT_FAILED
     except EssentialLostError as error:

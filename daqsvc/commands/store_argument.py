@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from daqsvc.settings import MachineFile
 
@@ -40,6 +40,27 @@ def store_directory(machine: MachineFile) -> Path:
     if directory := os.environ.get("STATE_DIRECTORY"):
         return Path(directory.split(":")[0])
     return _state_directory() / f"{machine.site}-{machine.box}-{machine.machine.name}"
+
+
+def store_doubts(machine: MachineFile) -> Iterator[str]:
+    """Why the service could not use the store that a machine file names, if this account ran it.
+
+    Raises:
+        AssemblyError: nobody could: it is no directory.
+    """
+    from daqsvc.outbox.messages import StorePathError  # noqa: PLC0415 - each verb imports only what it needs
+    from daqsvc.outbox.safety import account, unusable  # noqa: PLC0415
+    from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415
+
+    if machine.store is None:
+        return
+    at = f"{machine.path}: store.directory = {str(machine.store.directory)!r}"
+    try:
+        why = unusable(machine.resolve(machine.store.directory))
+    except StorePathError as error:
+        raise AssemblyError(f"{at}: {error}") from None
+    if why:
+        yield f"{at}: daqsvc run could not start as {account()}: {why}"
 
 
 def add_store(parser: argparse.ArgumentParser) -> None:

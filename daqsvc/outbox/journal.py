@@ -37,7 +37,7 @@ from daqsvc.outbox.messages import (
 )
 from daqsvc.outbox.reading import opened_to_read
 from daqsvc.outbox.renewal import Damage, Renewal
-from daqsvc.outbox.safety import refuse_link, refuse_unsafe, restrict_files
+from daqsvc.outbox.safety import refuse_link, refuse_no_directory, refuse_unsafe, restrict_files
 from daqsvc.outbox.salvage import LARGEST, readable
 from daqsvc.outbox.sequence import SequenceMark, place_of
 from daqsvc.outbox.tables import (
@@ -197,6 +197,7 @@ class Journal:
         if self._lock is not None:
             return
         try:
+            refuse_no_directory(self.path.parent)
             make_directory(self.path.parent)
             refuse_unsafe(self.path.parent)
             restrict_files(self.path.parent)

@@ -19,6 +19,10 @@ class NewerOutboxError(OutboxError):
     """A newer version of the program has written the file: starting again does not help."""
 
 
+class StorePathError(OutboxError):
+    """The store cannot be a directory, since a file is in its place: starting again does not help."""
+
+
 class OutboxAwayError(OutboxError):
     """The outbox cannot be used for now: its disk is full, takes no writes, or answers with errors."""
 

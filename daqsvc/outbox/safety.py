@@ -11,8 +11,8 @@ import pwd
 import stat
 from pathlib import Path
 
-from daqsvc.outbox.files import restrict
-from daqsvc.outbox.messages import OutboxError
+from daqsvc.outbox.files import is_read_only, remedy, restrict
+from daqsvc.outbox.messages import OutboxError, StorePathError
 
 JOURNAL, BESIDE = "outbox", ("audit.jsonl", "control.sock")
 """How the names of the files begin that nobody else may have put there."""
@@ -22,6 +22,61 @@ _OURS = (JOURNAL, "audit", "command-ids", "sparkplug.", "mqtt-", "home-assistant
 
 _MOST_LINKS = 40
 """Symbolic links in one path, as the kernel has it."""
+
+
+def refuse_no_directory(store: Path) -> None:
+    """Make sure that a store is a directory, or can be made one.
+
+    Raises:
+        StorePathError: something else is in its place, or above it.
+        OSError: it cannot be looked at.
+    """
+    for at in (store, *store.parents):
+        try:
+            mode = at.stat().st_mode
+        except (FileNotFoundError, NotADirectoryError):
+            continue
+        if not stat.S_ISDIR(mode):
+            what = f"the store {store} is" if at == store else f"{at}, above the store {store}, is"
+            raise StorePathError(
+                f"{what} no directory, but a file: name a directory in [store] of the machine file, or "
+                "with --store"
+            )
+        return
+
+
+def unusable(store: Path) -> str:
+    """Why a service of this account cannot use a store; empty if it can, or the store is not there yet.
+
+    Raises:
+        StorePathError: it is no directory.
+    """
+    try:
+        refuse_no_directory(store)
+        if not store.is_dir():
+            return ""
+        refuse_unsafe(store)
+    except StorePathError:
+        raise
+    except OutboxError as error:
+        return f"{error}"
+    except OSError as error:
+        return f"the store {store} cannot be used: {error.strerror}"
+    if is_read_only(store):
+        return f"the store {store} cannot be written: {remedy(store)}"
+    if not os.access(store, os.R_OK | os.W_OK | os.X_OK):
+        return (
+            f"the store {store} may not be written by {_user(os.geteuid())}: chmod u+rwx {store}, or chown it"
+        )
+    return ""
+
+
+def account() -> str:
+    """This process's user, as `chown` takes it."""
+    try:
+        return pwd.getpwuid(os.geteuid()).pw_name
+    except KeyError:
+        return f"{os.geteuid()}"
 
 
 def refuse_unsafe(store: Path) -> None:
@@ -121,7 +176,7 @@ def _narrowed(directory: Path, status: os.stat_result, *, is_store: bool) -> str
         return f"chmod go-w {directory}"
     if not is_store:
         return f"chmod go-w {directory}, or chmod +t it, as root"
-    owned = f"chown {_account()} {directory} && chmod 700 {directory}"
+    owned = f"chown {account()} {directory} && chmod 700 {directory}"
     return f"{owned}, as root (on Kubernetes: in an init container)"
 
 
@@ -138,21 +193,13 @@ def _refuse_file(path: Path, status: os.stat_result) -> None:
 def _belongs(what: str, owner: int, path: Path) -> str:
     return (
         f"{what} belongs to {_user(owner)} and the service runs as {_user(os.geteuid())}: "
-        f"chown {_account()} {path}, run the service as {_user(owner)}, "
+        f"chown {account()} {path}, run the service as {_user(owner)}, "
         "or give it a directory of its own"
     )
 
 
 def _trusted() -> set[int]:
     return {0, os.geteuid()}
-
-
-def _account() -> str:
-    """This process's user, as `chown` takes it."""
-    try:
-        return pwd.getpwuid(os.geteuid()).pw_name
-    except KeyError:
-        return f"{os.geteuid()}"
 
 
 def _user(number: int) -> str:

@@ -6,7 +6,7 @@ import ast
 import inspect
 import re
 import sys
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import is_dataclass
 from functools import cache
 from importlib import import_module
@@ -88,9 +88,20 @@ def _is_one(value: object, origin: Any, args: tuple[Any, ...], *, inside: bool) 
         return origin is Any or value in args
     if origin is type:
         return isinstance(value, type) and issubclass(value, getattr(args[0], "__bound__", args[0]))
+    if origin is Hashable:
+        return _is_hashable(value)
     if origin in {int, float}:
         return isinstance(value, Real) and not isinstance(value, bool)
     return isinstance(value, tuple if inside and origin is tuple else _ACCEPTED.get(origin, origin))
+
+
+def _is_hashable(value: object) -> bool:
+    """Whether it can be told apart from others: a tuple looks as if it could, whatever is in it."""
+    try:
+        hash(value)
+    except Exception:  # noqa: BLE001 - a hash of a plugin's own may raise anything
+        return False
+    return True
 
 
 def _parts(value: object, origin: Any, args: tuple[Any, ...]) -> Iterable[tuple[object, Any]] | None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
 
 from pydantic import ConfigDict, Field
 
 from daqsvc.settings.hooks import Hooks, contract
 from daqsvc.settings.section import Name, Section, UnusableValueError
+
+if TYPE_CHECKING:
+    from collections.abc import Hashable
 
 StartPolicy = Literal["error", "retry", "ignore"]
 
@@ -22,12 +25,12 @@ class Device(NamedTuple):
 
     Attributes:
         key: the key that names it.
-        identity: compares equal for whatever is the same device.
+        identity: compares equal, and has the same hash, for whatever is the same device.
         remedy: what to do about two buses that name it.
     """
 
     key: str
-    identity: object
+    identity: Hashable
     remedy: str
 
 

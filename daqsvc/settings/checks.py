@@ -27,7 +27,7 @@ from daqsvc.settings.sensor_checks import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Hashable, Iterator, Mapping
 
     from daqsvc.settings.buses import Layout
     from daqsvc.settings.hooks import PluginFailedError
@@ -177,7 +177,7 @@ def _check_drivers(draft: MachineFile) -> Iterator[Finding]:
 
 def _check_devices(draft: MachineFile) -> Iterator[Finding]:
     """No device belongs to two buses."""
-    owners: dict[object, str] = {}
+    owners: dict[Hashable, str] = {}
     for name, bus in draft.buses.items():
         with suppress(UnusableValueError):
             device = bus.device

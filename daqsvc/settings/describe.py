@@ -30,8 +30,13 @@ _GAP = "  "
 _NO_BREAK = "\N{NO-BREAK SPACE}"
 
 
-def describe(machine: MachineFile) -> str:
-    """Summary of a machine file: plain text for a terminal of 100 columns, without secrets, warnings last."""
+def describe(machine: MachineFile, doubts: Iterable[str] = ()) -> str:
+    """Summary of a machine file: plain text for a terminal of 100 columns, without secrets, warnings last.
+
+    Args:
+        machine: the machine file.
+        doubts: what is to be warned of beside its own warnings.
+    """
     blocks = [
         _facts(_identity(machine)),
         ["Buses", *_table([], [(name, _bus(machine, name)) for name in machine.buses])],
@@ -41,18 +46,18 @@ def describe(machine: MachineFile) -> str:
         ["Alarms", *_table(_ALARM_HEADER, list(_alarms(machine)))],
         _facts(_outlets(machine)),
     ]
-    if machine.warnings:
-        warnings = [
-            textwrap.fill(
-                str(warning),
-                COLUMNS,
-                initial_indent=_INDENT,
-                subsequent_indent=2 * _INDENT,
-                break_long_words=False,
-                break_on_hyphens=False,
-            )
-            for warning in machine.warnings
-        ]
+    warnings = [
+        textwrap.fill(
+            str(warning),
+            COLUMNS,
+            initial_indent=_INDENT,
+            subsequent_indent=2 * _INDENT,
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+        for warning in (*machine.warnings, *doubts)
+    ]
+    if warnings:
         blocks.append([f"Warnings: {len(warnings)}", *warnings])
     return "\n\n".join("\n".join(block) for block in blocks)
 

@@ -85,7 +85,7 @@ def parse_machine_file(text: str, path: Path) -> MachineFile:
     reading = _Reading(document, spots, path)
     reading.leave_out_broken()
     with collecting() as failures:
-        draft = reading.validate()
+        draft = reading.validate().found_at(Origin(path))
         facts = _read_files(draft, path, reading.findings)
         reading.findings += check(draft, facts)
     reading.take(draft, failures)

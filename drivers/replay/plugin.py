@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from daqsvc.recording.formats import CAN_LOGS, named_as_can_log
 from daqsvc.settings.problems import Finding
 from daqsvc.settings.section import UnusableValueError
 from drivers.can.settings import DbcLayout, PlainLayout
@@ -13,6 +15,7 @@ from drivers.replay.settings import TABLES, ReplayBus, TableLayout
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
+    from pathlib import Path
 
     from daqsvc.settings.buses import Bus, Layout
     from daqsvc.settings.models import MachineFile, Stream
@@ -63,7 +66,12 @@ def check_replay_buses(draft: MachineFile) -> Iterator[Finding]:
         with suppress(UnusableValueError):
             if not isinstance(bus, ReplayBus):
                 continue
-            yield from _check_format(bus, ("buses", name))
+            file = draft.resolve(bus.file)
+            if file.exists() and not file.is_file():
+                what = "a folder" if file.is_dir() else "a pipe or a device"
+                yield Finding(("buses", name, "file"), f"is no file but {what}", "name a file")
+            else:
+                yield from _check_format(bus, ("buses", name))
             if bus.at_end == "wait" and bus.file.suffix.lower() != ".log":
                 yield Finding(
                     ("buses", name, "at_end"),
@@ -79,12 +87,29 @@ def _check_format(bus: ReplayBus, at: KeyPath) -> Iterator[Finding]:
             "is a data base, which cannot be played",
             f"make a BLF of it: can_logconvert {bus.file.name} {bus.file.stem}.blf",
         )
+    elif not (bus.is_table or named_as_can_log(bus.file)) and (remedy := _unknown_format(bus.file)):
+        yield Finding(
+            (*at, "file"), "has an ending that no reader is known for, so that it cannot be played", remedy
+        )
     if bus.is_table and bus.channel is not None:
         yield Finding(
             (*at, "channel"),
             f"means nothing to a table of samples, which {bus.file.name} is",
             "remove it; the columns are named in the layouts of the streams",
         )
+
+
+def _unknown_format(file: Path) -> str:
+    """What to do about a file that is neither a table nor a CAN log; empty if python-can reads it."""
+    from can.io import MESSAGE_READERS  # noqa: PLC0415 - only for files of odd names
+
+    name = file.with_suffix("") if file.suffix.lower() == ".gz" else file
+    suffix = name.suffix.lower()
+    if suffix == ".mf4" and find_spec("asammdf") is None:
+        return "install asammdf, or make a BLF of it"
+    if suffix in MESSAGE_READERS and suffix not in _DATA_BASES:
+        return ""
+    return f"give a CAN log ({', '.join(CAN_LOGS)}; .gz behind it if zipped) or a table ({TABLES})"
 
 
 def check_replayed(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[Finding]:

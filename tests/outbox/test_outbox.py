@@ -17,7 +17,7 @@ from support.waiting import eventually
 import daqsvc
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.outbox.journal import TRIM_EVERY, Journal
-from daqsvc.outbox.messages import NewerOutboxError
+from daqsvc.outbox.messages import NewerOutboxError, StorePathError
 from daqsvc.outbox.sequence import STEP, UNRECORDED
 from daqsvc.outbox.store import Outbox, OutboxError, OutboxLimits
 
@@ -280,7 +280,7 @@ async def test_the_journal_of_sent_messages_is_bounded(tmp_path):
 
 async def test_what_cannot_be_used_is_said_with_a_remedy(tmp_path):
     (tmp_path / "file").write_text("not a directory")
-    with pytest.raises(OutboxError, match="give the service a directory"):
+    with pytest.raises(StorePathError, match="file is no directory, but a file: name a directory"):
         await opened(tmp_path / "file" / "outbox.sqlite")
     newer = sqlite3.connect(tmp_path / "newer.sqlite")
     newer.execute("PRAGMA user_version = 99")

@@ -23,7 +23,7 @@ from support.machine_files import MOTOR, problems_of
 
 import daqsvc
 from daqsvc.acquisition.clock import SystemClock
-from daqsvc.api import Bus, DetectorPlugin, DriverPlugin, OutputPlugin
+from daqsvc.api import Bus, DetectorPlugin, Device, DriverPlugin, OutputPlugin
 from daqsvc.cli import main
 from daqsvc.detectors.make import check_files, detectors
 from daqsvc.publish.make import output_set, watched
@@ -321,6 +321,25 @@ def test_a_hook_that_fails_is_one_finding_with_its_line(
     assert problem.line is not None
     removed = table.removesuffix(".layout")
     assert problem.remedy == f"have the authors of {BROUGHT[owner]} mend it, or remove [{removed}]"
+
+
+class NoHash:
+    def __hash__(self) -> int:
+        raise KeyError("no hash")
+
+
+@pytest.mark.parametrize("identity", [["can0"], ("can0", ["1"]), NoHash()], ids=["list", "tuple", "own"])
+def test_a_device_that_cannot_be_told_apart_is_one_finding(
+    monkeypatch: pytest.MonkeyPatch, identity: Any
+) -> None:
+    device = Device("address", identity, "take another")
+    monkeypatch.setattr(class_at("tcp_frames.LoggerBus"), "device", property(lambda _: device))
+    [problem] = problems_of(TABLES, MACHINE)
+    assert problem.key == "buses.logger"
+    assert "device of tcp_frames.LoggerBus has failed: it is Device(key='address', iden" in problem.message
+    assert "in its identity, " in problem.message
+    assert " is no Hashable (" in problem.message
+    assert problem.remedy == "have the authors of daqsvc-tcp-frames 1.0 mend it, or remove [buses.logger]"
 
 
 def test_a_validator_that_fails_is_one_finding_and_the_others_go_on(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -65,6 +65,10 @@ def test_one_channel_of_a_can_log_is_described() -> None:
         ('"loop"', '"rewind"', "buses.tape.at_end"),
         ('"loop"', '"loop"\nchannel = "1"', 'buses.tape.channel = "1": means nothing to a table of samples'),
         ("gap.npz", "gap.db", "gap.db.*is a data base.*can_logconvert gap.db gap.blf"),
+        ("gap.npz", "gap.db.gz", 'gap.db.gz": has an ending that no reader is known for.*give a CAN log'),
+        ("gap.npz", "gap.xyz", r'file = "gap.xyz": has an ending .* \(.blf, .asc, .*\) or a table \(.npz, '),
+        ("gap.npz", "gap", 'file = "gap": has an ending that no reader is known for'),
+        ("gap.npz", "gap.mf4", "install asammdf, or make a BLF of it"),
         (
             "gap.npz",
             "gap.blf",
@@ -84,3 +88,10 @@ def test_what_does_not_fit_is_named(old: str, new: str, said: str) -> None:
     assert old in TEXT
     with pytest.raises(MachineFileError, match=said):
         parse_machine_file(TEXT.replace(old, new), Path("/m/replayed.toml"))
+
+
+def test_what_is_no_file_is_named_and_what_is_not_there_yet_may_come(tmp_path: Path) -> None:
+    parse_machine_file(TEXT, tmp_path / "replayed.toml")
+    (tmp_path / "gap.npz").mkdir()
+    with pytest.raises(MachineFileError, match=r'buses.tape.file = "gap.npz": is no file but a folder'):
+        parse_machine_file(TEXT, tmp_path / "replayed.toml")

@@ -1,0 +1,114 @@
+"""What `daqsvc check` says of a store that `daqsvc run` could not use, and how `run` ends then."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from support.paths import ROOT
+
+from daqsvc.cli import main
+from daqsvc.commands import run as run_command
+from daqsvc.commands.service_manager import ServiceManager
+from daqsvc.settings import load_machine_file
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    Check = Callable[[Path], tuple[int, str, str]]
+
+MACHINE = ROOT / "config" / "machines" / "bearing.toml"
+NOBODY = 65_534
+
+
+@pytest.fixture
+def machine(tmp_path: Path) -> Callable[[Path], Path]:
+    """A machine file with a store."""
+
+    def written(store: Path) -> Path:
+        file = tmp_path / "machine.toml"
+        text = re.sub('(?m)^directory = ".*"$', f'directory = "{store}"', MACHINE.read_text())
+        file.write_text(text)
+        return file
+
+    return written
+
+
+@pytest.fixture
+def check(machine: Callable[[Path], Path], capsys: pytest.CaptureFixture[str]) -> Check:
+    def checked(store: Path) -> tuple[int, str, str]:
+        code = main(["check", str(machine(store))])
+        out, err = capsys.readouterr()
+        return code, " ".join(out.split()), err.strip()
+
+    return checked
+
+
+def run(machine: Path, store: Path | None = None) -> int:
+    """The exit code of a service that does not get far."""
+    guard: Any = SimpleNamespace(
+        stopping=None, protect=lambda _: None, stop_by=lambda *_: None, expect_turns=lambda _: None
+    )
+    return run_command._run(load_machine_file(machine), store, guard, ServiceManager())
+
+
+def test_a_store_that_is_a_file_or_below_one_is_refused_by_check_and_run(
+    tmp_path: Path, machine: Callable[[Path], Path], check: Check, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "alarms").write_text("")
+    for store, said in (
+        (
+            tmp_path / "alarms",
+            f"the store {tmp_path}/alarms is no directory, but a file: name a directory in",
+        ),
+        (tmp_path / "alarms" / "pump", f"{tmp_path}/alarms, above the store {tmp_path}/alarms/pump, is no"),
+    ):
+        code, out, err = check(store)
+        assert (code, out) == (2, "")
+        assert f"machine.toml: store.directory = '{store}': {said}" in err
+        assert run(machine(store)) == run(MACHINE, store) == 2
+        assert caplog.text.count(said) == 2
+
+
+def test_a_store_that_this_account_cannot_use_is_a_warning(tmp_path: Path, check: Check) -> None:
+    store = tmp_path / "alarms"
+    code, out, _ = check(store)
+    assert (code, "Warnings" in out) == (0, False), "it is made at the start"
+    store.mkdir(mode=0o700)
+    assert "Warnings" not in check(store)[1]
+    store.chmod(0o777)
+    code, out, err = check(store)
+    assert (code, err) == (0, "")
+    assert (
+        f"Warnings: 1 {tmp_path}/machine.toml: store.directory = '{store}': daqsvc run could not start" in out
+    )
+    assert f"the store {store} has mode 0777, so that others may put files of theirs into it" in out
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a directory away")
+def test_a_store_of_somebody_else_is_a_warning(tmp_path: Path, check: Check) -> None:
+    store = tmp_path / "alarms"
+    store.mkdir(mode=0o700)
+    os.chown(store, NOBODY, NOBODY)
+    code, out, _ = check(store)
+    assert code == 0
+    assert "could not start as root: the store" in out
+    assert f"alarms belongs to nobody and the service runs as root: chown root {store}" in out
+
+
+def test_an_account_without_a_place_for_a_store_is_not_started_again_and_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    def homeless() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    for variable in ("STATE_DIRECTORY", "XDG_STATE_HOME"):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setattr(Path, "home", homeless)
+    (tmp_path / "machine.toml").write_text(MACHINE.read_text().partition("[store]")[0])
+    assert run(tmp_path / "machine.toml") == 2
+    assert "has no home directory for the alarm journal: name one with --store" in caplog.text
