@@ -22,6 +22,7 @@ from daqsvc.commands.detectability import DetectabilityCommand
 from daqsvc.commands.example import ExampleCommand
 from daqsvc.commands.record import RecordCommand
 from daqsvc.commands.run import RunCommand
+from daqsvc.commands.status import StatusCommand
 
 if TYPE_CHECKING:
     import argparse
@@ -114,6 +115,7 @@ def commands() -> dict[str, Command]:
     known: dict[str, Command] = {
         "run": RunCommand(load, start_logging),
         "check": CheckCommand(),
+        "status": StatusCommand(load),
         "alarms": AlarmsCommand(load),
         **alarm_verbs(load),
         "analyze": AnalyzeCommand(load, kernel_cache.prepare),

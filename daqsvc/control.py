@@ -1,8 +1,9 @@
-"""Commands from people on the box: a Unix socket in the store, and the client for it.
+"""Commands and questions from people on the box: a Unix socket in the store, and the client for it.
 
-A request is one line of JSON, and so is its answer: see `ControlRequest` and `ControlAnswer`. The socket is
-``control.sock`` in the store's directory, or in systemd's ``$RUNTIME_DIRECTORY`` with a link from there, mode
-0600: only the service's own user and root may open it, and whoever may open it may command the alarms.
+A request is one line of JSON, and so is its answer: see `ControlRequest` and `ControlAnswer`; the status is a
+`daqsvc.publish.service_status.ServiceStatusPayload`. The socket is ``control.sock`` in the store's directory,
+or in systemd's ``$RUNTIME_DIRECTORY`` with a link from there, mode 0600: only the service's own user and root
+may open it, and whoever may open it may command the alarms.
 Whatever a client sends or leaves unsent costs the service a counter and a few kilobytes at most. Clients that
 hang keep nobody out: each user has connections of their own, and the quietest of them makes way for the next.
 """
@@ -18,7 +19,7 @@ import socket
 import stat
 import struct
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -38,7 +39,7 @@ from daqsvc.outbox.files import is_possessed, is_read_only
 from daqsvc.outbox.reading import JOURNAL_NAME
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Awaitable, Callable, Iterator
     from pathlib import Path
 
     from daqsvc.alarms.commands import AlarmCommand, CommandHandler
@@ -60,9 +61,14 @@ LOOK_S = 10.0
 """How often the service looks whether its socket is still there."""
 ANSWER_S = 20.0
 """How long the client waits for the service: longer than that waits for its disk."""
+STATUS_S = 10.0
+"""How long it waits for the status, which waits for nothing but the processor."""
+LONGEST_STATUS = 32 * 1024 * 1024
+"""Of 4096 sensors it is some 5 MB."""
 
 _REQUEST: Literal["daqsvc.control/1"] = "daqsvc.control/1"
 _QUESTION = b'{"schema": "daqsvc.control/1", "verb": "standing"}'
+STATUS_QUESTION = b'{"schema": "daqsvc.control/1", "verb": "status"}'
 _ANSWER: Literal["daqsvc.control-answer/1"] = "daqsvc.control-answer/1"
 
 
@@ -70,7 +76,11 @@ class ControlError(Exception):
     """The control socket cannot be used; the text names it and the remedy."""
 
 
-class UnreachableError(ControlError):
+class AbsentError(ControlError):
+    """Nobody answers at the control socket of a store, for now."""
+
+
+class UnreachableError(AbsentError):
     """A service runs on the store, but has no control socket there."""
 
 
@@ -154,6 +164,7 @@ class ControlServer:
         waiting: how many alarm events the disk has not got yet.
         runtime: directory for the socket itself, e.g. systemd's ``$RUNTIME_DIRECTORY``; the store then has a
             link to it.
+        status: the line of JSON for who asks how everything stands; None if nobody may.
     """
 
     def __init__(
@@ -163,6 +174,7 @@ class ControlServer:
         execute: CommandHandler,
         waiting: Callable[[], int] = lambda: 0,
         runtime: Path | None = None,
+        status: Callable[[], Awaitable[bytes]] | None = None,
     ) -> None:
         self.path = (runtime or store) / SOCKET
         self._link = None if runtime is None else store / SOCKET
@@ -170,6 +182,7 @@ class ControlServer:
         self._machine = machine
         self._execute = execute
         self._waiting = waiting
+        self._status = status
         self._server: asyncio.Server | None = None
         self._inode: int | None = None
         self._clients: list[_Client] = []
@@ -276,10 +289,13 @@ class ControlServer:
         try:
             while (line := await _next_line(reader)) is not None:
                 client.busy = True
-                answer = await self._answer(line, client.source)
+                if self._status is not None and line.strip() == STATUS_QUESTION:
+                    answer = await self._status()
+                else:
+                    answer = _json_line(await self._answer(line, client.source))
                 client.busy = False
                 self._clients.append(self._clients.pop(self._clients.index(client)))
-                writer.write(_json_line(answer))
+                writer.write(answer)
                 async with asyncio.timeout(PATIENCE_S):
                     await writer.drain()
                 if len(line) > LONGEST_LINE:
@@ -359,7 +375,7 @@ def events_waiting(store: Path, timeout_s: float = PATIENCE_S) -> int:
     Raises:
         ControlError: there is no service, it is somebody else's, or it does not answer.
     """
-    return _asked(store, _QUESTION + b"\n", timeout_s).waiting
+    return _outcome(store, _QUESTION + b"\n", timeout_s).waiting
 
 
 def ask(store: Path, request: ControlRequest, timeout_s: float = ANSWER_S) -> CommandOutcome:
@@ -373,11 +389,42 @@ def ask(store: Path, request: ControlRequest, timeout_s: float = ANSWER_S) -> Co
     Raises:
         ControlError: there is no service, it is somebody else's, or it does not answer.
     """
-    answer = _asked(store, _json_line(request), timeout_s)
+    answer = _outcome(store, _json_line(request), timeout_s)
     return CommandOutcome(accepted=answer.accepted, reason=answer.reason, events=answer.events)
 
 
-def _asked(store: Path, line: bytes, timeout_s: float) -> ControlAnswer:
+def ask_status(store: Path, timeout_s: float = STATUS_S) -> dict[str, Any]:
+    """How everything stands by the service that runs on a store, as it says; blocks.
+
+    Returns:
+        A `daqsvc.publish.service_status.ServiceStatusPayload`, by its keys in JSON.
+
+    Raises:
+        ControlError: there is no service, it is somebody else's, or it does not answer.
+    """
+    then = "its log says what holds it up"
+    line = _asked(store, STATUS_QUESTION + b"\n", timeout_s, LONGEST_STATUS, then)
+    try:
+        answer: dict[str, Any] = json.loads(line)
+        schema = answer["schema"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise _unanswered(store, error, then) from None
+    if schema == _ANSWER:
+        raise ControlError(
+            f"the daqsvc of {store} is of an older version, which does not tell its status: restart it"
+        )
+    return answer
+
+
+def _outcome(store: Path, line: bytes, timeout_s: float) -> ControlAnswer:
+    then = "whether it has obeyed, daqsvc alarms tells"
+    try:
+        return ControlAnswer.model_validate_json(_asked(store, line, timeout_s, LONGEST_LINE, then))
+    except ValidationError as error:
+        raise _unanswered(store, error, then) from None
+
+
+def _asked(store: Path, line: bytes, timeout_s: float, longest: int, then: str) -> bytes:
     path = store / SOCKET
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
@@ -386,7 +433,7 @@ def _asked(store: Path, line: bytes, timeout_s: float) -> ControlAnswer:
                 client.connect(address)
             client.sendall(line)
             with client.makefile("rb") as answers:
-                return ControlAnswer.model_validate_json(answers.readline(LONGEST_LINE))
+                return answers.readline(longest)
     except (FileNotFoundError, ConnectionRefusedError, NotADirectoryError):
         raise _absence(store) from None
     except PermissionError:
@@ -394,21 +441,21 @@ def _asked(store: Path, line: bytes, timeout_s: float) -> ControlAnswer:
             f"the daqsvc of {store} takes commands from its own user and from root only: try again with sudo"
         ) from None
     except TimeoutError:
-        raise ControlError(
-            f"the daqsvc of {store} has not answered within {timeout_s:g} s; whether it has obeyed, "
-            "daqsvc alarms tells"
-        ) from None
-    except (OSError, ValidationError) as error:
-        raise ControlError(
-            f"the daqsvc of {store} has closed the connection without an answer ({_in_short(error)}); "
-            "whether it has obeyed, daqsvc alarms tells"
-        ) from None
+        raise ControlError(f"the daqsvc of {store} has not answered within {timeout_s:g} s; {then}") from None
+    except OSError as error:
+        raise _unanswered(store, error, then) from None
 
 
-def _absence(store: Path) -> ControlError:
+def _unanswered(store: Path, error: Exception, then: str) -> AbsentError:
+    return AbsentError(
+        f"the daqsvc of {store} has closed the connection without an answer ({_in_short(error)}); {then}"
+    )
+
+
+def _absence(store: Path) -> AbsentError:
     """Why nobody listens at the control socket of a store."""
     if not is_possessed(store / f"{JOURNAL_NAME}.lock"):
-        return ControlError(
+        return AbsentError(
             f"no daqsvc runs on the store {store}: start it with daqsvc run, or name its store with --store"
         )
     if is_read_only(store):

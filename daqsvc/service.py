@@ -30,6 +30,7 @@ from daqsvc.publish.payloads import Figures
 from daqsvc.self_check import BusHealth, conditions
 from daqsvc.settings.failures import authors_of
 from daqsvc.settings.streams import Grid
+from daqsvc.status_report import StatusReport
 from daqsvc.supervision import EssentialLostError, Progress, Supervisor, over, stop_all
 from daqsvc.threads import CallThreads
 from drivers.base import BusCounters, DeviceAbsentError
@@ -166,12 +167,14 @@ class Service:
             bus_health=self._bus_health,
             supervisor=self.supervisor,
         )
+        self.report = StatusReport(machine, self.clock, self.rings, self.drivers, self.alarms, self.figures)
         self.control = ControlServer(
             store,
             machine.machine.name,
             self.alarms.execute,
             lambda: self.alarms.outbox.counters.waiting,
             runtime,
+            self.report.line,
         )
 
     async def run(self, stop: asyncio.Event) -> None:
@@ -316,6 +319,7 @@ class Service:
         return next(filter(None, over), "")
 
     def _report(self, diagnosis: Diagnosis) -> None:
+        self.report.take(diagnosis)
         with self.supervisor.sparing_others(
             f"alarms by {diagnosis.detector}", "one of its statements is lost"
         ):

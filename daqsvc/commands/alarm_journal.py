@@ -11,6 +11,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.commands.tables import ago, aligned
 from daqsvc.outbox.reading import read_journal, read_pasts
 
 if TYPE_CHECKING:
@@ -123,9 +124,6 @@ def _documents(entries: Iterable[JournalEntry]) -> Iterable[EventDocument]:
 ID_LENGTH = 8
 """So much of an occurrence's id is enough for a person to name it by."""
 
-_AGES = ((86_400, "d"), (3600, "h"), (60, "min"))
-_GAP = "  "
-
 
 def current_table(alarms: Sequence[AlarmView], now_ns: int) -> str:
     """How alarms stand: one line each, the worst first, then the newest.
@@ -149,7 +147,7 @@ def current_table(alarms: Sequence[AlarmView], now_ns: int) -> str:
         ]
         for event, since_ns, message in worst_first
     ]
-    return _aligned(["LEVEL", "STATE", *machines, "ALARM", "ID", "SINCE", "MESSAGE"], rows)
+    return aligned(["LEVEL", "STATE", *machines, "ALARM", "ID", "SINCE", "MESSAGE"], rows)
 
 
 def history_table(events: Sequence[EventDocument]) -> str:
@@ -169,18 +167,7 @@ def history_table(events: Sequence[EventDocument]) -> str:
         for event in events
     ]
     titles = ["TIME", "EVENT", "LEVEL", "STATE", *machines, "ALARM", "ID", "MESSAGE"]
-    return _aligned(titles, rows)
-
-
-def ago(age_ns: int) -> str:
-    """An age in its largest unit, e.g. ``12 min``; the wall clock may have stepped since."""
-    age_s = age_ns // NS_PER_S
-    if age_s < -60:
-        return "the clock was ahead"
-    for unit_s, name in _AGES:
-        if age_s >= unit_s:
-            return f"{age_s // unit_s} {name}"
-    return f"{max(age_s, 0)} s"
+    return aligned(titles, rows)
 
 
 _LEVELS = ("normal", "alert", "danger")
@@ -211,17 +198,3 @@ def _machine_title(events: Iterable[EventDocument]) -> list[str]:
 def _local(wall_ns: int) -> str:
     moment = datetime.fromtimestamp(wall_ns // NS_PER_S, UTC).astimezone()
     return moment.strftime("%Y-%m-%d %H:%M:%S")
-
-
-def _aligned(titles: list[str], rows: list[list[str]]) -> str:
-    lines = [titles, *([_harmless(cell) for cell in row] for row in rows)]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    return "\n".join(
-        _GAP.join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
-        for line in lines
-    )
-
-
-def _harmless(text: str) -> str:
-    """The text without control characters, which could change the state of a terminal."""
-    return "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)

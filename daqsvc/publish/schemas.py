@@ -14,6 +14,7 @@ from daqsvc.publish.home_assistant.readings import ReadingsPayload
 from daqsvc.publish.home_assistant.summary import SummaryPayload
 from daqsvc.publish.mqtt.commands import CommandPayload, ResponsePayload
 from daqsvc.publish.payloads import AlarmPayload, AvailabilityPayload, DiagnosisPayload, StatusPayload
+from daqsvc.publish.service_status import ServiceStatusPayload
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -27,6 +28,7 @@ PAYLOADS: Mapping[str, type[BaseModel]] = {
     "daqsvc.diagnosis/1": DiagnosisPayload,
     "daqsvc.readings/1": ReadingsPayload,
     "daqsvc.response/1": ResponsePayload,
+    "daqsvc.service-status/1": ServiceStatusPayload,
     "daqsvc.status/1": StatusPayload,
     "daqsvc.summary/1": SummaryPayload,
 }

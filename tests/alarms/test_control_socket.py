@@ -22,11 +22,13 @@ from daqsvc.acquisition.clock import SystemClock
 from daqsvc.alarms.commands import AlarmCommand, CommandOutcome, Verb
 from daqsvc.cli import main
 from daqsvc.control import (
+    AbsentError,
     ControlError,
     ControlRequest,
     ControlServer,
     UnreachableError,
     ask,
+    ask_status,
     events_waiting,
     request_of,
 )
@@ -337,6 +339,9 @@ async def test_nobody_but_its_own_user_may_command_the_service() -> None:
             try:
                 with pytest.raises(ControlError, match="takes commands from its own user and from root only"):
                     ask(store, RESET)
+                with pytest.raises(ControlError, match="try again with sudo") as refused:
+                    ask_status(store)
+                assert not isinstance(refused.value, AbsentError), "asking again would not help"
             finally:
                 os.seteuid(0)
             assert (server.counters.clients, desk.told) == (0, [])
@@ -347,6 +352,8 @@ async def test_a_socket_that_a_killed_service_left_is_replaced(tmp_path: Path) -
         dead.bind(os.fspath(tmp_path / "control.sock"))
     with pytest.raises(ControlError, match=r"no daqsvc runs on the store .* --store"):
         await asyncio.to_thread(ask, tmp_path, RESET)
+    with pytest.raises(AbsentError, match=r"no daqsvc runs on the store .* --store"):
+        await asyncio.to_thread(ask_status, tmp_path)
     async with serving(tmp_path) as server:
         assert (await say(server, json.dumps(wish()).encode() + b"\n"))["accepted"]
 

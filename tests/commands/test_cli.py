@@ -29,6 +29,7 @@ PEOPLE = ("alarms", "ack", "reset", "shelve", "unshelve", "bypass", "unbypass")
 VERBS = (
     "run",
     "check",
+    "status",
     *PEOPLE,
     "analyze",
     "calibrate",

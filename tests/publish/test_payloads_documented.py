@@ -1,4 +1,4 @@
-"""The examples of docs/mqtt.md are payloads, key by key, and such as the example rig really gives."""
+"""The examples of docs/mqtt.md and docs/status.md are payloads, key by key, as the example rig gives them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ RIG = load_machine_file(ROOT / "config" / "machines" / "laval-rig.toml")
 TEXT = (ROOT / "docs" / "mqtt.md").read_text(encoding="utf-8")
 EXAMPLES = {
     example["schema"]: example
-    for example in map(json.loads, re.findall(r"```json\n(.*?)```", TEXT, re.DOTALL))
+    for text in (TEXT, (ROOT / "docs" / "status.md").read_text(encoding="utf-8"))
+    for example in map(json.loads, re.findall(r"```json\n(.*?)```", text, re.DOTALL))
 }
 
 

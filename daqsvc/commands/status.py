@@ -1,0 +1,163 @@
+"""``daqsvc status``: how everything stands, by the word of the service that runs."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import sys
+import time
+from typing import TYPE_CHECKING, Any
+
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, signals_to_end
+from daqsvc.commands.store_argument import BadFileError, StoreNotFoundError, add_store, chosen_store
+
+if TYPE_CHECKING:
+    import argparse
+    from pathlib import Path
+
+    from daqsvc.commands.store_argument import Load
+
+EVERY_S = 1.0
+ENTER, LEAVE = "\x1b[?1049h\x1b[?25l", "\x1b[?25h\x1b[?1049l"
+"""To the terminal's other screen without a cursor, and back (xterm's controls)."""
+HOME, END_OF_LINE, END_OF_SCREEN = "\x1b[H", "\x1b[K", "\x1b[J"
+"""To the upper left corner; clear what an earlier picture has left in a line, and below the last one."""
+
+
+class StatusCommand:
+    """``daqsvc status [FILE | --store DIR]``.
+
+    Args:
+        load: reads a machine file; None after its errors have been printed.
+    """
+
+    help = "how everything stands, by the service that runs"
+    description = (
+        "Show present values of every channel and measure, whether sensors are OK, rates, losses by cause, "
+        "alarms, outbox and broker, as the service that runs on the store knows them. Exit code 1 if none "
+        "runs, or it may not be asked. daqsvc alarms shows the alarms without a service, too."
+    )
+
+    def __init__(self, load: Load) -> None:
+        self._load = load
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """See `daqsvc.cli.Command.add_arguments`."""
+        parser.add_argument("--json", action="store_true", help="one JSON object instead of text")
+        parser.add_argument(
+            "--watch",
+            action="store_true",
+            help="again every second until Ctrl-C, also over a restart of the service; with --json one "
+            "object a line",
+        )
+        add_store(parser)
+
+    def run(self, arguments: argparse.Namespace) -> int:
+        """See `daqsvc.cli.Command.run`."""
+        from daqsvc.control import ControlError, ask_status  # noqa: PLC0415 - only what a verb needs
+
+        try:
+            store = chosen_store(arguments, self._load)
+            if arguments.watch:
+                _watch(store, as_json=arguments.json)
+            else:
+                print(_shown(ask_status(store), as_json=arguments.json))  # noqa: T201 - what the verb is for
+        except BadFileError:
+            return EXIT_USAGE
+        except (StoreNotFoundError, ControlError) as error:
+            print(f"daqsvc status: {error}", file=sys.stderr)  # noqa: T201 - errors go to stderr
+            return EXIT_FAILED
+        return EXIT_OK
+
+
+def _shown(status: dict[str, Any], *, as_json: bool) -> str:
+    from daqsvc.commands.status_text import status_text  # noqa: PLC0415 - as above
+
+    return json.dumps(status) if as_json else status_text(status, shutil.get_terminal_size().columns)
+
+
+def _watch(store: Path, *, as_json: bool) -> None:
+    """Show the status again and again, until Ctrl-C.
+
+    Raises:
+        ControlError: there is no service at first, or it may not be asked.
+    """
+    from daqsvc.control import AbsentError, ask_status  # noqa: PLC0415 - as above
+
+    picture = _Picture(is_live=not as_json and sys.stdout.isatty() and os.environ.get("TERM") != "dumb")
+    before = {number: signal.signal(number, signal.default_int_handler) for number in signals_to_end()}
+    try:
+        shown = _shown(ask_status(store), as_json=as_json)
+        with picture:
+            picture.show(shown)
+            while True:
+                time.sleep(EVERY_S)
+                try:
+                    shown = _shown(ask_status(store), as_json=as_json)
+                except AbsentError as error:
+                    picture.wait(f"{error}; it is asked again every second", shown)
+                else:
+                    picture.show(shown)
+    except KeyboardInterrupt:
+        pass  # that is how a person ends it
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+class _Picture:
+    """What is shown: drawn over itself in a terminal, else one after the other.
+
+    Args:
+        is_live: whether it is drawn over itself.
+    """
+
+    def __init__(self, *, is_live: bool) -> None:
+        self._is_live = is_live
+        self._waits = False
+
+    def __enter__(self) -> None:
+        if self._is_live:
+            _write(ENTER)
+
+    def __exit__(self, *_: object) -> None:
+        if self._is_live:
+            _write(LEAVE)
+
+    def show(self, text: str) -> None:
+        """Show how things stand."""
+        self._waits = False
+        if self._is_live:
+            self._draw(text)
+        else:
+            _write(f"{text}\n" if text.startswith("{") else f"{text}\n\n")
+
+    def wait(self, why: str, last: str) -> None:
+        """Show why nothing is known by now, and how things stood."""
+        if self._is_live:
+            from daqsvc.commands.tables import harmless, wrapped  # noqa: PLC0415 - as above
+
+            lines = wrapped(harmless(why), shutil.get_terminal_size().columns)
+            self._draw("\n".join([*lines, "", "It stood last:", last]))
+        elif not self._waits:
+            print(f"daqsvc status: {why}", file=sys.stderr)  # noqa: T201 - errors go to stderr
+        self._waits = True
+
+    def _draw(self, text: str) -> None:
+        """In one go, and over what is there, so that nothing flickers."""
+        size = shutil.get_terminal_size()
+        lines = [line[: size.columns] for line in text.splitlines()]
+        if len(lines) > size.lines:
+            hidden = len(lines) - size.lines + 1
+            lines[size.lines - 1 :] = [
+                f"... and {hidden} more lines: daqsvc status shows all"[: size.columns]
+            ]
+        body = f"{END_OF_LINE}\n".join(lines)
+        _write(f"{HOME}{body}{END_OF_LINE}{END_OF_SCREEN}")
+
+
+def _write(text: str) -> None:
+    sys.stdout.write(text)
+    sys.stdout.flush()

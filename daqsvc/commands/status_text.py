@@ -1,0 +1,181 @@
+"""The answer of ``daqsvc status`` as a person reads it, in a terminal of 80 columns."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.commands.tables import ago, aligned, harmless, wrapped
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+    Document = Mapping[str, Any]
+
+LEAST_PROBABILITY = 0.005
+STATES = {"ok": "ok", "not_ok": "NOT OK", "missing": "missing", "unknown": "-"}
+
+
+def status_text(status: Document, width: int = 80) -> str:
+    """How everything stands, from a `ServiceStatusPayload` by its keys in JSON.
+
+    Args:
+        status: what the service has answered.
+        width: columns of the terminal.
+    """
+    return "\n\n".join(_blocks(status, width))
+
+
+def _blocks(status: Document, width: int) -> Iterator[str]:
+    yield _filled(
+        f"{status['machine']} ({status['site']}/{status['box']}), daqsvc {status['version']}, "
+        f"running for {_age(status['uptime_s'])}",
+        width,
+    )
+    buses = [[name, bus["driver"], bus["state"], bus["reason"]] for name, bus in status["buses"].items()]
+    yield aligned(["BUS", "DRIVER", "STATE", "WHY"], buses, width)
+    streams = [
+        [name, one["bus"], _rate(one), _age(one["age_s"]), _lost(one)]
+        for name, one in status["streams"].items()
+    ]
+    yield aligned(["STREAM", "BUS", "RATE (Hz)", "AGE", "LOST"], streams, width)
+    alone = _by_sensor(status["statements"])
+    channels = [_channel(one, alone) for one in status["channels"]]
+    yield aligned(["CHANNEL", "STATE", "NEWEST", "AGE", "MEASURES"], channels, width)
+    others = [one for one in status["statements"] if len(one["sensors"]) != 1]
+    if others:
+        rows = [[one["detector"], _quality(one), _age(one["age_s"]), _finding(one)] for one in others]
+        yield aligned(["DETECTOR", "QUALITY", "AGE", "FINDING"], rows, width)
+    if status["faults"]:
+        yield aligned(["LOST OR FAULTY", "SINCE THE START, BY CAUSE"], list(_faults(status["faults"])), width)
+    if failures := status["figures"]["failures"]:
+        yield aligned(["PART", "FAILURES"], [[name, f"{count}"] for name, count in failures.items()], width)
+    yield "\n".join(_filled(line, width) for line in (_alarms(status), _outbox(status), *_outputs(status)))
+    if standing := status["alarms"]["standing"]:
+        yield _standing(standing, width)
+
+
+def _standing(alarms: Sequence[Document], width: int) -> str:
+    """A line for each alarm, and what it says below."""
+    rows = [
+        [one["level"], one["state"].replace("_", " "), one["alarm"], _age(one["age_s"])] for one in alarms
+    ]
+    title, *lines = aligned(["LEVEL", "STATE", "ALARM", "SINCE"], rows).splitlines()
+    told = [title]
+    for line, one in zip(lines, alarms, strict=True):
+        message = one["message"].removeprefix(f"{one['alarm']} {one['level']}: ")
+        told += [line, *(f"    {part}" for part in wrapped(harmless(message), width - 4))]
+    return "\n".join(told)
+
+
+def _by_sensor(statements: Iterable[Document]) -> dict[str, list[Document]]:
+    """By sensor, what is said of it alone."""
+    alone: dict[str, list[Document]] = {}
+    for one in statements:
+        if len(one["sensors"]) == 1:
+            alone.setdefault(one["sensors"][0], []).append(one)
+    return alone
+
+
+def _channel(channel: Document, alone: Mapping[str, Sequence[Document]]) -> list[str]:
+    statements = alone.get(channel["sensor"] or "", ())
+    said = [_measures(one) for one in statements if one["measures"]]
+    said += [f"[{channel['reason']}]"] if channel["reason"] else []
+    state = STATES[channel["state"]]
+    severities = [one["severity"] for one in statements if one["severity"] != "normal"]
+    return [
+        channel["sensor"] or f"{channel['stream']}.{channel['channel']}",
+        f"{state}, {'danger' if 'danger' in severities else 'alert'}" if severities else state,
+        _figure(channel["value"], channel["unit"]),
+        _age(channel["age_s"]),
+        " ".join(said),
+    ]
+
+
+def _finding(statement: Document) -> str:
+    likely = {name: p for name, p in statement["probabilities"].items() if p and p >= LEAST_PROBABILITY}
+    parts = [f"{statement['where']}: " * bool(statement["where"]) + statement["decision"]]
+    parts[0] += f" ({statement['severity']})" * (statement["severity"] != "normal")
+    parts += [f"p({name}) {p:.3f}" for name, p in sorted(likely.items(), key=lambda one: -one[1])]
+    parts += [_measures(statement)] if statement["measures"] else []
+    parts += [f"[{statement['reason']}]"] if statement["reason"] else []
+    return "; ".join(parts)
+
+
+def _measures(statement: Document) -> str:
+    figures = ", ".join(
+        f"{name} {_figure(one['value'], one['unit'])}" for name, one in statement["measures"].items()
+    )
+    # Where nothing can be measured, what was measured last is shown with its own age.
+    held = statement["measures_age_s"] > statement["age_s"] or statement["quality"] != "good"
+    return f"{figures} ({_age(statement['measures_age_s'])} ago)" if held else figures
+
+
+def _quality(statement: Document) -> str:
+    return str(statement["quality"]).replace("not_ok", "NOT OK")
+
+
+def _faults(faults: Document) -> Iterator[list[str]]:
+    for kind, things in faults.items():
+        for name, causes in things.items():
+            what = name if name == kind else f"{_ONE[kind]} {name}"
+            yield [what, ", ".join(f"{cause} {count:,}" for cause, count in causes.items())]
+
+
+_ONE = {"streams": "stream", "buses": "bus", "detectors": "detector"}
+
+
+def _alarms(status: Document) -> str:
+    counted = {state: count for state, count in status["alarms"]["by_state"].items() if count}
+    return "alarms: " + (
+        ", ".join(f"{n} {state.replace('_', ' ')}" for state, n in counted.items()) or "none"
+    )
+
+
+def _outbox(status: Document) -> str:
+    outbox = status["outbox"]
+    events = outbox["depth"] + outbox["waiting"]
+    said = "outbox: " + (
+        f"{events:,} alarm event{' waits' if events == 1 else 's wait'} for the broker"
+        if events
+        else "nothing waits"
+    )
+    if outbox["oldest_age_s"] is not None:
+        said += f", the oldest for {_age(outbox['oldest_age_s'])}"
+    if outbox["waiting"]:
+        said += f"; {outbox['waiting']:,} of them only in memory"
+    return said if outbox["journal"] == "written" else f"{said}; the journal is {outbox['journal']}"
+
+
+def _outputs(status: Document) -> Iterator[str]:
+    if not status["outputs"]:
+        yield "broker: none is configured"
+    for path, output in status["outputs"].items():
+        name = "broker" if path == "mqtt" else path
+        if output["connected"] is not None:
+            yield f"{name}: {'connected' if output['connected'] else 'NOT CONNECTED'}"
+
+
+def _rate(stream: Document) -> str:
+    return f"{_figure(stream['rate_hz'], '', 7)} of {stream['configured_rate_hz']:g}"
+
+
+def _lost(stream: Document) -> str:
+    lost, received = stream["samples_lost"], stream["samples_received"]
+    share = f" ({100 * lost / (lost + received):.2g} %)" if lost else ""
+    doubt = f" [{stream['doubt']}]" if stream["doubt"] else ""
+    return f"{lost:,} of {lost + received:,} samples{share}{doubt}"
+
+
+def _figure(value: float | None, unit: str, digits: int = 4) -> str:
+    return "-" if value is None else f"{value:.{digits}g} {unit}".rstrip()
+
+
+def _age(age_s: float | None) -> str:
+    if age_s is None:
+        return "-"
+    return f"{age_s:.1f} s" if age_s < 10 else ago(round(age_s * NS_PER_S))
+
+
+def _filled(text: str, width: int) -> str:
+    return "\n".join(wrapped(harmless(text), width))

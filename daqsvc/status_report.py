@@ -1,0 +1,327 @@
+"""How everything stands that the service knows: what ``daqsvc status`` asks for.
+
+The event loop gathers references and the newest sample of each stream, and lets others have their turn
+meanwhile. The text is made on a thread, once for all who ask at about the same time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+from numbers import Real
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from daqsvc import __version__
+from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.alarms.states import AlarmState
+from daqsvc.diagnosis.snapshots import patience
+from daqsvc.outbox.messages import OutboxError
+from daqsvc.publish.faults import fault_counts
+from daqsvc.publish.payloads import stamp_now
+from daqsvc.publish.service_status import SCHEMA
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping, Sequence
+
+    from daqsvc.acquisition.clock import Clock
+    from daqsvc.acquisition.ring import SampleRing
+    from daqsvc.alarm_service import AlarmService
+    from daqsvc.alarms.status import AlarmStatus
+    from daqsvc.diagnosis.record import Diagnosis
+    from daqsvc.publish.service_status import SensorState
+    from daqsvc.settings.models import MachineFile
+    from daqsvc.settings.sensors import Sensor
+    from drivers.base import Driver
+
+    Document = dict[str, Any]
+
+T = TypeVar("T")
+
+FRESH_S = 0.2
+"""Who asks within so long gets the same answer."""
+OLDEST_S = 1.0
+"""The journal is waited for at most so long: a disk that hangs leaves the rest as it is."""
+AT_ONCE = 64
+"""Channels or alarms looked at in one turn of the event loop."""
+
+
+class StatusReport:
+    """Keeps what the detectors have said last, and tells how everything stands.
+
+    Args:
+        machine: the machine file.
+        clock: the service's clock.
+        rings: by stream name.
+        drivers: one for each bus.
+        alarms: the alarms, their outbox and outputs.
+        figures: the figures of the status message.
+    """
+
+    def __init__(
+        self,
+        machine: MachineFile,
+        clock: Clock,
+        rings: Mapping[str, SampleRing],
+        drivers: Sequence[Driver],
+        alarms: AlarmService,
+        figures: Callable[[], dict[str, Any]],
+    ) -> None:
+        self._machine = machine
+        self._clock = clock
+        self._rings = rings
+        self._drivers = drivers
+        self._alarms = alarms
+        self._figures = figures
+        self._begun_ns = clock.monotonic_ns()
+        self._patience_ns = {n: patience(machine, n, s.rate_hz).ns for n, s in machine.streams.items()}
+        self._latest: dict[str, Diagnosis] = {}
+        self._measured: dict[str, Diagnosis] = {}
+        self._sensors: dict[tuple[str, str], list[Sensor]] = {}
+        for sensor in machine.sensors:
+            self._sensors.setdefault((sensor.stream, sensor.channel), []).append(sensor)
+        self._one_at_a_time = asyncio.Lock()
+        self._text = b""
+        self._made_s = -math.inf
+
+    def take(self, diagnosis: Diagnosis) -> None:
+        """Take in a statement of a detector."""
+        self._latest[diagnosis.detector] = diagnosis
+        if diagnosis.statistics:
+            self._measured[diagnosis.detector] = diagnosis
+
+    async def line(self) -> bytes:
+        """How everything stands by now, or did `FRESH_S` ago: a `ServiceStatusPayload` as a line of JSON."""
+        loop = asyncio.get_running_loop()
+        async with self._one_at_a_time:
+            if loop.time() - self._made_s > FRESH_S:
+                document = await self._document()
+                self._text = await asyncio.to_thread(_json_line, document)
+                self._made_s = loop.time()
+        return self._text
+
+    async def _document(self) -> Document:
+        now_ns = self._clock.monotonic_ns()
+        figures = self._figures()
+        oldest_ns = await self._oldest_wall_ns(figures["outbox"]["depth"])
+        standing = self._alarms.manager.alarms
+        alarms = {name: status async for name, status in _by_turns((n, standing[n]) for n in list(standing))}
+        said = dict(self._latest)
+        states = _sensor_states(said.values(), alarms)
+        newest = {name: pair async for name, pair in _by_turns(self._newest())}
+        stamp = stamp_now(self._machine.site, self._machine.box, self._clock)
+        return {
+            "schema": SCHEMA,
+            **stamp,
+            "machine": self._machine.machine.name,
+            "version": __version__,
+            "uptime_s": _age_s(self._begun_ns, now_ns),
+            "buses": {
+                driver.name: {
+                    "driver": self._machine.buses[driver.name].driver,
+                    "state": driver.link.state,
+                    "reason": driver.link.reason,
+                }
+                for driver in self._drivers
+            },
+            "streams": {name: self._stream(name, figures, newest, now_ns) for name in self._machine.streams},
+            "channels": [one async for one in _by_turns(self._channels(newest, states, now_ns))],
+            "statements": [
+                one
+                async for one in _by_turns(
+                    _statement(said[name], self._measured.get(name), now_ns) for name in sorted(said)
+                )
+            ],
+            "alarms": _standing(alarms, now_ns),
+            "outbox": {
+                "depth": figures["outbox"]["depth"],
+                "waiting": figures["outbox"]["waiting"],
+                "oldest_age_s": None if oldest_ns is None else _age_s(oldest_ns, stamp["wall_ns"]),
+                "journal": _journal(figures["outbox"]),
+            },
+            "outputs": {path: _output(path, figures) for path in self._alarms.outputs},
+            "faults": _faults(figures),
+            "figures": figures,
+        }
+
+    async def _oldest_wall_ns(self, depth: int) -> int | None:
+        """When the oldest event happened that the broker has not acknowledged; None if that is not known."""
+        if not depth:
+            return None
+        try:
+            async with asyncio.timeout(OLDEST_S):
+                for message in await self._alarms.outbox.pending(0, 1):
+                    return int(json.loads(message.payload)["wall_ns"])
+        except (TimeoutError, OutboxError, ValueError, KeyError, TypeError):
+            pass  # the disk hangs, or the message is none of this version
+        return None
+
+    def _newest(self) -> Iterator[tuple[str, tuple[list[float], int] | None]]:
+        """By stream, its newest sample ``[channels]`` and when that was taken, ns; None before the first."""
+        for name in self._machine.streams:
+            ring = self._rings[name]
+            last = ring.end_index - 1
+            yield name, (ring.read(last, 1)[0].tolist(), ring.time_of(last)) if ring.started else None
+
+    def _stream(
+        self, name: str, figures: Document, newest: Mapping[str, tuple[list[float], int] | None], now_ns: int
+    ) -> Document:
+        stream, counted, sample = self._machine.streams[name], figures["streams"].get(name, {}), newest[name]
+        comes = sample is not None and now_ns - sample[1] < self._patience_ns[name]
+        known = comes and counted.get("time_settled") and not counted["doubt"]
+        return {
+            "bus": stream.bus,
+            "rate_hz": counted["rate_hz"] if known else None,
+            "configured_rate_hz": stream.rate_hz,
+            "age_s": None if sample is None else _age_s(sample[1], now_ns),
+            "doubt": counted.get("doubt", ""),
+            "samples_received": counted.get("samples_received", 0),
+            "samples_lost": counted.get("samples_lost", 0),
+        }
+
+    def _channels(
+        self,
+        newest: Mapping[str, tuple[list[float], int] | None],
+        states: Mapping[str, tuple[SensorState, str]],
+        now_ns: int,
+    ) -> Iterator[Document]:
+        for name, stream in self._machine.streams.items():
+            sample = newest[name]
+            for column, channel in enumerate(stream.layout.channel_names):
+                for sensor in self._sensors.get((name, channel), [None]):
+                    state, reason = states.get(sensor.name, _UNKNOWN) if sensor else _UNKNOWN
+                    yield {
+                        "stream": name,
+                        "channel": channel,
+                        "sensor": sensor and sensor.name,
+                        "value": None if sample is None else sample[0][column],
+                        "unit": sensor.unit if sensor else "",
+                        "age_s": None if sample is None else _age_s(sample[1], now_ns),
+                        "state": state,
+                        "reason": reason,
+                    }
+
+
+_UNKNOWN: tuple[SensorState, str] = ("unknown", "")
+_WORSE: tuple[SensorState, ...] = ("unknown", "ok", "missing", "not_ok")
+
+
+def _sensor_states(
+    said: Iterable[Diagnosis], alarms: Mapping[str, AlarmStatus]
+) -> dict[str, tuple[SensorState, str]]:
+    """By sensor, how it is, and why it is not OK: the worst of what is said of it alone, and of its alarm.
+
+    Of one that is only judged together with others it is known when it is OK, but not which of them is not.
+    """
+    states: dict[str, tuple[SensorState, str]] = {}
+    for statement in said:
+        alone = len(statement.sensors) == 1
+        state: SensorState = (
+            "ok" if statement.quality == "good" else statement.quality if alone else "unknown"
+        )
+        for sensor in statement.sensors:
+            if _WORSE.index(state) >= _WORSE.index(states.get(sensor, _UNKNOWN)[0]):
+                states[sensor] = (state, statement.reason)
+    for sensor, (state, _) in states.items():
+        alarm = alarms.get(f"sensor-ok/{sensor}")
+        if state == "ok" and alarm is not None and alarm.own_state.is_active:
+            states[sensor] = ("not_ok", alarm.message)
+    return states
+
+
+def _statement(latest: Diagnosis, measured: Diagnosis | None, now_ns: int) -> Document:
+    return {
+        "detector": latest.detector,
+        "sensors": list(latest.sensors),
+        "where": latest.where,
+        "decision": latest.decision,
+        "severity": latest.severity,
+        "quality": latest.quality,
+        "reason": latest.reason,
+        "age_s": _age_s(latest.t_ns, now_ns),
+        "measures": {
+            name: {"value": value, "unit": measured.units.get(name, "")}
+            for name, value in measured.statistics.items()
+        }
+        if measured
+        else {},
+        "measures_age_s": _age_s(measured.t_ns, now_ns) if measured else None,
+        "probabilities": dict(latest.probabilities),
+    }
+
+
+def _standing(alarms: Mapping[str, AlarmStatus], now_ns: int) -> Document:
+    by_state = dict.fromkeys((state.value for state in AlarmState), 0)
+    standing = []
+    for name, status in alarms.items():
+        by_state[status.state.value] += 1
+        if status.state is not AlarmState.NORMAL:
+            standing.append((name, status))
+    standing.sort(key=lambda one: (-one[1].level, -(one[1].since.t_ns if one[1].since else 0), one[0]))
+    return {
+        "by_state": by_state,
+        "standing": [
+            {
+                "alarm": name,
+                "state": status.state.value,
+                "level": status.level.label,
+                "occurrence": status.occurrence,
+                "age_s": _age_s(status.since.t_ns, now_ns) if status.since else None,
+                "message": status.message,
+            }
+            for name, status in standing
+        ],
+    }
+
+
+def _journal(outbox: Mapping[str, Any]) -> str:
+    return "not open" if outbox["shut"] else "not written" if outbox["unbacked"] else "written"
+
+
+def _output(path: str, figures: Mapping[str, Any]) -> Document:
+    connected = figures.get(path.rpartition(".")[2], {}).get("connected")
+    return {"connected": None if connected is None else bool(connected)}
+
+
+def _faults(figures: Mapping[str, Any]) -> Document:
+    faults: Document = {}
+    for fault in fault_counts(figures):
+        if fault.times:
+            faults.setdefault(fault.kind, {}).setdefault(fault.name, {})[fault.cause] = fault.times
+    return faults
+
+
+def _age_s(then_ns: int, now_ns: int) -> float:
+    return round(max(now_ns - then_ns, 0) / NS_PER_S, 3)
+
+
+async def _by_turns(things: Iterable[T]) -> AsyncIterator[T]:
+    """The things, with a turn of the event loop for others now and then."""
+    for number, thing in enumerate(things):
+        if number % AT_ONCE == AT_ONCE - 1:
+            await asyncio.sleep(0)
+        yield thing
+
+
+def _json_line(document: Document) -> bytes:
+    """JSON in pieces, between which other threads get on; what JSON or UTF-8 do not know is null or ``?``."""
+    parts = []
+    for name, value in document.items():
+        if isinstance(value, list):
+            text = f"[{','.join(json.dumps(_plain(one), ensure_ascii=False) for one in value)}]"
+        else:
+            text = json.dumps(_plain(value), ensure_ascii=False)
+        parts.append(f"{json.dumps(name)}:{text}")
+    return f"{{{','.join(parts)}}}\n".encode("utf-8", "replace")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {f"{name}": _plain(below) for name, below in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    if isinstance(value, str | bool | int | None):
+        return value
+    if isinstance(value, Real):  # also those of NumPy
+        return float(value) if math.isfinite(value) else None
+    return f"{value}"
