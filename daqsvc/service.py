@@ -5,9 +5,8 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import deque
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import asdict
 from functools import partial
-from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,17 +22,17 @@ from daqsvc.control import ControlError, ControlServer
 from daqsvc.detectors.make import detectors
 from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.diagnosis.snapshots import alignment, at_once, patience
+from daqsvc.driver_reports import DriverReports
 from daqsvc.outbox.limits import OutboxLimits
 from daqsvc.publish.make import output_plugins, output_set
 from daqsvc.publish.output import output_name
 from daqsvc.publish.payloads import Figures
 from daqsvc.self_check import BusHealth, conditions
-from daqsvc.settings.failures import authors_of
 from daqsvc.settings.streams import Grid
 from daqsvc.status_report import StatusReport
 from daqsvc.supervision import EssentialLostError, Progress, Supervisor, over, stop_all
 from daqsvc.threads import CallThreads
-from drivers.base import BusCounters, DeviceAbsentError
+from drivers.base import DeviceAbsentError
 from drivers.make import bus_drivers, bus_self_checks
 
 if TYPE_CHECKING:
@@ -143,6 +142,15 @@ class Service:
         self.rings = {grid.name: _ring(machine, grid, watching) for grid in grids}
         self.alignment = alignment(machine, self.clock, self._deliver)
         self.drivers: list[Driver] = bus_drivers(machine, self.clock, self._deliver, self._stand)
+        self.driver_reports = [
+            DriverReports(
+                name,
+                driver,
+                [s for s, stream in machine.streams.items() if stream.bus == name],
+                self.supervisor,
+            )
+            for name, driver in zip(machine.buses, self.drivers, strict=True)
+        ]
         settling_ns = {aligner.name: SETTLE_NS for aligner in self.alignment.aligners}
         self.pipeline = Pipeline(
             self.rings,
@@ -167,7 +175,9 @@ class Service:
             bus_health=self._bus_health,
             supervisor=self.supervisor,
         )
-        self.report = StatusReport(machine, self.clock, self.rings, self.drivers, self.alarms, self.figures)
+        self.report = StatusReport(
+            machine, self.clock, self.rings, self.driver_reports, self.alarms, self.figures
+        )
         self.control = ControlServer(
             store,
             machine.machine.name,
@@ -240,13 +250,13 @@ class Service:
         )
         reading = [
             keep(
-                f"driver {driver.name}",
+                f"driver {told.name}",
                 driver.run,
                 # One that is to be ignored if absent ends, and so does a recording.
-                may_end=partial(_has_ended, driver),
+                may_end=partial(_has_ended, told),
                 fatal=(DeviceAbsentError,),
             )
-            for driver in self.drivers
+            for driver, told in zip(self.drivers, self.driver_reports, strict=True)
         ]
         try:
             self.ready.set()
@@ -315,7 +325,8 @@ class Service:
     def _why_over(self, stream: str) -> str:
         """Why nothing more can come of a stream or grid, e.g. that its recording has ended; else empty."""
         streams = next(grid.streams for grid in self._grids if grid.name == stream)
-        over = (one.link.over for one in self.drivers if not one.streams.keys().isdisjoint(streams))
+        buses = {self.machine.streams[name].bus for name in streams}
+        over = (one.link.over for one in self.driver_reports if one.name in buses)
         return next(filter(None, over), "")
 
     def _report(self, diagnosis: Diagnosis) -> None:
@@ -331,37 +342,16 @@ class Service:
 
     def _bus_health(self) -> dict[str, BusHealth]:
         health: dict[str, BusHealth] = {}
-        for driver in self.drivers:
-            counters = self._counters_of(driver)
+        for driver in self.driver_reports:
+            counters = driver.counters
             health[driver.name] = BusHealth(
                 counters.overruns,
                 counters.bus_off,
                 counters.controller_state,
                 counters.frames_unrecorded,
-                _has_heard(driver, counters),
+                driver.has_heard,
             )
         return health
-
-    def _counters_of(self, driver: Driver) -> BusCounters:
-        """What a driver counts; nothing if that is no count, so that one driver's figures spoil no others."""
-        odd: dict[str, object] = {}
-        try:
-            counters = driver.counters
-            if is_dataclass(counters):
-                counted = {name: getattr(counters, name) for name in _COUNTS}
-                odd = {name: count for name, count in counted.items() if not isinstance(count, Integral)}
-            else:
-                odd = {"counters": counters}
-        except Exception as error:  # noqa: BLE001  said and counted below
-            odd = {"counters": error}
-        if not odd:
-            return counters
-        kind = type(driver)
-        name, value = next(iter(odd.items()))
-        said = f"{name} of {kind.__module__}.{kind.__qualname__} is {value!r:.60}, not a count"
-        said += f"; {authors_of(kind.__module__)}"
-        self.supervisor.failed(f"driver {driver.name}", said, "the counts of its bus are missing")
-        return BusCounters()
 
     def awaited(self, *, patient: bool = True) -> dict[str, str]:
         """The buses that keep the service from being ready, and what each is waited for.
@@ -373,10 +363,10 @@ class Service:
             patient: whether to wait for the latter at all.
         """
         awaited: dict[str, str] = {}
-        for driver in self.drivers:
+        for driver in self.driver_reports:
             link = driver.link
             if self.machine.buses[driver.name].start == "error":
-                if not any(self.rings[stream].started for stream in driver.streams):
+                if not any(self.rings[stream].started for stream in driver.names):
                     awaited[driver.name] = "no samples have come yet"
             elif patient and not (link.ever_up or link.reason or link.over):
                 awaited[driver.name] = "it is being opened"
@@ -388,7 +378,7 @@ class Service:
             f"driver {driver.name}": Progress(
                 link.turns if (link := driver.link).state == "up" and link.turns else None
             )
-            for driver in self.drivers
+            for driver in self.driver_reports
         }
         return {**readers, **self.pipeline.progress(), "outbox": self.alarms.outbox.progress}
 
@@ -407,10 +397,13 @@ class Service:
         """The service's figures by what they belong to: streams, buses, detectors, alarms, outbox, MQTT."""
         streams: dict[str, Mapping[str, float | str]] = {}
         buses: dict[str, Mapping[str, Any]] = {}
-        for driver in self.drivers:
-            counted = asdict(self._counters_of(driver))
-            up = int(driver.link.state == "up")
-            buses[driver.name] = {"up": up, "losses": driver.link.losses, **counted}
+        for driver in self.driver_reports:
+            link = driver.link
+            buses[driver.name] = {
+                "up": int(link.state == "up"),
+                "losses": link.losses,
+                **asdict(driver.counters),
+            }
             for name, (counters, base) in driver.streams.items():
                 ring, standing = self.rings[name], self._standings[name]
                 streams[name] = {
@@ -451,10 +444,6 @@ class Service:
         return figures
 
 
-_COUNTS = ["overruns", "frames_unrecorded", *(f.name for f in fields(BusCounters) if f.default == 0)]
-"""What every driver counts, each a whole number."""
-
-
 def _ring(machine: MachineFile, grid: Grid, detectors: Sequence[Detector]) -> SampleRing:
     wanted = round(machine.pipeline.ring_s * grid.rate_hz)
     # However short a ring is asked for, a detector must find its block in it, and some time to come for it.
@@ -463,13 +452,7 @@ def _ring(machine: MachineFile, grid: Grid, detectors: Sequence[Detector]) -> Sa
     return SampleRing(grid.name, grid.channel_names, max(wanted, needed))
 
 
-def _has_heard(driver: Driver, counters: BusCounters) -> bool:
-    """Whether anything has come from the bus of ``driver``, if only an error."""
-    others = counters.frames_unknown + counters.frames_remote + counters.frames_error
-    return others > 0 or any(stream.frames_received for stream, _ in driver.streams.values())
-
-
-def _has_ended(driver: Driver) -> bool:
+def _has_ended(driver: DriverReports) -> bool:
     return bool(driver.link.over)
 
 

@@ -29,10 +29,10 @@ if TYPE_CHECKING:
     from daqsvc.alarm_service import AlarmService
     from daqsvc.alarms.status import AlarmStatus
     from daqsvc.diagnosis.record import Diagnosis
+    from daqsvc.driver_reports import DriverReports
     from daqsvc.publish.service_status import SensorState
     from daqsvc.settings.models import MachineFile
     from daqsvc.settings.sensors import Sensor
-    from drivers.base import Driver
 
     Document = dict[str, Any]
 
@@ -53,7 +53,7 @@ class StatusReport:
         machine: the machine file.
         clock: the service's clock.
         rings: by stream name.
-        drivers: one for each bus.
+        drivers: what the driver of each bus tells.
         alarms: the alarms, their outbox and outputs.
         figures: the figures of the status message.
     """
@@ -63,7 +63,7 @@ class StatusReport:
         machine: MachineFile,
         clock: Clock,
         rings: Mapping[str, SampleRing],
-        drivers: Sequence[Driver],
+        drivers: Sequence[DriverReports],
         alarms: AlarmService,
         figures: Callable[[], dict[str, Any]],
     ) -> None:

@@ -172,8 +172,9 @@ class _Follower:
 
 def _in_short(service: Service) -> tuple[str, str]:
     """How a service stands, and the figures that change all the time."""
-    down = {d.name: d.link.reason or "it is being opened" for d in service.drivers if d.link.state != "up"}
-    count = len(service.drivers)
+    links = {driver.name: driver.link for driver in service.driver_reports}
+    down = {name: link.reason or "it is being opened" for name, link in links.items() if link.state != "up"}
+    count = len(links)
     up = f"{count - len(down)} of {count} buses up"
     if down:
         up += f" ({', '.join(f'{bus}: {reason[:LONGEST_REASON]}' for bus, reason in down.items())})"

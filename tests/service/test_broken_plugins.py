@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import logging
-from typing import TYPE_CHECKING, Any
+import math
+from typing import TYPE_CHECKING, Any, Never
 
 import pytest
 from support.example_packages import installed
 from support.live_service import running
 from support.waiting import eventually
 
+from daqsvc.acquisition.assembler import StreamCounters
+from daqsvc.acquisition.timebase import TimeBaseState
+from daqsvc.commands import service_manager
 from daqsvc.settings import parse_machine_file
 from drivers.base import BusCounters
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
 pytestmark = pytest.mark.integration
@@ -247,24 +252,88 @@ async def test_a_driver_with_a_run_of_its_own_is_named_once_and_started_again(
     assert line.endswith("have the authors of daqsvc-mishap 2.1 mend it; it is started again")
 
 
-@pytest.mark.parametrize("spoilt", ["none", "text"])
-async def test_counters_that_are_none_are_named_once_and_spare_the_other_buses(
+def _failing(_: object) -> Never:
+    raise KeyError("no figures")
+
+
+SPOILT: dict[str, tuple[Callable[[Any], object], str]] = {
+    "counters-none": (
+        lambda bad: setattr(bad, "counters", None),
+        "counters of mishap.MishapDriver is None, not a count; ",
+    ),
+    "counters-text": (
+        lambda bad: setattr(bad.counters, "frames_unknown", "many"),
+        "frames_unknown of mishap.MishapDriver is 'many', not a count; ",
+    ),
+    "unknown_ids": (
+        lambda bad: setattr(bad.counters, "unknown_ids", {(1, 2): 3}),
+        "unknown_ids of mishap.MishapDriver is {(1, 2): 3}, not counts by name; ",
+    ),
+    "unknown_ids-none": (
+        lambda bad: setattr(bad.counters, "unknown_ids", None),
+        "unknown_ids of mishap.MishapDriver is None, not counts by name; ",
+    ),
+    "link-none": (lambda bad: setattr(bad, "link", None), "link of mishap.MishapDriver is None, not Link; "),
+    "link-reason": (
+        lambda bad: setattr(bad.link, "reason", 7),
+        "reason of the link of mishap.MishapDriver is 7, not a text; ",
+    ),
+    "streams-none": (
+        lambda bad: setattr(type(bad), "streams", None),
+        "streams of mishap.MishapDriver is None, not counters and clock by stream; ",
+    ),
+    "streams-raises": (
+        lambda bad: setattr(type(bad), "streams", property(_failing)),
+        "streams of mishap.MishapDriver has failed: KeyError: 'no figures'; ",
+    ),
+    "streams-other": (
+        lambda bad: setattr(type(bad), "streams", {"else": (StreamCounters(), CLOCK)}),
+        "streams of mishap.MishapDriver is 'else', not one of bad; ",
+    ),
+    "streams-one": (
+        lambda bad: setattr(type(bad), "streams", {"bad": StreamCounters()}),
+        "stream bad of mishap.MishapDriver is StreamCounters(frames_received=0, ",
+    ),
+    "streams-count": (
+        lambda bad: setattr(type(bad), "streams", {"bad": (StreamCounters(gaps=None), CLOCK)}),
+        "gaps of stream bad of mishap.MishapDriver is None, not a count; ",
+    ),
+    "streams-clock": (
+        lambda bad: setattr(
+            type(bad), "streams", {"bad": (StreamCounters(), CLOCK._replace(period_ns=math.nan))}
+        ),
+        "period_ns of stream bad of mishap.MishapDriver is nan, not a finite number; ",
+    ),
+}
+CLOCK = TimeBaseState(1e6, 0.0, 0.0, settled=True, restarts=0)
+
+
+@pytest.mark.parametrize("spoilt", SPOILT)
+async def test_what_a_driver_tells_wrong_is_named_once_and_spares_the_other_buses(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, spoilt: str
 ) -> None:
+    spoil, said = SPOILT[spoilt]
     text = MACHINE.partition("[pipeline.mishap]")[0]
     text += "".join(STREAM.format(name=name, how="") for name in ("good", "bad"))
     async with running(parse_machine_file(text, tmp_path / "machine.toml"), tmp_path / "store") as service:
         bad: Any = next(one for one in service.drivers if one.name == "bad")
-        if spoilt == "none":
-            bad.counters = None
-        else:
-            bad.counters.frames_unknown = "many"
+        # One of its own, so that the other driver has what it had.
+        bad.__class__ = type("MishapDriver", (type(bad),), {"__module__": "mishap"})
+        link = bad.link
+        await eventually(lambda: link.state == "up", "it delivers")
+        spoil(bad)
         for _ in range(3):
             service.alarms.tick()
-            assert set(service.figures()["buses"]) == {"good", "bad"}
-        bad.counters = BusCounters()
+            figures = service.figures()
+            assert figures["buses"].keys() == {"good", "bad"}
+            assert figures["buses"]["good"]["up"] == 1
+            assert "good" in figures["streams"]
+            assert json.dumps(figures["buses"])
+            assert {"driver good", "driver bad"} <= service.progress().keys()
+            assert service.awaited(patient=False) == {}
+            assert service._why_over("bad") == ""
+            assert "buses up" in service_manager._in_short(service)[0]
+        bad.link, bad.counters, type(bad).streams = link, BusCounters(), {}
     [line] = [record.getMessage() for record in caplog.records if record.levelno >= logging.ERROR]
-    odd = "counters of mishap.MishapDriver is None" if spoilt == "none" else "is 'many'"
-    assert line.startswith("driver bad: ")
-    assert f"{odd}, not a count; " in line
-    assert "have the authors of daqsvc-mishap 2.1 mend it; the counts of its bus are missing" in line
+    assert line.startswith(f"driver bad: {said}")
+    assert "; have the authors of daqsvc-mishap 2.1 mend it; " in line
