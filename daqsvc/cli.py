@@ -102,12 +102,20 @@ def load(path: Path) -> MachineFile | None:
 def start_logging(*, verbose: bool, handler: logging.Handler | None = None) -> None:
     """Log to stderr, or to a handler; under systemd without time stamps, which the journal adds itself."""
     stamp = "" if "JOURNAL_STREAM" in os.environ else "%(asctime)s "
-    logging.basicConfig(
-        level=logging.INFO if verbose else logging.WARNING,
-        format=f"{stamp}%(levelname)s %(message)s",
-        handlers=[handler or logging.StreamHandler()],
-    )
+    handler = handler or logging.StreamHandler()
+    handler.setFormatter(_OneLine(f"{stamp}%(levelname)s %(message)s"))
+    logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, handlers=[handler])
     logging.getLogger("can").setLevel(logging.ERROR)
+
+
+class _OneLine(logging.Formatter):
+    """A message on one line, whatever words of plugins and devices are in it; tracebacks have their own."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - of logging
+        from daqsvc.settings.failures import one_line  # noqa: PLC0415 - each verb imports only what it needs
+
+        record.message = one_line(record.message)
+        return super().formatMessage(record)
 
 
 def commands() -> dict[str, Command]:
@@ -187,11 +195,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f"daqsvc: {error.strerror}: the output is not complete", file=sys.stderr)  # noqa: T201
         return EXIT_FAILED
     except Exception as error:
-        from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415 - with all that reads machine files
+        from daqsvc.settings.failures import one_line  # noqa: PLC0415 - with all that reads machine files
+        from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415
 
         if not isinstance(error, AssemblyError):
             raise
-        print(error, file=sys.stderr)  # noqa: T201
+        print(one_line(f"{error}"), file=sys.stderr)  # noqa: T201
         return EXIT_USAGE
     return code
 

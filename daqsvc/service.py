@@ -22,6 +22,7 @@ from daqsvc.control import ControlError, ControlServer
 from daqsvc.detectors.make import detectors
 from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.diagnosis.snapshots import alignment, at_once, patience
+from daqsvc.diagnosis.statements import said_of_silence
 from daqsvc.driver_reports import DriverReports
 from daqsvc.outbox.limits import OutboxLimits
 from daqsvc.publish.make import output_plugins, output_set
@@ -232,7 +233,9 @@ class Service:
         active_detectors: dict[str, Sequence[str]] = {}
         for detector in self.pipeline.detectors:
             with self.supervisor.sparing_others(f"detector {detector.name}", "its alarms begin anew"):
-                active_detectors.update({s.detector: s.sensors for s in detector.silent(0.0, now_ns)})
+                active_detectors.update(
+                    {s.detector: s.sensors for s in said_of_silence(detector, 0.0, now_ns)}
+                )
         await self.alarms.resume(active_detectors)
 
     async def _serve(self, stop: asyncio.Event) -> None:

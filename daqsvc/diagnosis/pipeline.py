@@ -12,27 +12,28 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.ring import RingClosed, RingReader
 from daqsvc.acquisition.standing import StreamState
-from daqsvc.diagnosis.record import Diagnosis, is_text, silence_reason
+from daqsvc.diagnosis.record import silence_reason
+from daqsvc.diagnosis.statements import asked, said_of_silence, said_of_window
 from daqsvc.dsp.quality.missing import Patience
 from daqsvc.settings.failures import BrokenContractError, error_text
 from daqsvc.supervision import Progress, Supervisor, over
 from daqsvc.threads import ThreadLostError, call_in_thread
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from daqsvc.acquisition.clock import Clock
     from daqsvc.acquisition.ring import SampleRing
     from daqsvc.acquisition.standing import Tell
     from daqsvc.diagnosis.detector import Detector, Window
+    from daqsvc.diagnosis.record import Diagnosis
 
 
 T = TypeVar("T")
@@ -176,9 +177,6 @@ LOOK_NS = NS_PER_S // 2
 MOST_HELD = 4096
 """Statements of a stream that wait for its rate to be known, at most; the oldest are dropped."""
 
-MOST_WORDS = 2000
-"""Characters of what an exception of a detector says, at most."""
-
 HANG_S = 30.0
 """A window that takes longer to process hangs; its detector is left alone with it, and the others go on."""
 
@@ -295,7 +293,7 @@ class Pipeline:
                 with self._supervisor.sparing_others(
                     _part(detector), "the others say that nothing is judged"
                 ):
-                    for diagnosis in _said(detector.silent, 0.0, now_ns):
+                    for diagnosis in said_of_silence(detector, 0.0, now_ns):
                         self._report(replace(diagnosis, quality="missing", reason=doubt))
 
     def _let_go(self, stream: str) -> None:
@@ -321,7 +319,7 @@ class Pipeline:
     def _compile_all(self) -> None:
         for detector in self.detectors:
             with self._supervisor.sparing_others(_part(detector), "it compiles when samples come"):
-                _asked(detector.warm)
+                asked(detector.warm)
 
     async def run(self) -> None:
         """Process until every ring is closed and every whole block in it is processed.
@@ -401,7 +399,7 @@ class Pipeline:
                 with self._supervisor.sparing_others(
                     _part(detector), "the other detectors say that nothing comes"
                 ):
-                    for diagnosis in _said(detector.silent, silence_s, now_ns):
+                    for diagnosis in said_of_silence(detector, silence_s, now_ns):
                         self._report(replace(diagnosis, reason=reason) if over else diagnosis)
 
     async def _follow(self, detector: Detector, kernels: KernelThreads) -> None:
@@ -475,7 +473,7 @@ class Pipeline:
         if all(one.detector == detector.name for one in said):
             return
         if detector.name not in self._names:
-            names = (one.detector for one in _said(detector.silent, 0.0, t_ns))
+            names = (one.detector for one in said_of_silence(detector, 0.0, t_ns))
             self._names[detector.name] = frozenset({detector.name, *names})
         known = self._names[detector.name]
         for one in said:
@@ -494,7 +492,7 @@ class Pipeline:
         # The kernels' load on the host is a matter of the host's clock, whatever clock the samples have.
         begun_ns = time.perf_counter_ns()
         try:
-            said = _said(detector.process, window)
+            said = said_of_window(detector, window)
             self._see_names(detector, said, window.t_end_ns)
         except Exception as error:  # noqa: BLE001 - said and counted
             counters.failures += 1
@@ -509,7 +507,7 @@ class Pipeline:
                         reason=reason,
                         sensors=() if held.detector == detector.name else held.sensors,
                     )
-                    for held in _said(detector.silent, 0.0, window.t_end_ns)
+                    for held in said_of_silence(detector, 0.0, window.t_end_ns)
                 ]
             return []
         else:
@@ -518,44 +516,6 @@ class Pipeline:
             counters.windows += 1
             counters.samples += len(window.samples)
             counters.busy_ns += time.perf_counter_ns() - begun_ns
-
-
-def _said(say: Callable[..., Sequence[Diagnosis]], *of: Any) -> Sequence[Diagnosis]:
-    """What a detector says.
-
-    Raises:
-        BrokenContractError: these are no statements.
-    """
-    said = _asked(say, *of)
-    if not isinstance(said, Sequence) or not all(isinstance(one, Diagnosis) for one in said):
-        raise BrokenContractError(say, f"it returns {said!r:.60}, not Sequence[Diagnosis]")
-    return said
-
-
-def _asked(hook: Callable[..., T], *of: Any) -> T:
-    """What a detector answers; whatever ends its code is a failure like any other, with words to be said.
-
-    Raises:
-        Exception: it has failed.
-    """
-    try:
-        return hook(*of)
-    except BaseException as error:
-        words = _words(error)
-        if isinstance(error, Exception) and words is not None:
-            raise
-        kind = type(error).__name__
-        told = "" if words is None else f": {words}" if words else ""
-        raise RuntimeError(f"it raises {kind}{told}").with_traceback(error.__traceback__) from None
-
-
-def _words(error: BaseException) -> str | None:
-    """What an exception of a detector says; None if it cannot be said, sent or written down."""
-    try:
-        words = str(error)
-        return words if is_text(words, MOST_WORDS) else None
-    except BaseException:  # noqa: BLE001 - that is what None says
-        return None
 
 
 def _part(detector: Detector) -> str:

@@ -11,7 +11,9 @@ import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.diagnosis.detector import Window
+from daqsvc.diagnosis.statements import said_of_window
 from daqsvc.dsp.quality.unit import UM_PER_UNIT
+from daqsvc.settings.failures import one_line
 from daqsvc.settings.hooks import Hooks, contract, may_raise
 from daqsvc.settings.models import ProximityProbe
 from daqsvc.settings.problems import AssemblyError
@@ -339,7 +341,7 @@ class Statements:
         before = ""
         if worst is not None and worst.severity != last.severity:
             before = f", {worst.severity} at {worst.first_index / self.rate_hz:.3f} s"
-        return f"{self.detector}: {last.decision} ({last.severity}{before}){doubt}; {figures}"
+        return one_line(f"{self.detector}: {last.decision} ({last.severity}{before}){doubt}; {figures}")
 
     def _step(self, diagnosis: Diagnosis) -> dict[str, Any]:
         return {
@@ -409,7 +411,7 @@ def listen(detector: Detector, samples: Floats, rate_hz: float, blocks: int = _B
         whole = len(part) // detector.block * detector.block
         if whole:
             end_ns = round((begin + whole - 1) * period_ns)
-            yield from detector.process(Window(begin, part[:whole], end_ns, period_ns))
+            yield from said_of_window(detector, Window(begin, part[:whole], end_ns, period_ns))
 
 
 def finite(value: Any) -> Any:

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from numbers import Real
-from typing import TYPE_CHECKING, Any, cast, get_args
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from daqsvc.diagnosis.record import Diagnosis, Severity, is_text
+from daqsvc.diagnosis.record import Diagnosis, Severity
+from daqsvc.diagnosis.statements import see_names, see_numbers, see_severity, see_texts
 from daqsvc.settings.failures import BrokenContractError
-from daqsvc.settings.problems import AssemblyError, choice
+from daqsvc.settings.problems import AssemblyError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from daqsvc.acquisition.samples import Samples
     from daqsvc.diagnosis.detector import Window
@@ -24,11 +24,6 @@ if TYPE_CHECKING:
     from daqsvc.settings.models import MachineFile, Sensor
 
 
-MOST_FIGURES = 1000
-"""Statistics, and thresholds, of a judgement at most."""
-MOST_CHARACTERS = 200
-"""Length of a name, a unit and a decision at most."""
-_TEXT = f"give a text of {MOST_CHARACTERS} characters at most, without NUL and surrogates"
 _RING_WINDOWS = 2
 """Windows that a ring must hold at least."""
 
@@ -57,31 +52,11 @@ class Judgement:
     thresholds: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.severity not in get_args(Severity):
-            raise ValueError(f"there is no severity {self.severity!r}; {choice('', get_args(Severity))}")
+        see_severity(self.severity)
         for name in ("statistics", "units", "thresholds"):
-            _see_names(name, getattr(self, name))
-        for name, text in (("decision", self.decision), *self.units.items()):
-            if not isinstance(text, str):
-                raise ValueError(f"{name} is {text!r:.60}, which is not a text")  # noqa: TRY004 - of the value
-            if not is_text(text, MOST_CHARACTERS):
-                raise ValueError(f"{name} is {text!r:.60}; {_TEXT}")
-        for name, value in (*self.statistics.items(), *self.thresholds.items()):
-            if not isinstance(value, Real):
-                raise ValueError(f"{name} is {value!r:.60}, which is not a number")  # noqa: TRY004 - of the value
-            if not _is_finite(value):
-                raise ValueError(f"{name} is {value!s:.60}; give a finite number, or leave it out")
-
-
-def _see_names(what: str, named: object) -> None:
-    """See that figures or units are there by names that can be told."""
-    if not isinstance(named, Mapping):
-        raise ValueError(f"its {what} are {named!r:.60}; give them by name, as a dict")  # noqa: TRY004 - of the value
-    if len(named) > MOST_FIGURES:
-        raise ValueError(f"it has {len(named)} {what}; give {MOST_FIGURES} at most")
-    for key in named:
-        if not is_text(key, MOST_CHARACTERS):
-            raise ValueError(f"{key!r:.60} in its {what} is no name; {_TEXT}")
+            see_names(name, getattr(self, name))
+        see_texts([("decision", self.decision), *self.units.items()])
+        see_numbers([*self.statistics.items(), *self.thresholds.items()])
 
 
 class WindowDetector(ABC):
@@ -175,13 +150,6 @@ class WindowDetector(ABC):
             changed=changed,
         )
         return self._held
-
-
-def _is_finite(value: Any) -> bool:
-    try:
-        return math.isfinite(value)
-    except OverflowError:  # an integer beyond what a float holds
-        return False
 
 
 def _sensor(machine: MachineFile, name: str, sensor: str) -> Sensor:

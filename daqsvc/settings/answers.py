@@ -14,6 +14,8 @@ from numbers import Real
 from types import NoneType, UnionType
 from typing import Any, ClassVar, ForwardRef, Literal, TypeVar, Union, get_args, get_origin
 
+from daqsvc.settings.failures import one_line
+
 _LONGEST = 60
 _ACCEPTED: Mapping[Any, type[Any]] = {
     # Whoever writes a list where one by one would do is understood.
@@ -74,7 +76,7 @@ def shown(wanted: Any) -> str:
 
 def short(value: object) -> str:
     """A value as an author knows it, on one short line."""
-    text = " ".join(re.sub(r" object at 0x[0-9a-f]+", "", repr(value)).split())
+    text = one_line(" ".join(re.sub(r" object at 0x[0-9a-f]+", "", repr(value)).split()))
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 4]} ..."
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from contextlib import suppress
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.settings.alarm_checks import alarm_checks
@@ -48,7 +49,7 @@ def check(draft: MachineFile, facts: Mapping[str, Any]) -> list[Finding]:
         facts: by stream, what was read from the files that its layout names.
     """
     findings: list[Finding] = []
-    for one in _checks(draft, facts):
+    for one in _checks(draft, MappingProxyType(facts)):
         with suppress(UnusableValueError):
             for finding in one:
                 findings.append(finding)

@@ -8,6 +8,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from daqsvc.settings.alarms import LevelAlarm, SetpointAlarm
+from daqsvc.settings.failures import one_line
 from daqsvc.settings.hooks import PluginFailedError
 from daqsvc.settings.plugins import (
     StreamWords,
@@ -94,7 +95,7 @@ def _bus(machine: MachineFile, name: str) -> str:
 def _words(say: Callable[[], str]) -> str:
     """What a plugin says of its table; if that fails, why."""
     try:
-        return str(say())
+        return one_line(str(say()))
     except PluginFailedError as failed:
         return failed.failure.said
 
@@ -115,8 +116,8 @@ def _stream(machine: MachineFile, name: str, stream: Stream) -> Sequence[str]:
         words = StreamWords() if plugin is None else plugin.describe_stream(machine, name)
     except PluginFailedError as failed:
         words = StreamWords(frame=failed.failure.said)
-    rate = f"{stream.rate_hz:g} Hz"
-    return name, stream.bus, words.frame_id, rate, words.frames, words.frame, words.counter, words.share
+    frame_id, frames, frame, counter, share = map(one_line, words)
+    return name, stream.bus, frame_id, f"{stream.rate_hz:g} Hz", frames, frame, counter, share
 
 
 _SENSOR_HEADER = ("name", "type", "channel", "unit", "sensitivity", "details")
@@ -208,7 +209,7 @@ def _outlets(machine: MachineFile) -> Iterator[tuple[str, str]]:
     for path, plugin in output_tables().items():
         below = [words for at, words in lines if f"{at}.".startswith(f"{path}.") and words]
         if "." not in path and (below or plugin.absent):
-            yield plugin.label or path, "; ".join(below) or plugin.absent
+            yield one_line(plugin.label) or path, "; ".join(below) or one_line(plugin.absent)
     yield (
         "Store",
         "no directory configured" if machine.store is None else str(machine.resolve(machine.store.directory)),

@@ -104,7 +104,7 @@ def import_failure(error: BaseException, module: str) -> Failure:
         module: that its entry point names.
     """
     again = "install the package that brings it again"
-    said = " ".join(said_by(error).split())
+    said = one_line(said_by(error))
     missing = error.name if isinstance(error, ModuleNotFoundError) else None
     if missing is not None and f"{module}.".startswith(f"{missing}."):
         return Failure(said, again, said)
@@ -130,7 +130,7 @@ def in_words(error: BaseException) -> str:
     foreign = foreign_failure(error)
     if foreign is not None:
         return str(foreign)
-    first_line = next(iter(said_by(error).splitlines()), "")
+    first_line = one_line(next(iter(said_by(error).splitlines()), ""))
     if isinstance(error, BrokenContractError):
         return first_line
     kind = type(error).__name__
@@ -151,9 +151,18 @@ def said_by(error: BaseException) -> str:
         return ""
 
 
+def one_line(text: str) -> str:
+    """A text of somebody else on one line, without what would change the state of a terminal."""
+    if text.isprintable():
+        return text
+    return "".join(
+        letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in " ".join(text.split())
+    )
+
+
 def error_text(error: BaseException) -> str:
     """The kind of an error and what it says, on one line."""
-    said = " ".join(said_by(error).split())
+    said = one_line(said_by(error))
     name = "" if isinstance(error, BrokenContractError | ExitRaisedError) else type(error).__name__
     return ": ".join(word for word in (name, said) if word)
 
@@ -190,6 +199,11 @@ def _foreign_frames(error: BaseException) -> list[tuple[FrameType, int]]:
     """What the error came through in plugins from outside, with the line of each."""
     trace = walk_tb(error.__traceback__)
     return [(frame, line) for frame, line in trace if _is_foreign(frame.f_globals.get("__name__", ""))]
+
+
+def is_ours(module: str) -> bool:
+    """Whether a module is of this program, not of a plugin from outside."""
+    return module.partition(".")[0] in _OURS
 
 
 def _is_foreign(module: str) -> bool:

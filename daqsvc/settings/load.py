@@ -13,6 +13,7 @@ from pydantic import ValidationError
 
 from daqsvc.settings.checks import check, failure
 from daqsvc.settings.error_messages import ErrorFormatter, dotted, is_secret, suggested_key
+from daqsvc.settings.failures import one_line
 from daqsvc.settings.files import UnreadableFileError, read_bounded
 from daqsvc.settings.hooks import collecting
 from daqsvc.settings.locate import Spot
@@ -206,7 +207,8 @@ class _Reading:
         line = next(
             self._spots[path[:end]].line for end in range(len(path), -1, -1) if path[:end] in self._spots
         )
-        return Problem(self._path, line, dotted(path), source, finding.message, finding.remedy)
+        message, remedy = one_line(finding.message), one_line(finding.remedy)
+        return Problem(self._path, line, dotted(path), source, message, remedy)
 
     def _as_written(self, path: KeyPath) -> KeyPath:
         """A path of the document as it was meant, in the keys that the file really has."""

@@ -28,7 +28,7 @@ from daqsvc.settings.registry import (
     no_detectors,
     with_outputs,
 )
-from daqsvc.settings.section import AngleDeg, DampingRatio, Line, Name, PositionUm, Section
+from daqsvc.settings.section import AngleDeg, DampingRatio, FrozenTables, Line, Name, PositionUm, Section
 from daqsvc.settings.sensors import (
     Accelerometer,
     Keyphasor,
@@ -174,10 +174,15 @@ class MachineFile(Section):
     site: Annotated[Name, Field(description="where the box stands; part of every topic", examples=["lab"])]
     box: Annotated[Name, Field(description="name of this box; part of every topic", examples=["edge-1"])]
     machine: Annotated[Machine, Field(description="the machine that is watched")]
-    buses: Annotated[dict[Name, AnyBus], Field(min_length=1, max_length=64, description="the buses, by name")]
+    buses: Annotated[
+        dict[Name, AnyBus],
+        Field(min_length=1, max_length=64, description="the buses, by name"),
+        AfterValidator(FrozenTables),
+    ]
     streams: Annotated[
         dict[Name, Stream],
         Field(min_length=1, max_length=1024, description="the streams of samples, by name"),
+        AfterValidator(FrozenTables),
     ]
     sensors: Annotated[
         tuple[Sensor, ...],

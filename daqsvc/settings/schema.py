@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeGuard, Union, get_args, ge
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from daqsvc.settings.section import Kinds, Section
+from daqsvc.settings.section import FrozenTables, Kinds, Section
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -156,7 +156,7 @@ def _valid_value(declared: Any, value: Any) -> Any:
         container, element = get_origin(_bare(declared)), _element_type(declared)
         if section_of(element, {}) is not None:
             if container is dict and isinstance(value, dict):
-                return {key: _valid_value(element, item) for key, item in value.items()}
+                return FrozenTables({key: _valid_value(element, item) for key, item in value.items()})
             if container is tuple and isinstance(value, list):
                 return tuple(_valid_value(element, item) for item in value)
         raise

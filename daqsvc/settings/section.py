@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NoReturn, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ModelWrapValidatorHandler, model_validator
 from pydantic_core import PydanticCustomError, core_schema
@@ -96,6 +96,18 @@ class Section(BaseModel):
             if name in type(self).model_fields:
                 raise UnusableValueError(name)
             return super().__getattr__(name)
+
+
+class FrozenTables(dict[str, Any]):
+    """Tables by name that nobody can change: every plugin is given the same machine file."""
+
+    def _refuse(self, *_: object, **__: object) -> NoReturn:
+        raise TypeError("a machine file is not to be changed: whoever needs another one makes a copy")
+
+    __setitem__ = __delitem__ = __ior__ = clear = pop = popitem = setdefault = update = _refuse
+
+    def __reduce__(self) -> tuple[type[FrozenTables], tuple[dict[str, Any]]]:
+        return FrozenTables, (dict(self),)
 
 
 @dataclass(frozen=True)

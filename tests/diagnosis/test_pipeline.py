@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import threading
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -266,6 +267,49 @@ async def test_a_statement_in_the_name_of_another_detector_is_a_failure() -> Non
     await running
     words = "detector broken has failed: it returns a statement of 'levels'; name it broken"
     assert [(d.detector, d.quality, d.reason) for d in said] == [("broken", "missing", words)]
+
+
+UNTOLD: dict[str, tuple[dict[str, Any], str]] = {
+    "nan": ({"statistics": {"rms": math.nan}}, "rms is nan; give a finite number, or leave it out"),
+    "text": ({"thresholds": {"rms": "high"}}, "rms is 'high', which is not a number"),
+    "names": (
+        {"evidence": {1: 2.0}},
+        "1 in its evidence is no name; give a text of 200 characters at most",
+    ),
+    "unit": ({"units": {"rms": "\udc00"}}, "rms is '\\udc00'; give a text"),
+    "decision": ({"decision": "N\x1b[31m"}, "decision is 'N\\x1b[31m'; give a text"),
+    "reason": ({"reason": "a\nb"}, "reason is 'a\\nb'; give a text of 2000 characters at most"),
+    "severity": ({"severity": "grave"}, "there is no severity 'grave'"),
+    "quality": ({"quality": ["good"]}, "there is no quality ['good']"),
+    "sensors": ({"sensors": ("x", None)}, "sensors is None, which is not a text"),
+    "bounds": ({"bounds": {"rms": (0.0, math.inf)}}, "rms is inf; give a finite number"),
+    "revolutions": ({"revolutions": math.nan}, "revolutions is nan; give a finite number"),
+    "index": ({"end_index": None}, "end_index is None, which is not a whole number"),
+    "future": ({"t_ns": 10**30}, f"t_ns is {10**30}; give the time of its last sample, from "),
+    "past": ({"t_ns": -(10**15)}, f"t_ns is -{10**15}; give the time of its last sample, from "),
+    "time": ({"t_ns": "now"}, "t_ns is 'now', which is not a whole number"),
+}
+
+
+@pytest.mark.parametrize("untold", UNTOLD)
+async def test_a_statement_by_hand_is_held_to_what_a_judgement_is(
+    untold: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    odd, words = UNTOLD[untold]
+    ring = SampleRing("s", ("a",), 50)
+    broken = Listener("broken", 10)
+    own = broken.process
+    broken.process = lambda window: [replace(one, **odd) for one in own(window)]  # type: ignore[method-assign]
+    said: list[Diagnosis] = []
+    running = asyncio.create_task(Pipeline({"s": ring}, [broken], said.append, CLOCK).run())
+    write(ring, 10)
+    await eventually(lambda: len(said) == 1, "the window has failed")
+    ring.close()
+    await running
+    begins = f"detector broken has failed: it returns a statement that cannot be told: {words}"
+    assert said[0].reason.startswith(begins)
+    [line] = [r.getMessage() for r in caplog.records if r.levelno >= logging.ERROR]
+    assert line.isprintable()
 
 
 def always_failing(window: Window) -> list[Diagnosis]:

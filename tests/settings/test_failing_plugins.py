@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import logging
 import re
 import sys
 from collections.abc import Iterator, Mapping
@@ -24,12 +25,13 @@ from support.machine_files import MOTOR, problems_of
 import daqsvc
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.api import Bus, DetectorPlugin, Device, DriverPlugin, OutputPlugin
-from daqsvc.cli import main
+from daqsvc.cli import main, start_logging
 from daqsvc.detectors.make import check_files, detectors
 from daqsvc.publish.make import output_set, watched
 from daqsvc.service import Service
 from daqsvc.settings import describe, hooks, parse_machine_file, registry
-from daqsvc.settings.problems import AssemblyError
+from daqsvc.settings.plugins import StreamWords
+from daqsvc.settings.problems import AssemblyError, Finding
 from drivers.make import bus_drivers
 
 if TYPE_CHECKING:
@@ -321,6 +323,88 @@ def test_a_hook_that_fails_is_one_finding_with_its_line(
     assert problem.line is not None
     removed = table.removesuffix(".layout")
     assert problem.remedy == f"have the authors of {BROUGHT[owner]} mend it, or remove [{removed}]"
+
+
+def test_a_plugin_cannot_change_the_machine_file_that_it_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    def meddling(_: Any, draft: Any, settings: Any) -> Iterator[Any]:
+        del settings
+        draft.buses.clear()
+        yield iter(())
+
+    monkeypatch.setattr(class_at("crest.CrestPlugin"), "checks", meddling)
+    partly_valid = '[[alarms]]\nname = "knocks"\ndetector = "crest"\nlatching = 7\n'
+    for more in ("", partly_valid):
+        [said] = [one.message for one in problems_of(TABLES + more, MACHINE) if one.key == "pipeline.crest"]
+        assert "checks of crest.CrestPlugin has failed: TypeError: a machine file is not to be" in said
+
+
+@pytest.mark.parametrize("change", ["draft.streams['x'] = 1", "draft.buses.pop('logger')", "facts['x'] = 1"])
+def test_a_driver_cannot_change_what_it_is_given(monkeypatch: pytest.MonkeyPatch, change: str) -> None:
+    def meddling(_: Any, draft: Any, facts: Any) -> Iterator[Any]:
+        exec(change, {"draft": draft, "facts": facts})  # noqa: S102 - our own text
+        yield iter(())
+
+    monkeypatch.setattr(class_at("tcp_frames.LoggerPlugin"), "checks", meddling)
+    [problem] = problems_of(TABLES, MACHINE)
+    assert "checks of tcp_frames.LoggerPlugin has failed: " in problem.message
+
+
+STEERING = "beats\n\x1b[2J\x1b]0;title\x07\tfast\udc00"
+
+
+@pytest.mark.parametrize(
+    ("owner", "hook", "answer"),
+    [
+        ("tcp_frames.LoggerBus", "summary", STEERING),
+        ("daqsvc.settings.packing.PackedLayout", "summary", STEERING),
+        ("tcp_frames.LoggerPlugin", "describe_stream", StreamWords(*[STEERING] * 5)),
+        ("crest.CrestPlugin", "describe", STEERING),
+        ("event_file.EventFilePlugin", "describe", STEERING),
+        ("crest.CrestPlugin", "checks", [iter([Finding((), STEERING, STEERING, fatal=False)])]),
+        ("crest.CrestPlugin", "checks", [iter([Finding((), STEERING, STEERING)])]),
+        ("crest.CrestPlugin", "check_files", AssemblyError(STEERING)),
+        ("crest.CrestPlugin", "describe", KeyError(STEERING)),
+    ],
+)
+def test_what_a_plugin_says_is_shown_in_lines_that_steer_no_terminal(
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    owner: str,
+    hook: str,
+    answer: Any,
+) -> None:
+    file = tmp_path / "machine.toml"
+    file.write_text(TABLES)
+    main(["check", str(file)])
+    before = capsys.readouterr().out
+
+    def answering(*_: Any, **__: Any) -> Any:
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    kind = class_at(owner)
+    is_property = isinstance(inspect.getattr_static(kind, hook), property)
+    monkeypatch.setattr(kind, hook, property(answering) if is_property else answering)
+    main(["check", str(file)])
+    said = capsys.readouterr()
+    assert said.out != before
+    assert all(line.isprintable() for line in (said.out + said.err).splitlines())
+    assert "beats" in said.out + said.err
+
+
+def test_the_log_steers_no_terminal_and_takes_one_line_for_a_message(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = logging.getLogger()
+    monkeypatch.setattr(root, "handlers", [])
+    monkeypatch.setattr(root, "level", root.level)
+    start_logging(verbose=False)
+    logging.getLogger("daqsvc.test").warning("%s", STEERING)
+    [line] = capsys.readouterr().err.splitlines()
+    assert "beats" in line
+    assert line.isprintable()
 
 
 class NoHash:
