@@ -10,7 +10,7 @@ import asyncio
 import json
 import math
 from numbers import Real
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from daqsvc import __version__
 from daqsvc.acquisition.clock import NS_PER_S
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from daqsvc.settings.sensors import Sensor
 
     Document = dict[str, Any]
+    Newest = tuple[list[float], int] | None
 
 T = TypeVar("T")
 
@@ -44,6 +45,28 @@ OLDEST_S = 1.0
 """The journal is waited for at most so long: a disk that hangs leaves the rest as it is."""
 AT_ONCE = 64
 """Channels or alarms looked at in one turn of the event loop."""
+
+
+class _Seen(NamedTuple):
+    """What the event loop has gathered.
+
+    Attributes:
+        now_ns: when, by the service's clock.
+        figures: those of the status message.
+        oldest_wall_ns: when the oldest event happened that waits for the broker; None if that is not known.
+        alarms: how each stands.
+        newest: by stream, its newest sample ``[channels]`` and when that was taken; None before the first.
+        latest: what each detector has said last.
+        measured: likewise, with figures.
+    """
+
+    now_ns: int
+    figures: Document
+    oldest_wall_ns: int | None
+    alarms: Mapping[str, AlarmStatus]
+    newest: Mapping[str, Newest]
+    latest: Mapping[str, Diagnosis]
+    measured: Mapping[str, Diagnosis]
 
 
 class StatusReport:
@@ -95,27 +118,34 @@ class StatusReport:
         loop = asyncio.get_running_loop()
         async with self._one_at_a_time:
             if loop.time() - self._made_s > FRESH_S:
-                document = await self._document()
-                self._text = await asyncio.to_thread(_json_line, document)
+                seen = await self._look()
+                self._text = await asyncio.to_thread(lambda: _json_line(self._document(seen)))
                 self._made_s = loop.time()
         return self._text
 
-    async def _document(self) -> Document:
-        now_ns = self._clock.monotonic_ns()
-        figures = self._figures()
-        oldest_ns = await self._oldest_wall_ns(figures["outbox"]["depth"])
-        standing = self._alarms.manager.alarms
-        alarms = {name: status async for name, status in _by_turns((n, standing[n]) for n in list(standing))}
-        said = dict(self._latest)
-        states = _sensor_states(said.values(), alarms)
-        newest = {name: pair async for name, pair in _by_turns(self._newest())}
+    async def _look(self) -> _Seen:
+        now_ns, figures, alarms = self._clock.monotonic_ns(), self._figures(), self._alarms.manager.alarms
+        return _Seen(
+            now_ns,
+            figures,
+            await self._oldest_wall_ns(figures["outbox"]["depth"]),
+            {name: status async for name, status in _by_turns((n, alarms[n]) for n in list(alarms))},
+            {name: sample async for name, sample in _by_turns(self._newest())},
+            dict(self._latest),
+            dict(self._measured),
+        )
+
+    def _document(self, seen: _Seen) -> Document:
+        """A `ServiceStatusPayload` in what JSON knows; on a thread."""
         stamp = stamp_now(self._machine.site, self._machine.box, self._clock)
+        outbox = seen.figures["outbox"]
+        states = _sensor_states(seen.latest.values(), seen.alarms)
         return {
             "schema": SCHEMA,
             **stamp,
             "machine": self._machine.machine.name,
             "version": __version__,
-            "uptime_s": _age_s(self._begun_ns, now_ns),
+            "uptime_s": _age_s(self._begun_ns, seen.now_ns),
             "buses": {
                 driver.name: {
                     "driver": self._machine.buses[driver.name].driver,
@@ -124,24 +154,24 @@ class StatusReport:
                 }
                 for driver in self._drivers
             },
-            "streams": {name: self._stream(name, figures, newest, now_ns) for name in self._machine.streams},
-            "channels": [one async for one in _by_turns(self._channels(newest, states, now_ns))],
+            "streams": {name: self._stream(name, seen) for name in self._machine.streams},
+            "channels": list(self._channels(seen, states)),
             "statements": [
-                one
-                async for one in _by_turns(
-                    _statement(said[name], self._measured.get(name), now_ns) for name in sorted(said)
-                )
+                _statement(seen.latest[name], seen.measured.get(name), seen.now_ns)
+                for name in sorted(seen.latest)
             ],
-            "alarms": _standing(alarms, now_ns),
+            "alarms": _standing(seen.alarms, seen.now_ns),
             "outbox": {
-                "depth": figures["outbox"]["depth"],
-                "waiting": figures["outbox"]["waiting"],
-                "oldest_age_s": None if oldest_ns is None else _age_s(oldest_ns, stamp["wall_ns"]),
-                "journal": _journal(figures["outbox"]),
+                "depth": outbox["depth"],
+                "waiting": outbox["waiting"],
+                "oldest_age_s": None
+                if seen.oldest_wall_ns is None
+                else _age_s(seen.oldest_wall_ns, stamp["wall_ns"]),
+                "journal": _journal(outbox),
             },
-            "outputs": {path: _output(path, figures) for path in self._alarms.outputs},
-            "faults": _faults(figures),
-            "figures": figures,
+            "outputs": {path: _output(path, seen.figures) for path in self._alarms.outputs},
+            "faults": _faults(seen.figures),
+            "figures": seen.figures,
         }
 
     async def _oldest_wall_ns(self, depth: int) -> int | None:
@@ -156,37 +186,33 @@ class StatusReport:
             pass  # the disk hangs, or the message is none of this version
         return None
 
-    def _newest(self) -> Iterator[tuple[str, tuple[list[float], int] | None]]:
-        """By stream, its newest sample ``[channels]`` and when that was taken, ns; None before the first."""
+    def _newest(self) -> Iterator[tuple[str, Newest]]:
         for name in self._machine.streams:
             ring = self._rings[name]
             last = ring.end_index - 1
             yield name, (ring.read(last, 1)[0].tolist(), ring.time_of(last)) if ring.started else None
 
-    def _stream(
-        self, name: str, figures: Document, newest: Mapping[str, tuple[list[float], int] | None], now_ns: int
-    ) -> Document:
-        stream, counted, sample = self._machine.streams[name], figures["streams"].get(name, {}), newest[name]
-        comes = sample is not None and now_ns - sample[1] < self._patience_ns[name]
+    def _stream(self, name: str, seen: _Seen) -> Document:
+        stream, counted, sample = (
+            self._machine.streams[name],
+            seen.figures["streams"].get(name, {}),
+            seen.newest[name],
+        )
+        comes = sample is not None and seen.now_ns - sample[1] < self._patience_ns[name]
         known = comes and counted.get("time_settled") and not counted["doubt"]
         return {
             "bus": stream.bus,
             "rate_hz": counted["rate_hz"] if known else None,
             "configured_rate_hz": stream.rate_hz,
-            "age_s": None if sample is None else _age_s(sample[1], now_ns),
+            "age_s": None if sample is None else _age_s(sample[1], seen.now_ns),
             "doubt": counted.get("doubt", ""),
             "samples_received": counted.get("samples_received", 0),
             "samples_lost": counted.get("samples_lost", 0),
         }
 
-    def _channels(
-        self,
-        newest: Mapping[str, tuple[list[float], int] | None],
-        states: Mapping[str, tuple[SensorState, str]],
-        now_ns: int,
-    ) -> Iterator[Document]:
+    def _channels(self, seen: _Seen, states: Mapping[str, tuple[SensorState, str]]) -> Iterator[Document]:
         for name, stream in self._machine.streams.items():
-            sample = newest[name]
+            sample = seen.newest[name]
             for column, channel in enumerate(stream.layout.channel_names):
                 for sensor in self._sensors.get((name, channel), [None]):
                     state, reason = states.get(sensor.name, _UNKNOWN) if sensor else _UNKNOWN
@@ -196,7 +222,7 @@ class StatusReport:
                         "sensor": sensor and sensor.name,
                         "value": None if sample is None else sample[0][column],
                         "unit": sensor.unit if sensor else "",
-                        "age_s": None if sample is None else _age_s(sample[1], now_ns),
+                        "age_s": None if sample is None else _age_s(sample[1], seen.now_ns),
                         "state": state,
                         "reason": reason,
                     }
