@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from daqsvc.publish.output import Output
     from daqsvc.self_check import BusHealth
     from daqsvc.settings.alarms import AlarmHandling
+    from daqsvc.supervision import Progress
 
 logger = logging.getLogger(__name__)
 
@@ -99,6 +100,7 @@ class AlarmService:
         buses: by name, what can be watched of each bus.
         bus_health: says how the buses stand.
         supervisor: counts what outputs do wrong.
+        progress: says how far each part of the service has come, for outputs that tell it.
     """
 
     def __init__(
@@ -114,6 +116,7 @@ class AlarmService:
         buses: Mapping[str, Collection[str]] | None = None,
         bus_health: Callable[[], Mapping[str, BusHealth]] = dict,
         supervisor: Supervisor | None = None,
+        progress: Callable[[], Mapping[str, Progress]] = dict,
     ) -> None:
         limits = limits or OutboxLimits()
         self.identity = identity
@@ -138,6 +141,7 @@ class AlarmService:
                 topics=self.topics,
                 commands=self.execute,
                 earlier=EarlierState(self._witness, self._take_witness),
+                progress=progress,
             )
         )
         """Who is told, by the path of its table; each is to be run by itself, until `stop`."""

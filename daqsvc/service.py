@@ -175,6 +175,7 @@ class Service:
             buses=bus_self_checks(machine),
             bus_health=self._bus_health,
             supervisor=self.supervisor,
+            progress=self.progress,
         )
         self.report = StatusReport(
             machine, self.clock, self.rings, self.driver_reports, self.alarms, self.figures

@@ -7,6 +7,7 @@ meanwhile. The text is made on a thread, once for all who ask at about the same 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import math
 from numbers import Real
@@ -128,7 +129,7 @@ class StatusReport:
         return _Seen(
             now_ns,
             figures,
-            await self._oldest_wall_ns(figures["outbox"]["depth"]),
+            await self._oldest_wall_ns(),
             {name: status async for name, status in _by_turns((n, alarms[n]) for n in list(alarms))},
             {name: sample async for name, sample in _by_turns(self._newest())},
             dict(self._latest),
@@ -174,16 +175,11 @@ class StatusReport:
             "figures": seen.figures,
         }
 
-    async def _oldest_wall_ns(self, depth: int) -> int | None:
-        """When the oldest event happened that the broker has not acknowledged; None if that is not known."""
-        if not depth:
-            return None
-        try:
+    async def _oldest_wall_ns(self) -> int | None:
+        """See `Outbox.oldest_wall_ns`; None also if the disk hangs."""
+        with contextlib.suppress(TimeoutError, OutboxError):
             async with asyncio.timeout(OLDEST_S):
-                for message in await self._alarms.outbox.pending(0, 1):
-                    return int(json.loads(message.payload)["wall_ns"])
-        except (TimeoutError, OutboxError, ValueError, KeyError, TypeError):
-            pass  # the disk hangs, or the message is none of this version
+                return await self._alarms.outbox.oldest_wall_ns()
         return None
 
     def _newest(self) -> Iterator[tuple[str, Newest]]:

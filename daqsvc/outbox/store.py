@@ -7,6 +7,8 @@ Telemetry is the lower class: it goes to a file of its own, unsynced, and may be
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import json
 import logging
 from typing import TYPE_CHECKING, TypeVar
 
@@ -183,6 +185,16 @@ class Outbox:
     async def pending(self, after: int, limit: int) -> list[OutboxMessage]:
         """Messages above ``after`` that the broker has not acknowledged, in order, at most ``limit``."""
         return await self._read(lambda: self._journal.pending(after, limit))
+
+    async def oldest_wall_ns(self) -> int | None:
+        """When the oldest event happened that the broker has not acknowledged; None if there is none.
+
+        By the payload, ns since the Unix epoch; None also for one that does not say it.
+        """
+        for message in await self.pending(0, 1) if self.counters.depth or self.counters.waiting else ():
+            with contextlib.suppress(ValueError, KeyError, TypeError):
+                return int(json.loads(message.payload)["wall_ns"])
+        return None
 
     async def retained(self) -> list[OutboxMessage]:
         """The latest retained message of each topic, where the broker has acknowledged it, in order."""

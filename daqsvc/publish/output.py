@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.outbox.store import Outbox
     from daqsvc.publish.topics import Topics
+    from daqsvc.supervision import Progress
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +77,7 @@ class OutputPort:
         topics: by which events are known in the outbox.
         commands: carries out what people ask of alarms; an output has to see that they may.
         earlier: what a broker is asked for before it is told anything; None for nothing.
+        progress: says how far each part of the service has come that can stall.
     """
 
     identity: Identity
@@ -86,6 +88,7 @@ class OutputPort:
     topics: Topics
     commands: CommandHandler | None = None
     earlier: EarlierState | None = None
+    progress: Callable[[], Mapping[str, Progress]] = dict
 
 
 class Output:

@@ -53,8 +53,9 @@ def test_it_holds_the_service_and_no_more(package: Path) -> None:
         "daqsvc-sim",
     }
     assert (root / "usr/bin/daqsvc").readlink() == Path("../lib/daqsvc/bin/daqsvc")
-    examples = {p.name for p in (root / "usr/share/doc/daqsvc/examples/machines").iterdir()}
-    assert examples == {p.name for p in (ROOT / "config/machines").iterdir()}
+    for kind in ("machines", "prometheus"):
+        examples = {p.name for p in (root / "usr/share/doc/daqsvc/examples" / kind).iterdir()}
+        assert examples == {p.name for p in (ROOT / "config" / kind).iterdir()}
     # What was compiled when it was built is what runs: the service cannot write there.
     assert len(list(site.glob("daqsvc/__pycache__/*.pyc"))) == len(list(site.glob("daqsvc/*.py")))
 

@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import ctypes
 import threading
+import urllib.request
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -18,6 +19,7 @@ from support.waiting import PATIENCE_S, eventually
 
 from daqsvc import supervision
 from daqsvc.control import ControlError, ControlRequest, ask
+from daqsvc.publish.metrics.settings import Metrics
 from daqsvc.service import Service
 from daqsvc.supervision import EssentialLostError
 
@@ -97,6 +99,7 @@ class Victim:
         except BaseException as error:
             error.add_note(f"after {what} these stand still: {sorted(behind)}")
             raise
+        await eventually_async(self._is_healthy, f"metrics are served after {what}")
         told = len(self._consumer.on("/alarms/never"))
         for verb in ("shelve", "unshelve"):
             await eventually_async(lambda verb=verb: self._obeyed(verb), f"a command is obeyed after {what}")
@@ -106,6 +109,18 @@ class Victim:
                 while len(self._consumer.on("/alarms/never")) < told + 2:
                     await asyncio.sleep(0.05)
         assert len(self._consumer.on("/alarms/never")) >= told + 2, f"both are told after {what}"
+
+    async def _is_healthy(self) -> bool:
+        metrics = self.service.machine.output(Metrics)
+        assert metrics is not None
+
+        def answer() -> int:
+            with urllib.request.urlopen(f"http://{metrics.listen}/healthz", timeout=1.0) as told:
+                return int(told.status)
+
+        with contextlib.suppress(OSError):
+            return await asyncio.to_thread(answer) == 200
+        return False
 
     async def _obeyed(self, verb: str) -> bool:
         duration_s = 60.0 if verb == "shelve" else None
@@ -193,7 +208,9 @@ async def test_all_at_once(tmp_path: Path, mosquitto: Mosquitto) -> None:
                 kill_thread(thread, SystemExit)
         await there.check("the end of all threads but the journal's")
         failures = there.service.figures()["failures"]
-        assert {"mqtt", "sparkplug", "alarm times", "status", "pipeline", "driver can0"} <= set(failures)
+        assert {"mqtt", "sparkplug", "metrics", "alarm times", "status", "pipeline", "driver can0"} <= set(
+            failures
+        )
         assert there.service.alarms.outbox.counters.telemetry.restarts == 1
 
 

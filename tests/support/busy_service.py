@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import can
 import numpy as np
+from support.brokers import free_port
 from support.machine_files import MACHINES
 from support.waiting import PATIENCE_S
 
@@ -99,6 +100,9 @@ allow = ["acknowledge", "shelve", "unshelve"]
 [mqtt.home_assistant]
 
 [mqtt.sparkplug]
+
+[metrics]
+listen = "127.0.0.1:{metrics}"
 """
 
 
@@ -112,7 +116,11 @@ def busy_machine(folder: Path, devices: Devices, broker: int) -> MachineFile:
     # How well streams are aligned is tested elsewhere, and on a machine that is less busy.
     text = text.replace("max_error_us = 200.0", "max_error_us = 20_000.0")
     more = MORE.format(
-        port=devices.port, tcp_port=devices.tcp_port, broker=broker, recording=folder / "recording"
+        port=devices.port,
+        tcp_port=devices.tcp_port,
+        broker=broker,
+        metrics=free_port(),
+        recording=folder / "recording",
     )
     (folder / "recording").mkdir()
     return parse_machine_file(text[: text.index("[mqtt]")] + more, path)

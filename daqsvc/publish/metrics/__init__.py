@@ -1,0 +1,1 @@
+"""Metrics for Prometheus, and whether the service is healthy, over HTTP."""
