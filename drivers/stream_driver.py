@@ -5,12 +5,13 @@ from __future__ import annotations
 import asyncio
 from abc import ABC, abstractmethod
 from inspect import isawaitable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.link import Link
+from daqsvc.settings.answers import short
 from daqsvc.settings.failures import BrokenContractError
 from drivers.base import BusCounters
 from drivers.reconnect import Attempt, CannotOpenError, run_with_reconnect
@@ -86,11 +87,15 @@ class StreamDriver(ABC):
             payloads: uint8 ``[n, spec.layout.length]``.
 
         Raises:
-            ValueError: they are of another shape.
+            ValueError: the stream is none of them, or the payloads are of another kind or shape.
         """
-        if np.shape(payloads)[1:] != (spec.layout.length,):
+        if getattr(spec, "name", None) not in self._assemblers:
+            raise ValueError(f"take() is given the stream {spec!r:.60}; give it one of self.port.streams")
+        given = payloads if isinstance(cast("object", payloads), np.ndarray) else None
+        if given is None or given.dtype != np.uint8 or given.shape[1:] != (spec.layout.length,):
+            what = short(payloads) if given is None else f"{given.dtype} {list(given.shape)}"
             raise ValueError(
-                f"take() is given {payloads!r:.60}; give it uint8 [n, {spec.layout.length}] of {spec.name}"
+                f"take() is given {what}; give it an array of uint8 [n, {spec.layout.length}] of {spec.name}"
             )
         if len(payloads):
             arrival_ns = np.full(len(payloads), self.port.clock.monotonic_ns())

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.samples import Samples
     from daqsvc.diagnosis.detector import Window
     from daqsvc.dsp.quality import Quality
-    from daqsvc.settings.models import MachineFile, Sensor
+    from daqsvc.settings.models import MachineFile
 
 
 _RING_WINDOWS = 2
@@ -74,7 +74,14 @@ class WindowDetector(ABC):
     """
 
     def __init__(self, machine: MachineFile, name: str, sensors: Sequence[str], window_s: float) -> None:
-        resolved = [_sensor(machine, name, sensor) for sensor in sensors]
+        known = {sensor.name: sensor for sensor in machine.sensors}
+        for sensor in sensors:
+            if sensor not in known:
+                raise AssemblyError(
+                    f"detector {name} ({type(self).__module__}.{type(self).__qualname__}) takes samples of "
+                    f"{sensor!r:.60}, which is no sensor; name some of {', '.join(known)} in its table"
+                )
+        resolved = [known[sensor] for sensor in sensors]
         streams = {sensor.stream for sensor in resolved}
         if len(streams) != 1:
             raise AssemblyError(
@@ -150,10 +157,3 @@ class WindowDetector(ABC):
             changed=changed,
         )
         return self._held
-
-
-def _sensor(machine: MachineFile, name: str, sensor: str) -> Sensor:
-    try:
-        return machine.sensor(sensor)
-    except KeyError as error:
-        raise AssemblyError(f"detector {name}: {error.args[0]}") from error

@@ -139,7 +139,9 @@ def _lacking(value: object, protocol: Any) -> str:
             members[name] = part.fget.__annotations__["return"] if isinstance(part, property) else "object"
     for name, annotation in members.items():
         if not hasattr(value, name):
-            return f"{short(value)} lacks {name} of {protocol.__name__}"
+            own_init = "__init__" in vars(type(value)) and len(type(value).__mro__) > len((type, object))
+            how = "call super().__init__() in its __init__, or set it" if own_init else "give it one"
+            return f"{short(value)} lacks {name} of {protocol.__name__}; {how}"
         words = misfit(getattr(value, name), meaning(annotation, protocol.__module__), inside=True)
         if words:
             return f"in its {name}, {words}"

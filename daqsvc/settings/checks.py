@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from daqsvc.settings.alarm_checks import alarm_checks
 from daqsvc.settings.error_messages import dotted
+from daqsvc.settings.failures import BrokenContractError
+from daqsvc.settings.hooks import PluginFailedError
 from daqsvc.settings.plugins import bus_tables, configured, configured_outputs, driver_of_layout
 from daqsvc.settings.problems import Finding, choice, unique
 from daqsvc.settings.registry import broken_drivers
@@ -28,10 +30,9 @@ from daqsvc.settings.sensor_checks import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Hashable, Iterator, Mapping
+    from collections.abc import Collection, Hashable, Iterator, Mapping
 
     from daqsvc.settings.buses import Layout
-    from daqsvc.settings.hooks import PluginFailedError
     from daqsvc.settings.models import MachineFile, Sensor, Stream
     from daqsvc.settings.plugins import BusTable
     from daqsvc.settings.problems import KeyPath
@@ -55,7 +56,22 @@ def check(draft: MachineFile, facts: Mapping[str, Any]) -> list[Finding]:
                 findings.append(finding)
                 if len(findings) >= _MOST_FINDINGS:
                     return findings
+    with suppress(UnusableValueError):
+        findings += _strangers(draft, {finding.path[:2] for finding in findings if finding.fatal})
     return findings
+
+
+def _strangers(draft: MachineFile, wrong: Collection[KeyPath]) -> Iterator[Finding]:
+    """Sensors that a detector takes together and that there are none of, where its table is not to blame."""
+    sensors = [sensor.name for sensor in draft.sensors]
+    for key, plugin, settings in configured(draft.pipeline, valid_only=True):
+        with suppress(UnusableValueError):
+            strange = [name for name in plugin.sampled_together(settings) if name not in sensors]
+            if strange and ("pipeline", key) not in wrong:
+                words = f"it names {strange[0]!r:.60}, which is no sensor; name some of {', '.join(sensors)}"
+                hook = type(plugin).sampled_together
+                error = BrokenContractError(hook, words)
+                yield failure(draft, PluginFailedError(plugin, "sampled_together", error))
 
 
 def failure(draft: MachineFile, failed: PluginFailedError) -> Finding:

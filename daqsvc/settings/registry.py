@@ -168,8 +168,11 @@ def _made(point: EntryPoint, what: str, contract: type[Any]) -> Any:
     plugin = point.load()
     if not (isinstance(plugin, type) and issubclass(plugin, contract)):
         raise TypeError(f"it is not derived from {what.title()}Plugin of daqsvc.api")
+    for name in ("buses", "layouts", "self_checks"):  # whoever writes a list is understood
+        if isinstance(listed := getattr(plugin, name, None), list):
+            setattr(plugin, name, tuple(listed))
     needed = "buses" if contract is DriverKind else "settings"
-    if getattr(plugin, needed, ()) in {None, ()}:
+    if getattr(plugin, needed, ()) in (None, ()):
         raise TypeError(f"{plugin.__qualname__} does not say its {needed}")
     see_declared(plugin)
     for table in (*getattr(plugin, "buses", ()), *getattr(plugin, "layouts", ())):

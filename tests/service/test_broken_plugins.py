@@ -197,7 +197,7 @@ PROCESS = line_of("            self.process = lambda window: [1]")
         (
             "takes",
             "process",
-            f"give it uint8 [n, 8] of bad (mishap.py, line {TAKEN})",
+            f"take() is given None; give it an array of uint8 [n, 8] of bad (mishap.py, line {TAKEN})",
             f"it returns [1], not Sequence[Diagnosis] (mishap.py, line {PROCESS})",
         ),
     ],

@@ -24,7 +24,7 @@ from support.machine_files import MOTOR, problems_of
 
 import daqsvc
 from daqsvc.acquisition.clock import SystemClock
-from daqsvc.api import Bus, DetectorPlugin, Device, DriverPlugin, OutputPlugin
+from daqsvc.api import Bus, DetectorPlugin, Device, DriverPlugin, OutputPlugin, StreamDriver, WindowDetector
 from daqsvc.cli import main, start_logging
 from daqsvc.detectors.make import check_files, detectors
 from daqsvc.publish.make import output_set, watched
@@ -323,6 +323,54 @@ def test_a_hook_that_fails_is_one_finding_with_its_line(
     assert problem.line is not None
     removed = table.removesuffix(".layout")
     assert problem.remedy == f"have the authors of {BROUGHT[owner]} mend it, or remove [{removed}]"
+
+
+@pytest.mark.parametrize("names", [("ghost",), ("casing-x", "ghost")])
+def test_sensors_that_a_plugin_takes_together_and_there_are_none_of_are_its_failure(
+    monkeypatch: pytest.MonkeyPatch, names: tuple[str, ...]
+) -> None:
+    monkeypatch.setattr(class_at("crest.CrestPlugin"), "sampled_together", lambda *_: names)
+    [problem] = problems_of(TABLES, MACHINE)
+    assert problem.key == "pipeline.crest"
+    words = "it names 'ghost', which is no sensor; name some of casing-x (test_failing_plugins.py, line"
+    assert f"sampled_together of crest.CrestPlugin has failed: {words}" in problem.message
+    assert problem.remedy == "have the authors of daqsvc-crest 1.0 mend it, or remove [pipeline.crest]"
+    # A table that names them is to blame for it, and says so itself.
+    [problem] = problems_of(TABLES.replace('sensor = "casing-x"', 'sensor = "ghost"'), MACHINE)
+    assert problem.key == "pipeline.crest.sensor"
+
+
+def test_kinds_of_buses_and_layouts_may_be_a_list(monkeypatch: pytest.MonkeyPatch) -> None:
+    plugin = class_at("tcp_frames.LoggerPlugin")
+    for name in ("buses", "layouts", "self_checks"):
+        monkeypatch.setattr(plugin, name, list(getattr(plugin, name)))
+    registry.forget()
+    assert list(parse_machine_file(TABLES, MACHINE).buses) == ["logger"]
+    monkeypatch.setattr(plugin, "buses", {})
+    registry.forget()
+    [problem] = problems_of(MACHINE.read_text(), MACHINE)
+    assert "buses of LoggerPlugin is {}, which must be tuple[type[Bus], ...]" in problem.message
+
+
+@pytest.mark.parametrize(
+    ("owner", "base", "contract"),
+    [
+        ("tcp_frames.LoggerPlugin", StreamDriver, "Driver"),
+        ("crest.CrestPlugin", WindowDetector, "Detector"),
+    ],
+)
+def test_an_init_that_forgets_its_base_is_named_with_the_remedy(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, owner: str, base: type[Any], contract: str
+) -> None:
+    body = {"__init__": lambda _: None, "__repr__": lambda _: "<Bare>", "read": None, "judge": None}
+    bare = type("Bare", (base,), body)
+    monkeypatch.setattr(class_at(owner), "build", lambda *_: [bare()] if contract == "Detector" else bare())
+    with pytest.raises(AssemblyError) as caught:
+        Service(parse_machine_file(TABLES, MACHINE), tmp_path)
+    remedy = "call super().__init__() in its __init__, or set it"
+    assert f"<Bare> lacks name of {contract}; {remedy} (test_failing_plugins.py, line" in f"{caught.value}"
+    assert f"build of {owner} has failed: " in f"{caught.value}"
+    assert f"have the authors of {BROUGHT[owner]} mend it" in f"{caught.value}"
 
 
 def test_a_plugin_cannot_change_the_machine_file_that_it_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
