@@ -99,23 +99,39 @@ def load(path: Path) -> MachineFile | None:
         return None
 
 
+class _JournalFormatter(logging.Formatter):
+    """Lines for systemd's journal: no time stamps, and the level in front, see sd-daemon(3)."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """See `logging.Formatter.format`."""
+        priority = next(number for least, number in _PRIORITIES if record.levelno >= least)
+        return "\n".join(f"<{priority}>{line}" for line in super().format(record).splitlines())
+
+
+_PRIORITIES = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (0, 7))
+"""Priorities of syslog(3) from these levels on."""
+
+
+def _stderr_as_stream() -> str:
+    """What ``$JOURNAL_STREAM`` says if stderr goes to the journal; who inherits it may write elsewhere."""
+    try:
+        stderr = os.fstat(2)
+    except OSError:
+        return ""
+    return f"{stderr.st_dev}:{stderr.st_ino}"
+
+
 def start_logging(*, verbose: bool, handler: logging.Handler | None = None) -> None:
-    """Log to stderr, or to a handler; under systemd without time stamps, which the journal adds itself."""
-    stamp = "" if "JOURNAL_STREAM" in os.environ else "%(asctime)s "
+    """Log to stderr, or to a handler; under systemd as its journal takes it."""
     handler = handler or logging.StreamHandler()
-    handler.setFormatter(_OneLine(f"{stamp}%(levelname)s %(message)s"))
+    text = "%(levelname)s %(message)s"
+    stream = os.environ.get("JOURNAL_STREAM")
+    if stream is None:
+        text = f"%(asctime)s {text}"
+    is_journal = stream is not None and stream == _stderr_as_stream()
+    handler.setFormatter(_JournalFormatter(text) if is_journal else logging.Formatter(text))
     logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, handlers=[handler])
     logging.getLogger("can").setLevel(logging.ERROR)
-
-
-class _OneLine(logging.Formatter):
-    """A message on one line, whatever words of plugins and devices are in it; tracebacks have their own."""
-
-    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - of logging
-        from daqsvc.settings.failures import one_line  # noqa: PLC0415 - each verb imports only what it needs
-
-        record.message = one_line(record.message)
-        return super().formatMessage(record)
 
 
 def commands() -> dict[str, Command]:

@@ -12,6 +12,8 @@ import threading
 import time
 from typing import TYPE_CHECKING
 
+from daqsvc.commands.log_flood import LogFlood
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -38,13 +40,17 @@ class LogThread(logging.Handler):
         self._fd = fd
         self._lines: queue.Queue[str | None] = queue.Queue(MOST_LINES)
         self._left_out = 0
+        self._flood = LogFlood()
         self._thread = threading.Thread(target=self._write_on, name="log", daemon=True)
         self._thread.start()
 
     def emit(self, record: logging.LogRecord) -> None:
         """See `logging.Handler.emit`; never waits."""
         try:
-            self._lines.put_nowait(self.format(record))
+            addition = self._flood.addition(record)
+            if addition is None:
+                return
+            self._lines.put_nowait(f"{self.format(record)}{addition}")
         except queue.Full:
             self._left_out += 1
         except Exception:  # noqa: BLE001 - of whoever logs what cannot be formatted

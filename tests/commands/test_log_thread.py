@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING
 import pytest
 from support.waiting import PATIENCE_S
 
+from daqsvc.cli import start_logging
 from daqsvc.commands import log_thread
+from daqsvc.commands.log_flood import LogFlood
 from daqsvc.commands.log_thread import LogThread
 
 if TYPE_CHECKING:
@@ -44,6 +46,62 @@ def test_lines_are_written_in_order(pipe: tuple[int, int]) -> None:
     handler.flush_within(20.0)
     assert os.read(pipe[0], 65536).decode().splitlines() == [f"line {n}" for n in range(100)]
     handler.end()
+
+
+def test_what_comes_again_and_again_is_limited_by_its_cause() -> None:
+    now_s = [0.0]
+    flood = LogFlood(lambda: now_s[0])
+
+    def written(count: int, *args: object, text: str = "bus %s has lost %d frames") -> list[str]:
+        additions = [
+            flood.addition(logging.LogRecord("n", logging.WARNING, "p", 1, text, args, None))
+            for _ in range(count)
+        ]
+        return [one for one in additions if one is not None]
+
+    told = written(500, "can0", 3)
+    assert told == [""] * 19 + [" (further lines like this are left out for 60 s)"]
+    assert written(1, "can1", 3) == written(1, "can0", 3, text="bus %s is back, %d") == [""], "others are not"
+    now_s[0] = 59.9
+    assert written(1, "can0", 4) == []
+    now_s[0] = 60.0
+    assert written(2, "can0", 4) == [" (481 lines like this were left out)", ""]
+    for n in range(5000):
+        written(1, n)
+    assert len(flood._windows) == 1000
+
+
+def test_a_flood_does_not_reach_the_reader(pipe: tuple[int, int]) -> None:
+    handler = LogThread(pipe[1])
+    for _ in range(1000):
+        handler.emit(record("again"))
+    handler.flush_within(20.0)
+    lines = os.read(pipe[0], 65536).decode().splitlines()
+    assert lines == ["again"] * 19 + ["again (further lines like this are left out for 60 s)"]
+    handler.end()
+
+
+@pytest.mark.parametrize(
+    ("level", "priority"),
+    [(logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (logging.DEBUG, 7)],
+)
+def test_the_journal_is_told_the_level_of_each_line(
+    level: int, priority: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stderr = os.fstat(2)
+    told = logging.LogRecord("n", level, "p", 1, "one\ntwo", None, None)
+
+    def formatted() -> str:
+        handler = logging.NullHandler()
+        start_logging(verbose=False, handler=handler)
+        return handler.format(told)
+
+    monkeypatch.setenv("JOURNAL_STREAM", f"{stderr.st_dev}:{stderr.st_ino}")
+    assert formatted() == f"<{priority}>{told.levelname} one\n<{priority}>two"
+    monkeypatch.setenv("JOURNAL_STREAM", "8:1")
+    assert formatted() == f"{told.levelname} one\ntwo", "inherited, and stderr goes elsewhere"
+    monkeypatch.delenv("JOURNAL_STREAM")
+    assert formatted().endswith(f" {told.levelname} one\ntwo")
 
 
 def test_a_reader_that_hangs_costs_lines_and_no_time(
