@@ -12,6 +12,8 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 if TYPE_CHECKING:
     from typing import Self
 
+    from pydantic_core import ErrorDetails
+
 
 class Verb(StrEnum):
     """What is asked."""
@@ -125,10 +127,40 @@ def faults_of(error: ValidationError, whole: str) -> list[str]:
         whole: what the command as a whole is called.
     """
     return [
-        # What checks of our own find pydantic marks by their exception.
-        f"{'.'.join(map(str, fault['loc'])) or whole}: {fault['msg'].removeprefix('Value error, ')}"
+        f"{'.'.join(map(str, fault['loc'])) or whole}: {_words(fault)}"
         for fault in error.errors(include_url=False)
     ]
+
+
+_WORDS = {
+    "missing": "is missing",
+    "extra_forbidden": "there is no such key",
+    "json_invalid": "is no JSON: {error}",
+    "json_type": "is no JSON",
+    "model_type": "must be a JSON object",
+    "string_type": "must be a text",
+    "too_short": "must not be empty",
+    "too_long": "must have {max_length} characters at most",
+    "string_pattern_mismatch": "must match {pattern}",
+    "float_type": "must be a number",
+    "finite_number": "must be a finite number",
+    "greater_than": "must be above {gt:g}",
+    "literal_error": "must be {expected}",
+    "enum": "must be {expected}",
+    "timezone_aware": "must have an offset from UTC, e.g. 2026-01-31T12:00:00Z",
+    "datetime_type": "must be a time, e.g. 2026-01-31T12:00:00Z",
+    "datetime_parsing": "must be a time, e.g. 2026-01-31T12:00:00Z",
+    "datetime_from_date_parsing": "must be a time, e.g. 2026-01-31T12:00:00Z",
+    "datetime_object_invalid": "must be a time, e.g. 2026-01-31T12:00:00Z",
+}
+"""What is wrong, by the type of the error."""
+
+
+def _words(fault: ErrorDetails) -> str:
+    if fault["type"] in _WORDS:
+        return _WORDS[fault["type"]].format(**fault.get("ctx", {}))
+    # What checks of our own find pydantic marks by their exception.
+    return fault["msg"].removeprefix("Value error, ")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -500,13 +500,8 @@ class Pipeline:
             reason = f"detector {detector.name} has failed: {error_text(error)}"
             with self._supervisor.sparing_others(_part(detector), "nothing is said of that window"):
                 return [
-                    # One that speaks for each of its sensors is judged by them; any other blames itself.
-                    replace(
-                        held,
-                        quality="missing",
-                        reason=reason,
-                        sensors=() if held.detector == detector.name else held.sensors,
-                    )
+                    # It blames itself, also where it speaks for each of its sensors: they have done nothing.
+                    replace(held, quality="missing", reason=reason, sensors=())
                     for held in said_of_silence(detector, 0.0, window.t_end_ns)
                 ]
             return []

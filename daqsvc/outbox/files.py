@@ -178,7 +178,9 @@ def take_possession(path: Path) -> BinaryIO:
     except BlockingIOError:
         lock.close()
         raise OutboxError(
-            f"another daqsvc uses the store {path.parent}; stop it, or give this one a directory of its own"
+            f"another daqsvc uses the store {path.parent}; stop it if it watches the same machine, else give "
+            f"this one a directory of its own, e.g. {path.parent}/NAME, in [store] of its machine file: each "
+            "machine needs one"
         ) from None
     except BaseException:
         lock.close()

@@ -116,7 +116,8 @@ def _rests_on(alarm: Alarm) -> Iterator[str]:
     if isinstance(alarm, DiagnosisAlarm):
         yield f"detector-ok/{alarm.detector}"
     else:
-        yield from (f"sensor-ok/{sensor}" for sensor in alarm.watched)
+        for sensor in alarm.watched:
+            yield from (f"sensor-ok/{sensor}", f"detector-ok/levels/{sensor}")
 
 
 def _asked(machine: MachineFile, hook: str, *, spared: bool) -> Iterator[Any]:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 import threading
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import pytest
 from support.notify_sockets import NotifySocket
 
-from daqsvc.commands.service_manager import ServiceManager
+from daqsvc.commands.service_manager import ServiceManager, _Follower
 from daqsvc.supervision import Progress, StallWatch
 
 if TYPE_CHECKING:
@@ -109,3 +110,29 @@ def test_a_watchdog_that_is_too_short_or_no_number_is_warned_of_once(
     assert manager.watchdog_s == watchdog_s
     assert len(caplog.records) == bool(warning)
     assert warning in caplog.text
+
+
+@pytest.mark.parametrize(("watchdog_s", "held_to_s"), [(0.5, 3.0), (3.0, 3.0), (5.0, 5.0)])
+def test_parts_are_held_to_the_watchdog_but_to_three_seconds_at_least(
+    watchdog_s: float, held_to_s: float, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    fed: list[bool] = []
+    manager = ServiceManager("@nobody", watchdog_s)
+    monkeypatch.setattr(manager, "tell", lambda **told: fed.append("WATCHDOG" in told) or True)
+    outbox = SimpleNamespace(counters=SimpleNamespace(shut=0, unbacked=0, depth=0, waiting=0))
+    service: Any = SimpleNamespace(
+        ready=SimpleNamespace(is_set=lambda: True),
+        awaited=lambda *, patient: {},
+        progress=lambda: {"part": Progress(1)},
+        driver_reports=[],
+        alarms=SimpleNamespace(manager=SimpleNamespace(shown={}), outbox=outbox, outputs={}),
+    )
+    follower = _Follower(manager, service)
+    every_s, last_s = 0.25, 0.0
+    for look in range(40):
+        fed.clear()
+        follower.look(look * every_s)
+        last_s = look * every_s if any(fed) else last_s
+    manager.close()
+    assert held_to_s - watchdog_s / 2 - every_s <= last_s < held_to_s
+    assert f"part has stalled, without a step for {held_to_s:g} s: " in caplog.text

@@ -192,8 +192,8 @@ async def test_one_that_raises_each_time_is_in_doubt_all_the_time() -> None:
     assert supervisor.failures["detector broken"] == 3
 
 
-@pytest.mark.parametrize(("speaks_for", "sensors"), [("broken", ()), ("broken/x", ("x",))])
-async def test_one_that_fails_says_nothing_of_its_sensor(speaks_for: str, sensors: tuple[str, ...]) -> None:
+@pytest.mark.parametrize("speaks_for", ["broken", "broken/x"])
+async def test_one_that_fails_says_nothing_of_its_sensor(speaks_for: str) -> None:
     ring = SampleRing("s", ("a",), 50)
     broken = Listener("broken", 10, fail_at=0)
     held = Diagnosis("m", speaks_for, 0, "s", 0, 0, "N", quality="missing", sensors=("x",))
@@ -204,7 +204,7 @@ async def test_one_that_fails_says_nothing_of_its_sensor(speaks_for: str, sensor
     await eventually(lambda: len(said) == 1, "the window has failed")
     ring.close()
     await running
-    assert [(d.detector, d.quality, d.sensors) for d in said] == [(speaks_for, "missing", sensors)]
+    assert [(d.detector, d.quality, d.sensors) for d in said] == [(speaks_for, "missing", ())]
 
 
 class UnsayableError(Exception):

@@ -57,7 +57,7 @@ def test_what_are_no_frames_of_a_stream_is_refused_with_what_to_give(
     layout = FrameLayout.plain(
         frame_id=1,
         length=8,
-        channels=[("x", "int16", 1.0, 0.0)],
+        channels=[("x", 16, "signed", 1.0, 0.0)],
         samples_per_frame=1,
         counter_byte=0,
         first_byte=4,

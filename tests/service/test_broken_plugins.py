@@ -15,6 +15,9 @@ from support.waiting import eventually
 from daqsvc.acquisition.assembler import StreamCounters
 from daqsvc.acquisition.timebase import TimeBaseState
 from daqsvc.commands import service_manager
+from daqsvc.detectors.levels.detector import LevelDetector
+from daqsvc.detectors.levels.trends import TrendDetector
+from daqsvc.publish.make import watched
 from daqsvc.settings import parse_machine_file
 from drivers.base import BusCounters
 
@@ -250,6 +253,28 @@ async def test_a_driver_with_a_run_of_its_own_is_named_once_and_started_again(
     [line] = [record.getMessage() for record in caplog.records if record.levelno >= logging.ERROR]
     assert line.startswith(f"driver bad: run of mishap.OwnDriver has failed: {said} (mishap.py, line ")
     assert line.endswith("have the authors of daqsvc-mishap 2.1 mend it; it is started again")
+
+
+@pytest.mark.parametrize("levels", [LevelDetector, TrendDetector])
+async def test_levels_and_trends_that_fail_blame_no_sensor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, levels: Any
+) -> None:
+    def failing(*_: object) -> Never:
+        raise ZeroDivisionError
+
+    text = MACHINE.partition("[pipeline.mishap]")[0] + STREAM.format(name="good", how="")
+    text += "[pipeline.levels]\nwindow_s = 0.1\nvelocity_band_hz = [10.0, 80.0]\n"
+    text += '[[alarms]]\nname = "vibration"\nsensor = "good"\nmeasure = "rms"\nalert = 5.0\n'
+    if levels is TrendDetector:
+        text = text.replace('type = "accelerometer"', 'type = "trend"').replace('"rms"', '"value"')
+    monkeypatch.setattr(levels, "process", failing)
+    machine = parse_machine_file(text, tmp_path / "machine.toml")
+    async with running(machine, tmp_path / "store") as service:
+        alarms = service.alarms.manager.alarms
+        await eventually(lambda: "detector-ok/levels/good" in alarms, "it is raised")
+        assert alarms["detector-ok/levels/good"].state.is_active
+        assert "sensor-ok/good" not in alarms
+    assert watched(machine).rests_on["vibration"] == ("sensor-ok/good", "detector-ok/levels/good")
 
 
 def _failing(_: object) -> Never:
