@@ -32,6 +32,7 @@ from daqsvc.recording.recording import (
     matching,
     set_limits,
 )
+from daqsvc.settings.failures import one_line
 from daqsvc.settings.plugins import configured, detector_tables
 from daqsvc.settings.problems import AssemblyError
 
@@ -157,7 +158,7 @@ class Runner:
             return self._outcome(_not_judged(self.detectors, recording, str(error)), {})
         present, machine = self._as_recorded(loaded)
         left_out = (one.left_out(loaded.names) for one in self.detectors.values())
-        notes = [*loaded.notes, *filter(None, left_out)]
+        notes = [*loaded.notes, *map(one_line, filter(None, left_out))]
         evaluated: dict[str, Evaluated] = {}
         wrong = ""
         for key, settings in present.items():
@@ -167,7 +168,7 @@ class Runner:
                     Recorded(machine, loaded, detector.options), settings, progress
                 )
             except (ValueError, AssemblyError) as error:
-                wrong = str(error)
+                wrong = one_line(str(error))
                 continue
             draw = evaluated[key].draw
             if figures is not None and draw is not None:

@@ -89,6 +89,21 @@ def test_a_store_that_this_account_cannot_use_is_a_warning(tmp_path: Path, check
     assert f"the store {store} has mode 0777, so that others may put files of theirs into it" in out
 
 
+def test_a_store_that_may_not_be_written_is_a_warning(
+    tmp_path: Path, check: Check, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = tmp_path / "alarms"
+    store.mkdir(mode=0o700)
+    allowed = os.access
+    monkeypatch.setattr(os, "access", lambda path, mode: path != store and allowed(path, mode))
+    code, out, _ = check(store)
+    assert code == 0
+    assert f"the store {store} may not be written by" in out
+    monkeypatch.undo()
+    monkeypatch.setattr("daqsvc.outbox.safety.is_read_only", lambda path: path == store)
+    assert f"the store {store} cannot be written: " in check(store)[1]
+
+
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a directory away")
 def test_a_store_of_somebody_else_is_a_warning(tmp_path: Path, check: Check) -> None:
     store = tmp_path / "alarms"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -145,6 +146,36 @@ def test_it_judges_recordings_too(tmp_path: Path, capsys: pytest.CaptureFixture[
     # The other bearing alone has nothing for it.
     assert main(["analyze", str(file), str(tmp_path / "accel-nde.npz"), "--json"]) == 0
     assert set(json.loads(capsys.readouterr().out)["detectors"]) == {"levels/accel-nde"}
+
+
+def test_why_it_refuses_a_recording_steers_no_terminal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Refusing(api.RecordedDetector[Any]):
+        def evaluate(self, *_: Any) -> Any:
+            raise ValueError("it is\n\x1b[2J too short")
+
+    def refusing(_self: Any, machine: MachineFile, given: Any, options: api.RecordingOptions) -> Refusing:
+        return Refusing(machine, given, options)
+
+    monkeypatch.setattr(importlib.import_module("crest").CrestPlugin, "recorded", refusing)
+    main(["analyze", str(two_sensors(tmp_path)), str(tmp_path / "accel-de.npz")])
+    said = "".join(capsys.readouterr())
+    assert "too short" in said
+    assert all(line.isprintable() for line in said.splitlines())
+
+
+def test_a_statement_by_hand_that_cannot_be_told_is_refused_in_recordings_too(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def process(self: Any, window: Window) -> list[api.Diagnosis]:
+        return [replace(one, statistics={"rms": np.nan}) for one in api.WindowDetector.process(self, window)]
+
+    monkeypatch.setattr(importlib.import_module("crest").CrestDetector, "process", process, raising=False)
+    main(["analyze", str(two_sensors(tmp_path)), str(tmp_path / "accel-de.npz")])
+    said = "".join(capsys.readouterr())
+    assert "it returns a statement that cannot be told: rms is nan; give a finite number" in said
+    assert "Traceback" not in said
 
 
 def test_it_may_say_what_else_is_shown_of_a_recording(
