@@ -95,8 +95,14 @@ def load(path: Path) -> MachineFile | None:
     try:
         return load_machine_file(path)
     except MachineFileError as error:
-        print(error, file=sys.stderr)  # noqa: T201 - errors of the command line go to stderr
+        text = f"{error}" if not _is_journal() else _with_level(f"{error}", logging.ERROR)
+        print(text, file=sys.stderr)  # noqa: T201 - errors of the command line go to stderr
         return None
+
+
+def _with_level(text: str, level: int) -> str:
+    priority = next(number for least, number in _PRIORITIES if level >= least)
+    return "\n".join(f"<{priority}>{line}" for line in text.splitlines() if line)
 
 
 class _JournalFormatter(logging.Formatter):
@@ -104,32 +110,29 @@ class _JournalFormatter(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """See `logging.Formatter.format`."""
-        priority = next(number for least, number in _PRIORITIES if record.levelno >= least)
-        return "\n".join(f"<{priority}>{line}" for line in super().format(record).splitlines())
+        return _with_level(super().format(record), record.levelno)
 
 
 _PRIORITIES = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (0, 7))
 """Priorities of syslog(3) from these levels on."""
 
 
-def _stderr_as_stream() -> str:
-    """What ``$JOURNAL_STREAM`` says if stderr goes to the journal; who inherits it may write elsewhere."""
+def _is_journal() -> bool:
+    """Whether stderr goes to systemd's journal; who inherits ``$JOURNAL_STREAM`` may write elsewhere."""
     try:
         stderr = os.fstat(2)
     except OSError:
-        return ""
-    return f"{stderr.st_dev}:{stderr.st_ino}"
+        return False
+    return os.environ.get("JOURNAL_STREAM") == f"{stderr.st_dev}:{stderr.st_ino}"
 
 
 def start_logging(*, verbose: bool, handler: logging.Handler | None = None) -> None:
     """Log to stderr, or to a handler; under systemd as its journal takes it."""
     handler = handler or logging.StreamHandler()
     text = "%(levelname)s %(message)s"
-    stream = os.environ.get("JOURNAL_STREAM")
-    if stream is None:
+    if "JOURNAL_STREAM" not in os.environ:
         text = f"%(asctime)s {text}"
-    is_journal = stream is not None and stream == _stderr_as_stream()
-    handler.setFormatter(_JournalFormatter(text) if is_journal else logging.Formatter(text))
+    handler.setFormatter(_JournalFormatter(text) if _is_journal() else logging.Formatter(text))
     logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, handlers=[handler])
     logging.getLogger("can").setLevel(logging.ERROR)
 

@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING
 import pytest
 from support.waiting import PATIENCE_S
 
-from daqsvc.cli import start_logging
+from daqsvc.cli import load, start_logging
 from daqsvc.commands import log_thread
 from daqsvc.commands.log_flood import LogFlood
 from daqsvc.commands.log_thread import LogThread
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
 
 def record(text: str) -> logging.LogRecord:
@@ -86,7 +87,11 @@ def test_a_flood_does_not_reach_the_reader(pipe: tuple[int, int]) -> None:
     [(logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (logging.DEBUG, 7)],
 )
 def test_the_journal_is_told_the_level_of_each_line(
-    level: int, priority: int, monkeypatch: pytest.MonkeyPatch
+    level: int,
+    priority: int,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     stderr = os.fstat(2)
     told = logging.LogRecord("n", level, "p", 1, "one\ntwo", None, None)
@@ -98,6 +103,11 @@ def test_the_journal_is_told_the_level_of_each_line(
 
     monkeypatch.setenv("JOURNAL_STREAM", f"{stderr.st_dev}:{stderr.st_ino}")
     assert formatted() == f"<{priority}>{told.levelname} one\n<{priority}>two"
+    if level == logging.ERROR:
+        file = tmp_path / "broken.toml"
+        file.write_text("site = 5\n")
+        assert load(file) is None
+        assert all(line.startswith(f"<3>{file}") for line in capsys.readouterr().err.splitlines())
     monkeypatch.setenv("JOURNAL_STREAM", "8:1")
     assert formatted() == f"{told.levelname} one\ntwo", "inherited, and stderr goes elsewhere"
     monkeypatch.delenv("JOURNAL_STREAM")

@@ -25,7 +25,7 @@ from support.vcan_links import VcanLink
 
 from daqsvc import kernel_cache
 from daqsvc.alarms.commands import Verb
-from daqsvc.control import ControlRequest, ask
+from daqsvc.control import ControlRequest, ask, ask_status
 from daqsvc.outbox.reading import read_journal
 from daqsvc.settings import load_machine_file
 from drivers.can.plugin import frame_layout
@@ -69,8 +69,9 @@ def shown(unit: str = UNIT) -> dict[str, str]:
     return dict(line.split("=", 1) for line in sh("systemctl", "show", unit, "-p", keys).splitlines())
 
 
-def journal(unit: str = UNIT) -> str:
-    return sh("journalctl", "-u", unit, "--no-pager", "-o", "cat")
+def journal(unit: str = UNIT, least: str = "debug") -> str:
+    """What the journal has of a unit, from a level on."""
+    return sh("journalctl", "-u", unit, "--no-pager", "-o", "cat", "-p", least)
 
 
 def until(true: Any, what: str) -> Any:
@@ -279,6 +280,12 @@ def test_whatever_ends_it_it_is_started_again_and_its_alarms_stand_as_they_did(u
         say(f"{what}: ready again after {time.monotonic() - begun_s:.1f} s")
         assert now["NRestarts"] == str(number)
         assert alarm(name) == stands
+    status = ask_status(STORE)
+    assert (status["buses"]["can0"]["state"], status["outputs"]) == ("up", {"mqtt": {"connected": False}})
+    away = "WARNING MQTT broker"
+    assert away in journal(least="warning")
+    assert away not in journal(least="err")
+    assert "CRITICAL detector levels/shaft has stalled" in journal(least="crit")
     said = journal()
     assert "detector levels/shaft has stalled, without a step for 6 s" in said
     assert "the event loop has stood still for 3 s: the event loop is in look (unit_main.py" in said
@@ -341,7 +348,7 @@ def test_a_wrong_machine_file_is_not_tried_again_and_again() -> None:
     assert done.returncode != 0
     now = until(lambda: (one := shown("daqsvc@broken"))["ActiveState"] == "failed" and one, "it has failed")
     assert (now["ExecMainStatus"], now["NRestarts"]) == ("2", "0")
-    assert "broken.toml:2: site = 5" in journal("daqsvc@broken")
+    assert "broken.toml:2: site = 5" in journal("daqsvc@broken", "err")
 
 
 def test_it_stops_within_two_seconds(unit: str) -> None:
