@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from support.made_once import made_once
 from support.paths import ROOT
 
 import daqsvc
@@ -27,7 +28,12 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The package, built of a copy of the tree; its files are unpacked beside it."""
     if shutil.which("dh") is None or not Path("/usr/bin/python3.11").exists():
         pytest.skip("a Debian package is built with debhelper and Debian's python3.11")
-    tree = tmp_path_factory.mktemp("deb") / "tree"
+    return made_once(tmp_path_factory, "deb", build)
+
+
+def build(folder: Path) -> Path:
+    """The package of a copy of the tree, in a folder; its path."""
+    tree = folder / "tree"
     shutil.copytree(ROOT, tree, ignore=shutil.ignore_patterns(".*", "tests", "__pycache__", "build", "dist"))
     ready = Path(sys.prefix) / ".ready"
     built = subprocess.run(
