@@ -105,7 +105,17 @@ def _with_level(text: str, level: int) -> str:
     return "\n".join(f"<{priority}>{line}" for line in text.splitlines() if line)
 
 
-class _JournalFormatter(logging.Formatter):
+class _OneLine(logging.Formatter):
+    """A message on one line, whatever words of plugins and devices are in it; tracebacks have their own."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - of logging
+        from daqsvc.settings.failures import one_line  # noqa: PLC0415 - each verb imports only what it needs
+
+        record.message = one_line(record.message)
+        return super().formatMessage(record)
+
+
+class _JournalFormatter(_OneLine):
     """Lines for systemd's journal: no time stamps, and the level in front, see sd-daemon(3)."""
 
     def format(self, record: logging.LogRecord) -> str:
@@ -132,7 +142,7 @@ def start_logging(*, verbose: bool, handler: logging.Handler | None = None) -> N
     text = "%(levelname)s %(message)s"
     if "JOURNAL_STREAM" not in os.environ:
         text = f"%(asctime)s {text}"
-    handler.setFormatter(_JournalFormatter(text) if _is_journal() else logging.Formatter(text))
+    handler.setFormatter(_JournalFormatter(text) if _is_journal() else _OneLine(text))
     logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, handlers=[handler])
     logging.getLogger("can").setLevel(logging.ERROR)
 

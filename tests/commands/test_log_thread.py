@@ -94,7 +94,8 @@ def test_the_journal_is_told_the_level_of_each_line(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     stderr = os.fstat(2)
-    told = logging.LogRecord("n", level, "p", 1, "one\ntwo", None, None)
+    told = logging.LogRecord("n", level, "p", 1, "one", None, None)
+    told.exc_text = "two"  # a traceback has lines of its own
 
     def formatted() -> str:
         handler = logging.NullHandler()

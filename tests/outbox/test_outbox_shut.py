@@ -219,6 +219,6 @@ async def test_the_whole_service_watches_on_a_full_disk(disk):
 
 async def test_what_a_start_cannot_mend_is_still_refused(tmp_path):
     (tmp_path / "file").write_text("not a directory")
-    with pytest.raises(OutboxError, match="give the service a directory"):
+    with pytest.raises(OutboxError, match="is no directory, but a file: name a directory in"):
         async with desk_in(tmp_path / "file"):
             pass

@@ -41,6 +41,7 @@ mishap = "mishap:MishapPlugin"
 SOURCE = """
 import asyncio
 import itertools
+import time
 
 import numpy as np
 
@@ -60,11 +61,13 @@ class MishapDriver(StreamDriver):
 
     async def read(self):
         self.link.up()
+        begun_s, number = time.monotonic(), 0
         while True:
             frame = np.zeros((1, 8), np.uint8)
             frame[0, :4] = np.frombuffer(next(self.count).to_bytes(4, "little"), np.uint8)
             self.take(self.port.streams[0], frame if self.how != "takes" else None)
-            await asyncio.sleep(0.005)
+            number += 1
+            await asyncio.sleep(max(0.0, begun_s + 0.005 * number - time.monotonic()))
             if self.how == "raises":
                 raise KeyError("it was here")
             if self.how == "exits":
