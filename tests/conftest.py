@@ -19,7 +19,7 @@ from support.examples import examples
 from support.paths import ROOT
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator
+    from collections.abc import AsyncIterator, Generator, Iterator
 
 # The machine that runs this may be slow and shared: what counts is what is right, not when.
 # The same examples in every run, so that a red run is red again; DAQSVC_ROAM=1 looks for new ones.
@@ -70,6 +70,20 @@ async def _no_leaked_tasks() -> AsyncIterator[None]:
     leaked = [t for t in asyncio.all_tasks() if t is not asyncio.current_task() and not t.done()]
     if leaked:
         pytest.fail(f"tasks that outlive the test: {[t.get_name() for t in leaked]}")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """What a test has printed or logged may be no Unicode, and a worker can only pass on what is."""
+    report = yield
+    report.sections = [(title, _encodable(text)) for title, text in report.sections]
+    if (said := report.longreprtext) != _encodable(said):
+        report.longrepr = _encodable(said)
+    return report
+
+
+def _encodable(text: str) -> str:
+    return text.encode(errors="backslashreplace").decode()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
