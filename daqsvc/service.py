@@ -334,7 +334,7 @@ class Service:
         return next(filter(None, over), "")
 
     def _report(self, diagnosis: Diagnosis) -> None:
-        self.report.take(diagnosis)
+        self.report.remember(diagnosis)
         with self.supervisor.sparing_others(
             f"alarms by {diagnosis.detector}", "one of its statements is lost"
         ):

@@ -108,8 +108,8 @@ class StatusReport:
         self._text = b""
         self._made_s = -math.inf
 
-    def take(self, diagnosis: Diagnosis) -> None:
-        """Take in a statement of a detector."""
+    def remember(self, diagnosis: Diagnosis) -> None:
+        """Keep a statement of a detector until its next one."""
         self._latest[diagnosis.detector] = diagnosis
         if diagnosis.statistics:
             self._measured[diagnosis.detector] = diagnosis
