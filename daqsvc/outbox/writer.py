@@ -248,6 +248,7 @@ class JournalWriter:
             try:
                 unsent = self._begin(post)
             except (OutboxError, *FileError) as error:
+                self._journal.close()  # first: whoever hears of it may try again at once
                 post(fail, opened, error)
                 return
             post(succeed, opened, unsent)

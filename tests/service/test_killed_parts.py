@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import ctypes
+import gc
 import threading
 import urllib.request
 from typing import TYPE_CHECKING, Any
@@ -24,7 +25,7 @@ from daqsvc.service import Service
 from daqsvc.supervision import EssentialLostError
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
+    from collections.abc import AsyncIterator, Callable, Iterator
     from pathlib import Path
 
     from support.brokers import Mosquitto
@@ -35,9 +36,11 @@ WRITER = "outbox-writer"
 
 
 @pytest.fixture(autouse=True)
-def _one_accident_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def _one_accident_at_a_time(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Waits grow with each failure of a part that comes soon after another; these have nothing in common."""
     monkeypatch.setattr(supervision, "WELL_S", 0.1)
+    yield
+    gc.collect()  # tasks whose end nobody has asked for are logged then, and not during another test
 
 
 class KilledError(Exception):
