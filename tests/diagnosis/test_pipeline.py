@@ -192,18 +192,23 @@ async def test_one_that_raises_each_time_is_in_doubt_all_the_time() -> None:
     assert supervisor.failures["detector broken"] == 3
 
 
-@pytest.mark.parametrize("speaks_for", ["broken", "broken/x"])
-async def test_one_that_fails_says_nothing_of_its_sensor(speaks_for: str) -> None:
-    ring = SampleRing("s", ("a",), 50)
-    broken = Listener("broken", 10, fail_at=0)
-    held = Diagnosis("m", speaks_for, 0, "s", 0, 0, "N", quality="missing", sensors=("x",))
-    broken.silent = lambda _silence_s, t_ns: [replace(held, t_ns=t_ns)]  # type: ignore[method-assign]
-    said: list[Diagnosis] = []
+async def said_of_a_failed_window(broken: Listener) -> list[Diagnosis]:
+    """What a pipeline reports of one window, in which its detector fails."""
+    ring, said = SampleRing("s", ("a",), 50), list[Diagnosis]()
     running = asyncio.create_task(Pipeline({"s": ring}, [broken], said.append, CLOCK).run())
     write(ring, 10)
     await eventually(lambda: len(said) == 1, "the window has failed")
     ring.close()
     await running
+    return said
+
+
+@pytest.mark.parametrize("speaks_for", ["broken", "broken/x"])
+async def test_one_that_fails_says_nothing_of_its_sensor(speaks_for: str) -> None:
+    broken = Listener("broken", 10, fail_at=0)
+    held = Diagnosis("m", speaks_for, 0, "s", 0, 0, "N", quality="missing", sensors=("x",))
+    broken.silent = lambda _silence_s, t_ns: [replace(held, t_ns=t_ns)]  # type: ignore[method-assign]
+    said = await said_of_a_failed_window(broken)
     assert [(d.detector, d.quality, d.sensors) for d in said] == [(speaks_for, "missing", ())]
 
 
@@ -296,16 +301,10 @@ async def test_a_statement_by_hand_is_held_to_what_a_judgement_is(
     untold: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     odd, words = UNTOLD[untold]
-    ring = SampleRing("s", ("a",), 50)
     broken = Listener("broken", 10)
     own = broken.process
     broken.process = lambda window: [replace(one, **odd) for one in own(window)]  # type: ignore[method-assign]
-    said: list[Diagnosis] = []
-    running = asyncio.create_task(Pipeline({"s": ring}, [broken], said.append, CLOCK).run())
-    write(ring, 10)
-    await eventually(lambda: len(said) == 1, "the window has failed")
-    ring.close()
-    await running
+    said = await said_of_a_failed_window(broken)
     begins = f"detector broken has failed: it returns a statement that cannot be told: {words}"
     assert said[0].reason.startswith(begins)
     [line] = [r.getMessage() for r in caplog.records if r.levelno >= logging.ERROR]

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import itertools
 import logging
 import sqlite3
 import subprocess
 import sys
 import textwrap
+import time
 
 import pytest
 from support.clocks import SettableClock
@@ -276,6 +278,17 @@ async def test_the_journal_of_sent_messages_is_bounded(tmp_path):
     assert kept[0] == old
     assert len(kept) <= 1 + TRIM_EVERY
     assert kept == [old, *sequences[len(sequences) + 1 - len(kept) :]]
+
+
+async def test_a_store_that_was_refused_is_free_when_that_is_told(tmp_path, monkeypatch):
+    with contextlib.closing(sqlite3.connect(tmp_path / "newer.sqlite")) as newer:
+        newer.execute("PRAGMA user_version = 99")
+    close = Journal.close
+    # A busy machine may leave the writer's thread alone just then.
+    monkeypatch.setattr(Journal, "close", lambda journal: (time.sleep(0.2), close(journal)))
+    for _ in range(2):
+        with pytest.raises(OutboxError, match="schema version 99"):
+            await opened(tmp_path / "newer.sqlite")
 
 
 async def test_what_cannot_be_used_is_said_with_a_remedy(tmp_path):
