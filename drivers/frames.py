@@ -300,7 +300,8 @@ class FrameLayout:
 
     def _crc(self, payloads: Payloads) -> NDArray[np.uint16]:
         assert self.crc_byte is not None  # noqa: S101 - callers ask only where there is one
-        covered = np.delete(payloads, [self.crc_byte, self.crc_byte + 1], axis=1).tobytes()
+        parts = payloads[:, : self.crc_byte], payloads[:, self.crc_byte + CRC_BYTES :]
+        covered = np.concatenate(parts, axis=1).tobytes()
         step = self.length - CRC_BYTES
         crcs = (binascii.crc_hqx(covered[i : i + step], 0xFFFF) for i in range(0, len(covered), step))
         return np.fromiter(crcs, np.uint16, len(payloads))

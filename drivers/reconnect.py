@@ -8,7 +8,8 @@ import logging
 import threading
 from collections import deque
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeAlias, TypeVar
+from weakref import WeakKeyDictionary
 
 from daqsvc.acquisition.link import Backoff
 from daqsvc.settings.failures import BrokenContractError, said_by
@@ -193,11 +194,16 @@ Call: TypeAlias = "tuple[Callable[..., object], tuple[Any, ...]]"
 
 
 class HandOver:
-    """Has calls made on the event loop in their order, one in each turn.
+    """Has calls made on the event loop in their order; of all that hand over there, one in each turn of it.
+
+    Batches of many buses that come at once would hold up all else for as long as they take together.
 
     Args:
         loop: the event loop.
     """
+
+    _lines: ClassVar[WeakKeyDictionary[asyncio.AbstractEventLoop, deque[HandOver]]] = WeakKeyDictionary()
+    """By event loop, those who have something to hand over, the next one first."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
@@ -216,23 +222,32 @@ class HandOver:
             if self._due:
                 return
             self._due = True
-        self._loop.call_soon_threadsafe(self._next)
+        self._loop.call_soon_threadsafe(self._line_up)
 
     def finish(self) -> None:
         """Make at once all calls that wait; on the event loop, when nobody posts any more."""
         while self._calls:
             self._make()
 
-    def _next(self) -> None:
+    def _line_up(self) -> None:
+        line = self._lines.setdefault(self._loop, deque())
+        line.append(self)
+        if len(line) == 1:
+            self._loop.call_soon(self._next, line)
+
+    def _next(self, line: deque[HandOver]) -> None:
         """Make the next call, and come back for the one after it when all others had their turn."""
         try:
             if self._calls:
                 self._make()
         finally:
+            line.popleft()
             with self._lock:
                 self._due = bool(self._calls)
                 if self._due:
-                    self._loop.call_soon(self._next)
+                    line.append(self)
+            if line:
+                self._loop.call_soon(line[0]._next, line)  # noqa: SLF001 - another of this class
 
     def _make(self) -> None:
         call, arguments = self._calls.popleft()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import grp
 import logging
 import os
 import stat
@@ -92,6 +93,39 @@ def why_not_open(error: Exception, port: str, key: str) -> str:
         return "another program has it open; stop that program"
     if number == errno.ENOENT:
         return f"there is no {port}; plug the device in, or correct {key}"
-    if number in {errno.EACCES, errno.EPERM}:
-        return "permission denied; make the service's user a member of the group dialout"
+    if number == errno.EACCES:
+        return f"permission denied; {_remedy_of_owner(port)}"
+    if number == errno.EPERM:
+        return "not permitted: a sandbox keeps it away; allow it by DeviceAllow= in a drop-in of the unit"
+    if kind := _other_kind(port):
+        return f"{port} is no serial port ({kind}); plug the device in, or correct {key}"
     return f"{error}" or type(error).__name__
+
+
+def _other_kind(port: str) -> str:
+    """What stands at a path where no device can be; empty if it may be one."""
+    try:
+        mode = os.stat(port).st_mode  # noqa: PTH116 - as above
+    except (OSError, ValueError):
+        return ""
+    return "a file" if stat.S_ISREG(mode) else "a directory" if stat.S_ISDIR(mode) else ""
+
+
+def _remedy_of_owner(port: str) -> str:
+    """What lets the service open a port that belongs to somebody else."""
+    member = "make the service's user a member of the group {}"
+    try:
+        status = os.stat(port)  # noqa: PTH116 - as above
+    except OSError:
+        return member.format("dialout")
+    try:
+        group = grp.getgrgid(status.st_gid).gr_name
+    except KeyError:
+        group = f"{status.st_gid}"
+    if status.st_mode & stat.S_IRGRP and status.st_mode & stat.S_IWGRP:
+        return member.format(group)
+    mode = stat.S_IMODE(status.st_mode)
+    return (
+        f"its owner alone may open it (mode {mode:04o}, group {group}): give it to dialout with mode 0660 by "
+        f"a rule of udev, and {member.format('dialout')}"
+    )

@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from daqsvc.kernels import njit
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -91,37 +93,34 @@ def clock_line(
     Returns:
         None if all buckets have the same sample count, or have come at the same time: no line can be told.
     """
-    table = _one_for_each_count(np.asarray(buckets, np.float64))
-    span_ns = float(np.ptp(table[:, 1]))
-    # From the window's beginning on: a device may have counted for months.
-    begin = float(table[0, 0])
-    x, arrivals, mean_x, mean_late = table[:, 0] - begin, table[:, 2], table[:, 3] - begin, table[:, 4]
-    if not (x[-1] > 0.0 and span_ns > 0.0):
-        return None
-    late = table[:, 1] - table[:, 0] * nominal_ns
-    slope = float(np.clip(_support_slope(x, late), *slopes_ns))
-    along = (table[:, 1] - table[:, 1].min()) / span_ns
-    offset, gap, missed = _touching(x, late, along, slope)
-    behind = mean_late - slope * mean_x
-    behind -= behind.min()
-    usual = behind <= _STALLED * np.median(behind)
-    mean_slope, spread_ns = _mean_slope(arrivals[usual], mean_x[usual], mean_late[usual])
-    if usual.sum() < _LEAST_USUAL or spread_ns > SOFT * gap or mean_slope != np.clip(mean_slope, *slopes_ns):
-        return ClockLine(slope, offset - slope * begin, _SUPPORT_ERROR[0] * gap + _SUPPORT_ERROR[1] * missed)
-    offset, gap, missed = _touching(x, late, along, mean_slope)
-    return ClockLine(
-        mean_slope, offset - mean_slope * begin, spread_ns + _MEAN_ERROR[0] * gap + _MEAN_ERROR[1] * missed
-    )
+    table = _one_for_each_count(np.ascontiguousarray(buckets, np.float64))
+    found, *line = _line_under(table, nominal_ns, *slopes_ns)
+    return ClockLine(*line) if found else None
 
 
 def _one_for_each_count(table: Floats) -> Floats:
     """Buckets ``[n, 5]`` in the order of their sample counts, the earliest of each."""
+    if (table[1:, 0] > table[:-1, 0]).all():
+        return table
     table = table[np.lexsort((table[:, 1], table[:, 0]))]
     first = np.ones(len(table), np.bool_)
     first[1:] = table[1:, 0] != table[:-1, 0]
     return table[first]
 
 
+@njit("float64(float64[::1])", cache=True, nogil=True, error_model="numpy")
+def _median(values: Floats) -> float:
+    """``numpy.median``, by the sort that is compiled anyway."""
+    ranked, middle = np.sort(values), len(values) // 2
+    return float(ranked[middle] if len(values) % 2 else (ranked[middle - 1] + ranked[middle]) / 2.0)
+
+
+@njit(
+    "Tuple((float64, float64, float64))(float64[::1], float64[::1], float64[::1], float64)",
+    cache=True,
+    nogil=True,
+    error_model="numpy",
+)
 def _touching(x: Floats, late: Floats, along: Floats, slope: float) -> tuple[float, float, float]:
     """The line of a given slope under all arrivals.
 
@@ -133,26 +132,30 @@ def _touching(x: Floats, late: Floats, along: Floats, slope: float) -> tuple[flo
         estimated to lie above the least delay there is.
     """
     above = late - slope * x
-    offset = float(above.min())
-    gaps = []
-    for parts in (PARTS, PARTS**2):
-        part = np.minimum(along * parts, parts - 1).astype(np.int64)
+    offset = above.min()
+    gaps = np.empty(2)
+    for k in range(2):
+        parts = PARTS if k == 0 else PARTS**2
         least = np.full(parts, np.inf)
-        np.minimum.at(least, part, above - offset)
+        come = np.zeros(parts)
+        for i in range(len(x)):
+            part = int(min(along[i] * parts, parts - 1.0))
+            least[part] = min(least[part], above[i] - offset)
+            come[part] += 1.0
         # What comes at once after a stall tells how long that was, and nothing of the clock.
-        heard = np.bincount(part, minlength=parts) * parts >= _HEARD * len(x)
-        ranked = np.sort(least[heard])
-        calm = ranked[: len(ranked) - round(len(ranked) / PARTS)]
-        gaps.append(float(min(ranked.mean(), _CALM * calm.mean())))
+        ranked = np.sort(least[come * parts >= _HEARD * len(x)])
+        calm = ranked[: len(ranked) - int(np.rint(len(ranked) / PARTS))]
+        gaps[k] = min(ranked.mean(), _CALM * calm.mean())
     gap, fine_gap = gaps
     if gap <= 0.0:
         # So few arrivals that the line touches one in each part: the rest of them tell what there is to tell.
-        gap = float(above.mean()) - offset
+        gap = above.mean() - offset
         return offset, gap, gap
     growth = min(max(fine_gap / gap - 1.0, _LEAST_GROWTH), float(PARTS))
     return offset, gap, gap / (growth - 1.0)
 
 
+@njit("float64(float64[::1], float64[::1])", cache=True, nogil=True, error_model="numpy")
 def _support_slope(x: Floats, late: Floats) -> float:
     """Slope of the edge of the lower convex hull that spans the mean of ``x``.
 
@@ -165,14 +168,23 @@ def _support_slope(x: Floats, late: Floats) -> float:
     slope = 0.0
     # Each step lowers the line where the sides meet, and there are only so many points.
     for _ in range(len(x)):
-        slope = float((late[right] - late[left]) / (x[right] - x[left]))
+        slope = (late[right] - late[left]) / (x[right] - x[left])
         lowest = int(np.argmin(late - slope * x))
         if late[lowest] - late[left] >= slope * (x[lowest] - x[left]) - _TOUCHES_NS:
             break
-        left, right = (lowest, right) if lowest < split else (left, lowest)
+        if lowest < split:
+            left = lowest
+        else:
+            right = lowest
     return slope
 
 
+@njit(
+    "UniTuple(float64, 2)(float64[::1], float64[::1], float64[::1])",
+    cache=True,
+    nogil=True,
+    error_model="numpy",
+)
 def _mean_slope(arrivals: Floats, x: Floats, late: Floats) -> tuple[float, float]:
     """Slope of least squares, and by how much it may be off at the end of the window, in ns.
 
@@ -181,13 +193,53 @@ def _mean_slope(arrivals: Floats, x: Floats, late: Floats) -> tuple[float, float
     weight = arrivals / arrivals.sum()
     centred = x - (weight * x).sum()
     moment = (weight * centred**2).sum()
-    reach = float(centred[-1] - centred[0])
+    reach = centred[-1] - centred[0]
     if not (moment > 0.0 and reach > 0.0):
         return 0.0, np.inf
-    slope = float((weight * centred * late).sum() / moment)
+    slope = (weight * centred * late).sum() / moment
     left = late - (weight * late).sum() - slope * centred
-    parts = np.minimum((centred - centred[0]) * (2 * PARTS / reach), 2 * PARTS - 1).astype(np.int64)
-    share = np.bincount(parts, weight, 2 * PARTS)
-    means = np.bincount(parts, weight * left, 2 * PARTS)[share > 0] / share[share > 0]
-    deviation = float(np.sqrt((share[share > 0] * means**2).sum() / max(len(means) - 2, 1)))
-    return slope, _SIGMAS * deviation * float(np.abs(centred).max() / np.sqrt(moment))
+    share, means = np.zeros(2 * PARTS), np.zeros(2 * PARTS)
+    for i in range(len(x)):
+        part = int(min((centred[i] - centred[0]) * (2 * PARTS / reach), 2 * PARTS - 1.0))
+        share[part] += weight[i]
+        means[part] += weight[i] * left[i]
+    there = share > 0.0
+    squares = (means[there] ** 2 / share[there]).sum()
+    deviation = np.sqrt(squares / max(there.sum() - 2, 1))
+    return slope, _SIGMAS * deviation * np.abs(centred).max() / np.sqrt(moment)
+
+
+@njit(
+    "Tuple((boolean, float64, float64, float64))(float64[:, ::1], float64, float64, float64)",
+    cache=True,
+    nogil=True,
+    error_model="numpy",
+)
+def _line_under(
+    table: Floats, nominal_ns: float, least_slope: float, greatest_slope: float
+) -> tuple[bool, float, float, float]:
+    """The better of the two lines under buckets with rising sample counts; see `clock_line`.
+
+    Returns:
+        Whether there is a line; its slope, its offset and its error, in the order of `ClockLine`.
+    """
+    first_ns, span_ns = table[:, 1].min(), table[:, 1].max() - table[:, 1].min()
+    # From the window's beginning on: a device may have counted for months.
+    begin = table[0, 0]
+    x, mean_x = table[:, 0] - begin, table[:, 3] - begin
+    if not (x[-1] > 0.0 and span_ns > 0.0):
+        return False, 0.0, 0.0, 0.0
+    late, mean_late = table[:, 1] - table[:, 0] * nominal_ns, table[:, 4].copy()
+    slope = min(max(_support_slope(x, late), least_slope), greatest_slope)
+    along = (table[:, 1] - first_ns) / span_ns
+    offset, gap, missed = _touching(x, late, along, slope)
+    behind = mean_late - slope * mean_x
+    behind -= behind.min()
+    usual = behind <= _STALLED * _median(behind)
+    mean_slope, spread_ns = _mean_slope(table[:, 2][usual], mean_x[usual], mean_late[usual])
+    likely = least_slope <= mean_slope <= greatest_slope
+    if usual.sum() < _LEAST_USUAL or spread_ns > SOFT * gap or not likely:
+        return True, slope, offset - slope * begin, _SUPPORT_ERROR[0] * gap + _SUPPORT_ERROR[1] * missed
+    offset, gap, missed = _touching(x, late, along, mean_slope)
+    error_ns = spread_ns + _MEAN_ERROR[0] * gap + _MEAN_ERROR[1] * missed
+    return True, mean_slope, offset - mean_slope * begin, error_ns

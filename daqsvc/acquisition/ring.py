@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import heapq
 import itertools
+from array import array
 from bisect import bisect_right
 from collections import deque
 from typing import TYPE_CHECKING
@@ -80,8 +81,10 @@ class SampleRing:
         self._data = np.full((capacity, len(channels)), np.nan, np.float32)
         self._oldest = 0
         self._end: int | None = None
-        self._anchor_index = [0] * ANCHORS
-        self._anchor_time = [(0, 0.0)] * ANCHORS
+        # Objects in lists would take six times the memory, and that only when the ring has run for minutes.
+        self._anchor_index = array("q", bytes(8 * ANCHORS))
+        self._anchor_t_ns = array("q", bytes(8 * ANCHORS))
+        self._anchor_period_ns = array("d", bytes(8 * ANCHORS))
         self._anchors = 0
         self._gaps: deque[tuple[int, int]] = deque(maxlen=GAPS)
         self._breaks: deque[int] = deque(maxlen=GAPS)
@@ -137,7 +140,8 @@ class SampleRing:
         self.samples_lost += block.lost_before
         slot = self._anchors % ANCHORS
         self._anchor_index[slot] = block.first_index
-        self._anchor_time[slot] = (block.t_first_ns, block.period_ns)
+        self._anchor_t_ns[slot] = block.t_first_ns
+        self._anchor_period_ns[slot] = block.period_ns
         self._anchors += 1
         self._end = block.end_index
         self._wake()
@@ -207,8 +211,8 @@ class SampleRing:
         known = range(max(0, self._anchors - ANCHORS), self._anchors)
         place = bisect_right(known, index, key=lambda k: self._anchor_index[k % ANCHORS])
         slot = known[max(place - 1, 0)] % ANCHORS
-        t_ns, period_ns = self._anchor_time[slot]
-        return t_ns + (index - self._anchor_index[slot]) * period_ns, period_ns
+        period_ns = self._anchor_period_ns[slot]
+        return self._anchor_t_ns[slot] + (index - self._anchor_index[slot]) * period_ns, period_ns
 
     async def wait_for(self, index: int) -> None:
         """Wait until sample ``index - 1`` has been written, so that everything below ``index`` is there.
@@ -222,7 +226,11 @@ class SampleRing:
             raise RingClosed(f"{self.stream!r} ended at {self.end_index}, before index {index}")
         woken: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         heapq.heappush(self._waiting, (index, next(self._order), woken))
-        await woken
+        try:
+            await woken
+        finally:
+            # Else its exception, which holds this frame, would keep the ring until the collector comes.
+            del woken
 
     async def window(self, trigger: int, before: int, after: int) -> Samples:
         """The samples around a trigger: ``before`` of them up to it and ``after`` from it on.

@@ -22,6 +22,7 @@ from drivers.can.batches import (
 from drivers.can.errors import ALL_CLASSES, BUS_OFF
 
 if TYPE_CHECKING:
+    import threading
     from collections.abc import Iterator, Sequence
 
     from daqsvc.acquisition.clock import Clock
@@ -32,6 +33,7 @@ LINUX_ERRORS = frozenset({"unixbus"})
 
 BATCH_FRAMES = 2048
 GATHER_S = 0.002
+"""A frame is taken to come when it is read: the longer it waits, the later."""
 
 
 class CanAdapter:
@@ -43,7 +45,6 @@ class CanAdapter:
         error_classes: see `drivers.can.batches.CanSource`.
     """
 
-    gather_s = GATHER_S
     recovers = False
 
     def __init__(self, bus: can.BusABC, clock: Clock, error_classes: int = BUS_OFF) -> None:
@@ -80,6 +81,10 @@ class CanAdapter:
             if not messages:
                 raise self._failure
         return batch_of(messages, arrival_ns, drained_ns)
+
+    def gather(self, stopping: threading.Event) -> None:
+        """See `drivers.can.batches.CanSource.gather`."""
+        stopping.wait(GATHER_S)
 
     def close(self) -> None:
         """See `drivers.can.batches.CanSource.close`."""

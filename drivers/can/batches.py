@@ -15,6 +15,7 @@ from drivers.can.errors import ErrorCounts
 from drivers.frames import DecodedBatch
 
 if TYPE_CHECKING:
+    import threading
     from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
@@ -77,9 +78,6 @@ class CanBatch:
 class CanSource(Protocol):
     """An open bus; `read` is called from one thread."""
 
-    gather_s: float
-    """How long frames may gather before the next read, so that one turn of the event loop serves many."""
-
     error_classes: int
     """Which classes of error frames this source reports as ``linux/can/error.h`` means them."""
 
@@ -92,6 +90,14 @@ class CanSource(Protocol):
         Raises:
             BusOffError: the controller went bus-off.
             Exception: whatever the adapter raises when it is lost.
+        """
+        ...
+
+    def gather(self, stopping: threading.Event) -> None:
+        """Let frames gather before the next read, so that one turn of the event loop serves many.
+
+        Args:
+            stopping: set when nothing more will be read; ends the wait.
         """
         ...
 

@@ -139,8 +139,7 @@ class CanReader(threading.Thread):
         if batch.errors is not None and batch.errors.bus_off and not self._source.recovers:
             raise BusOffError
         if len(raw.ids) and raw.drained_ns is not None:
-            # Let a few frames gather: one turn of the event loop then serves them all.
-            self._stopping.wait(self._source.gather_s)
+            self._source.gather(self._stopping)
 
     def _hand_over(self, batch: DecodedBatch) -> None:
         while not self._under_way.acquire(timeout=POLL_S):

@@ -23,6 +23,7 @@ import select
 import socket
 import struct
 import sys
+import time
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -32,6 +33,7 @@ from drivers.can.errors import ALL_CLASSES
 from drivers.can.kernel_time import KernelTime
 
 if TYPE_CHECKING:
+    import threading
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
@@ -44,7 +46,14 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 BATCH_FRAMES = 4096
-GATHER_S = 0.005
+GATHER_S = 0.1
+"""How long frames that the kernel stamps gather between two reads: one turn of each part serves them all."""
+UNSTAMPED_GATHER_S = 0.005
+"""Those that it does not stamp are taken to come when they are read."""
+FULLEST_BUS_HZ = 30_000
+"""Frames a second: more than a bus carries, of frames without data and with CAN FD."""
+FRAME_HELD_BYTES = 768
+"""What a frame takes of the receive buffer, with what the kernel notes of it."""
 RECEIVE_BUFFER_BYTES = 4 << 20
 """Doubled by the kernel: some 10 900 frames, more than a second of a full bus of 1 Mbit/s."""
 
@@ -76,7 +85,6 @@ class SocketCan:
         OSError: this is no Linux, or the socket takes no time stamps.
     """
 
-    gather_s = GATHER_S
     error_classes = ALL_CLASSES
     recovers = True
 
@@ -89,11 +97,13 @@ class SocketCan:
         self._buffer = DatagramBuffer(BATCH_FRAMES, FD_BYTES)
         self._dropped = 0
         self._failed_with = 0
+        self._gather_s = UNSTAMPED_GATHER_S
         sock.setblocking(False)
         sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         sock.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
         sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPING, _RX_HARDWARE_RAW)
         _make_room(sock, receive_buffer_bytes)
+        self._half_bytes = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
         # Not select(2): it knows no file descriptors past 1023.
         self._poll = select.poll()
         self._poll.register(sock, select.POLLIN)
@@ -112,19 +122,20 @@ class SocketCan:
         if not count and self._failed_with:
             raise OSError(self._failed_with, os.strerror(self._failed_with))
         stamps = self._buffer.stamps()
+        if count:
+            self._gather_s = GATHER_S if stamps.software_ns.all() else UNSTAMPED_GATHER_S
         drained = count < BATCH_FRAMES
         arrival_ns = self._time.monotonic(stamps.software_ns, stamps.hardware_ns, drained=drained)
         overrun = self._overrun(stamps.dropped if count else dropped_frames(self._socket))
         sizes = self._buffer.sizes
         rows = self._buffer.datagrams[:count]
-        whole = (sizes == CLASSIC_BYTES) | (sizes == FD_BYTES)
         malformed = 0
-        if not whole.all():
+        is_fd = sizes == FD_BYTES
+        if not (is_fd.all() or (whole := is_fd | (sizes == CLASSIC_BYTES)).all()):
             if (sizes == 0).any():
                 raise OSError(errno.ENOTCONN, "the other end has closed the socket")
             malformed = int((~whole).sum())
-            rows, sizes, arrival_ns = rows[whole], sizes[whole], arrival_ns[whole]
-        is_fd = sizes == FD_BYTES
+            rows, sizes, is_fd, arrival_ns = rows[whole], sizes[whole], is_fd[whole], arrival_ns[whole]
         return CanBatch(
             ids=np.ascontiguousarray(rows[:, :4]).view(np.uint32)[:, 0],
             lengths=np.minimum(rows[:, 4].astype(np.int64), sizes.astype(np.int64) - _HEADER_BYTES),
@@ -136,6 +147,17 @@ class SocketCan:
             # Not every kernel sets the flag that says FD; the size says it in any.
             fd_flags=np.where(is_fd, rows[:, 5] & _FD_FLAGS | FD, 0) if is_fd.any() else None,
         )
+
+    def gather(self, stopping: threading.Event) -> None:
+        """See `drivers.can.batches.CanSource.gather`; ends when half of the receive buffer is full.
+
+        A buffer that the fullest bus fills sooner is looked at in between.
+        """
+        look_s = self._half_bytes / FRAME_HELD_BYTES / FULLEST_BUS_HZ
+        until_s = time.monotonic() + self._gather_s
+        while (left_s := until_s - time.monotonic()) > 0.0:
+            if stopping.wait(min(left_s, look_s)) or _held_bytes(self._socket) > self._half_bytes:
+                return
 
     def close(self) -> None:
         """See `drivers.can.batches.CanSource.close`."""
@@ -204,8 +226,17 @@ def dropped_frames(sock: socket.socket) -> int:
 
     A frame that is received says how many were dropped before it; this says it when none follows.
     """
-    figures = struct.unpack("=9I", sock.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 36))
-    return int(figures[8])
+    return _memory_of(sock)[8]
+
+
+def _held_bytes(sock: socket.socket) -> int:
+    """What of the receive buffer is taken."""
+    return _memory_of(sock)[0]
+
+
+def _memory_of(sock: socket.socket) -> tuple[int, ...]:
+    """``SK_MEMINFO_RMEM_ALLOC`` to ``SK_MEMINFO_DROPS`` (linux/sock_diag.h)."""
+    return struct.unpack("=9I", sock.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 36))
 
 
 def _raw_socket() -> socket.socket:
@@ -264,6 +295,9 @@ _AFTER_STAMP = 16 + 16
 _AFTER_HARDWARE_STAMP = _AFTER_STAMP + 16 + 48
 
 
+_STAMP_ALONE = int(np.array([SOL_SOCKET, SO_TIMESTAMPNS], np.int32).view(np.int64)[0])
+"""Level and type of a control message that is a stamp, as one number."""
+
 # struct iovec, and struct mmsghdr with the struct msghdr that it begins with, on 64-bit Linux.
 _IOVEC = np.dtype([("base", np.uint64), ("length", np.uint64)])
 _MMSGHDR = np.dtype(
@@ -303,6 +337,7 @@ class DatagramBuffer:
     def __init__(self, count: int, size: int) -> None:
         self.datagrams = np.zeros((count, size), np.uint8)
         self._control = np.zeros((count, _CONTROL_BYTES), np.uint8)
+        self._kinds: NDArray[np.int64] = self._control[:, 8:16].view(np.int64)[:, 0]
         rows = np.arange(count, dtype=np.uint64)
         self._iovecs = np.zeros(count, _IOVEC)
         self._iovecs["base"] = self.datagrams.ctypes.data + rows * np.uint64(size)
@@ -369,6 +404,9 @@ class DatagramBuffer:
         ``SO_RXQ_OVFL``; they come in this order (``__sock_recv_timestamp``, ``sock_recv_drops``).
         """
         lengths = self._control_lengths[: self._used]
+        if (lengths == _AFTER_STAMP).all() and (self._kinds[: self._used] == _STAMP_ALONE).all():
+            # So nearly every batch is: what it says lies in one place, and what it does not say nowhere.
+            return Stamps(self._time(16), np.zeros(self._used, np.int64), None)
         stamped = self._is(0, SO_TIMESTAMPNS, lengths)
         software = np.where(stamped, self._time(16), 0)
         hardware = np.zeros(self._used, np.int64)

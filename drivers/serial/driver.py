@@ -23,6 +23,7 @@ from drivers.base import BusCounters, BusPort
 from drivers.reconnect import Attempt, CannotOpenError, ended, in_thread, run_with_reconnect, sparing_others
 from drivers.serial.binary import BodyCodec, CobsFraming, SyncFraming
 from drivers.serial.lines import TIME_COUNTER_BITS, LineFraming
+from drivers.serial.pauses import longest_pause_s
 from drivers.serial.reader import SHUTDOWN_S, SerialReader, close_port
 from drivers.serial.settings import CobsBus, LineLayout, LinesBus, SyncBus
 from drivers.stream_driver import assembler_of
@@ -137,7 +138,14 @@ class SerialDriver:
         self._framing.restart()
         loop = asyncio.get_running_loop()
         reader = SerialReader(
-            self.link.name, device, self._framing, self, self._port.clock, loop, self.link.turn
+            self.link.name,
+            device,
+            self._framing,
+            self,
+            self._port.clock,
+            loop,
+            longest_pause_s(self._bus.bits_per_character, self._bus.baud, map(_wrap_s, self._port.streams)),
+            self.link.turn,
         )
         reader.start()
         try:
@@ -248,6 +256,17 @@ def _assembler(spec: StreamSpec[Any], port: BusPort) -> StreamAssembler:
         stamped=layout.time is not None,
         tell=port.tell,
     )
+
+
+def _wrap_s(spec: StreamSpec[Any]) -> float:
+    """In what time a stream's counter begins anew; 0 if it has none, and its rate is told by arrivals."""
+    layout: FrameLayout | LineLayout = spec.layout
+    if isinstance(layout, LineLayout):
+        return 0.0 if layout.counter is None else 2.0**layout.counter.bits / spec.rate_hz
+    if layout.counter_bits is None:
+        return 0.0
+    frame_rate_hz = spec.rate_hz / layout.samples_per_frame
+    return 2.0**layout.counter_bits / (layout.counts_per_frame * frame_rate_hz)
 
 
 def _open_port(bus: SerialBus, characters: CharacterFormat) -> serial.Serial:

@@ -58,6 +58,15 @@ class Framing(Protocol):
         """
         ...
 
+    def ends_in(self, chunk: bytes, heard: int) -> bool:
+        """Whether a frame ends in a chunk of bytes, or did in those before it; from any thread.
+
+        Args:
+            chunk: the last bytes that came.
+            heard: how many have come in a row, those included.
+        """
+        ...
+
     def encode(
         self,
         stream: str,
@@ -152,6 +161,11 @@ class DelimitedFraming(ABC):
             self._astray = count_steps(batch, in_step[skipped:], astray=self._astray)
         self._astray |= overlong
         return batch
+
+    def ends_in(self, chunk: bytes, heard: int) -> bool:
+        """See `Framing.ends_in`."""
+        del heard
+        return self._delimiter in chunk
 
     @abstractmethod
     def _sort(self, pieces: Pieces, batch: DecodedBatch, arrivals_of: ArrivalsOf) -> NDArray[np.bool_]:

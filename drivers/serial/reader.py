@@ -13,6 +13,7 @@ import fcntl
 import logging
 import os
 import queue
+import random
 import select
 import threading
 import time
@@ -22,6 +23,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 
 from drivers.reconnect import HandOver
+from drivers.serial.pauses import Pauses
 
 if TYPE_CHECKING:
     import asyncio
@@ -37,8 +39,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 POLL_MS = 50
-GATHER_NS = 5_000_000
-"""How long bytes are gathered into one batch: one turn of the event loop then serves them all."""
+GATHER_NS = 100_000_000
+"""How long bytes are gathered into one batch: a turn of every part then serves them all."""
 
 READ_BYTES = 65_536
 BATCH_BYTES = 524_288
@@ -93,6 +95,7 @@ class SerialReader(threading.Thread):
         receiver: who is given the frames.
         clock: stamps arrivals.
         loop: where the receiver lives.
+        longest_pause_s: how long the port may be left alone; see `drivers.serial.pauses`.
         turn: called on this thread each time it comes round.
 
     Attributes:
@@ -108,6 +111,7 @@ class SerialReader(threading.Thread):
         receiver: Receiver,
         clock: Clock,
         loop: asyncio.AbstractEventLoop,
+        longest_pause_s: float = 0.0,
         turn: Callable[[], None] = lambda: None,
     ) -> None:
         super().__init__(name=f"reader of {name}", daemon=True)
@@ -117,6 +121,8 @@ class SerialReader(threading.Thread):
         self._poll = select.poll()
         self._poll.register(self._fd, select.POLLIN)
         self._framing = framing
+        self._pauses = Pauses(framing, longest_pause_s)
+        self._rng = random.Random()  # noqa: S311
         self._receiver = receiver
         self._clock = clock
         self._turn = turn
@@ -178,7 +184,7 @@ class SerialReader(threading.Thread):
         return f"its reader failed: {error or type(error).__name__}"
 
     def _drain(self) -> None:
-        """Gather what comes within 5 ms, or a batch of it, and have it cut.
+        """Gather what comes within `GATHER_NS`, or a batch of it, and have it cut.
 
         Raises:
             _HungUpError: the port is gone; what was read before has been handed over.
@@ -194,7 +200,9 @@ class SerialReader(threading.Thread):
         gathered = 0
         failure: _HungUpError | None = None
         # Real time, whatever the service's clock is: this is about how many turns a second cost.
-        until_ns = time.monotonic_ns() + GATHER_NS
+        # A length drawn at random, or a port that keeps step with it has the same stream stamped each time.
+        until_ns = time.monotonic_ns() + round(GATHER_NS * self._rng.uniform(0.9, 1.0))
+        self._pauses.listen()
         while gathered < BATCH_BYTES:
             try:
                 chunk = self._read()
@@ -205,8 +213,13 @@ class SerialReader(threading.Thread):
                 arrival_ns.append(self._clock.monotonic_ns())
                 chunks.append(chunk)
                 gathered += len(chunk)
-            left_ms = (until_ns - time.monotonic_ns()) // 1_000_000
-            if left_ms <= 0 or not self._poll.poll(left_ms):
+            now_ns = time.monotonic_ns()
+            left_ms = (until_ns - now_ns) // 1_000_000
+            if left_ms <= 0:
+                break
+            if chunk and (pause_s := self._pauses.after(chunk, now_ns)):
+                time.sleep(min(pause_s, left_ms / 1000))
+            elif not self._poll.poll(left_ms):
                 break
         if chunks and self._may_hand_over():
             self._jobs.put(partial(self._cut, chunks, arrival_ns))

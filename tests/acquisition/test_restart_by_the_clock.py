@@ -131,7 +131,7 @@ def test_a_device_that_has_counted_past_its_old_count_is_found_to_have_restarted
     assert unit.time_base.settled
 
 
-@settings(deadline=None, max_examples=15)
+@settings(deadline=None, max_examples=examples(15))
 @given(
     seed=st.integers(0, 2**31),
     waited_s=st.floats(0.1, 30.0),
@@ -150,7 +150,7 @@ def test_frames_that_were_delayed_lose_nothing_and_keep_their_times(seed, waited
     assert all(abs(off_ns(block)) < block.t_error_ns + 5e6 for block in blocks)
 
 
-@settings(deadline=None, max_examples=10)
+@settings(deadline=None, max_examples=examples(10))
 @given(seed=st.integers(0, 2**31), away_s=st.floats(10.0, 7200.0), ppm=st.floats(-150, 150))
 def test_a_device_that_counted_on_through_an_outage_of_hours_is_counted_exactly(seed, away_s, ppm) -> None:
     frames = sent(0, away_s + 60.0, 0.0, seed, ppm)

@@ -13,7 +13,7 @@ import pytest
 from conformance.example_transport import LoggerDevice
 from conformance.rig import samples_of
 from support.example_packages import DETECTOR, DOCS, DRIVER, installed, lines_of
-from support.live_service import running
+from support.live_service import running, watch_of
 from support.machine_files import problems_of
 from support.machine_mutations import toml
 from support.waiting import eventually
@@ -54,7 +54,7 @@ async def test_the_example_serves_a_machine(tmp_path: Path) -> None:
         async with running(machine("4001", f"{logger.tcp_port}"), tmp_path / "store") as service:
             [driver] = service.drivers
             await eventually(lambda: driver.link.state == "up", "the logger is connected")
-            ring = service.rings["casing"]
+            ring = watch_of(service).rings["casing"]
             await logger.send(0, samples_of(np.arange(1500)))
             # The last frames are held until it is sure that none of before them is still to come.
             await eventually(lambda: ring.end_index >= 1200, "the samples have arrived")

@@ -15,6 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.bus_tables import can_bus, line_layout, replay_bus, serial_bus, table_layout
+from support.examples import examples
 from support.fuzz_bytes import mutated
 from support.modbus_layouts import register
 
@@ -301,7 +302,7 @@ FILES = 12
 
 @pytest.mark.long
 @pytest.mark.parametrize("ending", [".log", ".asc", ".blf", ".trc", ".npz", ".csv"])
-@settings(max_examples=12)
+@settings(max_examples=examples(12))
 @given(seed=st.integers(0, 2**32 - 1))
 def test_a_recording_with_any_bytes_in_it_ends_in_words(
     tmp_path_factory: pytest.TempPathFactory, ending: str, seed: int

@@ -14,6 +14,7 @@ from support.rogue_buses import LAYOUT, machine_text
 from support.rogue_devices import WORST, RogueDevices, recording
 from support.waiting import eventually
 
+from daqsvc.box import Box
 from daqsvc.service import Service
 from daqsvc.settings import parse_machine_file
 from drivers.can.plugin import frame_layout
@@ -57,7 +58,7 @@ async def all_do_their_worst(kinds: tuple[str, ...], folder: Path, phase_s: floa
         if "replay" in kinds:
             layout = frame_layout(machine, "replay")
             recording(folder / "rogue.log", layout, WORST, phase_s, SEED)
-        service = Service(machine, folder / "store")
+        service = Service(Box.single(machine), folder / "store")
         stop = asyncio.Event()
         running = asyncio.create_task(service.run(stop))
         watch = Watch(service)

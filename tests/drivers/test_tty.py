@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import logging
 import os
 import termios
 
 import pytest
+import serial
 from support.bus_tables import line_layout, serial_bus
 from support.clocks import QuickClock
 from support.modbus_layouts import register, registers_layout
@@ -16,7 +18,7 @@ from support.modbus_lines import Rig, until
 
 from drivers.base import BusPort, StreamSpec
 from drivers.serial.driver import SerialDriver
-from drivers.tty import Character, CharacterFormat, is_pseudo_terminal
+from drivers.tty import Character, CharacterFormat, is_pseudo_terminal, why_not_open
 from sim_hw.nodes.modbus_node import ModbusRtuServer
 from sim_hw.nodes.modbus_unit import ModbusUnit
 from sim_hw.nodes.serial_node import PseudoTerminal
@@ -93,3 +95,33 @@ def test_a_pseudo_terminal_is_known_by_its_link(tmp_path):
         assert is_pseudo_terminal(tmp_path / "port")
         assert termios.tcgetattr(cable.fd)
     assert not is_pseudo_terminal(tmp_path / "port")
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file away")
+@pytest.mark.parametrize(
+    ("code", "group", "mode", "said"),
+    [
+        (errno.EACCES, 20, 0o660, "permission denied; make the service's user a member of the group dialout"),
+        (errno.EACCES, 4, 0o660, "permission denied; make the service's user a member of the group adm"),
+        (errno.EACCES, 4_004, 0o660, "permission denied; make the service's user a member of the group 4004"),
+        (errno.EACCES, 0, 0o600, "permission denied; its owner alone may open it (mode 0600, group root)"),
+        (errno.EPERM, 20, 0o660, "not permitted: a sandbox keeps it away; allow it by DeviceAllow="),
+    ],
+)
+def test_what_lets_a_port_of_somebody_else_be_opened_is_said(code, group, mode, said, tmp_path):
+    port = tmp_path / "ttyUSB0"
+    port.touch()
+    port.chmod(mode)
+    os.chown(port, 0, group)
+    assert why_not_open(OSError(code, os.strerror(code)), str(port), "port").startswith(said)
+    port.unlink()
+    assert "permission denied; make" in why_not_open(PermissionError(errno.EACCES, "x"), str(port), "port")
+
+
+def test_what_is_no_serial_port_is_said_with_the_remedy(tmp_path):
+    (tmp_path / "ttyUSB0").write_text("")
+    for port, kind in ((tmp_path / "ttyUSB0", "a file"), (tmp_path, "a directory")):
+        with pytest.raises(serial.SerialException) as refused:
+            serial.Serial(str(port))
+        said = why_not_open(refused.value, str(port), "port")
+        assert said == f"{port} is no serial port ({kind}); plug the device in, or correct port"

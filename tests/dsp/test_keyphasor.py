@@ -235,7 +235,7 @@ def test_run_up_from_any_speed_leaves_no_lag(slow, ratio, revolutions, down):
     assert subject.counts.rejected == subject.counts.missing == 0
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=examples(15), deadline=None)
 @given(seed=st.integers(0, 1000), per_rev=st.floats(40.0, 100.0))
 def test_drift_is_followed_without_lag(seed, per_rev):
     sample = np.arange(round(300 * per_rev))

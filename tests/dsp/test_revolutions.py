@@ -144,7 +144,7 @@ def test_keyphasor_in_any_blocks(period, ratio, cuts, lost, skip, extra, silent)
     assert other.counts == one.counts
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=examples(10), deadline=None)
 @given(
     seed=st.integers(0, 100),
     cuts=cuts_anywhere,
@@ -175,7 +175,7 @@ def test_edges_of_straight_flanks_are_exact(period, phase, off):
     assert np.abs(errors(got, turns)[0]).max() < 1e-6
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=examples(15), deadline=None)
 @given(
     fast=st.floats(30.0, 80.0),
     ratio=st.floats(1.0, 8.0),
@@ -293,7 +293,7 @@ def test_pulses_that_come_back_are_believed_again(
     assert np.abs(error[late]).max() < 0.02
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=examples(15), deadline=None)
 @given(
     cutter=st.sampled_from(["fixed", "keyphasor", "orbit"]),
     before=st.integers(0, 1000),
@@ -309,7 +309,7 @@ def test_after_a_reset_nothing_is_left_of_before(cutter, before, period):
     assert_same([used.process(xy, marker)], fresh.process(xy, marker))
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=examples(8), deadline=None)
 @given(
     seed=st.integers(0, 1000),
     law=st.sampled_from(["off by 2 %", "off by -2 %", "ramp", "sine"]),

@@ -82,6 +82,17 @@ def clipped_at(signal: Floats) -> float | None:
     return next(iter(ends_cut_off(signal, least)), None)
 
 
+def never_clipped(signals: Floats) -> bool:
+    """Whether signals come so rarely to their extremes that `clipped_at` finds none clipped.
+
+    Args:
+        signals: float64 ``[n, m]``, finite.
+    """
+    least = max(CLIPPED_REVOLUTION * len(signals), LEAST_IN_REVOLUTION)
+    ends = (signals.min(axis=0), signals.max(axis=0))
+    return bool(max(np.count_nonzero(signals == end) for end in ends) < least)
+
+
 def refuse_clipped(signal: Floats) -> None:
     """Refuse an accelerometer whose peaks all end at one value.
 

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.dsp.quality.clipped import clipped_at
+from daqsvc.dsp.quality.clipped import clipped_at, never_clipped
 from daqsvc.dsp.quality.missing import REVOLUTION_SHARE
-from daqsvc.dsp.quality.stuck import dropped_to, stands_still
-from daqsvc.dsp.quality.unit import RESCALE, beyond_any_unit
+from daqsvc.dsp.quality.stuck import dropped_to, never_rests, stands_still
+from daqsvc.dsp.quality.unit import RESCALE, beyond_any_unit, within_some_unit
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -104,14 +104,18 @@ class RevolutionJudge:
             samples: float64 ``[n, 2]``, micrometres, as the probes say it; NaN where missing.
             least_motion_um: standard deviation that each probe must show at least.
         """
-        if (bad := self.missing(samples) or self._impossible(samples)) is not None:
+        whole = within_some_unit(samples)
+        if not whole and (bad := self.missing(samples) or self._impossible(samples)) is not None:
             return bad
-        known = samples[np.isfinite(samples).all(axis=1)]
+        known = np.array(samples, order="C") if whole else samples[np.isfinite(samples).all(axis=1)]
         self._pool.append(known)
+        # Both probes at once, and only where that finds something each by itself.
+        moves = never_rests(known)
         signals = [known] if len(self._pool) == 1 else [known, np.concatenate(self._pool)]
+        signals = [signal for signal in signals if not never_clipped(signal)]
         deviations = known.std(axis=0)
         for column, probe in enumerate(self._probes):
-            if stands_still(known[:, column : column + 1]):
+            if not moves and stands_still(known[:, column : column + 1]):
                 return RevolutionQuality(
                     "not_ok",
                     f"{probe.name}: stood still at {known[0, column]:.6g} um for a revolution; "
@@ -131,7 +135,7 @@ class RevolutionJudge:
                         f"{probe.name}: clipped at {clipped:.6g} um; "
                         "check the gap and the range of the converter",
                     )
-            still = dropped_to(known[:, column])
+            still = None if moves else dropped_to(known[:, column])
             if still is not None:
                 return RevolutionQuality(
                     "not_ok",

@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 _SURE_NATS = 30.0
 """A run is no chance if it was so improbable, given how often samples repeat: once in some 10^13 windows."""
-_LONGER = 6
+LONGER = 6
 """It is no habit if it is so many times as long as any other; at its crest a rounded sine rests up to 5."""
-_RUNS = 8
+RUNS = 8
 """So many other runs are needed to know a habit."""
 _REMEMBERED = 8
 """Windows that the habit is taken from, besides the present one."""
@@ -51,7 +51,19 @@ def stands_still(probes: Floats) -> bool:
     Args:
         probes: float64 ``[n, 2]``.
     """
-    return len(probes) > 2 and bool((probes == probes[0]).all(axis=0).any())
+    if len(probes) <= 2 or not (probes[1] == probes[0]).any():
+        return False
+    return bool((probes == probes[0]).all(axis=0).any())
+
+
+def never_rests(signals: Floats) -> bool:
+    """Whether signals repeat values so rarely that none stands still, for a part of the window either.
+
+    Args:
+        signals: float64 ``[n, m]``, finite.
+    """
+    repeats = np.count_nonzero(signals[1:] == signals[:-1])
+    return bool(repeats < min(LONGER, len(signals)) - 1)
 
 
 class Standstill(NamedTuple):
@@ -122,7 +134,7 @@ class StandstillWatch:
         known = [_Habit(len(others), int(others.sum()), int(others.max())), *self._habits]
         count = sum(habit.runs for habit in known)
         samples = sum(habit.samples for habit in known)
-        if count < _RUNS or run < _LONGER * max(habit.longest for habit in known):
+        if count < RUNS or run < LONGER * max(habit.longest for habit in known):
             return False
         repeats = (samples - count + 1) / (samples + 2)  # share of samples like the one before (Laplace)
         return -run * math.log(repeats) >= _SURE_NATS

@@ -140,6 +140,8 @@ class EdgeFinder:
         Args:
             samples: float64 ``[n]``; NaN where missing.
         """
+        if self._find_none(samples):
+            return []
         signal = self._sign * np.where(np.isfinite(samples), samples, np.nan)
         before = np.concatenate(([self._last], signal[:-1])) if len(signal) else signal
         # +1 past the threshold, -1 back past the hysteresis, 0 says nothing: carry the last word on.
@@ -156,6 +158,20 @@ class EdgeFinder:
             self._armed = bool(previous[-1] < 0)
             self._last = float(signal[-1])
         return edges
+
+    def _find_none(self, samples: Floats) -> bool:
+        """Take in a block that nowhere gets to the threshold; False if it may, or lacks samples.
+
+        Most blocks of a fraction of a revolution are such, and this is a quarter of the work.
+        """
+        if not len(samples):
+            return False
+        low, high = sorted((self._sign * float(samples.min()), self._sign * float(samples.max())))
+        if not -math.inf < low <= high < self._threshold:
+            return False
+        self._armed = self._armed or low < self._rearm
+        self._last = self._sign * float(samples[-1])
+        return True
 
 
 class EdgeLine:
@@ -363,8 +379,26 @@ def _triples(n: int) -> Ints:
 def _line(x: Floats, y: Floats) -> tuple[float, float]:
     """Offset and slope of the line through most points: medians over pairs (Theil and Sen)."""
     i, j = _pairs(len(x))
-    slope = float(np.median((y[j] - y[i]) / (x[j] - x[i])))
-    return float(np.median(y - slope * x)), slope
+    slope = float(_median((y[j] - y[i]) / (x[j] - x[i])))
+    return float(_median(y - slope * x)), slope
+
+
+def _median(values: Floats) -> Floats:
+    """``numpy.median`` over the last axis: a few values, none NaN, for which its checks cost more than it."""
+    middle = values.shape[-1] // 2
+    ranked = np.sort(values)
+    if values.shape[-1] % 2:
+        return np.asarray(ranked[..., middle])
+    return np.asarray((ranked[..., middle - 1] + ranked[..., middle]) / 2.0)
+
+
+def _upper_quartile(values: Floats) -> float:
+    """``numpy.quantile`` of 0.75, likewise."""
+    ranked = np.sort(values).tolist()
+    place = 0.75 * (len(ranked) - 1)
+    below = math.floor(place)
+    low, high, part = ranked[below], ranked[min(below + 1, len(ranked) - 1)], place - below
+    return float(high - (high - low) * (1.0 - part) if part >= 0.5 else low + (high - low) * part)
 
 
 def _believable_bend(since: Floats, turns: Floats) -> float:
@@ -373,16 +407,17 @@ def _believable_bend(since: Floats, turns: Floats) -> float:
     if n < _MIN_BEND_EDGES:
         return 0.0
     i, j, k = _triples(n)
-    late = (turns[k] - turns[j]) / (since[k] - since[j])
-    early = (turns[j] - turns[i]) / (since[j] - since[i])
+    apart = since - since[:, np.newaxis]
+    np.fill_diagonal(apart, 1.0)  # of which no triple has any
+    rate = (turns - turns[:, np.newaxis]) / apart
     # Repeated medians (Siegel 1982) stay right while more than half of the edges are.
-    bend = float(np.median(np.median(np.median((late - early) / (since[k] - since[i]), axis=2), axis=1)))
+    bend = float(_median(_median(_median((rate[j, k] - rate[i, j]) / apart[i, k]))))
     straight = turns - bend * since**2
-    offset, rate = _line(since, straight)
+    offset, speed = _line(since, straight)
     # Few edges fit some parabola by chance: until there are more, half a sample is taken as their scatter.
     chance = 1.0 / (n - 2) ** 2
-    scatter = float(np.quantile(np.abs(straight - offset - rate * since), 0.75))
-    edge = scatter / _QUARTILE * (1.0 + 8.0 * chance) + 0.5 * rate * chance
+    scatter = _upper_quartile(np.abs(straight - offset - speed * since))
+    edge = scatter / _QUARTILE * (1.0 + 8.0 * chance) + 0.5 * speed * chance
     # Standard deviation of the curvature of a least-squares parabola through n evenly spaced points.
     spacing = -float(since[0]) / (n - 1)
     deviation = edge / (spacing**2 * math.sqrt(n * (n**2 - 1) * (n**2 - 4) / 180.0))

@@ -24,6 +24,7 @@ from drivers.can.driver import CanDriver
 from drivers.can.plugin import frame_layout
 
 if TYPE_CHECKING:
+    import threading
     from pathlib import Path
 
     from daqsvc.acquisition.samples import SampleBlock
@@ -64,7 +65,6 @@ async def test_frames_of_any_priority_are_one_stream() -> None:
 class Played:
     """A bus that has heard a device for ten seconds, and hears nothing more."""
 
-    gather_s = 0.0
     error_classes = 0
     recovers = True
 
@@ -94,6 +94,9 @@ class Played:
             )
         self.left -= 1
         return self._parts[-1 - self.left]
+
+    def gather(self, stopping: threading.Event) -> None:
+        pass
 
     def close(self) -> None:
         pass

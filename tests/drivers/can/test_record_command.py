@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 
 import can
 import pytest
-from support.brokers import free_port
 from support.can_recordings import numbers
 from support.examples import first_of
 from support.paths import ROOT
+from support.ports import free_port
 from support.waiting import PATIENCE_S, eventually_blocking
 
 from daqsvc.commands.arguments import signals_to_end

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.clocks import LoopClock
+from support.examples import examples
 from support.modbus_layouts import count_at, fifo_layout, in_sample, page_at, ring_layout, waveform_layout
 from support.modbus_lines import Rig, options_of, responding, simulate
 
@@ -210,7 +211,7 @@ BEGINNINGS = st.one_of(st.integers(0, 1500), st.integers(0, 2**16 - 1), st.integ
 
 
 @pytest.mark.long
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=examples(15), deadline=None)
 @given(
     st.integers(0, 2**32),
     BEGINNINGS,
@@ -234,7 +235,7 @@ def test_a_ring_is_read_once_and_its_books_are_exact(seed, count, restarts, dept
     assert rig.driver.streams["s"][1].restarts <= restarts
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=examples(15), deadline=None)
 @given(
     st.integers(0, 2**32),
     BEGINNINGS,
@@ -260,7 +261,7 @@ def test_a_queue_is_read_once_and_its_books_are_exact(seed, count, restarts, dep
     assert rig.driver.streams["s"][1].restarts <= restarts
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=examples(12), deadline=None)
 @given(
     st.integers(0, 2**32),
     st.one_of(st.just(0), st.integers(1, 65_535), st.integers(65_500, 65_535)),

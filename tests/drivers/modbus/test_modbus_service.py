@@ -7,7 +7,7 @@ import struct
 
 import numpy as np
 import pytest
-from support.live_service import running
+from support.live_service import running, watch_of
 from support.machine_files import MACHINES, problems_of
 from support.waiting import eventually
 
@@ -53,7 +53,7 @@ async def test_probes_on_an_analogue_module_are_read_by_the_service(tmp_path):
         await node.play(RealTimePacer(SystemClock()))
         counters = service.drivers[0].streams["gap"][0]
         await eventually(lambda: counters.samples_received > 60, "the ramp has been polled")
-        ring = service.rings["gap"]
+        ring = watch_of(service).rings["gap"]
         seen = ring.read(ring.oldest_index, ring.end_index - ring.oldest_index)
         assert service.figures()["buses"]["io"]["up"] == 1
         assert service.figures()["buses"]["io"]["timeouts"] == 0
@@ -79,8 +79,12 @@ async def test_a_reply_of_the_vibration_sensor_means_what_its_maker_says(tmp_pat
     async with running(machine, tmp_path) as service:
         received = lambda name: service.drivers[0].streams[name][0].samples_received  # noqa: E731
         await eventually(lambda: min(received("drive-end"), received("other-end")) > 5, "both are polled")
-        first = service.rings["drive-end"].read(service.rings["drive-end"].oldest_index, 1)[0]
-        other = service.rings["other-end"].read(service.rings["other-end"].oldest_index, 1)[0]
+        first = (
+            watch_of(service).rings["drive-end"].read(watch_of(service).rings["drive-end"].oldest_index, 1)[0]
+        )
+        other = (
+            watch_of(service).rings["other-end"].read(watch_of(service).rings["other-end"].oldest_index, 1)[0]
+        )
         polls = service.drivers[0].counters.requests
         assert polls < received("drive-end") + received("other-end"), "one request reads both sensors"
     server.stop()
