@@ -21,12 +21,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nothing_lost.broker import Broker, mosquitto_program
+from support.alarm_desk import alarm_service
 from support.alarm_rig import alarm_handling
 from support.mqtt_publishing import mqtt, outputs
 from targets import Targets
 
 from daqsvc.acquisition.clock import SystemClock
-from daqsvc.alarm_service import AlarmService
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.manager import AlarmManager, LevelRule
 from daqsvc.alarms.setpoints import Setpoint
@@ -133,7 +133,7 @@ class Rig:
     def __init__(self, count: int, store: Path, port: int) -> None:
         names = (*(rule.alarm for rule in rules(count)), *(f"sensor-ok/probe-{i}" for i in range(count)))
         told = outputs(mqtt(port, "bench"), Watched("rig", alarms=names), home_assistant=HomeAssistant())
-        self.alarms = AlarmService(RIG, rules(count), store, CLOCK, told, handling=HANDLING)
+        self.alarms = alarm_service(RIG, rules(count), store, CLOCK, told, handling=HANDLING)
         self.lag = LoopLag()
         self._count = count
         self._said = 0

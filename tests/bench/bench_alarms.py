@@ -22,17 +22,19 @@ from typing import TYPE_CHECKING, Any
 
 import paho.mqtt.client as paho
 from nothing_lost.broker import LOOPBACK, Broker, mosquitto_program
+from support.alarm_desk import alarm_service
 from support.mqtt_publishing import mqtt, outputs
 from targets import Targets
 
 from daqsvc.acquisition.clock import SystemClock
-from daqsvc.alarm_service import AlarmService
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.manager import DiagnosisRule
 from daqsvc.diagnosis.record import Diagnosis, Severity
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
+
+    from daqsvc.alarm_service import AlarmService
 
 SINGLE = 300
 """Alarms that are timed one by one."""
@@ -125,11 +127,11 @@ class Timed(Decider):
 @contextlib.asynccontextmanager
 async def running_desk(store: Path, port: int) -> AsyncIterator[AlarmService]:
     """A desk that publishes to the broker at ``port``."""
-    desk = AlarmService(
+    desk = alarm_service(
         RIG, [DiagnosisRule("rotor-fault", "rotor-bank")], store, CLOCK, outputs(mqtt(port, "bench"))
     )
     await desk.open()
-    await desk.resume({"rotor-bank": ("probe-x",)})
+    await desk.resume({desk.manager.identity.machine: {"rotor-bank": ("probe-x",)}})
     running = [asyncio.create_task(teller.run()) for teller in desk.outputs.values()]
     try:
         yield desk
