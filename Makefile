@@ -8,6 +8,7 @@
 # make guard  is what users see as before? make guard ARGS=--take takes the golden texts anew
 # make measure  figures of the source: lines, circles of imports, names that occur twice
 # make nothing-lost  200 randomised runs with kills, outages and full disks: does every alarm arrive?
+# make soak  ten minutes of all that can happen to several machines; make soak SECONDS=86400 a day of it
 # make bench-data  the tables of the documentation, anew from the measured recordings
 # make deb    a Debian package of the service, in dist/; apt install ./dist/daqsvc_*.deb
 # make test-wheel  the everyday tests against the wheel in dist/, installed in a venv of its own
@@ -33,7 +34,7 @@ export OMP_NUM_THREADS ?= 1
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.cache/kernels
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-long hil check guard measure bench bench-data dist deb nothing-lost test-wheel hooks proto lock clean
+.PHONY: help demo test test-long hil check guard measure bench bench-data dist deb nothing-lost soak test-wheel hooks proto lock clean
 
 help:
 	@sed -n 's/^# \(make.*\)/\1/p' Makefile
@@ -118,6 +119,10 @@ measure: $(READY)
 
 nothing-lost: $(READY)
 	@PYTHONPATH=tests $(BIN)/python -m nothing_lost $(ARGS)
+
+SECONDS ?= 600
+soak: $(READY)
+	@PYTHONPATH=tests $(BIN)/python -m soak --seconds $(SECONDS) $(ARGS)
 
 bench-data: $(READY)
 	@for table in tests/bench/data_*.py; do $(BIN)/python $$table || exit 1; done

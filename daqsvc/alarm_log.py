@@ -28,10 +28,12 @@ class AlarmLog:
 
     Args:
         clock: for how fast they come.
+        of_several: whether there are several machines, and each line has to say which one it is about.
     """
 
-    def __init__(self, clock: Clock) -> None:
+    def __init__(self, clock: Clock, *, of_several: bool = False) -> None:
         self._clock = clock
+        self._of_several = of_several
         self._left = LINES
         self._earned_ns = clock.monotonic_ns()
         self._left_out = 0
@@ -43,7 +45,8 @@ class AlarmLog:
             return
         self._left -= 1
         loud = logging.WARNING if event.to_level is not Level.NORMAL else logging.INFO
-        logger.log(loud, "alarm %s %s: %s", event.alarm, event.kind, event.message)
+        name = f"{event.alarm} of {event.identity.machine}" if self._of_several else event.alarm
+        logger.log(loud, "alarm %s %s: %s", name, event.kind, event.message)
 
     def sum_up(self) -> None:
         """Say how many events were only counted since the last time; about once a second."""

@@ -13,15 +13,13 @@ import itertools
 import json
 import logging
 from collections import Counter
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.alarm_log import AlarmLog
 from daqsvc.alarms.commands import CommandOutcome
 from daqsvc.alarms.conditions import Condition
-from daqsvc.alarms.handling import CALM
-from daqsvc.alarms.manager import AlarmManager
 from daqsvc.alarms.states import AlarmState, CommandNotAllowedError, Level
 from daqsvc.audit import AuditError, AuditLog, Refusals
 from daqsvc.outbox.limits import OutboxLimits
@@ -31,7 +29,7 @@ from daqsvc.publish.output import EarlierState, OutputPort, OutputSet, Watched, 
 from daqsvc.publish.payloads import alarm_json, restore_alarms
 from daqsvc.publish.topics import Topics
 from daqsvc.self_check import JOURNAL, SelfCheck, Vitals, conditions
-from daqsvc.supervision import Supervisor
+from daqsvc.supervision import StallWatch, Supervisor
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -39,14 +37,12 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.clock import Clock
     from daqsvc.alarms.commands import AlarmCommand
-    from daqsvc.alarms.events import AlarmEvent, Identity
-    from daqsvc.alarms.rules import Rule
+    from daqsvc.alarms.events import AlarmEvent
+    from daqsvc.alarms.manager import AlarmManager
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.outbox.messages import OutboxMessage
     from daqsvc.publish.output import Output
     from daqsvc.self_check import BusHealth
-    from daqsvc.settings.alarms import AlarmHandling
-    from daqsvc.supervision import Progress
 
 logger = logging.getLogger(__name__)
 
@@ -83,73 +79,89 @@ class CommandCounters:
     unanswered_in_log: int = 0
 
 
+class MadeOutputs(NamedTuple):
+    """Outputs that are to take over from others.
+
+    Attributes:
+        made: by the path of its table; each is to be run.
+        conditions: see `OutputSet`.
+        outdated: likewise.
+    """
+
+    made: dict[str, Output]
+    conditions: tuple[str, ...]
+    outdated: Mapping[str, str]
+
+
 class AlarmService:
-    """Alarms of one machine, from diagnosis to broker.
+    """Alarms of one machine or of several, from diagnosis to broker.
 
     Use: `open`, `resume`, then `take` and `execute` as diagnoses and commands come while `outputs` and
     `keep_time` run; `settle`, `stop`, `close`.
 
     Args:
-        identity: whose alarms these are.
-        rules: one per alarm.
+        manager: the alarms of the machine; of several ones, those of the service itself.
         store: directory of the journal and the audit log.
         clock: the service's clock.
         outputs: who is told; None keeps everything in the journal.
-        handling: what holds for all alarms.
+        others: the alarms of each machine, if there are several.
         limits: how much the journal may keep.
         buses: by name, what can be watched of each bus.
         bus_health: says how the buses stand.
         supervisor: counts what outputs do wrong.
-        progress: says how far each part of the service has come, for outputs that tell it.
+        stalls: finds the parts of the service that have stalled, for outputs that tell it.
     """
 
     def __init__(
         self,
-        identity: Identity,
-        rules: Sequence[Rule],
+        manager: AlarmManager,
         store: Path,
         clock: Clock,
         outputs: OutputSet | None,
         *,
-        handling: AlarmHandling = CALM,
+        others: Iterable[AlarmManager] = (),
         limits: OutboxLimits | None = None,
         buses: Mapping[str, Collection[str]] | None = None,
         bus_health: Callable[[], Mapping[str, BusHealth]] = dict,
         supervisor: Supervisor | None = None,
-        progress: Callable[[], Mapping[str, Progress]] = dict,
+        stalls: StallWatch | None = None,
     ) -> None:
         limits = limits or OutboxLimits()
-        self.identity = identity
-        self.manager = AlarmManager(identity, rules, clock, handling=handling)
+        stalls = stalls or StallWatch(dict)
+        identity = manager.identity
+        self.manager = manager
+        """The alarms of the service itself; of one machine, its own, too."""
+        self.managers = {one.identity.machine: one for one in (*others, manager)}
+        """By machine."""
         self.outbox = Outbox(store / "outbox.sqlite", clock, limits)
         self.audit = AuditLog(store / "audit.jsonl", clock, limits.audit_max_bytes)
         self._refusals = Refusals(clock)
         self.commands = CommandCounters()
-        asked = outputs or OutputSet(watched=Watched(identity.machine))
+        asked = outputs or OutputSet(machines={name: Watched(name) for name in self.managers})
         self.topics = Topics(asked.topic_root, identity.site, identity.box)
         self._witness = self.topics.alarm(identity.machine, JOURNAL)
         """Every run that cannot write its disk tells the broker so, here."""
         self._witness_known: int | None = None
         """The last number on it that the journal knew at the start; None if it need not be compared."""
-        self.outputs = asked.make(
-            OutputPort(
-                identity=identity,
-                watched=asked.watched,
-                store=store,
-                clock=clock,
-                outbox=self.outbox,
-                topics=self.topics,
-                commands=self.execute,
-                earlier=EarlierState(self._witness, self._take_witness),
-                progress=progress,
-            )
+        self._port = OutputPort(
+            machines=asked.machines,
+            store=store,
+            clock=clock,
+            outbox=self.outbox,
+            topics=self.topics,
+            commands=self.execute,
+            earlier=EarlierState(self._witness, self._take_witness),
+            progress=stalls.progress,
+            stalls=stalls,
         )
+        self.outputs = dict(asked.make(self._port))
         """Who is told, by the path of its table; each is to be run by itself, until `stop`."""
         self._outdated = asked.outdated
         self._waiting_max = limits.alarms_waiting_max
         self._clock = clock
         self._supervisor = supervisor or Supervisor()
-        self._log = AlarmLog(clock)
+        self._log = AlarmLog(clock, of_several=len(self.managers) > 1)
+        self._conditions_of_outputs = asked.conditions
         self._conditions = [*conditions(buses or {}), *asked.conditions]
         self._bus_health = bus_health
         self._self_check = SelfCheck(store, limits.reserve_bytes)
@@ -159,7 +171,7 @@ class AlarmService:
         self._topic_of: dict[tuple[str, str], str] = {}
         self._untold: dict[tuple[str, str], AlarmEvent] = {}
         """By alarm, its newest event if the outbox has refused that."""
-        self._active_detectors: Mapping[str, Sequence[str]] = {}
+        self._active_detectors: Mapping[str, Mapping[str, Sequence[str]]] = {}
         self._knows_journal = True
         """Whether the alarms have taken over what the journal knew when the service ended."""
         self._is_in_step = True
@@ -177,11 +189,12 @@ class AlarmService:
         """
         await self.outbox.open()
 
-    async def resume(self, active_detectors: Mapping[str, Sequence[str]]) -> None:
+    async def resume(self, active_detectors: Mapping[str, Mapping[str, Sequence[str]]]) -> None:
         """Take over from the journal how the alarms stood when the service ended.
 
         Args:
-            active_detectors: the detectors that will make statements, with the sensors that these rest on.
+            active_detectors: by machine, the detectors that will make statements, with the sensors that these
+                rest on.
         """
         self._active_detectors = active_detectors
         if self.outbox.counters.shut:
@@ -209,8 +222,62 @@ class AlarmService:
     def _take_over(self, events: Sequence[AlarmEvent]) -> None:
         for event in events:
             self._newest[event.identity.machine, event.alarm] = event
-        for event in self.manager.resume(events, self._active_detectors, self._conditions):
-            self._post(event)
+        for machine, manager in self.managers.items():
+            is_own = manager is self.manager
+            # Those of machines that are gone are withdrawn by the service itself.
+            theirs = [e for e in events if self.managers.get(e.identity.machine, self.manager) is manager]
+            known = self._conditions if is_own else ()
+            for event in manager.resume(theirs, self._active_detectors.get(machine, {}), known):
+                self._post(event)
+
+    def made_by(self, outputs: OutputSet) -> MadeOutputs:
+        """Make other outputs, for `change`; may block, and be called in a thread."""
+        made = outputs.make(replace(self._port, machines=outputs.machines))
+        return MadeOutputs(dict(made), outputs.conditions, outputs.outdated)
+
+    def change(
+        self,
+        anew: Iterable[AlarmManager],
+        *,
+        gone: Collection[str],
+        buses: Mapping[str, Collection[str]],
+        active_detectors: Mapping[str, Mapping[str, Sequence[str]]],
+        outputs: MadeOutputs | None,
+    ) -> None:
+        """Go on with alarms by other rules, which stand as they did: as over a restart, without one.
+
+        Args:
+            anew: the alarms of machines that are new, or whose rules are.
+            gone: machines that are no longer watched; their alarms return to normal.
+            buses: see `__init__`.
+            active_detectors: see `resume`.
+            outputs: who is told from now on; to be run. None if the same as before are, which still do.
+        """
+        newest: dict[str, list[AlarmEvent]] = {}
+        for (machine, _), event in self._newest.items():
+            newest.setdefault(machine, []).append(event)
+        self._active_detectors = active_detectors
+        if outputs is not None:
+            self._outdated = outputs.outdated
+            self._conditions_of_outputs = outputs.conditions
+            self.outputs.clear()
+            self.outputs.update(outputs.made)
+        self._conditions = [*conditions(buses), *self._conditions_of_outputs]
+        own = self.manager.identity.machine
+        for manager in anew:
+            machine = manager.identity.machine
+            self.managers[machine] = manager
+            if machine == own:
+                self.manager = manager
+            known = self._conditions if machine == own else ()
+            events = manager.resume(newest.get(machine, ()), active_detectors.get(machine, {}), known)
+            for event in events:
+                self._post(event)
+        for machine in gone:
+            del self.managers[machine]
+            for event in self.manager.withdraw(newest.get(machine, ())):
+                self._post(event)
+        self.manager.expect_conditions(self._conditions)
 
     def _damage(self) -> int:
         return self.outbox.counters.quarantined + self.outbox.counters.vanished
@@ -223,7 +290,7 @@ class AlarmService:
         ever = self.outbox.known_topics
         return [
             self._post(event)
-            for event in self.manager.begin_anew(events, FORGOTTEN)
+            for event in self._begin_anew(events, FORGOTTEN)
             if ever is None or self._topic(event) in ever
         ]
 
@@ -240,8 +307,13 @@ class AlarmService:
         again = [event for event in events if self._newest[event.identity.machine, event.alarm] is event]
         return [
             *(self._submit(event) for event in again),
-            *(self._post(event) for event in self.manager.begin_anew(events, UNJOURNALLED)),
+            *(self._post(event) for event in self._begin_anew(events, UNJOURNALLED)),
         ]
+
+    def _begin_anew(self, events: Iterable[AlarmEvent], reason: str) -> list[AlarmEvent]:
+        """See `AlarmManager.begin_anew`, of all machines."""
+        known = list(events)
+        return [event for one in self.managers.values() for event in one.begin_anew(known, reason)]
 
     def _last_on_witness(self, latest: Iterable[OutboxMessage]) -> int:
         return max((message.sequence for message in latest if message.topic == self._witness), default=0)
@@ -267,7 +339,7 @@ class AlarmService:
         )
         for event in [*self._newest.values()]:
             self._submit(event)
-        for event in self.manager.begin_anew([*self._newest.values()], UNJOURNALLED):
+        for event in self._begin_anew([*self._newest.values()], UNJOURNALLED):
             self._post(event)
 
     def _topic(self, event: AlarmEvent) -> str:
@@ -330,11 +402,17 @@ class AlarmService:
             was_backed = is_backed
             if tick % REFUSED_TICKS == 0:
                 await self._tell_refused()
-            self.tick()
+            for _ in self._tick_by_machine():
+                await asyncio.sleep(0)
             await self._clock.sleep_ns(TICK_NS)
 
     def tick(self) -> None:
         """What time alone brings, such as the end of shelving, and how the service itself stands."""
+        for _ in self._tick_by_machine():
+            pass
+
+    def _tick_by_machine(self) -> Iterator[None]:
+        """See `tick`; comes back after each machine, so that others may have a turn."""
         if self._untold and self.outbox.counters.waiting <= self._waiting_max // 2:
             # Once events are taken again, broker and disk must know how each alarm stands by now.
             for event in list(self._untold.values()):
@@ -343,15 +421,22 @@ class AlarmService:
             self._catching_up = True
             self._watch(asyncio.create_task(self._catch_up(), name="journal and alarms in step"))
         self._log.sum_up()
-        for event in self.manager.tick():
-            self._post(event)
+        for machine in [*self.managers]:
+            if (manager := self.managers.get(machine)) is not None:  # it may have been taken out meanwhile
+                for event in manager.tick():
+                    self._post(event)
+            yield
         for condition in (*self._of_outputs(), *self._self_check.look(self._vitals())):
             for event in self.manager.condition(*condition):
                 self._post(event)
 
     def take(self, diagnosis: Diagnosis) -> None:
-        """Take in a diagnosis; what follows from it is on its way to the disk when this returns."""
-        for event in self.manager.take(diagnosis):
+        """Take in a diagnosis; what follows from it is on its way to the disk when this returns.
+
+        Raises:
+            ValueError: it is about no machine of these.
+        """
+        for event in self.managers.get(diagnosis.machine, self.manager).take(diagnosis):
             self._post(event)
 
     async def execute(self, command: AlarmCommand, source: str) -> CommandOutcome:
@@ -377,15 +462,22 @@ class AlarmService:
 
     def figures(self) -> dict[str, Any]:
         """How many alarms stand, are covered or unacknowledged by now, and what has happened so far."""
-        counted = self.manager.counters
-        shown = Counter(self.manager.shown)
+        figures: Counter[str] = Counter()
+        for machine in self.managers:
+            figures.update(self.figures_of(machine))
+        return dict(figures)
+
+    def figures_of(self, machine: str) -> dict[str, int]:
+        """The same of one machine."""
+        counted = self.managers[machine].counters
+        shown = self.managers[machine].shown
         return {
             "active": sum(count for state, count in shown.items() if state.is_active),
             "unacknowledged": sum(c for state, c in shown.items() if state.value.endswith("_unacknowledged")),
             "latched": sum(count for state, count in shown.items() if state.is_latched),
-            "suppressed": shown[AlarmState.SUPPRESSED],
-            "shelved": shown[AlarmState.SHELVED],
-            "out_of_service": shown[AlarmState.OUT_OF_SERVICE],
+            "suppressed": shown.get(AlarmState.SUPPRESSED, 0),
+            "shelved": shown.get(AlarmState.SHELVED, 0),
+            "out_of_service": shown.get(AlarmState.OUT_OF_SERVICE, 0),
             "events": counted.events,
             "annunciations": counted.annunciations,
             "chattering": counted.chattering,
@@ -422,7 +514,7 @@ class AlarmService:
             async with self._one_at_a_time:
                 if self._stopping:
                     return self._refuse(STOPPING)
-                refusal = self.manager.refusal(command) if self._refusals.flooding else None
+                refusal = self._refusal(command) if self._refusals.flooding else None
                 if refusal is not None:
                     self._refusals.count(command, source, refusal)
                     return self._refuse(refusal)
@@ -439,9 +531,35 @@ class AlarmService:
         finally:
             self._commands_waiting -= 1
 
+    def _manager_of(self, command: AlarmCommand) -> AlarmManager:
+        """The alarms that a command is about.
+
+        Raises:
+            CommandNotAllowedError: there is no such machine, or several have an alarm of that name.
+        """
+        if command.machine is not None:
+            if (manager := self.managers.get(command.machine)) is not None:
+                return manager
+            there_are = ", ".join(sorted(self.managers))
+            raise CommandNotAllowedError(f"no machine is named {command.machine!r}; there are: {there_are}")
+        having = [one for one in self.managers.values() if one.knows(command.alarm)]
+        if len(having) > 1:
+            names = ", ".join(one.identity.machine for one in having)
+            raise CommandNotAllowedError(
+                f"{names} each have an alarm {command.alarm!r}: name the machine as well"
+            )
+        return having[0] if having else self.manager
+
+    def _refusal(self, command: AlarmCommand) -> str | None:
+        """Why a command would be refused now; None if it would not."""
+        try:
+            return self._manager_of(command).refusal(command)
+        except CommandNotAllowedError as refusal:
+            return f"{refusal}"
+
     async def _outcome(self, command: AlarmCommand) -> CommandOutcome:
         try:
-            events = self.manager.execute(command)
+            events = self._manager_of(command).execute(command)
         except CommandNotAllowedError as refusal:
             return self._refuse(f"{refusal}")
         self.commands.accepted += 1

@@ -141,6 +141,7 @@ class AuditLog:
             "source": source,
             "by": command.by,
             "verb": command.verb.value,
+            **({} if command.machine is None else {"machine": command.machine}),
             "alarm": command.alarm,
             "occurrence": command.occurrence,
             "duration_s": _in_json(command.duration_s),

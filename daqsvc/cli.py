@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import errno
 import logging
@@ -20,7 +21,9 @@ from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, Argument
 from daqsvc.commands.calibrate import CalibrateCommand
 from daqsvc.commands.detectability import DetectabilityCommand
 from daqsvc.commands.example import ExampleCommand
+from daqsvc.commands.machine_files import load_box
 from daqsvc.commands.record import RecordCommand
+from daqsvc.commands.reload import ReloadCommand
 from daqsvc.commands.run import RunCommand
 from daqsvc.commands.status import StatusCommand
 
@@ -51,24 +54,39 @@ class Command(Protocol):
 
 
 class CheckCommand:
-    """``daqsvc check FILE``."""
+    """``daqsvc check FILE ...``."""
 
     help = "read a machine file and say what was understood, or every error at once"
     description = (
         "Read a machine file and print what was understood. If it cannot be used, print every error with "
-        "file, line, key, value and remedy, and exit with 2."
+        "file, line, key, value and remedy, and exit with 2. Of several files, or a directory of them, it "
+        "also says whether one service can watch all of them."
     )
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `Command.add_arguments`."""
-        parser.add_argument("file", type=Path, metavar="FILE", help="the machine file (TOML)")
+        parser.add_argument(
+            "files",
+            type=Path,
+            nargs="+",
+            metavar="FILE",
+            help="the machine file (TOML); or several of one box",
+        )
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `Command.run`."""
-        machine = load(arguments.file)
-        if machine is None:
+        box = load_box(arguments.files, load)
+        if box is None:
             return EXIT_USAGE
         kernel_cache.prepare()
+        codes = []
+        for number, machine in enumerate(box.machines.values()):
+            if number:
+                print()  # noqa: T201 - this is what the verb is for
+            codes.append(self._check(machine, box.own))
+        return max(codes)
+
+    def _check(self, machine: MachineFile, own: MachineFile) -> int:
         from daqsvc.commands.store_argument import store_doubts  # noqa: PLC0415
         from daqsvc.detectors.make import check_files  # noqa: PLC0415
         from daqsvc.publish.make import check_outputs  # noqa: PLC0415
@@ -81,7 +99,7 @@ class CheckCommand:
         check_outputs(machine)
         doubts = list(store_doubts(machine))
         with collecting() as failures:
-            print(describe(machine, doubts))  # noqa: T201 - this is what the verb is for
+            print(describe(machine, doubts, own))  # noqa: T201 - this is what the verb is for
         for failed in failures:
             failed.file, failed.table = machine.path, dotted(failure(machine, failed).path)
             print(failed, file=sys.stderr)  # noqa: T201
@@ -152,6 +170,7 @@ def commands() -> dict[str, Command]:
     known: dict[str, Command] = {
         "run": RunCommand(load, start_logging),
         "check": CheckCommand(),
+        "reload": ReloadCommand(load),
         "status": StatusCommand(load),
         "alarms": AlarmsCommand(load),
         **alarm_verbs(load),
@@ -189,20 +208,30 @@ def parser(known: dict[str, Command]) -> argparse.ArgumentParser:
 def _chosen(root: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:
     """The arguments, those of a verb that takes files with options between them too.
 
-    argparse takes the files of a verb in one piece and knows no better with verbs.
+    argparse takes the words of a verb in one piece, where a FILE that may be left out ends up empty before an
+    option, and knows no better with verbs.
     """
     chosen, rest = root.parse_known_args(arguments)
     files = getattr(chosen, "files", None)
-    if rest and (files is None or any(one.startswith("-") for one in rest)):
+    if any(one.startswith("-") for one in rest):
         root.parse_args(arguments)  # says what is wrong
-    if rest and files is not None:
+    elif rest and files is not None:
         chosen.files = [*files, *rest]
+    elif len(rest) == 1 and {"file", "store"} <= vars(chosen).keys() and chosen.file is None:
+        if chosen.store is not None:
+            root.error("argument FILE: not allowed with argument --store")
+        chosen.file = Path(rest[0])
+    elif rest:
+        root.parse_args(arguments)  # as above
     return chosen
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of the console script; returns the exit code."""
     _ignore_until_heard(sys.argv[1:] if arguments is None else arguments)
+    if arguments is None:
+        # Before it ends, the interpreter takes its handlers back, and a late SIGHUP would end the process.
+        atexit.register(_ignore_from_here, sys.argv[1:])
     try:
         chosen = _chosen(parser(commands()), arguments)
         command: Command = chosen.command
@@ -245,6 +274,12 @@ def _ignore_until_heard(arguments: Sequence[str]) -> None:
     for number in (signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2):
         if signal.getsignal(number) is signal.SIG_DFL:
             signal.signal(number, lambda *_: None)
+
+
+def _ignore_from_here(arguments: Sequence[str]) -> None:
+    if arguments[:1] == ["run"]:
+        for number in (signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2):
+            signal.signal(number, signal.SIG_IGN)
 
 
 def _give_up_stdout() -> None:

@@ -19,7 +19,7 @@ import socket
 import stat
 import struct
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -39,7 +39,7 @@ from daqsvc.outbox.files import is_possessed, is_read_only
 from daqsvc.outbox.reading import JOURNAL_NAME
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterator
+    from collections.abc import Awaitable, Callable, Collection, Iterator
     from pathlib import Path
 
     from daqsvc.alarms.commands import AlarmCommand, CommandHandler
@@ -63,12 +63,20 @@ ANSWER_S = 20.0
 """How long the client waits for the service: longer than that waits for its disk."""
 STATUS_S = 10.0
 """How long it waits for the status, which waits for nothing but the processor."""
+RELOAD_S = 120.0
+"""How long it waits for a reload, which may compile kernels."""
 LONGEST_STATUS = 32 * 1024 * 1024
 """Of 4096 sensors it is some 5 MB."""
 
 _REQUEST: Literal["daqsvc.control/1"] = "daqsvc.control/1"
 _QUESTION = b'{"schema": "daqsvc.control/1", "verb": "standing"}'
-STATUS_QUESTION = b'{"schema": "daqsvc.control/1", "verb": "status"}'
+_STATUS_VERB = b'{"schema": "daqsvc.control/1", "verb": "status"'
+STATUS_QUESTION = _STATUS_VERB + b"}"
+_RELOADS = {
+    b'{"schema": "daqsvc.control/1", "verb": "reload"}': False,
+    b'{"schema": "daqsvc.control/1", "verb": "reload", "dry_run": true}': True,
+}
+"""The questions, and whether nothing is to be changed."""
 _ANSWER: Literal["daqsvc.control-answer/1"] = "daqsvc.control-answer/1"
 
 
@@ -78,6 +86,10 @@ class ControlError(Exception):
 
 class AbsentError(ControlError):
     """Nobody answers at the control socket of a store, for now."""
+
+
+class NotRunningError(AbsentError):
+    """No service runs on the store."""
 
 
 class UnreachableError(AbsentError):
@@ -112,6 +124,42 @@ class ControlAnswer(BaseModel):
     reason: str
     events: Annotated[tuple[str, ...], Field(strict=False)] = ()
     waiting: int = 0
+
+
+class WhichMachineAnswer(ControlAnswer):
+    """The status was asked for of no machine, where there are several, or of one that is not watched."""
+
+    machines: Annotated[tuple[str, ...], Field(strict=False)]
+
+
+class ReloadAnswer(ControlAnswer):
+    """What a reload has changed, or would; or why it was refused, a sentence each."""
+
+    lines: Annotated[tuple[str, ...], Field(strict=False)]
+
+
+class Reload(Protocol):
+    """See `daqsvc.service.Service.reload`."""
+
+    async def __call__(self, *, dry_run: bool = False) -> list[str]:
+        """Say what has been changed, or would be.
+
+        Raises:
+            ReloadRefusedError: nothing was.
+        """
+        ...
+
+
+class ReloadRefusedError(Exception):
+    """The service goes on as it is.
+
+    Attributes:
+        reasons: why, a sentence each.
+    """
+
+    def __init__(self, reasons: list[str]) -> None:
+        super().__init__("; ".join(reasons))
+        self.reasons = reasons
 
 
 @dataclass(slots=True)
@@ -159,30 +207,35 @@ class ControlServer:
 
     Args:
         store: the store's directory; the caller holds the store, so that a socket found there is left over.
-        machine: name of the machine that the service watches.
+        machines: names of the machines that the service watches.
         execute: carries a command out.
         waiting: how many alarm events the disk has not got yet.
         runtime: directory for the socket itself, e.g. systemd's ``$RUNTIME_DIRECTORY``; the store then has a
             link to it.
-        status: the line of JSON for who asks how everything stands; None if nobody may.
+        status: the line of JSON for who asks how a machine stands, or the only one; for one that is not
+            watched, the names of those that are. None if nobody may ask.
+        reload: reads the machine files again, or only says what would change; a line for each change. None if
+            nobody may ask.
     """
 
     def __init__(
         self,
         store: Path,
-        machine: str,
+        machines: Collection[str],
         execute: CommandHandler,
         waiting: Callable[[], int] = lambda: 0,
         runtime: Path | None = None,
-        status: Callable[[], Awaitable[bytes]] | None = None,
+        status: Callable[[str | None], Awaitable[bytes | tuple[str, ...]]] | None = None,
+        reload: Reload | None = None,
     ) -> None:
         self.path = (runtime or store) / SOCKET
         self._link = None if runtime is None else store / SOCKET
         self.counters = ControlCounters()
-        self._machine = machine
+        self._machines = machines
         self._execute = execute
         self._waiting = waiting
         self._status = status
+        self._reload = reload
         self._server: asyncio.Server | None = None
         self._inode: int | None = None
         self._clients: list[_Client] = []
@@ -289,8 +342,10 @@ class ControlServer:
         try:
             while (line := await _next_line(reader)) is not None:
                 client.busy = True
-                if self._status is not None and line.strip() == STATUS_QUESTION:
-                    answer = await self._status()
+                if self._status is not None and line.startswith(_STATUS_VERB):
+                    answer = await self._tell_status(self._status, line)
+                elif self._reload is not None and line.strip() in _RELOADS:
+                    answer = _json_line(await _reloaded(self._reload, dry_run=_RELOADS[line.strip()]))
                 else:
                     answer = _json_line(await self._answer(line, client.source))
                 client.busy = False
@@ -314,21 +369,45 @@ class ControlServer:
             else:
                 writer.close()
 
+    async def _tell_status(
+        self, status: Callable[[str | None], Awaitable[bytes | tuple[str, ...]]], line: bytes
+    ) -> bytes:
+        """The status of the machine that is meant; without one, of the only one that there is."""
+        try:
+            asked = json.loads(line).get("machine")
+        except (ValueError, RecursionError):
+            asked = ""
+        told = await status(asked if isinstance(asked, str | None) else "")
+        if isinstance(told, bytes):
+            return told
+        self.counters.malformed += asked is not None
+        reason = "name a machine" if asked is None else f"this service does not watch {asked!r:.200}"
+        return _json_line(WhichMachineAnswer(accepted=False, reason=reason, machines=told))
+
     async def _answer(self, line: bytes, source: str) -> ControlAnswer:
         if line.strip() == _QUESTION:
             return ControlAnswer(accepted=True, reason="", waiting=self._waiting())
         try:
-            request = parse_request(line, self._machine)
+            request = parse_request(line, self._machines)
         except ValueError as error:
             self.counters.malformed += 1
             return ControlAnswer(accepted=False, reason=f"{error}")
         self.counters.requests += 1
-        outcome = await self._execute(request.command(request.verb), source)
+        outcome = await self._execute(request.command(request.verb, request.machine), source)
         return ControlAnswer(accepted=outcome.accepted, reason=outcome.reason, events=outcome.events)
 
 
-def parse_request(line: bytes, machine: str) -> ControlRequest:
-    """The request in a line to the service that watches ``machine``.
+async def _reloaded(reload: Reload, *, dry_run: bool) -> ReloadAnswer:
+    try:
+        return ReloadAnswer(accepted=True, reason="", lines=tuple(await reload(dry_run=dry_run)))
+    except ReloadRefusedError as refused:
+        return ReloadAnswer(
+            accepted=False, reason="the machine files are refused", lines=tuple(refused.reasons)
+        )
+
+
+def parse_request(line: bytes, machines: Collection[str]) -> ControlRequest:
+    """The request in a line to the service that watches ``machines``.
 
     Raises:
         ValueError: it is none; the text is one sentence that says why.
@@ -339,8 +418,9 @@ def parse_request(line: bytes, machine: str) -> ControlRequest:
         request = ControlRequest.read(line)
     except ValidationError as error:
         raise ValueError(f"the request is not valid, {faults_of(error, 'it')[0]}") from None
-    if request.machine not in {None, machine}:
-        raise ValueError(f"this service watches {machine!r}, not {request.machine!r}")
+    if request.machine is not None and request.machine not in machines:
+        watched = ", ".join(repr(machine) for machine in machines)
+        raise ValueError(f"this service watches {watched}, not {request.machine!r}")
     return request
 
 
@@ -393,22 +473,66 @@ def ask(store: Path, request: ControlRequest, timeout_s: float = ANSWER_S) -> Co
     return CommandOutcome(accepted=answer.accepted, reason=answer.reason, events=answer.events)
 
 
-def ask_status(store: Path, timeout_s: float = STATUS_S) -> dict[str, Any]:
-    """How everything stands by the service that runs on a store, as it says; blocks.
+def ask_reload(store: Path, *, dry_run: bool = False) -> ReloadAnswer:
+    """Have the service that runs on a store read its machine files again; blocks.
 
-    Returns:
-        A `daqsvc.publish.service_status.ServiceStatusPayload`, by its keys in JSON.
+    Args:
+        store: the store's directory.
+        dry_run: only ask what that would change.
 
     Raises:
         ControlError: there is no service, it is somebody else's, or it does not answer.
     """
+    [line] = [line for line, is_dry in _RELOADS.items() if is_dry == dry_run]
+    answer = _asked(store, line + b"\n", RELOAD_S, LONGEST_STATUS, "its log says what it has done")
+    try:
+        return ReloadAnswer.model_validate_json(answer)
+    except ValidationError:
+        raise ControlError(
+            f"the daqsvc of {store} is of an older version, which cannot reload: restart it"
+        ) from None
+
+
+def ask_status(store: Path, machine: str | None = None, timeout_s: float = STATUS_S) -> list[dict[str, Any]]:
+    """How everything stands by the service that runs on a store, as it says; blocks.
+
+    Args:
+        store: the store's directory.
+        machine: which one is meant; None for all that it watches.
+        timeout_s: how long to wait for each answer.
+
+    Returns:
+        For each machine a `daqsvc.publish.service_status.ServiceStatusPayload`, by its keys in JSON.
+
+    Raises:
+        ControlError: there is no service, it is somebody else's, it does not answer, or does not watch that.
+    """
+    status = _status_of(store, machine, timeout_s)
+    if isinstance(status, dict):
+        return [status]
+    told = [_status_of(store, one, timeout_s) for one in status if machine is None]
+    if machine is not None or not told:
+        raise ControlError(f"the daqsvc of {store} watches {', '.join(status)}, not {machine}")
+    # One that was taken out in between is left out.
+    return [one for one in told if isinstance(one, dict)]
+
+
+def _status_of(store: Path, machine: str | None, timeout_s: float) -> dict[str, Any] | tuple[str, ...]:
+    """How a machine stands, or which ones there are, if that is none of them.
+
+    Raises:
+        ControlError: see `ask_status`.
+    """
     then = "its log says what holds it up"
-    line = _asked(store, STATUS_QUESTION + b"\n", timeout_s, LONGEST_STATUS, then)
+    named = b"}" if machine is None else b', "machine": ' + json.dumps(machine).encode() + b"}"
+    line = _asked(store, _STATUS_VERB + named + b"\n", timeout_s, LONGEST_STATUS, then)
     try:
         answer: dict[str, Any] = json.loads(line)
         schema = answer["schema"]
     except (ValueError, KeyError, TypeError) as error:
         raise _unanswered(store, error, then) from None
+    if schema == _ANSWER and answer.get("machines"):
+        return tuple(f"{one}" for one in answer["machines"])
     if schema == _ANSWER:
         raise ControlError(
             f"the daqsvc of {store} is of an older version, which does not tell its status: restart it"
@@ -455,7 +579,7 @@ def _unanswered(store: Path, error: Exception, then: str) -> AbsentError:
 def _absence(store: Path) -> AbsentError:
     """Why nobody listens at the control socket of a store."""
     if not is_possessed(store / f"{JOURNAL_NAME}.lock"):
-        return AbsentError(
+        return NotRunningError(
             f"no daqsvc runs on the store {store}: start it with daqsvc run, or name its store with --store"
         )
     if is_read_only(store):

@@ -1,57 +1,61 @@
-"""The service: one machine file, one event loop, and everything that runs on it."""
+"""The service: one machine or several, one event loop, and everything that runs on it."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
 from collections import deque
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from daqsvc.acquisition.alignment import SETTLE_NS
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
-from daqsvc.acquisition.ring import SampleRing
-from daqsvc.acquisition.standing import StreamState
 from daqsvc.alarm_service import AlarmService
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.make import alarm_rule
-from daqsvc.control import ControlError, ControlServer
-from daqsvc.detectors.make import detectors
-from daqsvc.diagnosis.pipeline import Pipeline
-from daqsvc.diagnosis.snapshots import alignment, at_once, patience
-from daqsvc.diagnosis.statements import said_of_silence
+from daqsvc.alarms.manager import AlarmManager
+from daqsvc.control import ControlError, ControlServer, ReloadRefusedError
+from daqsvc.diagnosis.pipeline import THREADS, KernelThreads, kernel_failed
 from daqsvc.driver_reports import DriverReports
+from daqsvc.machine_watch import MachineWatch
+from daqsvc.outbox.files import make_directory
 from daqsvc.outbox.limits import OutboxLimits
+from daqsvc.publish.machine_figures import MACHINES, of_machine
 from daqsvc.publish.make import output_plugins, output_set
 from daqsvc.publish.output import output_name
 from daqsvc.publish.payloads import Figures
+from daqsvc.reload import Changes, changes
 from daqsvc.self_check import BusHealth, conditions
-from daqsvc.settings.streams import Grid
+from daqsvc.settings.problems import AssemblyError, MachineFileError
 from daqsvc.status_report import StatusReport
-from daqsvc.supervision import EssentialLostError, Progress, Supervisor, over, stop_all
+from daqsvc.supervision import EssentialLostError, Progress, StallWatch, Supervisor, over, stop_all
 from daqsvc.threads import CallThreads
 from drivers.base import DeviceAbsentError
-from drivers.make import bus_drivers, bus_self_checks
+from drivers.frames import LayoutError
+from drivers.make import bus_driver, bus_drivers, bus_self_checks
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Mapping
     from pathlib import Path
 
     from daqsvc.acquisition.clock import Clock
+    from daqsvc.acquisition.ring import SampleRing
     from daqsvc.acquisition.samples import SampleBlock
-    from daqsvc.diagnosis.detector import Detector
+    from daqsvc.acquisition.standing import StreamState
+    from daqsvc.box import Box
     from daqsvc.diagnosis.record import Diagnosis
+    from daqsvc.publish.output import OutputSet
     from daqsvc.settings.models import MachineFile
+    from daqsvc.supervision import Part
     from drivers.base import Driver
 
 logger = logging.getLogger(__name__)
 
 STATUS_EVERY_NS = NS_PER_S
-LAG_EVERY_S = 0.01
-LAG_REMEMBERED = 6000
+LAG_EVERY_S = 0.1
+LAG_REMEMBERED = round(60.0 / LAG_EVERY_S)
 SUSPENDED_S = 1.0
 """A loop that is later than this was not busy: the process was suspended, or the host starved it."""
 RELEASE_S = 0.6
@@ -66,8 +70,12 @@ CLOSE_S = 0.3
 """... and then the journal to close: within the two seconds in which the service promises to stop."""
 
 
+ENDS = "the service ends"
+"""Why nothing is reloaded any more."""
+
+
 class LoopLag:
-    """How late the event loop gets round to things: a timer's lateness, every 10 ms for a minute.
+    """How late the event loop gets round to things: a timer's lateness, 10 times a second for a minute.
 
     Attributes:
         suspensions: how often it stood still for longer than `SUSPENDED_S`.
@@ -107,14 +115,17 @@ class LoopLag:
 
 
 class Service:
-    """Acquires, diagnoses and tells, as a machine file says.
+    """Acquires, diagnoses and tells, as the machine files of a box say.
 
     Args:
-        machine: the machine file.
+        box: the machine files.
         store: directory of the journal.
         clock: the service's clock.
         on_ending: called when the service begins to end, for whatever reason.
         runtime: directory for the control socket, if not the store.
+        read_again: reads the machine files again, for `reload`; blocks, and raises `MachineFileError`. None
+            if there are none.
+        on_reload: called with True when a reload begins to change something, and with False when it is over.
 
     Raises:
         AssemblyError: the machine file asks for a driver that is not installed.
@@ -123,70 +134,104 @@ class Service:
 
     def __init__(
         self,
-        machine: MachineFile,
+        box: Box,
         store: Path,
         clock: Clock | None = None,
         on_ending: Callable[[], None] = lambda: None,
         runtime: Path | None = None,
+        read_again: Callable[[], Box] | None = None,
+        on_reload: Callable[[bool], None] = lambda _: None,
     ) -> None:
-        self.machine = machine
+        self.box = box
         self.clock: Clock = clock or SystemClock()
         self.lag = LoopLag()
         self.ready = asyncio.Event()
         self.supervisor = Supervisor()
+        self._store = store
+        self._read_again = read_again
         self._on_ending = on_ending
-        self._identity = Identity(machine.site, machine.box, machine.machine.name)
-        watching = detectors(machine, store)
-        grids = [*(Grid({name: stream}) for name, stream in machine.streams.items()), *machine.grids]
-        self._grids = grids
-        self._standings = dict.fromkeys(machine.streams, StreamState())
-        self.rings = {grid.name: _ring(machine, grid, watching) for grid in grids}
-        self.alignment = alignment(machine, self.clock, self._deliver)
-        self.drivers: list[Driver] = bus_drivers(machine, self.clock, self._deliver, self._stand)
+        self._on_reload = on_reload
+        self._reloading = asyncio.Lock()
+        self._is_ending = False
+        self._begun_ns = self.clock.monotonic_ns()
+        self._parts = Parts()
+        self._kernels = KernelThreads(THREADS, kernel_failed(self.supervisor))
+        own = box.own
+        self.watches = {name: self._watch(box, name) for name in box.machines}
+        self.streams: dict[str, BoxStream] = {}
+        self._receivers: dict[str, Callable[[SampleBlock], None]] = {}
+        self._join_streams()
+        self.drivers: list[Driver] = bus_drivers(own, self.clock, self._deliver, self._stand)
         self.driver_reports = [
-            DriverReports(
-                name,
-                driver,
-                [s for s, stream in machine.streams.items() if stream.bus == name],
-                self.supervisor,
-            )
-            for name, driver in zip(machine.buses, self.drivers, strict=True)
+            self._reports_of(box, name, driver) for name, driver in zip(own.buses, self.drivers, strict=True)
         ]
-        settling_ns = {aligner.name: SETTLE_NS for aligner in self.alignment.aligners}
-        self.pipeline = Pipeline(
-            self.rings,
-            watching,
-            self._report,
-            self.clock,
-            settling_ns=settling_ns,
-            patience={grid.name: patience(machine, grid.name, grid.rate_hz) for grid in grids},
-            supervisor=self.supervisor,
-            fall_silent=self._fall_silent,
-            why_over=self._why_over,
-        )
+        self.stalls = StallWatch(self.progress)
         self.alarms = AlarmService(
-            self._identity,
-            [alarm_rule(alarm) for alarm in machine.alarms],
+            self._alarms_of(own),
             store,
             self.clock,
-            output_set(machine, conditions(bus_self_checks(machine))),
-            handling=machine.alarm_handling,
-            limits=OutboxLimits.of(machine.store),
-            buses=bus_self_checks(machine),
+            _output_set(box),
+            others=[self._alarms_of(machine) for machine in box.others],
+            limits=OutboxLimits.of(own.store),
+            buses=bus_self_checks(own),
             bus_health=self._bus_health,
             supervisor=self.supervisor,
-            progress=self.progress,
+            stalls=self.stalls,
         )
-        self.report = StatusReport(
-            machine, self.clock, self.rings, self.driver_reports, self.alarms, self.figures
-        )
+        self.reports = {name: self._status_report(name) for name in self.watches}
         self.control = ControlServer(
             store,
-            machine.machine.name,
+            self.alarms.managers,
             self.alarms.execute,
             lambda: self.alarms.outbox.counters.waiting,
             runtime,
-            self.report.line,
+            self._status_line,
+            self.reload,
+        )
+
+    def _watch(self, box: Box, name: str) -> MachineWatch:
+        return MachineWatch(
+            box.machines[name],
+            self._store if box.is_single else self._store / name,
+            self.clock,
+            self._report,
+            self.supervisor if box.is_single else self.supervisor.within(name),
+            self._why_bus_over,
+            self._kernels,
+        )
+
+    def _join_streams(self) -> None:
+        """Let the samples of each stream go to the machine that it belongs to by now."""
+        self.streams = {
+            self.box.stream_key(machine, stream): BoxStream(watch, stream)
+            for machine, watch in self.watches.items()
+            for stream in watch.machine.streams
+        }
+        self._receivers = {key: one.watch.receiver(one.name) for key, one in self.streams.items()}
+
+    def _reports_of(self, box: Box, name: str, driver: Driver) -> DriverReports:
+        streams = [key for key, stream in box.own.streams.items() if stream.bus == name]
+        return DriverReports(name, driver, streams, self.supervisor)
+
+    def _status_report(self, name: str) -> StatusReport:
+        figures = partial(self.figures_of, name)
+        return StatusReport(
+            self.watches[name], self.clock, self.driver_reports, self.alarms, figures, self._begun_ns
+        )
+
+    async def _status_line(self, machine: str | None) -> bytes | tuple[str, ...]:
+        """How a machine stands, or the only one; the names of all if there is no such machine."""
+        if machine is None and len(self.reports) == 1:
+            [machine] = self.reports
+        report = self.reports.get(machine or "")
+        return tuple(self.reports) if report is None else await report.line()
+
+    def _alarms_of(self, machine: MachineFile) -> AlarmManager:
+        return AlarmManager(
+            Identity(machine.site, machine.box, machine.machine.name),
+            [alarm_rule(alarm) for alarm in machine.alarms],
+            self.clock,
+            handling=machine.alarm_handling,
         )
 
     async def run(self, stop: asyncio.Event) -> None:
@@ -220,27 +265,24 @@ class Service:
 
     async def _start(self) -> None:
         await self.alarms.open()
-        await self.pipeline.warm()
-        await self._resume()
+        for watch in self.watches.values():
+            await self._prepare(watch)
+        # Take over from the journal how the alarms stood when the service ended.
+        await self.alarms.resume({name: watch.active_detectors() for name, watch in self.watches.items()})
         try:
             await self.control.open()
         except ControlError as error:
             # Watching the machine matters more than being told what to do.
             logger.error("no commands on this box until this is mended: %s", error)  # noqa: TRY400
 
-    async def _resume(self) -> None:
-        """Take over from the journal how the alarms stood when the service ended."""
-        now_ns = self.clock.monotonic_ns()
-        active_detectors: dict[str, Sequence[str]] = {}
-        for detector in self.pipeline.detectors:
-            with self.supervisor.sparing_others(f"detector {detector.name}", "its alarms begin anew"):
-                active_detectors.update(
-                    {s.detector: s.sensors for s in said_of_silence(detector, 0.0, now_ns)}
-                )
-        await self.alarms.resume(active_detectors)
+    async def _prepare(self, watch: MachineWatch) -> None:
+        if watch.store != self._store:
+            with watch.supervisor.sparing_others("store", "its detectors keep nothing over restarts"):
+                await asyncio.to_thread(make_directory, watch.store)
+        await watch.pipeline.warm()
 
     async def _serve(self, stop: asyncio.Event) -> None:
-        keep = self.supervisor.keep
+        keep, parts = self.supervisor.keep, self._parts
         helpers = [
             keep("loop lag", self.lag.watch),
             keep("status", self._tell_status),
@@ -248,38 +290,175 @@ class Service:
             keep("journal", self._watch_journal),
         ]
         controlling = keep("control socket", self.control.serve)
-        telling = [keep(output_name(path), output.run) for path, output in self.alarms.outputs.items()]
-        pipeline = keep(
-            "pipeline", self.pipeline.run, may_end=lambda: all(r.is_closed for r in self.rings.values())
-        )
-        reading = [
-            keep(
-                f"driver {told.name}",
-                driver.run,
-                # One that is to be ignored if absent ends, and so does a recording.
-                may_end=partial(_has_ended, told),
-                fatal=(DeviceAbsentError,),
-            )
-            for driver, told in zip(self.drivers, self.driver_reports, strict=True)
-        ]
+        self._start_outputs()
+        for name in self.watches:
+            self._start_pipeline(name)
+        for driver, reports in zip(self.drivers, self.driver_reports, strict=True):
+            self._start_driver(driver, reports, fatal=(DeviceAbsentError,))
         try:
             self.ready.set()
             await self._until_stopped(stop)
         finally:
             self._on_ending()
+            self._is_ending = True
             left = _Deadline(STOP_S)
-            for part in (*telling, pipeline):
+            if parts.reload is not None:
+                parts.reload.cancel()
+                await asyncio.wait({parts.reload}, timeout=left.most(DRAIN_S))
+            telling, pipelines = [*parts.outputs.values()], [*parts.pipelines.values()]
+            for part in (*telling, *pipelines):
                 part.leave()
             await stop_all([controlling], left.most(DRAIN_S))
-            await stop_all(reading, left.most(RELEASE_S))
-            for ring in self.rings.values():
-                ring.close()
-            await over([pipeline], left.most(DRAIN_S))
+            await stop_all(parts.drivers.values(), left.most(RELEASE_S))
+            for watch in self.watches.values():
+                watch.close()
+            await over(pipelines, left.most(DRAIN_S))
             await self.alarms.settle(left.most(DRAIN_S))
             with self.supervisor.sparing_others("status", "the service is stopping anyway"):
                 self._publish_status()
             await self.alarms.stop(left.most(GOODBYE_S))
-            await stop_all([*helpers, *telling, pipeline], left.most(DRAIN_S))
+            await stop_all([*helpers, *telling, *pipelines], left.most(DRAIN_S))
+
+    def _start_outputs(self) -> None:
+        for path, output in self.alarms.outputs.items():
+            self._parts.outputs[path] = self.supervisor.keep(output_name(path), output.run)
+
+    def _start_pipeline(self, name: str) -> None:
+        watch = self.watches[name]
+        keep = watch.supervisor.keep
+        self._parts.pipelines[name] = keep("pipeline", watch.pipeline.run, may_end=partial(_is_over, watch))
+
+    def _start_driver(
+        self, driver: Driver, reports: DriverReports, *, fatal: tuple[type[Exception], ...] = ()
+    ) -> None:
+        # One that is to be ignored if absent ends, and so does a recording.
+        ends = partial(_has_ended, reports)
+        keep = self.supervisor.keep
+        self._parts.drivers[reports.name] = keep(
+            f"driver {reports.name}", driver.run, may_end=ends, fatal=fatal
+        )
+
+    async def reload(self, *, dry_run: bool = False) -> list[str]:
+        """Read the machine files again and go on with them, by what is different.
+
+        They are applied as a whole or not at all. What has not changed goes on: its bus stays open, its
+        samples go on being counted, its detectors know what they knew. Alarms stand as they did.
+
+        Args:
+            dry_run: only say what would be done.
+
+        Returns:
+            What was done, a line each; nothing if nothing is different.
+
+        Raises:
+            ReloadRefusedError: the files cannot be used, or not while the service runs.
+        """
+        if self._read_again is None:
+            raise ReloadRefusedError(["this service was not made of files"])
+        async with self._reloading:
+            try:
+                box = await asyncio.to_thread(self._read_again)
+                found = await asyncio.to_thread(changes, self.box, box)
+                if dry_run or not found:
+                    return found.lines()
+                made = await self._make(box, found)
+                if self._is_ending:
+                    raise ReloadRefusedError([ENDS])
+            except MachineFileError as error:
+                raise ReloadRefusedError([f"{problem}" for problem in error.problems]) from error
+            except (AssemblyError, LayoutError) as error:
+                raise ReloadRefusedError([f"{error}"]) from error
+            # A task of its own: whoever has asked for it may go away, the service may not stay in between.
+            going_on = self._parts.reload = asyncio.create_task(
+                self._go_on_with(box, found, made), name="reload"
+            )
+            self._on_reload(True)
+            try:
+                await asyncio.wait({going_on})
+            finally:
+                self._on_reload(False)
+            if going_on.cancelled():
+                raise ReloadRefusedError([ENDS])
+            going_on.result()
+            for line in found.lines():
+                logger.warning("reloaded: %s", line)
+            return found.lines()
+
+    async def _make(self, box: Box, found: Changes) -> Made:
+        """Make all that is new, before anything of what runs is touched.
+
+        Raises:
+            AssemblyError, LayoutError: that cannot be done.
+        """
+        names = (*found.machines_anew, *found.machines_new)
+        watches = {name: await asyncio.to_thread(self._watch, box, name) for name in names}
+        drivers = {
+            name: bus_driver(box.own, name, self.clock, self._deliver, self._stand)
+            for name in (*found.buses_anew, *found.buses_new)
+        }
+        for watch in watches.values():
+            await self._prepare(watch)
+        return Made(watches, drivers)
+
+    async def _go_on_with(self, box: Box, found: Changes, made: Made) -> None:
+        before, parts = self.watches, self._parts
+        ending = [parts.drivers.pop(name) for name in (*found.buses_gone, *found.buses_anew)]
+        await stop_all(ending, RELEASE_S)
+        # From here to the next await samples change over from the old to the new.
+        self.box = box
+        self.watches = {name: made.watches.get(name) or before[name] for name in box.machines}
+        for name, watch in made.watches.items():
+            if name in before:
+                watch.take_over(before[name], box.own.buses.keys() - {*found.buses_new, *found.buses_anew})
+        self._join_streams()
+        drivers = dict(zip((one.name for one in self.driver_reports), self.drivers, strict=True))
+        reports = {one.name: one for one in self.driver_reports}
+        drivers |= made.drivers
+        reports |= {name: self._reports_of(box, name, driver) for name, driver in made.drivers.items()}
+        self.drivers[:] = [drivers[name] for name in box.own.buses]
+        self.driver_reports[:] = [reports[name] for name in box.own.buses]
+        replaced = [before[name] for name in (*found.machines_gone, *found.machines_anew)]
+        pipelines = [parts.pipelines.pop(name) for name in (*found.machines_gone, *found.machines_anew)]
+        for part in pipelines:
+            part.leave()
+        for watch in replaced:
+            watch.close()
+        await over(pipelines, DRAIN_S)
+        await stop_all(pipelines, DRAIN_S)
+        for watch, part in zip(replaced, pipelines, strict=True):
+            if part.over.done():
+                watch.let_go()
+        await self._change_alarms(box, found)
+        self.reports = {
+            name: self._status_report(name) if name in made.watches else self.reports[name]
+            for name in self.watches
+        }
+        for name in made.watches:
+            self._start_pipeline(name)
+        for name, driver in made.drivers.items():
+            self._start_driver(driver, reports[name])
+
+    async def _change_alarms(self, box: Box, found: Changes) -> None:
+        """Go on with the alarms of the new files, which stand as they did."""
+        telling = [*self._parts.outputs.values()] if found.outputs else []
+        if found.outputs:
+            for part in telling:
+                part.leave()
+            await self.alarms.stop(GOODBYE_S)
+            await stop_all(telling, DRAIN_S)
+            self._parts.outputs.clear()
+        anew = {*found.machines_anew, *found.machines_new, *found.alarms_anew}
+        # In a thread, for what outputs are made of may have to be imported.
+        outputs = await asyncio.to_thread(self.alarms.made_by, _output_set(box)) if found.outputs else None
+        self.alarms.change(
+            [self._alarms_of(box.machines[name]) for name in box.machines if name in anew],
+            gone=found.machines_gone,
+            buses=bus_self_checks(box.own),
+            active_detectors={name: watch.active_detectors() for name, watch in self.watches.items()},
+            outputs=outputs,
+        )
+        if found.outputs:
+            self._start_outputs()
 
     async def _until_stopped(self, stop: asyncio.Event, first: asyncio.Task[None] | None = None) -> None:
         """Wait until the service is to stop, or ``first`` is done.
@@ -308,33 +487,19 @@ class Service:
 
     def _deliver(self, block: SampleBlock) -> None:
         with self.supervisor.sparing_others(f"stream {block.stream}", "a block of its samples is lost"):
-            self.rings[block.stream].write(block)
-            self.alignment.accept(block)
+            self._receivers[block.stream](block)
 
     def _stand(self, stream: str, standing: StreamState) -> None:
-        """Tell the pipeline how a stream stands, and every grid that it is on: that is no better."""
-        self._standings[stream] = standing
-        for grid in self._grids:
-            if stream in grid.streams:
-                standings = [self._standings[name] for name in grid.streams]
-                worst = next((one for one in standings if one.doubt), StreamState())
-                proven = all(one.proven for one in standings)
-                self.pipeline.stand(grid.name, worst._replace(proven=proven))
+        """Tell the machine of a stream how that stands."""
+        one = self.streams[stream]
+        one.watch.stand(one.name, standing)
 
-    def _fall_silent(self, stream: str, standing: StreamState) -> None:
-        """Take in that nothing comes any more of a stream in doubt; a grid stands as its streams do."""
-        if stream in self._standings:
-            self._stand(stream, standing)
-
-    def _why_over(self, stream: str) -> str:
-        """Why nothing more can come of a stream or grid, e.g. that its recording has ended; else empty."""
-        streams = next(grid.streams for grid in self._grids if grid.name == stream)
-        buses = {self.machine.streams[name].bus for name in streams}
-        over = (one.link.over for one in self.driver_reports if one.name in buses)
-        return next(filter(None, over), "")
+    def _why_bus_over(self, bus: str) -> str:
+        """Why nothing more can come from a bus, e.g. that its recording has ended; else empty."""
+        return next((one.link.over for one in self.driver_reports if one.name == bus), "")
 
     def _report(self, diagnosis: Diagnosis) -> None:
-        self.report.remember(diagnosis)
+        self.reports[diagnosis.machine].remember(diagnosis)
         with self.supervisor.sparing_others(
             f"alarms by {diagnosis.detector}", "one of its statements is lost"
         ):
@@ -369,8 +534,8 @@ class Service:
         awaited: dict[str, str] = {}
         for driver in self.driver_reports:
             link = driver.link
-            if self.machine.buses[driver.name].start == "error":
-                if not any(self.rings[stream].started for stream in driver.names):
+            if self.box.own.buses[driver.name].start == "error":
+                if not any(self.streams[stream].ring.started for stream in driver.names):
                     awaited[driver.name] = "no samples have come yet"
             elif patient and not (link.ever_up or link.reason or link.over):
                 awaited[driver.name] = "it is being opened"
@@ -384,7 +549,8 @@ class Service:
             )
             for driver in self.driver_reports
         }
-        return {**readers, **self.pipeline.progress(), "outbox": self.alarms.outbox.progress}
+        parts = {part: p for watch in self.watches.values() for part, p in watch.progress().items()}
+        return {**readers, **parts, "outbox": self.alarms.outbox.progress}
 
     async def _tell_status(self) -> None:
         while True:
@@ -409,7 +575,7 @@ class Service:
                 **asdict(driver.counters),
             }
             for name, (counters, base) in driver.streams.items():
-                ring, standing = self.rings[name], self._standings[name]
+                ring, standing = self.streams[name].ring, self.streams[name].standing
                 streams[name] = {
                     **asdict(counters),
                     "rate_hz": base.rate_hz,
@@ -423,8 +589,10 @@ class Service:
         return {
             "streams": streams,
             "buses": buses,
-            "grids": self.alignment.figures(),
-            "detectors": {name: asdict(c) for name, c in self.pipeline.counters.items()},
+            "grids": self._of_machines(lambda watch: watch.alignment.figures()),
+            "detectors": self._of_machines(
+                lambda watch: {name: asdict(counted) for name, counted in watch.pipeline.counters.items()}
+            ),
             "loop_lag_ms": self.lag.figures_ms(),
             "suspensions": self.lag.suspensions,
             "failures": dict(self.supervisor.failures),
@@ -433,7 +601,23 @@ class Service:
             "control": asdict(self.control.counters),
             "outbox": asdict(self.alarms.outbox.counters),
             **self._figures_of_outputs(),
+            **({} if self.box.is_single else {MACHINES: self._figures_of_machines()}),
         }
+
+    def _of_machines(self, figures: Callable[[MachineWatch], Mapping[str, Any]]) -> dict[str, Any]:
+        """Figures of all machines by their names on the box."""
+        return {
+            self.box.stream_key(machine, name): one
+            for machine, watch in self.watches.items()
+            for name, one in figures(watch).items()
+        }
+
+    def _figures_of_machines(self) -> dict[str, Any]:
+        return {machine: {"alarms": self.alarms.figures_of(machine)} for machine in self.alarms.managers}
+
+    def figures_of(self, machine: str) -> dict[str, Any]:
+        """The figures of one machine, by the names of its file."""
+        return of_machine(self.figures(), machine, self.box.machines[machine].buses)
 
     def _figures_of_outputs(self) -> dict[str, Mapping[str, Any]]:
         figures: dict[str, Mapping[str, Any]] = {}
@@ -448,12 +632,54 @@ class Service:
         return figures
 
 
-def _ring(machine: MachineFile, grid: Grid, detectors: Sequence[Detector]) -> SampleRing:
-    wanted = round(machine.pipeline.ring_s * grid.rate_hz)
-    # However short a ring is asked for, a detector must find its block in it, and some time to come for it.
-    needed = max((4 * d.block for d in detectors if d.stream == grid.name), default=1)
-    needed = max(needed, 2 * at_once(machine, grid.name))
-    return SampleRing(grid.name, grid.channel_names, max(wanted, needed))
+@dataclass(slots=True)
+class Parts:
+    """What is kept going: outputs by the path of their table, pipelines by machine, drivers by bus.
+
+    And the reload that is under way, or was the last.
+    """
+
+    outputs: dict[str, Part] = field(default_factory=dict)
+    pipelines: dict[str, Part] = field(default_factory=dict)
+    drivers: dict[str, Part] = field(default_factory=dict)
+    reload: asyncio.Task[None] | None = None
+
+
+class Made(NamedTuple):
+    """What a reload has made: of machines and buses that are new, or begin anew."""
+
+    watches: dict[str, MachineWatch]
+    drivers: dict[str, Driver]
+
+
+def _output_set(box: Box) -> OutputSet:
+    return output_set(box.own, conditions(bus_self_checks(box.own)), box.others)
+
+
+class BoxStream(NamedTuple):
+    """A stream of a machine.
+
+    Attributes:
+        watch: of the machine.
+        name: in the file of the machine.
+    """
+
+    watch: MachineWatch
+    name: str
+
+    @property
+    def ring(self) -> SampleRing:
+        """Its newest samples."""
+        return self.watch.rings[self.name]
+
+    @property
+    def standing(self) -> StreamState:
+        """Whether anything can be judged by it."""
+        return self.watch.standings[self.name]
+
+
+def _is_over(watch: MachineWatch) -> bool:
+    return watch.is_over
 
 
 def _has_ended(driver: DriverReports) -> bool:

@@ -26,13 +26,12 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping, Sequence
 
     from daqsvc.acquisition.clock import Clock
-    from daqsvc.acquisition.ring import SampleRing
     from daqsvc.alarm_service import AlarmService
     from daqsvc.alarms.status import AlarmStatus
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.driver_reports import DriverReports
+    from daqsvc.machine_watch import MachineWatch
     from daqsvc.publish.service_status import SensorState
-    from daqsvc.settings.models import MachineFile
     from daqsvc.settings.sensors import Sensor
 
     Document = dict[str, Any]
@@ -74,30 +73,30 @@ class StatusReport:
     """Keeps what the detectors have said last, and tells how everything stands.
 
     Args:
-        machine: the machine file.
+        watch: of the machine.
         clock: the service's clock.
-        rings: by stream name.
         drivers: what the driver of each bus tells.
         alarms: the alarms, their outbox and outputs.
-        figures: the figures of the status message.
+        figures: the figures of the status message that are about the machine, by the names of its file.
+        begun_ns: when the service has begun, by its clock.
     """
 
     def __init__(
         self,
-        machine: MachineFile,
+        watch: MachineWatch,
         clock: Clock,
-        rings: Mapping[str, SampleRing],
         drivers: Sequence[DriverReports],
         alarms: AlarmService,
         figures: Callable[[], dict[str, Any]],
+        begun_ns: int,
     ) -> None:
-        self._machine = machine
+        machine = self._machine = watch.machine
         self._clock = clock
-        self._rings = rings
-        self._drivers = drivers
+        self._rings = watch.rings
+        self._drivers = [driver for driver in drivers if driver.name in machine.buses]
         self._alarms = alarms
         self._figures = figures
-        self._begun_ns = clock.monotonic_ns()
+        self._begun_ns = begun_ns
         self._patience_ns = {n: patience(machine, n, s.rate_hz).ns for n, s in machine.streams.items()}
         self._latest: dict[str, Diagnosis] = {}
         self._measured: dict[str, Diagnosis] = {}
@@ -125,13 +124,18 @@ class StatusReport:
         return self._text
 
     async def _look(self) -> _Seen:
-        now_ns, figures, alarms = self._clock.monotonic_ns(), self._figures(), self._alarms.manager.alarms
+        now_ns, figures = self._clock.monotonic_ns(), self._figures()
+        # Before a block can come: the newest sample is then the last one that the figures count.
+        newest = {name: sample async for name, sample in _by_turns(self._newest())}
+        # What the service says of itself concerns each of its machines.
+        of_machine = self._alarms.managers[self._machine.machine.name]
+        alarms = {**self._alarms.manager.alarms, **of_machine.alarms}
         return _Seen(
             now_ns,
             figures,
             await self._oldest_wall_ns(),
             {name: status async for name, status in _by_turns((n, alarms[n]) for n in list(alarms))},
-            {name: sample async for name, sample in _by_turns(self._newest())},
+            newest,
             dict(self._latest),
             dict(self._measured),
         )
@@ -170,7 +174,10 @@ class StatusReport:
                 else _age_s(seen.oldest_wall_ns, stamp["wall_ns"]),
                 "journal": _journal(outbox),
             },
-            "outputs": {path: _output(path, seen.figures) for path in self._alarms.outputs},
+            "outputs": {
+                path: _output(path, seen.figures, output.reason)
+                for path, output in self._alarms.outputs.items()
+            },
             "faults": _faults(seen.figures),
             "figures": seen.figures,
         }
@@ -300,9 +307,9 @@ def _journal(outbox: Mapping[str, Any]) -> str:
     return "not open" if outbox["shut"] else "not written" if outbox["unbacked"] else "written"
 
 
-def _output(path: str, figures: Mapping[str, Any]) -> Document:
+def _output(path: str, figures: Mapping[str, Any], reason: str) -> Document:
     connected = figures.get(path.rpartition(".")[2], {}).get("connected")
-    return {"connected": None if connected is None else bool(connected)}
+    return {"connected": None if connected is None else bool(connected), "reason": reason}
 
 
 def _faults(figures: Mapping[str, Any]) -> Document:

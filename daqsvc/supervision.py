@@ -12,6 +12,7 @@ import logging
 import threading
 from collections import Counter
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from daqsvc.acquisition.clock import NS_PER_S
@@ -69,6 +70,14 @@ class Supervisor:
         part = Part(self, name, work, may_end, fatal)
         part.start()
         return part
+
+    def within(self, machine: str) -> Supervisor:
+        """The same for the parts of one machine, whose names have that of the machine in front."""
+        return _Within(self, machine)
+
+    def named(self, name: str) -> str:
+        """What a part is called in the log and in the count of failures."""
+        return name
 
     def failed(self, name: str, error: BaseException | str, then: str) -> None:
         """Count a failure, and say it in one line, but the same one once an hour only; from any thread.
@@ -134,6 +143,36 @@ class Supervisor:
     def _hear_thread(self, failure: threading.ExceptHookArgs) -> None:
         name = "thread" if failure.thread is None else f"thread {failure.thread.name}"
         self.failed(name, failure.exc_value or failure.exc_type.__name__, "it has ended")
+
+
+class _Within(Supervisor):
+    """See `Supervisor.within`."""
+
+    def __init__(self, whole: Supervisor, machine: str) -> None:
+        super().__init__()
+        self.failures = whole.failures
+        self._whole = whole
+        self._machine = machine
+
+    def named(self, name: str) -> str:
+        return f"{self._machine}: {name}"
+
+    def keep(
+        self,
+        name: str,
+        work: Work,
+        *,
+        may_end: Callable[[], bool] = lambda: False,
+        fatal: tuple[type[Exception], ...] = (),
+    ) -> Part:
+        return self._whole.keep(self.named(name), work, may_end=may_end, fatal=fatal)
+
+    def failed(self, name: str, error: BaseException | str, then: str) -> None:
+        self._whole.failed(self.named(name), error, then)
+
+    @property
+    def lost(self) -> asyncio.Future[None]:
+        return self._whole.lost
 
 
 class Part:
@@ -249,33 +288,36 @@ class _Standstill:
 
 
 class StallWatch:
-    """Finds parts that have something to do and get nowhere.
+    """Finds parts that have something to do and get nowhere, for all who act on that, and says each once.
 
     Time is counted from look to look, and without what a part's thread has waited for a processor: where the
     whole process gets on slowly, or not at all for a while, no part of it has stalled.
 
     Args:
-        limit_s: without a step for so long, a part has stalled.
-        then: what follows, for the log, e.g. ``"the service is started again"``.
+        progress: by name, how far each part has come.
     """
 
-    def __init__(self, limit_s: float, then: str) -> None:
-        self._limit_s = limit_s
-        self._then = then
+    def __init__(self, progress: Callable[[], Mapping[str, Progress]]) -> None:
+        self.progress = progress
+        self._limits: list[tuple[float, str]] = []
         self._looked_s: float | None = None
         self._parts: dict[str, _Standstill] = {}
 
-    def look(self, parts: Mapping[str, Progress], now_s: float) -> list[str]:
-        """The parts that have stalled; each is said once.
+    def hold_to(self, limit_s: float, then: str) -> Callable[[float], list[str]]:
+        """What finds the parts that have stalled; to be called now and then with the monotonic clock in s.
 
         Args:
-            parts: by name, how far each has come.
-            now_s: monotonic clock.
+            limit_s: without a step for so long, a part has stalled.
+            then: what follows, for the log, e.g. ``"the service is started again"``.
         """
+        self._limits = sorted([*self._limits, (limit_s, then)])
+        return partial(self._look, limit_s)
+
+    def _look(self, limit_s: float, now_s: float) -> list[str]:
         passed_s = 0.0 if self._looked_s is None else min(now_s - self._looked_s, MOST_LOOK_S)
         self._looked_s = now_s
         stalled: list[str] = []
-        for name, (step, thread) in parts.items():
+        for name, (step, thread) in self.progress().items():
             waited_s = 0.0 if thread is None else kept_waiting_s(thread)
             before = self._parts.get(name)
             if before is None or step is None or step != before.step:
@@ -285,15 +327,14 @@ class StallWatch:
                 continue
             before.still_s += max(0.0, passed_s - max(0.0, waited_s - before.waited_s))
             before.waited_s = waited_s
-            if before.still_s < self._limit_s:
+            if before.still_s < limit_s:
                 continue
             stalled.append(name)
             if not before.said:
                 before.said = True
+                then = "; after ".join(f"{limit:g} s: {then}" for limit, then in self._limits)
                 where = "" if thread is None else f"; its thread is in {where_is(thread.ident)}"
-                logger.critical(
-                    "%s has stalled, without a step for %g s: %s%s", name, self._limit_s, self._then, where
-                )
+                logger.critical("%s has stalled, without a step for %s%s", name, then, where)
         return stalled
 
 

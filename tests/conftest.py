@@ -87,6 +87,7 @@ def _encodable(text: str) -> str:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: item.get_closest_marker("first") is None)
     for item in items:
         if (suite := item.path.parent.name) in KINDS:
             item.add_marker(suite)

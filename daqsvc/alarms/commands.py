@@ -44,6 +44,7 @@ class AlarmCommand:
         occurrence: the activation that is meant; if another one stands by now, the command is refused.
             None means whichever stands.
         reason: why, in the person's words; it stands in the event and in the audit log.
+        machine: whose alarm; None for the one machine that has an alarm of that name.
     """
 
     verb: Verb
@@ -52,6 +53,7 @@ class AlarmCommand:
     duration_s: float | None = None
     occurrence: str | None = None
     reason: str = ""
+    machine: str | None = None
 
 
 def printable(text: str) -> str:
@@ -107,8 +109,8 @@ class CommandMessage(BaseModel):
         json.loads(raw, object_pairs_hook=_once)
         return message
 
-    def command(self, verb: Verb) -> AlarmCommand:
-        """What it asks for by ``verb``."""
+    def command(self, verb: Verb, machine: str | None = None) -> AlarmCommand:
+        """What it asks for by ``verb``, of a machine if it says of which."""
         return AlarmCommand(
             verb=verb,
             alarm=self.alarm,
@@ -116,6 +118,7 @@ class CommandMessage(BaseModel):
             duration_s=self.duration_s,
             occurrence=self.occurrence,
             reason=self.reason,
+            machine=machine,
         )
 
 

@@ -110,6 +110,15 @@ class AlarmManager:
             self._ruled.add(self._add(rule.alarm, latching=rule.latching), rule)
 
     @property
+    def identity(self) -> Identity:
+        """Whose alarms these are."""
+        return self._identity
+
+    def knows(self, name: str) -> bool:
+        """Whether there is an alarm of that name, or can be."""
+        return name in self._alarms or name in self._expected.names
+
+    @property
     def alarms(self) -> Mapping[str, AlarmStatus]:
         """How every alarm stands at any time, by name.
 
@@ -232,6 +241,18 @@ class AlarmManager:
             ):
                 self._doubts.unsettle(ruled.rule)
         return withdrawn
+
+    def withdraw(self, events: Iterable[AlarmEvent]) -> list[AlarmEvent]:
+        """Return alarms to normal that nobody will judge any more, of whichever machine.
+
+        Args:
+            events: the last event of each.
+        """
+        return [self._withdraw(event) for event in events if _stands(event)]
+
+    def expect_conditions(self, conditions: Iterable[str]) -> None:
+        """Let people act on these conditions of the service before they are reported."""
+        self._expected.note({}, conditions)
 
     def begin_anew(self, events: Iterable[AlarmEvent], reason: str) -> list[AlarmEvent]:
         """Say of every alarm that the journal does not know that it is normal; after `resume`.
@@ -410,7 +431,7 @@ class AlarmManager:
         ruled = self._ruled.named(name)
         if ours and ruled is not None:
             self._resume_ruled(ruled, event)
-        elif event.own_state is AlarmState.NORMAL and not event.holds:
+        elif not _stands(event):
             return True
         elif ours and (
             name in self._expected.quality or name.removeprefix("detector-ok/") in active_detectors
@@ -492,6 +513,10 @@ class AlarmManager:
     def _instant(self, t_ns: int) -> ClockReading:
         """The wall-clock label of a monotonic time."""
         return ClockReading(t_ns, self._clock.wall_ns() - self._clock.monotonic_ns() + t_ns)
+
+
+def _stands(event: AlarmEvent) -> bool:
+    return event.own_state is not AlarmState.NORMAL or bool(event.holds)
 
 
 def _bears_on(doubt: Doubt, ruled: Ruled, event: AlarmEvent) -> bool:

@@ -56,6 +56,15 @@ def current(store: Path) -> list[EventDocument]:
     return list(_documents(view.latest))
 
 
+def machines_of(store: Path) -> set[str]:
+    """The machines that ever had an alarm, by the journal; blocks.
+
+    Raises:
+        OutboxError: there is no journal, or it cannot be read.
+    """
+    return {event["machine"] for event in _documents(read_journal(store, history=0).latest)}
+
+
 def standing(store: Path, events: Sequence[EventDocument]) -> list[AlarmView]:
     """How alarms stand, with what their own past adds to it; blocks.
 
@@ -89,8 +98,8 @@ def standing(store: Path, events: Sequence[EventDocument]) -> list[AlarmView]:
     return views
 
 
-def history(store: Path, most: int) -> list[EventDocument]:
-    """The newest events, at most so many, newest last; blocks.
+def history(store: Path, most: int, machine: str | None = None) -> list[EventDocument]:
+    """The newest events, of all machines or of one, at most so many, newest last; blocks.
 
     Raises:
         OutboxError: there is no journal, or it cannot be read.
@@ -98,8 +107,8 @@ def history(store: Path, most: int) -> list[EventDocument]:
     asked = most
     while True:
         view = read_journal(store, history=asked)
-        events = list(_documents(view.history))
-        # Messages of other kinds may lie between.
+        events = [one for one in _documents(view.history) if machine in {None, one["machine"]}]
+        # Messages of other kinds and machines may lie between.
         if len(events) >= most or len(view.history) + view.damaged < asked:
             _tell_damage(view, store)
             return events[-most:]

@@ -6,6 +6,7 @@ the service that runs: ``ack``, ``reset``, ``shelve``, ``bypass``, and their und
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import pwd
@@ -21,7 +22,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from daqsvc.commands.store_argument import Load
+    from daqsvc.commands.machine_files import Load
+    from daqsvc.commands.store_argument import ChosenStore
 
 HISTORY = 20
 """Events that ``--history`` shows by default."""
@@ -68,13 +70,17 @@ class AlarmsCommand:
         from daqsvc.outbox.messages import OutboxError  # noqa: PLC0415
 
         try:
-            store = chosen_store(arguments, self._load)
+            chosen = chosen_store(arguments, self._load)
+            store = chosen.directory
             doubt = _doubt(store)
             try:
+                _refuse_unknown(chosen)
                 if arguments.history is not None:
-                    events = history(store, arguments.history)
+                    events = history(store, arguments.history, chosen.machine)
                 else:
                     events = current(store)
+                    if chosen.machine is not None:
+                        events = [event for event in events if event["machine"] == chosen.machine]
                     if not arguments.all:
                         events = [event for event in events if event["state"] != "normal"]
                 _show(store, events, arguments)
@@ -84,10 +90,38 @@ class AlarmsCommand:
                     print(f"daqsvc alarms: {doubt}", file=sys.stderr)  # noqa: T201
         except BadFileError:
             return EXIT_USAGE
-        except (StoreNotFoundError, OutboxError) as error:
+        except (StoreNotFoundError, NoSuchMachineError, OutboxError) as error:
             print(f"daqsvc alarms: {error}", file=sys.stderr)  # noqa: T201 - errors go to stderr
             return EXIT_FAILED
         return EXIT_OK
+
+
+class NoSuchMachineError(Exception):
+    """The machine that was named is not among those of the store; the text says which are."""
+
+
+def _refuse_unknown(chosen: ChosenStore) -> None:
+    """Make sure that a machine is one of the store: by its files, its journal, or the service that runs.
+
+    Raises:
+        NoSuchMachineError: it is not.
+        OutboxError: there is no journal, or it cannot be read.
+    """
+    from daqsvc.commands.alarm_journal import machines_of  # noqa: PLC0415 - brings SQLite
+    from daqsvc.control import ControlError, ask_status  # noqa: PLC0415 - only what a verb needs
+
+    if chosen.machine in {None, *chosen.machines}:
+        return
+    known = machines_of(chosen.directory).union(chosen.machines)
+    if chosen.machine in known:
+        return
+    with contextlib.suppress(ControlError):
+        known |= {f"{status['machine']}" for status in ask_status(chosen.directory)}
+    if chosen.machine not in known:
+        those = ", ".join(sorted(known)) or "no machine yet"
+        raise NoSuchMachineError(
+            f"the store {chosen.directory} has alarms of {those}, not of {chosen.machine}"
+        )
 
 
 def _show(store: Path, events: list[dict[str, Any]], arguments: argparse.Namespace) -> None:
@@ -187,8 +221,9 @@ class AlarmVerb:
 
         name = arguments.verb
         try:
-            store = chosen_store(arguments, self._load)
+            store, asked, _ = chosen_store(arguments, self._load)
             alarm, occurrence, machine = _meant(store, arguments.alarm)
+            machine = asked or machine
             request = request_of(
                 AlarmCommand(
                     verb=Verb(self._verb),

@@ -66,6 +66,7 @@ class ProcessGuard:
         self._on_stopping = on_stopping
         self._end_process = end
         self._stop: Callable[[], None] | None = None
+        self._reload: Callable[[], object] | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._close: Callable[[float], bool] | None = None
         self._main = threading.get_ident()
@@ -115,6 +116,10 @@ class ProcessGuard:
         self._stop, self._loop = stop, loop
         if self._turns_stopping is not None:
             stop()
+
+    def reload_by(self, reload: Callable[[], object]) -> None:
+        """Say what SIGHUP has done on the event loop; called there."""
+        self._reload = reload
 
     def protect(self, close: Callable[[float], bool]) -> None:
         """Say what must be done before the process may be ended by force.
@@ -198,11 +203,11 @@ class ProcessGuard:
         elif number == signal.SIGHUP:
             if any(_is_gone(fd) for fd in self._terminals):
                 self.lose_terminal("the terminal is gone")
+            elif self._reload is not None and self._loop is not None:
+                with contextlib.suppress(RuntimeError):  # the loop is closed already
+                    self._loop.call_soon_threadsafe(self._reload)
             else:
-                log.warning(
-                    "SIGHUP is ignored: the machine file is read at the start only; restart the service to "
-                    "have it read again"
-                )
+                log.warning("SIGHUP is ignored: the service starts, and has just read its machine files")
 
     def _ask_to_stop(self, why: str) -> None:
         if self._turns_stopping is not None:

@@ -1,4 +1,4 @@
-"""``daqsvc run FILE``: the service, until it is stopped."""
+"""``daqsvc run FILE ...``: the service, until it is stopped."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import asyncio
 import gc
 import logging
 import os
+import sys
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,15 +14,21 @@ from typing import TYPE_CHECKING, Any
 from daqsvc import kernel_cache
 from daqsvc.commands.arguments import EXIT_FAILED, EXIT_HUNG, EXIT_LOST, EXIT_OK, EXIT_STUCK, EXIT_USAGE
 from daqsvc.commands.log_thread import LogThread
+from daqsvc.commands.machine_files import load_box, read_box
 from daqsvc.commands.process_guard import ProcessGuard
 from daqsvc.commands.service_manager import ServiceManager
+from daqsvc.commands.start_memory import give_back
 from daqsvc.commands.store_argument import StoreNotFoundError, store_directory
+from daqsvc.threads import call_in_thread
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Callable, Coroutine
+    from collections.abc import Callable, Coroutine, Sequence
 
+    from daqsvc.box import Box
+    from daqsvc.service import Service
     from daqsvc.settings import MachineFile
+    from daqsvc.supervision import Part
 
 log = logging.getLogger(__name__)
 
@@ -31,9 +38,12 @@ LOG_S = 0.3
 
 STDERR = 2
 
+SWITCH_S = 0.001
+"""How long a thread that computes may keep the interpreter from another that waits for it: the event loop."""
+
 
 class RunCommand:
-    """``daqsvc run FILE``.
+    """``daqsvc run FILE ...``.
 
     Args:
         load: reads a machine file; None after its errors have been printed.
@@ -42,7 +52,8 @@ class RunCommand:
 
     help = "run the service until SIGTERM or SIGINT"
     description = (
-        "Run the service for one machine file: acquire, diagnose, and publish alarms. SIGTERM, SIGINT "
+        "Run the service for one machine file, or for several machines that share their buses, one journal "
+        "and one connection to the broker: acquire, diagnose, and publish alarms. SIGTERM, SIGINT "
         "(Ctrl-C) or the loss of its terminal stop it within two seconds; alarms that the broker has not "
         "acknowledged stay in the journal and go out at the next start. Exit codes: 0 it was stopped; 1 it "
         "could not start; 2 the machine file has errors; 3 something without which it is useless was lost, "
@@ -58,7 +69,13 @@ class RunCommand:
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `daqsvc.cli.Command.add_arguments`."""
-        parser.add_argument("file", type=Path, metavar="FILE", help="the machine file (TOML)")
+        parser.add_argument(
+            "files",
+            type=Path,
+            nargs="+",
+            metavar="FILE",
+            help="the machine file (TOML); or several of one box, or a directory of them",
+        )
         parser.add_argument(
             "--store",
             type=Path,
@@ -74,44 +91,67 @@ class RunCommand:
         handler = LogThread(STDERR)
         self._start_logging(verbose=arguments.verbose, handler=handler)
         try:
-            machine = self._load(arguments.file)
-            if machine is None:
+            box = load_box(arguments.files, self._load)
+            if box is None:
                 return EXIT_USAGE
             kernel_cache.prepare()
+            sys.setswitchinterval(SWITCH_S)
             with ProcessGuard(handler.flush_within, manager.stopping) as guard:
                 # Under systemd its journal reads the log, whose restart is no reason to stop.
                 handler.on_gone = None if "JOURNAL_STREAM" in os.environ else guard.lose_terminal
-                return _run(machine, arguments.store, guard, manager)
+                return _run(box, arguments.files, arguments.store, guard, manager)
         finally:
             manager.close()
             handler.flush_within(LOG_S)
 
 
-def _run(machine: MachineFile, store: Path | None, guard: ProcessGuard, manager: ServiceManager) -> int:
-    from daqsvc.outbox.messages import NewerOutboxError, OutboxError, StorePathError  # noqa: PLC0415
+def _run(
+    box: Box, files: Sequence[Path], store: Path | None, guard: ProcessGuard, manager: ServiceManager
+) -> int:
+    from daqsvc.outbox.messages import (  # noqa: PLC0415
+        NewerOutboxError,
+        OutboxError,
+        StoreInUseError,
+        StorePathError,
+    )
     from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415 - each verb imports only what it needs
     from daqsvc.supervision import EssentialLostError  # noqa: PLC0415
     from drivers.base import DeviceAbsentError  # noqa: PLC0415
     from drivers.frames import LayoutError  # noqa: PLC0415
 
     try:
-        _run_loop(_run_until_stopped(machine, store or store_directory(machine), guard, manager))
+        store = store or store_directory(box)
+        _run_loop(_run_until_stopped(box, files, store, guard, manager))
     except (AssemblyError, LayoutError, NewerOutboxError, StoreNotFoundError, StorePathError) as error:
         log.critical("%s", error)
         return EXIT_USAGE
+    except StoreInUseError as error:
+        log.critical("%s", error)
+        # Of other machines, it will always be in use; of these, until the other service ends.
+        watched = {*box.machines} if store is None else _watched(store) or {*box.machines}
+        return EXIT_USAGE if watched.isdisjoint(box.machines) else EXIT_FAILED
     except (DeviceAbsentError, OutboxError) as error:
         log.critical("%s", error)
         return EXIT_FAILED
     except EssentialLostError as error:
         log.critical("%s; the service ends, and must be started again", error)
         return EXIT_LOST
-    except SystemExit:
-        log.critical("the service was ended by something in its process, and must be started again")
-        return EXIT_LOST
-    except asyncio.CancelledError:
-        log.critical("the service was cancelled by something in its process, and must be started again")
+    except (SystemExit, asyncio.CancelledError) as error:
+        how = "ended" if isinstance(error, SystemExit) else "cancelled"
+        log.critical("the service was %s by something in its process, and must be started again", how)
         return EXIT_LOST
     return EXIT_OK
+
+
+def _watched(store: Path) -> set[str]:
+    """The machines that the service on a store watches; empty if it does not say."""
+    from daqsvc.control import ControlError, ask_status  # noqa: PLC0415 - only what a verb needs
+
+    try:
+        return {str(status["machine"]) for status in ask_status(store)}
+    except ControlError as error:
+        log.info("what the other daqsvc watches is not known: %s", error)
+        return set()
 
 
 def _run_loop(work: Coroutine[Any, Any, None]) -> None:
@@ -128,15 +168,45 @@ def _run_loop(work: Coroutine[Any, Any, None]) -> None:
         running.result()
 
 
+def _reload(service: Service, asked: list[Part]) -> None:
+    """Have the machine files read again, as SIGHUP asks; adds what does that."""
+
+    async def reload() -> None:
+        from daqsvc.control import ReloadRefusedError  # noqa: PLC0415 - as above
+
+        try:
+            if not await service.reload():
+                log.warning("SIGHUP: the machine files say nothing different")
+        except ReloadRefusedError as refused:
+            for reason in refused.reasons:
+                log.error("SIGHUP is refused, and the service goes on as it is: %s", reason)  # noqa: TRY400
+
+    asked[:] = [one for one in asked if not one.over.done()]
+    asked.append(service.supervisor.keep("reload", reload, may_end=lambda: True))
+
+
+def _reloading(manager: ServiceManager, begins: bool) -> None:  # noqa: FBT001 - a callback
+    manager.reloading(begins=begins)
+    if not begins:
+        call_in_thread(give_back, name="give back")
+
+
 async def _run_until_stopped(
-    machine: MachineFile, store: Path, guard: ProcessGuard, manager: ServiceManager
+    box: Box, files: Sequence[Path], store: Path, guard: ProcessGuard, manager: ServiceManager
 ) -> None:
     from daqsvc.service import Service  # noqa: PLC0415
     from daqsvc.supervision import stop_all  # noqa: PLC0415
 
     stop = asyncio.Event()
     runtime = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]
-    service = Service(machine, store, on_ending=guard.stopping, runtime=Path(runtime) if runtime else None)
+    service = Service(
+        box,
+        store,
+        on_ending=guard.stopping,
+        runtime=Path(runtime) if runtime else None,
+        read_again=partial(read_box, files),
+        on_reload=partial(_reloading, manager),
+    )
     guard.protect(service.alarms.outbox.close_from_outside)
     guard.stop_by(asyncio.get_running_loop(), stop.set)
     running = asyncio.create_task(service.run(stop), name="service")
@@ -150,7 +220,9 @@ async def _run_until_stopped(
             # What the start has made stays until the end. Looking through it for garbage, libraries and all
             # alarms, would hold up the event loop for some .1 s each time.
             gc.freeze()
-            log.info("watching %s; the journal is in %s", machine.machine.name, store)
+            guard.reload_by(partial(_reload, service, following))
+            log.info("watching %s; the journal is in %s", box.names, store)
+            call_in_thread(give_back, name="give back")
         await running
     finally:
         ready.cancel()

@@ -10,11 +10,12 @@ import asyncio
 import logging
 import os
 import socket
+import time
 from typing import TYPE_CHECKING, Self
 
-from daqsvc.supervision import StallWatch
-
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from daqsvc.service import Service
 
 log = logging.getLogger(__name__)
@@ -97,6 +98,13 @@ class ServiceManager:
             return False
         return True
 
+    def reloading(self, *, begins: bool) -> None:
+        """The service goes over to other machine files, or has done so."""
+        if begins:
+            self.tell(RELOADING=1, MONOTONIC_USEC=time.monotonic_ns() // 1000, STATUS="reloading")
+        else:
+            self.tell(READY=1, STATUS="reloaded")
+
     def stopping(self) -> None:
         """The service stops; from any thread."""
         self._stopping = True
@@ -122,10 +130,10 @@ class _Follower:
     def __init__(self, manager: ServiceManager, service: Service) -> None:
         self._manager = manager
         self._service = service
-        self._watch: StallWatch | None = None
+        self._stalled: Callable[[float], list[str]] | None = None
         if manager.watchdog_s is not None:
             then = "the service manager is told nothing more, and starts the service again"
-            self._watch = StallWatch(max(manager.watchdog_s, LEAST_WATCH_S), then)
+            self._stalled = service.stalls.hold_to(max(manager.watchdog_s, LEAST_WATCH_S), then)
         self._begun_s: float | None = None
         self._serving_since_s = 0.0
         self._is_ready = False
@@ -141,7 +149,7 @@ class _Follower:
             self._status(STARTING, STARTING, now_s)
             self._extend(now_s, gets_on=now_s - self._begun_s < START_MOST_S)
             return
-        gets_on = self._watch is None or not self._watch.look(service.progress(), now_s)
+        gets_on = self._stalled is None or not self._stalled(now_s)
         if not self._is_ready:
             awaited = service.awaited(patient=now_s - self._serving_since_s < TRIED_S)
             if not awaited:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import argparse
     from pathlib import Path
 
-    from daqsvc.commands.store_argument import Load
+    from daqsvc.commands.machine_files import Load
 
 EVERY_S = 1.0
 ENTER, LEAVE = "\x1b[?1049h\x1b[?25l", "\x1b[?25h\x1b[?1049l"
@@ -59,11 +59,11 @@ class StatusCommand:
         from daqsvc.control import ControlError, ask_status  # noqa: PLC0415 - only what a verb needs
 
         try:
-            store = chosen_store(arguments, self._load)
+            store, machine, _ = chosen_store(arguments, self._load)
             if arguments.watch:
-                _watch(store, as_json=arguments.json)
+                _watch(store, machine, as_json=arguments.json)
             else:
-                print(_shown(ask_status(store), as_json=arguments.json))  # noqa: T201 - what the verb is for
+                print(_shown(ask_status(store, machine), as_json=arguments.json))  # noqa: T201 - what the verb is for
         except BadFileError:
             return EXIT_USAGE
         except (StoreNotFoundError, ControlError) as error:
@@ -72,13 +72,15 @@ class StatusCommand:
         return EXIT_OK
 
 
-def _shown(status: dict[str, Any], *, as_json: bool) -> str:
+def _shown(machines: list[dict[str, Any]], *, as_json: bool) -> str:
     from daqsvc.commands.status_text import status_text  # noqa: PLC0415 - as above
 
-    return json.dumps(status) if as_json else status_text(status, shutil.get_terminal_size().columns)
+    if as_json:
+        return "\n".join(json.dumps(status) for status in machines)
+    return "\n\n".join(status_text(status, shutil.get_terminal_size().columns) for status in machines)
 
 
-def _watch(store: Path, *, as_json: bool) -> None:
+def _watch(store: Path, machine: str | None, *, as_json: bool) -> None:
     """Show the status again and again, until Ctrl-C.
 
     Raises:
@@ -89,13 +91,13 @@ def _watch(store: Path, *, as_json: bool) -> None:
     picture = _Picture(is_live=not as_json and sys.stdout.isatty() and os.environ.get("TERM") != "dumb")
     before = {number: signal.signal(number, signal.default_int_handler) for number in signals_to_end()}
     try:
-        shown = _shown(ask_status(store), as_json=as_json)
+        shown = _shown(ask_status(store, machine), as_json=as_json)
         with picture:
             picture.show(shown)
             while True:
                 time.sleep(EVERY_S)
                 try:
-                    shown = _shown(ask_status(store), as_json=as_json)
+                    shown = _shown(ask_status(store, machine), as_json=as_json)
                 except AbsentError as error:
                     picture.wait(f"{error}; it is asked again every second", shown)
                 else:

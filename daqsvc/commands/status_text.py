@@ -152,8 +152,13 @@ def _outputs(status: Document) -> Iterator[str]:
         yield "broker: none is configured"
     for path, output in status["outputs"].items():
         name = "broker" if path == "mqtt" else path
+        # Services of earlier versions give no reason.
+        reason = output.get("reason", "")
         if output["connected"] is not None:
-            yield f"{name}: {'connected' if output['connected'] else 'NOT CONNECTED'}"
+            why = f" ({reason})" * bool(reason)
+            yield f"{name}: {'connected' if output['connected'] else f'NOT CONNECTED{why}'}"
+        elif reason:
+            yield f"{name}: {reason}"
 
 
 def _rate(stream: Document) -> str:

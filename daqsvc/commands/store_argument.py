@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import os
 import re
+import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
+
+from daqsvc.commands.machine_files import load_machines, read_box
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator, Sequence
 
+    from daqsvc.box import Box
+    from daqsvc.commands.machine_files import Load
     from daqsvc.settings import MachineFile
-
-    Load = Callable[[Path], MachineFile | None]
-    """Reads a machine file; None after its errors have been printed."""
 
 JOURNAL = "outbox.sqlite"
 
@@ -27,19 +29,38 @@ class BadFileError(Exception):
     """The machine file has errors, which have been printed."""
 
 
-def store_directory(machine: MachineFile) -> Path:
-    """The default place of the journal.
+class ChosenStore(NamedTuple):
+    """What the arguments of a verb mean.
+
+    Attributes:
+        directory: of the store.
+        machine: the machine that is meant; None for all.
+        machines: those of the machine files that were named, where the store is theirs for certain.
+    """
+
+    directory: Path
+    machine: str | None
+    machines: tuple[str, ...] = ()
+
+
+def store_directory(box: Box) -> Path:
+    """The default place of the journal of a box.
 
     The machine file's own word first, then systemd's, then the user's state directory (XDG).
 
     Raises:
         StoreNotFoundError: none of these says anything.
     """
-    if machine.store is not None:
-        return machine.resolve(machine.store.directory)
+    own = box.own
+    if own.store is not None:
+        return own.resolve(own.store.directory)
+    return _default_directory(own, f"-{own.machine.name}" if box.is_single else "")
+
+
+def _default_directory(machine: MachineFile, end: str = "") -> Path:
     if directory := os.environ.get("STATE_DIRECTORY"):
         return Path(directory.split(":")[0])
-    return _state_directory() / f"{machine.site}-{machine.box}-{machine.machine.name}"
+    return _state_directory() / f"{machine.site}-{machine.box}{end}"
 
 
 def store_doubts(machine: MachineFile) -> Iterator[str]:
@@ -63,11 +84,20 @@ def store_doubts(machine: MachineFile) -> Iterator[str]:
         yield f"{at}: daqsvc run could not start as {account()}: {why}"
 
 
-def add_store(parser: argparse.ArgumentParser) -> None:
-    """``[FILE | --store DIR]``: whose alarms; to be called when all other arguments are there."""
+def add_store(parser: argparse.ArgumentParser, *, of_a_machine: bool = True) -> None:
+    """``[FILE | --store DIR]``: whose alarms; to be called when all other arguments are there.
+
+    Args:
+        parser: of the verb.
+        of_a_machine: whether the verb can be about one of several machines, by ``--machine``.
+    """
     either = parser.add_mutually_exclusive_group()
     either.add_argument(
-        "file", type=Path, nargs="?", metavar="FILE", help="the machine file that the service runs (TOML)"
+        "file",
+        type=Path,
+        nargs="?",
+        metavar="FILE",
+        help="the machine file that the service runs (TOML), or the directory of them",
     )
     either.add_argument(
         "--store",
@@ -76,29 +106,92 @@ def add_store(parser: argparse.ArgumentParser) -> None:
         help="directory of its alarm journal (default: $STATE_DIRECTORY, else the one there is in "
         "~/.local/state/daqsvc)",
     )
+    if of_a_machine:
+        parser.add_argument(
+            "--machine", metavar="NAME", help="which machine, where the service watches several"
+        )
     # argparse shows each for itself, as if both could be given.
     usage = re.sub(r"\[--store DIR\]\s+", "", parser.format_usage())
     parser.usage = usage.removeprefix("usage: ").rstrip().replace("[FILE]", "[FILE | --store DIR]")
 
 
-def chosen_store(arguments: argparse.Namespace, load: Load) -> Path:
+def chosen_store(arguments: argparse.Namespace, load: Load, *, all_sound: bool = False) -> ChosenStore:
     """The store that the arguments of `add_store` mean.
+
+    Args:
+        arguments: of the command line.
+        load: reads a machine file; None after its errors have been printed.
+        all_sound: whether all files of a directory must be sound; else those that are may tell the store.
 
     Raises:
         BadFileError: the machine file cannot be read.
         StoreNotFoundError: nothing was named, and there is not exactly one store.
     """
+    machine: str | None = getattr(arguments, "machine", None)
     if arguments.store is not None:
-        store: Path = arguments.store
-        return store
+        return ChosenStore(arguments.store, machine)
     if arguments.file is not None:
-        machine = load(arguments.file)
-        if machine is None:
-            raise BadFileError
-        return store_directory(machine)
+        return _of_file(arguments.file, load, machine, all_sound=all_sound)
     if directory := os.environ.get("STATE_DIRECTORY"):
-        return Path(directory.split(":")[0])
-    return _only_store(_state_directory())
+        return ChosenStore(Path(directory.split(":")[0]), machine)
+    return ChosenStore(_only_store(_state_directory()), machine)
+
+
+def _of_file(path: Path, load: Load, machine: str | None, *, all_sound: bool) -> ChosenStore:
+    from daqsvc.box import BOX  # noqa: PLC0415 - each verb imports only what it needs
+
+    box, sound = load_machines([path], load)
+    if box is None:
+        if all_sound:
+            raise BadFileError
+        return ChosenStore(_of_sound(path, sound), machine, (*(one.machine.name for one in sound), BOX))
+    store = store_directory(box)
+    if not box.is_single:
+        return ChosenStore(store, machine, (*box.machines, BOX))
+    if box.own.store is None and not _is_used(store):
+        for other in _of_its_box(path, box.own):
+            if _is_used(other):
+                return ChosenStore(other, machine or box.own.machine.name)
+    return ChosenStore(store, machine, tuple(box.machines))
+
+
+def _of_sound(path: Path, sound: Sequence[MachineFile]) -> Path:
+    """The store by the sound files of a directory: the service goes on with what others were before.
+
+    Raises:
+        BadFileError: they do not tell one store.
+    """
+    told = {one.resolve(one.store.directory) for one in sound if one.store is not None}
+    stores = told or {_default_directory(one) for one in sound}
+    # Without [store] in any, one of those with errors may have it.
+    if len(stores) != 1 or not (told or all(map(_is_used, stores))):
+        raise BadFileError
+    [store] = stores
+    print(  # noqa: T201 - what goes wrong goes to stderr
+        f"{path}: the store is taken from the other machine files: {store}", file=sys.stderr
+    )
+    return store
+
+
+def _of_its_box(path: Path, own: MachineFile) -> Iterator[Path]:
+    """Which stores the machine of a file may have together with others."""
+    from daqsvc.settings import MachineFileError  # noqa: PLC0415 - as above
+
+    try:
+        box = read_box([path.parent])
+    except MachineFileError:
+        box = None  # its neighbours are none of its business, as a rule
+    if box is not None and own.machine.name in box.machines:
+        yield store_directory(box)
+    yield _default_directory(own)
+
+
+def _is_used(store: Path) -> bool:
+    """Whether a service has a journal in a directory, or runs on it."""
+    from daqsvc.control import SOCKET  # noqa: PLC0415 - as above
+
+    # A directory of somebody else says nothing.
+    return any(os.path.lexists(store / name) for name in (JOURNAL, SOCKET))
 
 
 def _only_store(state: Path) -> Path:

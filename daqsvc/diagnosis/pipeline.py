@@ -1,7 +1,8 @@
 """The pipeline: one task per detector takes windows from a ring and has them processed off the loop.
 
-None of the threads that detectors compute in is lost for good, and none holds up the end of the process. A
-pool of the library does not replace a thread that is gone, and waits at the end for one that hangs.
+None of the threads that detectors compute in is lost for good, none holds up the end of the process, and one
+that a detector keeps busy is missed by no other. A pool of the library does not replace a thread that is
+gone, and waits at the end for one that hangs.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import os
 import threading
 import time
 from collections import deque
@@ -27,7 +29,7 @@ from daqsvc.supervision import Progress, Supervisor, over
 from daqsvc.threads import ThreadLostError, call_in_thread
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from daqsvc.acquisition.clock import Clock
     from daqsvc.acquisition.ring import SampleRing
@@ -47,66 +49,99 @@ class Job(Generic[T]):
         call: what to do.
         outcome: what becomes of it.
         thread: who does it; None while it waits.
+        apart: whether the thread does nothing else any more.
+        given_up: whether nobody waits for the thread any more.
     """
 
     call: Callable[[], T]
     outcome: asyncio.Future[T]
     thread: threading.Thread | None = None
+    apart: bool = False
+    given_up: bool = False
 
 
 class KernelThreads:
-    """Threads that make calls in the order in which they were asked for.
+    """Threads that make calls in the order in which they were asked for; for one pipeline or for several.
+
+    They are started when there is something to do, and end with the last one who uses them. Of those that
+    wait the last one to have worked is asked: its processor knows the kernels best.
 
     Args:
-        count: threads; so many calls are made at a time.
+        count: so many calls are made at a time, besides those that are set apart.
         failed: told, on the thread, that one was interrupted by an exception of its own; it goes on.
     """
 
     def __init__(self, count: int, failed: Callable[[BaseException], None]) -> None:
+        self._count = count
         self._failed = failed
-        self._changed = threading.Condition()
+        self._lock = threading.RLock()
+        self._idle: list[threading.Condition] = []
         self._jobs: list[Job[object]] = []
-        self._closing = False
+        self._users = 0
         self._threads: set[threading.Thread] = set()
+        self._apart: set[threading.Thread] = set()
         self._numbers = 0
-        for _ in range(count):
-            self._start_thread()
+
+    def enter(self) -> None:
+        """Begin to use them."""
+        self._users += 1
+
+    async def leave(self, jobs: Iterable[Job[T]]) -> None:
+        """Use them no more; the last one to leave has them end.
+
+        Args:
+            jobs: what is left to do; waited for, as are the threads that end, but for what was given up.
+        """
+        self._users -= 1
+        if not self._users:
+            with self._lock:
+                for idle in self._idle:
+                    idle.notify()
+        if left := {job.outcome for job in jobs if not job.given_up}:
+            await asyncio.wait(left)
+        if not self._users:
+            await asyncio.to_thread(self._join)
 
     def submit(self, call: Callable[[], T]) -> Job[T]:
-        """Have a call made; on the event loop."""
+        """Have a call made; on the event loop, while in use."""
         for thread in [thread for thread in self._threads if not thread.is_alive()]:
             self._threads.discard(thread)
             self._recover(thread, ThreadLostError(f"thread {thread.name} was lost"))
-            self._start_thread()
         job = Job(call, asyncio.get_running_loop().create_future())
-        with self._changed:
+        with self._lock:
             self._jobs.append(job)
-            self._changed.notify()
+            if self._idle:
+                self._idle.pop().notify()
+            elif len(self._threads) < self._count:
+                self._start_thread()
         return job
 
-    def replace(self, job: Job[T]) -> bool:
-        """Give up the thread that a job hangs in, and start another; whether there was one.
+    def set_apart(self, job: Job[T]) -> None:
+        """Have another thread go on with the calls that wait, if the job was begun: it takes long.
 
-        The job may still come to its end; its thread then ends with it.
+        The job's thread ends with it.
         """
-        with self._changed:
-            if job.thread not in self._threads or job.outcome.done():
-                return False
+        with self._lock:
+            if job not in self._jobs or job.thread not in self._threads:
+                return
             self._threads.discard(job.thread)
+            self._apart.add(job.thread)
+            job.apart = True
+            if any(one.thread is None for one in self._jobs):
+                self._start_thread()
+
+    def give_up(self, job: Job[T]) -> None:
+        """Wait no longer for the end of the thread of a job that was set apart."""
+        job.given_up = True
+        if job.thread is None:
+            return
+        self._apart.discard(job.thread)
         if not job.thread.is_alive():
             self._settle(job, None, RuntimeError("its thread was lost"))  # type: ignore[arg-type]  # as above
-        self._start_thread()
-        return True
 
-    def close(self) -> None:
-        """Have every thread end when it has made the calls that wait."""
-        with self._changed:
-            self._closing = True
-            self._changed.notify_all()
-
-    def join(self) -> None:
+    def _join(self) -> None:
         """Wait for the end of every thread that was not given up; blocks."""
-        for thread in list(self._threads):
+        for thread in [*self._threads, *self._apart]:
             thread.join()
 
     def _start_thread(self) -> None:
@@ -117,26 +152,37 @@ class KernelThreads:
 
     def _work(self) -> None:
         me = threading.current_thread()
+        with contextlib.suppress(OSError, AttributeError):  # Linux alone knows the priority of a thread
+            os.setpriority(
+                os.PRIO_PROCESS, threading.get_native_id(), os.getpriority(os.PRIO_PROCESS, 0) + NICE
+            )
         while me in self._threads:
             try:
                 job = self._next(me)
-                if job is None:
-                    return
-                self._make(job)
+                if job is not None:
+                    self._make(job)
             except BaseException as error:  # noqa: BLE001 - said and counted there
                 self._recover(me, error)
+        self._apart.discard(me)
 
     def _next(self, me: threading.Thread) -> Job[object] | None:
         """The next call that waits, which stays on the list until it is made; None at the end."""
-        with self._changed:
+        with self._lock:
             while True:
                 for job in self._jobs:
                     if job.thread is None:
                         job.thread = me
                         return job
-                if self._closing:
+                if not self._users:
+                    self._threads.discard(me)
                     return None
-                self._changed.wait()
+                idle = threading.Condition(self._lock)
+                try:
+                    self._idle.append(idle)
+                    idle.wait()
+                finally:
+                    if idle in self._idle:
+                        self._idle.remove(idle)
 
     def _make(self, job: Job[object]) -> None:
         try:
@@ -148,7 +194,7 @@ class KernelThreads:
 
     def _recover(self, me: threading.Thread, error: BaseException) -> None:
         """Something has interrupted the thread: whoever waits for what it was doing hears of it."""
-        with self._changed:
+        with self._lock:
             mine = [job for job in self._jobs if job.thread is me]
         for job in mine:
             self._settle(job, None, RuntimeError(f"its thread was interrupted by {error!r}"))
@@ -162,7 +208,7 @@ class KernelThreads:
         # The loop may be closed, and nobody left who waits.
         with contextlib.suppress(RuntimeError):
             job.outcome.get_loop().call_soon_threadsafe(tell)
-        with self._changed:
+        with self._lock:
             if job in self._jobs:
                 self._jobs.remove(job)
 
@@ -177,8 +223,17 @@ LOOK_NS = NS_PER_S // 2
 MOST_HELD = 4096
 """Statements of a stream that wait for its rate to be known, at most; the oldest are dropped."""
 
+LONG_S = 0.5
+"""A window that takes longer to process has its thread to itself, and the others go on with another."""
+
 HANG_S = 30.0
-"""A window that takes longer to process hangs; its detector is left alone with it, and the others go on."""
+"""One that takes so much longer hangs; its detector is left alone with it."""
+
+NICE = 10
+"""By how much the priority of what computes is lower than that of the event loop, which has to be on time."""
+
+THREADS = 2
+"""Windows that are processed at a time, besides those that take long: of one machine or of several."""
 
 
 @dataclass(slots=True)
@@ -210,7 +265,7 @@ class Pipeline:
         detectors: each names its stream.
         report: called on the event loop with each diagnosis, per detector in order.
         clock: tells how long a stream has been silent.
-        threads: kernels that may run at a time.
+        kernels: threads that detectors compute in; None for some of its own.
         settling_ns: by stream, how long its first sample may be in coming without the stream being silent.
         patience: by stream, how long it may be silent; whatever is not named is fast.
         supervisor: keeps the detectors' tasks going; None for one of its own.
@@ -225,7 +280,7 @@ class Pipeline:
         detectors: Sequence[Detector],
         report: Callable[[Diagnosis], None],
         clock: Clock,
-        threads: int = 2,
+        kernels: KernelThreads | None = None,
         settling_ns: Mapping[str, int] | None = None,
         patience: Mapping[str, Patience] | None = None,
         supervisor: Supervisor | None = None,
@@ -249,7 +304,7 @@ class Pipeline:
         self._report = report
         self._clock = clock
         self._supervisor = supervisor or Supervisor()
-        self._threads = threads
+        self._kernels = kernels or KernelThreads(THREADS, kernel_failed(self._supervisor))
         self._names: dict[str, frozenset[str]] = {}
         """By detector, the names that its statements may have."""
         self._under_way: dict[str, Job[Sequence[Diagnosis]]] = {}
@@ -326,15 +381,11 @@ class Pipeline:
 
         Cancelled, it can be called again, and goes on where it was.
         """
-        kernels = KernelThreads(self._threads, self._kernel_failed)
+        self._kernels.enter()
         keep = self._supervisor.keep
         listening = keep("silence", self._listen_for_silence)
         following = [
-            keep(
-                _part(d),
-                partial(self._follow, d, kernels),
-                may_end=partial(_is_closed, self._rings[d.stream]),
-            )
+            keep(_part(d), partial(self._follow, d), may_end=partial(_is_closed, self._rings[d.stream]))
             for d in self.detectors
         ]
         try:
@@ -344,13 +395,9 @@ class Pipeline:
         finally:
             for part in (listening, *following):
                 part.stop()
-            kernels.close()
             # A cancelled task may have left a kernel running; nothing is left behind, nor the loop held up.
-            await asyncio.shield(asyncio.to_thread(kernels.join))
+            await asyncio.shield(self._kernels.leave(self._under_way.values()))
             await over([listening, *following])
-
-    def _kernel_failed(self, error: BaseException) -> None:
-        self._supervisor.failed("kernel thread", error, "it goes on")
 
     async def _listen_for_silence(self) -> None:
         """Have detectors say, once, that their stream has fallen silent: a window never comes to say it.
@@ -402,7 +449,7 @@ class Pipeline:
                     for diagnosis in said_of_silence(detector, silence_s, now_ns):
                         self._report(replace(diagnosis, reason=reason) if over else diagnosis)
 
-    async def _follow(self, detector: Detector, kernels: KernelThreads) -> None:
+    async def _follow(self, detector: Detector) -> None:
         while True:
             if detector.name not in self._under_way:
                 window = await self._next_window(detector)
@@ -410,9 +457,9 @@ class Pipeline:
                     self._let_go(detector.stream)
                     return
                 work = partial(self._process, detector, window)
-                self._under_way[detector.name] = kernels.submit(work)
+                self._under_way[detector.name] = self._kernels.submit(work)
             job = self._under_way[detector.name]
-            await self._until_made(detector, job, kernels)
+            await self._until_made(detector, job)
             del self._under_way[detector.name]
             stream, diagnoses = detector.stream, job.outcome.result()
             if self._changes[stream] != self._seen_changes[detector.name]:
@@ -443,8 +490,8 @@ class Pipeline:
         if missed := reader.samples_skipped - skipped_before:
             counters.samples_skipped += missed
             logger.warning(
-                "detector %s was too slow and has missed %d samples of %r from index %d on",
-                detector.name,
+                "%s was too slow and has missed %d samples of %r from index %d on",
+                self._supervisor.named(_part(detector)),
                 missed,
                 detector.stream,
                 window.first_index - window.skipped,
@@ -454,13 +501,16 @@ class Pipeline:
         breaks = sorted({*window.breaks, *([window.first_index] if broken else [])})
         return replace(window, skipped=window.skipped + withheld, breaks=tuple(breaks))
 
-    async def _until_made(
-        self, detector: Detector, job: Job[Sequence[Diagnosis]], kernels: KernelThreads
-    ) -> None:
-        """Wait for a window; one that hangs must not keep its thread from the other detectors."""
+    async def _until_made(self, detector: Detector, job: Job[Sequence[Diagnosis]]) -> None:
+        """Wait for a window; one that takes long must not keep its thread from the other detectors."""
         while not job.outcome.done():
-            await asyncio.wait({job.outcome}, timeout=HANG_S)
-            if not job.outcome.done() and kernels.replace(job):
+            await asyncio.wait({job.outcome}, timeout=HANG_S if job.apart else LONG_S)
+            if job.outcome.done() or job.given_up:
+                continue
+            if not job.apart:
+                self._kernels.set_apart(job)
+            else:
+                self._kernels.give_up(job)
                 hangs = f"it has computed on one window for {HANG_S:g} s"
                 self._supervisor.failed(_part(detector), hangs, "the other detectors go on without it")
 
@@ -511,6 +561,11 @@ class Pipeline:
             counters.windows += 1
             counters.samples += len(window.samples)
             counters.busy_ns += time.perf_counter_ns() - begun_ns
+
+
+def kernel_failed(supervisor: Supervisor) -> Callable[[BaseException], None]:
+    """What counts and says that a thread of `KernelThreads` was interrupted."""
+    return lambda error: supervisor.failed("kernel thread", error, "it goes on")
 
 
 def _part(detector: Detector) -> str:

@@ -11,7 +11,7 @@ import stat
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daqsvc.outbox.messages import OutboxError
+from daqsvc.outbox.messages import StoreInUseError
 
 if TYPE_CHECKING:
     from typing import BinaryIO
@@ -169,7 +169,7 @@ def take_possession(path: Path) -> BinaryIO:
         path: the lock file.
 
     Raises:
-        OutboxError: another process has it.
+        StoreInUseError: another process has it.
     """
     lock = os.fdopen(_lock_file(path), "rb")
     try:
@@ -177,10 +177,10 @@ def take_possession(path: Path) -> BinaryIO:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         lock.close()
-        raise OutboxError(
+        raise StoreInUseError(
             f"another daqsvc uses the store {path.parent}; stop it if it watches the same machine, else give "
-            f"this one a directory of its own, e.g. {path.parent}/NAME, in [store] of its machine file: each "
-            "machine needs one"
+            f"this one a directory of its own, e.g. {path.parent}/NAME, in [store] of its machine file, or "
+            "have one service watch all these machines"
         ) from None
     except BaseException:
         lock.close()

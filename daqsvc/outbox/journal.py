@@ -32,12 +32,19 @@ from daqsvc.outbox.messages import (
     OutboxAwayError,
     OutboxError,
     OutboxMessage,
+    StoreRefusedError,
     checksum,
     is_sound,
 )
 from daqsvc.outbox.reading import opened_to_read
 from daqsvc.outbox.renewal import Damage, Renewal
-from daqsvc.outbox.safety import refuse_link, refuse_no_directory, refuse_unsafe, restrict_files
+from daqsvc.outbox.safety import (
+    refuse_link,
+    refuse_no_directory,
+    refuse_unsafe,
+    refuse_unwritable,
+    restrict_files,
+)
 from daqsvc.outbox.salvage import LARGEST, readable
 from daqsvc.outbox.sequence import SequenceMark, place_of
 from daqsvc.outbox.tables import (
@@ -192,7 +199,8 @@ class Journal:
         """Create the directory and keep other processes out of it, until `close`.
 
         Raises:
-            OutboxError: the directory cannot be used, or another process uses it, or others may write there.
+            StoreRefusedError: this account may not use it, or others may write there.
+        OutboxError: the directory cannot be used, or another process uses it.
         """
         if self._lock is not None:
             return
@@ -200,9 +208,13 @@ class Journal:
             refuse_no_directory(self.path.parent)
             make_directory(self.path.parent)
             refuse_unsafe(self.path.parent)
+            refuse_unwritable(self.path.parent)
             restrict_files(self.path.parent)
             self._lock = take_possession(self.path.with_name(self.path.name + ".lock"))
         except OSError as error:
+            if isinstance(error, PermissionError):
+                with contextlib.suppress(OSError):
+                    refuse_unsafe(self.path.parent)  # it says whose it is
             raise self._unusable(error) from error
 
     def open(self) -> None:
@@ -267,7 +279,8 @@ class Journal:
         self._known_topics.open(topics, is_whole=is_whole)
 
     def _unusable(self, error: Exception) -> OutboxError:
-        kind = OutboxAwayError if may_pass(error) else OutboxError
+        refused = StoreRefusedError if isinstance(error, PermissionError) else OutboxError
+        kind = OutboxAwayError if may_pass(error) else refused
         return kind(
             f"cannot open the outbox {self.path}: {error}; "
             f"give the service a directory that it may write in, with space left"

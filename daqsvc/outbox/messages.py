@@ -19,8 +19,16 @@ class NewerOutboxError(OutboxError):
     """A newer version of the program has written the file: starting again does not help."""
 
 
+class StoreInUseError(OutboxError):
+    """Another process uses the store."""
+
+
 class StorePathError(OutboxError):
     """The store cannot be a directory, since a file is in its place: starting again does not help."""
+
+
+class StoreRefusedError(StorePathError):
+    """The store is somebody else's, others may write there, or this account may not: as before."""
 
 
 class OutboxAwayError(OutboxError):

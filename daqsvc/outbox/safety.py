@@ -12,7 +12,7 @@ import stat
 from pathlib import Path
 
 from daqsvc.outbox.files import is_read_only, remedy, restrict
-from daqsvc.outbox.messages import OutboxError, StorePathError
+from daqsvc.outbox.messages import StorePathError, StoreRefusedError
 
 JOURNAL, BESIDE = "outbox", ("audit.jsonl", "control.sock")
 """How the names of the files begin that nobody else may have put there."""
@@ -56,19 +56,12 @@ def unusable(store: Path) -> str:
         if not store.is_dir():
             return ""
         refuse_unsafe(store)
-    except StorePathError:
-        raise
-    except OutboxError as error:
+        refuse_unwritable(store)
+    except StoreRefusedError as error:
         return f"{error}"
     except OSError as error:
         return f"the store {store} cannot be used: {error.strerror}"
-    if is_read_only(store):
-        return f"the store {store} cannot be written: {remedy(store)}"
-    if not os.access(store, os.R_OK | os.W_OK | os.X_OK):
-        return (
-            f"the store {store} may not be written by {_user(os.geteuid())}: chmod u+rwx {store}, or chown it"
-        )
-    return ""
+    return f"the store {store} cannot be written: {remedy(store)}" if is_read_only(store) else ""
 
 
 def account() -> str:
@@ -86,7 +79,7 @@ def refuse_unsafe(store: Path) -> None:
         store: its directory, which exists.
 
     Raises:
-        OutboxError: somebody can, or has; the text says who and what to do.
+        StoreRefusedError: somebody can, or has; the text says who and what to do.
         OSError: it cannot be looked at.
     """
     _refuse_path(store)
@@ -94,7 +87,19 @@ def refuse_unsafe(store: Path) -> None:
         if path.name.startswith(JOURNAL):
             refuse_link(path)
         elif path.name.startswith(BESIDE) and (owner := path.lstat().st_uid) not in _trusted():
-            raise OutboxError(_belongs(f"{path}", owner, path))
+            raise StoreRefusedError(_belongs(f"{path}", owner, path))
+
+
+def refuse_unwritable(store: Path) -> None:
+    """Make sure that this account may write in a store; a file system that is read-only may come back.
+
+    Raises:
+        StoreRefusedError: it may not; the text says what to do.
+    """
+    if not is_read_only(store) and not os.access(store, os.R_OK | os.W_OK | os.X_OK, effective_ids=True):
+        raise StoreRefusedError(
+            f"the store {store} may not be written by {_user(os.geteuid())}: chmod u+rwx {store}, or chown it"
+        )
 
 
 def restrict_files(store: Path) -> None:
@@ -112,7 +117,7 @@ def refuse_link(path: Path) -> None:
     """Make sure that a file is none of another place or kind, if it is there at all.
 
     Raises:
-        OutboxError: it is; the text says what to do.
+        StoreRefusedError: it is; the text says what to do.
         OSError: it cannot be looked at.
     """
     try:
@@ -132,7 +137,7 @@ def _refuse_path(store: Path) -> None:
         if stat.S_ISLNK(status.st_mode):
             links += 1
             if status.st_uid not in _trusted() or links > _MOST_LINKS:
-                raise OutboxError(
+                raise StoreRefusedError(
                     f"the store {store} is behind {at}, a symbolic link of {_user(status.st_uid)}: name a "
                     "directory that the service's own user has made"
                 )
@@ -150,8 +155,8 @@ def _refuse_directory(directory: Path, status: os.stat_result, store: Path | Non
     """Look at one directory: the ``store``, or with None one ``above`` it."""
     if status.st_uid not in _trusted():
         if store is not None:
-            raise OutboxError(_belongs(f"the store {store}", status.st_uid, directory))
-        raise OutboxError(
+            raise StoreRefusedError(_belongs(f"the store {store}", status.st_uid, directory))
+        raise StoreRefusedError(
             f"{above} belongs to {_user(status.st_uid)}, who could put another store in its place, and the "
             f"service runs as {_user(os.geteuid())}: give it a directory of its own, such as /var/lib/daqsvc"
         )
@@ -159,7 +164,7 @@ def _refuse_directory(directory: Path, status: os.stat_result, store: Path | Non
     is_open = mode & stat.S_IWOTH or (mode & stat.S_IWGRP and status.st_gid != os.getegid())
     if not is_open or (store is None and mode & stat.S_ISVTX):
         return
-    raise OutboxError(
+    raise StoreRefusedError(
         f"{above if store is None else f'the store {store}'} has mode {mode:04o}, so that others may put "
         f"files of theirs into it: {_narrowed(directory, status, is_store=store is not None)}, and look at "
         "what is in it before the next start"
@@ -182,12 +187,12 @@ def _narrowed(directory: Path, status: os.stat_result, *, is_store: bool) -> str
 
 def _refuse_file(path: Path, status: os.stat_result) -> None:
     if stat.S_ISLNK(status.st_mode):
-        raise OutboxError(
+        raise StoreRefusedError(
             f"{path} is a symbolic link of {_user(status.st_uid)} to {path.readlink()}: the service follows "
             "none in its store; remove it, and move what it points to here if it is the store's"
         )
     if status.st_uid not in _trusted():
-        raise OutboxError(_belongs(f"{path}", status.st_uid, path))
+        raise StoreRefusedError(_belongs(f"{path}", status.st_uid, path))
 
 
 def _belongs(what: str, owner: int, path: Path) -> str:

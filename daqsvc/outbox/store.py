@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import json
 import logging
+import os
 from typing import TYPE_CHECKING, TypeVar
 
 from daqsvc.outbox.command_ids import CommandIds
@@ -110,7 +111,8 @@ class Outbox:
         Raises:
             OutboxError: the directory or the alarms' file cannot be used, and that will not pass by itself.
         """
-        is_new = not self._journal.path.exists()
+        # In a directory that this account may not search, the writer says what is wrong.
+        is_new = not await asyncio.to_thread(os.path.lexists, self._journal.path)
         begun_ns = self._clock.wall_ns()
         opened, self._ended = self._writer.start()
         unsent = await opened

@@ -30,12 +30,15 @@ def output_plugins() -> dict[str, OutputPlugin[Any]]:
     return cast("dict[str, OutputPlugin[Any]]", dict(output_tables()))
 
 
-def output_set(machine: MachineFile, conditions: Iterable[str] = ()) -> OutputSet:
+def output_set(
+    machine: MachineFile, conditions: Iterable[str] = (), others: Iterable[MachineFile] = ()
+) -> OutputSet:
     """The outputs that a machine file asks for.
 
     Args:
         machine: the machine file.
         conditions: names of what the service may say of itself, outputs aside.
+        others: machine files of the same box, whose machines they tell of, too.
     """
     installed, tables = output_plugins(), {path: tables for path, _, tables in configured_outputs(machine)}
     own: list[str] = []
@@ -53,14 +56,23 @@ def output_set(machine: MachineFile, conditions: Iterable[str] = ()) -> OutputSe
                     made[path] = output
         return made
 
-    mqtt = machine.output(Mqtt)
     return OutputSet(
-        watched=watched(machine, (*conditions, *own)),
+        machines={
+            **{other.machine.name: watched(other) for other in others},
+            machine.machine.name: watched(machine, (*conditions, *own)),
+        },
         make=make,
-        topic_root=Mqtt.model_fields["topic_root"].default if mqtt is None else mqtt.topic_root,
+        topic_root=topic_root(machine),
         conditions=tuple(own),
         outdated={prefix: words for each in outdated for prefix, words in each.items()},
     )
+
+
+def topic_root(machine: MachineFile) -> str:
+    """The first level of all topics, under which the journal keeps its messages."""
+    mqtt = machine.output(Mqtt)
+    root: str = Mqtt.model_fields["topic_root"].default if mqtt is None else mqtt.topic_root
+    return root
 
 
 @contextmanager
@@ -108,6 +120,8 @@ def watched(machine: MachineFile, conditions: Iterable[str] = (), *, spared: boo
         readings=tuple(_asked(machine, "readings", spared=spared)),
         findings=machine.detectors,
         rests_on={alarm.name: tuple(_rests_on(alarm)) for alarm in machine.alarms},
+        buses=tuple(machine.buses),
+        rates_hz={name: stream.rate_hz for name, stream in machine.streams.items()},
     )
 
 

@@ -8,6 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from daqsvc.supervision import StallWatch
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
     from pathlib import Path
@@ -15,7 +17,6 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.clock import Clock
     from daqsvc.alarms.commands import CommandHandler
     from daqsvc.alarms.conditions import Condition
-    from daqsvc.alarms.events import Identity
     from daqsvc.diagnosis.reading import Reading
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.outbox.store import Outbox
@@ -35,6 +36,8 @@ class Watched:
         readings: the figures to show.
         findings: the detectors whose decision is shown.
         rests_on: by alarm, the alarms about sensors and detectors that say whether it can be judged at all.
+        buses: names of the buses that it is watched over.
+        rates_hz: by the name that a stream has in the status, what its machine file says.
     """
 
     machine: str
@@ -44,6 +47,8 @@ class Watched:
     readings: tuple[Reading, ...] = ()
     findings: tuple[str, ...] = ()
     rests_on: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    buses: tuple[str, ...] = ()
+    rates_hz: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(slots=True)
@@ -68,20 +73,20 @@ class OutputPort:
     """What an output works with.
 
     Attributes:
-        identity: whose alarms these are: site, box and machine.
-        watched: what there is to tell.
+        machines: by name, what there is to tell of each machine. The last one has what the service says of
+            itself as well; where there are several, it stands for the service alone, without readings.
         store: directory of what survives restarts.
         clock: the service's clock.
         outbox: the alarm events, on disk and numbered; an output goes on after the last one that it has told
             by ``await outbox.next_following(sequence, most)``. Open while `Output.run` runs.
-        topics: by which events are known in the outbox.
+        topics: of the box, whose site and name they have; by them events are known in the outbox.
         commands: carries out what people ask of alarms; an output has to see that they may.
         earlier: what a broker is asked for before it is told anything; None for nothing.
         progress: says how far each part of the service has come that can stall.
+        stalls: finds those that have.
     """
 
-    identity: Identity
-    watched: Watched
+    machines: Mapping[str, Watched]
     store: Path
     clock: Clock
     outbox: Outbox
@@ -89,10 +94,17 @@ class OutputPort:
     commands: CommandHandler | None = None
     earlier: EarlierState | None = None
     progress: Callable[[], Mapping[str, Progress]] = dict
+    stalls: StallWatch = field(default_factory=lambda: StallWatch(dict))
 
 
 class Output:
-    """Tells others what the service finds. Every method is called by the event loop and must not block it."""
+    """Tells others what the service finds. Every method is called by the event loop and must not block it.
+
+    Attributes:
+        reason: why it reaches nobody at present, for a person; empty if it does, or that is not known.
+    """
+
+    reason: str = ""
 
     async def run(self) -> None:
         """Tell, until `stop` or until cancelled; begun again if it fails or ends before."""
@@ -130,14 +142,14 @@ class OutputSet:
     """The outputs of a machine file, to be made once there is an outbox.
 
     Attributes:
-        watched: what there is to tell.
+        machines: see `OutputPort.machines`.
         make: makes them, by the path of their table.
         topic_root: first part of the topics by which events are known in the outbox.
         conditions: names of all that they may say of themselves.
         outdated: see `OutputPlugin.outdated`, of those that the file has no table for.
     """
 
-    watched: Watched
+    machines: Mapping[str, Watched]
     make: Callable[[OutputPort], Mapping[str, Output]] = _nothing
     topic_root: str = "daqsvc"
     conditions: tuple[str, ...] = ()

@@ -103,6 +103,7 @@ class OutputPayload(JsonPayload):
     """How an output stands."""
 
     connected: bool | None = Field(description="null for one that has no connection")
+    reason: str = Field("", description="why it reaches nobody at present; empty if it does")
 
 
 class ServiceStatusPayload(Stamped):

@@ -107,8 +107,8 @@ class BankReport:
 
         The machine has changed then, and the cause is not yet known.
         """
-        decision, departed = self._figure("decision"), self._figure("departed")
-        if not departed or decision != self.decision:
+        departed = self._figure("departed")
+        if not departed or (decision := self._figure("decision")) != self.decision:
             return None
         rivals = ~self._alike[decision]
         rivals[decision] = False

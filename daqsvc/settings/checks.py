@@ -107,17 +107,12 @@ def _checks(draft: MachineFile, facts: Mapping[str, Any]) -> Iterator[Iterator[F
         for name, stream in draft.streams.items():
             at: KeyPath = ("streams", name)
             yield _check_stream_bus(draft, stream, at)
-            for plugin in _drivers_of(draft, stream):
-                with suppress(UnusableValueError):
-                    yield from plugin.stream_checks(draft, stream, facts.get(name), at)
+            yield from _stream_checks(draft, facts, name)
             with suppress(UnusableValueError):
                 yield _check_channels(stream.layout, (*at, "layout"))
     yield _check_unused(draft)
     yield _check_drivers(draft)
-    yield _check_devices(draft)
-    for plugin in _drivers(draft):
-        with suppress(UnusableValueError):
-            yield from plugin.checks(draft, facts)
+    yield from _bus_checks(draft, facts)
     yield from _sensor_checks(draft, facts)
     yield _check_memory(draft)
     yield _names(draft)
@@ -131,6 +126,27 @@ def _checks(draft: MachineFile, facts: Mapping[str, Any]) -> Iterator[Iterator[F
     for _, output, settings in configured_outputs(draft, valid_only=True):
         with suppress(UnusableValueError):
             yield from output.checks(draft, settings)
+
+
+def _stream_checks(draft: MachineFile, facts: Mapping[str, Any], name: str) -> Iterator[Iterator[Finding]]:
+    """Every check of a stream by those whose bus or layout it has."""
+    for plugin in _drivers_of(draft, draft.streams[name]):
+        with suppress(UnusableValueError):
+            yield from plugin.stream_checks(draft, draft.streams[name], facts.get(name), ("streams", name))
+
+
+def _bus_checks(draft: MachineFile, facts: Mapping[str, Any]) -> Iterator[Iterator[Finding]]:
+    """Every check of what buses, and the streams on each of them, are to each other."""
+    yield _check_devices(draft)
+    for plugin in _drivers(draft):
+        with suppress(UnusableValueError):
+            yield from plugin.checks(draft, facts)
+
+
+def bus_checks(draft: MachineFile, facts: Mapping[str, Any]) -> list[Finding]:
+    """What is wrong with buses, and with the streams on each of them, beside each other; see `check`."""
+    of_streams = (one for name in draft.streams for one in _stream_checks(draft, facts, name))
+    return [finding for one in (*of_streams, *_bus_checks(draft, facts)) for finding in one]
 
 
 def _drivers_of(draft: MachineFile, stream: Stream) -> list[BusTable]:
@@ -311,6 +327,11 @@ def memory_bytes() -> int:
         with suppress(OSError, ValueError):
             there = min(there, int(file.read_text(encoding="ascii")))
     return there
+
+
+def memory_share() -> float:
+    """What rings may take of the memory at most: the rest is for detectors, outbox and all others."""
+    return _MOST_SHARE
 
 
 def needed_bytes(draft: MachineFile) -> dict[str, float]:

@@ -31,12 +31,13 @@ _GAP = "  "
 _NO_BREAK = "\N{NO-BREAK SPACE}"
 
 
-def describe(machine: MachineFile, doubts: Iterable[str] = ()) -> str:
+def describe(machine: MachineFile, doubts: Iterable[str] = (), own: MachineFile | None = None) -> str:
     """Summary of a machine file: plain text for a terminal of 100 columns, without secrets, warnings last.
 
     Args:
         machine: the machine file.
         doubts: what is to be warned of beside its own warnings.
+        own: the box with its outputs and its store (`daqsvc.box.Box.own`), if others share these.
     """
     blocks = [
         _facts(_identity(machine)),
@@ -45,7 +46,7 @@ def describe(machine: MachineFile, doubts: Iterable[str] = ()) -> str:
         ["Sensors", *_table(_SENSOR_HEADER, [_sensor(sensor) for sensor in machine.sensors])],
         ["Detectors", *_table([], list(_detectors(machine)))],
         ["Alarms", *_table(_ALARM_HEADER, list(_alarms(machine)))],
-        _facts(_outlets(machine)),
+        _facts(_outlets(own or machine)),
     ]
     warnings = [
         textwrap.fill(

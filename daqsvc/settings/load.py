@@ -89,7 +89,7 @@ def parse_machine_file(text: str, path: Path) -> MachineFile:
         draft = reading.validate().found_at(Origin(path))
         facts = _read_files(draft, path, reading.findings)
         reading.findings += check(draft, facts)
-    reading.take(draft, failures)
+    reading.note_failures(draft, failures)
     problems, warnings = reading.problems()
     if problems:
         raise MachineFileError(problems)
@@ -120,7 +120,7 @@ class _Reading:
                     self.findings.append(Finding(path, why.said, why.or_remove(name)))
                     self._lacks_detector |= path[0] == "pipeline"
 
-    def take(self, draft: MachineFile, failures: Iterable[PluginFailedError]) -> None:
+    def note_failures(self, draft: MachineFile, failures: Iterable[PluginFailedError]) -> None:
         """Take in what plugins have failed at, of the file or what is valid of it."""
         for failed in failures:
             self.findings.append(failure(draft, failed))

@@ -80,6 +80,11 @@ class OutputTable(OutputKind[SettingsT]):
         del draft, settings
         return iter(())
 
+    def several_checks(self, settings: SettingsT) -> Iterator[Finding]:
+        """Every check of what the table says where one process watches several machines."""
+        del settings
+        return iter(())
+
     def describe(self, machine: MachineFile, settings: SettingsT) -> str:
         """What was understood of the table, for a person; empty for nothing."""
         del machine

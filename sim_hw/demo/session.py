@@ -19,6 +19,7 @@ import aiomqtt
 import can
 
 from daqsvc.acquisition.clock import DrivenClock, SystemClock
+from daqsvc.box import Box
 from daqsvc.detectors.rotor_bank.settings import ROTOR_BANK
 from daqsvc.service import Service
 from drivers.can.plugin import frame_layout
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.acquisition.assembler import StreamCounters
+    from daqsvc.machine_watch import MachineWatch
     from daqsvc.settings import MachineFile
     from drivers.frames import FrameLayout
     from sim_hw.nodes.pacing import Pacer
@@ -255,7 +257,7 @@ class DemoSession:
 
     async def _serve(self, machine: MachineFile, store: Path) -> None:
         clock = SystemClock() if self.speed == 1 else DrivenClock()
-        service = self.service = Service(machine, store, clock)
+        service = self.service = Service(Box.single(machine), store, clock)
         stop = asyncio.Event()
         async with _task(service.run(stop)) as running:
             await _first(service.ready.wait(), running, "the service did not start", KERNELS_S)
@@ -277,11 +279,11 @@ class DemoSession:
 
     async def _play(self, bus: can.BusABC, service: Service, clock: SystemClock | DrivenClock) -> None:
         script = self.script
-        layout = frame_layout(service.machine, script.stream)
+        layout = frame_layout(_watch(service).machine, script.stream)
         node = self.node = _node(bus, layout, script)
         pacer: Pacer
         if isinstance(clock, DrivenClock):
-            block = max((d.block for d in service.pipeline.detectors), default=0)
+            block = max((d.block for d in _watch(service).pipeline.detectors), default=0)
             limit = 2 * block + round(0.1 * script.rate_hz)
             pacer = DrivenPacer(clock, self.backlog, limit, speed=self.speed)
         else:
@@ -317,7 +319,7 @@ class DemoSession:
         if self.service is None or self.node is None or counters is None:
             return 0
         on_the_way = self.node.frames_sent - counters.frames_received
-        return on_the_way * self.node.samples_per_frame + self.service.pipeline.behind_samples
+        return on_the_way * self.node.samples_per_frame + _watch(self.service).pipeline.behind_samples
 
     async def _last_frames(self, service: Service) -> None:
         """Let the frames that are still on the bus arrive."""
@@ -326,8 +328,8 @@ class DemoSession:
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(LAST_FRAMES_S):
                 await _until(lambda: counters.frames_received >= self.outcome.frames_sent)
-                block = max((d.block for d in service.pipeline.detectors), default=0)
-                await _until(lambda: service.pipeline.behind_samples <= block)
+                block = max((d.block for d in _watch(service).pipeline.detectors), default=0)
+                await _until(lambda: _watch(service).pipeline.behind_samples <= block)
 
     def _take(self, message: Received) -> None:
         if message.kind == "alarm":
@@ -344,6 +346,12 @@ def _node(bus: can.BusABC, layout: FrameLayout, script: Script) -> CanNode:
     except LayoutError as error:
         logger.warning("%s. The device saturates such values, as an analogue input does", error)
         return CanNode(bus, layout, script.samples, script.rate_hz, faults=script.faults, clip=True)
+
+
+def _watch(service: Service) -> MachineWatch:
+    """The one machine of the demo."""
+    [watch] = service.watches.values()
+    return watch
 
 
 async def _links_up(service: Service) -> None:

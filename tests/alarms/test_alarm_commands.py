@@ -11,6 +11,7 @@ from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from support.alarm_desk import alarm_service as service_of
 from support.brokers import Consumer, running_mosquitto
 from support.can_gateway import MACHINE, CanGateway
 from support.live_service import running
@@ -19,7 +20,6 @@ from support.waiting import eventually
 
 from daqsvc import alarm_service, audit
 from daqsvc.acquisition.clock import DrivenClock
-from daqsvc.alarm_service import AlarmService
 from daqsvc.alarms.commands import AlarmCommand, CommandOutcome, Verb
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.rules import DiagnosisRule
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
+    from daqsvc.alarm_service import AlarmService
     from daqsvc.publish.output import OutputSet
 
 pytestmark = pytest.mark.integration
@@ -48,7 +49,7 @@ async def desk_in(
 ) -> AsyncIterator[AlarmService]:
     """A desk with latching alarms on what detectors of the same names find."""
     rules = [DiagnosisRule(name, name, latching=True) for name in (RUB, *OTHERS)]
-    desk = AlarmService(Identity("lab", "edge-1", "pump"), rules, store, clock or DrivenClock(), asked)
+    desk = service_of(Identity("lab", "edge-1", "pump"), rules, store, clock or DrivenClock(), asked)
     await desk.open()
     try:
         await desk.resume({})

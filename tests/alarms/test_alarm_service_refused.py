@@ -7,10 +7,10 @@ import json
 import shutil
 
 import pytest
+from support.alarm_desk import alarm_service
 from support.waiting import eventually
 
 from daqsvc.acquisition.clock import SystemClock
-from daqsvc.alarm_service import AlarmService
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.manager import DiagnosisRule
 from daqsvc.diagnosis.record import Diagnosis
@@ -32,7 +32,7 @@ async def states(desk):
 
 
 async def test_the_last_of_the_refused_events_is_told_again(tmp_path, monkeypatch) -> None:
-    desk = AlarmService(IDENTITY, [DiagnosisRule("fault", "bank")], tmp_path, CLOCK, None)
+    desk = alarm_service(IDENTITY, [DiagnosisRule("fault", "bank")], tmp_path, CLOCK, None)
     await desk.open()
     try:
         desk.take(said("F1"))
@@ -61,7 +61,7 @@ async def test_the_last_of_the_refused_events_is_told_again(tmp_path, monkeypatc
 
 async def test_a_newer_event_makes_the_refused_one_needless(tmp_path, monkeypatch) -> None:
     """Told again after the newer one, the refused event would stand as the alarm's state."""
-    desk = AlarmService(IDENTITY, [DiagnosisRule("fault", "bank")], tmp_path, CLOCK, None)
+    desk = alarm_service(IDENTITY, [DiagnosisRule("fault", "bank")], tmp_path, CLOCK, None)
     await desk.open()
     try:
         refused = asyncio.get_running_loop().create_future()
@@ -82,7 +82,7 @@ async def test_alarms_that_a_damaged_journal_forgot_are_told_as_normal(tmp_path,
     """Else the broker would show them as active for ever."""
     rules = [DiagnosisRule("fault", "bank"), DiagnosisRule("other", "bank")]
     active_detectors = {"bank": ("x",)}
-    desk = AlarmService(IDENTITY, rules, tmp_path, CLOCK, None)
+    desk = alarm_service(IDENTITY, rules, tmp_path, CLOCK, None)
     await desk.open()
     desk.take(said("F1"))
     await states(desk)
@@ -92,9 +92,9 @@ async def test_alarms_that_a_damaged_journal_forgot_are_told_as_normal(tmp_path,
         (tmp_path / "outbox.sqlite.topics").write_text("garbage")
     journal.write_bytes(b"garbage!" * (journal.stat().st_size // 8))
 
-    desk = AlarmService(IDENTITY, rules, tmp_path, CLOCK, None)
+    desk = alarm_service(IDENTITY, rules, tmp_path, CLOCK, None)
     await desk.open()
-    await desk.resume(active_detectors)
+    await desk.resume({IDENTITY.machine: active_detectors})
     await desk.settle(5.0)
     told = {}
     for message in await desk.outbox.latest():
@@ -104,10 +104,10 @@ async def test_alarms_that_a_damaged_journal_forgot_are_told_as_normal(tmp_path,
     assert told == dict.fromkeys(names, ("returned", "normal", None))
     await desk.close(1.0)
 
-    desk = AlarmService(IDENTITY, rules, tmp_path, CLOCK, None)
+    desk = alarm_service(IDENTITY, rules, tmp_path, CLOCK, None)
     await desk.open()
     before = len(await states(desk))
-    await desk.resume(active_detectors)
+    await desk.resume({IDENTITY.machine: active_detectors})
     assert len(await states(desk)) == before, "once"
     await desk.close(1.0)
 
@@ -116,7 +116,7 @@ async def test_alarms_that_a_damaged_journal_forgot_are_told_as_normal(tmp_path,
 async def test_an_alarm_that_stands_still_stands_after_damage_of_the_log(tmp_path, damage) -> None:
     """And one that was never raised is not told of."""
     rules = [DiagnosisRule("fault", "bank", latching=True), DiagnosisRule("other", "another")]
-    desk = AlarmService(IDENTITY, rules, tmp_path / "store", CLOCK, None)
+    desk = alarm_service(IDENTITY, rules, tmp_path / "store", CLOCK, None)
     await desk.open()
     desk.take(said("F1", "danger"))
     desk.take(said("N", "normal"))
@@ -133,9 +133,9 @@ async def test_an_alarm_that_stands_still_stands_after_damage_of_the_log(tmp_pat
         content[200 if damage == "at byte 200" else len(content) // 2] ^= 1
         log.write_bytes(content)
 
-    desk = AlarmService(IDENTITY, rules, tmp_path / "killed", CLOCK, None)
+    desk = alarm_service(IDENTITY, rules, tmp_path / "killed", CLOCK, None)
     await desk.open()
-    await desk.resume({"bank": ("x",)})
+    await desk.resume({IDENTITY.machine: {"bank": ("x",)}})
     await desk.settle(5.0)
     assert await states(desk) == stood
     assert desk.figures()["latched"] == 1
@@ -144,7 +144,7 @@ async def test_an_alarm_that_stands_still_stands_after_damage_of_the_log(tmp_pat
 
 async def test_ids_of_commands_that_are_gone_at_the_start_are_an_alarm(tmp_path) -> None:
     async def damage():
-        desk = AlarmService(IDENTITY, [], tmp_path, CLOCK, None)
+        desk = alarm_service(IDENTITY, [], tmp_path, CLOCK, None)
         await desk.open()
         try:
             await desk.resume({})

@@ -63,7 +63,7 @@ class Desk:
 
 @contextlib.asynccontextmanager
 async def serving(store: Path, desk: Desk | None = None) -> AsyncIterator[ControlServer]:
-    server = ControlServer(store, MACHINE, desk or Desk())
+    server = ControlServer(store, (MACHINE,), desk or Desk())
     await server.open()
     try:
         yield server
@@ -105,7 +105,12 @@ async def test_a_request_becomes_a_command_with_the_kernels_word_for_who_asks(tm
     }
     (told,) = desk.told
     command = AlarmCommand(
-        verb=Verb.SHELVE, alarm="rotor-fault", by="ann", duration_s=1800.0, reason="spare part on order"
+        verb=Verb.SHELVE,
+        alarm="rotor-fault",
+        by="ann",
+        duration_s=1800.0,
+        reason="spare part on order",
+        machine=MACHINE,
     )
     assert told == (command, f"local uid {os.getuid()} pid {os.getpid()}")
 
@@ -270,7 +275,7 @@ async def test_a_mistake_in_carrying_out_costs_one_connection(tmp_path: Path) ->
     async def fail(_command: AlarmCommand, _source: str) -> CommandOutcome:
         raise RuntimeError("a mistake")
 
-    server = ControlServer(tmp_path, MACHINE, fail)
+    server = ControlServer(tmp_path, (MACHINE,), fail)
     await server.open()
     try:
         reader, writer = await asyncio.open_unix_connection(server.path)
@@ -288,7 +293,7 @@ async def test_a_socket_that_is_taken_away_or_cannot_be_made_comes_back(
 ) -> None:
     monkeypatch.setattr(control, "LOOK_S", 0.01)
     (tmp_path / "control.sock").write_text("in the way")
-    server = ControlServer(tmp_path, MACHINE, Desk())
+    server = ControlServer(tmp_path, (MACHINE,), Desk())
     serving = asyncio.create_task(server.serve())
     await asyncio.sleep(0.05)
     for _ in range(2):
@@ -363,7 +368,7 @@ async def test_a_socket_elsewhere_is_found_from_the_store(tmp_path: Path) -> Non
     store.mkdir()
     runtime.mkdir()
     for _ in range(2):  # a link that was left over is no matter, nor a socket of a start without systemd
-        server = ControlServer(store, MACHINE, Desk(), lambda: 7, runtime)
+        server = ControlServer(store, (MACHINE,), Desk(), lambda: 7, runtime)
         await server.open()
         try:
             assert stat.S_ISSOCK((runtime / "control.sock").lstat().st_mode)
@@ -379,7 +384,7 @@ async def test_a_socket_elsewhere_is_found_from_the_store(tmp_path: Path) -> Non
 
 
 async def test_what_waits_in_memory_is_told_to_who_asks(tmp_path: Path) -> None:
-    server = ControlServer(tmp_path, MACHINE, Desk(), lambda: 7)
+    server = ControlServer(tmp_path, (MACHINE,), Desk(), lambda: 7)
     await server.open()
     try:
         assert await asyncio.to_thread(events_waiting, tmp_path) == 7
@@ -392,7 +397,7 @@ async def test_what_waits_in_memory_is_told_to_who_asks(tmp_path: Path) -> None:
 async def test_what_is_in_the_way_and_no_socket_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "control.sock").write_text("precious")
     with pytest.raises(ControlError, match=r"control\.sock is in the way"):
-        await ControlServer(tmp_path, MACHINE, Desk()).open()
+        await ControlServer(tmp_path, (MACHINE,), Desk()).open()
     assert (tmp_path / "control.sock").read_text() == "precious"
 
 

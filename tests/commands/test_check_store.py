@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import os
 import re
+import sqlite3
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from support.live_service import running
+from support.machine_files import LAVAL, parsed
 from support.paths import ROOT
 
+from daqsvc.box import Box
 from daqsvc.cli import main
 from daqsvc.commands import run as run_command
 from daqsvc.commands.service_manager import ServiceManager
+from daqsvc.control import ask_status
+from daqsvc.detectors.make import detectors
 from daqsvc.settings import load_machine_file
 
 if TYPE_CHECKING:
@@ -53,7 +61,7 @@ def run(machine: Path, store: Path | None = None) -> int:
     guard: Any = SimpleNamespace(
         stopping=None, protect=lambda _: None, stop_by=lambda *_: None, expect_turns=lambda _: None
     )
-    return run_command._run(load_machine_file(machine), store, guard, ServiceManager())
+    return run_command._run(Box.single(load_machine_file(machine)), [machine], store, guard, ServiceManager())
 
 
 def test_a_store_that_is_a_file_or_below_one_is_refused_by_check_and_run(
@@ -74,6 +82,39 @@ def test_a_store_that_is_a_file_or_below_one_is_refused_by_check_and_run(
         assert caplog.text.count(said) == 2
 
 
+def test_a_store_of_a_newer_version_is_refused_for_good_and_left_as_it_is(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    store = tmp_path / "alarms"
+    store.mkdir(mode=0o700)
+    with contextlib.closing(sqlite3.connect(store / "outbox.sqlite")) as newer:
+        newer.execute("PRAGMA journal_mode = WAL")
+        newer.execute("PRAGMA user_version = 99")
+    (store / "outbox.sqlite.version").write_text("9.9.0\n")
+    before = (store / "outbox.sqlite").read_bytes()
+    assert run(MACHINE, store) == 2
+    assert "written by daqsvc 9.9.0" in caplog.text
+    assert "install that version again" in caplog.text
+    assert (store / "outbox.sqlite").read_bytes() == before
+    assert (store / "outbox.sqlite.version").read_text() == "9.9.0\n"
+
+
+@pytest.mark.parametrize(("name", "code"), [("laval-rig", 1), ("pump", 2)])
+async def test_a_store_in_use_is_tried_again_only_by_a_service_of_the_same_machine(
+    name: str, code: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its turn comes when the other one ends; that of another machine would be started again for ever."""
+    first = parsed(LAVAL, ('interface = "socketcan"', 'interface = "virtual"'))
+    second = tmp_path / "second.toml"
+    second.write_text(LAVAL.read_text().replace('name = "laval-rig"', f'name = "{name}"'))
+    store = tmp_path / "store"
+    async with running(first, store):
+        assert await asyncio.to_thread(run, second, store) == code
+        [status] = await asyncio.to_thread(ask_status, store)
+    assert f"another daqsvc uses the store {store}; stop it if it watches the same machine" in caplog.text
+    assert status["machine"] == "laval-rig"
+
+
 def test_a_store_that_this_account_cannot_use_is_a_warning(tmp_path: Path, check: Check) -> None:
     store = tmp_path / "alarms"
     code, out, _ = check(store)
@@ -81,6 +122,7 @@ def test_a_store_that_this_account_cannot_use_is_a_warning(tmp_path: Path, check
     store.mkdir(mode=0o700)
     assert "Warnings" not in check(store)[1]
     store.chmod(0o777)
+    assert run(MACHINE, store) == 2
     code, out, err = check(store)
     assert (code, err) == (0, "")
     assert (
@@ -95,10 +137,11 @@ def test_a_store_that_may_not_be_written_is_a_warning(
     store = tmp_path / "alarms"
     store.mkdir(mode=0o700)
     allowed = os.access
-    monkeypatch.setattr(os, "access", lambda path, mode: path != store and allowed(path, mode))
+    monkeypatch.setattr(os, "access", lambda path, mode, **_: path != store and allowed(path, mode))
     code, out, _ = check(store)
     assert code == 0
     assert f"the store {store} may not be written by" in out
+    assert run(MACHINE, store) == 2
     monkeypatch.undo()
     monkeypatch.setattr("daqsvc.outbox.safety.is_read_only", lambda path: path == store)
     assert f"the store {store} cannot be written: " in check(store)[1]
@@ -109,10 +152,23 @@ def test_a_store_of_somebody_else_is_a_warning(tmp_path: Path, check: Check) -> 
     store = tmp_path / "alarms"
     store.mkdir(mode=0o700)
     os.chown(store, NOBODY, NOBODY)
+    assert run(MACHINE, store) == 2
     code, out, _ = check(store)
     assert code == 0
     assert "could not start as root: the store" in out
     assert f"alarms belongs to nobody and the service runs as root: chown root {store}" in out
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can be somebody else for a while")
+def test_detectors_leave_it_to_the_outbox_to_refuse_a_store_that_may_not_be_searched(tmp_path: Path) -> None:
+    for file in (MACHINE, LAVAL):
+        machine = load_machine_file(file)
+        there = [type(detector) for detector in detectors(machine, tmp_path)]
+        os.seteuid(NOBODY)
+        try:
+            assert [type(detector) for detector in detectors(machine, tmp_path)] == there
+        finally:
+            os.seteuid(0)
 
 
 def test_an_account_without_a_place_for_a_store_is_not_started_again_and_again(

@@ -9,9 +9,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from support.brokers import free_port
 from support.examples import first_of
 from support.paths import ROOT
+from support.ports import free_port
 
 from daqsvc import service as service_module
 from daqsvc.cli import main
@@ -29,6 +29,7 @@ PEOPLE = ("alarms", "ack", "reset", "shelve", "unshelve", "bypass", "unbypass")
 VERBS = (
     "run",
     "check",
+    "reload",
     "status",
     *PEOPLE,
     "analyze",

@@ -10,20 +10,22 @@ import signal
 import subprocess
 import sys
 import time
+from itertools import permutations
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from support.brokers import free_port
 from support.can_gateway import MACHINE, CanGateway, daqsvc_run
+from support.ports import free_port
 from support.waiting import PATIENCE_S, eventually
+from support.written_journals import write_journal
 
+from daqsvc import cli
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.alarms.commands import AlarmCommand, CommandOutcome
 from daqsvc.control import ControlServer
 from daqsvc.outbox.store import Outbox
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
 
 pytestmark = pytest.mark.integration
@@ -209,37 +211,6 @@ async def test_a_service_that_was_killed_leaves_a_journal_that_can_be_read(tmp_p
             assert (await daqsvc("ack", raised["occurrence"], "--store", store))[0] == 0
 
 
-def payload(sequence: int, **keys: Any) -> bytes:
-    told = {
-        "schema": "daqsvc.alarm/1",
-        "id": f"edge-1-{sequence}",
-        "sequence": sequence,
-        "machine": "motor",
-        "alarm": "shaking",
-        "occurrence": "0d8c1c4e-6f3a-4a55-9a53-5b0e8c1f7a21",
-        "kind": "raised",
-        "state": "active_unacknowledged",
-        "level": "alert",
-        "wall_ns": 1_795_264_095_376_165_000,
-        "message": "shaking alert: rms of accel is 0.98 g",
-    }
-    return json.dumps(told | keys).encode()
-
-
-async def write_journal(store: Path, *events: dict[str, Any]) -> None:
-    outbox = Outbox(store / "outbox.sqlite", SystemClock())
-    await outbox.open()
-
-    def of(keys: dict[str, Any]) -> Callable[[int], bytes]:
-        return lambda sequence: payload(sequence, **keys)
-
-    for keys in events:
-        topic = f"daqsvc/lab/edge-1/{keys.get('machine', 'motor')}/alarms/{keys.get('alarm', 'shaking')}"
-        await outbox.append(topic, of(keys), retain=True)
-    await outbox.append("daqsvc/lab/edge-1/other", lambda _: b'{"schema": "other/1"}', retain=True)
-    await outbox.close()
-
-
 OTHER = {"machine": "pump", "alarm": "rotor-fault", "occurrence": "0d8cffff-0000", "level": "danger"}
 
 
@@ -354,6 +325,31 @@ async def test_what_cannot_be_meant_is_never_asked(arguments: list[str], why: st
     assert why in err
 
 
+@pytest.mark.parametrize(
+    "verb", ["ack", "reset", "shelve", "unshelve", "bypass", "unbypass", "alarms", "status"]
+)
+def test_the_words_of_a_verb_may_stand_in_any_order(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    root = cli.parser(cli.commands())
+    words = ["plant"] if verb in {"alarms", "status"} else ["hot", "plant"]
+    options = [["--machine", "pump"], ["--json"], *([["--for", "1h"]] if verb == "shelve" else [])]
+    parts = [(0, words[:1]), *((1, words[1:]) for _ in words[1:]), *((2, one) for one in options)]
+    for order in permutations(parts):
+        line = [word for _, part in order for word in part]
+        if [kind for kind, _ in order if kind < 2] != sorted(kind for kind, _ in order if kind < 2):
+            continue
+        chosen = cli._chosen(root, [verb, *line])
+        assert (f"{chosen.file}", chosen.machine, getattr(chosen, "alarm", "hot")) == ("plant", "pump", "hot")
+    for wrong, why in (
+        ([*words, "--json", "more"], "unrecognized arguments: more"),
+        (["--bogus", *words], "unrecognized arguments: --bogus"),
+        ([*words[:-1], "--store", "here", "--json", "plant"], "not allowed with argument"),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            cli._chosen(root, [verb, *(["--for", "1h"] if verb == "shelve" else []), *wrong])
+        assert ended.value.code == 2
+        assert why in capsys.readouterr().err
+
+
 async def test_what_the_disk_has_not_got_is_told(tmp_path: Path) -> None:
     """The journal alone would show an older state as the present one."""
     outbox = Outbox(tmp_path / "outbox.sqlite", SystemClock())
@@ -363,7 +359,7 @@ async def test_what_the_disk_has_not_got_is_told(tmp_path: Path) -> None:
     async def execute(command: AlarmCommand, source: str) -> CommandOutcome:
         return CommandOutcome(accepted=True, reason="done, but the journal cannot be written yet", events=())
 
-    server = ControlServer(tmp_path, "rig", execute, lambda: 3)
+    server = ControlServer(tmp_path, ("rig",), execute, lambda: 3)
     await server.open()
     try:
         code, _, err = await daqsvc("alarms", "--store", tmp_path)

@@ -31,15 +31,21 @@ async def test_what_the_start_has_made_is_not_looked_through_for_garbage_again(m
             frozen.append(gc.get_freeze_count())
 
     monkeypatch.setattr(daqsvc.service, "Service", Service)
+    reloads = []
     guard = SimpleNamespace(
-        stopping=None, protect=lambda _: None, stop_by=lambda *_: None, expect_turns=lambda _: None
+        stopping=None,
+        protect=lambda _: None,
+        stop_by=lambda *_: None,
+        expect_turns=lambda _: None,
+        reload_by=reloads.append,
     )
-    machine = SimpleNamespace(machine=SimpleNamespace(name="rig"))
+    box = SimpleNamespace(names="rig")
     try:
-        await asyncio.wait_for(run._run_until_stopped(machine, tmp_path, guard, ServiceManager()), 10.0)
+        await asyncio.wait_for(run._run_until_stopped(box, [], tmp_path, guard, ServiceManager()), 10.0)
     finally:
         gc.unfreeze()
     assert frozen[1] > frozen[0] + 1000
+    assert len(reloads) == 1, "SIGHUP is obeyed from the start on, not before"
 
 
 def test_a_hang_up_that_comes_before_the_service_has_its_handlers_ends_nothing():

@@ -62,8 +62,9 @@ def test_the_watchdog_is_on_only_where_somebody_waits_for_this_process(
 
 def stalls(steps: list[Any], every_s: float = 1.0, thread: threading.Thread | None = None) -> list[bool]:
     """At each look, whether a part with these steps has stalled, if it may stand still for 3 s."""
-    watch = StallWatch(3.0, "it is restarted")
-    return [bool(watch.look({"part": Progress(step, thread)}, every_s * n)) for n, step in enumerate(steps)]
+    now = iter(steps)
+    stalled = StallWatch(lambda: {"part": Progress(next(now), thread)}).hold_to(3.0, "it is restarted")
+    return [bool(stalled(every_s * n)) for n in range(len(steps))]
 
 
 def test_a_part_has_stalled_that_has_work_and_takes_no_step(caplog: pytest.LogCaptureFixture) -> None:
@@ -71,6 +72,18 @@ def test_a_part_has_stalled_that_has_work_and_takes_no_step(caplog: pytest.LogCa
     assert [record.message for record in caplog.records] == [
         "part has stalled, without a step for 3 s: it is restarted",
         "part gets on again",
+    ]
+
+
+def test_a_part_that_several_watch_is_said_once_with_all_that_follows(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    watch = StallWatch(lambda: {"part": Progress(1)})
+    for_systemd, for_health = watch.hold_to(6.0, "it is restarted"), watch.hold_to(3.0, "it is unhealthy")
+    seen = [(bool(for_systemd(float(s))), bool(for_health(float(s)))) for s in range(9)]
+    assert seen == [(False, False)] * 3 + [(False, True)] * 3 + [(True, True)] * 3
+    assert [record.message for record in caplog.records] == [
+        "part has stalled, without a step for 3 s: it is unhealthy; after 6 s: it is restarted"
     ]
 
 
@@ -123,7 +136,7 @@ def test_parts_are_held_to_the_watchdog_but_to_three_seconds_at_least(
     service: Any = SimpleNamespace(
         ready=SimpleNamespace(is_set=lambda: True),
         awaited=lambda *, patient: {},
-        progress=lambda: {"part": Progress(1)},
+        stalls=StallWatch(lambda: {"part": Progress(1)}),
         driver_reports=[],
         alarms=SimpleNamespace(manager=SimpleNamespace(shown={}), outbox=outbox, outputs={}),
     )

@@ -54,6 +54,9 @@ def lasting_threads() -> set[threading.Thread]:
 class Rig:
     """Sends numbered samples over a transport and keeps what comes out at the other end.
 
+    Attributes:
+        late_ns: how long after its last sample a frame was taken in at most: a busy computer is in no hurry.
+
     Args:
         transport: started.
         start: policy for a device that is absent.
@@ -66,6 +69,7 @@ class Rig:
         self.blocks: list[SampleBlock] = []
         self.driver: Driver = transport.driver(self.blocks.append, start=start)
         self.sent = 0
+        self.late_ns = 0
         self._forgotten_samples = 0
         self._forgotten_lost = 0
         self._first_index = first_index
@@ -182,8 +186,15 @@ class Rig:
             else:
                 # A driver that polls sees it when it is time to; the device does not wait for that.
                 await self.rest()
+            self._note_lateness()
         if not to_be_continued:
             await self.settle()
+            self._note_lateness()
+
+    def _note_lateness(self) -> None:
+        """Remember how long after its last sample the device's frame was taken in, or may have been."""
+        due_ns = self._origin_ns + (self.sent - 1) * self.period_ns
+        self.late_ns = max(self.late_ns, self.transport.time.clock.monotonic_ns() - due_ns)
 
     async def rest(self) -> None:
         """Wait until the driver has nothing to do before more time has passed."""

@@ -2,7 +2,7 @@
 # run.sh - tests/hil, and the conformance suite over SocketCAN, on real vcan interfaces (root).
 #
 # Natively where the kernel has vcan, in a network namespace of its own; otherwise in a guest kernel
-# (guest.sh). Then the unit under a systemd of its own, always in a guest. Whatever is missing for either is a
+# (guest.sh). Then the Debian package and the unit under a systemd of its own, always in a guest. Whatever is missing for either is a
 # failure, never a reason to skip.
 #
 #   run.sh [ARGUMENT OF PYTEST ...]      HIL_GUEST=1 forces the guest; arguments leave the unit out
@@ -10,19 +10,20 @@ set -euo pipefail
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 cd "$here/../.."
 
-missing() { echo "hil: $1 is missing; install it with: apt-get install --no-install-recommends user-mode-linux kmod iproute2 can-utils mosquitto systemd" >&2; exit 1; }
+missing() { echo "hil: $1 is missing; install it with: apt-get install --no-install-recommends user-mode-linux kmod iproute2 can-utils mosquitto systemd debhelper" >&2; exit 1; }
 [ "$(id -u)" = 0 ] || { echo "hil: interfaces are made by root only; run it as root" >&2; exit 1; }
 for program in ip cansend candump cangen; do command -v "$program" >/dev/null || missing "$program"; done
 command -v mosquitto >/dev/null || [ -x /usr/sbin/mosquitto ] || missing mosquitto
 
 export PATH="$PWD/.venv/bin:$PATH:/usr/sbin" DAQSVC_HIL=1 DAQSVC_REQUIRE_MOSQUITTO=1 OMP_NUM_THREADS=1
 export NUMBA_CACHE_DIR=${NUMBA_CACHE_DIR:-$PWD/.cache/kernels}
-unit=(python -m pytest -q -p no:cacheprovider tests/hil/test_systemd.py)
+unit=(python -m pytest -q -p no:cacheprovider tests/hil/test_package.py tests/hil/test_systemd.py)
 suite=(python -m pytest -q -p no:cacheprovider tests/hil tests/conformance -k vcan "$@")
 
 command -v linux.uml >/dev/null || missing linux.uml
 command -v modprobe >/dev/null || missing kmod
 [ -x /lib/systemd/systemd ] || missing systemd
+command -v dh >/dev/null || missing dh
 has_vcan() { unshare --net ip link add dev probe type vcan 2>/dev/null; }
 status=0
 if [ -z "${HIL_GUEST:-}" ] && { has_vcan || { modprobe -a can-raw vcan 2>/dev/null && has_vcan; }; }; then
@@ -34,9 +35,11 @@ else
 fi
 if [ "$#" = 0 ]; then
     # Never on this machine itself: the unit is installed, killed and hung.
-    echo "hil: the unit under systemd, in a guest"
+    echo "hil: the package and its unit under systemd, in a guest"
+    DAQSVC_DEBS=$(PYTHONPATH=tests python -m support.deb_package)
     DAQSVC_HOST_S=$(PYTHONPATH=tests python -m support.unit_kernels)
-    export DAQSVC_HOST_S
-    "$here/guest.sh" --systemd "${unit[@]}" || status=$?
+    export DAQSVC_DEBS DAQSVC_HOST_S
+    # An upgrade has both versions on the disk, which is in memory.
+    HIL_LIMIT_S=${HIL_LIMIT_S:-600} HIL_MEMORY=${HIL_MEMORY:-2500M} "$here/guest.sh" --systemd "${unit[@]}" || status=$?
 fi
 exit "$status"

@@ -6,92 +6,46 @@ import contextlib
 import json
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
 import sysconfig
-import threading
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import numpy as np
 import pytest
-from numba.core import caching
+from support.guide_commands import shell_blocks
 from support.paths import ROOT
-from support.unit_kernels import reference_s
+from support.systemd_units import IN_A_GUEST, STORE, UNIT, Shaft, alarm, journal, say, sh, shown, until
+from support.unit_kernels import put_kernels, reference_s
 from support.vcan_links import VcanLink
 
 from daqsvc import kernel_cache
 from daqsvc.alarms.commands import Verb
 from daqsvc.control import ControlRequest, ask, ask_status
-from daqsvc.outbox.reading import read_journal
-from daqsvc.settings import load_machine_file
-from drivers.can.plugin import frame_layout
-from sim_hw.nodes.can_node import to_frames
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-pytestmark = [
-    pytest.mark.skipif(
-        os.environ.get("DAQSVC_HIL_SYSTEMD") != "1", reason="needs a systemd of its own: make hil"
-    ),
-    pytest.mark.timeout(120),
-]
-UNIT = "daqsvc@pump"
-STORE = Path("/var/lib/daqsvc/pump")
+pytestmark = [IN_A_GUEST, pytest.mark.timeout(120)]
 LATE = "daqsvc@late"
 """Whose bus, broker, disk and time are not there at the start."""
 KERNELS = Path("/var/cache/daqsvc/kernels")
 INSTALLED = Path("/opt/hil")
 """Not where it lies on the host: that may be below /root or /tmp, which the sandbox hides."""
 WATCHDOG_S = 6
-PATIENCE_S = 60.0
 READY_S, STOP_S = 3.0, 2.0
 """What the service promises; the guest is some times as slow as a machine that it is for."""
 NOMINAL_S = 0.8
 """What `reference_s` is on such a machine."""
-RATE_HZ = 640
 FIRST_OF_2000_S = 946_684_800.0
 BROKEN = "schema_version = 1\nsite = 5\n"
-
-
-def sh(*command: object) -> str:
-    done = subprocess.run([*map(str, command)], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, f"{command}: {done.stdout}{done.stderr}"
-    return done.stdout
-
-
-def shown(unit: str = UNIT) -> dict[str, str]:
-    keys = "ActiveState,SubState,MainPID,NRestarts,Result,StatusText,ExecMainStatus"
-    return dict(line.split("=", 1) for line in sh("systemctl", "show", unit, "-p", keys).splitlines())
-
-
-def journal(unit: str = UNIT, least: str = "debug") -> str:
-    """What the journal has of a unit, from a level on."""
-    return sh("journalctl", "-u", unit, "--no-pager", "-o", "cat", "-p", least)
-
-
-def until(true: Any, what: str) -> Any:
-    until_s = time.monotonic() + PATIENCE_S
-    while time.monotonic() < until_s:
-        if result := true():
-            return result
-        time.sleep(0.1)
-    pytest.fail(f"not within {PATIENCE_S:g} s: {what}; {shown()}\n{journal()[-3000:]}")
 
 
 def slowness(*taken_s: float) -> float:
     """How many times as slow this is as a machine on which the promises hold, by `reference_s` taken here."""
     return max(1.0, max(taken_s) / min(NOMINAL_S, float(os.environ["DAQSVC_HOST_S"])))
-
-
-def say(figure: str) -> None:
-    """Into the log of `make hil`, whatever pytest captures."""
-    with contextlib.suppress(OSError), Path(os.environ["HIL_OUT"], "console").open("a") as console:
-        console.write(f"\n{figure}\n")
 
 
 def started_again(before: dict[str, str]) -> dict[str, str]:
@@ -107,53 +61,8 @@ def started_again(before: dict[str, str]) -> dict[str, str]:
     return now
 
 
-def alarm(name: str, store: Path = STORE) -> dict[str, Any] | None:
-    """How an alarm stands, by the journal, which its own account may read."""
-    os.seteuid(store.stat().st_uid)
-    try:
-        payloads = [json.loads(message.payload) for message in read_journal(store, history=0).latest]
-    finally:
-        os.seteuid(0)
-    stands = next((one for one in payloads if one.get("alarm") == name), None)
-    return stands and {key: stands[key] for key in ("state", "level", "occurrence", "time")}
-
-
-class Shaft(threading.Thread):
-    """The probes of the rig: an orbit of 20 um at 600 rpm, on a CAN interface, until the end."""
-
-    def __init__(self, machine: Path, link: VcanLink) -> None:
-        super().__init__(daemon=True)
-        self._layout = frame_layout(load_machine_file(machine), "shaft")
-        self._link = link
-        self._over = threading.Event()
-
-    def run(self) -> None:
-        turns = np.arange(RATE_HZ) / 64.0
-        rng = np.random.default_rng(3)
-        waves = {
-            "x": 20.0 * np.cos(2 * np.pi * turns),
-            "y": 20.0 * np.sin(2 * np.pi * turns),
-            "kph": np.where(turns % 1.0 < 0.1, -2.0, -10.0),
-        }
-        samples = np.stack([waves[n] + rng.normal(0.0, 0.02, RATE_HZ) for n in self._layout.channels], axis=1)
-        begun_s, second = time.monotonic(), 0
-        with self._link.sender() as sender:
-            while not self._over.is_set():
-                frames = to_frames(samples, self._layout, RATE_HZ, first_index=second * RATE_HZ).payloads
-                for n, payload in enumerate(frames):
-                    due_s = begun_s + second + (n + 1) / len(frames)
-                    time.sleep(max(0.0, due_s - time.monotonic()))
-                    head = (0x101).to_bytes(4, sys.byteorder) + bytes([len(payload), 0, 0, 0])
-                    sender.send(head + payload.tobytes())
-                second += 1
-
-    def stop(self) -> None:
-        self._over.set()
-        self.join()
-
-
 def install() -> None:
-    """Put program, account and unit where they belong, with the kernels that the host has compiled."""
+    """Put the program where it belongs, all else as docs/edge-box.md says, and kernels of the host."""
     places = {"tree": ROOT, "site": sysconfig.get_path("purelib"), "python": sys.base_prefix}
     for name, place in places.items():
         (INSTALLED / name).mkdir(parents=True)
@@ -166,11 +75,9 @@ def install() -> None:
         f'exec {python} {INSTALLED}/tree/tests/hil/unit_main.py "$@"\n'
     )
     program.chmod(0o755)
-    config = ROOT / "config" / "systemd"
-    Path("/etc/sysusers.d").mkdir(exist_ok=True)
-    shutil.copy(config / "daqsvc.sysusers.conf", "/etc/sysusers.d/daqsvc.conf")
-    sh("systemd-sysusers", "/etc/sysusers.d/daqsvc.conf")
-    shutil.copy(config / "daqsvc@.service", "/etc/systemd/system/")
+    [[*guide, _check, _start]] = shell_blocks("edge-box.md")["The service under systemd"]
+    for command in guide:
+        sh("/bin/sh", "-ec", command, cwd=ROOT)
     for unit in (UNIT, LATE, "daqsvc@broken"):
         changes = Path(f"/etc/systemd/system/{unit}.service.d")
         changes.mkdir()
@@ -180,14 +87,7 @@ def install() -> None:
     secret.write_text("s3cret\n")
     secret.chmod(0o600)
     sh("systemctl", "daemon-reload")
-    warmed = Path(os.environ["NUMBA_CACHE_DIR"])
-    path_of = caching._CacheLocator.get_suitable_cache_subpath
-    for source in {
-        file.parent for package in ("daqsvc", "drivers") for file in (ROOT / package).rglob("*.py")
-    }:
-        kept = warmed / path_of(f"{source}/x.py")
-        if kept.is_dir():
-            shutil.copytree(kept, KERNELS / path_of(f"{INSTALLED}/tree/{source.relative_to(ROOT)}/x.py"))
+    put_kernels(INSTALLED / "tree", KERNELS)
     sh("chown", "-R", "daqsvc:daqsvc", KERNELS.parent)
     assert KERNELS.parent == kernel_cache.SERVICE
 
@@ -198,12 +98,12 @@ def unit() -> Iterator[str]:
     install()
     link = VcanLink()
     folder = Path("/etc/daqsvc")
-    folder.mkdir()
-    text = (ROOT / "config" / "machines" / "laval-rig.toml").read_text()
+    text = (folder / "pump.toml").read_text()
+    assert f'directory = "{STORE}"' in text
     text = text.replace('channel = "can0"', f'channel = "{link.name}"').replace(
         'start = "retry"', 'start = "error"'
     )
-    text = text.replace("alert = 40.0", "alert = 4.0").replace('"/var/lib/daqsvc"', f'"{STORE}"')
+    text = text.replace("alert = 40.0", "alert = 4.0")
     text = re.sub(r"^(ca_file|password_file) = .*$", "", text, flags=re.MULTILINE)
     text = text.replace("broker.example", "127.0.0.1")
     text = text.replace('username = "daq"', 'username = "daq"\npassword_credential = "mqtt-password"')
@@ -280,8 +180,12 @@ def test_whatever_ends_it_it_is_started_again_and_its_alarms_stand_as_they_did(u
         say(f"{what}: ready again after {time.monotonic() - begun_s:.1f} s")
         assert now["NRestarts"] == str(number)
         assert alarm(name) == stands
-    status = ask_status(STORE)
-    assert (status["buses"]["can0"]["state"], status["outputs"]) == ("up", {"mqtt": {"connected": False}})
+    status = until(
+        lambda: (now := ask_status(STORE)[0])["outputs"]["mqtt"]["reason"] and now,
+        "it knows why no broker is there",
+    )
+    away = {"connected": False, "reason": "127.0.0.1:8883: nothing listens there"}
+    assert (status["buses"]["can0"]["state"], status["outputs"]) == ("up", {"mqtt": away})
     away = "WARNING MQTT broker"
     assert away in journal(least="warning")
     assert away not in journal(least="err")
@@ -291,6 +195,30 @@ def test_whatever_ends_it_it_is_started_again_and_its_alarms_stand_as_they_did(u
     assert "the event loop has stood still for 3 s: the event loop is in look (unit_main.py" in said
     assert said.count("Watchdog timeout (limit 6s)!") == 2, said
     assert "gets on again" not in said
+
+
+def test_its_machine_file_is_read_again_without_a_restart(unit: str) -> None:
+    file = Path("/etc/daqsvc/pump.toml")
+    text, before, stands = file.read_text(), shown(unit), alarm("shaft-vibration-x")
+    received = ask_status(STORE)[0]["streams"]["shaft"]["samples_received"]
+    changed = re.sub("(?m)^shelve_at_most_s = .*$", "shelve_at_most_s = 60.0", text)
+    assert changed != text
+    try:
+        file.write_text(changed)
+        sh("systemctl", "reload", unit)
+        assert "reloaded: machine laval-rig: other alarms or setpoints" in journal()
+        file.write_text(changed.replace("[machine]", "[machin]"))
+        refused = subprocess.run(["systemctl", "reload", unit], capture_output=True, text=True, check=False)
+        assert refused.returncode != 0
+        assert "machin: unknown key" in journal()
+    finally:
+        file.write_text(text)
+    now = until(lambda: (one := shown(unit))["ActiveState"] == "active" and one, "it goes on")
+    assert (now["MainPID"], now["NRestarts"]) == (before["MainPID"], before["NRestarts"])
+    status = ask_status(STORE)[0]["streams"]["shaft"]
+    assert status["samples_received"] > received
+    assert alarm("shaft-vibration-x") == stands
+    sh("systemctl", "reload", unit)
 
 
 def boot_without_time(unit: str) -> None:

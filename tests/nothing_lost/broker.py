@@ -49,7 +49,8 @@ def signal_child(process: asyncio.subprocess.Process, number: signal.Signals) ->
     return True
 
 
-def _unused_port() -> int:
+def unused_port() -> int:
+    """A port that nobody has, and that stays free while whoever listens there is away."""
     for port in _PORTS:
         with socket.socket() as probe:
             try:
@@ -63,8 +64,10 @@ def _unused_port() -> int:
 class Broker:
     """One broker without persistence: whatever way it ends, it forgets everything."""
 
-    def __init__(self, name: BrokerName, directory: Path, environment: dict[str, str]) -> None:
-        self.port = _unused_port()
+    def __init__(
+        self, name: BrokerName, directory: Path, environment: dict[str, str], *, verbose: bool = True
+    ) -> None:
+        self.port = unused_port()
         self._environment = environment
         self._log = directory / f"{name}.log"
         self._process: asyncio.subprocess.Process | None = None
@@ -76,7 +79,7 @@ class Broker:
             config = directory / "mosquitto.conf"
             user = "user root" if os.geteuid() == 0 else ""
             config.write_text(MOSQUITTO.format(port=self.port, user=user))
-            self._command = [program, "-c", str(config), "-v"]
+            self._command = [program, "-c", str(config), *(["-v"] if verbose else [])]
 
     async def start(self) -> None:
         """Start it and wait until it listens."""

@@ -36,11 +36,12 @@ class Consumer:
     A broker that has forgotten it is subscribed to anew; `subscribed` says when that is done.
     """
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, port: int, topic: str = "daqsvc/#") -> None:
         self.arrivals: list[Arrival] = []
         self.ids: set[str] = set()
         self.subscribed = threading.Event()
         self._port = port
+        self._topic = topic
 
     async def __aenter__(self) -> Self:
         await self._join()
@@ -96,7 +97,7 @@ class Consumer:
         if flags.session_present:
             self.subscribed.set()
         else:
-            client.subscribe("daqsvc/#", qos=1)
+            client.subscribe(self._topic, qos=1)
 
     def _take(self, _client: object, _userdata: object, message: paho.MQTTMessage) -> None:
         if "/alarms/" in message.topic and message.payload:

@@ -59,10 +59,10 @@ class LimitedFiles:
 
 
 @contextlib.asynccontextmanager
-async def small_disk(mount: Path) -> AsyncIterator[Disk]:
+async def small_disk(mount: Path, size_mb: int = SIZE_MB) -> AsyncIterator[Disk]:
     """Mount a small disk at ``mount`` if this process may, else limit what is written there."""
     await asyncio.to_thread(mount.mkdir)
-    if await _run("mount", "-t", "tmpfs", "-o", f"size={SIZE_MB}m", "tmpfs", str(mount)):
+    if await _run("mount", "-t", "tmpfs", "-o", f"size={size_mb}m", "tmpfs", str(mount)):
         try:
             yield SmallDisk(mount)
         finally:

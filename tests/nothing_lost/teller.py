@@ -22,12 +22,12 @@ from typing import TYPE_CHECKING, Any
 
 import paho.mqtt.client as paho
 from nothing_lost.script import RULES, SENSORS, Script
+from support.alarm_desk import alarm_service
 from support.clocks import SteppedClock
 from support.mqtt_publishing import mqtt, outputs
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.link import Backoff
-from daqsvc.alarm_service import AlarmService
 from daqsvc.outbox.messages import event_id
 
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
     from nothing_lost.script import Step
 
+    from daqsvc.alarm_service import AlarmService
     from daqsvc.outbox.store import Outbox
 
 QUICK_RETRY = Backoff(NS_PER_S // 20, NS_PER_S // 5)
@@ -122,7 +123,7 @@ class Teller:
                 await asyncio.sleep(step.pause_s)
             self._clock.ahead_ns = step.wall_offset_s * NS_PER_S
             self._under_way = []
-            self._desk.take(step.diagnosis(self._desk.identity.machine, self._clock.monotonic_ns()))
+            self._desk.take(step.diagnosis(self._desk.manager.identity.machine, self._clock.monotonic_ns()))
             self._desk.outbox.telemetry(f"{self._desk.topics.base}/status", b'{"step": %d}' % step.number)
             before = settling[-1:]
             settling.append(asyncio.create_task(self._settled(step.number, self._under_way, before)))
@@ -187,7 +188,7 @@ async def run(arguments: argparse.Namespace) -> None:
         protocol=arguments.protocol,
     )
     bypassed = arguments.mutation == "bypass"
-    desk = AlarmService(script.identity, RULES, arguments.store, clock, None if bypassed else outputs(table))
+    desk = alarm_service(script.identity, RULES, arguments.store, clock, None if bypassed else outputs(table))
     if desk.outputs:
         assert hasattr(desk.outputs["mqtt"], "_backoff")
         desk.outputs["mqtt"]._backoff = QUICK_RETRY
@@ -201,7 +202,7 @@ async def run(arguments: argparse.Namespace) -> None:
     teller = Teller(desk, clock, arguments.witness)
     teller.write("started")
     clock.ahead_ns = script.steps[min(untold, len(script.steps) - 1)].wall_offset_s * NS_PER_S
-    await desk.resume(SENSORS)
+    await desk.resume({script.identity.machine: SENSORS})
     running = [asyncio.create_task(each.run()) for each in desk.outputs.values()]
     timekeeper = asyncio.create_task(desk.keep_time())
     await teller.tell(script.steps[untold:])

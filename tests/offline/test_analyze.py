@@ -254,7 +254,7 @@ def test_options_may_stand_between_recordings(
     assert "unrecognized arguments" in err
     assert "--no-such-option" in err
     with pytest.raises(SystemExit):
-        main(["check", "one.toml", "two.toml"])
+        main(["example", "one", "two.toml"])
     assert "unrecognized arguments: two.toml" in capsys.readouterr().err
 
 

@@ -366,7 +366,7 @@ async def test_a_store_belongs_to_one_service_at_a_time(tmp_path):
     first = Outbox(tmp_path / "outbox.sqlite", SystemClock())
     await first.open()
     second = Outbox(tmp_path / "outbox.sqlite", SystemClock())
-    with pytest.raises(OutboxError, match=r"another daqsvc uses the store .*: each machine needs one"):
+    with pytest.raises(OutboxError, match=r"another daqsvc uses the store .*, or have one service watch all"):
         await second.open()
     await second.close()
     await first.close()

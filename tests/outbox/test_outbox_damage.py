@@ -113,7 +113,7 @@ def test_flipped_bytes(stores, data):
         asyncio.run(restarted(store, numbers))
 
 
-@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=examples(15), suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_torn_files(stores, data):
     kept, numbers = stores

@@ -6,9 +6,9 @@ import json
 import shutil
 
 import pytest
+from support.alarm_desk import alarm_service
 
 from daqsvc.acquisition.clock import DrivenClock
-from daqsvc.alarm_service import AlarmService
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.rules import DiagnosisRule
 from daqsvc.diagnosis.record import Diagnosis
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.integration
 async def told_by(store, site="lab"):
     """The ids of the events of a box without a clock of its own, from one start to its end."""
     clock = DrivenClock(wall_start_ns=0)
-    desk = AlarmService(
+    desk = alarm_service(
         Identity(site, "edge-1", "rig"), [DiagnosisRule("rotor-fault", "rotor-bank")], store, clock, None
     )
     await desk.open()

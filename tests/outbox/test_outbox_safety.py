@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
 import stat
+import tempfile
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 from support.paths import ROOT
@@ -14,8 +17,9 @@ from daqsvc.alarms.commands import AlarmCommand, Verb
 from daqsvc.audit import AuditError, AuditLog
 from daqsvc.outbox.journal import Journal
 from daqsvc.outbox.limits import OutboxLimits
-from daqsvc.outbox.messages import OutboxError
+from daqsvc.outbox.messages import OutboxError, StoreRefusedError
 from daqsvc.outbox.reading import read_journal
+from daqsvc.outbox.store import Outbox
 
 STRANGER = 61234
 
@@ -37,6 +41,15 @@ def refused(store, *words):
     for word in words:
         assert word in str(caught.value)
     yield
+
+
+@pytest.fixture
+def searched():
+    """A directory that every user may search, unlike those of pytest, with above/store in it."""
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "above" / "store").mkdir(parents=True)
+        Path(folder).chmod(0o755)
+        yield Path(folder)
 
 
 @pytest.fixture
@@ -113,6 +126,37 @@ def test_what_belongs_to_another_user_is_refused(tmp_path, whose):
     os.chown(path, STRANGER, 0)
     with refused(store, f"belongs to user {STRANGER}", "runs as root", str(path)):
         pass
+
+
+@is_root
+@pytest.mark.parametrize(
+    ("directory", "owner", "mode", "said"),
+    [
+        (
+            "above/store",
+            STRANGER + 1,
+            0o700,
+            "/store belongs to user 61235 and the service runs as user 61234",
+        ),
+        ("above", STRANGER + 1, 0o700, "/above, above the store "),
+        ("above/store", STRANGER, 0o500, "/store may not be written by user 61234: chmod u+rwx "),
+        ("above/store", STRANGER, 0o000, "cannot open the outbox "),
+        ("above", 0, 0o700, "cannot open the outbox "),
+    ],
+)
+async def test_a_store_that_this_account_may_not_use_is_refused_for_good(
+    directory, owner, mode, said, searched
+):
+    (searched / directory).chmod(mode)
+    os.chown(searched / directory, owner, owner)
+    outbox = Outbox(searched / "above" / "store" / "outbox.sqlite", SystemClock())
+    os.seteuid(STRANGER)
+    try:
+        with pytest.raises(StoreRefusedError, match=re.escape(said)):
+            await outbox.open()
+    finally:
+        os.seteuid(0)
+        await outbox.close()
 
 
 @is_root

@@ -8,12 +8,12 @@ import logging
 
 import numpy as np
 import pytest
+from support.alarm_desk import alarm_service
 from support.live_service import play, running
 from support.small_disks import mounted
 from support.waiting import eventually
 
 from daqsvc.acquisition.clock import SystemClock
-from daqsvc.alarm_service import AlarmService
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.rules import DiagnosisRule
 from daqsvc.alarms.states import AlarmState
@@ -46,7 +46,7 @@ def disk(tmp_path):
 @contextlib.asynccontextmanager
 async def desk_in(store, limits=LIMITS):
     """The alarms of a service from its start to its stop."""
-    desk = AlarmService(Identity("lab", "edge-1", "rig"), LATCHING, store, CLOCK, None, limits=limits)
+    desk = alarm_service(Identity("lab", "edge-1", "rig"), LATCHING, store, CLOCK, None, limits=limits)
     await desk.open()
     try:
         await desk.resume({})

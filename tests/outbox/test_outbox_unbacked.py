@@ -10,13 +10,14 @@ import textwrap
 from collections import Counter
 
 import pytest
-from support.brokers import Consumer, free_port, running_mosquitto
+from support.alarm_desk import alarm_service
+from support.brokers import Consumer, running_mosquitto
 from support.mqtt_publishing import mqtt, outputs
+from support.ports import free_port
 from support.small_disks import failing, mounted
 from support.waiting import eventually
 
 from daqsvc.acquisition.clock import SystemClock
-from daqsvc.alarm_service import AlarmService
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.rules import DiagnosisRule
 from daqsvc.diagnosis.record import Diagnosis
@@ -45,7 +46,7 @@ def disk(tmp_path):
 @contextlib.asynccontextmanager
 async def desk_at(store, port, *, stop_s=20.0):
     """The alarms of a service with a broker, from its start to its stop."""
-    desk = AlarmService(
+    desk = alarm_service(
         Identity("lab", "edge-1", "rig"), RULES, store, CLOCK, outputs(mqtt(port)), limits=LIMITS
     )
     await desk.open()

@@ -5,9 +5,16 @@ from __future__ import annotations
 import runpy
 import socket
 import threading
+from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 from support.paths import ROOT
+
+from drivers.can.plugin import frame_layout
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 BENCH = ROOT / "tests" / "bench"
 
@@ -60,3 +67,19 @@ def test_a_load_counts_only_what_the_other_end_has_taken(
             reader.join(10)
     assert least <= sent <= most
     assert took_s >= 0.2
+
+
+def test_what_watching_costs_is_measured_on_devices_that_go_on(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """They are sent over and over: a counter that leaps would cost what a device that restarts does."""
+    monkeypatch.syspath_prepend(str(BENCH))
+    bench = runpy.run_path(str(BENCH / "bench_cost.py"))
+    layout = frame_layout(bench["rig"](tmp_path), "shaft")
+    frames = bench["can_frames"]()
+    payloads = np.frombuffer(b"".join(frames), np.uint8).reshape(len(frames), -1)[:, 8 : 8 + layout.length]
+    found = layout.decode(payloads, np.zeros(len(frames), np.int64))
+    assert found.intact.all()
+    assert set((np.roll(found.counter, -1) - found.counter) % 2**16) == {layout.samples_per_frame}
+    counts = np.array([int(line.split(b",")[0]) for line in bench["line_bytes"]()])
+    assert set((np.roll(counts, -1) - counts) % 2**16) == {1}

@@ -34,6 +34,7 @@ from pathlib import Path
 from daqsvc import api
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.alarm_service import AlarmService
+from daqsvc.alarms.manager import AlarmManager
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.make import alarm_rule
 from daqsvc.detectors.make import detectors
@@ -72,11 +73,12 @@ async def main():
     [said] = detector.process(api.Window(0, samples, 10**9, 1e6))
     identity = Identity(machine.site, machine.box, machine.machine.name)
     rules = [alarm_rule(alarm) for alarm in machine.alarms]
-    alarms = AlarmService(identity, rules, path.parent / "store", SystemClock(), output_set(machine))
+    manager = AlarmManager(identity, rules, SystemClock())
+    alarms = AlarmService(manager, path.parent / "store", SystemClock(), output_set(machine))
     output = alarms.outputs["event_file"]
     assert isinstance(output, event_file.EventFileOutput), output
     await alarms.open()
-    await alarms.resume({"crest": ("casing-x",)})
+    await alarms.resume({identity.machine: {"crest": ("casing-x",)}})
     telling = asyncio.create_task(output.run())
     alarms.take(said)
     events = path.parent / "events.jsonl"

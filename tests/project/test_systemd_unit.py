@@ -37,7 +37,7 @@ def unit(tmp_path: Path) -> Path:
     """A copy whose program is there."""
     copy = tmp_path / "daqsvc@pump.service"
     text = UNIT.read_text()
-    assert text.count(PROGRAM) == 1
+    assert text.count(PROGRAM) == 2, "to start it, and to reload it"
     copy.write_text(text.replace(PROGRAM, str(Path(sys.executable).with_name("daqsvc"))))
     return copy
 

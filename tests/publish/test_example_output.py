@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from support.alarm_desk import alarm_service
 from support.example_packages import DOCS, OUTPUT, installed
-from support.live_service import play, running
+from support.live_service import play, running, watch_of
 from support.machine_files import LAVAL, MOTOR, problems_of
 from support.waiting import eventually
 
 from daqsvc.acquisition.clock import SystemClock
-from daqsvc.alarm_service import AlarmService
 from daqsvc.alarms.conditions import Condition
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.rules import DiagnosisRule
@@ -30,6 +30,7 @@ from daqsvc.settings import describe, parse_machine_file, registry
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
 
+    from daqsvc.alarm_service import AlarmService
     from daqsvc.settings import MachineFile
 
 pytestmark = pytest.mark.integration
@@ -54,9 +55,9 @@ def without_broker() -> str:
 @contextlib.asynccontextmanager
 async def alarms_of(told: MachineFile, store: Path) -> AsyncIterator[AlarmService]:
     identity = Identity(told.site, told.box, told.machine.name)
-    alarms = AlarmService(identity, [DiagnosisRule("knocks", "crest")], store, CLOCK, output_set(told))
+    alarms = alarm_service(identity, [DiagnosisRule("knocks", "crest")], store, CLOCK, output_set(told))
     await alarms.open()
-    await alarms.resume({"crest": ("accel-de",)})
+    await alarms.resume({identity.machine: {"crest": ("accel-de",)}})
     tasks = [asyncio.create_task(alarms.outputs["event_file"].run())]
     try:
         yield alarms
@@ -144,7 +145,7 @@ async def test_one_that_fails_in_everything_ends_nothing(
     async with running(told, tmp_path / "store") as service:
         await play(service, np.tile([5.0, 5.0, 0.0], (1280, 1)), 640.0)
         await eventually(lambda: service.figures()["streams"]["shaft"]["samples_received"] > 1200, "acquired")
-        assert any(c.windows for c in service.pipeline.counters.values())
+        assert any(c.windows for c in watch_of(service).pipeline.counters.values())
         events = service.alarms.manager.condition("store/disk", Level.ALERT, "is nearly full")
         for event in events:
             await service.alarms._post(event)
@@ -164,7 +165,7 @@ def test_what_an_output_has_said_is_over_once_its_table_is_gone(tmp_path: Path) 
     outputs = output_set(parse_machine_file(without_broker(), LAVAL))
     assert outputs.outdated["broker/refused"] == "there is no broker any more"
     assert outputs.outdated["certificate/"] == "it is no longer in use"
-    alarms = AlarmService(Identity("lab", "edge-1", "motor"), [], tmp_path, CLOCK, outputs)
+    alarms = alarm_service(Identity("lab", "edge-1", "motor"), [], tmp_path, CLOCK, outputs)
     alarms.manager.condition("certificate/ca", Level.ALERT, "it ends soon")
     said = Condition("certificate/ca", Level.NORMAL, "it is no longer in use")
     assert list(alarms._of_outputs()) == [said]

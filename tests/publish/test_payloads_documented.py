@@ -11,6 +11,7 @@ from support.paths import ROOT
 
 from daqsvc.alarms.events import EventKind
 from daqsvc.alarms.states import AlarmState
+from daqsvc.box import Box
 from daqsvc.detectors.make import detectors
 from daqsvc.diagnosis.detector import Window
 from daqsvc.publish.schemas import PAYLOADS
@@ -49,7 +50,7 @@ def shape(figures):
 
 
 def test_the_documented_status_has_the_figures_of_the_example_rig(tmp_path):
-    figures = Service(RIG, tmp_path).figures()
+    figures = Service(Box.single(RIG), tmp_path).figures()
     assert shape(EXAMPLES["daqsvc.status/1"]["figures"]) == shape(figures)
 
 

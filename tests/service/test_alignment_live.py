@@ -10,10 +10,12 @@ import can
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
+from support.live_service import watch_of
 from support.machine_files import MACHINES
 from support.waiting import eventually
 
 from daqsvc.acquisition.clock import DrivenClock
+from daqsvc.box import Box
 from daqsvc.service import Service
 from daqsvc.settings import parse_machine_file
 from drivers.can.plugin import frame_layout
@@ -61,15 +63,15 @@ def machine_file(name):
 
 def device_frames(service, stream, shaft, ppm, delay_ms, rng):
     """Frames of a device whose clock is ``ppm`` fast: when each arrives, and its bytes."""
-    layout = frame_layout(service.machine, stream)
-    rate_hz = service.machine.streams[stream].rate_hz * (1.0 + ppm * 1e-6)
+    layout = frame_layout(watch_of(service).machine, stream)
+    rate_hz = watch_of(service).machine.streams[stream].rate_hz * (1.0 + ppm * 1e-6)
     t_s = np.arange(math.floor((LAST_REV / SPEED_HZ - 0.1) * rate_hz)) / rate_hz
     noise = {"x": NOISE_UM, "y": NOISE_UM, "kph": NOISE_V}
     samples = [shaft[name](t_s) + noise[name] * rng.normal(size=len(t_s)) for name in layout.channels]
     frames = to_frames(np.column_stack(samples), layout, rate_hz, clip=True)
     late = frames.t_ns + rng.uniform(0.0, delay_ms * 1e6, len(frames.t_ns))
-    bus = service.machine.streams[stream].bus
-    channel = service.machine.buses[bus].model_dump()["channel"]
+    bus = watch_of(service).machine.streams[stream].bus
+    channel = watch_of(service).machine.buses[bus].model_dump()["channel"]
     arrival_ns = np.maximum.accumulate(late).astype(np.int64).tolist()
     return [
         (t_ns, channel, layout.frame_id, payload.tobytes())
@@ -80,10 +82,10 @@ def device_frames(service, stream, shaft, ppm, delay_ms, rng):
 async def watch(machine, shaft, ppm, store: Path) -> tuple[Service, list[Diagnosis]]:
     """Play the shaft's motion to a service, in simulated time."""
     clock = DrivenClock()
-    service = Service(machine, store, clock)
+    service = Service(Box.single(machine), store, clock)
     heard: list[Diagnosis] = []
-    report = service.pipeline._report
-    service.pipeline._report = lambda diagnosis: (heard.append(diagnosis), report(diagnosis))
+    report = watch_of(service).pipeline._report
+    watch_of(service).pipeline._report = lambda diagnosis: (heard.append(diagnosis), report(diagnosis))
     stop = asyncio.Event()
     running = asyncio.create_task(service.run(stop))
     sent = 0
@@ -92,7 +94,7 @@ async def watch(machine, shaft, ppm, store: Path) -> tuple[Service, list[Diagnos
         counted = [counters for driver in service.drivers for counters, _ in driver.streams.values()]
         on_the_way = sent - sum(counters.frames_received for counters in counted)
         # What is on the way is stamped late; what detectors have not read yet is not.
-        return 1_000_000 * on_the_way + service.pipeline.behind_samples
+        return 1_000_000 * on_the_way + watch_of(service).pipeline.behind_samples
 
     try:
         await service.ready.wait()
@@ -148,7 +150,7 @@ async def test_probes_on_two_buses_give_the_diagnosis_of_one(shaft, tmp_path: Pa
     # The healthy state too: 1X forward and backward, and the mean position, in um.
     baselines = []
     for service in (one, two):
-        (detector,) = (d for d in service.pipeline.detectors if d.name == "rotor-synchronous")
+        (detector,) = (d for d in watch_of(service).pipeline.detectors if d.name == "rotor-synchronous")
         baselines.append(detector.watch.calibration.baseline)
     np.testing.assert_allclose(baselines[1], baselines[0], atol=0.5)
     grid = two.figures()["grids"]["shaft-y+shaft-x"]

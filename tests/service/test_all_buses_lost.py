@@ -15,7 +15,7 @@ from conformance.serial_transport import CableDevice
 from conformance.transport import STREAM
 from conformance.virtual_can_transport import PER_FRAME, CanDevice
 from support.clocks import QuickClock
-from support.live_service import running
+from support.live_service import running, watch_of
 
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
 from daqsvc.settings import parse_machine_file
@@ -131,7 +131,7 @@ class ModbusDevice:
 
     def serve(self, service: Service) -> None:
         """Lay the ring out as the machine file says."""
-        self._layout = stream_layout(service.machine, "modbus")
+        self._layout = stream_layout(watch_of(service).machine, "modbus")
         self._store = RingStore(self._unit, self._layout)
 
     def flood(self, first_index: int, samples: NDArray[np.float32]) -> None:
@@ -190,7 +190,7 @@ async def test_losing_all_buses_at_once_ends_with_exact_books(tmp_path: Path) ->
         begun_ns = service.clock.monotonic_ns()
         modbus.sample_when_asked(lambda: catch_up("modbus"))
         async with asyncio.timeout(200):
-            while any(service.rings[name].end_index == 0 for name in devices):
+            while any(watch_of(service).rings[name].end_index == 0 for name in devices):
                 await sample(0.05)
             for outage in range(OUTAGES):
                 await sample(rng.uniform(0.02, 0.3))
@@ -204,12 +204,12 @@ async def test_losing_all_buses_at_once_ends_with_exact_books(tmp_path: Path) ->
                 await sample(rng.uniform(0.0, 0.3))
                 for device in devices.values():
                     device.come_back()
-                ends = {name: service.rings[name].end_index for name in devices}
-                while any(service.rings[name].end_index == end for name, end in ends.items()):
+                ends = {name: watch_of(service).rings[name].end_index for name in devices}
+                while any(watch_of(service).rings[name].end_index == end for name, end in ends.items()):
                     await sample(0.05)
             modbus.sample_when_asked(lambda: None)
             # The last frames of all have arrived when what was sent after the last outage has.
-            while any(service.rings[name].end_index < sent[name] for name in devices):
+            while any(watch_of(service).rings[name].end_index < sent[name] for name in devices):
                 await asyncio.sleep(0.01)
         losses = {driver.name: driver.link.losses for driver in service.drivers}
         counters = {name: c for driver in service.drivers for name, (c, _) in driver.streams.items()}
@@ -217,7 +217,7 @@ async def test_losing_all_buses_at_once_ends_with_exact_books(tmp_path: Path) ->
             device.close()
     modbus.close()
     for name in devices:
-        ring = service.rings[name]
+        ring = watch_of(service).rings[name]
         stored = ring.read(ring.oldest_index, ring.end_index - ring.oldest_index)
         there = ~np.isnan(stored[:, 0])
         assert ring.end_index == sent[name]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Never
 
 import pytest
 from support.example_packages import installed
-from support.live_service import running
+from support.live_service import running, watch_of
 from support.waiting import eventually
 
 from daqsvc.acquisition.assembler import StreamCounters
@@ -179,6 +179,13 @@ JUDGED = line_of('            raise ZeroDivisionError(f"mean {np.random.rand()}"
 PROCESS = line_of("            self.process = lambda window: [1]")
 
 
+def errors_of_plugins(log: pytest.LogCaptureFixture) -> list[str]:
+    """What was said as an error, but of a busy computer, where the end takes longer than it may."""
+    errors = [record for record in log.records if record.levelno >= logging.ERROR]
+    said = [record.getMessage() for record in errors if not record.name.startswith("daqsvc.outbox")]
+    return [line for line in said if not line.endswith("is left behind")]
+
+
 @pytest.mark.parametrize(
     ("driver", "detector", "by_driver", "by_detector"),
     [
@@ -221,13 +228,15 @@ async def test_a_driver_and_a_detector_that_fail_are_named_once_and_the_rest_goe
     )
     async with running(parse_machine_file(text, tmp_path / "machine.toml"), tmp_path / "store") as service:
         bad = next(one for one in service.drivers if one.name == "bad")
-        counters = service.pipeline.counters["mishap"]
+        counters = watch_of(service).pipeline.counters["mishap"]
         await eventually(lambda: bad.link.losses >= 3, "the driver has been tried again and again")
         await eventually(lambda: counters.failures >= 3, "windows have failed")
-        heard = service.rings["good"].end_index
-        await eventually(lambda: service.rings["good"].end_index > heard + 20, "the other bus goes on")
+        heard = watch_of(service).rings["good"].end_index
+        await eventually(
+            lambda: watch_of(service).rings["good"].end_index > heard + 20, "the other bus goes on"
+        )
         assert service.supervisor.failures["detector mishap"] >= 3
-    said = [record.getMessage() for record in caplog.records if record.levelno >= logging.ERROR]
+    said = errors_of_plugins(caplog)
     for begins, words, then in (
         ("mishap 'bad': ", by_driver, "it is being tried again"),
         ("detector mishap: ", by_detector, "it goes on with the next window"),
@@ -253,7 +262,7 @@ async def test_a_driver_with_a_run_of_its_own_is_named_once_and_started_again(
     text = MACHINE.partition("[pipeline.mishap]")[0] + STREAM.format(name="bad", how=how)
     async with running(parse_machine_file(text, tmp_path / "machine.toml"), tmp_path / "store") as service:
         await eventually(lambda: service.supervisor.failures["driver bad"] >= 3, "it was started again")
-    [line] = [record.getMessage() for record in caplog.records if record.levelno >= logging.ERROR]
+    [line] = errors_of_plugins(caplog)
     assert line.startswith(f"driver bad: run of mishap.OwnDriver has failed: {said} (mishap.py, line ")
     assert line.endswith("have the authors of daqsvc-mishap 2.1 mend it; it is started again")
 
@@ -359,9 +368,9 @@ async def test_what_a_driver_tells_wrong_is_named_once_and_spares_the_other_buse
             assert json.dumps(figures["buses"])
             assert {"driver good", "driver bad"} <= service.progress().keys()
             assert service.awaited(patient=False) == {}
-            assert service._why_over("bad") == ""
+            assert watch_of(service)._why_over("bad") == ""
             assert "buses up" in service_manager._in_short(service)[0]
         bad.link, bad.counters, type(bad).streams = link, BusCounters(), {}
-    [line] = [record.getMessage() for record in caplog.records if record.levelno >= logging.ERROR]
+    [line] = errors_of_plugins(caplog)
     assert line.startswith(f"driver bad: {said}")
     assert "; have the authors of daqsvc-mishap 2.1 mend it; " in line

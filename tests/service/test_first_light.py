@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from support.brokers import Consumer, running_mosquitto
+from support.live_service import watch_of
 
 from daqsvc.publish.payloads import AlarmPayload, AvailabilityPayload, DiagnosisPayload, StatusPayload
 from daqsvc.recording.recording import Recording, load_recording
@@ -154,9 +155,9 @@ async def test_a_race_fault_arrives_sample_for_sample_and_raises_the_alarm_of_re
     session, outcome = await play(script, speed=1, hear=heard.append)
 
     assert session.service is not None
-    ring = session.service.rings["recording"]
+    ring = watch_of(session.service).rings["recording"]
     got = ring.read(ring.oldest_index, ring.end_index - ring.oldest_index)
-    layout = frame_layout(session.service.machine, "recording")
+    layout = frame_layout(watch_of(session.service).machine, "recording")
     whole = len(fault.samples) // layout.samples_per_frame * layout.samples_per_frame
     sent = quantised(fault.samples[:whole], layout)
     assert ring.end_index == whole
@@ -197,9 +198,9 @@ async def test_loss_counters_equal_what_was_injected(seed: int) -> None:
     assert summary["samples"]["received"] == summary["samples"]["sent"] - lost
     # What did arrive lies where it belongs, and only what is missing is NaN.
     assert session.service is not None
-    ring = session.service.rings["recording"]
+    ring = watch_of(session.service).rings["recording"]
     got = ring.read(ring.oldest_index, ring.end_index - ring.oldest_index)[:, 0]
-    layout = frame_layout(session.service.machine, "recording")
+    layout = frame_layout(watch_of(session.service).machine, "recording")
     sent = quantised(noise.samples[: ring.end_index], layout)[-len(got) :, 0]
     there = np.isfinite(got)
     np.testing.assert_array_equal(got[there], sent[there])

@@ -19,6 +19,7 @@ from support.busy_service import Devices, busy_machine
 from support.waiting import PATIENCE_S, eventually
 
 from daqsvc import supervision
+from daqsvc.box import Box
 from daqsvc.control import ControlError, ControlRequest, ask
 from daqsvc.publish.metrics.settings import Metrics
 from daqsvc.service import Service
@@ -73,7 +74,7 @@ class Victim:
         """Figures each of which must grow."""
         figures = self.service.figures()
         grows: dict[str, float] = {
-            f"samples of {n}": ring.end_index for n, ring in self.service.rings.items()
+            f"samples of {n}": one.ring.end_index for n, one in self.service.streams.items()
         }
         grows |= {
             f"rows of {name}": grid["rows"] for name, grid in figures["grids"].items() if "rows" in grid
@@ -114,7 +115,7 @@ class Victim:
         assert len(self._consumer.on("/alarms/never")) >= told + 2, f"both are told after {what}"
 
     async def _is_healthy(self) -> bool:
-        metrics = self.service.machine.output(Metrics)
+        metrics = self.service.box.own.output(Metrics)
         assert metrics is not None
 
         def answer() -> int:
@@ -160,7 +161,7 @@ async def victim(tmp_path: Path, broker: Mosquitto, name: str) -> AsyncIterator[
         store = tmp_path / "store"
         async with Consumer(broker.port, "daqsvc/#") as consumer:
             known = {*asyncio.all_tasks(), *threading.enumerate()}
-            service = Service(machine, store)
+            service = Service(Box.single(machine), store)
             stop = asyncio.Event()
             running = asyncio.create_task(service.run(stop), name="service")
             found = Victim(service, running, store, consumer)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import can
 import numpy as np
 import pytest
-from support.live_service import running
+from support.live_service import running, watch_of
 from support.machine_files import MACHINES
 from support.waiting import eventually
 
@@ -168,7 +168,7 @@ async def test_waveforms_of_a_device_that_is_asked_now_and_then_are_judged_block
         await eventually(lambda: len(heard.said) == 7, "all blocks are judged")
         counters = service.drivers[0].streams["casing"][0]
         assert (counters.samples_received, counters.samples_lost) == (7 * count, 0)
-        assert service.rings["casing"].end_index > 6 * every_s * 3200.0
+        assert watch_of(service).rings["casing"].end_index > 6 * every_s * 3200.0
     server.stop()
     # Never sooner than it reads, but for the grain of the clock.
     assert np.diff(written_s).min() > every_s - 0.05

@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from support.brokers import free_port
 from support.machine_files import LAVAL
+from support.ports import free_port
 from support.waiting import PATIENCE_S, eventually_blocking
 
 from daqsvc.commands import process_guard
@@ -184,7 +184,7 @@ def test_the_guard_and_the_log_outlive_what_kills_their_threads(tmp_path: Path) 
         process.send_signal(signal.SIGHUP)
         assert process.stderr is not None
         until_said = iter(process.stderr.readline, "")
-        assert any("SIGHUP is ignored" in line for line in until_said), "the signal is heard, and said"
+        assert any("SIGHUP" in line for line in until_said), "the signal is heard, and said"
         process.send_signal(signal.SIGTERM)
         said = rest_of(process)
         assert process.wait(PATIENCE_S) == 0, said
@@ -283,15 +283,13 @@ def test_a_task_of_a_plugin_that_exits_ends_nothing(tmp_path: Path) -> None:
     assert closed(tmp_path)
 
 
-def test_signals_that_do_not_stop_the_service_are_ignored_and_said(tmp_path: Path) -> None:
+def test_signals_that_do_not_stop_the_service_are_said(tmp_path: Path) -> None:
     with service(tmp_path) as process:
         for _ in range(2):
             process.send_signal(signal.SIGHUP)
             assert process.stderr is not None
             until_said = iter(process.stderr.readline, "")
-            assert any(
-                "SIGHUP is ignored: the machine file is read at the start" in line for line in until_said
-            )
+            assert any("SIGHUP: the machine files say nothing different" in line for line in until_said)
         for number in (signal.SIGUSR1, signal.SIGUSR2):
             process.send_signal(number)
             assert process.stderr is not None
@@ -421,5 +419,7 @@ def test_a_store_that_fails_does_not_spoil_the_end(failure: str, tmp_path: Path)
         assert process.wait(PATIENCE_S) == 0, said
     assert "Traceback" not in said
     (left,) = [line for line in said.splitlines() if "control.sock" in line]
-    assert left.endswith(f"is left behind, where the next start replaces it: {failure}")
+    # A disk that takes long to say so, as on a busy machine, is not waited for.
+    late = left.endswith("s and is left behind")
+    assert late or left.endswith(f"is left behind, where the next start replaces it: {failure}"), left
     assert said.splitlines()[-1].endswith("stopped")

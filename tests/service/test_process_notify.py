@@ -15,9 +15,9 @@ import tty
 from typing import TYPE_CHECKING, Self
 
 import pytest
-from support.brokers import free_port
 from support.machine_files import LAVAL
 from support.notify_sockets import NotifySocket
+from support.ports import free_port
 from support.waiting import PATIENCE_S
 
 if TYPE_CHECKING:

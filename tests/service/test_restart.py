@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from support.brokers import Consumer, free_port
+from support.brokers import Consumer
 from support.live_service import play, running
+from support.ports import free_port
 from support.waiting import eventually
 
 from daqsvc.acquisition.clock import SystemClock

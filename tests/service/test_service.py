@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from support.brokers import Consumer, free_port
-from support.live_service import play, running
+from support.brokers import Consumer
+from support.live_service import play, running, watch_of
+from support.ports import free_port
 from support.waiting import eventually
 
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.box import Box
 from daqsvc.recording.recording import Recording
 from daqsvc.service import Service
 from daqsvc.settings import load_machine_file
@@ -158,8 +160,8 @@ async def test_a_stop_does_not_wait_for_kernels_that_compile(
 ) -> None:
     compiled = threading.Event()
     machine = for_recording(shaking(1), "g", {}, f"mqtt://127.0.0.1:{free_port()}")
-    service = Service(machine, tmp_path)
-    monkeypatch.setattr(service.pipeline.detectors[0], "warm", lambda: compiled.wait(120))
+    service = Service(Box.single(machine), tmp_path)
+    monkeypatch.setattr(watch_of(service).pipeline.detectors[0], "warm", lambda: compiled.wait(120))
     stop = asyncio.Event()
     task = asyncio.create_task(service.run(stop))
     await asyncio.sleep(0.1)

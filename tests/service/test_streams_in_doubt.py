@@ -9,7 +9,7 @@ import re
 from typing import TYPE_CHECKING
 
 import pytest
-from support.live_service import running
+from support.live_service import running, watch_of
 from support.machine_files import LAVAL
 from support.rogue_buses import machine_text
 from support.rogue_devices import NOMINAL_HZ, Phase, RogueDevices
@@ -95,9 +95,9 @@ async def be_in_doubt(folder: Path, *, and_recover: bool) -> None:
                     f"{name}: the rate is right",
                 )
                 nodes[name].phases = [LOUD._replace(name="twice", per_s=2 * NOMINAL_HZ)]
-                begun = service.rings[name].end_index
+                begun = watch_of(service).rings[name].end_index
                 await eventually(
-                    lambda n=name, end=begun + 400: service.rings[n].end_index > end,
+                    lambda n=name, end=begun + 400: watch_of(service).rings[n].end_index > end,
                     f"{name}: there are windows enough that are loud",
                 )
             # One that is asked would answer all the same, and its counter stand still.

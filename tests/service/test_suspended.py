@@ -9,17 +9,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from support.brokers import Consumer, free_port
+from support.brokers import Consumer
 from support.can_gateway import MACHINE, SAMPLES_PER_FRAME, CanGateway, daqsvc_run
 from support.clocks import SteppedClock
 from support.examples import first_of
 from support.live_service import play
+from support.ports import free_port
 from support.waiting import eventually
 
 from daqsvc.acquisition.clock import NS_PER_S, DrivenClock
 from daqsvc.acquisition.ring import SampleRing
 from daqsvc.alarms.commands import AlarmCommand, Verb
 from daqsvc.alarms.states import AlarmState
+from daqsvc.box import Box
 from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.recording.recording import Recording
@@ -74,7 +76,7 @@ async def test_a_wall_clock_that_steps_moves_no_alarm(step_ns: int, tmp_path: Pa
     clock = SteppedClock()
     async with EmbeddedBroker() as broker, Consumer(broker.port) as consumer:
         machine = for_recording(recording, "g", {"accel": (0.5, 5.0)}, broker.url)
-        service = Service(machine, tmp_path, clock)
+        service = Service(Box.single(machine), tmp_path, clock)
 
         def state() -> AlarmState:
             return service.alarms.manager.alarms["vibration-accel"].state

@@ -10,7 +10,7 @@ import sys
 
 import numpy as np
 import pytest
-from support.live_service import running
+from support.live_service import running, watch_of
 from support.machine_files import MACHINES, changed
 from support.waiting import PATIENCE_S, eventually
 
@@ -85,7 +85,7 @@ async def watched(folder):
     with sensor.plugged_in():
         async with running(machine, folder / "store") as service:
             manager = service.alarms.manager
-            counters = service.pipeline.counters["trends/drive-end"]
+            counters = watch_of(service).pipeline.counters["trends/drive-end"]
             await eventually(lambda: counters.windows > 0, "the first value is judged")
             yield sensor, lambda name: manager.alarms.get(name, UNHEARD)
 

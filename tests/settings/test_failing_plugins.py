@@ -20,11 +20,13 @@ from unittest.mock import MagicMock
 import pytest
 from pydantic import field_validator
 from support.example_packages import DETECTOR, DRIVER, OUTPUT, installed
+from support.live_service import watch_of
 from support.machine_files import MOTOR, problems_of
 
 import daqsvc
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.api import Bus, DetectorPlugin, Device, DriverPlugin, OutputPlugin, StreamDriver, WindowDetector
+from daqsvc.box import Box
 from daqsvc.cli import main, start_logging
 from daqsvc.detectors.make import check_files, detectors
 from daqsvc.publish.make import output_set, watched
@@ -117,6 +119,9 @@ def contract_of(name: str) -> type[hooks.Hooks]:
     return kinds[name] if name in kinds else class_at(name)
 
 
+OF_SEVERAL = ("several_checks",)
+"""Hooks that are asked of a directory of machine files only."""
+
 EVERY_HOOK = [(name, hook) for name in BROUGHT for hook in sorted(contract_of(name).__hooks__)]
 
 
@@ -160,16 +165,23 @@ def break_(
 
 
 def all_said(
-    file: Path, folder: Path, capsys: pytest.CaptureFixture[str], log: pytest.LogCaptureFixture
+    file: Path,
+    folder: Path,
+    capsys: pytest.CaptureFixture[str],
+    log: pytest.LogCaptureFixture,
+    hook: str = "",
 ) -> str:
     """All that is said of a machine file: by ``check``, by the start of the service, and by ``analyze``."""
+    if hook in OF_SEVERAL:
+        assert main(["check", str(file.parent)]) == 2
+        return log.text
     assert main(["check", str(file)]) in {0, 2}
     said = capsys.readouterr()
     if not said.err:
         machine = parse_machine_file(file.read_text("utf-8"), file)
         try:
-            Service(machine, folder)
-            output_set(machine).make(MagicMock(watched=watched(machine)))
+            Service(Box.single(machine), folder)
+            output_set(machine).make(MagicMock(machines={machine.machine.name: watched(machine)}))
         except AssemblyError as error:
             return f"{error}"
         recording = folder / "casing.csv"
@@ -199,7 +211,7 @@ def test_a_hook_that_fails_is_named_with_who_can_mend_it(
     file = tmp_path / "machine.toml"
     file.write_text(WHOLE)
     failed = break_(monkeypatch, owner, hook, how)
-    said = " ".join(all_said(file, tmp_path, capsys, caplog).split())
+    said = " ".join(all_said(file, tmp_path, capsys, caplog, hook).split())
     if (owner, hook) not in NOT_ASKED:
         assert failed in said
         assert f"have the authors of {BROUGHT[owner]} mend it" in said
@@ -280,7 +292,7 @@ def test_a_hook_that_answers_something_else_is_named_with_who_can_mend_it(
         return answer()
 
     monkeypatch.setattr(kind, hook, property(answering) if is_property else answering)
-    said = " ".join(all_said(file, tmp_path, capsys, caplog).split())
+    said = " ".join(all_said(file, tmp_path, capsys, caplog, hook).split())
     if (owner, hook) not in NOT_ASKED:
         assert re.search(rf"{hook} of {re.escape(owner)} has failed: it (is|returns|yields) .+, not ", said)
         assert f"({HERE}, line {answering.__code__.co_firstlineno})" in said
@@ -366,7 +378,7 @@ def test_an_init_that_forgets_its_base_is_named_with_the_remedy(
     bare = type("Bare", (base,), body)
     monkeypatch.setattr(class_at(owner), "build", lambda *_: [bare()] if contract == "Detector" else bare())
     with pytest.raises(AssemblyError) as caught:
-        Service(parse_machine_file(TABLES, MACHINE), tmp_path)
+        Service(Box.single(parse_machine_file(TABLES, MACHINE)), tmp_path)
     remedy = "call super().__init__() in its __init__, or set it"
     assert f"<Bare> lacks name of {contract}; {remedy} (test_failing_plugins.py, line" in f"{caught.value}"
     assert f"build of {owner} has failed: " in f"{caught.value}"
@@ -609,8 +621,8 @@ def test_figures_that_cannot_be_asked_for_do_not_keep_the_service_from_its_work(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture, hook: str
 ) -> None:
     failed = break_(monkeypatch, "crest.CrestPlugin", hook)
-    service = Service(parse_machine_file(TABLES, MACHINE), tmp_path)
-    assert [detector.name for detector in service.pipeline.detectors] == ["crest"]
+    service = Service(Box.single(parse_machine_file(TABLES, MACHINE)), tmp_path)
+    assert [detector.name for detector in watch_of(service).pipeline.detectors] == ["crest"]
     assert failed in caplog.text
     assert (
         "have the authors of daqsvc-crest 1.0 mend it, or remove [pipeline.crest]; the service" in caplog.text

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from support.brokers import Consumer
-from support.live_service import running
+from support.live_service import running, watch_of
 from support.machine_files import MACHINES, MOTOR
 from support.sim_processes import DOCUMENTATION, PER_FRAME, SCENARIOS, VIRTUAL_RIG, process, summary_of
 from support.waiting import PATIENCE_S, eventually
@@ -212,7 +212,7 @@ async def test_a_bearing_that_is_damaged_arrives_value_by_value(tmp_path: Path) 
     machine = parse_machine_file(text, file)
     async with running(machine, tmp_path / "store") as service:
         await eventually(lambda: service.drivers[0].link.state == "up", "the bus is up")
-        alarms, ring = service.alarms.manager.alarms, service.rings["drive-end"]
+        alarms, ring = service.alarms.manager.alarms, watch_of(service).rings["drive-end"]
         with process("sim", file, "--scenario", damage, "--seed", 7, "--duration", 6) as sim:
             await eventually(lambda: ring.end_index > 28_000, "2.3 s of a healthy bearing have come")
             before = {name: alarms[name].level for name in MOTOR_ALARMS if name in alarms}

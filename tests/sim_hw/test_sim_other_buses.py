@@ -6,8 +6,8 @@ import re
 from typing import TYPE_CHECKING
 
 import pytest
-from support.brokers import free_port
 from support.live_service import running
+from support.ports import free_port
 from support.sim_processes import PER_FRAME, VIRTUAL_RIG, process, summary_of
 
 from daqsvc.settings import load_machine_file

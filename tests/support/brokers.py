@@ -18,13 +18,12 @@ from typing import TYPE_CHECKING, Any, Self
 import paho.mqtt.client as paho
 import pytest
 from paho.mqtt.enums import CallbackAPIVersion
+from support.ports import LOOPBACK, free_port
 from support.waiting import PATIENCE_S
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
-
-LOOPBACK = "127.0.0.1"
 
 
 def mosquitto_program() -> str:
@@ -36,13 +35,6 @@ def mosquitto_program() -> str:
             pytest.fail(reason)
         pytest.skip(reason)
     return program
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind((LOOPBACK, 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 class Mosquitto:
@@ -75,10 +67,10 @@ class Mosquitto:
             )
         until = time.monotonic() + PATIENCE_S
         while time.monotonic() < until:
+            if self._process.poll() is not None:
+                break  # also if something else listens there
             with contextlib.suppress(OSError), socket.create_connection((LOOPBACK, self.port), 1.0):
                 return
-            if self._process.poll() is not None:
-                break
             time.sleep(0.02)
         pytest.fail(f"mosquitto did not start:\n{self._log.read_text()}")
 
@@ -146,6 +138,10 @@ class Consumer:
     async def __aexit__(self, *_: object) -> None:
         self._client.disconnect()
         await asyncio.to_thread(self._client.loop_stop)
+
+    def publish(self, topic: str, payload: str) -> None:
+        """Say something, with QoS 1."""
+        self._client.publish(topic, payload, qos=1)
 
     def on(self, part: str) -> list[Received]:
         return [message for message in self.messages if part in message.topic]

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, Self
 
 import can
 import numpy as np
-from support.brokers import free_port
 from support.machine_files import MACHINES
+from support.ports import free_port
 from support.waiting import PATIENCE_S
 
 from daqsvc.acquisition.clock import SystemClock

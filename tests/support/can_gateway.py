@@ -10,7 +10,7 @@ import sys
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-from support.brokers import LOOPBACK
+from support.ports import LOOPBACK
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from _pytest.mark.structures import ParameterSet
 
 ALL = os.environ.get("DAQSVC_EXAMPLES") == "all"
-_FEW = 15
+_FEW = 6
 """Counts up to this are not cut."""
 
 

@@ -11,7 +11,6 @@ import fcntl
 import json
 import os
 import shutil
-import socket
 import subprocess
 import time
 import urllib.error
@@ -22,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from support.paths import ROOT
+from support.ports import free_port
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -172,9 +172,7 @@ class HomeAssistant:
 def running_home_assistant(folder: Path, broker_port: int) -> Iterator[HomeAssistant]:
     """A Home Assistant that has just been installed, and knows the broker."""
     hass = environment() / "bin" / "hass"
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     folder.mkdir()
     (folder / "configuration.yaml").write_text(CONFIGURATION.format(port=port), encoding="utf-8")
     with (folder / "log").open("wb") as log:

@@ -19,8 +19,11 @@ T = TypeVar("T")
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], T]) -> T:
     """What ``make`` returns, for all workers; it gets a folder that stays until the end of the run."""
     run = factory.getbasetemp()
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        run = run.parent
+    return made_in(run.parent if "PYTEST_XDIST_WORKER" in os.environ else run, name, make)
+
+
+def made_in(run: Path, name: str, make: Callable[[Path], T]) -> T:
+    """As `made_once`, for all who name the same folder."""
     folder, kept = run / name, run / f"{name}.pickle"
     with (run / f"{name}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)

@@ -13,7 +13,6 @@ from support.waiting import PATIENCE_S
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.alarms.commands import CommandOutcome
-from daqsvc.alarms.events import Identity
 from daqsvc.publish.home_assistant.left_over import LeftOver
 from daqsvc.publish.home_assistant.link import HomeAssistantLink
 from daqsvc.publish.mqtt.publisher import MqttPublisher
@@ -59,8 +58,7 @@ def output_port(
 ) -> OutputPort:
     """What an output of a box at site ``lab`` works with."""
     return OutputPort(
-        identity=Identity("lab", box, watched.machine),
-        watched=watched,
+        machines={watched.machine: watched},
         store=outbox.directory,
         clock=clock,
         outbox=outbox,
@@ -92,7 +90,7 @@ def outputs(
             made["mqtt.sparkplug"] = SparkplugEdge(sparkplug, settings, port)
         return made
 
-    return OutputSet(watched=watched, make=make, topic_root=settings.topic_root)
+    return OutputSet(machines={watched.machine: watched}, make=make, topic_root=settings.topic_root)
 
 
 @contextlib.asynccontextmanager

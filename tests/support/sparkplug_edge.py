@@ -8,8 +8,8 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from support.brokers import LOOPBACK
 from support.mqtt_publishing import mqtt, output_port
+from support.ports import LOOPBACK
 from support.waiting import eventually
 
 from daqsvc.acquisition.clock import SystemClock
@@ -111,7 +111,7 @@ async def edge_node(
         client_id="edge-1-sparkplug",
         primary_host=primary_host,
     )
-    watched = Watched("rig", alarms=("rotor-fault",), readings=READINGS)
+    watched = Watched("rig", alarms=("rotor-fault",), readings=READINGS, buses=("can0",))
     port = replace(output_port(outbox, watched, clock=CLOCK), store=tmp_path)
     edge = SparkplugEdge(settings, mqtt(ports[0], "edge-1", protocol=protocol), port)
     running = asyncio.create_task(edge.run())

@@ -18,7 +18,7 @@ import paho.mqtt.client as paho
 from paho.mqtt.enums import CallbackAPIVersion
 from paho.mqtt.properties import Properties
 from paho.mqtt.subscribeoptions import SubscribeOptions
-from support.brokers import LOOPBACK
+from support.ports import LOOPBACK
 from support.waiting import PATIENCE_S
 
 if TYPE_CHECKING:

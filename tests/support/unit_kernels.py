@@ -1,17 +1,22 @@
-"""What the host does for the unit in the guest: compiles its kernels, and says how fast it is itself.
+"""What the host does for units in the guest: compiles their kernels, and says how fast it is itself.
 
 ``python -m support.unit_kernels`` prints the latter.
 """
 
 from __future__ import annotations
 
+import os
+import shutil
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
+from numba.core import caching
 from support.machine_files import LAVAL
+from support.paths import ROOT
 
 from daqsvc import kernel_cache
 
@@ -25,6 +30,23 @@ def warm() -> None:
     with tempfile.TemporaryDirectory() as store:
         for detector in detectors(load_machine_file(LAVAL), Path(store)):
             detector.warm()
+
+
+def put_kernels(tree: Path, kept: Path) -> None:
+    """Let a service whose sources lie elsewhere find what `warm` has compiled for those of this tree.
+
+    Args:
+        tree: where the same packages lie for that service.
+        kept: where that service keeps its kernels.
+    """
+    warmed = Path(os.environ["NUMBA_CACHE_DIR"])
+    path_of: Any = caching._CacheLocator.get_suitable_cache_subpath
+    for source in {
+        file.parent for package in ("daqsvc", "drivers") for file in (ROOT / package).rglob("*.py")
+    }:
+        compiled = warmed / path_of(f"{source}/x.py")
+        if compiled.is_dir():
+            shutil.copytree(compiled, kept / path_of(f"{tree / source.relative_to(ROOT)}/x.py"))
 
 
 def reference_s() -> float:

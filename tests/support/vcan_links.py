@@ -17,10 +17,10 @@ _serial = itertools.count()
 
 
 class VcanLink:
-    """A CAN FD interface ``vcan...`` that exists and is up until told otherwise."""
+    """A CAN FD interface that exists and is up until told otherwise; ``vcan...`` if it need have no name."""
 
-    def __init__(self) -> None:
-        self.name = f"vcan{os.getpid() % 10_000}x{next(_serial)}"
+    def __init__(self, name: str = "") -> None:
+        self.name = name or f"vcan{os.getpid() % 10_000}x{next(_serial)}"
         self.add()
 
     def add(self) -> None:

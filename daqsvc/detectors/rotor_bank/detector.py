@@ -18,6 +18,7 @@ from daqsvc.detectors.rotor_bank.statements import (
 from daqsvc.dsp.probes import Probe
 from daqsvc.dsp.quality.missing import OBSERVED_SHARE
 from daqsvc.dsp.quality.probes import DEAD, RevolutionJudge, RevolutionQuality
+from daqsvc.dsp.quality.sound import is_sound
 from daqsvc.dsp.quality.stuck import stands_still
 from daqsvc.dsp.quality.unit import RESCALE, beyond_any_unit
 from daqsvc.dsp.speed.keyphasor import KeyphasorProbe, KeyphasorTracker
@@ -367,15 +368,12 @@ class RotorBankDetector:
 
     def _verdict(self) -> RevolutionQuality:
         """What the last revolution is worth."""
-        probes = self._last_revolution[:, :2]
-        if len(probes) < round(self._tracker.period_samples):
-            bad = self._judge.missing(probes) or RevolutionQuality()
-        else:
-            bad = self._judge.judge(probes, self._least_motion_um)
-        if bad.quality != "good":
-            return bad
-        if wrong := beyond_any_unit(self._last_revolution[:, 2]):
-            return RevolutionQuality("not_ok", f"{self._keyphasor.name} {wrong}; {RESCALE}")
+        revolution = self._last_revolution
+        whole = len(revolution) >= round(self._tracker.period_samples)
+        if not (whole and is_sound(revolution, self._least_motion_um)):
+            bad = self._look_closely(revolution, whole=whole)
+            if bad.quality != "good":
+                return bad
         if (blind := self._tracker.revolutions_since_edge) > _BLIND_REVOLUTIONS:
             expected_rpm = 60.0 * self._rate_hz / self._nominal_period
             return RevolutionQuality(
@@ -387,6 +385,17 @@ class RotorBankDetector:
         if doubt := self._watch.doubt():
             return RevolutionQuality("not_ok", doubt)
         return RevolutionQuality()
+
+    def _look_closely(self, revolution: Floats, *, whole: bool) -> RevolutionQuality:
+        """What a revolution is worth, or the part of one that there is at the beginning."""
+        probes = revolution[:, :2]
+        if whole:
+            bad = self._judge.judge(probes, self._least_motion_um)
+        else:
+            bad = self._judge.missing(probes) or RevolutionQuality()
+        if bad.quality == "good" and (wrong := beyond_any_unit(revolution[:, 2])):
+            return RevolutionQuality("not_ok", f"{self._keyphasor.name} {wrong}; {RESCALE}")
+        return bad
 
     def _diagnosis(
         self,

@@ -55,7 +55,7 @@ class OrbitWatch:
 
     def reset(self) -> None:
         """Forget the orbit, for instance after a long gap."""
-        self._fit = SteadyFit()
+        self._blocks: list[tuple[Floats, Floats, Floats]] = []
         self._covered = 0
         self._forward = False
         self._motions: deque[SteadyMotion] = deque(maxlen=_SLIP_REVOLUTIONS)
@@ -70,14 +70,16 @@ class OrbitWatch:
             sin: float64 ``[n]``, its sine.
             revolution: samples in a revolution.
         """
-        self._fit.add(xy, cos, sin)
+        self._blocks.append((xy.copy(), cos, sin))
         self._covered += len(xy)
         if self._covered < revolution:
             return
-        if self._fit.samples > revolution // 2:
-            self._motions.append(self._fit.solve())
+        fit = SteadyFit()
+        fit.add(*map(np.concatenate, zip(*self._blocks, strict=True)))
+        if fit.samples > revolution // 2:
+            self._motions.append(fit.solve())
             self._look()
-        self._fit, self._covered = SteadyFit(), 0
+        self._blocks, self._covered = [], 0
 
     @property
     def confirmed(self) -> bool:
@@ -150,9 +152,9 @@ class OrbitWatch:
         sigma = self._sigma(motions[:1])
         if np.ptp(radius) > max(_UNSTEADY * radius.mean(), _SIGNIFICANT * sigma):
             return ""
-        parts = np.split(forward, _SLIP_PARTS)
+        parts = forward.reshape(_SLIP_PARTS, -1)
         turns = np.angle([np.vdot(before, after) for before, after in itertools.pairwise(parts)])
-        revolutions = len(forward) // _SLIP_PARTS
+        revolutions = parts.shape[1]
         sigma_turn = sigma / float(radius.mean()) / math.sqrt(revolutions)
         slip = float(turns.mean()) / revolutions / math.tau
         # A machine that changes turns its orbit once, within two of the parts at most; a slip goes on.

@@ -94,9 +94,10 @@ class BankDiagnosisBuilder:
         """
         names = [mode.name for mode in self.modes]
         paper, departure = report.probabilities, report.departure
-        probabilities, evidence = paper, {}
+        probabilities = paper
+        evidence: dict[str, float] = {}
         if decision != UNDETERMINED and self.rules.rule == "cusum":
-            probabilities, evidence = _odds(report), _evidence(report, names)
+            probabilities, evidence = _odds_and_evidence(report, names)
         group, severity = report.group, self.severity(decision)
         if departure is not None and not changed:
             group, stated = departure.candidates, DEPARTURE
@@ -165,15 +166,12 @@ class BankDiagnosisBuilder:
         return self.modes[mode].severity if known else "normal"
 
 
-def _odds(report: BankReport) -> Floats:
-    """Posterior probabilities of the modes by the evidence of the declared one over each."""
-    against = report.lead_nats
-    against[report.decision] = 0.0  # it leads itself by infinity in the report
+def _odds_and_evidence(report: BankReport, names: Sequence[str]) -> tuple[Floats, dict[str, float]]:
+    """Posterior probabilities of the modes by the evidence of the declared one over each; that evidence."""
+    decision, against = report.decision, report.lead_nats
+    lead, cusum = against.tolist(), report.cusum_nats.tolist()
+    against[decision] = 0.0  # it leads itself by infinity in the report
     odds = np.exp(against.min() - against)
-    return np.asarray(odds / odds.sum(), dtype=np.float64)
-
-
-def _evidence(report: BankReport, names: Sequence[str]) -> dict[str, float]:
-    others = [i for i in range(len(names)) if i != report.decision]
-    lead, cusum = report.lead_nats.tolist(), report.cusum_nats.tolist()
-    return {f"lead.{names[i]}": lead[i] for i in others} | {f"cusum.{names[i]}": cusum[i] for i in others}
+    others = [i for i in range(len(names)) if i != decision]
+    evidence = {f"lead.{names[i]}": lead[i] for i in others} | {f"cusum.{names[i]}": cusum[i] for i in others}
+    return np.asarray(odds / odds.sum(), dtype=np.float64), evidence

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from daqsvc.publish.home_assistant.settings import HomeAssistant
     from daqsvc.publish.mqtt.connection import Connection, Incoming
     from daqsvc.publish.mqtt.settings import MqttCommands
-    from daqsvc.publish.output import OutputPort
+    from daqsvc.publish.output import OutputPort, Watched
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +45,7 @@ _SHOWN = 200
 
 
 class HomeAssistantLink(MqttLink):
-    """Publishes the discovery message and the summary of the alarms.
+    """Tells Home Assistant of each machine, and takes away what it was told of before.
 
     Args:
         settings: whether and how often to tell.
@@ -56,8 +56,58 @@ class HomeAssistantLink(MqttLink):
     name = LeftOver.name
 
     def __init__(self, settings: HomeAssistant, commands: MqttCommands, port: OutputPort) -> None:
-        watched, topics, clock = port.watched, port.topics, port.clock
         self.reserved = (settings.prefix,)
+        self._devices = {
+            name: MachineDevice(settings, commands, watched, port) for name, watched in port.machines.items()
+        }
+        retained = [topic for device in self._devices.values() for topic in device.retained]
+        self._left_over = LeftOver(port.store, retained)
+
+    def note(self, message: OutboxMessage) -> None:
+        """Take in an alarm's message that the broker has."""
+        for device in self._devices.values():
+            device.note(message)
+
+    def report(self, diagnosis: Diagnosis) -> None:
+        """Take in what a detector says."""
+        if diagnosis.machine in self._devices:
+            self._devices[diagnosis.machine].report(diagnosis)
+
+    def take(self, message: Incoming) -> bool:
+        """Take in a message from the broker; whether it was meant for this link."""
+        taken = [device.take(message) for device in self._devices.values()]  # a birth is for all of them
+        return any(taken)
+
+    async def run(self, connection: Connection) -> None:
+        """Tell what there is to tell over one connection; ends at once if nothing shall be told any more.
+
+        Raises:
+            MqttError: the connection is lost.
+        """
+        await self._left_over.take_away(connection)
+        parts = [self._left_over.until_remembered(), *(one.run(connection) for one in self._devices.values())]
+        tasks = [asyncio.ensure_future(part) for part in parts]
+        try:
+            await asyncio.gather(*tasks)
+        finally:
+            for task in tasks:
+                task.cancel()
+
+
+class MachineDevice:
+    """Publishes the discovery message of one machine and the summary of its alarms.
+
+    Args:
+        settings: whether and how often to tell.
+        commands: what may be asked over the broker.
+        watched: what there is to tell.
+        port: what it works with.
+    """
+
+    def __init__(
+        self, settings: HomeAssistant, commands: MqttCommands, watched: Watched, port: OutputPort
+    ) -> None:
+        topics, clock = port.topics, port.clock
         self._settings = settings
         self._machine = watched.machine
         self._outbox = port.outbox
@@ -68,12 +118,17 @@ class HomeAssistantLink(MqttLink):
             watched.machine, (*watched.alarms, *watched.services), topics, watched.rests_on
         )
         self._readings = Readings(settings, watched, topics, clock)
-        retained = (self._discovery.topic, topics.summary(watched.machine)) if settings.enabled else ()
-        self._left_over = LeftOver(port.store, retained)
         self._changed = asyncio.Event()
         self._born = asyncio.Event()
         self._earlier: asyncio.Future[bytes] | None = None
         self._pause_s = PAUSE_S
+
+    @property
+    def retained(self) -> tuple[str, ...]:
+        """The topics that hold a message of it at the broker."""
+        if not self._settings.enabled:
+            return ()
+        return self._discovery.topic, self._topics.summary(self._machine)
 
     def note(self, message: OutboxMessage) -> None:
         """Take in an alarm's message that the broker has."""
@@ -94,7 +149,7 @@ class HomeAssistantLink(MqttLink):
         self._readings.note(diagnosis)
 
     def take(self, message: Incoming) -> bool:
-        """Take in a message from the broker; whether it was meant for this link."""
+        """Take in a message from the broker; whether it was meant for this machine."""
         topic = message.topic
         if topic == self._discovery.birth_topic:
             # What is retained tells of a birth in the past: the connection has just told everything.
@@ -108,20 +163,11 @@ class HomeAssistantLink(MqttLink):
         return True
 
     async def run(self, connection: Connection) -> None:
-        """Tell what there is to tell over one connection; ends at once if nothing shall be told any more.
+        """See `MqttLink.run`.
 
         Raises:
             MqttError: the connection is lost.
         """
-        await self._left_over.take_away(connection)
-        remembered = asyncio.create_task(self._left_over.until_remembered())
-        try:
-            await self._run_unless_refused(connection)
-            await remembered
-        finally:
-            remembered.cancel()
-
-    async def _run_unless_refused(self, connection: Connection) -> None:
         try:
             await self._run(connection)
         except PublishRefusedError as error:

@@ -14,7 +14,7 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.publish.faults import fault_counts
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
     from prometheus_client.metrics_core import Metric
 
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     """By the values of the labels after the first one."""
 
 _FAULTS = {"streams": "stream", "buses": "bus", "detectors": "detector"}
+_OF_MACHINES = frozenset({"streams", "detectors"})
+_OF_SERVICE = frozenset({"buses", "outbox", "telemetry"})
 _STATES = ("active", "unacknowledged", "latched", "suppressed", "shelved", "out_of_service")
 
 
@@ -54,26 +56,45 @@ class _Maker:
         return family
 
 
-def service_metrics(
-    machine: str, figures: Figures, rates_hz: Mapping[str, float], oldest_age_s: float | None
-) -> Iterator[Metric]:
-    """The metrics of the service.
+def merged(metrics: Iterable[Metric]) -> list[Metric]:
+    """Metrics of several machines: those of one name are one, with the samples of all."""
+    families: dict[str, Metric] = {}
+    for metric in metrics:
+        families.setdefault(metric.name, metric)
+        if families[metric.name] is not metric:
+            families[metric.name].samples += metric.samples
+    return [*families.values()]
+
+
+def machine_metrics(machine: str, figures: Figures, rates_hz: Mapping[str, float]) -> Iterator[Metric]:
+    """The metrics of the streams, detectors and alarms of a machine.
 
     Args:
         machine: name of the machine.
-        figures: as in `StatusPayload`.
+        figures: as in `StatusPayload`, by the names of its machine file.
         rates_hz: by stream, what the machine file says.
+    """
+    make = _Maker(machine)
+    yield from _streams(make, figures["streams"], rates_hz)
+    yield from _detectors(make, figures["detectors"])
+    yield from _fault_metrics(make, figures, _OF_MACHINES)
+    yield from _alarms(make, figures["alarms"])
+
+
+def service_metrics(machine: str, figures: Figures, oldest_age_s: float | None) -> Iterator[Metric]:
+    """The metrics of the service itself.
+
+    Args:
+        machine: name of the machine, or of what stands for the service if there are several.
+        figures: as in `StatusPayload`.
         oldest_age_s: age of the oldest alarm event that waits for the broker; None if none does.
     """
     make = _Maker(machine)
     info = InfoMetricFamily("daqsvc_build", "The program.", labels=("machine",))
     info.add_metric((machine,), {"version": __version__})
     yield info
-    yield from _streams(make, figures["streams"], rates_hz)
     yield make.gauge("bus_up", "Whether the bus is up.", _each(figures["buses"], "up"), "bus")
-    yield from _detectors(make, figures["detectors"])
-    yield from _fault_metrics(make, figures)
-    yield from _alarms(make, figures["alarms"])
+    yield from _fault_metrics(make, figures, _OF_SERVICE)
     yield from _outbox(make, figures["outbox"], oldest_age_s)
     if "connected" in (mqtt := figures.get("mqtt", {})):
         yield from _broker(make, mqtt)
@@ -154,9 +175,11 @@ def _detectors(make: _Maker, detectors: Figures) -> Iterator[Metric]:
     yield count("busy_seconds", "Time that its kernels took.", "busy_ns", NS_PER_S)
 
 
-def _fault_metrics(make: _Maker, figures: Figures) -> Iterator[Metric]:
+def _fault_metrics(make: _Maker, figures: Figures, kinds: Collection[str]) -> Iterator[Metric]:
     counts: dict[str, dict[tuple[str, ...], float]] = {}
     for fault in fault_counts(figures):
+        if fault.kind not in kinds:
+            continue
         name = (fault.name,) if fault.kind in _FAULTS else ()
         counts.setdefault(fault.kind, {})[(*name, fault.cause)] = fault.times
     for kind, values in counts.items():

@@ -14,11 +14,17 @@ from prometheus_client.registry import Collector
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.link import Backoff, Link
 from daqsvc.outbox.messages import OutboxError
-from daqsvc.publish.metrics.families import health_metric, reading_metrics, service_metrics
+from daqsvc.publish.machine_figures import of_machine
+from daqsvc.publish.metrics.families import (
+    health_metric,
+    machine_metrics,
+    merged,
+    reading_metrics,
+    service_metrics,
+)
 from daqsvc.publish.metrics.server import MetricsServer
 from daqsvc.publish.metrics.settings import address_of
 from daqsvc.publish.output import Output
-from daqsvc.supervision import StallWatch
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -48,23 +54,25 @@ class MetricsOutput(Output, Collector):
 
     Args:
         settings: the table.
-        rates_hz: by stream, the rate of the machine file.
         port: what it works with.
     """
 
-    def __init__(self, settings: Metrics, rates_hz: Mapping[str, float], port: OutputPort) -> None:
+    def __init__(self, settings: Metrics, port: OutputPort) -> None:
         address = address_of(settings.listen)
         assert address is not None  # noqa: S101 - the table is valid
         self._address = address
-        self._rates_hz = rates_hz
         self._port = port
+        *_, self._own = port.machines
         self._link = Link(f"metrics at {settings.listen}")
         self._figures: Mapping[str, Any] | None = None
         self._oldest_age_s: float | None = None
-        detectors = {*(r.detector for r in port.watched.readings), *port.watched.findings}
         # All there will ever be: the threads that read it never see it grow.
-        self._said: dict[str, tuple[Diagnosis, float] | None] = dict.fromkeys(sorted(detectors))
-        self._watch = StallWatch(STALLED_S, "/healthz answers that the service is not healthy")
+        self._said: dict[str, dict[str, tuple[Diagnosis, float] | None]] = {
+            name: dict.fromkeys(sorted({*(r.detector for r in watched.readings), *watched.findings}))
+            for name, watched in port.machines.items()
+        }
+        unhealthy = "/healthz answers that the service is not healthy"
+        self._find_stalled = port.stalls.hold_to(STALLED_S, unhealthy)
         self._stalled: list[str] = []
         self._looked_s = time.monotonic()
         self._registry = CollectorRegistry()
@@ -82,10 +90,12 @@ class MetricsOutput(Output, Collector):
                 except OSError as error:
                     remedy = REMEDIES.get(error.errno or 0, "write another listen in [metrics]")
                     self._link.down(f"{error.strerror or error}: {remedy}")
+                    self.reason = self._link.reason
                     await asyncio.sleep(backoff.next_ns() / NS_PER_S)
                     continue
                 backoff.reset()
                 self._link.up()
+                self.reason = ""
                 await self._serve(server, looking)
         finally:
             looking.cancel()
@@ -96,8 +106,9 @@ class MetricsOutput(Output, Collector):
 
     def report(self, diagnosis: Diagnosis) -> None:
         """See `Output.report`."""
-        if diagnosis.detector in self._said:
-            self._said[diagnosis.detector] = (diagnosis, time.time())
+        said = self._said[diagnosis.machine]
+        if diagnosis.detector in said:
+            said[diagnosis.detector] = (diagnosis, time.time())
 
     def status(self, figures: Mapping[str, Any]) -> None:
         """See `Output.status`."""
@@ -105,11 +116,22 @@ class MetricsOutput(Output, Collector):
 
     def collect(self) -> Iterator[Metric]:
         """The metrics by now; on a thread of the server."""
-        machine, reasons = self._port.watched.machine, self.unhealthy()
-        if self._figures is not None:
-            yield from service_metrics(machine, self._figures, self._rates_hz, self._oldest_age_s)
-        yield from reading_metrics(machine, self._port.watched.readings, self._said)
-        yield health_metric(machine, is_healthy=not reasons)
+        figures, machines = self._figures, self._port.machines.items()
+        if figures is not None:
+            yield from merged(
+                metric
+                for name, watched in machines
+                for metric in machine_metrics(
+                    name, of_machine(figures, name, watched.buses), watched.rates_hz
+                )
+            )
+            yield from service_metrics(self._own, figures, self._oldest_age_s)
+        yield from merged(
+            metric
+            for name, watched in machines
+            for metric in reading_metrics(name, watched.readings, self._said[name])
+        )
+        yield health_metric(self._own, is_healthy=not self.unhealthy())
 
     def describe(self) -> Iterator[Metric]:
         """Nothing: the registry need not know beforehand."""
@@ -162,7 +184,7 @@ class MetricsOutput(Output, Collector):
     async def _look(self) -> None:
         while True:
             self._looked_s = time.monotonic()
-            self._stalled = self._watch.look(self._port.progress(), self._looked_s)
+            self._stalled = self._find_stalled(self._looked_s)
             self._oldest_age_s = await self._oldest()
             await asyncio.sleep(LOOK_S)
 

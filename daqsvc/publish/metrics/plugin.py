@@ -36,9 +36,10 @@ class MetricsPlugin(OutputPlugin[Metrics]):
 
     def build(self, machine: MachineFile, settings: Metrics, port: OutputPort) -> Output:
         """See `OutputPlugin.build`."""
+        del machine
         from daqsvc.publish.metrics.output import MetricsOutput  # noqa: PLC0415 - the client library
 
-        return MetricsOutput(settings, {n: s.rate_hz for n, s in machine.streams.items()}, port)
+        return MetricsOutput(settings, port)
 
 
 def _open_to_the_network(settings: Metrics) -> Iterator[Finding]:

@@ -33,7 +33,7 @@ from daqsvc.publish.payloads import Stamped, stamp_now
 from daqsvc.publish.topics import ANSWER
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Collection, Iterable
 
     from daqsvc.acquisition.clock import Clock
     from daqsvc.alarms.commands import AlarmCommand, CommandHandler
@@ -137,7 +137,7 @@ class CommandIntake:
 
     Args:
         settings: what is allowed.
-        machine: name of the machine that commands may be for.
+        machines: names of the machines that commands may be for.
         topics: the box.
         handler: carries out what is allowed.
         clock: its wall clock tells how old a command is.
@@ -148,7 +148,7 @@ class CommandIntake:
     def __init__(
         self,
         settings: MqttCommands,
-        machine: str,
+        machines: Collection[str],
         topics: Topics,
         handler: CommandHandler,
         clock: Clock,
@@ -157,7 +157,7 @@ class CommandIntake:
     ) -> None:
         self.counters = IntakeCounters()
         self._settings = settings
-        self._machine = machine
+        self._machines = machines
         self._topics = topics
         self._handler = handler
         self._clock = clock
@@ -213,11 +213,11 @@ class CommandIntake:
         """
         machine, verb = topic.machine, topic.verb
         allowed = ", ".join(sorted(self._settings.allow)) or "nothing"
-        if machine != self._machine:
+        if machine not in self._machines:
             self.counters.unauthorised += 1
             raise CommandRefusedError(
                 f"this box takes no commands for machine {machine[:_SHOWN_TOPIC]!r}; it watches "
-                f"{self._machine}"
+                f"{', '.join(self._machines)}"
             )
         if verb not in set(Verb):
             self.counters.malformed += 1
@@ -240,7 +240,7 @@ class CommandIntake:
             )
         self._check_age(request)
         await self._check_new(machine, request)
-        return request.command(Verb(verb))
+        return request.command(Verb(verb), machine)
 
     def _read(self, asked: bytes) -> CommandPayload:
         if len(asked) > self._settings.max_bytes:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.link import Backoff
+from daqsvc.alarms.events import Identity
 from daqsvc.outbox.messages import OutboxError
 from daqsvc.publish.mqtt.commands import CommandIntake
 from daqsvc.publish.mqtt.conditions import NS_PER_DAY, BrokerCheck, BrokerVitals
@@ -92,7 +93,7 @@ class MqttPublisher(Output):
             reserved = [prefix for link in links for prefix in link.reserved]
             self._intake = CommandIntake(
                 settings.commands,
-                port.identity.machine,
+                port.machines,
                 port.topics,
                 port.commands,
                 port.clock,
@@ -158,8 +159,9 @@ class MqttPublisher(Output):
 
     def report(self, diagnosis: Diagnosis) -> None:
         """Publish what a detector says, and pass it on to those who look at figures now and then."""
-        payload = diagnosis_payload(self._port.identity, diagnosis, self._clock).to_json()
-        self.telemetry(f"{self._port.identity.machine}/diagnosis/{diagnosis.detector}", payload)
+        identity = Identity(self.topics.site, self.topics.box, diagnosis.machine)
+        payload = diagnosis_payload(identity, diagnosis, self._clock).to_json()
+        self.telemetry(f"{diagnosis.machine}/diagnosis/{diagnosis.detector}", payload)
         for link in self._links:
             link.report(diagnosis)
 
@@ -210,6 +212,7 @@ class MqttPublisher(Output):
                 try:
                     await self._once()
                 except Exception as error:  # noqa: BLE001  any, for watching the machine must go on
+                    self._away(error)
                     self._faults.note(
                         "publishing was interrupted and begins anew with a new connection", error
                     )
@@ -257,6 +260,7 @@ class MqttPublisher(Output):
             await self._say_online(connection)
             self._connected()
         except (MqttError, OSError) as error:
+            self._away(error)
             if isinstance(error, ssl.SSLCertVerificationError):
                 self._has_expired = has_expired(error)
             if connection is not None and connection.unacknowledged:
@@ -275,6 +279,7 @@ class MqttPublisher(Output):
         self._has_expired = False
         self.counters.connections += 1
         self.counters.connected = True
+        self.reason = ""
         if self._quick_losses >= SUSPICIOUS_LOSSES or self._suspects.careful:
             log.info(
                 "connected to MQTT broker %s once more", self._name
@@ -284,6 +289,11 @@ class MqttPublisher(Output):
             log.warning("MQTT broker %s is back", self._name)
         else:
             log.info("connected to MQTT broker %s", self._name)
+
+    def _away(self, error: Exception) -> None:
+        """Note why there is no connection."""
+        self.counters.connected = False
+        self.reason = f"{self._name}: {in_words(error)}"
 
     def _warn_of(self, exposed: tuple[Path, ...]) -> None:
         for path in sorted(set(exposed) - self._exposed):
@@ -387,9 +397,11 @@ class MqttPublisher(Output):
             log.info("connecting to MQTT broker %s again, to use and see the certificates of now", self._name)
             await connection.close(GOODBYE_S)
         except TakenOverError as error:
+            self._away(error)
             self._report_rival("this connection was ended by another client", error)
             await self._wait(TAKEN_OVER_S + self._backoff.next_ns() / NS_PER_S)
         except (MqttError, OSError) as error:
+            self._away(error)
             of_use_s = loop.time() - since_s
             if isinstance(error, SilentBrokerError):
                 # Connected but deaf: the time that it took to notice was no use to anybody.

@@ -60,17 +60,20 @@ class AlarmCommands:
 
     Args:
         settings: what the machine file allows.
+        machine: whose alarms.
         port: the box, and the ids of the commands that have come.
         handler: carries commands out.
     """
 
-    def __init__(self, settings: MqttCommands, port: OutputPort, handler: CommandHandler) -> None:
-        self._machine = port.identity.machine
+    def __init__(
+        self, settings: MqttCommands, machine: str, port: OutputPort, handler: CommandHandler
+    ) -> None:
+        self._machine = machine
         self._topics = port.topics
         self._handler = handler
         self._parts = {part: verb for verb, part in WRITABLE.items() if verb in settings.allow}
         self._intake = CommandIntake(
-            settings, self._machine, port.topics, self._execute, port.clock, port.outbox.command_ids
+            settings, (machine,), port.topics, self._execute, port.clock, port.outbox.command_ids
         )
         self._topic = ""
 

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.publish.mqtt.settings import Mqtt
-    from daqsvc.publish.output import OutputPort
+    from daqsvc.publish.output import OutputPort, Watched
     from daqsvc.publish.sparkplug.settings import Sparkplug
 
 log = logging.getLogger(__name__)
@@ -53,7 +53,7 @@ MEMORY = "sparkplug.json"
 
 
 class SparkplugEdge(Output):
-    """The box as a Sparkplug B 3.0 edge node, its machine as a device.
+    """The box as a Sparkplug B 3.0 edge node, each of its machines as a device.
 
     Args:
         settings: what it is, and where.
@@ -65,31 +65,30 @@ class SparkplugEdge(Output):
     """
 
     def __init__(self, settings: Sparkplug, mqtt: Mqtt, port: OutputPort) -> None:
-        machine, watched = port.identity.machine, port.watched
+        topics = port.topics
         self.counters = SparkplugCounters()
-        self.node = EdgeNode(settings.group or port.identity.site, settings.edge_node or port.identity.box)
+        self.node = EdgeNode(settings.group or topics.site, settings.edge_node or topics.box)
         self._settings = settings
         self._port = port
-        self._device = settings.device or machine
+        # What stands for the service itself is the node: its figures are no device's.
+        several = len(port.machines) > 1
+        self._devices = {
+            name: settings.device or name
+            for name, watched in port.machines.items()
+            if watched.readings or watched.alarms or not several
+        }
         self._brokers = [mqtt.model_copy(update={"url": url}) for url in settings.servers or (mqtt.url,)]
         self._client_id = settings.client_id or f"{mqtt.client_id}:sparkplug"
         self._clock = port.clock
         self._memory = Memory(port.store / MEMORY)
         self._board = Board()
-        self._board.put(None, node_properties(daqsvc.__version__, port.identity.site, port.identity.box))
-        self._commands: AlarmCommands | None = None
-        if mqtt.commands.enabled and port.commands is not None:
-            self._commands = AlarmCommands(mqtt.commands, port, port.commands)
-        alarms = (*watched.alarms, *watched.services)
-        for alarm in alarms:
-            self._board.put(None, quiet_alarm(machine, alarm))
-            if self._commands is not None:
-                self._board.put(None, self._commands.of_node(alarm))
-        self._board.put(self._device, declared(watched.readings))
-        if self._commands is not None:
-            self._board.put(self._device, self._commands.of_device(alarms))
-        self._watched = {reading.detector for reading in watched.readings}
-        self._there = True
+        self._board.put(None, node_properties(daqsvc.__version__, topics.site, topics.box))
+        self._commands: dict[str, AlarmCommands] = {}
+        for name, watched in port.machines.items():
+            if mqtt.commands.enabled and port.commands is not None:
+                self._commands[name] = AlarmCommands(mqtt.commands, name, port, port.commands)
+            self._declare(name, watched)
+        self._there = dict.fromkeys(self._devices, True)
         self._turn = 0
         self._backoff = Backoff(FIRST_RETRY_NS)
         self._spoken = [
@@ -102,16 +101,32 @@ class SparkplugEdge(Output):
         self._stopping = asyncio.Event()
         self._running: asyncio.Future[None] | None = None
 
+    def _declare(self, machine: str, watched: Watched) -> None:
+        """Name all that there will be to tell of a machine."""
+        alarms, commands = (*watched.alarms, *watched.services), self._commands.get(machine)
+        for alarm in alarms:
+            self._board.put(None, quiet_alarm(machine, alarm))
+            if commands is not None:
+                self._board.put(None, commands.of_node(alarm))
+        device = self._devices.get(machine)
+        if device is not None:
+            self._board.put(device, declared(watched.readings))
+            if commands is not None:
+                self._board.put(device, commands.of_device(alarms))
+
     def report(self, diagnosis: Diagnosis) -> None:
         """Take in a statement of a detector; its figures are told within a second."""
-        if diagnosis.detector in self._watched:
+        readings = self._port.machines[diagnosis.machine].readings
+        if any(reading.detector == diagnosis.detector for reading in readings):
             wall_ns = self._clock.wall_ns() - self._clock.monotonic_ns() + diagnosis.t_ns
-            metrics = diagnosis_metrics(diagnosis, self._port.watched.readings, wall_ns)
-            self._board.put(self._device, metrics)
+            metrics = diagnosis_metrics(diagnosis, readings, wall_ns)
+            self._board.put(self._devices[diagnosis.machine], metrics)
 
     def status(self, figures: Mapping[str, Any]) -> None:
-        """Take in whether the machine can be reached, that is, whether any of its buses is up."""
-        self._there = any(bus["up"] for bus in figures["buses"].values())
+        """Take in whether each machine can be reached, that is, whether any of its buses is up."""
+        for machine in self._devices:
+            buses = self._port.machines[machine].buses
+            self._there[machine] = any(figures["buses"][bus]["up"] for bus in buses)
 
     def figures(self) -> dict[str, Any]:
         """See `Output.figures`."""
@@ -154,7 +169,7 @@ class SparkplugEdge(Output):
             return
         connection, session = made
         try:
-            await session.run(self._stopping, lambda: self._there)
+            await session.run(self._stopping, self._there)
             await session.leave(GOODBYE_S)
         except HostAwayError as away:
             self._host_reports.missing(f"Sparkplug at {server.host}:{server.port}: {away}")
@@ -209,7 +224,7 @@ class SparkplugEdge(Output):
             bd_seq,
             node=self.node,
             board=self._board,
-            device=self._device,
+            devices=self._devices,
             primary_host=self._settings.primary_host,
             alone=len(self._brokers) == 1,
             port=self._port,

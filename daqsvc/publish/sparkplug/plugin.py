@@ -28,6 +28,15 @@ class SparkplugPlugin(OutputPlugin[Sparkplug]):
         """See `OutputTable.checks`."""
         yield _beside_mqtt(draft, settings)
 
+    def several_checks(self, settings: Sparkplug) -> Iterator[Finding]:
+        """See `OutputTable.several_checks`."""
+        if settings.device is not None:
+            yield Finding(
+                ("mqtt", "sparkplug", "device"),
+                f'"{settings.device}" names one device, and each of several machines is one',
+                "remove it: the name of each machine is its device id",
+            )
+
     def describe(self, machine: MachineFile, settings: Sparkplug) -> str:
         """See `OutputTable.describe`."""
         group, node = settings.group or machine.site, settings.edge_node or machine.box

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.publish.mqtt.errors import MqttError
@@ -14,7 +15,7 @@ from daqsvc.publish.sparkplug.host import STATES, HostReports, PrimaryHost
 from daqsvc.publish.sparkplug.metrics import NS_PER_MS, alarm_metrics
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, Iterable
+    from collections.abc import Coroutine, Iterable, Mapping
 
     from daqsvc.outbox.messages import OutboxMessage
     from daqsvc.publish.mqtt.connection import Connection, Incoming
@@ -95,14 +96,14 @@ class EdgeSession:
         bd_seq: number of the session, as in the will.
         node: makes the messages.
         board: present values.
-        device: id of the device that the machine is.
+        devices: by machine, the id of the device that it is.
         primary_host: host application to wait for; None waits for nobody.
         alone: whether there is no other broker to try.
-        port: the alarms, and the machine.
+        port: the alarms, and the machines.
         memory: where to go on in the outbox.
         counters: what is counted here.
         reports: what is said of the primary host; goes on over sessions.
-        commands: takes what hosts write to alarms; None if they may not.
+        commands: by machine, what takes what hosts write to its alarms; empty if they may not.
     """
 
     def __init__(
@@ -112,21 +113,21 @@ class EdgeSession:
         *,
         node: EdgeNode,
         board: Board,
-        device: str,
+        devices: Mapping[str, str],
         primary_host: str | None,
         alone: bool,
         port: OutputPort,
         memory: Memory,
         counters: SparkplugCounters,
         reports: HostReports,
-        commands: AlarmCommands | None = None,
+        commands: Mapping[str, AlarmCommands] = MappingProxyType({}),
     ) -> None:
         self._connection = connection
         self._bd_seq = bd_seq
         self._node = node
         self._board = board
-        self._device = device
-        self._machine = port.identity.machine
+        self._devices = devices
+        self._machine_of = {device: machine for machine, device in devices.items()}
         self._alone = alone
         self._host = None if primary_host is None else PrimaryHost(primary_host)
         self._memory = memory
@@ -136,19 +137,20 @@ class EdgeSession:
         self._counters = counters
         self._reports = reports
         self._commands = commands
-        self._wishes: asyncio.Queue[HostCommand] = asyncio.Queue(MOST_AT_A_TIME)
+        self._wishes: asyncio.Queue[tuple[AlarmCommands, HostCommand]] = asyncio.Queue(MOST_AT_A_TIME)
         self._ungranted: list[str] = []
-        self._told: dict[str, Any] = {}
-        self._there: Callable[[], bool] = lambda: True
+        self._told: dict[str, dict[str, Any]] = {}
+        """By device, what it has told."""
+        self._there: Mapping[str, bool] = dict.fromkeys(devices, True)
         self.was_born = False
         """Whether this session got as far as its births."""
 
-    async def run(self, stopping: asyncio.Event, there: Callable[[], bool]) -> None:
+    async def run(self, stopping: asyncio.Event, there: Mapping[str, bool]) -> None:
         """Listen, wait for the host, tell everything; until ``stopping`` is set.
 
         Args:
             stopping: ends the session when the alarms that are on disk are told.
-            there: whether the machine can be reached.
+            there: by machine, whether it can be reached by now.
 
         Raises:
             HostAwayError: the primary host has left this broker, or never came.
@@ -276,9 +278,9 @@ class EdgeSession:
 
     async def _execute(self) -> None:
         """Carry out what hosts have written to alarms, one after the other."""
-        while self._commands is not None:
-            wish = await self._wishes.get()
-            if await self._commands.carry_out(wish):
+        while self._commands:
+            commands, wish = await self._wishes.get()
+            if await commands.carry_out(wish):
                 self._counters.commands += 1
             else:
                 self._counters.commands_refused += 1
@@ -306,8 +308,12 @@ class EdgeSession:
     def _be_born(self) -> None:
         """Publish all births, with present values."""
         node = self._board.of(None, self._now_ms)
-        devices = {self._device: self._board.of(self._device, self._now_ms)} if self._there() else {}
-        self._told = _values(devices.get(self._device, ()))
+        devices = {
+            device: self._board.of(device, self._now_ms)
+            for machine, device in self._devices.items()
+            if self._there[machine]
+        }
+        self._told = {device: _values(metrics) for device, metrics in devices.items()}
         for publication in self._node.births(self._bd_seq, self._now_ms, node, devices):
             self._publish(publication)
         self._counters.births += 1
@@ -361,7 +367,8 @@ class EdgeSession:
                     arriving = asyncio.create_task(self._outbox.next_following(self._cursor, READ_AHEAD))
                 if loop.time() >= due_s:
                     due_s = loop.time() + TELL_S
-                    self._tell_device()
+                    for machine, device in self._devices.items():
+                        self._tell_device(device, there=self._there[machine])
         finally:
             for task in (arriving, asked):
                 task.cancel()
@@ -382,21 +389,20 @@ class EdgeSession:
         if messages:
             await self._confirm(messages[-1].sequence)
 
-    def _tell_device(self) -> None:
-        """Tell what has changed at the machine, and whether it can be reached."""
-        there = self._there()
+    def _tell_device(self, device: str, *, there: bool) -> None:
+        """Tell what has changed at a machine, and whether it can be reached."""
         if not there:
-            if self._node.lives(self._device):
-                self._publish(self._node.device_death(self._device, self._now_ms))
+            if self._node.lives(device):
+                self._publish(self._node.device_death(device, self._now_ms))
             return
-        present = self._board.of(self._device, self._now_ms)
-        changed = [m for m in present if m.name not in self._told or self._told[m.name] != m.value]
-        if not self._node.lives(self._device) or not self._node.knows(self._device, changed):
-            self._publish(self._node.device_birth(self._device, self._now_ms, present))
+        present, told = self._board.of(device, self._now_ms), self._told.get(device, {})
+        changed = [m for m in present if m.name not in told or told[m.name] != m.value]
+        if not self._node.lives(device) or not self._node.knows(device, changed):
+            self._publish(self._node.device_birth(device, self._now_ms, present))
         elif changed:
-            self._publish(self._node.data(self._device, self._now_ms, changed))
+            self._publish(self._node.data(device, self._now_ms, changed))
             self._counters.data += 1
-        self._told = _values(present)
+        self._told[device] = _values(present)
 
     def _hear(self, message: Incoming) -> bool:
         """Take in what a host says; whether it asks for new births."""
@@ -412,8 +418,8 @@ class EdgeSession:
             elif topic == self._node.commands:
                 rest = self._take_wishes(topic, None, payload)
                 return rest is not None and self._node.is_born and self._node.wants_rebirth(rest)
-            elif topic == self._node.command_topic(self._device):
-                if self._take_wishes(topic, self._device, payload) is not None:
+            elif (device := self._device_of(topic)) is not None:
+                if self._take_wishes(topic, device, payload) is not None:
                     raise PayloadError("it asks for nothing that can be written")  # noqa: TRY301
             else:
                 self._counters.commands_refused += 1
@@ -425,6 +431,11 @@ class EdgeSession:
             log.info("%s is left alone: %s", topic, error)
         return False
 
+    def _device_of(self, topic: str) -> str | None:
+        """The device that commands on a topic are for; None for none of these."""
+        topics = {self._node.command_topic(device): device for device in self._machine_of}
+        return topics.get(topic)
+
     def _take_wishes(self, topic: str, device: str | None, payload: bytes) -> list[Metric] | None:
         """Take in what is written to alarms.
 
@@ -435,7 +446,7 @@ class EdgeSession:
             PayloadError: it cannot be read, or asks for too much at a time.
         """
         commands = self._node.command(device, payload)
-        if self._commands is None:
+        if not self._commands:
             return list(commands.metrics)
         if len(commands.metrics) > MOST_AT_A_TIME:
             raise PayloadError(
@@ -443,7 +454,7 @@ class EdgeSession:
             )
         rest = []
         for metric in commands.metrics:
-            wish = self._commands.meant(topic, metric, commands.timestamp_ms, of_node=device is None)
+            wish = self._meant(topic, device, metric, commands.timestamp_ms)
             if wish is None:
                 rest.append(metric)
             elif self._wishes.full():
@@ -452,15 +463,28 @@ class EdgeSession:
                 self._wishes.put_nowait(wish)
         return rest if rest or not commands.metrics else None
 
+    def _meant(
+        self, topic: str, device: str | None, metric: Metric, sent_ms: int | None
+    ) -> tuple[AlarmCommands, HostCommand] | None:
+        """What a written metric asks for, and who carries it out; None if hosts may not write it."""
+        if device is not None:
+            asked = [self._commands[self._machine_of[device]]]
+        else:
+            asked = [*self._commands.values()]
+        for commands in asked:
+            wish = commands.meant(topic, metric, sent_ms, of_node=device is None)
+            if wish is not None:
+                return commands, wish
+        return None
+
     def _all_metrics_of(self, message: OutboxMessage) -> list[Metric]:
         """The metrics of an alarm event, and those by which hosts may ask something of the alarm."""
         metrics = self._metrics_of(message)
-        if self._commands is None or not metrics:
-            return metrics
-        prefix = self._topics.alarm_prefix(self._machine)
-        if not message.topic.startswith(prefix):
-            return metrics  # of a machine of before
-        return [*metrics, *self._commands.of_node(message.topic.removeprefix(prefix))]
+        for machine, commands in self._commands.items() if metrics else ():
+            prefix = self._topics.alarm_prefix(machine)
+            if message.topic.startswith(prefix):
+                return [*metrics, *commands.of_node(message.topic.removeprefix(prefix))]
+        return metrics  # of a machine of before, perhaps
 
     def _metrics_of(self, message: OutboxMessage) -> list[Metric]:
         """The metrics of an alarm event; none of anything else in the outbox."""

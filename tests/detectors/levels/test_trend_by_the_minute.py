@@ -47,10 +47,10 @@ class AtOnce:
         outcome.set_result(call())
         return SimpleNamespace(outcome=outcome)
 
-    def close(self):
+    def enter(self):
         pass
 
-    def join(self):
+    async def leave(self, _jobs):
         pass
 
 

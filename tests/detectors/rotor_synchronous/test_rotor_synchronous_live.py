@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from support.live_service import play, running
+from support.live_service import play, running, watch_of
 from support.machine_files import MACHINES
 from support.waiting import eventually
 
+from daqsvc.box import Box
 from daqsvc.service import Service
 from daqsvc.settings import parse_machine_file
 from sim_hw.demo.broker import EmbeddedBroker
@@ -126,8 +127,8 @@ async def test_a_silent_bus_does_not_clear_the_alarm(tmp_path: Path) -> None:
             assert alarms["rotor-changed"].level.label == "danger"
             assert alarms["rotor-changed"].state.is_active
         # A restart knows what healthy was: it does not take the faulty machine for it.
-        again = Service(machine_file(broker.url), tmp_path)
-        (detector,) = (d for d in again.pipeline.detectors if d.name == "rotor-synchronous")
-        before = next(d for d in service.pipeline.detectors if d.name == "rotor-synchronous")
+        again = Service(Box.single(machine_file(broker.url)), tmp_path)
+        (detector,) = (d for d in watch_of(again).pipeline.detectors if d.name == "rotor-synchronous")
+        before = next(d for d in watch_of(service).pipeline.detectors if d.name == "rotor-synchronous")
         assert detector.watch.state == "watching"
         np.testing.assert_array_equal(detector.watch.calibration.baseline, before.watch.calibration.baseline)

@@ -13,19 +13,23 @@ import subprocess
 import time
 import urllib.parse
 import urllib.request
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
-from support.brokers import LOOPBACK, free_port
 from support.live_service import running
 from support.machine_files import LAVAL, only_problem, parsed
 from support.mqtt_publishing import output_port
 from support.paths import ROOT
+from support.ports import LOOPBACK, free_port
 from support.prometheus_programs import program
 from support.waiting import PATIENCE_S, eventually
 
 from daqsvc.acquisition.clock import SystemClock
+from daqsvc.box import Box
+from daqsvc.commands.status_text import status_text
+from daqsvc.control import ask_status
 from daqsvc.diagnosis.reading import Reading
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.outbox.store import Outbox
@@ -36,7 +40,7 @@ from daqsvc.publish.metrics.output import MetricsOutput
 from daqsvc.publish.metrics.settings import Metrics, address_of
 from daqsvc.publish.output import Watched
 from daqsvc.service import Service
-from daqsvc.supervision import Progress
+from daqsvc.supervision import Progress, StallWatch
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -45,6 +49,7 @@ if TYPE_CHECKING:
     from daqsvc.settings import MachineFile
 
 pytestmark = pytest.mark.integration
+FREE = "end what listens there, or write another listen in [metrics]"
 RULES = ROOT / "config" / "prometheus" / "daqsvc.rules.yml"
 RIG = Watched(
     "laval-rig",
@@ -87,10 +92,10 @@ async def serving(tmp_path: Path, port: int, **more: Any) -> AsyncIterator[Metri
     """The output of the rig, which runs."""
     outbox = Outbox(tmp_path / "outbox.sqlite", SystemClock())
     await outbox.open()
-    given = output_port(outbox, RIG, clock=SystemClock())
+    given = output_port(outbox, replace(RIG, rates_hz={"shaft": 640.0}), clock=SystemClock())
     for name, value in more.items():
         object.__setattr__(given, name, value)
-    output = MetricsOutput(Metrics(listen=f"{LOOPBACK}:{port}"), {"shaft": 640.0}, given)
+    output = MetricsOutput(Metrics(listen=f"{LOOPBACK}:{port}"), given)
     work = asyncio.create_task(output.run())
     try:
         yield output
@@ -104,7 +109,7 @@ async def serving(tmp_path: Path, port: int, **more: Any) -> AsyncIterator[Metri
 
 def figures(tmp_path: Path) -> dict[str, Any]:
     """Those of a rig on which something of everything has happened."""
-    told = Service(rig(free_port()), tmp_path / "other").figures()
+    told = Service(Box.single(rig(free_port())), tmp_path / "other").figures()
     told["streams"]["shaft"] |= {"samples_lost": 7, "frames_corrupt": 3, "rate_hz": 639.5, "time_settled": 1}
     told["buses"]["can0"] |= {"up": 1, "bus_off": 2, "unknown_ids": {"0x7ff": 9}}
     told["detectors"]["rotor-bank"] |= {"busy_ns": 1_500_000_000}
@@ -194,7 +199,7 @@ async def test_a_part_that_does_not_get_on_is_named(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(output_module, "STALLED_S", 0.0)
     monkeypatch.setattr(output_module, "LOOK_S", 0.02)
     port, steps = free_port(), {"outbox": Progress(None), "detector levels": Progress(None)}
-    async with serving(tmp_path, port, progress=lambda: dict(steps)) as output:
+    async with serving(tmp_path, port, stalls=StallWatch(lambda: dict(steps))) as output:
         monkeypatch.setattr(output_module, "STALLED_S", 30.0)
         await eventually(lambda: output._link.state == "up", "it is served")
         assert await asyncio.to_thread(get, port, "/healthz") == (200, "ok\n")
@@ -232,14 +237,19 @@ async def test_a_port_in_use_is_said_once_and_taken_when_it_is_free(
         async with running(rig(port), tmp_path / "store") as service:
             output = service.alarms.outputs["metrics"]
             assert isinstance(output, MetricsOutput)
-            await eventually(lambda: output._link.reason, "it is found")
+            await eventually(lambda: output.reason, "it is found")
+            [status] = await asyncio.to_thread(ask_status, tmp_path / "store")
+            reason = f"Address already in use: {FREE}"
+            assert status["outputs"]["metrics"] == {"connected": None, "reason": reason}
+            assert f"metrics: {reason}" in status_text(status, 200)
             assert service.control._server is not None
             other.close()
             await eventually(lambda: output._link.state == "up", "it is served")
             assert (await asyncio.to_thread(get, port, "/healthz"))[0] == 200
+            assert output.reason == ""
             assert service.supervisor.failures.total() == 0
     said = [r.getMessage() for r in caplog.records if "metrics at" in r.message and r.levelno > logging.INFO]
-    remedy = "end what listens there, or write another listen in [metrics]; it is being tried again"
+    remedy = f"{FREE}; it is being tried again"
     name = f"metrics at {LOOPBACK}:{port}"
     assert said == [f"{name}: Address already in use: {remedy}", f"{name} is there now"]
 

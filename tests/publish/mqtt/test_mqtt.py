@@ -8,8 +8,9 @@ import json
 import logging
 
 import pytest
-from support.brokers import Consumer, TcpProxy, free_port, running_mosquitto
+from support.brokers import Consumer, TcpProxy, running_mosquitto
 from support.mqtt_publishing import publishing
+from support.ports import free_port
 from support.waiting import PATIENCE_S, eventually
 
 from daqsvc.acquisition.clock import SystemClock

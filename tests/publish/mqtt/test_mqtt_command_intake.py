@@ -58,7 +58,7 @@ def intake(desk, tmp_path):
 def make(desk, store, settings=SETTINGS, reserved=()):
     clock = DrivenClock(wall_start_ns=round(NOW.timestamp()) * 10**9)
     ids = CommandIds(store / "command-ids")
-    return CommandIntake(settings, "rig", TOPICS, desk, clock, ids, reserved)
+    return CommandIntake(settings, ("rig",), TOPICS, desk, clock, ids, reserved)
 
 
 def message(payload=None, topic=ACKNOWLEDGE, *, retain=False, properties=None, **changes):
@@ -89,6 +89,7 @@ async def test_a_command_reaches_the_desk_with_all_that_it_says(intake, desk):
         duration_s=600.0,
         occurrence="o-1",
         reason="probe is being replaced",
+        machine="rig",
     )
     assert source == "mqtt daqsvc/lab/edge-1/rig/commands/shelve"
     assert (response.accepted, response.id, response.events) == (True, "c1", ("edge-1-7",))
@@ -301,7 +302,7 @@ async def test_a_flood_of_commands_cannot_make_the_box_forget_an_id(intake, desk
 async def test_ids_are_forgotten_when_a_repeat_would_be_too_old_anyway(desk, tmp_path, monkeypatch):
     monkeypatch.setattr("daqsvc.outbox.command_ids.REMEMBERED", 1)
     clock = DrivenClock(wall_start_ns=round(NOW.timestamp()) * 10**9)
-    intake = CommandIntake(SETTINGS, "rig", TOPICS, desk, clock, CommandIds(tmp_path / "ids"))
+    intake = CommandIntake(SETTINGS, ("rig",), TOPICS, desk, clock, CommandIds(tmp_path / "ids"))
     await answer(intake)
     clock.advance_to(clock.monotonic_ns() + 121 * 10**9)
     repeated, _ = await answer(intake)
@@ -397,7 +398,7 @@ async def test_with_its_ids_lost_a_restart_obeys_nothing_from_before(desk, tmp_p
     clock = DrivenClock(wall_start_ns=round(NOW.timestamp()) * 10**9)
     ids = CommandIds(tmp_path / "command-ids")
     assert not ids.open(clock.wall_ns(), is_new=True)
-    response, _ = await answer(CommandIntake(SETTINGS, "rig", TOPICS, desk, clock, ids))
+    response, _ = await answer(CommandIntake(SETTINGS, ("rig",), TOPICS, desk, clock, ids))
     assert response.accepted
     if damage is None:
         (tmp_path / "command-ids").unlink()
@@ -406,7 +407,7 @@ async def test_with_its_ids_lost_a_restart_obeys_nothing_from_before(desk, tmp_p
     clock = DrivenClock(wall_start_ns=round(NOW.timestamp() + 10) * 10**9)
     ids = CommandIds(tmp_path / "command-ids")
     assert ids.open(clock.wall_ns(), is_new=False)
-    again = CommandIntake(SETTINGS, "rig", TOPICS, desk, clock, ids)
+    again = CommandIntake(SETTINGS, ("rig",), TOPICS, desk, clock, ids)
     response, _ = await answer(again)
     assert not response.accepted
     assert "before the service started" in response.reason

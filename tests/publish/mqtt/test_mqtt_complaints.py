@@ -144,6 +144,8 @@ async def test_a_broker_that_tells_of_a_rival_is_believed_at_once(mosquitto, out
         await eventually(lambda: publisher.counters.connected, "connected")
         wire._writers[0].write(b"\xe0\x02\x8e\x00")
         await eventually(lambda: "ended by another client with client_id" in caplog.text, "it is said")
+        assert not publisher.counters.connected, "nor while it waits to come back"
+        assert publisher.reason.startswith(f"127.0.0.1:{wire.port}: ")
         await asyncio.sleep(1.5)  # more than the first wait after any other loss
         assert publisher.counters.connections == 1
 

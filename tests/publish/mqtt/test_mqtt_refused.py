@@ -8,12 +8,13 @@ import logging
 from functools import partial
 
 import pytest
-from support.brokers import Consumer, free_port, running_mosquitto
+from support.alarm_desk import alarm_service
+from support.brokers import Consumer, running_mosquitto
 from support.mqtt_publishing import CLOCK, mqtt, outputs, publishing
+from support.ports import free_port
 from support.rogue_broker import PickyBroker
 from support.waiting import eventually
 
-from daqsvc.alarm_service import AlarmService
 from daqsvc.alarms.commands import AlarmCommand, Verb
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.manager import DiagnosisRule
@@ -274,7 +275,7 @@ async def test_an_alarm_names_what_is_refused_and_returns_when_it_is_taken(tmp_p
         return Diagnosis("rig", detector, CLOCK.monotonic_ns(), "shaft", 0, 1, "bad", severity="alert")
 
     async def desk_at(port):
-        desk = AlarmService(Identity("lab", "edge-1", "rig"), rules, store, CLOCK, outputs(mqtt(port, "c")))
+        desk = alarm_service(Identity("lab", "edge-1", "rig"), rules, store, CLOCK, outputs(mqtt(port, "c")))
         await desk.open()
         await desk.resume({})
         return desk, asyncio.create_task(desk.outputs["mqtt"].run())

@@ -8,8 +8,9 @@ import shutil
 import subprocess
 
 import pytest
-from support.brokers import Consumer, TcpProxy, free_port, listens, running_mosquitto
+from support.brokers import Consumer, TcpProxy, listens, running_mosquitto
 from support.mqtt_publishing import mqtt, output_port, running_output
+from support.ports import free_port
 from support.tls_files import authority, self_signed, signed
 from support.waiting import eventually
 

@@ -150,7 +150,7 @@ def test_only_enabled_commands_are_taken():
 
 
 def watched(machine):
-    return output_set(machine, conditions()).watched
+    return output_set(machine, conditions()).machines[machine.machine.name]
 
 
 def test_home_assistant_is_told_of_every_alarm_and_of_the_sensors_behind_them():

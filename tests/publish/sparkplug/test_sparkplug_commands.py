@@ -9,12 +9,12 @@ import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from support.alarm_desk import alarm_service
 from support.mqtt_publishing import commands, mqtt, outputs
 from support.sparkplug_edge import BOOLEAN, CLOCK, NODE, born, rebirth, said
 from support.sparkplug_host import Host
 from support.waiting import eventually
 
-from daqsvc.alarm_service import AlarmService
 from daqsvc.alarms.commands import Verb
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.rules import DiagnosisRule
@@ -27,6 +27,8 @@ from daqsvc.publish.sparkplug.settings import Sparkplug
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
+
+    from daqsvc.alarm_service import AlarmService
 
 pytestmark = [pytest.mark.integration, pytest.mark.mosquitto]
 
@@ -41,7 +43,7 @@ async def box(tmp_path: Path, port: int, allow: frozenset[Verb] | None = BOTH) -
     """A desk whose alarm latches, at a broker, as an edge node."""
     watched = Watched("rig", alarms=("rotor-fault",))
     allowed = MqttCommands() if allow is None else commands(*allow)
-    desk = AlarmService(
+    desk = alarm_service(
         Identity("lab", "edge-1", "rig"),
         [DiagnosisRule("rotor-fault", "bank", latching=True)],
         tmp_path / "store",
@@ -49,7 +51,7 @@ async def box(tmp_path: Path, port: int, allow: frozenset[Verb] | None = BOTH) -
         outputs(mqtt(port, "edge-1", commands=allowed), watched, sparkplug=Sparkplug()),
     )
     await desk.open()
-    await desk.resume({"bank": ("x",)})
+    await desk.resume({"rig": {"bank": ("x",)}})
     running = [asyncio.create_task(teller.run()) for teller in desk.outputs.values()]
     try:
         yield desk

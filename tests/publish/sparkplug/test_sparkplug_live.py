@@ -59,10 +59,10 @@ def test_what_is_not_said_follows_from_the_box(tmp_path: Path) -> None:
     machine = parse_machine_file(text, LAVAL)
     outbox = Outbox(tmp_path / "outbox.sqlite", CLOCK)
     asked = output_set(machine)
-    edge = asked.make(output_port(outbox, asked.watched))["mqtt.sparkplug"]
+    edge = asked.make(output_port(outbox, *asked.machines.values()))["mqtt.sparkplug"]
     assert isinstance(edge, SparkplugEdge)
     assert edge.node.commands == "spBv1.0/lab/NCMD/edge-1"
-    assert edge._device == "laval-rig"
+    assert edge._devices == {"laval-rig": "laval-rig"}
     assert [broker.url for broker in edge._brokers] == ["mqtts://broker.example:8883"]
     assert edge._client_id == "daqsvc-lab:edge-1:sparkplug"
     assert "Alarms/laval-rig/rotor-fault/State" in [metric.name for metric in edge._board.of(None, 0)]

@@ -9,7 +9,8 @@ from __future__ import annotations
 import asyncio
 
 import pytest
-from support.brokers import LOOPBACK, TcpProxy, free_port, running_mosquitto
+from support.brokers import TcpProxy, running_mosquitto
+from support.ports import LOOPBACK, free_port
 from support.sparkplug_edge import (
     INT64,
     NODE,

@@ -1,0 +1,66 @@
+"""``daqsvc reload``: have the service that runs read its machine files again."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import TYPE_CHECKING
+
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE
+from daqsvc.commands.store_argument import BadFileError, StoreNotFoundError, add_store, chosen_store
+
+if TYPE_CHECKING:
+    import argparse
+
+    from daqsvc.commands.machine_files import Load
+
+
+class ReloadCommand:
+    """``daqsvc reload [FILE | --store DIR]``.
+
+    Args:
+        load: reads a machine file; None after its errors have been printed.
+    """
+
+    help = "have the service that runs read its machine files again"
+    description = (
+        "Have the service that runs on the store read its machine files again, and go on by what differs. "
+        "Buses, detectors and outputs that are as before go on without a break; alarms stand as they did. "
+        "Files with errors are refused as a whole, and the service goes on as it is. SIGHUP and systemctl "
+        "reload do the same. Exit code 2 if the files are refused, 1 if no service runs."
+    )
+
+    def __init__(self, load: Load) -> None:
+        self._load = load
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """See `daqsvc.cli.Command.add_arguments`."""
+        parser.add_argument("--dry-run", action="store_true", help="only say what would be different")
+        parser.add_argument("--json", action="store_true", help="one JSON object instead of text")
+        add_store(parser, of_a_machine=False)
+
+    def run(self, arguments: argparse.Namespace) -> int:
+        """See `daqsvc.cli.Command.run`."""
+        from daqsvc.control import ControlError, NotRunningError, ask_reload  # noqa: PLC0415 - only what a verb needs
+
+        try:
+            store = chosen_store(arguments, self._load, all_sound=True).directory
+            answer = ask_reload(store, dry_run=arguments.dry_run)
+        except BadFileError:
+            return EXIT_USAGE
+        except (StoreNotFoundError, ControlError) as error:
+            where = ""
+            if arguments.file is not None and isinstance(error, NotRunningError):
+                moved = f"site, box or [store] of {arguments.file}"
+                where = f"; if {moved} were changed, the service must be restarted"
+            print(f"daqsvc reload: {error}{where}", file=sys.stderr)  # noqa: T201 - errors go to stderr
+            return EXIT_FAILED
+        if arguments.json:
+            told = {"accepted": answer.accepted, "dry_run": arguments.dry_run, "lines": list(answer.lines)}
+            print(json.dumps(told))  # noqa: T201 - this is what the verb is for
+        elif answer.accepted:
+            print("\n".join(answer.lines) or "nothing is different")  # noqa: T201 - as above
+        else:
+            for line in answer.lines:
+                print(line, file=sys.stderr)  # noqa: T201 - errors go to stderr
+        return EXIT_OK if answer.accepted else EXIT_USAGE

@@ -1,0 +1,172 @@
+"""One machine under watch: from the samples of its streams to what its detectors say."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from daqsvc.acquisition.alignment import SETTLE_NS
+from daqsvc.acquisition.ring import SampleRing
+from daqsvc.acquisition.standing import StreamState
+from daqsvc.detectors.make import detectors
+from daqsvc.diagnosis.pipeline import Pipeline
+from daqsvc.diagnosis.snapshots import alignment, at_once, patience
+from daqsvc.diagnosis.statements import said_of_silence
+from daqsvc.settings.streams import Grid
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Mapping, Sequence
+    from pathlib import Path
+
+    from daqsvc.acquisition.clock import Clock
+    from daqsvc.acquisition.samples import SampleBlock
+    from daqsvc.diagnosis.detector import Detector
+    from daqsvc.diagnosis.pipeline import KernelThreads
+    from daqsvc.diagnosis.record import Diagnosis
+    from daqsvc.settings.models import MachineFile
+    from daqsvc.supervision import Progress, Supervisor
+
+
+class MachineWatch:
+    """Rings, grids and detectors of one machine.
+
+    Args:
+        machine: the machine file.
+        store: directory of the state of its detectors that survives restarts.
+        clock: the service's clock.
+        report: takes what the detectors say.
+        supervisor: keeps its parts going.
+        bus_over: says of a bus why nothing more can come from it; empty if something can.
+        kernels: threads that its detectors compute in.
+
+    Attributes:
+        machine: as given.
+        store: as given.
+        supervisor: as given.
+        rings: by stream, and by grid.
+        alignment: makes the grids.
+        standings: how each stream stands.
+        pipeline: runs the detectors.
+
+    Raises:
+        AssemblyError: see `daqsvc.detectors.make.detectors`.
+    """
+
+    def __init__(
+        self,
+        machine: MachineFile,
+        store: Path,
+        clock: Clock,
+        report: Callable[[Diagnosis], None],
+        supervisor: Supervisor,
+        bus_over: Callable[[str], str],
+        kernels: KernelThreads,
+    ) -> None:
+        self.machine = machine
+        self.store = store
+        self._clock = clock
+        self.supervisor = supervisor
+        self._bus_over = bus_over
+        watching = detectors(machine, store)
+        grids = [*(Grid({name: stream}) for name, stream in machine.streams.items()), *machine.grids]
+        self._grids = grids
+        self.standings = dict.fromkeys(machine.streams, StreamState())
+        self.rings = {grid.name: _ring(machine, grid, watching) for grid in grids}
+        self.alignment = alignment(machine, clock, self.deliver)
+        self.pipeline = Pipeline(
+            self.rings,
+            watching,
+            report,
+            clock,
+            kernels,
+            settling_ns={aligner.name: SETTLE_NS for aligner in self.alignment.aligners},
+            patience={grid.name: patience(machine, grid.name, grid.rate_hz) for grid in grids},
+            supervisor=supervisor,
+            fall_silent=self._fall_silent,
+            why_over=self._why_over,
+        )
+
+    def deliver(self, block: SampleBlock) -> None:
+        """Take in samples of one of its streams."""
+        with self.supervisor.sparing_others(f"stream {block.stream}", "a block of its samples is lost"):
+            self.rings[block.stream].write(block)
+            self.alignment.accept(block)
+
+    def receiver(self, stream: str) -> Callable[[SampleBlock], None]:
+        """What takes in the samples of one stream, whatever that is called in them."""
+
+        def receive(block: SampleBlock) -> None:
+            self.deliver(block if block.stream == stream else replace(block, stream=stream))
+
+        return receive
+
+    def stand(self, stream: str, standing: StreamState) -> None:
+        """Tell the pipeline how a stream stands, and every grid that it is on: that is no better."""
+        self.standings[stream] = standing
+        for grid in self._grids:
+            if stream in grid.streams:
+                standings = [self.standings[name] for name in grid.streams]
+                worst = next((one for one in standings if one.doubt), StreamState())
+                proven = all(one.proven for one in standings)
+                self.pipeline.stand(grid.name, worst._replace(proven=proven))
+
+    def take_over(self, before: MachineWatch, buses: Collection[str]) -> None:
+        """Go on with what is known of the streams of buses that stay as they are.
+
+        Args:
+            before: the machine as it was watched.
+            buses: names of these buses.
+        """
+        for name, stream in self.machine.streams.items():
+            if stream.bus in buses and name in before.standings:
+                self.stand(name, before.standings[name])
+
+    def active_detectors(self) -> Mapping[str, Sequence[str]]:
+        """The detectors that will make statements, with the sensors that these rest on."""
+        now_ns = self._clock.monotonic_ns()
+        active: dict[str, Sequence[str]] = {}
+        for detector in self.pipeline.detectors:
+            with self.supervisor.sparing_others(f"detector {detector.name}", "its alarms begin anew"):
+                active.update({s.detector: s.sensors for s in said_of_silence(detector, 0.0, now_ns)})
+        return active
+
+    def progress(self) -> dict[str, Progress]:
+        """How far each detector has come."""
+        return {self.supervisor.named(part): one for part, one in self.pipeline.progress().items()}
+
+    def close(self) -> None:
+        """No more samples come."""
+        for ring in self.rings.values():
+            ring.close()
+
+    def let_go(self) -> None:
+        """Forget everything, so that its memory is free at once; once its pipeline has ended.
+
+        It and its parts refer to each other. The garbage collector would find them, but would hold up the
+        event loop for .1 s, and buses that are polled would lose samples.
+        """
+        vars(self).clear()
+
+    @property
+    def is_over(self) -> bool:
+        """Whether no more samples can come."""
+        return all(ring.is_closed for ring in self.rings.values())
+
+    def _fall_silent(self, stream: str, standing: StreamState) -> None:
+        """Take in that nothing comes any more of a stream in doubt; a grid stands as its streams do."""
+        if stream in self.standings:
+            self.stand(stream, standing)
+
+    def _why_over(self, stream: str) -> str:
+        """Why nothing more can come of a stream or grid, e.g. that its recording has ended; else empty."""
+        streams = next(grid.streams for grid in self._grids if grid.name == stream)
+        buses = {self.machine.streams[name].bus for name in streams}
+        return next(filter(None, (self._bus_over(bus) for bus in sorted(buses))), "")
+
+
+def _ring(machine: MachineFile, grid: Grid, watching: Sequence[Detector]) -> SampleRing:
+    wanted = round(machine.pipeline.ring_s * grid.rate_hz)
+    # However short a ring is asked for, a detector must find its block in it, and some time to come for it.
+    needed = max((4 * d.block for d in watching if d.stream == grid.name), default=1)
+    needed = max(needed, 2 * at_once(machine, grid.name))
+    return SampleRing(grid.name, grid.channel_names, max(wanted, needed))

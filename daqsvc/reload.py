@@ -1,0 +1,171 @@
+"""What is different between the machine files that a service runs on and those that it is to go on with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from daqsvc.control import ReloadRefusedError
+from daqsvc.outbox.limits import OutboxLimits
+from daqsvc.publish.make import topic_root, watched
+from daqsvc.settings.models import MachineFile
+from daqsvc.settings.sensors import TrendValue
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator, Mapping
+
+    from daqsvc.box import Box
+
+RESTART = "restart the service for that"
+
+_OF_ALARMS = frozenset({"alarms", "alarm_handling"})
+_OF_BOX = frozenset({"schema_version", "site", "box", "buses", "store"})
+
+
+@dataclass(frozen=True, slots=True)
+class Changes:
+    """What a reload does.
+
+    Attributes:
+        machines_gone: no longer watched.
+        machines_new: watched from now on.
+        machines_anew: watched on, by new detectors, and why: the keys that have changed.
+        alarms_anew: machines whose alarms have other rules, but whose detectors are as they were.
+        buses_gone: closed.
+        buses_new: opened.
+        buses_anew: closed and opened again, and why.
+        outputs: the tables of outputs that have changed, or ``"what there is to tell"``; empty if none has.
+    """
+
+    machines_gone: tuple[str, ...] = ()
+    machines_new: tuple[str, ...] = ()
+    machines_anew: Mapping[str, str] = field(default_factory=dict)
+    alarms_anew: tuple[str, ...] = ()
+    buses_gone: tuple[str, ...] = ()
+    buses_new: tuple[str, ...] = ()
+    buses_anew: Mapping[str, str] = field(default_factory=dict)
+    outputs: tuple[str, ...] = ()
+
+    def __bool__(self) -> bool:
+        return any(self.lines())
+
+    def lines(self) -> list[str]:
+        """The same for a person, a line each."""
+        return [
+            *(f"machine {name} is no longer watched" for name in self.machines_gone),
+            *(f"machine {name} is watched from now on" for name in self.machines_new),
+            *(f"machine {name}: detectors begin anew ({why})" for name, why in self.machines_anew.items()),
+            *(f"machine {name}: other alarms or setpoints" for name in self.alarms_anew),
+            *(f"bus {name} is closed" for name in self.buses_gone),
+            *(f"bus {name} is opened" for name in self.buses_new),
+            *(f"bus {name} is opened anew ({why})" for name, why in self.buses_anew.items()),
+            *([f"outputs begin anew ({', '.join(self.outputs)})"] if self.outputs else []),
+        ]
+
+
+def changes(before: Box, after: Box) -> Changes:
+    """What has to be done to go on with ``after`` in place of ``before``.
+
+    Raises:
+        ReloadRefusedError: that cannot be done while the service runs.
+    """
+    if reasons := list(_needs_restart(before, after)):
+        raise ReloadRefusedError(reasons)
+    old, new = before.machines, after.machines
+    common = [name for name in new if name in old]
+    old_buses, new_buses = (dict(_buses(box)) for box in (before, after))
+    kept = [name for name in new_buses if name in old_buses]
+    buses_anew = {name: why for name in kept if (why := _otherwise(old_buses[name], new_buses[name]))}
+    # The driver of a bus that is opened anew counts samples from 0, which no ring takes that has some.
+    anew = {
+        name: why
+        for name in common
+        if (why := ", ".join([*_watched_otherwise(old[name], new[name]), *_read_by(new[name], buses_anew)]))
+    }
+    alarms = [name for name in common if name not in anew and _differ(old[name], new[name], _OF_ALARMS)]
+    return Changes(
+        machines_gone=tuple(name for name in old if name not in new),
+        machines_new=tuple(name for name in new if name not in old),
+        machines_anew=anew,
+        alarms_anew=tuple(alarms),
+        buses_gone=tuple(name for name in old_buses if name not in new_buses),
+        buses_new=tuple(name for name in new_buses if name not in old_buses),
+        buses_anew=buses_anew,
+        outputs=tuple(_outputs(before, after)),
+    )
+
+
+def _needs_restart(before: Box, after: Box) -> Iterator[str]:
+    for key in ("site", "box"):
+        was, wanted = getattr(before.own, key), getattr(after.own, key)
+        if was != wanted:
+            yield f"{key} is {was!r} and would become {wanted!r}: {RESTART}"
+    if before.is_single and [*before.machines] != [*after.machines]:
+        was, wanted = before.own.machine.name, after.own.machine.name
+        yield f"machine.name is {was!r} and would become {wanted!r}: {RESTART}"
+    root, wanted_root = topic_root(before.own), topic_root(after.own)
+    if root != wanted_root:
+        yield f"topic_root is {root!r} and would become {wanted_root!r}: {RESTART}"
+    store, wanted_store = (
+        None if one.own.store is None else one.own.resolve(one.own.store.directory) for one in (before, after)
+    )
+    if store != wanted_store:
+        yield f"store.directory is {store} and would become {wanted_store}: {RESTART}"
+    elif OutboxLimits.of(before.own.store) != OutboxLimits.of(after.own.store):
+        yield f"the limits in [store] are others: {RESTART}"
+
+
+def _differ(old: MachineFile, new: MachineFile, keys: frozenset[str]) -> list[str]:
+    return [key for key in sorted(keys) if getattr(old, key) != getattr(new, key)]
+
+
+def _read_by(machine: MachineFile, buses: Collection[str]) -> Iterator[str]:
+    """Which of these buses a machine has."""
+    yield from (f"bus {name}" for name in machine.buses if name in buses)
+
+
+def _watched_otherwise(old: MachineFile, new: MachineFile) -> list[str]:
+    """The keys by which a machine is watched in another way."""
+    keys = {*type(old).model_fields} - _OF_BOX - set(_output_tables(old))
+    if not any(isinstance(sensor, TrendValue) for sensor in new.sensors):
+        keys -= _OF_ALARMS  # the detector of trend values says which limit will be reached when
+    differ = _differ(old, new, frozenset(keys))
+    if old.layout_facts != new.layout_facts and "streams" not in differ:
+        differ.append("files that its streams name")
+    return differ
+
+
+def _output_tables(file: MachineFile) -> Iterator[str]:
+    yield from (key for key in type(file).model_fields if key not in MachineFile.model_fields)
+
+
+def _buses(box: Box) -> Iterator[tuple[str, dict[str, Any]]]:
+    """By bus, all that its driver is made of."""
+    own = box.own
+    for name, table in own.buses.items():
+        streams = {key: stream for key, stream in own.streams.items() if stream.bus == name}
+        sensors = [
+            (sensor.stream, sensor.channel, sensor.gain, sensor.shift)
+            for sensor in own.sensors
+            if sensor.stream in streams
+        ]
+        facts = {key: fact for key in streams if (fact := own.layout_facts.get(key)) is not None}
+        yield name, {"its table": table, "its streams": streams, "units": sensors, "its files": facts}
+
+
+def _otherwise(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
+    return ", ".join(key for key in new if old[key] != new[key])
+
+
+def _outputs(before: Box, after: Box) -> Iterator[str]:
+    """The tables of outputs that differ, and whether there is something else to tell."""
+    for key in _output_tables(after.own):
+        if getattr(before.own, key) != getattr(after.own, key):
+            yield f"[{key}]"
+    speaks = any(getattr(after.own, key) is not None for key in _output_tables(after.own))
+    if speaks and _told(before) != _told(after):
+        yield "what there is to tell"
+
+
+def _told(box: Box) -> Any:
+    return {name: watched(machine) for name, machine in box.machines.items()}, sorted(box.own.buses)

@@ -1,0 +1,362 @@
+"""Machine files read again while the service runs: refused as a whole, or applied by what is different."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import gc
+import json
+import signal
+import subprocess
+import sys
+import weakref
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import can
+import numpy as np
+import pytest
+from support.brokers import Consumer, running_mosquitto
+from support.can_gateway import daqsvc_run
+from support.live_service import running_box
+from support.machine_files import LAVAL
+from support.waiting import eventually
+
+from daqsvc.acquisition.clock import SystemClock
+from daqsvc.alarms.commands import AlarmCommand, Verb
+from daqsvc.alarms.states import AlarmState
+from daqsvc.box import BOX
+from daqsvc.commands.machine_files import read_box
+from daqsvc.control import ReloadRefusedError, ask_reload
+from daqsvc.reload import changes
+from drivers.can.plugin import frame_layout
+from sim_hw.nodes.can_node import CanNode
+from sim_hw.nodes.pacing import RealTimePacer
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+    from daqsvc.service import Service
+
+pytestmark = pytest.mark.integration
+RATE_HZ = 640.0
+RIG = LAVAL.read_text().replace('interface = "socketcan"', 'interface = "virtual"').partition("[mqtt]")[0]
+CASING = """
+[buses.can1]
+driver = "can"
+interface = "virtual"
+channel = "can1"
+fd = true
+
+[streams.casing]
+bus = "can1"
+rate_hz = 3200.0
+
+[streams.casing.layout]
+id = 0x201
+length = 12
+counter = { byte = 0, bits = 16, counts = "samples" }
+first_byte = 4
+samples_per_frame = 1
+channels = [{ name = "de", type = "int16", scale = 0.001 }, { name = "nde", type = "int16", scale = 0.001 }]
+
+[[sensors]]
+name = "accel"
+type = "accelerometer"
+stream = "casing"
+channel = "de"
+unit = "g"
+
+[[alarms]]
+name = "accel-high"
+sensor = "accel"
+measure = "rms"
+alert = 5.0
+danger = 9.0
+"""
+MQTT_ELSEWHERE = '[mqtt]\nurl = "mqtt://127.0.0.1"\ninsecure = true\ntopic_root = "x"\n[pipeline]'
+ANOTHER = """
+[[sensors]]
+name = "accel-nde"
+type = "accelerometer"
+stream = "casing"
+channel = "nde"
+unit = "g"
+"""
+
+
+def put(file: Path, *changes_: tuple[str, str], more: str = "") -> None:
+    """Write the machine file of the rig and its casing."""
+    text = RIG + CASING
+    for old, new in changes_:
+        assert old in text, old
+        text = text.replace(old, new)
+    file.write_text(text + more)
+
+
+@contextlib.asynccontextmanager
+async def serving(*files: Path, store: Path) -> AsyncIterator[Service]:
+    async with running_box(read_box(files), store, read_again=partial(read_box, files)) as service:
+        yield service
+
+
+@contextlib.asynccontextmanager
+async def turning(service: Service, machine: str, stream: str = "shaft") -> AsyncIterator[CanNode]:
+    """A device that sends for as long as this is entered."""
+    driver = {one.name: one for one in service.driver_reports}["can0"]
+    await eventually(lambda: driver.link.state == "up", "the bus is up")
+    turns = np.arange(round(RATE_HZ * 60.0)) / RATE_HZ * 10.0
+    x, y = 20.0 * np.cos(2 * np.pi * turns), -10.0 + 20.0 * np.sin(2 * np.pi * turns)
+    samples = np.stack([x, y, np.where(turns % 1 < 0.1, -2.0, -10.0)], axis=1)
+    with can.Bus(interface="virtual", channel="can0", protocol=can.CanProtocol.CAN_FD) as bus:
+        node = CanNode(bus, frame_layout(service.box.machines[machine], stream), samples, RATE_HZ)
+        playing = asyncio.create_task(node.play(RealTimePacer(SystemClock())))
+        try:
+            yield node
+        finally:
+            playing.cancel()
+            await asyncio.wait({playing})
+
+
+def counted(service: Service, stream: str = "shaft") -> dict[str, Any]:
+    return dict(service.figures()["streams"][stream])
+
+
+async def all_has_come(service: Service, node: CanNode, stream: str = "shaft") -> None:
+    """What was sent until now has been received, and nothing is missing."""
+    await eventually(lambda: counted(service, stream)["frames_received"] >= node.frames_sent, "all has come")
+    assert counted(service, stream)["samples_lost"] == 0
+    assert counted(service, stream)["gaps"] == 0
+
+
+async def test_another_setpoint_leaves_buses_detectors_and_alarms_as_they_are(tmp_path: Path) -> None:
+    file = tmp_path / "rig.toml"
+    put(file)
+    async with serving(file, store=tmp_path / "store") as service, turning(service, "laval-rig") as node:
+        watch, driver = service.watches["laval-rig"], service.drivers[0]
+        shown = lambda: service.alarms.manager.alarms["rotor-fault"]  # noqa: E731
+        await eventually(lambda: shown().occurrence, "its unbalance raises an alarm")
+        bypass = AlarmCommand(verb=Verb.BYPASS, alarm="rotor-fault", by="the test")
+        assert (await service.alarms.execute(bypass, "test")).accepted
+        before = shown()
+        put(file, ("alert = 5.0", "alert = 4.0"))
+        said = ["machine laval-rig: other alarms or setpoints"]
+        answer = await asyncio.to_thread(ask_reload, tmp_path / "store", dry_run=True)
+        assert (answer.accepted, list(answer.lines)) == (True, said)
+        assert service.box.machines["laval-rig"].alarms[-1].alert == 5.0, "it was only asked"
+        assert await service.reload() == said
+        assert service.watches["laval-rig"] is watch
+        assert service.drivers[0] is driver
+        assert service.box.machines["laval-rig"].alarms[-1].alert == 4.0
+        after = shown()
+        assert (after.state, after.occurrence) == (before.state, before.occurrence)
+        assert after.state is AlarmState.OUT_OF_SERVICE
+        assert await service.reload() == []
+        await all_has_come(service, node)
+
+
+async def test_another_sensor_costs_no_other_bus_a_sample(tmp_path: Path) -> None:
+    file = tmp_path / "rig.toml"
+    put(file)
+    async with serving(file, store=tmp_path / "store") as service, turning(service, "laval-rig") as node:
+        await eventually(lambda: counted(service)["time_settled"], "its clock is known")
+        shaft, casing = service.drivers
+        put(file, more=ANOTHER)
+        assert await service.reload() == [
+            "machine laval-rig: detectors begin anew (sensors, bus can1)",
+            "bus can1 is opened anew (units)",
+        ]
+        assert service.drivers[0] is shaft
+        assert service.drivers[1] is not casing
+        watch = service.watches["laval-rig"]
+        assert [sensor.name for sensor in watch.machine.sensors][-1] == "accel-nde"
+        await eventually(lambda: watch.pipeline.counters["rotor-bank"].windows > 20, "it is judged again")
+        await all_has_come(service, node)
+        received = counted(service)["samples_received"]
+        assert watch.rings["shaft"].end_index == received, "one count over the reload"
+        [report] = service.reports.values()
+        assert b"accel-nde" in await report.line()
+
+
+async def test_a_machine_comes_and_goes_while_another_is_watched(tmp_path: Path) -> None:
+    plant = tmp_path / "plant"
+    plant.mkdir()
+    for name, number in (("one", 1), ("two", 2)):
+        text = RIG.replace('name = "laval-rig"', f'name = "{name}"').replace("0x101", f"{0x100 + number:#x}")
+        (plant / f"{name}.toml").write_text(text)
+    second = (plant / "two.toml").read_text()
+    (plant / "two.toml").unlink()
+    async with serving(plant, store=tmp_path / "store") as service, turning(service, "one") as node:
+        await eventually(
+            lambda: service.watches["one"].pipeline.counters["rotor-bank"].windows > 10, "judged"
+        )
+        # On a bus of its own: what shares a bus is read by one driver, which then begins anew.
+        (plant / "two.toml").write_text(second.replace("buses.can0", "buses.b").replace('"can0"', '"b"'))
+        assert await service.reload() == ["machine two is watched from now on", "bus b is opened"]
+        assert sorted(service.alarms.managers) == [BOX, "one", "two"]
+        bypass = AlarmCommand(verb=Verb.BYPASS, alarm="rotor-fault", by="the test", machine="two")
+        assert (await service.alarms.execute(bypass, "test")).accepted
+        await all_has_come(service, node, "one/shaft")
+        (plant / "two.toml").unlink()
+        assert await service.reload() == ["machine two is no longer watched", "bus b is closed"]
+        assert [one.name for one in service.driver_reports] == ["can0"]
+        latest = {m.topic: m for m in await service.alarms.outbox.latest()}
+        assert b'"state":"normal"' in latest["daqsvc/lab/edge-1/two/alarms/rotor-fault"].payload
+        await all_has_come(service, node, "one/shaft")
+
+
+async def test_what_is_on_a_bus_that_is_opened_anew_is_judged_again(tmp_path: Path) -> None:
+    plant = tmp_path / "plant"
+    plant.mkdir()
+    for name, number in (("one", 1), ("two", 2)):
+        text = RIG.replace('name = "laval-rig"', f'name = "{name}"').replace("0x101", f"{0x100 + number:#x}")
+        (plant / f"{name}.toml").write_text(text)
+    async with serving(plant, store=tmp_path / "store") as service:
+        judged = lambda: service.watches["one"].pipeline.counters["rotor-bank"].windows  # noqa: E731
+        async with turning(service, "one"):
+            await eventually(lambda: judged() > 10, "judged")
+        gone = weakref.ref(service.watches["one"].pipeline)
+        gc.disable()
+        try:
+            (plant / "two.toml").unlink()
+            assert await service.reload() == [
+                "machine two is no longer watched",
+                "machine one: detectors begin anew (bus can0)",
+                "bus can0 is opened anew (its streams, units)",
+            ]
+            assert gone() is None, "its memory is free without the collector, which would hold up the loop"
+        finally:
+            gc.enable()
+        async with turning(service, "one"):
+            await eventually(lambda: judged() > 10, "judged again")
+        (plant / "one.toml").write_text(
+            (plant / "one.toml").read_text().replace('start = "retry"', 'start = "ignore"')
+        )
+        await service.reload()
+        async with turning(service, "one"):
+            await eventually(lambda: judged() > 10, "judged once more")
+        assert not service.supervisor.failures
+        [report] = service.reports.values()
+        status = json.loads(await report.line())
+        assert status["uptime_s"] > 1.0, "of the service, not of the machine"
+        assert status["buses"]["can0"]["state"] == "up"
+
+
+async def test_a_stop_in_the_middle_of_a_reload_is_a_stop(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "rig.toml"
+    put(file)
+    began = asyncio.Event()
+
+    async def hang(*_: object) -> None:
+        began.set()
+        await asyncio.Event().wait()
+
+    async with serving(file, store=tmp_path / "store") as service:
+        monkeypatch.setattr(service, "_change_alarms", hang)
+        put(file, more=ANOTHER)
+        reloading = asyncio.create_task(service.reload())
+        await began.wait()
+    with pytest.raises(ReloadRefusedError, match="the service ends"):
+        await reloading
+    assert not service.supervisor.failures
+    assert not [one for one in caplog.records if one.name == "daqsvc.supervision"]
+
+
+async def test_another_broker_gets_what_happens_from_then_on(tmp_path: Path) -> None:
+    file = tmp_path / "rig.toml"
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    with running_mosquitto(tmp_path / "a") as first, running_mosquitto(tmp_path / "b") as second:
+        broker = '\n[mqtt]\nurl = "mqtt://127.0.0.1:{}"\ninsecure = true\n'
+        put(file, more=broker.format(first.port))
+        async with Consumer(second.port) as consumer, serving(file, store=tmp_path / "store") as service:
+            await eventually(lambda: service.figures()["mqtt"]["connected"], "the first is connected")
+            put(file, more=broker.format(second.port))
+            assert await service.reload() == ["outputs begin anew ([mqtt])"]
+            bypass = AlarmCommand(verb=Verb.BYPASS, alarm="rotor-fault", by="the test")
+            assert (await service.alarms.execute(bypass, "test")).accepted
+            await eventually(lambda: consumer.on("alarms/rotor-fault"), "the second one is told")
+            put(file)
+            assert await service.reload() == ["outputs begin anew ([mqtt])"]
+            assert not service.alarms.outputs
+            await eventually(
+                lambda: [m.payload["state"] for m in consumer.on("availability")][-1] == "offline", "it left"
+            )
+
+
+async def test_what_cannot_be_is_refused_whole(tmp_path: Path) -> None:
+    file = tmp_path / "rig.toml"
+    put(file)
+    async with serving(file, store=tmp_path / "store") as service, turning(service, "laval-rig") as node:
+        watch, box = service.watches["laval-rig"], service.box
+        for words, change in {
+            'rate_hz = "fast": must be a number': ("rate_hz = 3200.0", 'rate_hz = "fast"'),
+            "site is 'lab' and would become 'plant': restart": ('site = "lab"', 'site = "plant"'),
+            "topic_root is 'daqsvc' and would become 'x': restart": ("[pipeline]", MQTT_ELSEWHERE),
+            "machine.name is 'laval-rig' and would become 'x': restart": ('name = "laval-rig"', 'name = "x"'),
+        }.items():
+            put(file, change, ("alert = 5.0", "alert = 4.0"))
+            with pytest.raises(ReloadRefusedError) as refused:
+                await service.reload()
+            assert words in str(refused.value), refused.value
+        put(file, more=f'\n[store]\ndirectory = "{tmp_path}/other"\n')
+        with pytest.raises(ReloadRefusedError, match=r"store\.directory is None and would become"):
+            await service.reload()
+        file.unlink()
+        with pytest.raises(ReloadRefusedError, match="no such file"):
+            await service.reload()
+        assert service.box is box
+        assert service.watches["laval-rig"] is watch
+        assert box.machines["laval-rig"].alarms[-1].alert == 5.0
+        await all_has_come(service, node)
+
+
+def test_what_is_different_is_said_with_its_reason(tmp_path: Path) -> None:
+    file = tmp_path / "rig.toml"
+    put(file)
+    before = read_box([file])
+    assert not changes(before, read_box([file]))
+    for change, said in {
+        ("ring_s = 30.0", "ring_s = 20.0"): ["machine laval-rig: detectors begin anew (pipeline)"],
+        ("id = 0x201", "id = 0x202"): [
+            "machine laval-rig: detectors begin anew (streams, bus can1)",
+            "bus can1 is opened anew (its streams)",
+        ],
+        ('channel = "can1"', 'channel = "can2"'): [
+            "machine laval-rig: detectors begin anew (bus can1)",
+            "bus can1 is opened anew (its table)",
+        ],
+        ("shelve_at_most_s = 28_800.0", "shelve_at_most_s = 60.0"): [
+            "machine laval-rig: other alarms or setpoints"
+        ],
+    }.items():
+        put(file, change)
+        assert changes(before, read_box([file])).lines() == said
+
+
+@pytest.mark.long
+async def test_a_process_reloads_by_sighup_and_by_the_verb(tmp_path: Path) -> None:
+    file, store = tmp_path / "rig.toml", tmp_path / "store"
+    put(file)
+    verb = partial(subprocess.run, capture_output=True, text=True, check=False, timeout=60)
+    reload = [sys.executable, "-m", "daqsvc", "reload", "--store", f"{store}"]
+    log = tmp_path / "log"
+    async with daqsvc_run(file, store) as process:
+        await eventually(lambda: "watching laval-rig" in log.read_text(), "it runs")
+        put(file, ("alert = 5.0", "alert = 4.0"))
+        dry = await asyncio.to_thread(verb, [*reload, "--dry-run"])
+        assert (dry.returncode, dry.stdout) == (0, "machine laval-rig: other alarms or setpoints\n"), dry
+        process.send_signal(signal.SIGHUP)
+        await eventually(lambda: "reloaded: machine laval-rig: other" in log.read_text(), "it has reloaded")
+        done = await asyncio.to_thread(verb, reload)
+        assert (done.returncode, done.stdout) == (0, "nothing is different\n")
+        file.write_text("nonsense")
+        refused = await asyncio.to_thread(verb, reload)
+        assert refused.returncode == 2
+        assert f"{file}:1: is not valid TOML" in refused.stderr
+        process.send_signal(signal.SIGHUP)
+        await eventually(lambda: "SIGHUP is refused" in log.read_text(), "it is refused")
+        assert process.poll() is None
