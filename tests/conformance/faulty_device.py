@@ -9,6 +9,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+REFUSED_FRAMES = 500
+
 
 class FaultyDevice(ABC):
     """A `conformance.transport.Device` but for the wire: a transport adds how one frame is put on it.
@@ -30,6 +32,7 @@ class FaultyDevice(ABC):
         self._resetting = False
         self._held: tuple[int, NDArray[np.float32]] | None = None
         self._counted_from = 0
+        self._refused = 0
 
     @abstractmethod
     def put(self, first_index: int, samples: NDArray[np.float32], *, corrupt: bool) -> bool:
@@ -40,8 +43,15 @@ class FaultyDevice(ABC):
         self.flood(first_index, samples)
 
     def flood(self, first_index: int, samples: NDArray[np.float32]) -> None:
-        """See `Device.flood`."""
+        """See `Device.flood`.
+
+        It ends once the wire has refused many: where a thread empties the wire meanwhile, it would else
+        take more the slower the computer is, and in the end as many as no backlog can hold.
+        """
+        self._refused = 0
         for at in range(0, len(samples), self._per_frame):
+            if self._refused >= REFUSED_FRAMES:
+                return
             self._pass_on(first_index + at, samples[at : at + self._per_frame])
 
     def drop(self, frames: int = 1) -> None:
@@ -101,6 +111,7 @@ class FaultyDevice(ABC):
     def _put(self, index: int, samples: NDArray[np.float32]) -> None:
         corrupt, self._corrupting = self._corrupting, False
         taken = self.put(index, samples, corrupt=corrupt)
+        self._refused += not taken
         self.frames_on_wire += taken
         self.samples_on_wire += len(samples) if taken and not corrupt else 0
         if self._duplicating:
