@@ -129,7 +129,7 @@ bench-data: $(READY)
 
 # What is compiled needs a protobuf of this major version, no older than the compiler: pyproject.toml says which.
 proto: $(READY)
-	@$(BIN)/python -m grpc_tools.protoc -I. --python_out=. --pyi_out=. daqsvc/publish/sparkplug/sparkplug_b.proto
+	@$(BIN)/python -m grpc_tools.protoc -I. --python_out=. --pyi_out=. daqsvc/publish/sparkplug/sparkplug_b.proto daqsvc/snapshots/samples.proto
 
 # Pin again what pyproject.toml asks for. Needs uv (pip install uv).
 lock:
