@@ -51,6 +51,7 @@ class _Compiling:
     """What is to be said when a kernel is compiled, once."""
 
     kept = True
+    failed = False
     first: Callable[[], bool] | None = None
 
 
@@ -61,6 +62,13 @@ def say_compiling() -> None:
     if first is not None and (logging.root.handlers or sys.stderr.isatty()) and first():
         when = "first start only; " if _Compiling.kept else ""
         log.warning("compiling kernels for this processor (%stakes up to a minute)", when)
+
+
+def say_not_kept(error: OSError) -> None:
+    """A kernel could not be written after all."""
+    if not _Compiling.failed:
+        _Compiling.failed = True
+        log.warning("compiled kernels cannot be kept, and the next start compiles them again: %s", error)
 
 
 def _choose(*, say: bool) -> bool:

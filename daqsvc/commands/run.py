@@ -87,6 +87,8 @@ class RunCommand:
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `daqsvc.cli.Command.run`."""
+        from daqsvc.kernel_compiler import compile_apart  # noqa: PLC0415 - each verb imports only what it needs
+
         manager = ServiceManager.of_environment()
         handler = LogThread(STDERR)
         self._start_logging(verbose=arguments.verbose, handler=handler)
@@ -95,6 +97,7 @@ class RunCommand:
             if box is None:
                 return EXIT_USAGE
             kernel_cache.prepare()
+            compile_apart()
             sys.setswitchinterval(SWITCH_S)
             with ProcessGuard(handler.flush_within, manager.stopping) as guard:
                 # Under systemd its journal reads the log, whose restart is no reason to stop.

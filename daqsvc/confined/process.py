@@ -84,6 +84,7 @@ class WorkResult(NamedTuple):
 
 @dataclass(slots=True)
 class _Running:
+    name: str
     process: subprocess.Popen[bytes]
     requests: int
     replies: int
@@ -93,9 +94,13 @@ class ConfinedProcess:
     """Calls functions in a process of its own, one at a time; it is begun at need, and anew after a loss.
 
     Calls of several threads wait for each other. It ends with `close`, or with this process.
+
+    Args:
+        name: what it is called where it failed, e.g. ``"its reader"`` of a file.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, name: str = "its reader") -> None:
+        self._name = name
         self._lock = RLock()
         self._running: _Running | None = None
         self._aborted = False
@@ -128,9 +133,9 @@ class ConfinedProcess:
             "cpu_s": cpu_s,
         }
         with self._lock:
-            running = self._running = self._running or _begin()
+            running = self._running = self._running or _begin(self._name)
             if self._aborted:
-                raise ConfinedError("crash", "its reader was told to stop")
+                raise ConfinedError("crash", f"{self._name} was told to stop")
             until = time.monotonic() + _WALL_BASE_S + _WALL_PER_CPU * cpu_s
             try:
                 return _ask(running, request, memory_bytes, until)
@@ -173,7 +178,7 @@ class ConfinedProcess:
             os.close(running.requests)
 
 
-def _begin() -> _Running:
+def _begin(name: str) -> _Running:
     """Begin the process: this interpreter and its modules, none of the working directory."""
     code = f"import sys; sys.path[:] = {sys.path!r}; from daqsvc.confined.child import serve; serve()"
     request_in, request_out = os.pipe()
@@ -193,7 +198,7 @@ def _begin() -> _Running:
     finally:
         os.close(request_in)
         os.close(reply_out)
-    return _Running(process, request_out, reply_in)
+    return _Running(name, process, request_out, reply_in)
 
 
 def _ask(running: _Running, request: Mapping[str, Any], memory_bytes: int, until: float) -> WorkResult:
@@ -205,7 +210,7 @@ def _ask(running: _Running, request: Mapping[str, Any], memory_bytes: int, until
         raise _lost(running) from None
     (length,) = LENGTH.unpack(_take(running, bytearray(LENGTH.size), until))
     if length > _LONGEST_HEADER:
-        raise ConfinedError("crash", "its reader answered without sense")
+        raise ConfinedError("crash", f"{running.name} answered without sense")
     header = json.loads(bytes(_take(running, bytearray(length), until)))
     if "raised" in header:
         raise RaisedThereError(header["raised"], header["message"])
@@ -230,7 +235,7 @@ def _take(running: _Running, into: bytearray | memoryview, until: float) -> byte
     poll.register(running.replies, select.POLLIN)
     while left:
         if not poll.poll(max(0.0, until - time.monotonic()) * 1e3):
-            raise ConfinedError("time", "its reader is stuck")
+            raise ConfinedError("time", f"{running.name} is stuck")
         count = os.readv(running.replies, [left])
         if not count:
             raise _lost(running)
@@ -242,12 +247,12 @@ def _lost(running: _Running) -> ConfinedError:
     try:
         code = running.process.wait(_END_S)
     except subprocess.TimeoutExpired:
-        return ConfinedError("crash", "its reader closed its output")
+        return ConfinedError("crash", f"{running.name} closed its output")
     if code == -signal.SIGXCPU:
         return ConfinedError("time", "it takes more processor time than it may")
     if code < 0:
-        return ConfinedError("crash", f"its reader was ended by {_signal_name(-code)}")
-    return ConfinedError("crash", f"its reader ended with exit code {code}")
+        return ConfinedError("crash", f"{running.name} was ended by {_signal_name(-code)}")
+    return ConfinedError("crash", f"{running.name} ended with exit code {code}")
 
 
 def _signal_name(number: int) -> str:
