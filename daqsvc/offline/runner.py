@@ -33,8 +33,10 @@ from daqsvc.recording.recording import (
     set_limits,
 )
 from daqsvc.settings.failures import one_line
+from daqsvc.settings.models import ProximityProbe
 from daqsvc.settings.plugins import configured, detector_tables
 from daqsvc.settings.problems import AssemblyError
+from daqsvc.settings.units import factor_between
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
@@ -252,12 +254,13 @@ class Runner:
         machine, options = self.machine, self.options
         if options.in_memory:
             wanted = {sensor.name: sensor.channel for sensor in machine.sensors}
-            return (load_matching if options.patterns else load_recording)(recording, wanted, options.rate_hz)
+            load = load_matching if options.patterns else load_recording
+            return self._in_its_units(load(recording, wanted, options.rate_hz))
         if not _is_can_log(recording):
             columns = self._columns(recording)
             self._refuse_lacking(recording, only or (), columns)
             wanted = columns if only is None else {name: columns[name] for name in only}
-            return load_recording(recording, wanted, options.rate_hz)
+            return self._in_its_units(load_recording(recording, wanted, options.rate_hz))
         if options.channels or options.unit is not None:
             raise RefusedError(
                 f"{recording} is a CAN log, of which the machine file says channels and units: leave out "
@@ -278,6 +281,25 @@ class Runner:
             nan_count=int(np.isnan(samples).sum()),
             infinity_count=int(np.isinf(samples).sum()),
         )
+
+    def _in_its_units(self, recording: Recording) -> Recording:
+        """A recording whose units are not contradicted by its file.
+
+        Raises:
+            RefusedError: they are.
+        """
+        for sensor in self.machine.sensors:
+            stated = recording.units.get(sensor.name, "")
+            unit = sensor.unit
+            if isinstance(sensor, ProximityProbe) and self.options.unit is not None:
+                unit = self.options.unit
+            if factor_between(stated, unit) not in {None, 1.0}:
+                raise RefusedError(
+                    f"{sensor.name} of {recording.source} is in {stated} by the file and in {unit} as it "
+                    "would be read: say the file's unit (--unit, or the sensor's in the machine file), or "
+                    f"save it in {unit}"
+                )
+        return recording
 
     def _refuse_lacking(self, recording: str, wanted: Iterable[str], there: Container[str]) -> None:
         """Refuse a recording without a sensor that is wanted.

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import re
+from collections import Counter
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -52,11 +54,17 @@ class Contents:
         entries: arrays; one dimension is a channel, none a scalar or a text.
         is_table: the first entries are columns that may also be called by their number from 0.
         has_header: the file names its columns; without a header their names are their numbers.
+        rates_hz: samples per second of single channels, by their names.
+        times: for single channels the entry that holds the time of each sample, in seconds or as dates.
+        units: of single channels, as the file spells them.
     """
 
     entries: Mapping[str, NDArray[np.generic]]
     is_table: bool = False
     has_header: bool = True
+    rates_hz: Mapping[str, float] = field(default_factory=dict)
+    times: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
 
     def vectors(self) -> dict[str, NDArray[np.generic]]:
         """Numeric entries of one dimension, of any length."""
@@ -111,6 +119,22 @@ def column_names(headers: Sequence[str]) -> list[str]:
         header if header and first[header] == i else str(i) if str(i) not in first else f"column {i}"
         for i, header in enumerate(headers)
     ]
+
+
+def last_part(name: str) -> str:
+    """The name of an entry without the groups, folders or structs that it lies in."""
+    return re.split(r"[./]", name)[-1]
+
+
+def names_of_groups(names: Sequence[tuple[str, str]]) -> list[str]:
+    """A name for each channel of a file with groups: with the group's before it where several share it.
+
+    Args:
+        names: of the group and the channel, for each channel.
+    """
+    count = Counter(channel for _, channel in names)
+    told = [channel if channel and count[channel] == 1 else f"{group}/{channel}" for group, channel in names]
+    return column_names(told)
 
 
 def flattened(name: str, value: object) -> Iterator[tuple[str, NDArray[np.generic]]]:

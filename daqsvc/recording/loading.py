@@ -46,7 +46,8 @@ def load(
     if not channels:
         channels, left_out = _longest(file, contents)
     columns, length = _channels(file, contents, channels)
-    timing = timing_of(file, contents, length, rate_hz)
+    in_file = [_variable(contents, variable) for variable in channels.values()]
+    timing = timing_of(file, contents, length, rate_hz, in_file)
     about = {
         "names": list(columns),
         "rate_hz": timing.rate_hz,
@@ -55,6 +56,11 @@ def load(
         "notes": timing.notes,
         "scalars": contents.scalars(),
         "texts": contents.texts(),
+        "units": {
+            name: contents.units[variable]
+            for name, variable in zip(columns, in_file, strict=True)
+            if variable in contents.units
+        },
     }
     del contents
     samples = _together(columns, length, timing.rows)
@@ -81,7 +87,8 @@ def load_streams(
     loaded: list[Floats] = []
     for channels, rate_hz in streams:
         columns, length = _channels(file, contents, channels)
-        rows, noted = place_at(file, contents, length, rate_hz)
+        in_file = [_variable(contents, variable) for variable in channels.values()]
+        rows, noted = place_at(file, contents, length, rate_hz, in_file)
         samples = _together(columns, length, rows)
         _refuse_impossible(file, list(channels), samples)
         notes.append(noted)
@@ -100,12 +107,22 @@ def channels_of(path: str, expected: Sequence[str], memory_bytes: int) -> tuple[
     for name in expected:
         if name in contents.entries:
             _channels(file, contents, {name: name})
-    return {name: len(values) for name, values in contents.vectors().items() if len(values) > 1}, ()
+    return _lengths(contents), ()
+
+
+def _lengths(contents: Contents) -> dict[str, int]:
+    """The samples of each entry that may be a channel."""
+    times = set(contents.times.values())
+    return {
+        name: len(values)
+        for name, values in contents.vectors().items()
+        if len(values) > 1 and name not in times
+    }
 
 
 def _longest(path: Path, contents: Contents) -> tuple[dict[str, str], dict[str, int]]:
     """Channels as long as the longest under their own names, and the lengths of the others."""
-    lengths = {name: len(values) for name, values in contents.vectors().items() if len(values) > 1}
+    lengths = _lengths(contents)
     longest = max(lengths.values(), default=0)
     time = time_column(contents, longest)
     channels = {name: name for name, length in lengths.items() if length == longest and name != time}
@@ -126,7 +143,8 @@ def _channels(
     return columns, _common_length(path, columns, channels)
 
 
-def _channel(path: Path, contents: Contents, variable: str) -> NDArray[np.generic]:
+def _variable(contents: Contents, variable: str) -> str:
+    """The entry that a name means: of a table's columns their numbers do, too."""
     entries = contents.entries
     if (
         contents.is_table
@@ -136,7 +154,13 @@ def _channel(path: Path, contents: Contents, variable: str) -> NDArray[np.generi
         and len(variable) < 9
         and int(variable) < len(entries)
     ):
-        variable = list(entries)[int(variable)]
+        return list(entries)[int(variable)]
+    return variable
+
+
+def _channel(path: Path, contents: Contents, variable: str) -> NDArray[np.generic]:
+    entries = contents.entries
+    variable = _variable(contents, variable)
     holds = f"it holds {contents.listing()}"
     if variable not in entries:
         raise RecordingError(f"{path} has no channel {variable!r}; {holds}")

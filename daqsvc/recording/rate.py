@@ -10,9 +10,10 @@ import numpy as np
 
 from daqsvc.dsp.quality.rate import SAME_RATE, StampedRate, rate_of_stamps
 from daqsvc.recording import RecordingError
+from daqsvc.recording.contents import last_part
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Collection, Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -32,7 +33,7 @@ RATE_NAMES = frozenset(
 
 TIME_NAME = re.compile(
     # A capital T alone is a temperature or a torque.
-    r"(?:.*\.)?(?:t|(?i:time|elapsed|zeit))(?:[\s_]*[\[(]?(?P<unit>s|sec|seconds|ms|us|µs|μs|ns)[\])]?)?"
+    r"(?:.*[./])?(?:t|(?i:time|elapsed|zeit))(?:[\s_]*[\[(]?(?P<unit>s|sec|seconds|ms|us|µs|μs|ns)[\])]?)?"
 )
 """Names that a column of time may have, with its unit or in seconds: ``t``, ``Time [ms]``, ``time_s``."""
 
@@ -95,7 +96,22 @@ class _TimeColumn:
         return any(self.stamps.agrees(hz / per) for per in (1.0, *others))
 
 
-def timing_of(path: Path, contents: Contents, length: int, given_hz: float | None) -> Timing:
+def rate_of_step(step_s: float, digits: int = 12) -> float:
+    """Samples per second by the time between two, as a whole number if that has its first ``digits``."""
+    if not step_s > 0.0 or not np.isfinite(1.0 / step_s):
+        return float("nan")
+    rate_hz = 1.0 / step_s
+    whole = round(rate_hz)
+    return float(whole) if abs(rate_hz - whole) <= 10.0 ** (1 - digits) * rate_hz else rate_hz
+
+
+def timing_of(
+    path: Path,
+    contents: Contents,
+    length: int,
+    given_hz: float | None,
+    channels: Collection[str] = (),
+) -> Timing:
     """When the samples of channels with ``length`` samples were taken.
 
     Args:
@@ -103,13 +119,14 @@ def timing_of(path: Path, contents: Contents, length: int, given_hz: float | Non
         contents: what it holds.
         length: samples of a channel.
         given_hz: what the user says; it never contradicts what the file says, where that says one thing.
+        channels: the channels themselves, by their names in the file.
 
     Raises:
         RecordingError: nobody says the rate, the file contradicts itself or what is given, most samples are
             missing, or the rate is outside of `LEAST_RATE_HZ` to `MOST_RATE_HZ`.
     """
-    stated = _stated(contents)
-    column = _time(path, contents, length)
+    stated = _stated(contents, channels)
+    column = _time(path, contents, length, channels)
     if given_hz is not None:
         others = "".join(
             f"; {name} of the file says {hz:g} Hz" for name, hz in stated.items() if hz != given_hz
@@ -123,7 +140,9 @@ def timing_of(path: Path, contents: Contents, length: int, given_hz: float | Non
         source = f"derived from time column {column.name!r}, read as {column.unit}"
     else:
         statement = (
-            f"states several: {stated}" if stated else f"does not state one{_why_not(contents, length)}"
+            f"states several: {stated}"
+            if stated
+            else f"does not state one{_why_not(contents, length, channels)}"
         )
         raise RecordingError(
             f"the sampling rate of {path} is not known: the file {statement}. Give it with --fs, in Hz"
@@ -135,12 +154,12 @@ def timing_of(path: Path, contents: Contents, length: int, given_hz: float | Non
         )
     _refuse_contradictions(path, stated, column, given_hz)
     if column is None:
-        return Timing(float(rate_hz), source, notes=_reversed(contents, length))
+        return Timing(float(rate_hz), source, notes=_reversed(contents, length, channels))
     return Timing(float(rate_hz), source, column.stamps.rows, column.notes())
 
 
 def place_at(
-    path: Path, contents: Contents, length: int, rate_hz: float
+    path: Path, contents: Contents, length: int, rate_hz: float, channels: Collection[str] = ()
 ) -> tuple[NDArray[np.int64] | None, tuple[str, ...]]:
     """Where samples have their places that are taken at a rate, whatever the file says about it.
 
@@ -149,6 +168,7 @@ def place_at(
         contents: what it holds.
         length: samples of a channel.
         rate_hz: samples per second.
+        channels: the channels themselves, by their names in the file.
 
     Returns:
         As `Timing.rows` and `Timing.notes`. Nothing is said to be missing by a column of time that tells
@@ -157,7 +177,7 @@ def place_at(
     Raises:
         RecordingError: most samples are missing.
     """
-    stated, column = _stated(contents), _time(path, contents, length)
+    stated, column = _stated(contents, channels), _time(path, contents, length, channels)
     if other := _other_rates(stated, column, rate_hz):
         note = (
             f"the sampling rate of {path} is {other} by the file and {rate_hz:g} Hz by the machine file, "
@@ -165,16 +185,19 @@ def place_at(
         )
         return None, (note,)
     if column is None:
-        return None, _reversed(contents, length)
+        return None, _reversed(contents, length, channels)
     return column.stamps.rows, column.notes()
 
 
-def _stated(contents: Contents) -> dict[str, float]:
-    return {
-        name: value
-        for name, value in contents.scalars().items()
-        if name.rpartition(".")[2].lower() in RATE_NAMES
+def _stated(contents: Contents, channels: Collection[str]) -> dict[str, float]:
+    """What the file says outright: for all that it holds, and for the channels."""
+    stated = {
+        name: value for name, value in contents.scalars().items() if last_part(name).lower() in RATE_NAMES
     }
+    own = {name: contents.rates_hz[name] for name in channels if name in contents.rates_hz}
+    if len(set(own.values())) == 1:
+        own = dict(list(own.items())[:1])
+    return stated | {f"rate of {name}": hz for name, hz in own.items()}
 
 
 def _refuse_contradictions(
@@ -224,17 +247,19 @@ def time_column(contents: Contents, length: int) -> str | None:
     without a header it is the first column if it rises by even steps, which no measured signal does. Steps
     of one are left: they number the samples.
     """
-    columns = (_read(contents, name) for name in _candidates(contents, length))
+    columns = (_read(contents, name) for name in _candidates(contents, length, ()))
     return next((column.name for column in columns if column is not None and column.stamps.is_even), None)
 
 
-def _time(path: Path, contents: Contents, length: int) -> _TimeColumn | None:
+def _time(path: Path, contents: Contents, length: int, channels: Collection[str]) -> _TimeColumn | None:
     """The column of time: the first even one, else the first that tells the mean rate at least.
 
     Raises:
         RecordingError: it lacks most of the samples.
     """
-    columns = [column for name in _candidates(contents, length) if (column := _read(contents, name))]
+    columns = [
+        column for name in _candidates(contents, length, channels) if (column := _read(contents, name))
+    ]
     column = next((one for one in columns if one.stamps.is_even), columns[0] if columns else None)
     rows = None if column is None else column.stamps.rows
     if column is not None and rows is not None and rows[-1] >= MOST_STRETCHED * length:
@@ -246,18 +271,30 @@ def _time(path: Path, contents: Contents, length: int) -> _TimeColumn | None:
     return column
 
 
-def _candidates(contents: Contents, length: int) -> list[str]:
+def _candidates(contents: Contents, length: int, channels: Collection[str]) -> list[str]:
+    if own := {contents.times[name] for name in channels if name in contents.times}:
+        return [name for name in sorted(own) if len(contents.entries[name]) == length > 2]
     fitting = {
         name: values
         for name, values in contents.entries.items()
         if values.ndim == 1 and len(values) == length > 2 and values.dtype.kind in "iufM"
     }
-    names = [name for name, values in fitting.items() if values.dtype.kind == "M" or _is_named(name)]
+    of_others = set(contents.times.values())
+    names = [
+        name
+        for name, values in fitting.items()
+        if (values.dtype.kind == "M" or _is_named(name)) and name not in of_others
+    ]
     if contents.is_table and not contents.has_header and "0" in fitting and len(fitting) > 1:
         first = np.asarray(fitting["0"][:2], np.float64)
         if abs(first[1] - first[0]) != 1.0:
             names.append("0")
     return names
+
+
+def _is_time(contents: Contents, name: str) -> bool:
+    """Whether a column is one of time by the structure of the file, or by its name."""
+    return name in contents.times.values() or _is_named(name)
 
 
 def _is_named(name: str) -> bool:
@@ -268,13 +305,14 @@ def _read(contents: Contents, name: str) -> _TimeColumn | None:
     """What a column says if it is one of time; None if it says nothing."""
     values = contents.entries[name]
     with np.errstate(invalid="ignore"):  # infinities make NaN
-        seconds, unit, unit_is_named = _seconds(name, values)
-    stamps = rate_of_stamps(seconds, surely_time=values.dtype.kind == "M" or _is_named(name))
+        seconds, unit, unit_is_named = _seconds(contents, name)
+    stamps = rate_of_stamps(seconds, surely_time=values.dtype.kind == "M" or _is_time(contents, name))
     return None if stamps is None else _TimeColumn(name, unit, unit_is_named, stamps)
 
 
-def _seconds(name: str, values: NDArray[np.generic]) -> tuple[Floats, str, bool]:
+def _seconds(contents: Contents, name: str) -> tuple[Floats, str, bool]:
     """Seconds since the first sample, the unit that they were in, and whether the file names it."""
+    values = contents.entries[name]
     if values.dtype.kind == "M":
         return (values - values[0]) / np.timedelta64(1, "s"), "dates", True
     named = TIME_NAME.fullmatch(name)
@@ -283,14 +321,14 @@ def _seconds(name: str, values: NDArray[np.generic]) -> tuple[Floats, str, bool]
         values = values.astype(np.int64)  # the differences of unsigned or short ones wrap
     # Nanoseconds since 1970 have more digits than a float64.
     since_first = (values - values[0]).astype(np.float64)
-    if unit in PER_SECOND:
+    if unit in PER_SECOND and name not in contents.times.values():
         return since_first / PER_SECOND[unit], unit, True
-    return since_first, "seconds", unit is not None
+    return since_first, "seconds", unit is not None or name in contents.times.values()
 
 
-def _reversed(contents: Contents, length: int) -> tuple[str, ...]:
+def _reversed(contents: Contents, length: int, channels: Collection[str]) -> tuple[str, ...]:
     """A note on a column of time that goes backwards from row to row, if there is one."""
-    why = _why_not(contents, length)
+    why = _why_not(contents, length, channels)
     if _BACKWARDS not in why:
         return ()
     note = (
@@ -300,12 +338,12 @@ def _reversed(contents: Contents, length: int) -> tuple[str, ...]:
     return (note,)
 
 
-def _why_not(contents: Contents, length: int) -> str:
+def _why_not(contents: Contents, length: int, channels: Collection[str]) -> str:
     """Why a column that looks like time is of no use."""
-    for name in _candidates(contents, length):
-        if _is_named(name):
+    for name in _candidates(contents, length, channels):
+        if _is_time(contents, name):
             with np.errstate(invalid="ignore"):
-                steps = np.diff(_seconds(name, contents.entries[name])[0])
+                steps = np.diff(_seconds(contents, name)[0])
             known = steps[np.isfinite(steps)]
             if not len(known):
                 return f", and its time column {name!r} has no two times in a row"

@@ -40,6 +40,7 @@ class Recording:
         scalars: the single numbers of the file, e.g. ``{"RPM": 1797.0}``.
         texts: its single texts, e.g. ``{"label": "healthy"}``.
         notes: what a person should know of how it was read, in sentences.
+        units: of the channels that the file names one of, as it spells them.
     """
 
     names: tuple[str, ...]
@@ -53,6 +54,7 @@ class Recording:
     scalars: Mapping[str, float] = field(default_factory=dict)
     texts: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
 
 
 class _ReadingLimits:
@@ -84,11 +86,11 @@ def get_limits() -> ResourceLimits:
 def load_recording(
     path: Path | str, channels: Mapping[str, str] | None = None, rate_hz: float | None = None
 ) -> Recording:
-    """Read channels from an ``.npz``, ``.mat`` (up to v7), ``.csv[.gz]``, ``.wav`` or ``.parquet`` file.
+    """Read channels from a file of one of the kinds of `formats.READERS`.
 
     In the file a channel is named by its variable (``X105_DE_time``), the field of a struct
     (``bearing.gs``), a column of a matrix (``data[2]``), the header or number from 0 of a table's column,
-    or the number from 0 of a WAV file's channel.
+    the number from 0 of a WAV file's channel, or the path of an HDF5 file's data set (``run/accel``).
 
     The file is read in a process of its own, within the limits of `set_limits`: what is damaged or hostile
     costs that process at most. Samples that are missing by a column of time are NaN.

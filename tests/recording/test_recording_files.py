@@ -196,7 +196,11 @@ def test_an_unknown_rate_is_asked_for(tmp_path):
         ("a.npz", _npz(x=np.array([])), "is too short"),
         ("a.csv", b"1,2\n", "is too short"),
         ("a.npz", ENCRYPTED_NPZ, "cannot be read: .*encrypted"),
-        ("a.tdms", b"TDSm", r"use .npz, .mat, .csv, .csv.gz, .wav, .parquet$"),
+        (
+            "a.sie",
+            b"TDSm",
+            r"use .npz, .mat, .csv, .csv.gz, .wav, .parquet, .tdms, .mf4, .uff, .unv, .h5, .hdf5$",
+        ),
     ],
 )
 def test_files_that_cannot_be_read(tmp_path, name, content, message):

@@ -8,13 +8,16 @@ import pickle
 import struct
 import zipfile
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, cast
 
 import can
+import h5py
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from scipy.io import savemat, wavfile
+from support.foreign_files import WRITERS
 from support.fuzz_bytes import mutated
 
 if TYPE_CHECKING:
@@ -55,6 +58,15 @@ def _csv(samples: np.ndarray = SAMPLES) -> bytes:
 
 _CHANNELS = {"x": SAMPLES[:, 0], "y": SAMPLES[:, 1]}
 
+
+def _foreign(ending: str) -> bytes:
+    """As the library of the format writes it."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / f"sound{ending}"
+        WRITERS[ending](path, _CHANNELS, RATE_HZ, "g")
+        return path.read_bytes()
+
+
 SOUND: dict[str, bytes] = {
     ".npz": _npz(**_CHANNELS, t=np.arange(60) / RATE_HZ, label="healthy"),
     ".mat": _mat({**_CHANNELS, "rig": {"name": "hall 3"}, "parts": np.array([1.0, "a"], dtype=object)}),
@@ -62,6 +74,7 @@ SOUND: dict[str, bytes] = {
     ".csv.gz": gzip.compress(_csv()),
     ".wav": _wav(SAMPLES.astype(np.float32)),
     ".parquet": _parquet(pa.table(_CHANNELS)),
+    **{ending: _foreign(ending) for ending in WRITERS},
 }
 """Sound files, by the ends of their names."""
 
@@ -127,9 +140,48 @@ def _wav_header(channels: int, bits: int, size: int) -> bytes:
     )
 
 
+def _h5(**sets: tuple[tuple[int, ...], str]) -> bytes:
+    """Data sets by their shapes and types, of which nothing is written."""
+    stream = io.BytesIO()
+    with h5py.File(stream, "w") as file:
+        for name, (shape, dtype) in sets.items():
+            file.create_dataset(name, shape, dtype, chunks=True)
+    return stream.getvalue()
+
+
+def _tdms(count: int) -> bytes:
+    """A segment whose only channel says that it has so many samples,
+
+    Layout: NI, "TDMS File Format Internal Structure".
+    """
+
+    def text(value: str) -> bytes:
+        return struct.pack("<I", len(value)) + value.encode()
+
+    channel = text("/'run'/'x'") + struct.pack("<IIIQ", 20, 10, 1, count) + struct.pack("<I", 0)
+    body = struct.pack("<I", 1) + channel
+    lead = b"TDSm" + struct.pack("<IIQQ", 0b1110, 4713, len(body) + 80, len(body))
+    return lead + body + bytes(80)
+
+
 def structures() -> dict[str, bytes]:
     """Files whose parts are sound and whose whole is not; none can be judged."""
     return {
+        "many.tdms": _tdms(2**62),
+        "objects.tdms": b"TDSm" + struct.pack("<IIQQI", 0b1110, 4713, 2**40, 2**40, 2**32 - 1),
+        "empty.tdms": b"",
+        "zero.mf4": bytes(4000),
+        "empty.mf4": b"",
+        "header.mf4": b"MDF     4.10    " + bytes(200),
+        "links.mf4": b"MDF     4.10    " + SOUND[".mf4"][16:64] + b"\xff" * 400,
+        "empty.uff": b"",
+        "functions.uff": b"    -1\n    58\n    -1\n" * 50_000,
+        "words.uff": b"    -1\n    58\n" + b"NONE\n" * 40 + b"    -1\n",
+        "empty.h5": b"",
+        "shape.h5": _h5(x=((10**12,), "f8")),
+        "cube.h5": _h5(x=((3, 3, 3), "f8")),
+        "columns.h5": _h5(x=((5_000, 5_000), "i1")),
+        "texts.h5": _h5(x=((3,), "S9")),
         "columns.csv": b",".join(b"c%d" % i for i in range(1_000_000)) + b"\n" + b"0," * 999_999 + b"0\n",
         "line.csv": b"x\n" + b"1" * 3_000_000,
         "ragged.csv": b"x,y\n" + b"1,2\n" * 30 + b"1,2,3,4\n1\n",

@@ -8,9 +8,13 @@ from typing import TYPE_CHECKING
 from daqsvc.confined.limits import Budget, TooLargeError
 from daqsvc.recording import RecordingError
 from daqsvc.recording.formats.delimited import read_csv
+from daqsvc.recording.formats.hdf5 import read_hdf5
 from daqsvc.recording.formats.matlab import read_mat
+from daqsvc.recording.formats.mdf import read_mdf
 from daqsvc.recording.formats.numpy_archive import read_npz
 from daqsvc.recording.formats.parquet import read_parquet
+from daqsvc.recording.formats.tdms import read_tdms
+from daqsvc.recording.formats.uff import read_uff
 from daqsvc.recording.formats.wav import read_wav
 
 if TYPE_CHECKING:
@@ -27,6 +31,12 @@ READERS: Mapping[str, Callable[[Path, Budget], Contents]] = {
     ".csv.gz": read_csv,
     ".wav": read_wav,
     ".parquet": read_parquet,
+    ".tdms": read_tdms,
+    ".mf4": read_mdf,
+    ".uff": read_uff,
+    ".unv": read_uff,
+    ".h5": read_hdf5,
+    ".hdf5": read_hdf5,
 }
 
 

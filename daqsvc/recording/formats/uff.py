@@ -1,0 +1,108 @@
+"""Universal files of data set 58, ASCII or binary: one function at a nodal degree of freedom in each."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from daqsvc.recording import RecordingError
+from daqsvc.recording.contents import Contents, check_columns, column_names
+from daqsvc.recording.formats.extras import needed
+from daqsvc.recording.rate import rate_of_step
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from daqsvc.confined.limits import Budget
+
+FUNCTION = 58
+"""Number of the data set."""
+
+TIME_RESPONSES = frozenset({0, 1})
+"""Kinds of function that a recording is made of: general or unknown, and time response."""
+
+TIME = frozenset({0, 1, 17})
+"""What its abscissa may be: unknown, general, or time."""
+
+DIRECTIONS = {0: "", 1: "+X", 2: "+Y", 3: "+Z", 4: "+RX", 5: "+RY", 6: "+RZ"} | {
+    -1: "-X",
+    -2: "-Y",
+    -3: "-Z",
+    -4: "-RX",
+    -5: "-RY",
+    -6: "-RZ",
+}
+
+_STEP_DIGITS = 6
+"""Of the time between two samples in an ASCII file: E13.5."""
+
+_EXPANSION = 2
+"""A number of four bytes becomes one of eight."""
+
+
+def read_uff(path: Path, budget: Budget) -> Contents:
+    """Time responses by the first line of their headers, or by node and direction."""
+    pyuff = needed(path, "pyuff", "pyuff")
+    budget.check_declared(_EXPANSION * budget.file_bytes)
+    file = pyuff.UFF(str(path))
+    numbers = [i for i, kind in enumerate(file.get_set_types()) if int(kind) == FUNCTION]
+    if not numbers:
+        raise RecordingError(f"{path} holds no function; save the time signals in it as data sets 58")
+    check_columns(len(numbers))
+    entries: dict[str, NDArray[np.generic]] = {}
+    rates_hz, times, units = {}, {}, {}
+    sets: list[Mapping[str, Any]] = [_without_abscissa(file.read_sets(i)) for i in numbers]
+    names = _names(sets)
+    for name, one in zip(names, sets, strict=True):
+        samples = np.asarray(one["data"])
+        if not _is_recording(one) or samples.dtype.kind not in "iuf":
+            entries[name] = np.empty(1, dtype=object)
+            continue
+        if len(samples) != one["num_pts"]:
+            raise RecordingError(
+                f"{path} cannot be read: {name!r} should have {one['num_pts']} samples and has "
+                f"{len(samples)}; copy or save it anew"
+            )
+        entries[name] = samples
+        if int(one["abscissa_spacing"]) == 1:
+            rates_hz[name] = rate_of_step(float(one["abscissa_inc"]), _STEP_DIGITS)
+        else:
+            times[name] = f"abscissa of {name}"
+            entries[times[name]] = np.asarray(one["x"])
+        if unit := _text(one.get("ordinate_axis_units_lab")):
+            units[name] = unit
+    if start := _text(sets[0].get("id3")):
+        entries.setdefault("start_time", np.array(start))
+    return Contents(entries, rates_hz=rates_hz, times=times, units=units)
+
+
+def _without_abscissa(one: dict[str, Any]) -> dict[str, Any]:
+    """Without the column of even steps, which nobody needs."""
+    if int(one["abscissa_spacing"]) == 1:
+        one.pop("x", None)
+    return one
+
+
+def _is_recording(one: Mapping[str, Any]) -> bool:
+    return int(one["func_type"]) in TIME_RESPONSES and int(one["abscissa_spec_data_type"]) in TIME
+
+
+def _names(sets: Sequence[Mapping[str, Any]]) -> list[str]:
+    lines = [_text(one.get("id1")) for one in sets]
+    if all(lines) and len(set(lines)) == len(lines):
+        return column_names(lines)
+    places = [f"{int(one['rsp_node'])}{_direction(int(one['rsp_dir']))}" for one in sets]
+    return column_names(places)
+
+
+def _direction(number: int) -> str:
+    return DIRECTIONS.get(number, f":{number}")
+
+
+def _text(value: Any) -> str:
+    text = str(value or "").strip()
+    return "" if text.upper() == "NONE" else text
