@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -33,7 +33,8 @@ RATE_NAMES = frozenset(
 
 TIME_NAME = re.compile(
     # A capital T alone is a temperature or a torque.
-    r"(?:.*[./])?(?:t|(?i:time|elapsed|zeit))(?:[\s_]*[\[(]?(?P<unit>s|sec|seconds|ms|us|µs|μs|ns)[\])]?)?"
+    r"(?:.*[./])?(?:t|(?i:(?:elapsed|relative|absolute|rel\.|abs\.)?[\s_]*(?:time|elapsed|zeit)|(?:date|time|zeit)[\s_-]?(?:stamp|stempel)|"
+    r"date|datum|uhrzeit|date[\s_/]*time|datum[\s_/]*(?:uhr)?zeit))(?:[\s_]*[\[(]?(?P<unit>s|sec|seconds|ms|us|µs|μs|ns)[\])]?)?"
 )
 """Names that a column of time may have, with its unit or in seconds: ``t``, ``Time [ms]``, ``time_s``."""
 
@@ -321,9 +322,47 @@ def _seconds(contents: Contents, name: str) -> tuple[Floats, str, bool]:
         values = values.astype(np.int64)  # the differences of unsigned or short ones wrap
     # Nanoseconds since 1970 have more digits than a float64.
     since_first = (values - values[0]).astype(np.float64)
+    if unit is None and name not in contents.times.values() and (clock := _clock(values, since_first)):
+        return since_first * clock.s_each, clock.words, True
     if unit in PER_SECOND and name not in contents.times.values():
         return since_first / PER_SECOND[unit], unit, True
     return since_first, "seconds", unit is not None or name in contents.times.values()
+
+
+class _Clock(NamedTuple):
+    """A way to count time that its numbers give away.
+
+    Attributes:
+        words: what it is called.
+        s_each: seconds of each.
+        least, most: the numbers of some fifty years.
+    """
+
+    words: str
+    s_each: float
+    least: float
+    most: float
+
+
+_CLOCKS = (
+    _Clock("milliseconds since 1970", 1e-3, 3e11, 3e12),
+    _Clock("microseconds since 1970", 1e-6, 3e14, 3e15),
+    _Clock("nanoseconds since 1970", 1e-9, 3e17, 3e18),
+)
+_EXCEL = _Clock("days of Excel", 86_400.0, 2e4, 8e4)
+
+_SHORT_STEP_DAYS = 1e-6
+"""A twelfth of a second: seconds would be a hundred times as short as any logger's."""
+
+
+def _clock(values: NDArray[np.generic], since_first: Floats) -> _Clock | None:
+    """How a column counts time that does not say it; None if it may be in seconds since any moment."""
+    first = float(values[0])
+    if _EXCEL.least <= first <= _EXCEL.most:
+        known = since_first[np.isfinite(since_first)]
+        mean = abs(known[-1] - known[0]) / max(1, len(known) - 1) if len(known) else 0.0
+        return _EXCEL if 0.0 < mean < _SHORT_STEP_DAYS else None
+    return next((clock for clock in _CLOCKS if clock.least <= first <= clock.most), None)
 
 
 def _reversed(contents: Contents, length: int, channels: Collection[str]) -> tuple[str, ...]:

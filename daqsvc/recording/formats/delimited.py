@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import gzip
 import io
+import itertools
 import re
 import struct
 from contextlib import contextmanager
@@ -20,6 +21,7 @@ from daqsvc.confined.limits import CountedFile, TooLargeError
 from daqsvc.recording import RecordingError
 from daqsvc.recording.contents import LONGEST_NAME, Contents
 from daqsvc.recording.formats.table_layout import SNIFFED_LINES, is_number, layout_of
+from daqsvc.recording.formats.written_times import in_turn, times_of
 
 if TYPE_CHECKING:
     from collections.abc import Generator
@@ -41,6 +43,7 @@ LONGEST_LINE = 1_000_000
 """Characters; what is longer among the first lines is no table."""
 
 _MOST_STATEMENTS = 1000
+_BLOCK_ROWS = 1 << 16
 
 
 def read_csv(path: Path, budget: Budget) -> Contents:
@@ -85,9 +88,34 @@ class _DelimitedTable:
             name: numbers[:, layout.numeric.index(i)] if i in layout.numeric else np.empty(1, dtype=object)
             for i, name in enumerate(layout.names)
         }
+        entries |= self._times(len(numbers))
         for name, number in {**layout.scalars, **self._stated}.items():
             entries.setdefault(name, np.array(number))
         return Contents(entries, is_table=True, has_header=layout.has_header)
+
+    def _times(self, length: int) -> dict[str, NDArray[np.generic]]:
+        """The columns of times, datetime64[ns]; a date and the time of the day beside it are one."""
+        layout, forms = self._layout, self._layout.times
+        if not forms:
+            return {}
+        pieces: dict[int, list[NDArray[np.datetime64]]] = {i: [] for i in forms}
+        with contextlib.closing(self._rows(fill=False)) as rows:
+            while block := list(itertools.islice(rows, _BLOCK_ROWS)):
+                cells = [layout.split(line) for line in block]
+                for i, form in forms.items():
+                    pieces[i].append(times_of([row[i] if len(row) > i else "" for row in cells], form))
+        columns = {i: np.concatenate(parts)[:length] for i, parts in pieces.items()}
+        entries: dict[str, NDArray[np.generic]] = {}
+        for i, column in columns.items():
+            if forms[i].holds == "time":
+                date = next((j for j in (i - 1, i + 1) if j in forms and forms[j].holds == "date"), None)
+                joined = in_turn(column)
+                if date is not None:
+                    joined = column + (columns[date] - np.datetime64(0, "ns"))
+                entries[layout.names[i]] = joined
+            elif forms[i].holds == "both":
+                entries[layout.names[i]] = column
+        return entries
 
     def _first_lines(self) -> list[str]:
         first: list[str] = []

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import csv
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from daqsvc.recording.contents import check_columns, column_names
+from daqsvc.recording.formats.written_times import format_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+
+    from daqsvc.recording.formats.written_times import TimeFormat
 
 DELIMITERS = ("\t", ";", "|", ",", " ")
 """Between the columns, tried in this order (a comma may also be a decimal point)."""
@@ -26,7 +29,8 @@ _LEAST_TABLE_LINES = 2
 
 UNIT = re.compile(
     r"(?i)[\[(]?\s*(?:|-+|%|s|sec|ms|us|µs|μs|ns|h|min|date|time|V|mV|uV|µV|A|mA|g|mg|m/s2|m/s²|m/s\^2|mm/s|m/s|in/s|"
-    r"m|mm|um|µm|μm|mil|mils|Hz|kHz|rpm|1/min|U/min|°|deg|rad|°C|C|degC|K|N|kN|Nm|Pa|kPa|MPa|bar|W|kW)\s*[\])]?"
+    r"m|mm|um|µm|μm|mil|mils|Hz|kHz|rpm|1/min|U/min|°|deg|rad|°C|C|degC|K|N|kN|Nm|Pa|kPa|MPa|bar|W|kW|"
+    r"(?:[dt]{1,2}|[yj]{2,4})[./ -]?[mdytjhs.,:/ \-f0]*|hh?:mm[:s.,f0]*)\s*[\])]?"
 )
 """What stands in a line of units."""
 
@@ -50,6 +54,7 @@ class Layout:
         names: of the columns.
         numeric: numbers of those that hold numbers.
         scalars: numbers that the preamble states.
+        times: for columns of times in words, how these are written, by their numbers.
     """
 
     delimiter: str | None
@@ -59,6 +64,7 @@ class Layout:
     names: Sequence[str]
     numeric: Sequence[int]
     scalars: Mapping[str, float]
+    times: Mapping[int, TimeFormat] = field(default_factory=dict)
 
     @property
     def width(self) -> int:
@@ -85,7 +91,16 @@ def layout_of(lines: Sequence[str]) -> Layout:
     """
     plain, fits = _from_the_first_line(lines)
     behind = None if fits else _behind_a_preamble(lines)
-    return behind or plain
+    layout = behind or plain
+    return replace(layout, times=_times(layout, lines[layout.lines_before :]))
+
+
+def _times(layout: Layout, body: Sequence[str]) -> dict[int, TimeFormat]:
+    """The columns of times in words among those that are not numeric."""
+    rows = [layout.split(line) for line in body]
+    words = (i for i in range(layout.width) if i not in layout.numeric)
+    formats = {i: format_of([row[i] for row in rows if len(row) > i]) for i in words}
+    return {i: form for i, form in formats.items() if form is not None}
 
 
 def _from_the_first_line(lines: Sequence[str]) -> tuple[Layout, bool]:
@@ -132,6 +147,7 @@ def _behind_a_preamble(lines: Sequence[str]) -> Layout | None:
             first -= 1
         if len(rows) - first < _LEAST_TABLE_LINES:
             continue
+        table = replace(table, times=_times(table, lines[first:]))
         if any(_is_like(row, table) for row in rows[:first]):
             return None
         header = _header_above(rows, first, width)
@@ -147,6 +163,8 @@ def _is_like(row: Sequence[str], table: Layout) -> bool:
     """Whether a line is rather a damaged row of samples than one about them."""
     if len(row) < table.width:
         return False
+    if table.times:
+        return any(form.fits(row[i]) for i, form in table.times.items())
     numbers = [table.is_number(row[i]) for i in table.numeric]
     return numbers[0] if table.numeric[0] == 0 else sum(numbers) * 2 >= len(numbers)
 
