@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import time
 from typing import TYPE_CHECKING, Any, Protocol, Self
 
@@ -32,6 +33,10 @@ if TYPE_CHECKING:
     Send = Callable[[NDArray[np.int64], NDArray[np.float64]], NDArray[np.bool_]]
 
 TICK_S = 0.05
+STILL_S = 2.0
+"""Devices that are so late have stood still: this process was starved, which is no fault of the service."""
+AT_ONCE_S = 1.0
+"""What a device sends at once at most; older samples are none that it could send."""
 MODULUS = 2**24
 """What a device writes beside each sample is its number, modulo this: a float of 32 bits has all of them."""
 CALM_G, LOUD_G = 0.1, 8.0
@@ -69,6 +74,7 @@ class Device:
         self.disturbances = 0
         self.disturbed_at = 0
         self.steady = False
+        self._recovers = False
         self.send: Send = lambda first, _: np.zeros(len(first), np.bool_)
         self._per_frame = per_frame
         self._rng = np.random.default_rng(seed)
@@ -79,7 +85,17 @@ class Device:
         """Something happens to its wire."""
         self.disturbances += 1
         self.disturbed_at = self.count
-        self.steady = False
+        self.steady = self._recovers = False
+
+    def stand_still(self) -> None:
+        """It was not played for a while: who reads it may have lost samples, until it is read on steadily."""
+        self.disturb()
+        self._recovers = True
+
+    def read_to(self, number: int) -> None:
+        """The service has samples up to a number."""
+        if self._recovers and number > self.disturbed_at:
+            self.steady, self._recovers = True, False
 
     def step(self) -> None:
         """Take the samples that are due, and send them."""
@@ -92,7 +108,10 @@ class Device:
         x = self._rng.normal(scale=self.rms_g, size=number.shape).clip(-30.0, 30.0)
         self.count = due * self._per_frame
         samples = np.stack([x, number], axis=2)
-        sent = np.zeros(frames, np.bool_) if self.silent else self.send(first, samples)
+        sent = np.zeros(frames, np.bool_)
+        if not self.silent:
+            late = 0 if self.keeps else max(0, frames - math.ceil(AT_ONCE_S * self.rate_hz / self._per_frame))
+            sent[late:] = self.send(first[late:], samples[late:])
         for begin in first[~sent].tolist():
             self._miss(begin, begin + self._per_frame)
 
@@ -213,6 +232,7 @@ class Plant:
         devices: by the names of their machines.
         wires: likewise.
         answered: requests for the trend value that were answered.
+        stood_still_s: how long they were not played, each time.
         tcp_port: of the Modbus server.
 
     Args:
@@ -223,6 +243,7 @@ class Plant:
     def __init__(self, folder: Path, seed: int) -> None:
         self.folder = folder
         self.answered = 0
+        self.stood_still_s: list[float] = []
         kinds = {
             "pump": (640.0, 10),
             "fan": (100.0, 1),
@@ -291,9 +312,15 @@ class Plant:
             await wire.pull()
 
     async def _play(self) -> None:
+        played_s = time.monotonic()
         while True:
+            late_s, played_s = time.monotonic() - played_s - TICK_S, time.monotonic()
+            if late_s > STILL_S:
+                self.stood_still_s.append(late_s)
             for device in self.devices.values():
                 device.step()
+                if late_s > STILL_S:
+                    device.stand_still()
             await asyncio.sleep(TICK_S)
 
     def _asked(self, name: str, unit: int) -> PlannedReply:

@@ -64,6 +64,7 @@ class Report:
         duration_s: of all.
         cpu_share: of a core that the service took in its last life.
         own_cpu_share: of a core that devices, consumer and books took.
+        stood_still_s: how long these stood still each time, starved by the host.
         directory: where its traces are.
     """
 
@@ -77,6 +78,7 @@ class Report:
     duration_s: float
     cpu_share: float
     own_cpu_share: float
+    stood_still_s: list[float]
     directory: Path
 
     def __str__(self) -> str:
@@ -86,6 +88,7 @@ class Report:
         lines = [
             f"{self.duration_s:.0f} s, {self.lives} lives of the process",
             f"of a core: the service {self.cpu_share:.1%}, devices and books {self.own_cpu_share:.1%}",
+            f"these stood still {len(self.stood_still_s)} times, for {sum(self.stood_still_s):.1f} s",
             "what befell it: " + ", ".join(f"{kind} {times}" for kind, times in sorted(self.befell.items())),
             "stream       books  compared   received      lost    of these unsent",
         ]
@@ -213,6 +216,7 @@ class Soak:
                         )
                     )
                 )
+                device.read_to(book.next_number)
             if name == "fan" and self.ledger.trend is not None:
                 self.say(list(self.ledger.trend.enter(streams["temperature"], self.plant.answered)))
             cycle = self.cycles.get(name)
@@ -506,7 +510,7 @@ class Soak:
             order = self.rng.sample(sorted(faults), k=len(faults))
             for kind in order:
                 late = self.elapsed_s > SHARE_WITH_KILLS * self.seconds and self.befell["process killed"]
-                if (kind == "process killed" and late) or (
+                if (kind == "process killed" and late and len(faults) > 1) or (
                     self.elapsed_s > self.seconds and len(self.befell) == len(faults)
                 ):
                     continue
@@ -599,6 +603,7 @@ async def _carried_out(one: Soak) -> Report:
         time.monotonic() - begun_s,
         cpu_share,
         (time.process_time() - own_s) / (time.monotonic() - begun_s),
+        one.plant.stood_still_s,
         one.directory,
     )
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 import json
+import random
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,6 +18,7 @@ from soak.books import Book, TrendBook
 from soak.devices import MODULUS, Device
 from soak.figures import MIB, Trend
 from soak.machines import ALARM
+from soak.run import Soak
 
 SECOND_NS = 4 * 10**9
 COUNTED = {"counter_restarts": 0, "frames_rejected": 0, "frames_set_aside": 0, "frames_late": 0}
@@ -193,3 +198,37 @@ def test_memory_that_grows_is_told_from_memory_that_varies() -> None:
     assert "memory was 100.0 MiB and is 120.0" in leap.violations()[0]
     with pytest.raises(ValueError, match="too few"):
         Trend.of([(0.0, 1)])
+
+
+def test_a_device_that_was_not_played_sends_no_more_than_a_second_and_excuses_what_is_lost() -> None:
+    device = Device("pump", 100.0, 10, seed=1)
+    sent: list[int] = []
+    device.send = lambda first, samples: (sent.extend(first.tolist()), np.ones(len(samples), np.bool_))[1]
+    device._begun_s -= 50.0
+    device.step()
+    assert device.count - sent[0] == 100
+    assert device.unsent(0, device.count) == sent[0]
+    device.steady = True
+    device.stand_still()
+    device.read_to(device.count - 1)
+    assert not device.steady
+    device.read_to(device.count + 1)
+    assert device.steady
+    device.stand_still()
+    device.disturb()
+    device.read_to(device.count + 1)
+    assert not device.steady, "a wire that is pulled meanwhile is another matter"
+
+
+async def test_one_thing_that_befalls_it_does_so_again_and_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    plant: Any = SimpleNamespace(devices={})
+    parts: Any = None
+    one = Soak(Path(), 9.0, random.Random(1), plant, parts, parts, parts, None, {}, {}, ("process killed",))
+
+    async def killed() -> None:
+        one._begun_s -= 1.0
+
+    monkeypatch.setattr(one, "killed", killed)
+    monkeypatch.setattr(one, "count", lambda: asyncio.sleep(0))
+    await one.befall()
+    assert one.befell["process killed"] > 4
