@@ -37,7 +37,7 @@ from drivers.frames import LayoutError
 from drivers.make import bus_driver, bus_drivers, bus_self_checks
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Collection, Mapping
     from pathlib import Path
 
     from daqsvc.acquisition.clock import Clock
@@ -393,7 +393,7 @@ class Service:
         names = (*found.machines_anew, *found.machines_new)
         watches = {name: await asyncio.to_thread(self._watch, box, name) for name in names}
         drivers = {
-            name: bus_driver(box.own, name, self.clock, self._deliver, self._stand)
+            name: bus_driver(box.own, name, self.clock, self._deliver, self._stand, at_start=False)
             for name in (*found.buses_anew, *found.buses_new)
         }
         for watch in watches.values():
@@ -565,9 +565,28 @@ class Service:
 
     def figures(self) -> dict[str, Any]:
         """The service's figures by what they belong to: streams, buses, detectors, alarms, outbox, MQTT."""
+        machines = {machine: {"alarms": self.alarms.figures_of(machine)} for machine in self.alarms.managers}
+        figures = self._figures(self.watches, self.box.own.buses, self.alarms.figures())
+        return figures if self.box.is_single else {**figures, MACHINES: machines}
+
+    def figures_of(self, machine: str) -> dict[str, Any]:
+        """The figures of one machine, by the names of its file."""
+        if self.box.is_single:
+            return self.figures()
+        watches, buses = {machine: self.watches[machine]}, self.box.machines[machine].buses
+        alarms = self.alarms.figures_of(machine)
+        figures = {**self._figures(watches, buses, alarms), MACHINES: {machine: {"alarms": alarms}}}
+        return of_machine(figures, machine, buses)
+
+    def _figures(
+        self, watches: Mapping[str, MachineWatch], on: Collection[str], alarms: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        """The figures of the service, and of some machines on some buses."""
         streams: dict[str, Mapping[str, float | str]] = {}
         buses: dict[str, Mapping[str, Any]] = {}
         for driver in self.driver_reports:
+            if driver.name not in on:
+                continue
             link = driver.link
             buses[driver.name] = {
                 "up": int(link.state == "up"),
@@ -575,6 +594,8 @@ class Service:
                 **asdict(driver.counters),
             }
             for name, (counters, base) in driver.streams.items():
+                if self.streams[name].watch not in watches.values():
+                    continue
                 ring, standing = self.streams[name].ring, self.streams[name].standing
                 streams[name] = {
                     **asdict(counters),
@@ -589,35 +610,30 @@ class Service:
         return {
             "streams": streams,
             "buses": buses,
-            "grids": self._of_machines(lambda watch: watch.alignment.figures()),
+            "grids": self._of_machines(watches, lambda watch: watch.alignment.figures()),
             "detectors": self._of_machines(
-                lambda watch: {name: asdict(counted) for name, counted in watch.pipeline.counters.items()}
+                watches,
+                lambda watch: {name: asdict(counted) for name, counted in watch.pipeline.counters.items()},
             ),
             "loop_lag_ms": self.lag.figures_ms(),
             "suspensions": self.lag.suspensions,
             "failures": dict(self.supervisor.failures),
-            "alarms": self.alarms.figures(),
+            "alarms": alarms,
             "commands": asdict(self.alarms.commands),
             "control": asdict(self.control.counters),
             "outbox": asdict(self.alarms.outbox.counters),
             **self._figures_of_outputs(),
-            **({} if self.box.is_single else {MACHINES: self._figures_of_machines()}),
         }
 
-    def _of_machines(self, figures: Callable[[MachineWatch], Mapping[str, Any]]) -> dict[str, Any]:
-        """Figures of all machines by their names on the box."""
+    def _of_machines(
+        self, watches: Mapping[str, MachineWatch], figures: Callable[[MachineWatch], Mapping[str, Any]]
+    ) -> dict[str, Any]:
+        """Figures of machines by their names on the box."""
         return {
             self.box.stream_key(machine, name): one
-            for machine, watch in self.watches.items()
+            for machine, watch in watches.items()
             for name, one in figures(watch).items()
         }
-
-    def _figures_of_machines(self) -> dict[str, Any]:
-        return {machine: {"alarms": self.alarms.figures_of(machine)} for machine in self.alarms.managers}
-
-    def figures_of(self, machine: str) -> dict[str, Any]:
-        """The figures of one machine, by the names of its file."""
-        return of_machine(self.figures(), machine, self.box.machines[machine].buses)
 
     def _figures_of_outputs(self) -> dict[str, Mapping[str, Any]]:
         figures: dict[str, Mapping[str, Any]] = {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
 from daqsvc.acquisition.standing import tell_nobody
@@ -58,6 +59,8 @@ def bus_driver(
     clock: Clock,
     deliver: Callable[[SampleBlock], None],
     tell: Tell = tell_nobody,
+    *,
+    at_start: bool = True,
 ) -> Driver:
     """The driver of one bus.
 
@@ -67,6 +70,7 @@ def bus_driver(
         clock: the service's clock.
         deliver: see `drivers.base.BusPort`.
         tell: see `drivers.base.BusPort`.
+        at_start: whether the service starts; one that runs does not end because a device is absent.
 
     Raises:
         AssemblyError: a driver cannot use an option, or fails when it is made.
@@ -74,9 +78,12 @@ def bus_driver(
     """
     bus = machine.buses[name]
     plugin = cast("DriverPlugin[Any]", bus_tables()[bus.driver])
+    port = bus_port(machine, name, clock, deliver, tell)
+    if not at_start and port.start == "error":
+        port = replace(port, start="retry")
     try:
         with failing_in(machine.path, f"buses.{name}"):
-            return plugin.build(plugin.absolute(machine, bus), bus_port(machine, name, clock, deliver, tell))
+            return plugin.build(plugin.absolute(machine, bus), port)
     except BusOptionError as error:
         raise AssemblyError(f"{machine.path}: buses.{name}: {error}") from error
 

@@ -243,7 +243,7 @@ class DetectorCounters:
     Attributes:
         windows: windows processed.
         samples: samples in them.
-        samples_skipped: samples it was too slow for, exactly; what never arrived is none.
+        samples_skipped: samples overwritten before it came to them, exactly; what never arrived is none.
         samples_withheld: samples that it was not given, since nothing could be judged by them.
         failures: windows in which it raised, against its contract.
         busy_ns: time its kernels took, on the host's clock.
@@ -490,7 +490,8 @@ class Pipeline:
         if missed := reader.samples_skipped - skipped_before:
             counters.samples_skipped += missed
             logger.warning(
-                "%s was too slow and has missed %d samples of %r from index %d on",
+                "%s has missed %d samples of %r from index %d on: more came at once than [pipeline] ring_s "
+                "holds, or this computer was too slow",
                 self._supervisor.named(_part(detector)),
                 missed,
                 detector.stream,

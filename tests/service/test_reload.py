@@ -243,6 +243,40 @@ async def test_what_is_on_a_bus_that_is_opened_anew_is_judged_again(tmp_path: Pa
         assert status["buses"]["can0"]["state"] == "up"
 
 
+ABSENT = """
+[buses.port]
+driver = "serial"
+port = "{port}"
+framing = "lines"
+baud = 115_200
+start = "error"
+
+[streams.more]
+bus = "port"
+rate_hz = 50.0
+
+[streams.more.layout]
+line = ["seq", "x"]
+counter = {{ column = "seq" }}
+channels = [{{ name = "x" }}]
+"""
+
+
+async def test_a_new_bus_may_be_absent_whatever_it_says_of_the_start(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    file, absent = tmp_path / "rig.toml", tmp_path / "nowhere"
+    put(file)
+    async with serving(file, store=tmp_path / "store") as service:
+        put(file, more=ABSENT.format(port=absent))
+        await service.reload()
+        said = lambda: [text for text in caplog.messages if f"{absent}" in text]  # noqa: E731
+        await eventually(said, "it is said that it is absent")
+        assert "it is being tried again" in said()[0]
+        assert not service.supervisor.failures
+    assert not any("failed" in text for text in caplog.messages)
+
+
 async def test_a_stop_in_the_middle_of_a_reload_is_a_stop(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

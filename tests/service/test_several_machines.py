@@ -171,7 +171,7 @@ async def test_machines_share_a_bus_a_journal_and_the_broker(tmp_path: Path) -> 
                 assert not service.alarms.managers["two"].counters.events
 
 
-async def test_the_service_speaks_of_itself_once(tmp_path: Path) -> None:
+async def test_the_service_speaks_of_itself_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     box = Box.several([machine("one", 1), machine("two", 2)])
     async with running_box(box, tmp_path / "store") as service:
         service.alarms.manager.condition("store/disk", Level.ALERT, "the disk is full")
@@ -182,6 +182,12 @@ async def test_the_service_speaks_of_itself_once(tmp_path: Path) -> None:
             assert [one["alarm"] for one in status["alarms"]["standing"]] == ["store/disk"]
         both = await asyncio.to_thread(ask_status, tmp_path / "store")
         assert [status["machine"] for status in both] == ["one", "two"]
+        known = service.figures()
+        with monkeypatch.context() as patch:
+            patch.setattr(
+                service.watches["two"].alignment, "figures", lambda: pytest.fail("nobody has asked")
+            )
+            assert service.figures_of("one").keys() == known.keys() - {"machines"}
         with pytest.raises(ControlError, match="watches one, two, not three"):
             await asyncio.to_thread(ask_status, tmp_path / "store", "three")
         wish = partial(AlarmCommand, verb=Verb.BYPASS, by="the test")
