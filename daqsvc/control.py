@@ -39,7 +39,7 @@ from daqsvc.outbox.files import is_possessed, is_read_only
 from daqsvc.outbox.reading import JOURNAL_NAME
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Collection, Iterator
+    from collections.abc import Awaitable, Callable, Collection, Iterator, Sequence
     from pathlib import Path
 
     from daqsvc.alarms.commands import AlarmCommand, CommandHandler
@@ -133,9 +133,13 @@ class WhichMachineAnswer(ControlAnswer):
 
 
 class ReloadAnswer(ControlAnswer):
-    """What a reload has changed, or would; or why it was refused, a sentence each."""
+    """What a reload has changed, or would; or why it was refused, a sentence each.
+
+    ``files`` are the machine files and directories that the service was started with, and reads again.
+    """
 
     lines: Annotated[tuple[str, ...], Field(strict=False)]
+    files: Annotated[tuple[str, ...], Field(strict=False)] = ()
 
 
 class Reload(Protocol):
@@ -216,6 +220,7 @@ class ControlServer:
             watched, the names of those that are. None if nobody may ask.
         reload: reads the machine files again, or only says what would change; a line for each change. None if
             nobody may ask.
+        files: what it reads then.
     """
 
     def __init__(
@@ -227,6 +232,7 @@ class ControlServer:
         runtime: Path | None = None,
         status: Callable[[str | None], Awaitable[bytes | tuple[str, ...]]] | None = None,
         reload: Reload | None = None,
+        files: Sequence[Path] = (),
     ) -> None:
         self.path = (runtime or store) / SOCKET
         self._link = None if runtime is None else store / SOCKET
@@ -236,6 +242,7 @@ class ControlServer:
         self._waiting = waiting
         self._status = status
         self._reload = reload
+        self._files = tuple(f"{file.absolute()}" for file in files)
         self._server: asyncio.Server | None = None
         self._inode: int | None = None
         self._clients: list[_Client] = []
@@ -345,7 +352,8 @@ class ControlServer:
                 if self._status is not None and line.startswith(_STATUS_VERB):
                     answer = await self._tell_status(self._status, line)
                 elif self._reload is not None and line.strip() in _RELOADS:
-                    answer = _json_line(await _reloaded(self._reload, dry_run=_RELOADS[line.strip()]))
+                    told = await _reloaded(self._reload, dry_run=_RELOADS[line.strip()])
+                    answer = _json_line(told.model_copy(update={"files": self._files}))
                 else:
                     answer = _json_line(await self._answer(line, client.source))
                 client.busy = False

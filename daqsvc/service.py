@@ -37,7 +37,7 @@ from drivers.frames import LayoutError
 from drivers.make import bus_driver, bus_drivers, bus_self_checks
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Mapping
+    from collections.abc import Callable, Collection, Mapping, Sequence
     from pathlib import Path
 
     from daqsvc.acquisition.clock import Clock
@@ -126,6 +126,7 @@ class Service:
         read_again: reads the machine files again, for `reload`; blocks, and raises `MachineFileError`. None
             if there are none.
         on_reload: called with True when a reload begins to change something, and with False when it is over.
+        files: what is read again, as it was named.
 
     Raises:
         AssemblyError: the machine file asks for a driver that is not installed.
@@ -141,6 +142,7 @@ class Service:
         runtime: Path | None = None,
         read_again: Callable[[], Box] | None = None,
         on_reload: Callable[[bool], None] = lambda _: None,
+        files: Sequence[Path] = (),
     ) -> None:
         self.box = box
         self.clock: Clock = clock or SystemClock()
@@ -187,6 +189,7 @@ class Service:
             runtime,
             self._status_line,
             self.reload,
+            files,
         )
 
     def _watch(self, box: Box, name: str) -> MachineWatch:

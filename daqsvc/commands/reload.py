@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
     import argparse
 
     from daqsvc.commands.machine_files import Load
+    from daqsvc.control import ReloadAnswer
 
 
 class ReloadCommand:
@@ -63,4 +65,16 @@ class ReloadCommand:
         else:
             for line in answer.lines:
                 print(line, file=sys.stderr)  # noqa: T201 - errors go to stderr
+        if arguments.file is not None and (hint := other_files(arguments.file, answer)):
+            print(f"daqsvc reload: {hint}", file=sys.stderr)  # noqa: T201 - beside what the verb is for
         return EXIT_OK if answer.accepted else EXIT_USAGE
+
+
+def other_files(named: Path, answer: ReloadAnswer) -> str:
+    """What to know where the service reads other files than the one that was named, or more."""
+    files = [Path(file) for file in answer.files]
+    mine = named.absolute()
+    if not files or mine in files or (answer.lines and mine.parent in files):
+        return ""
+    started = " ".join(answer.files)
+    return f"the service was started with {started}: it reads that again, whatever is named here"

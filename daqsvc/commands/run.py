@@ -209,6 +209,7 @@ async def _run_until_stopped(
         runtime=Path(runtime) if runtime else None,
         read_again=partial(read_box, files),
         on_reload=partial(_reloading, manager),
+        files=files,
     )
     guard.protect(service.alarms.outbox.close_from_outside)
     guard.stop_by(asyncio.get_running_loop(), stop.set)

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import weakref
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import can
 import numpy as np
@@ -27,7 +27,8 @@ from daqsvc.alarms.commands import AlarmCommand, Verb
 from daqsvc.alarms.states import AlarmState
 from daqsvc.box import BOX
 from daqsvc.commands.machine_files import read_box
-from daqsvc.control import ReloadRefusedError, ask_reload
+from daqsvc.commands.reload import other_files
+from daqsvc.control import ControlServer, ReloadRefusedError, ask_reload
 from daqsvc.reload import changes
 from drivers.can.plugin import frame_layout
 from sim_hw.nodes.can_node import CanNode
@@ -84,6 +85,10 @@ stream = "casing"
 channel = "nde"
 unit = "g"
 """
+
+
+async def unasked(command: AlarmCommand, source: str) -> NoReturn:
+    raise AssertionError(f"{command} of {source}")
 
 
 def put(file: Path, *changes_: tuple[str, str], more: str = "") -> None:
@@ -371,6 +376,36 @@ def test_what_is_different_is_said_with_its_reason(tmp_path: Path) -> None:
         assert changes(before, read_box([file])).lines() == said
 
 
+@pytest.mark.parametrize(
+    ("started", "named", "lines", "is_told"),
+    [
+        (["plant/a.toml"], "plant", (), True),
+        (["plant/a.toml", "plant/b.toml"], "plant/b.toml", (), False),
+        (["plant"], "plant", (), False),
+        (["plant"], "plant/a.toml", (), True),
+        (["plant"], "plant/a.toml", ("machine a: other alarms or setpoints",), False),
+    ],
+)
+async def test_who_names_other_files_than_the_service_reads_is_told(
+    started: list[str], named: str, lines: tuple[str, ...], *, is_told: bool, tmp_path: Path
+) -> None:
+    async def reload(*, dry_run: bool = False) -> list[str]:
+        assert not dry_run
+        return [*lines]
+
+    files = [tmp_path / file for file in started]
+    control = ControlServer(tmp_path, [], unasked, reload=reload, files=files)
+    await control.open()
+    serving_ = asyncio.create_task(control.serve())
+    answer = await asyncio.to_thread(ask_reload, tmp_path)
+    serving_.cancel()
+    await asyncio.wait({serving_})
+    await control.close()
+    paths = " ".join(map(str, files))
+    told = f"the service was started with {paths}: it reads that again, whatever is named here"
+    assert other_files(tmp_path / named, answer) == (told if is_told else "")
+
+
 @pytest.mark.long
 async def test_a_process_reloads_by_sighup_and_by_the_verb(tmp_path: Path) -> None:
     file, store = tmp_path / "rig.toml", tmp_path / "store"
@@ -386,7 +421,7 @@ async def test_a_process_reloads_by_sighup_and_by_the_verb(tmp_path: Path) -> No
         process.send_signal(signal.SIGHUP)
         await eventually(lambda: "reloaded: machine laval-rig: other" in log.read_text(), "it has reloaded")
         done = await asyncio.to_thread(verb, reload)
-        assert (done.returncode, done.stdout) == (0, "nothing is different\n")
+        assert (done.returncode, done.stdout, done.stderr) == (0, "nothing is different\n", "")
         file.write_text("nonsense")
         refused = await asyncio.to_thread(verb, reload)
         assert refused.returncode == 2
