@@ -136,6 +136,18 @@ def test_it_is_ready_soon_with_kernels_that_are_compiled(unit: str) -> None:
     assert took_s <= READY_S * slow
 
 
+def test_a_kernel_that_is_not_kept_is_compiled_in_the_sandbox_by_another_process(unit: str) -> None:
+    kept = {*KERNELS.rglob("*.nbc")}
+    missing = next(path for path in kept if path.name.startswith("sound.is_sound"))
+    missing.unlink()
+    sh("systemctl", "restart", unit)
+    assert shown(unit)["ActiveState"] == "active"
+    said = journal(unit)
+    assert "compiling kernels" in said
+    assert "compiles kernels by itself" not in said
+    assert {*KERNELS.rglob("*.nbc")} == kept
+
+
 def test_the_sandbox_is_in_force(unit: str) -> None:
     assert shown(unit)["ActiveState"] == "active"
     found = json.loads((STORE / "probe.json").read_text())

@@ -1,4 +1,4 @@
-"""The soak as a test: ten minutes, and the hour of a machine's time that ``.ci/run`` executes."""
+"""The soak as a test: four minutes of it, and an hour of a machine's time."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from support.paths import ROOT
 if TYPE_CHECKING:
     from pathlib import Path
 
-TEN_MINUTES_S = 600.0
+FOUR_MINUTES_S = 240.0
 
 pytestmark = [pytest.mark.integration, pytest.mark.mosquitto, pytest.mark.long, pytest.mark.timeout(3600)]
 
@@ -32,15 +32,14 @@ def _mosquitto() -> None:
 
 
 @pytest.mark.first
-@pytest.mark.marathon
-async def test_ten_minutes_of_all_that_can_happen_lose_nothing(tmp_path: Path) -> None:
-    report = await soak(TEN_MINUTES_S, tmp_path)
+async def test_four_minutes_of_all_that_can_happen_lose_nothing(tmp_path: Path) -> None:
+    """Memory is left to the hour below and to `make soak`: here the last life is too short to say."""
+    report = await soak(FOUR_MINUTES_S, tmp_path)
     print(report)  # noqa: T201 - pytest shows it if it fails
     assert not report.violations, f"{report}"
     # What did not happen proves nothing.
     assert {"process killed", "broker killed", "another machine", "bus can0 flaps"} <= report.befell.keys()
     assert report.lives > 1
-    assert report.memory is not None
     assert report.census[0] is not None
     for name, total in report.ledger.totals.items():
         assert total.received > 0, name
