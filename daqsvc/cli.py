@@ -26,6 +26,7 @@ from daqsvc.commands.record import RecordCommand
 from daqsvc.commands.reload import ReloadCommand
 from daqsvc.commands.run import RunCommand
 from daqsvc.commands.status import StatusCommand
+from daqsvc.commands.trend import TrendCommand
 
 if TYPE_CHECKING:
     import argparse
@@ -172,6 +173,7 @@ def commands() -> dict[str, Command]:
         "check": CheckCommand(),
         "reload": ReloadCommand(load),
         "status": StatusCommand(load),
+        "trend": TrendCommand(load),
         "alarms": AlarmsCommand(load),
         **alarm_verbs(load),
         "analyze": AnalyzeCommand(load, kernel_cache.prepare),

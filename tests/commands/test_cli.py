@@ -31,6 +31,7 @@ VERBS = (
     "check",
     "reload",
     "status",
+    "trend",
     *PEOPLE,
     "analyze",
     "calibrate",

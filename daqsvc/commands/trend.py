@@ -1,0 +1,341 @@
+"""``daqsvc trend``: what figures were over hours or months, from the history on the box."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import fnmatch
+import importlib.util
+import json
+import shutil
+import sys
+import time
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, duration
+from daqsvc.commands.store_argument import BadFileError, StoreNotFoundError, add_store, chosen_store
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from daqsvc.commands.machine_files import Load
+    from daqsvc.history.file import HistoryReader, Series
+    from daqsvc.history.points import Step, Trend
+
+SINCE = "1d"
+SECONDS_UP_TO_S, MINUTES_UP_TO_S = 2 * 3600, 10 * 86_400
+"""The step, where none is stated, by the time that is shown."""
+BARS = "▁▂▃▄▅▆▇█"
+LEAST_BARS, MOST_BARS = 8, 40
+FIGURES = ("low", "mean", "high")
+COLUMNS = ("time", "machine", "reading", "unit", *FIGURES)
+EXTRAS = {"parquet": ("pyarrow", "parquet"), "plot": ("matplotlib", "plot")}
+"""By option, the library that it needs, and the extra that brings it."""
+
+
+class NoTrendError(Exception):
+    """There is nothing to show; the text says why, and what to do."""
+
+
+class _Shown(NamedTuple):
+    series: Series
+    trend: Trend
+
+
+class TrendCommand:
+    """``daqsvc trend [FILE | --store DIR]``.
+
+    Args:
+        load: reads a machine file; None after its errors have been printed.
+    """
+
+    help = "what figures were over hours or months, from the history on the box"
+    description = (
+        "Show what levels, probabilities and other figures were, from the history that the service keeps "
+        "where the machine file has [history], whether it runs or not. TIME is how long ago (90m, 8h, 30d), "
+        "or a date and time (2026-11-23, 2026-11-23T14:30; local unless it says otherwise)."
+    )
+
+    def __init__(self, load: Load) -> None:
+        self._load = load
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """See `daqsvc.cli.Command.add_arguments`."""
+        parser.add_argument(
+            "--since", type=moment, default=SINCE, metavar="TIME", help=f"begin (default: {SINCE})"
+        )
+        parser.add_argument("--until", type=moment, default=None, metavar="TIME", help="end (default: now)")
+        parser.add_argument(
+            "--step",
+            choices=("second", "minute", "hour"),
+            help="from point to point (default: by the time that is shown)",
+        )
+        parser.add_argument(
+            "--reading",
+            action="append",
+            metavar="NAME",
+            help="this figure only, e.g. levels/shaft-x.rms, or all like '*.rms'; may be repeated",
+        )
+        form = parser.add_mutually_exclusive_group()
+        form.add_argument("--json", action="store_true", help="one JSON object a figure and line")
+        form.add_argument("--csv", type=Path, metavar="FILE", help="write a table; - for standard output")
+        form.add_argument("--parquet", type=Path, metavar="FILE", help="write a Parquet table")
+        form.add_argument("--plot", type=Path, metavar="FILE", help="draw a picture (.png, .svg, .pdf)")
+        form.add_argument("--events", action="store_true", help="the alarm events instead, one JSON a line")
+        add_store(parser)
+
+    def run(self, arguments: argparse.Namespace) -> int:
+        """See `daqsvc.cli.Command.run`."""
+        import sqlite3  # noqa: PLC0415 - each verb imports only what it needs
+
+        from daqsvc.history.file import NewerHistoryError  # noqa: PLC0415
+
+        now_s = time.time()
+        since_s, until_s = arguments.since, arguments.until or now_s
+        if (problem := _unusable(arguments, since_s, until_s)) is not None:
+            print(f"daqsvc trend: {problem}", file=sys.stderr)  # noqa: T201 - errors go to stderr
+            return EXIT_USAGE
+        try:
+            store, machine, _ = chosen_store(arguments, self._load)
+            _tell(store, machine, arguments, since_s, until_s)
+        except BadFileError:
+            return EXIT_USAGE
+        except (StoreNotFoundError, NoTrendError, NewerHistoryError) as error:
+            print(f"daqsvc trend: {error}", file=sys.stderr)  # noqa: T201
+            return EXIT_FAILED
+        except sqlite3.Error as error:
+            print(f"daqsvc trend: the history in {store} cannot be read: {error}", file=sys.stderr)  # noqa: T201
+            return EXIT_FAILED
+        except OSError as error:
+            print(f"daqsvc trend: {error.filename}: {error.strerror}", file=sys.stderr)  # noqa: T201
+            return EXIT_FAILED
+        return EXIT_OK
+
+
+def moment(text: str) -> float:
+    """``8h`` ago, or a date with or without a time; s since the Unix epoch."""
+    try:
+        return time.time() - duration(text)
+    except argparse.ArgumentTypeError:
+        pass
+    try:
+        return datetime.fromisoformat(text).astimezone().timestamp()
+    except (ValueError, OverflowError, OSError):
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no time; write e.g. 8h, 30d, 2026-11-23 or 2026-11-23T14:30"
+        ) from None
+
+
+def _unusable(arguments: argparse.Namespace, since_s: float, until_s: float) -> str | None:
+    """What is wrong with the options together; None if nothing is."""
+    for option, (library, extra) in EXTRAS.items():
+        if getattr(arguments, option) is not None and importlib.util.find_spec(library) is None:
+            return f"--{option} needs {library}; install it with: pip install 'daqsvc[{extra}]'"
+    if since_s >= until_s:
+        return "--since is not before --until; write the earlier one as --since"
+    return None
+
+
+def _tell(
+    store: Path, machine: str | None, arguments: argparse.Namespace, since_s: float, until_s: float
+) -> None:
+    """Show what was asked for.
+
+    Raises:
+        NoTrendError: there is nothing.
+        NewerHistoryError: a newer version wrote the file.
+        sqlite3.Error: it cannot be read.
+        OSError: what was asked for cannot be written.
+    """
+    from daqsvc.history.file import NAME, HistoryReader  # noqa: PLC0415 - brings SQLite and NumPy
+
+    path = store / NAME
+    if not path.is_file():
+        raise NoTrendError(
+            f"there is no history in {store}; write [history] into the machine file, and start the service "
+            "with it"
+        )
+    reader = HistoryReader(path)
+    try:
+        if arguments.events:
+            for event in reader.events(machine, since_s, until_s):
+                print(event.payload.decode())  # noqa: T201 - this is what the verb is for
+            return
+        chosen = _chosen(reader, machine, arguments.reading)
+        step = _step(arguments.step, until_s - since_s)
+        shown = [_Shown(one, reader.trend(one, step, since_s, until_s)) for one in chosen]
+    finally:
+        reader.close()
+    shown = [one for one in shown if len(one.trend.t_s)]
+    if not shown:
+        raise NoTrendError(
+            f"nothing was written down of these {step.name.lower()}s; ask for another time with --since, or "
+            "another --step"
+        )
+    if arguments.json:
+        for one in shown:
+            print(json.dumps(_document(one, step)))  # noqa: T201 - as above
+    elif arguments.csv is not None:
+        _write_csv(arguments.csv, shown)
+    elif arguments.parquet is not None:
+        _write_parquet(arguments.parquet, shown)
+    elif arguments.plot is not None:
+        _plot(arguments.plot, shown)
+    else:
+        print(_text(shown, step, since_s, until_s, shutil.get_terminal_size().columns))  # noqa: T201
+
+
+def _chosen(reader: HistoryReader, machine: str | None, readings: list[str] | None) -> list[Series]:
+    everything = reader.series()
+    machines = sorted({one.machine for one in everything})
+    if machine is not None and machine not in machines:
+        raise NoTrendError(f"no machine {machine!r} in the history; there is {', '.join(machines) or 'none'}")
+    of_machine = [one for one in everything if machine in {None, one.machine}]
+    if readings is None:
+        return of_machine
+    for pattern in readings:
+        if not any(fnmatch.fnmatchcase(one.name, pattern) for one in of_machine):
+            names = ", ".join(sorted({one.name for one in of_machine}))
+            raise NoTrendError(f"no figure {pattern!r} in the history; there is {names or 'none'}")
+    return [one for one in of_machine if any(fnmatch.fnmatchcase(one.name, p) for p in readings)]
+
+
+def _step(name: str | None, shown_s: float) -> Step:
+    from daqsvc.history.points import Step  # noqa: PLC0415 - as above
+
+    if name is not None:
+        return Step[name.upper()]
+    if shown_s <= SECONDS_UP_TO_S:
+        return Step.SECOND
+    return Step.MINUTE if shown_s <= MINUTES_UP_TO_S else Step.HOUR
+
+
+def _text(shown: list[_Shown], step: Step, since_s: float, until_s: float, width: int) -> str:
+    from daqsvc.commands.tables import aligned, harmless  # noqa: PLC0415 - as above
+
+    blocks = []
+    for machine in dict.fromkeys(one.series.machine for one in shown):
+        rows = []
+        for series, trend in (one for one in shown if one.series.machine == machine):
+            figures = (trend.mean[-1], trend.low.min(), trend.mean.mean(), trend.high.max())
+            rows.append([series.name, *(f"{figure:.4g}" for figure in figures), series.unit])
+        titles = ["reading", "last", "least", "mean", "greatest", "unit"]
+        table = aligned([*titles, ""], [[*row, ""] for row in rows]).splitlines()
+        bars = min(MOST_BARS, width - max(map(len, table)) - 2)
+        if bars >= LEAST_BARS:
+            means = [one.trend for one in shown if one.series.machine == machine]
+            lines = ["", *(_bars(trend, since_s, until_s, bars) for trend in means)]
+            longest = max(map(len, table))
+            table = [f"{row.ljust(longest)}  {line}".rstrip() for row, line in zip(table, lines, strict=True)]
+        head = f"{harmless(machine)}, {_local(since_s)} to {_local(until_s)}, by the {step.name.lower()}"
+        blocks.append("\n".join([head, *table]))
+    return "\n\n".join(blocks)
+
+
+def _bars(trend: Trend, since_s: float, until_s: float, bars: int) -> str:
+    """The means as a row of bars from the least to the greatest; a blank where nothing was measured."""
+    import numpy as np  # noqa: PLC0415 - as above
+
+    place = ((trend.t_s - since_s) / (until_s - since_s) * bars).astype(int).clip(0, bars - 1)
+    counts = np.bincount(place, minlength=bars)
+    means = np.bincount(place, trend.mean, minlength=bars) / np.maximum(counts, 1)
+    least, most = means[counts > 0].min(), means[counts > 0].max()
+    height = np.round((means - least) / (most - least or 1.0) * (len(BARS) - 1)).astype(int)
+    return "".join(BARS[h] if n else " " for h, n in zip(height.clip(0, len(BARS) - 1), counts, strict=True))
+
+
+def _local(t_s: float) -> str:
+    return datetime.fromtimestamp(t_s).astimezone().strftime("%Y-%m-%d %H:%M")
+
+
+def _document(one: _Shown, step: Step) -> dict[str, Any]:
+    series, trend = one
+    return {
+        "schema": "daqsvc.trend/1",
+        **series._asdict(),
+        "reading": series.name,
+        "step_s": int(step),
+        "t_s": trend.t_s.tolist(),
+        **{
+            name: [float(f"{value:.6g}") for value in getattr(trend, name)]
+            for name in ("low", "mean", "high")
+        },
+    }
+
+
+def _rows(shown: Iterable[_Shown]) -> Iterator[tuple[Any, ...]]:
+    for series, trend in shown:
+        for t_s, low, mean, high in zip(*(column.tolist() for column in trend), strict=True):
+            yield t_s, series.machine, series.name, series.unit, low, mean, high
+
+
+def _write_csv(path: Path, shown: list[_Shown]) -> None:
+    file = sys.stdout if str(path) == "-" else path.open("w", encoding="utf-8", newline="")
+    try:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(COLUMNS)
+        for t_s, *names, low, mean, high in _rows(shown):
+            figures = (f"{figure:.6g}" for figure in (low, mean, high))
+            table.writerow([_utc(t_s).isoformat().replace("+00:00", "Z"), *names, *figures])
+    finally:
+        if file is not sys.stdout:
+            file.close()
+
+
+def _utc(t_s: float) -> datetime:
+    return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=t_s)
+
+
+def _write_parquet(path: Path, shown: list[_Shown]) -> None:
+    import numpy as np  # noqa: PLC0415 - as above
+    import pyarrow as pa  # noqa: PLC0415 - an extra
+    import pyarrow.parquet as pq  # noqa: PLC0415 - as above
+
+    lengths = [len(one.trend.t_s) for one in shown]
+    columns: dict[str, Any] = {
+        "time": pa.array(np.concatenate([one.trend.t_s for one in shown]), pa.timestamp("s", tz="UTC"))
+    }
+    for name, of in (("machine", "machine"), ("reading", "name"), ("unit", "unit")):
+        words = [getattr(one.series, of) for one in shown]
+        columns[name] = pa.array(np.repeat(np.array(words, object), lengths), pa.string())
+    for name in FIGURES:
+        columns[name] = pa.array(np.concatenate([getattr(one.trend, name) for one in shown]))
+    pq.write_table(pa.table(columns), path)
+
+
+def _plot(path: Path, shown: list[_Shown]) -> None:
+    import matplotlib as mpl  # noqa: PLC0415 - an extra
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt  # noqa: PLC0415 - as above
+
+    panels: dict[tuple[str, str, str], list[_Shown]] = {}
+    for one in shown:
+        panels.setdefault((one.series.machine, one.series.detector, one.series.unit), []).append(one)
+    figure, axes = plt.subplots(
+        len(panels),
+        1,
+        sharex=True,
+        squeeze=False,
+        figsize=(10, 1.2 + 1.9 * len(panels)),
+        layout="constrained",
+    )
+    for axis, ((machine, detector, unit), lines) in zip(axes[:, 0], panels.items(), strict=True):
+        for series, trend in lines:
+            times = [_utc(t_s) for t_s in trend.t_s.tolist()]
+            [line] = axis.plot(times, trend.mean, linewidth=1.0, label=series.key)
+            axis.fill_between(times, trend.low, trend.high, alpha=0.2, color=line.get_color(), linewidth=0)
+        axis.set_title(f"{machine}: {detector}", loc="left", fontsize=9)
+        axis.set_ylabel(unit)
+        axis.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+        axis.grid(alpha=0.3)
+    axes[-1, 0].set_xlabel("time (UTC)")
+    figure.autofmt_xdate()
+    try:
+        figure.savefig(path)
+    except ValueError as error:
+        raise NoTrendError(f"{path}: {error}") from error
+    finally:
+        plt.close(figure)

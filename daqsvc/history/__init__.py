@@ -1,0 +1,1 @@
+"""What figures were over months, in one file on the box, and the alarm events beside them."""

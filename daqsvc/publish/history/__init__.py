@@ -1,0 +1,1 @@
+"""Trends and alarm events of months, kept on the box."""
