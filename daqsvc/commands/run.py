@@ -17,7 +17,7 @@ from daqsvc.commands.log_thread import LogThread
 from daqsvc.commands.machine_files import load_box, read_box
 from daqsvc.commands.process_guard import ProcessGuard
 from daqsvc.commands.service_manager import ServiceManager
-from daqsvc.commands.start_memory import give_back
+from daqsvc.commands.start_memory import give_back, share_heaps
 from daqsvc.commands.store_argument import StoreNotFoundError, store_directory
 from daqsvc.threads import call_in_thread
 
@@ -89,6 +89,7 @@ class RunCommand:
         """See `daqsvc.cli.Command.run`."""
         from daqsvc.kernel_compiler import compile_apart  # noqa: PLC0415 - each verb imports only what it needs
 
+        share_heaps()
         manager = ServiceManager.of_environment()
         handler = LogThread(STDERR)
         self._start_logging(verbose=arguments.verbose, handler=handler)

@@ -1,4 +1,4 @@
-"""Memory that only the start of the service needs, or a reload, given back when it is over.
+"""Memory that only the start of the service needs, or a reload, given back when it is over; and few heaps.
 
 Kernels are loaded by the compiler, the largest library of all by far, which nothing calls afterwards. Its
 code lies in a file, of which the pages that were read stay mapped until the host runs short of memory.
@@ -18,9 +18,21 @@ if TYPE_CHECKING:
 
 _MADV_DONTNEED = 4
 """Linux numbers it so (asm-generic/mman-common.h)."""
+_M_ARENA_MAX, _HEAPS = -8, 2
+"""The C library numbers it so (malloc.h)."""
 _MAPPING = re.compile(r"([0-9a-f]+)-([0-9a-f]+) (\S{4}) \S+ \S+ [1-9]\d* +(/.*\.so[.\d]*)$")
 _CHANGED = ("Anonymous:", "Swap:")
 _ANY = re.compile(r"[0-9a-f]+-[0-9a-f]+ ")
+
+
+def share_heaps() -> None:
+    """Have all threads share two heaps; call before any is begun.
+
+    Else the C library makes one after the other, eight for each core, as blocking calls have threads of their
+    own. In each a MB or two stay of what is free again, so that a service would grow for long.
+    """
+    with contextlib.suppress(AttributeError):  # another C library than GNU's
+        ctypes.CDLL(None).mallopt(_M_ARENA_MAX, _HEAPS)
 
 
 def give_back() -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -57,3 +59,29 @@ def test_what_was_let_go_comes_back_when_it_is_needed() -> None:
     give_back()
     assert resident_kb() < before / 2
     np.testing.assert_array_equal(np.linalg.inv(matrix), inverse)
+
+
+HEAPS = """
+import ctypes, sys, threading
+from daqsvc.commands.start_memory import share_heaps
+if sys.argv[1:]:
+    share_heaps()
+libc = ctypes.CDLL(None)
+libc.malloc.restype = ctypes.c_void_p
+there = threading.Barrier(12)
+def use():
+    libc.malloc(1000)
+    there.wait()
+threads = [threading.Thread(target=use) for _ in range(12)]
+for thread in threads: thread.start()
+for thread in threads: thread.join()
+libc.malloc_stats()
+"""
+
+
+def test_threads_share_two_heaps() -> None:
+    def heaps(*arguments: str) -> int:
+        command = [sys.executable, "-c", HEAPS, *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stderr.count("Arena ")
+
+    assert heaps("share") <= 2 < heaps()

@@ -27,6 +27,7 @@ from support.live_service import running, watch_of
 from support.machine_files import LAVAL
 
 from daqsvc.acquisition.clock import NS_PER_S, DrivenClock
+from daqsvc.commands.start_memory import share_heaps
 from daqsvc.settings import parse_machine_file
 from drivers.can.plugin import frame_layout
 
@@ -198,6 +199,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="soak.hour", description=__doc__)
     parser.add_argument("--seconds", type=float, default=3600.0, help="of the machine's time")
     arguments = parser.parse_args()
+    share_heaps()  # as `daqsvc run` does
     with tempfile.TemporaryDirectory(prefix="soak-hour-") as folder:
         outcome = asyncio.run(pass_time(arguments.seconds, Path(folder)))
     print(json.dumps(asdict(outcome)))
