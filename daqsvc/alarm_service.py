@@ -110,6 +110,7 @@ class AlarmService:
         bus_health: says how the buses stand.
         supervisor: counts what outputs do wrong.
         stalls: finds the parts of the service that have stalled, for outputs that tell it.
+        heard: told, on the event loop, of each event that comes about.
     """
 
     def __init__(
@@ -125,6 +126,7 @@ class AlarmService:
         bus_health: Callable[[], Mapping[str, BusHealth]] = dict,
         supervisor: Supervisor | None = None,
         stalls: StallWatch | None = None,
+        heard: Callable[[AlarmEvent], None] = lambda _event: None,
     ) -> None:
         limits = limits or OutboxLimits()
         stalls = stalls or StallWatch(dict)
@@ -160,6 +162,7 @@ class AlarmService:
         self._waiting_max = limits.alarms_waiting_max
         self._clock = clock
         self._supervisor = supervisor or Supervisor()
+        self._heard = heard
         self._log = AlarmLog(clock, of_several=len(self.managers) > 1)
         self._conditions_of_outputs = asked.conditions
         self._conditions = [*conditions(buses or {}), *asked.conditions]
@@ -229,6 +232,10 @@ class AlarmService:
             known = self._conditions if is_own else ()
             for event in manager.resume(theirs, self._active_detectors.get(machine, {}), known):
                 self._post(event)
+
+    def newest(self, machine: str) -> list[AlarmEvent]:
+        """The last event of each alarm of a machine, from before a restart too."""
+        return [event for (whose, _), event in self._newest.items() if whose == machine]
 
     def made_by(self, outputs: OutputSet) -> MadeOutputs:
         """Make other outputs, for `change`; may block, and be called in a thread."""
@@ -634,7 +641,10 @@ class AlarmService:
 
     def _post(self, event: AlarmEvent) -> asyncio.Future[int]:
         self._log.say(event)
-        return self._submit(event)
+        committed = self._submit(event)
+        with self._supervisor.sparing_others("recorder", "it is not told of one alarm event"):
+            self._heard(event)
+        return committed
 
     def _submit(self, event: AlarmEvent) -> asyncio.Future[int]:
         alarm = (event.identity.machine, event.alarm)

@@ -187,6 +187,7 @@ def _own(files: Sequence[MachineFile]) -> MachineFile:
             "pipeline": no_detectors(),
             "alarms": (),
             "alarm_handling": AlarmHandling(),
+            "recorder": None,
             **tables,
         }
     )

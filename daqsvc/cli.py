@@ -24,7 +24,9 @@ from daqsvc.commands.example import ExampleCommand
 from daqsvc.commands.machine_files import load_box
 from daqsvc.commands.record import RecordCommand
 from daqsvc.commands.reload import ReloadCommand
+from daqsvc.commands.replay import ReplayCommand
 from daqsvc.commands.run import RunCommand
+from daqsvc.commands.snapshot import SnapshotCommand
 from daqsvc.commands.status import StatusCommand
 from daqsvc.commands.trend import TrendCommand
 
@@ -172,6 +174,8 @@ def commands() -> dict[str, Command]:
         "run": RunCommand(load, start_logging),
         "check": CheckCommand(),
         "reload": ReloadCommand(load),
+        "snapshot": SnapshotCommand(load),
+        "replay": ReplayCommand(load, kernel_cache.prepare),
         "status": StatusCommand(load),
         "trend": TrendCommand(load),
         "alarms": AlarmsCommand(load),

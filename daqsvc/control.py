@@ -65,6 +65,8 @@ STATUS_S = 10.0
 """How long it waits for the status, which waits for nothing but the processor."""
 RELOAD_S = 120.0
 """How long it waits for a reload, which may compile kernels."""
+SNAPSHOT_S = 90_000.0
+"""How long it waits for a snapshot, which is complete some time after it was asked for."""
 LONGEST_STATUS = 32 * 1024 * 1024
 """Of 4096 sensors it is some 5 MB."""
 
@@ -77,6 +79,7 @@ _RELOADS = {
     b'{"schema": "daqsvc.control/1", "verb": "reload", "dry_run": true}': True,
 }
 """The questions, and whether nothing is to be changed."""
+_SNAPSHOT_VERB = b'{"schema": "daqsvc.control/1", "verb": "snapshot"'
 _ANSWER: Literal["daqsvc.control-answer/1"] = "daqsvc.control-answer/1"
 
 
@@ -154,6 +157,28 @@ class Reload(Protocol):
         ...
 
 
+class SnapshotAnswer(ControlAnswer):
+    """Where the snapshot is that was made."""
+
+    path: str = ""
+
+
+class TakeSnapshot(Protocol):
+    """See `daqsvc.service.Service.snapshot`."""
+
+    async def __call__(self, machine: str | None, reason: str) -> str:
+        """Make a snapshot of a machine, or of the only one; returns its file.
+
+        Raises:
+            SnapshotNotMadeError: it was not made.
+        """
+        ...
+
+
+class SnapshotNotMadeError(Exception):
+    """No snapshot was made; the text says why."""
+
+
 class ReloadRefusedError(Exception):
     """The service goes on as it is.
 
@@ -221,6 +246,7 @@ class ControlServer:
         reload: reads the machine files again, or only says what would change; a line for each change. None if
             nobody may ask.
         files: what it reads then.
+        snapshot: makes a snapshot. None if nobody may ask.
     """
 
     def __init__(
@@ -233,6 +259,7 @@ class ControlServer:
         status: Callable[[str | None], Awaitable[bytes | tuple[str, ...]]] | None = None,
         reload: Reload | None = None,
         files: Sequence[Path] = (),
+        snapshot: TakeSnapshot | None = None,
     ) -> None:
         self.path = (runtime or store) / SOCKET
         self._link = None if runtime is None else store / SOCKET
@@ -243,6 +270,7 @@ class ControlServer:
         self._status = status
         self._reload = reload
         self._files = tuple(f"{file.absolute()}" for file in files)
+        self._snapshot = snapshot
         self._server: asyncio.Server | None = None
         self._inode: int | None = None
         self._clients: list[_Client] = []
@@ -354,6 +382,8 @@ class ControlServer:
                 elif self._reload is not None and line.strip() in _RELOADS:
                     told = await _reloaded(self._reload, dry_run=_RELOADS[line.strip()])
                     answer = _json_line(told.model_copy(update={"files": self._files}))
+                elif self._snapshot is not None and line.startswith(_SNAPSHOT_VERB):
+                    answer = _json_line(await _snapshot_answer(self._snapshot, line, client.source))
                 else:
                     answer = _json_line(await self._answer(line, client.source))
                 client.busy = False
@@ -412,6 +442,17 @@ async def _reloaded(reload: Reload, *, dry_run: bool) -> ReloadAnswer:
         return ReloadAnswer(
             accepted=False, reason="the machine files are refused", lines=tuple(refused.reasons)
         )
+
+
+async def _snapshot_answer(snapshot: TakeSnapshot, line: bytes, source: str) -> SnapshotAnswer:
+    try:
+        machine = json.loads(line).get("machine")
+        path = await snapshot(machine if isinstance(machine, str) else None, f"asked for by {source}")
+    except (ValueError, RecursionError):
+        return SnapshotAnswer(accepted=False, reason="the request is not valid JSON")
+    except SnapshotNotMadeError as refused:
+        return SnapshotAnswer(accepted=False, reason=f"{refused}")
+    return SnapshotAnswer(accepted=True, reason="", path=path)
 
 
 def parse_request(line: bytes, machines: Collection[str]) -> ControlRequest:
@@ -499,6 +540,25 @@ def ask_reload(store: Path, *, dry_run: bool = False) -> ReloadAnswer:
         raise ControlError(
             f"the daqsvc of {store} is of an older version, which cannot reload: restart it"
         ) from None
+
+
+def ask_snapshot(store: Path, machine: str | None = None) -> SnapshotAnswer:
+    """Have the service that runs on a store make a snapshot, and wait until it is complete; blocks.
+
+    Args:
+        store: the store's directory.
+        machine: of which one; None for the only one.
+
+    Raises:
+        ControlError: there is no service, it is somebody else's, or it does not answer.
+    """
+    named = b"}" if machine is None else b', "machine": ' + json.dumps(machine).encode() + b"}"
+    then = "its log says what it has done"
+    answer = _asked(store, _SNAPSHOT_VERB + named + b"\n", SNAPSHOT_S, LONGEST_LINE, then)
+    try:
+        return SnapshotAnswer.model_validate_json(answer)
+    except ValidationError as error:
+        raise _unanswered(store, error, then) from None
 
 
 def ask_status(store: Path, machine: str | None = None, timeout_s: float = STATUS_S) -> list[dict[str, Any]]:

@@ -6,12 +6,13 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from daqsvc.acquisition.alignment import SETTLE_NS
-from daqsvc.acquisition.ring import SampleRing
+from daqsvc.acquisition.ring import RingReader, SampleRing
 from daqsvc.acquisition.standing import StreamState
 from daqsvc.detectors.make import detectors
 from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.diagnosis.snapshots import alignment, at_once, patience
 from daqsvc.diagnosis.statements import said_of_silence
+from daqsvc.recorder import Recorder
 from daqsvc.settings.streams import Grid
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daqsvc.acquisition.clock import Clock
-    from daqsvc.acquisition.samples import SampleBlock
+    from daqsvc.acquisition.samples import SampleBlock, Window
     from daqsvc.diagnosis.detector import Detector
     from daqsvc.diagnosis.pipeline import KernelThreads
     from daqsvc.diagnosis.record import Diagnosis
@@ -38,6 +39,7 @@ class MachineWatch:
         supervisor: keeps its parts going.
         bus_over: says of a bus why nothing more can come from it; empty if something can.
         kernels: threads that its detectors compute in.
+        make_reader: makes what hands the samples of a ring to a detector.
 
     Attributes:
         machine: as given.
@@ -47,6 +49,7 @@ class MachineWatch:
         alignment: makes the grids.
         standings: how each stream stands.
         pipeline: runs the detectors.
+        recorder: records what comes and what is said; None if the machine file does not ask for it.
 
     Raises:
         AssemblyError: see `daqsvc.detectors.make.detectors`.
@@ -61,6 +64,7 @@ class MachineWatch:
         supervisor: Supervisor,
         bus_over: Callable[[str], str],
         kernels: KernelThreads,
+        make_reader: Callable[[SampleRing], RingReader] = RingReader,
     ) -> None:
         self.machine = machine
         self.store = store
@@ -71,6 +75,8 @@ class MachineWatch:
         grids = [*(Grid({name: stream}) for name, stream in machine.streams.items()), *machine.grids]
         self._grids = grids
         self.standings = dict.fromkeys(machine.streams, StreamState())
+        settings = machine.recorder
+        self.recorder = None if settings is None else Recorder(machine, settings, store, clock, supervisor)
         self.rings = {grid.name: _ring(machine, grid, watching) for grid in grids}
         self.alignment = alignment(machine, clock, self.deliver)
         self.pipeline = Pipeline(
@@ -84,12 +90,17 @@ class MachineWatch:
             supervisor=supervisor,
             fall_silent=self._fall_silent,
             why_over=self._why_over,
+            make_reader=make_reader,
+            on_read=self._on_read,
+            on_processed=self._on_processed,
         )
 
     def deliver(self, block: SampleBlock) -> None:
         """Take in samples of one of its streams."""
         with self.supervisor.sparing_others(f"stream {block.stream}", "a block of its samples is lost"):
             self.rings[block.stream].write(block)
+            if self.recorder is not None:
+                self.recorder.block(block)
             self.alignment.accept(block)
 
     def receiver(self, stream: str) -> Callable[[SampleBlock], None]:
@@ -103,6 +114,8 @@ class MachineWatch:
     def stand(self, stream: str, standing: StreamState) -> None:
         """Tell the pipeline how a stream stands, and every grid that it is on: that is no better."""
         self.standings[stream] = standing
+        if self.recorder is not None:
+            self.recorder.stand(stream, standing)
         for grid in self._grids:
             if stream in grid.streams:
                 standings = [self.standings[name] for name in grid.streams]
@@ -151,6 +164,14 @@ class MachineWatch:
     def is_over(self) -> bool:
         """Whether no more samples can come."""
         return all(ring.is_closed for ring in self.rings.values())
+
+    def _on_read(self, detector: str, window: Window) -> None:
+        if self.recorder is not None:
+            self.recorder.read(detector, window)
+
+    def _on_processed(self, detector: Detector, window: Window) -> None:
+        if self.recorder is not None:
+            self.recorder.processed(detector, window)
 
     def _fall_silent(self, stream: str, standing: StreamState) -> None:
         """Take in that nothing comes any more of a stream in doubt; a grid stands as its streams do."""

@@ -16,7 +16,7 @@ from daqsvc.alarm_service import AlarmService
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.make import alarm_rule
 from daqsvc.alarms.manager import AlarmManager
-from daqsvc.control import ControlError, ControlServer, ReloadRefusedError
+from daqsvc.control import ControlError, ControlServer, ReloadRefusedError, SnapshotNotMadeError
 from daqsvc.diagnosis.pipeline import THREADS, KernelThreads, kernel_failed
 from daqsvc.driver_reports import DriverReports
 from daqsvc.machine_watch import MachineWatch
@@ -26,6 +26,7 @@ from daqsvc.publish.machine_figures import MACHINES, of_machine
 from daqsvc.publish.make import output_plugins, output_set
 from daqsvc.publish.output import output_name
 from daqsvc.publish.payloads import Figures
+from daqsvc.recorder import SnapshotRefusedError
 from daqsvc.reload import Changes, changes
 from daqsvc.self_check import BusHealth, conditions
 from daqsvc.settings.problems import AssemblyError, MachineFileError
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.ring import SampleRing
     from daqsvc.acquisition.samples import SampleBlock
     from daqsvc.acquisition.standing import StreamState
+    from daqsvc.alarms.events import AlarmEvent
     from daqsvc.box import Box
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.publish.output import OutputSet
@@ -179,6 +181,7 @@ class Service:
             bus_health=self._bus_health,
             supervisor=self.supervisor,
             stalls=self.stalls,
+            heard=self._record_alarm,
         )
         self.reports = {name: self._status_report(name) for name in self.watches}
         self.control = ControlServer(
@@ -190,6 +193,7 @@ class Service:
             self._status_line,
             self.reload,
             files,
+            self.snapshot,
         )
 
     def _watch(self, box: Box, name: str) -> MachineWatch:
@@ -272,6 +276,9 @@ class Service:
             await self._prepare(watch)
         # Take over from the journal how the alarms stood when the service ended.
         await self.alarms.resume({name: watch.active_detectors() for name, watch in self.watches.items()})
+        for name, watch in self.watches.items():
+            if watch.recorder is not None:
+                watch.recorder.take_over(self.alarms.newest(name))
         try:
             await self.control.open()
         except ControlError as error:
@@ -309,6 +316,7 @@ class Service:
                 parts.reload.cancel()
                 await asyncio.wait({parts.reload}, timeout=left.most(DRAIN_S))
             telling, pipelines = [*parts.outputs.values()], [*parts.pipelines.values()]
+            recorders = [*parts.recorders.values()]
             for part in (*telling, *pipelines):
                 part.leave()
             await stop_all([controlling], left.most(DRAIN_S))
@@ -316,6 +324,7 @@ class Service:
             for watch in self.watches.values():
                 watch.close()
             await over(pipelines, left.most(DRAIN_S))
+            await stop_all(recorders, left.most(DRAIN_S))
             await self.alarms.settle(left.most(DRAIN_S))
             with self.supervisor.sparing_others("status", "the service is stopping anyway"):
                 self._publish_status()
@@ -331,6 +340,9 @@ class Service:
         keep = watch.supervisor.keep
         self._parts.pipelines[name] = keep("pipeline", watch.pipeline.run, may_end=partial(_is_over, watch))
 
+        if (recorder := watch.recorder) is not None:
+            self._parts.recorders[name] = keep("recorder", recorder.run)
+
     def _start_driver(
         self, driver: Driver, reports: DriverReports, *, fatal: tuple[type[Exception], ...] = ()
     ) -> None:
@@ -340,6 +352,28 @@ class Service:
         self._parts.drivers[reports.name] = keep(
             f"driver {reports.name}", driver.run, may_end=ends, fatal=fatal
         )
+
+    async def snapshot(self, machine: str | None, reason: str) -> str:
+        """Make a snapshot; returns its file when it is complete.
+
+        Args:
+            machine: of which one; None for the only one.
+            reason: who has asked, in words.
+
+        Raises:
+            SnapshotNotMadeError: there is no such machine, it has no recorder, or the disk did not take it.
+        """
+        name = next(iter(self.watches)) if machine is None and len(self.watches) == 1 else machine
+        watch = None if name is None else self.watches.get(name)
+        if watch is None:
+            why = "name a machine" if name is None else f"this service does not watch {name!r:.80}"
+            raise SnapshotNotMadeError(f"{why}; it watches {', '.join(self.watches)}")
+        if watch.recorder is None:
+            raise SnapshotNotMadeError(f"{watch.machine.path} has no table [recorder]; write one")
+        try:
+            return str(await watch.recorder.snapshot(reason))
+        except SnapshotRefusedError as refused:
+            raise SnapshotNotMadeError(f"{refused}") from None
 
     async def reload(self, *, dry_run: bool = False) -> list[str]:
         """Read the machine files again and go on with them, by what is different.
@@ -428,6 +462,9 @@ class Service:
             watch.close()
         await over(pipelines, DRAIN_S)
         await stop_all(pipelines, DRAIN_S)
+        gone = (*found.machines_gone, *found.machines_anew)
+        recorders = [parts.recorders.pop(name) for name in gone if name in parts.recorders]
+        await stop_all(recorders, DRAIN_S)
         for watch, part in zip(replaced, pipelines, strict=True):
             if part.over.done():
                 watch.let_go()
@@ -436,7 +473,9 @@ class Service:
             name: self._status_report(name) if name in made.watches else self.reports[name]
             for name in self.watches
         }
-        for name in made.watches:
+        for name, watch in made.watches.items():
+            if watch.recorder is not None:
+                watch.recorder.take_over(self.alarms.newest(name))
             self._start_pipeline(name)
         for name, driver in made.drivers.items():
             self._start_driver(driver, reports[name])
@@ -503,6 +542,8 @@ class Service:
 
     def _report(self, diagnosis: Diagnosis) -> None:
         self.reports[diagnosis.machine].remember(diagnosis)
+        if (recorder := self.watches[diagnosis.machine].recorder) is not None:
+            recorder.diagnosis(diagnosis)
         with self.supervisor.sparing_others(
             f"alarms by {diagnosis.detector}", "one of its statements is lost"
         ):
@@ -511,6 +552,11 @@ class Service:
             about = f"{output_name(path)} of {diagnosis.detector}"
             with self.supervisor.sparing_others(about, "it is not told of one statement"):
                 output.report(diagnosis)
+
+    def _record_alarm(self, event: AlarmEvent) -> None:
+        watch = self.watches.get(event.identity.machine)
+        if watch is not None and watch.recorder is not None:
+            watch.recorder.alarm(event)
 
     def _bus_health(self) -> dict[str, BusHealth]:
         health: dict[str, BusHealth] = {}
@@ -626,6 +672,7 @@ class Service:
             "control": asdict(self.control.counters),
             "outbox": asdict(self.alarms.outbox.counters),
             **self._figures_of_outputs(),
+            **_figures_of_recorders(watches),
         }
 
     def _of_machines(
@@ -653,13 +700,14 @@ class Service:
 
 @dataclass(slots=True)
 class Parts:
-    """What is kept going: outputs by the path of their table, pipelines by machine, drivers by bus.
+    """What is kept going: outputs by the path of their table, drivers by bus, the rest by machine.
 
     And the reload that is under way, or was the last.
     """
 
     outputs: dict[str, Part] = field(default_factory=dict)
     pipelines: dict[str, Part] = field(default_factory=dict)
+    recorders: dict[str, Part] = field(default_factory=dict)
     drivers: dict[str, Part] = field(default_factory=dict)
     reload: asyncio.Task[None] | None = None
 
@@ -669,6 +717,12 @@ class Made(NamedTuple):
 
     watches: dict[str, MachineWatch]
     drivers: dict[str, Driver]
+
+
+def _figures_of_recorders(watches: Mapping[str, MachineWatch]) -> dict[str, Any]:
+    recorders = {name: watch.recorder for name, watch in watches.items()}
+    figures = {name: one.figures() for name, one in recorders.items() if one is not None}
+    return {"recorders": figures} if figures else {}
 
 
 def _output_set(box: Box) -> OutputSet:

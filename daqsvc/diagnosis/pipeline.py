@@ -272,6 +272,9 @@ class Pipeline:
         fall_silent: called with the name and the standing of a stream in doubt of which nothing comes any
             more; whoever tells the pipeline how streams stand passes it on. None: it is passed on at once.
         why_over: why nothing more can come of a stream, in a clause; empty if something may.
+        make_reader: makes what hands the samples of a ring to a detector.
+        on_read: called on the event loop with a detector's name and each window that is read for it.
+        on_processed: called, on the thread that computes, with a detector and each window it has processed.
     """
 
     def __init__(
@@ -286,10 +289,15 @@ class Pipeline:
         supervisor: Supervisor | None = None,
         fall_silent: Tell | None = None,
         why_over: Callable[[str], str] = lambda _stream: "",
+        make_reader: Callable[[SampleRing], RingReader] = RingReader,
+        on_read: Callable[[str, Window], None] = lambda _detector, _window: None,
+        on_processed: Callable[[Detector, Window], None] = lambda _detector, _window: None,
     ) -> None:
+        self._on_read = on_read
+        self._on_processed = on_processed
         self.counters = {detector.name: DetectorCounters() for detector in detectors}
         self.detectors = tuple(detectors)
-        self._readers = {d.name: RingReader(rings[d.stream]) for d in detectors}
+        self.readers = {d.name: make_reader(rings[d.stream]) for d in detectors}
         self._rings = rings
         self._settling_ns = settling_ns or {}
         self._patience = {name: Patience() for name in rings} | dict(patience or {})
@@ -313,13 +321,13 @@ class Pipeline:
     @property
     def behind_samples(self) -> int:
         """Samples that the slowest detector has not read yet."""
-        return max((reader.behind for reader in self._readers.values()), default=0)
+        return max((reader.behind for reader in self.readers.values()), default=0)
 
     def progress(self) -> dict[str, Progress]:
         """How far each detector has come with the samples that wait for it."""
         parts: dict[str, Progress] = {}
         for detector in self.detectors:
-            reader, job = self._readers[detector.name], self._under_way.get(detector.name)
+            reader, job = self.readers[detector.name], self._under_way.get(detector.name)
             waits = job is not None or reader.behind >= detector.block
             step = (self.counters[detector.name].windows, reader.position) if waits else None
             parts[_part(detector)] = Progress(step, None if job is None else job.thread)
@@ -471,7 +479,7 @@ class Pipeline:
 
     async def _next_window(self, detector: Detector) -> Window | None:
         """The next samples for a detector; None if no more will come."""
-        reader, counters = self._readers[detector.name], self.counters[detector.name]
+        reader, counters = self.readers[detector.name], self.counters[detector.name]
         withheld, broken = 0, False
         while True:
             try:
@@ -479,6 +487,7 @@ class Pipeline:
                 window = await reader.read(detector.block, MOST_BLOCKS)
             except RingClosed:
                 return None
+            self._on_read(detector.name, window)
             stream, changes = detector.stream, self._changes[detector.stream]
             if not self._standings[stream].doubt and changes == self._seen_changes[detector.name]:
                 break
@@ -562,6 +571,8 @@ class Pipeline:
             counters.windows += 1
             counters.samples += len(window.samples)
             counters.busy_ns += time.perf_counter_ns() - begun_ns
+            with self._supervisor.sparing_others("recorder", "it lacks what a detector remembers"):
+                self._on_processed(detector, window)
 
 
 def kernel_failed(supervisor: Supervisor) -> Callable[[BaseException], None]:

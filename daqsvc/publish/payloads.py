@@ -263,6 +263,16 @@ def alarm_event(payload: bytes) -> AlarmEvent:
     )
 
 
+def alarm_document(event: AlarmEvent) -> dict[str, Any]:
+    """An alarm event as a dictionary of what JSON knows, without a number; `alarm_event` reads its JSON."""
+    return _alarm(event, 0, "")
+
+
+def statement_document(diagnosis: Diagnosis) -> dict[str, Any]:
+    """A diagnosis as a dictionary of what JSON knows, without a stamp."""
+    return {"machine": diagnosis.machine, "monotonic_ns": diagnosis.t_ns, **_statement(diagnosis)}
+
+
 def diagnosis_payload(identity: Identity, diagnosis: Diagnosis, clock: Clock) -> DiagnosisPayload:
     """The payload of a diagnosis, stamped with the time of its last sample."""
     wall_ns = clock.wall_ns() - clock.monotonic_ns() + diagnosis.t_ns

@@ -315,6 +315,8 @@ def _fine_enough(draft: MachineFile, max_error_us: float) -> Iterator[Finding]:
 
 
 SAMPLE_BYTES = 4
+_HISTORY_SPARE_S = 8.0
+"""What the recorder remembers beyond the begin of a snapshot."""
 _MOST_SHARE = 0.5
 """Of the memory: the rest is for detectors, outbox, operating system and whoever else there is."""
 _CGROUP_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
@@ -347,6 +349,8 @@ def needed_bytes(draft: MachineFile) -> dict[str, float]:
         with suppress(UnusableValueError):
             row_bytes = SAMPLE_BYTES * len(stream.layout.channel_names)
             kept_s = pipeline.ring_s * rings[name] + stream.reorder_window_ms / 1e3
+            if (recorder := draft.recorder) is not None:
+                kept_s += (recorder.before_s + _HISTORY_SPARE_S) * rings[name]
             needed[name] = stream.rate_hz * kept_s * row_bytes
             if (block := stream.layout.block) is not None:
                 needed[name] += block.buffer_bytes

@@ -83,6 +83,25 @@ def parse_machine_file(text: str, path: Path) -> MachineFile:
         document, spots = parse(text)
     except TomlTextError as error:
         raise MachineFileError([Problem(path, error.line, "", "", str(error), error.remedy)]) from None
+    return _machine_file(document, spots, path, text)
+
+
+def machine_file_of(values: dict[str, Any], path: Path) -> MachineFile:
+    """A machine file from its values, as if it stood at ``path``.
+
+    Args:
+        values: what TOML would give.
+        path: see `parse_machine_file`.
+
+    Raises:
+        MachineFileError: they cannot be used; holds every problem found.
+    """
+    return _machine_file(values, {(): Spot(1)}, path, "")
+
+
+def _machine_file(
+    document: dict[str, Any], spots: Mapping[KeyPath, Spot], path: Path, text: str
+) -> MachineFile:
     reading = _Reading(document, spots, path)
     reading.leave_out_broken()
     with collecting() as failures:
@@ -93,7 +112,7 @@ def parse_machine_file(text: str, path: Path) -> MachineFile:
     problems, warnings = reading.problems()
     if problems:
         raise MachineFileError(problems)
-    return draft.found_at(Origin(path, tuple(warnings), MappingProxyType(facts)))
+    return draft.found_at(Origin(path, tuple(warnings), MappingProxyType(facts), text))
 
 
 class _Reading:

@@ -21,6 +21,7 @@ from daqsvc.settings.alarms import (
 from daqsvc.settings.buses import Bus, Layout
 from daqsvc.settings.packing import Channel, Counter
 from daqsvc.settings.pipeline import Pipeline, TableT
+from daqsvc.settings.recorder import Recorder
 from daqsvc.settings.registry import (
     INSTALLED,
     configured,
@@ -61,6 +62,7 @@ __all__ = [
     "Origin",
     "Pipeline",
     "ProximityProbe",
+    "Recorder",
     "Rotor",
     "Sensor",
     "SetpointAlarm",
@@ -155,11 +157,13 @@ class Origin:
         path: the file.
         warnings: what should be looked at although the file can be used.
         layout_facts: by stream, what was read from the files that its layout names.
+        text: the file as it was read; empty if it was made in memory.
     """
 
     path: Path = Path("<text>")
     warnings: tuple[Problem, ...] = ()
     layout_facts: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+    text: str = ""
 
 
 class MachineFile(Section):
@@ -195,6 +199,7 @@ class MachineFile(Section):
         default=(), description="the alarms"
     )
     alarm_handling: AlarmHandling = Field(default=AlarmHandling(), description="what holds for all alarms")
+    recorder: Recorder | None = Field(default=None, description="what is recorded")
     store: Store | None = Field(default=None, description="the journal's place")
 
     _origin: Origin = PrivateAttr(default_factory=Origin)
@@ -209,6 +214,11 @@ class MachineFile(Section):
     def path(self) -> Path:
         """The file this came from."""
         return self._origin.path
+
+    @property
+    def text(self) -> str:
+        """The file as it was read; empty if it was made in memory."""
+        return self._origin.text
 
     @property
     def warnings(self) -> tuple[Problem, ...]:

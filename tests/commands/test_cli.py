@@ -30,6 +30,8 @@ VERBS = (
     "run",
     "check",
     "reload",
+    "snapshot",
+    "replay",
     "status",
     "trend",
     *PEOPLE,

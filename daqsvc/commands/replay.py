@@ -1,0 +1,130 @@
+"""``daqsvc replay``: judge a snapshot again, by the detectors and alarms of the service."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_REFUSED, EXIT_USAGE
+
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import Callable, Iterator
+
+    from daqsvc.offline.replay import Comparison, Replayed
+    from daqsvc.settings import MachineFile
+
+_SHOWN = 5
+"""Differences that are shown one by one."""
+
+
+class ReplayCommand:
+    """``daqsvc replay SNAPSHOT [MACHINE]``.
+
+    Args:
+        load: reads a machine file; None after its errors have been printed.
+        prepare_kernel_cache: says where compiled kernels are kept.
+    """
+
+    help = "judge a snapshot again: the same detectors and alarms over the same samples"
+    description = (
+        "Play the samples of a snapshot into the rings, detectors and alarms of the service, as fast as it "
+        "goes, print the alarms that come of it, and hold them and every statement of the detectors against "
+        "what the service said then, to the last bit. With a machine file that judges instead of the one in "
+        "the snapshot. Exit code: 0 if it was judged, with --check 1 if anything differs, 3 if it cannot be "
+        "read or judged, 2 for wrong usage."
+    )
+
+    def __init__(
+        self, load: Callable[[Path], MachineFile | None], prepare_kernel_cache: Callable[[], None]
+    ) -> None:
+        self._load = load
+        self._prepare_kernel_cache = prepare_kernel_cache
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """See `daqsvc.cli.Command.add_arguments`."""
+        parser.add_argument("snapshot", type=Path, metavar="SNAPSHOT", help="the snapshot (.mcap)")
+        parser.add_argument(
+            "machine", type=Path, nargs="?", metavar="MACHINE", help="a machine file to judge by instead"
+        )
+        parser.add_argument("--check", action="store_true", help="exit with 1 if anything differs")
+        parser.add_argument("--json", action="store_true", help="one JSON object instead of text")
+
+    def run(self, arguments: argparse.Namespace) -> int:
+        """See `daqsvc.cli.Command.run`."""
+        from daqsvc.confined.limits import ResourceLimits  # noqa: PLC0415 - each verb imports what it needs
+        from daqsvc.offline.replay import ReplayError, replay  # noqa: PLC0415
+        from daqsvc.snapshots.reading import SnapshotError, read_snapshot  # noqa: PLC0415
+
+        machine = None
+        if arguments.machine is not None and (machine := self._load(arguments.machine)) is None:
+            return EXIT_USAGE
+        self._prepare_kernel_cache()
+        try:
+            snapshot = read_snapshot(arguments.snapshot, ResourceLimits())
+            with tempfile.TemporaryDirectory(prefix="daqsvc-replay-") as directory:
+                replayed = asyncio.run(replay(snapshot, machine, Path(directory)))
+        except SnapshotError as error:
+            print(f"daqsvc replay: {error}", file=sys.stderr)  # noqa: T201 - errors go to stderr
+            return EXIT_REFUSED
+        except ReplayError as error:
+            print(f"daqsvc replay: {arguments.snapshot} {error}", file=sys.stderr)  # noqa: T201
+            return EXIT_REFUSED
+        text = json.dumps(_document(replayed)) if arguments.json else "\n".join(_lines(replayed))
+        print(text)  # noqa: T201 - this is what the verb is for
+        return EXIT_FAILED if arguments.check and not replayed.is_equal else EXIT_OK
+
+
+def _lines(replayed: Replayed) -> Iterator[str]:
+    from daqsvc.acquisition.clock import iso_utc  # noqa: PLC0415 - only what a verb needs
+
+    yield from replayed.notes
+    for detector, why in replayed.anew.items():
+        yield f"{detector} is judged anew: {why}"
+    for event in replayed.alarms:
+        yield f"{iso_utc(event.wall_ns)} {event.alarm} {event.kind.value}: {event.message}"
+    if not replayed.alarms:
+        yield "no alarm changes"
+    for words, comparison in (("statements", replayed.said), ("alarm events", replayed.alarmed)):
+        then = comparison.equal + len(comparison.changed)
+        yield f"{comparison.equal} of {then} {words} are as they were, to the last bit"
+        for document in comparison.changed[:_SHOWN]:
+            yield f"  only then: {_in_short(document)}"
+        for document in comparison.added[:_SHOWN]:
+            yield f"  only now: {_in_short(document)}"
+
+
+def _in_short(document: dict[str, Any]) -> str:
+    return ", ".join(
+        f"{key} {document[key]}"
+        for key in ("alarm", "kind", "level", "detector", "decision", "monotonic_ns", "quality")
+        if key in document
+    )
+
+
+def _document(replayed: Replayed) -> dict[str, Any]:
+    from daqsvc.publish.payloads import alarm_document, statement_document  # noqa: PLC0415 - only what is needed
+
+    def told(comparison: Comparison) -> dict[str, Any]:
+        return {"equal": comparison.equal, "only_then": comparison.changed, "only_now": comparison.added}
+
+    from pydantic_core import to_json  # noqa: PLC0415 - as above
+
+    document: dict[str, Any] = json.loads(
+        to_json(
+            {
+                "is_equal": replayed.is_equal,
+                "anew": replayed.anew,
+                "notes": replayed.notes,
+                "alarms": [alarm_document(event) for event in replayed.alarms],
+                "statements": [statement_document(one) for one in replayed.statements],
+                "compared": {"statements": told(replayed.said), "alarms": told(replayed.alarmed)},
+            },
+            inf_nan_mode="null",
+        )
+    )
+    return document

@@ -1,0 +1,59 @@
+"""``daqsvc snapshot``: have the service that runs write down what its machine does now."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import TYPE_CHECKING
+
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE
+from daqsvc.commands.store_argument import BadFileError, StoreNotFoundError, add_store, chosen_store
+
+if TYPE_CHECKING:
+    import argparse
+
+    from daqsvc.commands.machine_files import Load
+
+
+class SnapshotCommand:
+    """``daqsvc snapshot [FILE | --store DIR]``.
+
+    Args:
+        load: reads a machine file; None after its errors have been printed.
+    """
+
+    help = "have the service write a snapshot of a machine: samples, statements, alarms"
+    description = (
+        "Have the service that runs on the store write a snapshot: the samples of all channels of a machine "
+        "from before_s before until after_s after now, and what was said by them. Waits until it is complete "
+        "and prints its file. The machine file needs a table [recorder]. Exit code 1 if none was made."
+    )
+
+    def __init__(self, load: Load) -> None:
+        self._load = load
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """See `daqsvc.cli.Command.add_arguments`."""
+        parser.add_argument("--json", action="store_true", help="one JSON object instead of text")
+        add_store(parser)
+
+    def run(self, arguments: argparse.Namespace) -> int:
+        """See `daqsvc.cli.Command.run`."""
+        from daqsvc.control import ControlError, ask_snapshot  # noqa: PLC0415 - only what a verb needs
+
+        try:
+            store = chosen_store(arguments, self._load)
+            answer = ask_snapshot(store.directory, store.machine)
+        except BadFileError:
+            return EXIT_USAGE
+        except (StoreNotFoundError, ControlError) as error:
+            print(f"daqsvc snapshot: {error}", file=sys.stderr)  # noqa: T201 - errors go to stderr
+            return EXIT_FAILED
+        if arguments.json:
+            told = {"accepted": answer.accepted, "reason": answer.reason, "path": answer.path}
+            print(json.dumps(told))  # noqa: T201 - this is what the verb is for
+        elif answer.accepted:
+            print(answer.path)  # noqa: T201 - as above
+        else:
+            print(f"daqsvc snapshot: {answer.reason}", file=sys.stderr)  # noqa: T201 - errors go to stderr
+        return EXIT_OK if answer.accepted else EXIT_FAILED

@@ -1,0 +1,436 @@
+"""A snapshot is judged again by the rings, detectors and alarms of the service.
+
+The buses are replaced, and the hands that give samples to detectors: these give the windows that were given
+then. So every detector computes the same numbers from the same samples in the same portions. It begins with
+what it remembered then, if the snapshot has that, else anew.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NoReturn
+
+from pydantic_core import to_json
+
+from daqsvc import __version__
+from daqsvc.acquisition.clock import NS_PER_S, DrivenClock
+from daqsvc.acquisition.ring import RingClosed, RingError, RingReader
+from daqsvc.acquisition.samples import SampleBlock, Window
+from daqsvc.acquisition.standing import StreamState
+from daqsvc.alarms.events import Identity
+from daqsvc.alarms.make import alarm_rule
+from daqsvc.alarms.manager import AlarmManager
+from daqsvc.diagnosis.memory import Memory, MemoryNotFittingError, put
+from daqsvc.diagnosis.pipeline import THREADS, KernelThreads, kernel_failed
+from daqsvc.diagnosis.statements import said_of_silence
+from daqsvc.machine_watch import MachineWatch
+from daqsvc.publish.payloads import alarm_document, alarm_event, statement_document
+from daqsvc.recorder import machine_values
+from daqsvc.settings.load import machine_file_of
+from daqsvc.settings.problems import AssemblyError, MachineFileError
+from daqsvc.snapshots.contents import ALARMS, DIAGNOSES, FILES, MACHINE_JSON, STANDING, STATES, STORE, WINDOWS
+from daqsvc.supervision import Supervisor
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from daqsvc.acquisition.ring import SampleRing
+    from daqsvc.alarms.events import AlarmEvent
+    from daqsvc.diagnosis.detector import Detector
+    from daqsvc.diagnosis.record import Diagnosis
+    from daqsvc.settings import MachineFile
+    from daqsvc.snapshots.contents import Document, Noted, Snapshot
+
+STEP_NS = NS_PER_S // 4
+"""The clock goes on in steps of this length, so that silence is noticed as it was."""
+LONGEST_GAP_NS = 3600 * NS_PER_S
+"""Between two entries of a snapshot: what is longer is damage."""
+ALARM_TICK_NS = NS_PER_S
+_TURNS = 4
+"""Of the event loop, after which whoever woke has done what there was to do."""
+_NOT_COMPARED = ("time", "wall_ns", "id", "sequence", "occurrence")
+"""Of an alarm event: its label of wall time, and what is new each time."""
+
+
+class ReplayError(Exception):
+    """A snapshot that cannot be replayed; the text is to be read after its name."""
+
+
+@dataclass(slots=True)
+class Comparison:
+    """What was said then, held against what is said now.
+
+    Attributes:
+        equal: said then and now, to the last bit.
+        changed: said then and not now.
+        added: said now and not then.
+    """
+
+    equal: int = 0
+    changed: list[Document] = field(default_factory=list)
+    added: list[Document] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class Replayed:
+    """What came of a replay.
+
+    Attributes:
+        statements: of the detectors, in order.
+        alarms: events of alarms, in order.
+        anew: the detectors that began anew, and why.
+        notes: what a person should know of the snapshot, in sentences.
+        said: the statements held against those of the snapshot.
+        alarmed: likewise the events of alarms, but for people's.
+    """
+
+    statements: list[Diagnosis] = field(default_factory=list)
+    alarms: list[AlarmEvent] = field(default_factory=list)
+    anew: dict[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    said: Comparison = field(default_factory=Comparison)
+    alarmed: Comparison = field(default_factory=Comparison)
+
+    @property
+    def is_equal(self) -> bool:
+        """Whether all that was said then is said now, and nothing else."""
+        return not (self.said.changed or self.alarmed.changed or self.alarmed.added)
+
+
+class GivenWindows(RingReader):
+    """Hands a detector the windows that it is given, and no others."""
+
+    def __init__(self, ring: SampleRing) -> None:
+        super().__init__(ring)
+        self._given: asyncio.Queue[Window | None] = asyncio.Queue()
+        self.asks = asyncio.Event()
+        """Whether the detector has done with the last one."""
+
+    def give(self, window: Window | None) -> None:
+        """Hand it on; None if no more will come."""
+        self.asks.clear()
+        self._given.put_nowait(window)
+
+    async def read(self, block: int, most_blocks: int) -> Window:
+        """See `RingReader.read`."""
+        del block, most_blocks
+        self.asks.set()
+        window = await self._given.get()
+        if window is None:
+            raise RingClosed(f"the snapshot of {self.ring.stream!r} has ended")
+        return window
+
+
+def machine_of(snapshot: Snapshot, directory: Path) -> MachineFile:
+    """The machine file of a snapshot; the files that it names are laid into a directory.
+
+    Args:
+        snapshot: as read.
+        directory: empty.
+
+    Raises:
+        ReplayError: it has none, or none that can be used.
+    """
+    try:
+        text = snapshot.files[MACHINE_JSON].decode()
+        for name, data in snapshot.files.items():
+            if name.startswith(FILES):
+                # Wherever it was then: here it lies among the others.
+                number = f"{len(list(directory.iterdir()))}-{name.rpartition('/')[2]}"
+                (directory / number).write_bytes(data)
+                text = text.replace(json.dumps(name.removeprefix(FILES)), json.dumps(number))
+        values = json.loads(text)
+        return machine_file_of(values, directory / MACHINE_JSON)
+    except MachineFileError as error:
+        problem = error.problems[0]
+        raise ReplayError(f"has a machine file that cannot be used here: {problem.message}") from None
+    except (KeyError, ValueError, TypeError, AttributeError, RecursionError, OSError):
+        raise ReplayError("has no machine file that can be used: name one behind it") from None
+
+
+class Replay:
+    """One replay of a snapshot.
+
+    Args:
+        snapshot: as read.
+        machine: the machine file to judge by.
+        directory: for what detectors keep.
+
+    Raises:
+        ReplayError: the snapshot is none that can be replayed.
+        AssemblyError: the detectors cannot be made.
+    """
+
+    def __init__(self, snapshot: Snapshot, machine: MachineFile, directory: Path) -> None:
+        self._snapshot = snapshot
+        self._machine = machine.model_copy(update={"recorder": None})
+        self._directory = directory
+        self._result = Replayed(notes=list(snapshot.notes))
+        self._since: dict[str, int] = {}
+        """By detector, the index from which on it judges."""
+        about = snapshot.about
+        try:
+            self._begin_ns, self._wall_ns = int(about["begin_ns"]), int(about["wall_ns_at_0"])
+            self._standings = {n: StreamState(**one) for n, one in dict(about["standings"]).items()}
+            before = [alarm_event(json.dumps(one).encode()) for one in about["alarms"]]
+            self._is_from_start = bool(about["from_start"])
+            self._is_same = about["version"] == __version__ and machine_values(machine) == json.loads(
+                snapshot.files.get(MACHINE_JSON, b"null")
+            )
+        except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
+            _refuse(error)
+        self._memories = self._found_memories() if self._is_same else {}
+        self._why_anew = (
+            "the snapshot does not have what it remembered"
+            if self._is_same
+            else "the snapshot is of another version of daqsvc, or of another machine file"
+        )
+        self._clock = DrivenClock(self._begin_ns, self._begin_ns + self._wall_ns)
+        self._supervisor = Supervisor()
+        self._readers: dict[str, GivenWindows] = {}
+        self._watch = self._made()
+        self._alarms = AlarmManager(
+            Identity(machine.site, machine.box, machine.machine.name),
+            [alarm_rule(alarm) for alarm in machine.alarms],
+            self._clock,
+            handling=machine.alarm_handling,
+        )
+        self._before = before
+        self._ticked_ns = self._begin_ns
+
+    async def run(self) -> Replayed:
+        """Replay it, as fast as it goes.
+
+        Raises:
+            ReplayError: it is damaged.
+        """
+        watch, pipeline = self._watch, self._watch.pipeline
+        await pipeline.warm()
+        self._alarms.resume(self._before, watch.active_detectors())
+        for stream, standing in self._standings.items():
+            if stream in watch.standings:
+                watch.stand(stream, standing)
+        running = asyncio.create_task(pipeline.run(), name="replayed pipeline")
+        try:
+            for reader in self._readers.values():
+                await reader.asks.wait()
+            for entry in self._snapshot.entries:
+                await self._go_on_to(entry.at_ns)
+                if isinstance(entry.what, SampleBlock):
+                    self._write(entry.what)
+                else:
+                    await self._note(entry.what)
+            for reader in self._readers.values():
+                reader.give(None)
+            watch.close()
+            self._clock.advance_to(self._clock.monotonic_ns() + NS_PER_S)
+            await running
+        finally:
+            running.cancel()
+            await asyncio.wait({running})
+        self._compare()
+        return self._result
+
+    def _made(self) -> MachineWatch:
+        """The rings and detectors, which remember what they can."""
+        while True:
+            watch = MachineWatch(
+                self._machine,
+                self._directory,
+                self._clock,
+                self._report,
+                self._supervisor,
+                lambda _bus: "",
+                KernelThreads(THREADS, kernel_failed(self._supervisor)),
+                GivenWindows,
+            )
+            misfit = self._remind(watch)
+            if not misfit:
+                return watch
+            del self._memories[misfit]  # it may remember half of it now
+
+    def _remind(self, watch: MachineWatch) -> str:
+        """Have detectors remember; returns the one that cannot, else nothing."""
+        self._readers.clear()
+        self._since.clear()
+        for detector in watch.pipeline.detectors:
+            reader = watch.pipeline.readers[detector.name]
+            assert isinstance(reader, GivenWindows)  # noqa: S101 - for the type checker
+            self._readers[detector.name] = reader
+            if detector.name in self._memories:
+                end_index, memory = self._memories[detector.name]
+                try:
+                    put(detector, memory)
+                except MemoryNotFittingError as error:
+                    self._result.notes.append(f"{detector.name} cannot remember what it did: {error}")
+                    return detector.name
+                self._since[detector.name] = end_index
+                self._result.anew.pop(detector.name, None)
+            elif not (self._is_from_start and self._is_same):
+                self._result.anew[detector.name] = self._why_anew
+        return ""
+
+    def _found_memories(self) -> dict[str, tuple[int, Memory]]:
+        found: dict[str, tuple[int, Memory]] = {}
+        for entry in self._snapshot.entries:
+            if not isinstance(entry.what, SampleBlock) and entry.what.topic == STATES:
+                document = entry.what.document
+                try:
+                    found[str(document["detector"])] = int(document["end_index"]), Memory.of(document)
+                except (KeyError, ValueError, TypeError, MemoryNotFittingError) as error:
+                    _refuse(error)
+        return found
+
+    async def _go_on_to(self, at_ns: int) -> None:
+        """Let time pass."""
+        clock = self._clock
+        if at_ns - clock.monotonic_ns() > LONGEST_GAP_NS:
+            raise ReplayError("is damaged: its time leaps by more than an hour")
+        while (now_ns := clock.monotonic_ns()) < at_ns:
+            due_ns = self._ticked_ns + STEP_NS
+            clock.advance_to(min(at_ns, max(due_ns, now_ns)))
+            if clock.monotonic_ns() < due_ns:
+                return
+            self._ticked_ns = due_ns
+            for _ in range(_TURNS):
+                await asyncio.sleep(0)
+            if (due_ns - self._begin_ns) % ALARM_TICK_NS < STEP_NS:
+                self._result.alarms += self._alarms.tick()
+
+    def _write(self, block: SampleBlock) -> None:
+        """Samples come, of a stream or of a grid: grids are as they were made then."""
+        ring = self._watch.rings.get(block.stream)
+        if ring is None:
+            return
+        try:
+            ring.write(block)
+        except ValueError as error:
+            raise ReplayError(f"is damaged: {error}") from None
+
+    async def _note(self, noted: Noted) -> None:
+        document = noted.document
+        try:
+            if noted.topic == STANDING and document["stream"] in self._watch.standings:
+                told = {key: value for key, value in document.items() if key != "stream"}
+                self._watch.stand(document["stream"], StreamState(**told))
+            elif noted.topic == WINDOWS and document["detector"] in self._readers:
+                await self._give(document["detector"], document)
+        except (KeyError, ValueError, TypeError, AttributeError) as error:
+            _refuse(error)
+
+    async def _give(self, detector: str, document: Document) -> None:
+        """Have a detector process what it processed then."""
+        reader = self._readers[detector]
+        first, count = int(document["first_index"]), int(document["count"])
+        if first < self._since.get(detector, first):
+            return
+        ring = reader.ring
+        try:
+            samples = ring.read(first, count)
+        except RingError:
+            # It began before the snapshot.
+            self._result.anew.setdefault(detector, "its first samples are not in the snapshot")
+            return
+        last = first + count - 1
+        self._since.setdefault(detector, first)
+        reader.give(
+            Window(
+                first,
+                samples,
+                ring.time_of(last),
+                ring.period_at(last),
+                int(document["skipped"]),
+                bool(document["snapshot"]),
+                tuple(map(int, document["breaks"])),
+            )
+        )
+        await reader.asks.wait()
+
+    def _report(self, diagnosis: Diagnosis) -> None:
+        self._result.statements.append(diagnosis)
+        self._result.alarms += self._alarms.take(diagnosis)
+
+    def _compare(self) -> None:
+        """Hold what was said then against what is said now."""
+        names = {
+            name: detector.name
+            for detector in self._watch.pipeline.detectors
+            for name in _names(detector, self._begin_ns)
+        }
+        said, alarmed = [], []
+        for entry in self._snapshot.entries:
+            if isinstance(entry.what, SampleBlock):
+                continue
+            document = entry.what.document
+            if entry.what.topic == DIAGNOSES and self._is_replayed(document, names):
+                said.append(document)
+            elif entry.what.topic == ALARMS and not document.get("by"):
+                alarmed.append(document)
+        _hold(self._result.said, said, [statement_document(one) for one in self._result.statements])
+        of_data = [event for event in self._result.alarms if not event.by]
+        _hold(self._result.alarmed, alarmed, [alarm_document(one) for one in of_data])
+
+    def _is_replayed(self, document: Document, names: Mapping[str, str]) -> bool:
+        """Whether a statement of then rests on samples that were judged again."""
+        try:
+            since = self._since.get(names[document["detector"]])
+            return since is not None and document["window"]["end_index"] > since
+        except (KeyError, TypeError):
+            return False
+
+
+def _names(detector: Detector, t_ns: int) -> set[str]:
+    return {detector.name, *(one.detector for one in said_of_silence(detector, 0.0, t_ns))}
+
+
+def _hold(comparison: Comparison, then: list[Document], now: list[Document]) -> None:
+    told_now = [_comparable(one) for one in now]
+    told_then = [_comparable(one) for one in then]
+    left = Counter(told_now)
+    for text, document in zip(told_then, then, strict=True):
+        if left[text]:
+            left[text] -= 1
+            comparison.equal += 1
+        else:
+            comparison.changed.append(document)
+    for text, document in zip(told_now, now, strict=True):
+        if left[text]:
+            left[text] -= 1
+            comparison.added.append(document)
+
+
+def _comparable(document: Document) -> str:
+    """The same text for what is the same to the last bit."""
+    told = json.loads(to_json(document, inf_nan_mode="null"))
+    return json.dumps({key: one for key, one in told.items() if key not in _NOT_COMPARED}, sort_keys=True)
+
+
+def _refuse(error: Exception) -> NoReturn:
+    raise ReplayError(f"holds what is none of daqsvc's ({type(error).__name__}: {error})") from None
+
+
+async def replay(snapshot: Snapshot, machine: MachineFile | None, directory: Path) -> Replayed:
+    """Judge a snapshot again.
+
+    Args:
+        snapshot: as read.
+        machine: the machine file to judge by; None for that of the snapshot.
+        directory: empty; for files.
+
+    Raises:
+        ReplayError: it cannot be replayed.
+    """
+    for part in ("files", "store"):
+        (directory / part).mkdir()
+    for name, data in snapshot.files.items():
+        if name.startswith(STORE):
+            (directory / "store" / name.rpartition("/")[2]).write_bytes(data)
+    try:
+        judged_by = machine or machine_of(snapshot, directory / "files")
+        return await Replay(snapshot, judged_by, directory / "store").run()
+    except AssemblyError as error:
+        raise ReplayError(f"has detectors that cannot be made here: {error}") from None

@@ -1,0 +1,662 @@
+"""The recorder of a machine: what came and what was said lately, and snapshots of it on the disk.
+
+The event loop only puts references to what passes into a history; a thread writes them when there is a cause.
+A disk that is full, slow or gone costs the snapshot and nothing else.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+import os
+import shutil
+from collections import deque
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
+
+from daqsvc import __version__
+from daqsvc.acquisition.clock import NS_PER_S, iso_utc
+from daqsvc.acquisition.samples import SampleBlock
+from daqsvc.alarms.conditions import is_condition
+from daqsvc.alarms.events import ANNUNCIATIONS, AlarmEvent, Identity
+from daqsvc.diagnosis.memory import MemoryNotTakenError, take
+from daqsvc.diagnosis.record import Diagnosis
+from daqsvc.publish.payloads import alarm_document, statement_document
+from daqsvc.settings.models import MachineFile
+from daqsvc.settings.registry import configured
+from daqsvc.snapshots.contents import (
+    ALARMS,
+    DIAGNOSES,
+    FILES,
+    MACHINE_JSON,
+    MACHINE_TOML,
+    SCHEMA,
+    STANDING,
+    STATES,
+    STORE,
+    SUFFIX,
+    WINDOWS,
+    Entry,
+    Noted,
+)
+from daqsvc.snapshots.writing import SnapshotWriter
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+    from pathlib import Path
+
+    from daqsvc.acquisition.clock import Clock
+    from daqsvc.acquisition.samples import Window
+    from daqsvc.acquisition.standing import StreamState
+    from daqsvc.diagnosis.detector import Detector
+    from daqsvc.diagnosis.memory import Memory
+    from daqsvc.settings.recorder import Recorder as RecorderTable
+    from daqsvc.settings.streams import Grid
+    from daqsvc.snapshots.contents import Document
+    from daqsvc.supervision import Supervisor
+
+log = logging.getLogger(__name__)
+
+Kind = Literal["alarm", "asked", "scheduled"]
+
+FOLDER = "snapshots"
+"""Of the machine's part of the store."""
+TURN_NS = NS_PER_S // 4
+"""How often what has come is handed to the thread that writes."""
+SPARE_NS = NS_PER_S
+"""What the history holds beyond what a snapshot begins with: a cause is seen a turn late."""
+MOST_WAITING_BYTES = 64_000_000
+"""Samples that wait for a disk that is slow, at most."""
+MOST_CAUSES = 100
+"""Of one snapshot that are written down."""
+MEMORY_EVERY_NS = 5 * NS_PER_S
+"""How often detectors are asked what they remember."""
+MOST_ASKED = 16
+"""People who wait for a snapshot at a time."""
+LONGEST_FILE = 16_000_000
+"""Of a file that goes into a snapshot."""
+END_S = 0.25
+"""What the end of the service leaves for the last of a snapshot."""
+
+
+class SnapshotRefusedError(Exception):
+    """A snapshot that was asked for is not made; the text says why."""
+
+
+@dataclass(slots=True)
+class RecorderCounters:
+    """What the recorder has done; every figure only grows.
+
+    Attributes:
+        snapshots: written to their end.
+        snapshots_failed: begun or due, and not written to their end.
+        snapshots_deleted: to keep within age and size.
+        bytes_written: in snapshots.
+        blocks_dropped: blocks that a snapshot lacks, as the disk was too slow.
+        memories_not_taken: how often a detector remembered too much for a snapshot to begin with.
+        write_failures: how often the disk refused something.
+    """
+
+    snapshots: int = 0
+    snapshots_failed: int = 0
+    snapshots_deleted: int = 0
+    bytes_written: int = 0
+    blocks_dropped: int = 0
+    memories_not_taken: int = 0
+    write_failures: int = 0
+
+
+class _Read(NamedTuple):
+    """Samples were handed to a detector."""
+
+    detector: str
+    window: Document
+
+
+class _Stands(NamedTuple):
+    """A stream stands otherwise than before."""
+
+    stream: str
+    standing: StreamState
+
+
+class _Remembered(NamedTuple):
+    """What a detector remembered when it had processed everything before an index."""
+
+    at_ns: int
+    detector: str
+    stream: str
+    end_index: int
+    memory: Memory
+
+
+_Happened: TypeAlias = "SampleBlock | Diagnosis | AlarmEvent | _Read | _Stands | _Remembered"
+
+
+class _Item(NamedTuple):
+    """Something that has happened, as the event loop saw it."""
+
+    at_ns: int
+    what: _Happened
+
+
+@dataclass(slots=True)
+class _Open:
+    """The snapshot that is being written.
+
+    Attributes:
+        kind: why; of several causes the weightiest.
+        cause_ns: when there was cause to begin it.
+        begin_ns: its begin.
+        until_ns: its end, as it looks now.
+        causes: in words.
+        about: its first message, but for the causes.
+        writer: its file; None before that is open.
+    """
+
+    kind: Kind
+    cause_ns: int
+    begin_ns: int
+    until_ns: int
+    causes: list[str]
+    about: Document
+    writer: SnapshotWriter | None = None
+
+
+@dataclass(slots=True)
+class _Kept:
+    """How things stood before the oldest item of the history.
+
+    Attributes:
+        alarms: by alarm, its newest event.
+        standings: by stream.
+        since_begin: whether nothing has been forgotten yet.
+    """
+
+    alarms: dict[str, AlarmEvent] = field(default_factory=dict)
+    standings: dict[str, StreamState] = field(default_factory=dict)
+    since_begin: bool = True
+
+
+class Recorder:
+    """Records one machine. All methods belong to the event loop.
+
+    Args:
+        machine: the machine file.
+        settings: its table ``[recorder]``.
+        store: directory of the machine's part of the store.
+        clock: the service's clock.
+        supervisor: of the machine; told once of each kind of trouble.
+
+    Attributes:
+        counters: what it has done.
+        directory: where the snapshots are.
+        is_writing: whether a thread writes what has come.
+    """
+
+    def __init__(
+        self, machine: MachineFile, settings: RecorderTable, store: Path, clock: Clock, supervisor: Supervisor
+    ) -> None:
+        self.counters = RecorderCounters()
+        self.directory = store / FOLDER
+        self.is_writing = False
+        self._machine = machine
+        self._identity = Identity(machine.site, machine.box, machine.machine.name)
+        self._settings = settings
+        self._store = store
+        self._clock = clock
+        self._supervisor = supervisor
+        self._before_ns = round(settings.before_s * NS_PER_S)
+        self._after_ns = round(settings.after_s * NS_PER_S)
+        self._history: deque[_Item] = deque()
+        self._kept = _Kept()
+        self._open: _Open | None = None
+        self._waiting: list[_Item] = []
+        """What is to be written to the snapshot that is open."""
+        self._waiting_bytes = 0
+        self._asked: list[asyncio.Future[Path]] = []
+        self._due_ns: int | None = None
+        self._is_well = True
+        self._memories: dict[str, deque[_Remembered]] = {}
+        """Of each detector, the newest last; its thread adds to them."""
+        self._memories_kept = 2 + self._before_ns // MEMORY_EVERY_NS
+
+    def take_over(self, events: Iterable[AlarmEvent]) -> None:
+        """Take in how alarms stand from before the recorder was made."""
+        for event in events:
+            self._kept.alarms.setdefault(event.alarm, event)
+
+    def processed(self, detector: Detector, window: Window) -> None:
+        """A detector has processed a window; on the thread that it computes in."""
+        now_ns = self._clock.monotonic_ns()
+        memories = self._memories.get(detector.name)
+        if memories is None:
+            memories = self._memories[detector.name] = deque(maxlen=self._memories_kept)
+        if memories and now_ns - memories[-1].at_ns < MEMORY_EVERY_NS:
+            return
+        try:
+            memory = take(detector)
+        except MemoryNotTakenError:
+            self.counters.memories_not_taken += 1
+            return
+        end_index = window.first_index + len(window.samples)
+        memories.append(_Remembered(now_ns, detector.name, detector.stream, end_index, memory))
+
+    def block(self, block: SampleBlock) -> None:
+        """Samples have come, of a stream or of a grid."""
+        self._note(block, block.samples.nbytes)
+
+    def stand(self, stream: str, standing: StreamState) -> None:
+        """A stream stands otherwise."""
+        self._note(_Stands(stream, standing))
+
+    def read(self, detector: str, window: Window) -> None:
+        """Samples were handed to a detector."""
+        told = {
+            "detector": detector,
+            "first_index": window.first_index,
+            "count": len(window.samples),
+            "skipped": window.skipped,
+            "snapshot": window.snapshot,
+            "breaks": list(window.breaks),
+        }
+        self._note(_Read(detector, told))
+
+    def diagnosis(self, diagnosis: Diagnosis) -> None:
+        """A detector has made a statement."""
+        self._note(diagnosis)
+
+    def alarm(self, event: AlarmEvent) -> None:
+        """An alarm has changed: one that calls for a person is a cause."""
+        self._note(event)
+        if event.kind in ANNUNCIATIONS and not is_condition(event):
+            self._cause("alarm", f"{event.alarm}: {event.kind.value}")
+
+    async def snapshot(self, reason: str) -> Path:
+        """Make a snapshot now; returns when it is complete.
+
+        Args:
+            reason: who has asked, in words.
+
+        Raises:
+            SnapshotRefusedError: it was not made.
+        """
+        if len(self._asked) >= MOST_ASKED:
+            raise SnapshotRefusedError(f"{MOST_ASKED} others wait for a snapshot already; ask again later")
+        asked: asyncio.Future[Path] = asyncio.get_running_loop().create_future()
+        self._asked.append(asked)
+        self._cause("asked", reason)
+        return await asked
+
+    async def run(self) -> None:
+        """Write what there is cause to write, until cancelled."""
+        try:
+            while True:
+                await self._clock.sleep_ns(TURN_NS)
+                self.is_writing = True
+                await self._turn()
+                self.is_writing = False
+        finally:
+            self.is_writing = False
+            await self._end()
+
+    def figures(self) -> dict[str, int]:
+        """What it has done, and how much waits for the disk."""
+        return {
+            **asdict(self.counters),
+            "recording": int(self._open is not None),
+            "waiting_bytes": self._waiting_bytes,
+        }
+
+    def _note(self, what: _Happened, size_bytes: int = 0) -> None:
+        item = _Item(self._clock.monotonic_ns(), what)
+        self._history.append(item)
+        if self._open is not None:
+            if self._waiting_bytes + size_bytes > MOST_WAITING_BYTES:
+                self.counters.blocks_dropped += 1
+                return
+            self._waiting.append(item)
+            self._waiting_bytes += size_bytes
+
+    def _cause(self, kind: Kind, words: str) -> None:
+        """Begin a snapshot, or let the one that is open last longer."""
+        now_ns = self._clock.monotonic_ns()
+        if self._open is None:
+            history = list(self._history)
+            first, memories = self._begin(history, now_ns - self._before_ns)
+            begin_ns = history[first].at_ns if first < len(history) else now_ns
+            about = self._about(history[:first], begin_ns, memories)
+            self._open = _Open(kind, now_ns, begin_ns, now_ns + self._after_ns, [words], about)
+            self._waiting = [*(_Item(begin_ns, one) for one in memories), *history[first:]]
+            self._waiting_bytes = sum(map(_size, self._waiting))
+            return
+        most_ns = self._open.begin_ns + round(self._settings.longest_s * NS_PER_S)
+        self._open.until_ns = max(self._open.until_ns, min(now_ns + self._after_ns, most_ns))
+        if len(self._open.causes) < MOST_CAUSES:
+            self._open.causes.append(words)
+        if kind == "alarm" or (kind == "asked" and self._open.kind == "scheduled"):
+            self._open.kind = kind
+
+    def _begin(self, history: Sequence[_Item], begin_ns: int) -> tuple[int, list[_Remembered]]:
+        """Where a snapshot begins that reaches back to a time, and what detectors remembered there.
+
+        It begins as much earlier as the last moment at which they were asked.
+        """
+        if self._kept.since_begin:
+            return 0, []
+        firsts = [next((k for k, one in enumerate(history) if one.at_ns >= begin_ns), len(history))]
+        chosen: list[_Remembered] = []
+        for memories in [*self._memories.values()]:
+            there = [one for one in [*memories] if one.at_ns <= begin_ns]
+            first = _first_after(history, there[-1]) if there else None
+            if first is not None:
+                firsts.append(first)
+                chosen.append(there[-1])
+        return min(firsts), chosen
+
+    def _trim(self, now_ns: int) -> None:
+        """Forget what no snapshot would begin with any more, but for how alarms and streams stood."""
+        oldest_ns = now_ns - self._before_ns - MEMORY_EVERY_NS - SPARE_NS
+        history, kept = self._history, self._kept
+        while history and history[0].at_ns < oldest_ns:
+            what = history.popleft().what
+            kept.since_begin = False
+            if isinstance(what, AlarmEvent):
+                kept.alarms[what.alarm] = what
+            elif isinstance(what, _Stands):
+                kept.standings[what.stream] = what.standing
+
+    async def _turn(self) -> None:
+        now_ns = self._clock.monotonic_ns()
+        self._trim(now_ns)
+        every_s = self._settings.every_s
+        if every_s is not None and (self._due_ns is None or now_ns >= self._due_ns):
+            if self._due_ns is not None:
+                self._cause("scheduled", "scheduled")
+            self._due_ns = now_ns + round(every_s * NS_PER_S)
+        if self._open is not None:
+            await self._write_on(self._open, now_ns)
+
+    async def _write_on(self, snapshot: _Open, now_ns: int) -> None:
+        items, self._waiting, self._waiting_bytes = self._waiting, [], 0
+        is_over = now_ns >= snapshot.until_ns
+        try:
+            if snapshot.writer is None:
+                snapshot.writer = await asyncio.to_thread(self._open_file, snapshot)
+            await asyncio.to_thread(self._put, snapshot.writer, items)
+            if not is_over:
+                return
+            path = await asyncio.to_thread(self._finish, snapshot)
+        except (OSError, ValueError) as error:
+            self._give_up(snapshot, error)
+            return
+        self._open = None
+        self._waiting, self._waiting_bytes = [], 0
+        self.counters.snapshots += 1
+        if not self._is_well:
+            self._is_well = True
+            log.warning("snapshots of %s are written again", self._identity.machine)
+        asked, self._asked = self._asked, []
+        for one in asked:
+            if not one.done():
+                one.set_result(path)
+
+    def _give_up(self, snapshot: _Open, error: Exception) -> None:
+        """The disk takes no more of a snapshot: what it has got stays, and the service goes on."""
+        self.counters.write_failures += 1
+        self.counters.snapshots_failed += 1
+        self._open = None
+        self._waiting, self._waiting_bytes = [], 0
+        if snapshot.writer is not None:
+            with contextlib.suppress(OSError):
+                snapshot.writer.abandon()
+        if self._is_well:
+            self._is_well = False
+            log.error("a snapshot of %s is lost: %s", self._identity.machine, _in_words(error))
+        asked, self._asked = self._asked, []
+        for one in asked:
+            if not one.done():
+                one.set_exception(SnapshotRefusedError(f"the snapshot is lost: {_in_words(error)}"))
+
+    async def _end(self) -> None:
+        """No more is written: bring what is under way to its end, if the disk is quick."""
+        snapshot, self._open = self._open, None
+        for one in self._asked:
+            if not one.done():
+                one.set_exception(SnapshotRefusedError("the service ends"))
+        if snapshot is None or snapshot.writer is None:
+            return
+        items, self._waiting, writer = self._waiting, [], snapshot.writer
+
+        def finish() -> None:
+            self._put(writer, items)
+            self._finish(snapshot)
+
+        with contextlib.suppress(OSError, ValueError, TimeoutError):
+            await asyncio.wait_for(asyncio.to_thread(finish), END_S)
+
+    def _about(self, before: Iterable[_Item], begin_ns: int, memories: Iterable[_Remembered]) -> Document:
+        """The first message of a snapshot: whose it is, and how things stood at its begin."""
+        wall_ns = self._clock.wall_ns() - self._clock.monotonic_ns()
+        alarms, standings = dict(self._kept.alarms), dict(self._kept.standings)
+        for item in before:
+            if isinstance(item.what, AlarmEvent):
+                alarms[item.what.alarm] = item.what
+            elif isinstance(item.what, _Stands):
+                standings[item.what.stream] = item.what.standing
+        return {
+            "schema": SCHEMA,
+            "version": __version__,
+            "site": self._identity.site,
+            "box": self._identity.box,
+            "machine": self._identity.machine,
+            "begin_ns": begin_ns,
+            "begin": iso_utc(begin_ns + wall_ns),
+            "wall_ns_at_0": wall_ns,
+            "from_start": self._kept.since_begin,
+            "remembered": {one.detector: one.end_index for one in memories},
+            "streams": dict(self._streams()),
+            "standings": {name: one._asdict() for name, one in standings.items()},
+            "alarms": [alarm_document(event) for event in alarms.values()],
+        }
+
+    def _streams(self) -> Iterator[tuple[str, Document]]:
+        machine = self._machine
+        sensors = {(one.stream, one.channel): one for one in machine.sensors}
+        for name, stream in machine.streams.items():
+            names = stream.layout.channel_names
+            known = [sensors.get((name, channel)) for channel in names]
+            yield (
+                name,
+                {
+                    "rate_hz": stream.rate_hz,
+                    "channels": list(names),
+                    "sensors": ["" if one is None else one.name for one in known],
+                    "units": ["" if one is None else one.unit for one in known],
+                },
+            )
+        for grid in machine.grids:
+            yield grid.name, _of_grid(grid)
+
+    def _open_file(self, snapshot: _Open) -> SnapshotWriter:
+        """Make the file; blocks.
+
+        Raises:
+            OSError: it cannot be made.
+        """
+        self.directory.mkdir(mode=0o750, exist_ok=True)
+        self._make_room()
+        self._see_space()
+        about = {**snapshot.about, "causes": list(snapshot.causes)}
+        wall_ns = about["wall_ns_at_0"]
+        cause = datetime.fromtimestamp((snapshot.cause_ns + wall_ns) / NS_PER_S, UTC)
+        name = f"{cause:%Y%m%dT%H%M%S}.{cause.microsecond:06d}Z-{snapshot.kind}{SUFFIX}"
+        return SnapshotWriter(self.directory / name, about, self._files(), wall_ns)
+
+    def _files(self) -> dict[str, bytes]:
+        """What a replay needs beside samples: the machine file, and files that detectors use; blocks."""
+        machine = self._machine
+        values = machine_values(machine)
+        files = {MACHINE_JSON: json.dumps(values, indent=1).encode()}
+        if machine.text:
+            files[MACHINE_TOML] = machine.text.encode()
+        for path in _paths(values):
+            with contextlib.suppress(OSError):
+                if (whole := machine.path.parent / path).stat().st_size <= LONGEST_FILE:
+                    files[f"{FILES}{path}"] = whole.read_bytes()
+        for key, _, _ in configured(machine.pipeline):
+            with contextlib.suppress(OSError):
+                files[f"{STORE}{key}.toml"] = (self._store / f"{key}.toml").read_bytes()
+        return files
+
+    def _put(self, writer: SnapshotWriter, items: Iterable[_Item]) -> None:
+        """Write what has happened; blocks.
+
+        Raises:
+            OSError: the disk does not take it.
+        """
+        if not items:
+            return
+        self._see_space()
+        before = writer.size
+        writer.write(self._entry(item) for item in items)
+        self.counters.bytes_written += writer.size - before
+
+    def _finish(self, snapshot: _Open) -> Path:
+        """Close the file, and give it the name of its cause; blocks.
+
+        Raises:
+            OSError: the disk does not take it.
+        """
+        assert snapshot.writer is not None  # noqa: S101 - for the type checker
+        path = snapshot.writer.path
+        snapshot.writer.finish()
+        stem = path.name.rpartition("-")[0]
+        path = path.rename(path.with_name(f"{stem}-{snapshot.kind}{SUFFIX}"))
+        self._make_room()
+        return path
+
+    def _see_space(self) -> None:
+        """Leave the alarms room on the disk.
+
+        Raises:
+            OSError: there is too little.
+        """
+        free = shutil.disk_usage(self.directory).free
+        reserve = self._settings.reserve_mb * 1_000_000
+        if free < reserve:
+            raise OSError(
+                f"{self.directory} has {free / 1e6:.0f} MB free, of which reserve_mb = "
+                f"{self._settings.reserve_mb} in [recorder] belong to the alarms; make room on the disk"
+            )
+
+    def _make_room(self) -> None:
+        """Delete what is too old or too much, the oldest first, and those of alarms last; blocks.
+
+        Raises:
+            OSError: the folder cannot be read.
+        """
+        kept: list[tuple[bool, str, int]] = []
+        oldest = self._clock.wall_ns() - self._settings.keep_days * 86_400 * NS_PER_S
+        writing = self._open.writer.path.name if self._open is not None and self._open.writer else ""
+        with os.scandir(self.directory) as found:
+            for one in found:
+                if one.name.endswith(SUFFIX) and one.is_file(follow_symlinks=False) and one.name != writing:
+                    status = one.stat()
+                    if status.st_mtime_ns < oldest:
+                        self._delete(one.name)
+                    else:
+                        kept.append((one.name.endswith(f"-alarm{SUFFIX}"), one.name, status.st_size))
+        total = sum(size for _, _, size in kept)
+        for _, name, size in sorted(kept):
+            if total <= self._settings.max_mb * 1_000_000:
+                break
+            self._delete(name)
+            total -= size
+
+    def _delete(self, name: str) -> None:
+        (self.directory / name).unlink(missing_ok=True)
+        self.counters.snapshots_deleted += 1
+
+    def _entry(self, item: _Item) -> Entry:
+        """An item as it is written."""
+        match item.what:
+            case SampleBlock() as block:
+                return Entry(item.at_ns, block)
+            case Diagnosis() as diagnosis:
+                return Entry(item.at_ns, Noted(DIAGNOSES, statement_document(diagnosis)))
+            case AlarmEvent() as event:
+                return Entry(item.at_ns, Noted(ALARMS, alarm_document(event)))
+            case _Read() as read:
+                return Entry(item.at_ns, Noted(WINDOWS, read.window))
+            case _Remembered() as one:
+                about = {"detector": one.detector, "end_index": one.end_index}
+                return Entry(item.at_ns, Noted(STATES, {**about, **one.memory.document()}))
+            case _Stands(stream, standing):
+                return Entry(item.at_ns, Noted(STANDING, {"stream": stream, **standing._asdict()}))
+
+
+def machine_values(machine: MachineFile) -> dict[str, Any]:
+    """What is in force of a machine file, as TOML would give it, but for outputs, store and recorder."""
+    others = {key for key in type(machine).model_fields if key not in MachineFile.model_fields}
+    values: dict[str, Any] = json.loads(
+        machine.model_dump_json(
+            serialize_as_any=True, exclude_unset=True, by_alias=True, exclude={*others, "store", "recorder"}
+        )
+    )
+    return values
+
+
+def _of_grid(grid: Grid) -> Document:
+    names = list(grid.channel_names)
+    nothing = ["" for _ in names]
+    return {
+        "rate_hz": grid.rate_hz,
+        "channels": names,
+        "sensors": nothing,
+        "units": nothing,
+    }
+
+
+def _paths(values: Any) -> Iterator[str]:
+    """The files that tables of detectors and layouts of streams name."""
+    for table in (values.get("pipeline", {}), values.get("streams", {})):
+        yield from _texts(table)
+
+
+def _texts(value: Any) -> Iterator[str]:
+    """Texts that look like the path of a file."""
+    if isinstance(value, dict):
+        for one in value.values():
+            yield from _texts(one)
+    elif isinstance(value, list):
+        for one in value:
+            yield from _texts(one)
+    elif isinstance(value, str) and value.lower().endswith((".toml", ".dbc")):
+        yield value
+
+
+def _first_after(history: Sequence[_Item], memory: _Remembered) -> int | None:
+    """Where the samples begin that a detector goes on with; None if some of them are forgotten."""
+    for number, item in enumerate(history):
+        block = item.what
+        if isinstance(block, SampleBlock) and block.stream == memory.stream:
+            if block.first_index - block.gap > memory.end_index:
+                return None
+            if block.end_index > memory.end_index:
+                return number
+    return len(history)
+
+
+def _size(item: _Item) -> int:
+    """Bytes of samples."""
+    return item.what.samples.nbytes if isinstance(item.what, SampleBlock) else 0
+
+
+def _in_words(error: Exception) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename or 'the disk'}: {error.strerror}"
+    return f"{error}"

@@ -1,0 +1,226 @@
+"""When snapshots are made, how long they last, how many are kept, and what a bad disk does to them."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import os
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from support.recorded_rig import recorded_rig
+from support.waiting import eventually
+
+from daqsvc.acquisition.clock import NS_PER_S, DrivenClock
+from daqsvc.acquisition.samples import SampleBlock
+from daqsvc.acquisition.standing import StreamState
+from daqsvc.alarms.events import AlarmEvent, EventKind, Identity
+from daqsvc.alarms.states import AlarmState, Level
+from daqsvc.diagnosis.record import Diagnosis
+from daqsvc.recorder import MOST_WAITING_BYTES, Recorder, SnapshotRefusedError
+from daqsvc.snapshots.mcap import Attachment, Damage
+from daqsvc.snapshots.reading import entries_of
+from daqsvc.supervision import Supervisor
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+    from daqsvc.snapshots.contents import Document
+
+ROWS = 64
+
+
+class Bench:
+    """A recorder and what drives it: a block every tenth of a second."""
+
+    def __init__(self, store: Path, **table: Any) -> None:
+        machine, _ = recorded_rig("unused", **{"before_s": 1.0, "after_s": 1.0, **table})
+        assert machine.recorder is not None
+        self.clock = DrivenClock(wall_start_ns=1_800_000_000 * NS_PER_S)
+        self.recorder = Recorder(machine, machine.recorder, store, self.clock, Supervisor())
+        self._index = 0
+
+    async def passes(self, seconds: float) -> None:
+        for _ in range(round(10 * seconds)):
+            self.clock.advance_to(self.clock.monotonic_ns() + NS_PER_S // 10)
+            samples = np.full((ROWS, 3), self._index, np.float32)
+            now_ns = self.clock.monotonic_ns()
+            self.recorder.block(SampleBlock("shaft", self._index, samples, now_ns, 1.5e6))
+            self._index += ROWS
+            await asyncio.sleep(0)
+            await asyncio.sleep(0)
+            await eventually(lambda: not self.recorder.is_writing, "what has come is written")
+
+    def alarm(self, name: str = "rotor-fault", kind: EventKind = EventKind.RAISED) -> None:
+        now_ns = self.clock.monotonic_ns()
+        cause = Diagnosis("laval-rig", "rotor-bank", now_ns, "shaft", 0, 1, "F1")
+        states = AlarmState.NORMAL, AlarmState.ACTIVE_UNACKNOWLEDGED
+        levels = Level.NORMAL, Level.ALERT
+        identity = Identity("demo", "virtual", "laval-rig")
+        self.recorder.alarm(AlarmEvent(identity, name, "1", kind, *states, *levels, now_ns, 0, cause, "bad"))
+
+    @property
+    def files(self) -> list[Path]:
+        return sorted(self.recorder.directory.glob("*")) if self.recorder.directory.exists() else []
+
+
+@contextlib.asynccontextmanager
+async def bench(store: Path, **table: Any) -> AsyncIterator[Bench]:
+    made = Bench(store, **table)
+    task = asyncio.create_task(made.recorder.run())
+    await asyncio.sleep(0)
+    try:
+        yield made
+    finally:
+        task.cancel()
+        await asyncio.wait({task})
+
+
+def held(path: Path) -> tuple[Document, float, float, Damage]:
+    """What a snapshot is about, from when to when it has samples in s, and what is wrong with it."""
+    damage = Damage()
+    read = [
+        one for one in entries_of(memoryview(path.read_bytes()), damage) if not isinstance(one, Attachment)
+    ]
+    times = [one.at_ns / NS_PER_S for one in read if isinstance(one.what, SampleBlock)]
+    assert not isinstance(read[0].what, SampleBlock)
+    return read[0].what.document, min(times), max(times), damage
+
+
+async def test_a_snapshot_is_from_before_to_after_its_cause(tmp_path: Path) -> None:
+    async with bench(tmp_path) as one:
+        await one.passes(30.0)
+        at_s = one.clock.monotonic_ns() / NS_PER_S
+        one.alarm()
+        await one.passes(2.0)
+        [path] = one.files
+    assert path.name == "20270115T080030.000000Z-alarm.mcap"
+    about, begin_s, end_s, damage = held(path)
+    assert about["causes"] == ["rotor-fault: raised"]
+    assert damage == Damage()
+    assert at_s - 1.0 == pytest.approx(begin_s, abs=0.11)
+    assert at_s + 1.0 == pytest.approx(end_s, abs=0.3)
+    assert one.recorder.counters.snapshots == 1
+
+
+async def test_causes_that_overlap_make_one_snapshot_up_to_a_length(tmp_path: Path) -> None:
+    async with bench(tmp_path, longest_s=5.0) as one:
+        await one.passes(10.0)
+        asked = asyncio.create_task(one.recorder.snapshot("somebody"))
+        await asyncio.sleep(0)
+        for _ in range(8):
+            one.alarm()
+            await one.passes(0.8)
+        await one.passes(2.0)
+        assert (await asked).name.endswith("-alarm.mcap")
+        first, second = one.files
+    about, begin_s, end_s, _ = held(first)
+    assert about["causes"][0] == "somebody"
+    assert end_s - begin_s == pytest.approx(5.0, abs=0.3)
+    assert held(second)[2] > end_s
+
+
+async def test_what_calls_for_nobody_is_no_cause(tmp_path: Path) -> None:
+    async with bench(tmp_path) as one:
+        one.alarm(kind=EventKind.RETURNED)
+        await one.passes(3.0)
+        assert not one.files
+
+
+async def test_snapshots_come_by_the_clock(tmp_path: Path) -> None:
+    async with bench(tmp_path, every_s=10.0) as one:
+        await one.passes(32.0)
+        assert [path.name.rpartition("-")[2] for path in one.files] == 3 * ["scheduled.mcap"]
+
+
+async def test_the_oldest_go_first_and_those_of_alarms_last(tmp_path: Path) -> None:
+    folder = tmp_path / "snapshots"
+    folder.mkdir()
+    names = [f"2026010{day}T000000.000000Z-{kind}.mcap" for day, kind in enumerate(("alarm", "asked") * 2)]
+    for name in names:
+        (folder / name).write_bytes(bytes(600_000))
+        os.utime(folder / name, (1_800_000_000 - 60, 1_800_000_000 - 60))
+    old = folder / "20250101T000000.000000Z-alarm.mcap"
+    old.write_bytes(b"old")
+    os.utime(old, (1_700_000_000, 1_700_000_000))
+    (folder / "notes.txt").write_text("of somebody")
+    async with bench(tmp_path, max_mb=1, keep_days=100.0) as one:
+        one.alarm()
+        await one.passes(2.0)
+        kept = [path.name for path in one.files]
+    assert kept[0] == names[2]
+    assert kept[1].startswith("2027")
+    assert kept[2:] == ["notes.txt"]
+    assert one.recorder.counters.snapshots_deleted == 4
+
+
+async def test_a_disk_that_is_full_costs_the_snapshot_only(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with bench(tmp_path, reserve_mb=1_000_000) as one:
+        asked = asyncio.create_task(one.recorder.snapshot("somebody"))
+        await asyncio.sleep(0)
+        await one.passes(1.0)
+        with pytest.raises(SnapshotRefusedError, match="reserve_mb"):
+            await asked
+        for _ in range(3):
+            one.alarm()
+            await one.passes(2.0)
+        assert one.recorder.counters.snapshots_failed == 4
+        assert [record.levelname for record in caplog.records] == ["ERROR"], "said once"
+
+
+async def test_a_disk_that_fails_amid_a_snapshot_leaves_what_it_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with bench(tmp_path) as one:
+        one.alarm()
+        await one.passes(0.8)
+        with monkeypatch.context() as patched:
+
+            def refuse(*_: object) -> None:
+                raise OSError(errno.EIO, "Input/output error")
+
+            patched.setattr("daqsvc.snapshots.writing.SnapshotWriter.write", refuse)
+            await one.passes(0.5)
+        assert one.recorder.counters.write_failures == 1
+        await one.passes(2.0)
+        one.alarm()
+        await one.passes(2.0)
+        broken, whole = one.files
+    assert held(broken)[3].ends_early
+    assert not held(whole)[3].ends_early
+
+
+async def test_a_disk_that_hangs_holds_up_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import threading
+
+    hanging = threading.Event()
+
+    def hang(*_: object) -> None:
+        hanging.wait()
+
+    async with bench(tmp_path) as one:
+        monkeypatch.setattr("daqsvc.recorder.Recorder._see_space", hang)
+        one.alarm()
+        one.clock.advance_to(one.clock.monotonic_ns() + NS_PER_S)
+        await eventually(lambda: one.recorder.is_writing, "it hangs")
+        rows = np.zeros((MOST_WAITING_BYTES // 12 // 4, 3), np.float32)
+        for number in range(8):
+            one.recorder.block(SampleBlock("shaft", number * len(rows), rows, 0, 1.0))
+        assert one.recorder.figures()["waiting_bytes"] <= MOST_WAITING_BYTES
+        assert one.recorder.counters.blocks_dropped >= 4
+        hanging.set()
+        await eventually(lambda: not one.recorder.is_writing, "it is over")
+
+
+async def test_the_end_of_the_service_closes_what_is_open(tmp_path: Path) -> None:
+    async with bench(tmp_path) as one:
+        one.recorder.stand("shaft", StreamState("its rate is odd"))
+        one.alarm()
+        await one.passes(0.6)
+    [path] = one.files
+    assert held(path)[3] == Damage()

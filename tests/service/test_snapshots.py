@@ -1,0 +1,88 @@
+"""A service leaves snapshots of its machine, and what they hold is judged again to the last bit."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from support.recorded_rig import RATE_HZ, let_time_pass, play, recorded_rig, recorder_of, recording
+from support.waiting import eventually
+
+from daqsvc.acquisition.samples import SampleBlock
+from daqsvc.confined.limits import ResourceLimits
+from daqsvc.offline.replay import replay
+from daqsvc.snapshots.contents import ALARMS, MACHINE_JSON, MACHINE_TOML
+from daqsvc.snapshots.reading import read_snapshot
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from daqsvc.offline.replay import Replayed
+    from daqsvc.service import Service
+    from daqsvc.snapshots.contents import Snapshot
+
+pytestmark = pytest.mark.integration
+
+
+def snapshots(service: Service) -> list[Path]:
+    return sorted(recorder_of(service).directory.glob("*.mcap"))
+
+
+async def again(snapshot: Snapshot, folder: Path) -> Replayed:
+    folder.mkdir()  # noqa: ASYNC240 - of this test alone
+    return await replay(snapshot, None, folder)
+
+
+async def test_an_alarm_leaves_a_snapshot_that_replays_to_the_same_alarm(tmp_path: Path) -> None:
+    machine, samples = recorded_rig("snapshot-alarm", after_s=2.0)
+    async with recording(machine, tmp_path / "store") as (service, clock):
+        recorder = recorder_of(service)
+        await play(service, clock, samples[: round(6.5 * RATE_HZ)])
+        await let_time_pass(service, clock, 1.75)
+        await eventually(lambda: recorder.counters.snapshots > 0, "the first snapshot is complete")
+        path, *_ = snapshots(service)
+    assert path.name.endswith("-alarm.mcap")
+    assert recorder.counters.snapshots_failed == recorder.counters.blocks_dropped == 0
+    snapshot = read_snapshot(path, ResourceLimits())
+    assert snapshot.notes == ()
+    assert MACHINE_JSON in snapshot.files
+    assert b"laval-rig" in snapshot.files[MACHINE_TOML]
+    recorded = np.concatenate([e.what.samples for e in snapshot.entries if isinstance(e.what, SampleBlock)])
+    scale = 0.0005 / 0.00787  # a count of the device, in um
+    assert np.abs(recorded[:, :2] - samples[: len(recorded), :2]).max() < scale
+    alarms = [e.what.document for e in snapshot.entries if getattr(e.what, "topic", "") == ALARMS]
+    assert next(one["kind"] for one in alarms if one["alarm"] == "rotor-fault") == "raised"
+
+    replayed = await again(snapshot, tmp_path / "replay")
+    assert not replayed.anew
+    assert replayed.is_equal, (replayed.said.changed[:1], replayed.alarmed)
+    assert replayed.said.equal > 20
+    assert replayed.alarmed.equal == len(alarms) > 0
+    assert not replayed.said.added
+
+
+@pytest.mark.long
+async def test_a_snapshot_from_amid_a_run_begins_with_what_detectors_remember(tmp_path: Path) -> None:
+    machine, samples = recorded_rig("snapshot-amid", before_s=1.0, after_s=2.0)
+    machine = machine.model_copy(update={"alarms": ()})
+    async with recording(machine, tmp_path / "store") as (service, clock):
+
+        async def ask() -> Path:
+            await clock.sleep_ns(round(11e9))
+            return await recorder_of(service).snapshot("a test")
+
+        asked = asyncio.create_task(ask())
+        await play(service, clock, samples)
+        await let_time_pass(service, clock, 3.0)
+        path = await asked
+    assert path.name.endswith("-asked.mcap")
+    snapshot = read_snapshot(path, ResourceLimits())
+    assert not snapshot.about["from_start"]
+    assert snapshot.about["causes"] == ["a test"]
+    assert {name.partition("/")[0] for name in snapshot.about["remembered"]} == {"levels", "rotor-bank"}
+    replayed = await again(snapshot, tmp_path / "replay")
+    assert not replayed.anew
+    assert not replayed.said.changed, replayed.said.changed[0]
+    assert replayed.said.equal > 5
