@@ -12,12 +12,14 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass
+from tempfile import gettempdir
 from threading import RLock
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 
 import numpy as np
 
 from daqsvc.confined.child import LENGTH
+from daqsvc.confined.spilled import LEAST_BYTES, spilled
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -112,7 +114,13 @@ class ConfinedProcess:
         self.close()
 
     def call(
-        self, function: str, arguments: Mapping[str, Any], *, memory_bytes: int, cpu_s: float
+        self,
+        function: str,
+        arguments: Mapping[str, Any],
+        *,
+        memory_bytes: int,
+        cpu_s: float,
+        spill: bool = False,
     ) -> WorkResult:
         """Call a function there.
 
@@ -121,6 +129,8 @@ class ConfinedProcess:
             arguments: of it, as JSON can say them.
             memory_bytes: what it may take beyond what the process has, in address space.
             cpu_s: processor time that it may take.
+            spill: leave large arrays that come back in files, to be looked at piece by piece
+                (`daqsvc.confined.spilled`).
 
         Raises:
             ConfinedError: it took more than that, or crashed.
@@ -138,7 +148,7 @@ class ConfinedProcess:
                 raise ConfinedError("crash", f"{self._name} was told to stop")
             until = time.monotonic() + _WALL_BASE_S + _WALL_PER_CPU * cpu_s
             try:
-                return _ask(running, request, memory_bytes, until)
+                return _ask(running, request, memory_bytes, until, spill=spill)
             except RaisedThereError as error:
                 if error.kind != "MemoryError":
                     raise
@@ -201,7 +211,9 @@ def _begin(name: str) -> _Running:
     return _Running(name, process, request_out, reply_in)
 
 
-def _ask(running: _Running, request: Mapping[str, Any], memory_bytes: int, until: float) -> WorkResult:
+def _ask(
+    running: _Running, request: Mapping[str, Any], memory_bytes: int, until: float, *, spill: bool
+) -> WorkResult:
     try:
         rest = json.dumps(request).encode() + b"\n"
         while rest:
@@ -217,11 +229,24 @@ def _ask(running: _Running, request: Mapping[str, Any], memory_bytes: int, until
     kinds = [(np.dtype(kind), tuple(shape)) for kind, shape in header["arrays"]]
     if sum(kind.itemsize * float(np.prod(shape, dtype=np.float64)) for kind, shape in kinds) > memory_bytes:
         raise ConfinedError("memory", "what it holds takes more memory than it may")
-    arrays = [np.empty(shape, kind) for kind, shape in kinds]
-    for array in arrays:
-        if array.size:
-            _take(running, array.reshape(-1).view(np.uint8).data, until)
+    arrays = [_receive(running, kind, shape, until, spill=spill) for kind, shape in kinds]
     return WorkResult(header["found"], arrays)
+
+
+def _receive(
+    running: _Running, kind: np.dtype[Any], shape: tuple[int, ...], until: float, *, spill: bool
+) -> NDArray[Any]:
+    """An array that the process sends."""
+    size = kind.itemsize * int(np.prod(shape))
+    if spill and size >= LEAST_BYTES:
+        try:
+            return spilled(kind, shape, lambda piece: _take(running, piece, until))
+        except OSError as error:
+            raise ConfinedError("memory", f"it does not fit into {gettempdir()} ({error.strerror})") from None
+    array: NDArray[Any] = np.empty(shape, kind)
+    if array.size:
+        _take(running, array.reshape(-1).view(np.uint8).data, until)
+    return array
 
 
 def _take(running: _Running, into: bytearray | memoryview, until: float) -> bytearray | memoryview:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeAlias, TypeVar
 import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.confined.spilled import let_go
 from daqsvc.diagnosis.detector import Window
 from daqsvc.diagnosis.statements import said_of_window
 from daqsvc.dsp.quality.unit import UM_PER_UNIT
@@ -20,7 +21,7 @@ from daqsvc.settings.problems import AssemblyError
 from daqsvc.settings.section import Section
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Container, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -39,6 +40,9 @@ SettingsT = TypeVar("SettingsT", bound=Section)
 _SEVERITIES = ("normal", "alert", "danger")
 _BLOCKS = 256
 """Blocks handed over at a time."""
+
+_MOST_ROWS = 1 << 18
+"""Samples of a channel that are handed over at a time at most, unless a block has more."""
 _LONGEST_NAME = 40
 
 
@@ -88,21 +92,47 @@ class Recorded:
 
     def samples_of(self, stream: str) -> Floats:
         """The recording in columns and units of a stream or grid, float64 ``[n, channels]``; NaN: missing."""
+        return self.blocks_of(stream)[:]
+
+    def blocks_of(self, stream: str) -> Blocks:
+        """The same, made piece by piece: a long recording is not held twice."""
         # A recording has all channels of a grid on one grid already.
         grids = {grid.name: tuple(grid.streams) for grid in self.machine.grids}
-        return np.concatenate([self._stream(name) for name in grids.get(stream, (stream,))], axis=1)
+        return Blocks(self, grids.get(stream, (stream,)))
 
-    def _stream(self, stream: str) -> Floats:
+    def _stream(self, stream: str, rows: slice) -> Floats:
         recording, unit = self.recording, self.options.unit
         names = self.machine.streams[stream].layout.channel_names
-        samples = np.full((len(recording.samples), len(names)), np.nan)
+        taken = recording.samples[rows].astype(np.float64, copy=False)
+        samples = np.full((len(taken), len(names)), np.nan)
         for sensor in self.machine.sensors:
             if sensor.stream == stream:
-                column = recording.samples[:, recording.names.index(sensor.name)]
+                column = taken[:, recording.names.index(sensor.name)]
                 if isinstance(sensor, ProximityProbe) and unit is not None:
                     column = column * UM_PER_UNIT[unit] / UM_PER_UNIT[sensor.unit]
                 samples[:, names.index(sensor.channel)] = column
         return np.where(np.isfinite(samples), samples, np.nan)
+
+
+class Blocks:
+    """The samples of streams of a recording; a slice of it is float64 ``[n, channels]``, NaN: missing.
+
+    Args:
+        recorded: the recording.
+        streams: whose channels stand side by side.
+    """
+
+    def __init__(self, recorded: Recorded, streams: Sequence[str]) -> None:
+        self._recorded = recorded
+        self._streams = streams
+
+    def __len__(self) -> int:
+        return len(self._recorded.recording.samples)
+
+    def __getitem__(self, rows: slice) -> Floats:
+        streams = [self._recorded._stream(name, rows) for name in self._streams]  # noqa: SLF001
+        let_go(self._recorded.recording.samples)
+        return streams[0] if len(streams) == 1 else np.concatenate(streams, axis=1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -363,7 +393,7 @@ def statements_of(detector: Detector, recorded: Recorded) -> tuple[Statements, .
         recorded: the recording.
     """
     rate_hz = recorded.recording.rate_hz
-    return by_name(detector.name, listen(detector, recorded.samples_of(detector.stream), rate_hz), rate_hz)
+    return by_name(detector.name, listen(detector, recorded.blocks_of(detector.stream), rate_hz), rate_hz)
 
 
 def by_name(detector: str, diagnoses: Iterable[Diagnosis], rate_hz: float) -> tuple[Statements, ...]:
@@ -392,7 +422,9 @@ def worst(statements: Iterable[Statements]) -> str:
     return f"{name}, {diagnosis.severity} from {diagnosis.first_index / rate_hz:.3f} s on"
 
 
-def listen(detector: Detector, samples: Floats, rate_hz: float, blocks: int = _BLOCKS) -> Iterator[Diagnosis]:
+def listen(
+    detector: Detector, samples: Floats | Blocks, rate_hz: float, blocks: int = _BLOCKS
+) -> Iterator[Diagnosis]:
     """Have a detector process a recording.
 
     Args:
@@ -405,7 +437,7 @@ def listen(detector: Detector, samples: Floats, rate_hz: float, blocks: int = _B
         What it says.
     """
     period_ns = NS_PER_S / rate_hz
-    length = detector.block * blocks
+    length = detector.block * max(1, min(blocks, _MOST_ROWS // detector.block))
     for begin in range(0, len(samples), length):
         part = samples[begin : begin + length].astype(np.float32)
         whole = len(part) // detector.block * detector.block

@@ -155,7 +155,7 @@ class Runner:
             progress: called with the samples done and the samples in all.
         """
         try:
-            loaded = self.load(recording)
+            loaded = self.load(recording, narrow=True)
         except (RecordingError, RefusedError) as error:
             return self._outcome(_not_judged(self.detectors, recording, str(error)), {})
         present, machine = self._as_recorded(loaded)
@@ -240,12 +240,13 @@ class Runner:
         present = {key: table for key, table in tables.items() if table is not None}
         return present, machine.model_copy(update=update)
 
-    def load(self, recording: str, only: Sequence[str] | None = None) -> Recording:
+    def load(self, recording: str, only: Sequence[str] | None = None, *, narrow: bool = False) -> Recording:
         """The sensors of the machine in a recording, by their names.
 
         Args:
             recording: path of the recording: a file, a CAN log, or a folder of CAN logs.
             only: names of the sensors that are wanted; None: all that it has.
+            narrow: see `load_recording`.
 
         Raises:
             RecordingError: it cannot be read.
@@ -255,12 +256,12 @@ class Runner:
         if options.in_memory:
             wanted = {sensor.name: sensor.channel for sensor in machine.sensors}
             load = load_matching if options.patterns else load_recording
-            return self._in_its_units(load(recording, wanted, options.rate_hz))
+            return self._in_its_units(load(recording, wanted, options.rate_hz, narrow=narrow))
         if not _is_can_log(recording):
             columns = self._columns(recording)
             self._refuse_lacking(recording, only or (), columns)
             wanted = columns if only is None else {name: columns[name] for name in only}
-            return self._in_its_units(load_recording(recording, wanted, options.rate_hz))
+            return self._in_its_units(load_recording(recording, wanted, options.rate_hz, narrow=narrow))
         if options.channels or options.unit is not None:
             raise RefusedError(
                 f"{recording} is a CAN log, of which the machine file says channels and units: leave out "

@@ -26,11 +26,17 @@ if TYPE_CHECKING:
     from daqsvc.recording.contents import Contents
 
     Floats: TypeAlias = NDArray[np.float64]
+    Samples: TypeAlias = NDArray[np.float64] | NDArray[np.float32]
 
 
 def load(
-    path: str, channels: Mapping[str, str] | None, rate_hz: float | None, memory_bytes: int
-) -> tuple[dict[str, Any], tuple[Floats]]:
+    path: str,
+    channels: Mapping[str, str] | None,
+    rate_hz: float | None,
+    memory_bytes: int,
+    *,
+    narrow: bool = False,
+) -> tuple[dict[str, Any], tuple[Samples]]:
     """Read channels; arguments as of `daqsvc.recording.recording.load_recording`.
 
     Returns:
@@ -63,7 +69,7 @@ def load(
         },
     }
     del contents
-    samples = _together(columns, length, timing.rows)
+    samples = _together(columns, length, timing.rows, narrow=narrow)
     if named:  # what nobody asked for may be anything, e.g. a time in nanoseconds
         _refuse_impossible(file, list(channels), samples)
     about["nan_count"], about["infinity_count"] = _count_bad(samples)
@@ -188,13 +194,28 @@ def _common_length(
     return length
 
 
-def _together(columns: dict[str, NDArray[np.generic]], length: int, rows: NDArray[np.int64] | None) -> Floats:
-    """The samples float64 ``[n, channels]``; NaN in the rows that no sample has its place in.
+def _together(
+    columns: dict[str, NDArray[np.generic]],
+    length: int,
+    rows: NDArray[np.int64] | None,
+    *,
+    narrow: bool = False,
+) -> Any:
+    """The samples ``[n, channels]``; NaN in the rows that no sample has its place in.
 
     Takes the columns away as it goes, so that they and the samples need not all be held at once.
+
+    Args:
+        columns: the channels.
+        length: of each.
+        rows: the places of the samples; None: one behind the other.
+        narrow: float32 where that holds every sample as it is, else float64.
     """
     total = length if rows is None else int(rows[-1]) + 1
-    samples = np.full((total, len(columns)), np.nan)
+    single = narrow and all(np.can_cast(column.dtype, np.float32) for column in columns.values())
+    if single and rows is None and len(columns) == 1:
+        return next(iter(columns.values())).astype(np.float32, copy=False).reshape(-1, 1)
+    samples = np.full((total, len(columns)), np.nan, np.float32 if single else np.float64)
     place: slice | NDArray[np.int64] = slice(None) if rows is None else rows
     for i, name in enumerate(list(columns)):
         with np.errstate(invalid="ignore"):  # signalling NaN
@@ -202,7 +223,7 @@ def _together(columns: dict[str, NDArray[np.generic]], length: int, rows: NDArra
     return samples
 
 
-def _refuse_impossible(path: Path, names: list[str], samples: Floats) -> None:
+def _refuse_impossible(path: Path, names: list[str], samples: Samples) -> None:
     for name, signal in zip(names, samples.T, strict=True):
         try:
             refuse_beyond_any_unit(signal, f"{name} of {path}")
@@ -210,7 +231,7 @@ def _refuse_impossible(path: Path, names: list[str], samples: Floats) -> None:
             raise RecordingError(f"{error}") from None
 
 
-def _count_bad(samples: Floats) -> tuple[int, int]:
+def _count_bad(samples: Samples) -> tuple[int, int]:
     """How many samples are NaN, and how many infinite, counted channel by channel to save memory."""
     nan = sum(int(np.isnan(column).sum()) for column in samples.T)
     return nan, sum(int(np.isinf(column).sum()) for column in samples.T)

@@ -29,7 +29,7 @@ class Recording:
 
     Attributes:
         names: of the channels.
-        samples: float64 ``[n, channels]``, in the units of the file.
+        samples: float64 ``[n, channels]``, in the units of the file; float32 where that was asked for.
         rate_hz: samples per second.
         source: the file.
         nan_count: how many of the samples are NaN.
@@ -84,7 +84,11 @@ def get_limits() -> ResourceLimits:
 
 
 def load_recording(
-    path: Path | str, channels: Mapping[str, str] | None = None, rate_hz: float | None = None
+    path: Path | str,
+    channels: Mapping[str, str] | None = None,
+    rate_hz: float | None = None,
+    *,
+    narrow: bool = False,
 ) -> Recording:
     """Read channels from a file of one of the kinds of `formats.READERS`.
 
@@ -105,6 +109,9 @@ def load_recording(
         rate_hz: samples per second. Unless given: what the file says under one of `rate.RATE_NAMES`, or
             else what follows from a column of time, even steps provided (`rate.time_column`). A rate that
             contradicts what the file says is refused.
+        narrow: for who looks at the samples piece by piece: they stay in float32 where that holds each as it
+            is in the file, and in a file if they are many (`daqsvc.confined.spilled`). Who asks for it
+            calculates with them in float64 all the same.
 
     Raises:
         RecordingError: the file cannot be read within the limits, a channel is not there, not numeric, empty
@@ -113,7 +120,14 @@ def load_recording(
     """
     path = Path(path)
     about, (samples,) = _there(
-        "load", path, {"channels": None if channels is None else dict(channels), "rate_hz": rate_hz}
+        "load",
+        path,
+        {
+            "channels": None if channels is None else dict(channels),
+            "rate_hz": rate_hz,
+            "narrow": narrow,
+        },
+        spill=narrow,
     )
     about["names"], about["notes"] = tuple(about["names"]), tuple(about["notes"])
     return Recording(samples=samples, source=path, **about)
@@ -160,20 +174,22 @@ def list_channels(path: Path | str, expected: Sequence[str] = ()) -> dict[str, i
     return lengths
 
 
-def load_matching(path: Path | str, channels: Mapping[str, str], rate_hz: float | None = None) -> Recording:
+def load_matching(
+    path: Path | str, channels: Mapping[str, str], rate_hz: float | None = None, *, narrow: bool = False
+) -> Recording:
     """The same; a channel that the file does not have may be a pattern, or what one of its names ends with.
 
     Raises:
         RecordingError: see `load_recording` and `matching`.
     """
     try:
-        return load_recording(path, channels, rate_hz)
+        return load_recording(path, channels, rate_hz, narrow=narrow)
     except RecordingError:
         there = list_channels(path)
         paths = {name: matching(path, variable, there) for name, variable in channels.items()}
         if paths == channels:
             raise
-    return load_recording(path, paths, rate_hz)
+    return load_recording(path, paths, rate_hz, narrow=narrow)
 
 
 def matching(path: Path | str, variable: str, there: Iterable[str]) -> str:
@@ -214,6 +230,8 @@ def _there(
     arguments: Mapping[str, Any],
     limits: ResourceLimits | None = None,
     reader: ConfinedProcess = shared,
+    *,
+    spill: bool = False,
 ) -> WorkResult:
     """Call a function of `daqsvc.recording.loading` about a file in the process that reads.
 
@@ -228,6 +246,7 @@ def _there(
             {"path": str(path), "memory_bytes": limits.memory_bytes, **arguments},
             memory_bytes=limits.memory_bytes,
             cpu_s=limits.cpu_s(file_bytes),
+            spill=spill,
         )
     except RaisedThereError as error:
         if error.kind == RecordingError.__name__:

@@ -186,14 +186,20 @@ def race_features(
     sound = checked(np.asarray(samples, dtype=np.float64), rate_hz, speed_rpm, (rules.low_hz, rules.high_hz))
     length = scipy.fft.prev_fast_len(len(sound.values), real=True)
     spectrum = scipy.fft.rfft(sound.values[:length])
+    notes, repairs = sound.notes, sound.repairs
+    holes = np.array(sound.stretches, dtype=np.float64).reshape(-1, 2) / length
+    # Of a long record each of these is as large as the record: what has been used is let go.
+    del sound
+    levels = band_levels(spectrum, length, rate_hz)
     top_hz = min(TOP_SHARE * rate_hz, rules.high_hz)
     band = whiten(spectrum, length, rate_hz, rules.low_hz, top_hz, rules.whitening_hz)
     top_order = max(highest_order(bearing), NOTCHED_HARMONICS + 1.0)
     stated_hz, step_hz = speed_rpm / 60.0, rate_hz / length
     bins = min(int(top_order * stated_hz / step_hz) + 10, len(band.phase) // 2)
-    phases, sizes = squared_envelope(band.phase, bins), squared_envelope(band.clipped, bins)
-    holes = np.array(sound.stretches, dtype=np.float64).reshape(-1, 2) / length
     series, series_hz = slow_series(spectrum, step_hz, stated_hz)
+    del spectrum
+    phases, sizes = squared_envelope(band.phase, bins), squared_envelope(band.clipped, bins)
+    del band
     track = shaft_track(series, levelled(phases, holes), stated_hz / step_hz)
     if track is not None:
         series = track.even(series)
@@ -214,13 +220,13 @@ def race_features(
     return RaceFeatures(
         evidence=evidence,
         lines=_found(evidence, square, bearing, shaft.rate_hz),
-        levels=band_levels(spectrum, length, rate_hz),
+        levels=levels,
         speed_rpm=60.0 * shaft.rate_hz,
         speed_unconfirmed=shaft.doubt,
         other_speed=shaft.elsewhere,
         revolutions=revolutions,
-        notes=sound.notes if track is None else (*sound.notes, _wander_note(track)),
-        repairs=sound.repairs,
+        notes=notes if track is None else (*notes, _wander_note(track)),
+        repairs=repairs,
         lost=float(np.diff(holes, axis=1).sum()),
         spectrum=EnvelopeSpectrum(
             order=np.arange(bins) / revolutions,

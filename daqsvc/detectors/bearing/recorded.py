@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from daqsvc.detectors.bearing.evaluation import Evaluation
     from daqsvc.detectors.bearing.finding import ConfirmedState
     from daqsvc.diagnosis.record import Diagnosis
-    from daqsvc.diagnosis.recorded import Progress, Recorded, RecordingOptions
+    from daqsvc.diagnosis.recorded import Blocks, Progress, Recorded, RecordingOptions
     from daqsvc.dsp.quality.unit import AccelerationUnit
     from daqsvc.recording.recording import Recording
     from daqsvc.settings.models import MachineFile
@@ -186,18 +186,55 @@ def _draw(verdict: BearingVerdict, prefix: str) -> None:
     draw_envelopes(verdict, prefix)
 
 
-def _watched(detector: BearingDetector, recorded: Recorded) -> tuple[list[Diagnosis], list[Evaluation]]:
+def _watched(detector: BearingDetector, recorded: Recorded) -> tuple[list[Diagnosis], _Looks]:
     """Have the detector see a recording block by block, so that no look is missed: statements and looks."""
     diagnoses: list[Diagnosis] = []
-    looks: list[Evaluation] = []
-    for statements in _watch(detector, recorded.samples_of(detector.stream), recorded.recording.rate_hz):
+    looks = _Looks()
+    for statements in _watch(detector, recorded.blocks_of(detector.stream), recorded.recording.rate_hz):
         diagnoses += statements
-        if detector.seen is not None and (not looks or detector.seen is not looks[-1]):
-            looks.append(detector.seen)
+        if detector.seen is not None and detector.seen is not looks.last:
+            looks.add(detector.seen)
     return diagnoses, looks
 
 
-def _watch(detector: BearingDetector, samples: Floats, rate_hz: float) -> Iterator[Sequence[Diagnosis]]:
+class _Looks:
+    """The looks at a recording that a verdict may rest on: the strongest of each finding, and the last.
+
+    Attributes:
+        last: None before the first.
+    """
+
+    def __init__(self) -> None:
+        self.last: Evaluation | None = None
+        self._severe: dict[tuple[str, str], Evaluation] = {}
+        self._departed: dict[tuple[str, str], Evaluation] = {}
+
+    def add(self, look: Evaluation) -> None:
+        """Take in the next one."""
+        self.last = look
+        if look.finding is None:
+            return
+        found = look.finding.verdict, look.finding.where
+        for strongest, size in ((self._severe, _severity), (self._departed, _departure)):
+            before = strongest.get(found)
+            if before is None or size(look) > size(before):
+                strongest[found] = look
+
+    def decisive(self, standing: ConfirmedState) -> Evaluation | None:
+        """The strongest that found what stands, or else the last."""
+        strongest = self._departed if standing.decision == "changed" else self._severe
+        return strongest.get((standing.decision, standing.where), self.last)
+
+
+def _severity(look: Evaluation) -> float:
+    return 0.0 if look.finding is None else look.finding.severity
+
+
+def _departure(look: Evaluation) -> float:
+    return 0.0 if look.change is None else look.change.departure
+
+
+def _watch(detector: BearingDetector, samples: Blocks, rate_hz: float) -> Iterator[Sequence[Diagnosis]]:
     period_ns = NS_PER_S / rate_hz
     whole = len(samples) // detector.block * detector.block
     for begin in range(0, whole, detector.block):
@@ -215,11 +252,13 @@ def _concluded(
     recording: Recording,
     detector: BearingDetector,
     diagnoses: list[Diagnosis],
-    looks: list[Evaluation],
+    looks: _Looks,
 ) -> BearingVerdict:
     """What the detector stands by at the end, with the figures of the look that shows it most."""
     columns = [recording.names.index(bearing.sensor) for bearing in detector.bearings]
-    quality = accelerometer_quality(setup.channels, recording.samples[:, columns], setup.unit)
+    in_turn = columns == list(range(columns[0], columns[0] + len(columns)))
+    chosen = slice(columns[0], columns[0] + len(columns)) if in_turn else columns  # the former copies nothing
+    quality = accelerometer_quality(setup.channels, recording.samples[:, chosen], setup.unit)
     good = [one for one in diagnoses if one.quality == "good"]
     poor = [one for one in diagnoses if one.quality != "good"]
     for reason in dict.fromkeys(one.reason for one in poor):
@@ -231,7 +270,7 @@ def _concluded(
         quality=quality,
     )
     standing = detector.standing
-    look = _decisive(looks, standing)
+    look = looks.decisive(standing)
     if len(poor) > len(good):
         return replace(analysis, refused=poor[-1].reason)
     if look is None or look.finding is None or standing.decision == UNDETERMINED:
@@ -267,21 +306,6 @@ def _concluded(
         healthy=healthy,
         change=look.change,
     )
-
-
-def _decisive(looks: list[Evaluation], standing: ConfirmedState) -> Evaluation | None:
-    """The look that a standing verdict rests on: the strongest that found the same, or else the last."""
-    same = [
-        look
-        for look in looks
-        if look.finding is not None
-        and (look.finding.verdict, look.finding.where) == (standing.decision, standing.where)
-    ]
-    if not same:
-        return looks[-1] if looks else None
-    if standing.decision == "changed":
-        return max(same, key=lambda look: 0.0 if look.change is None else look.change.departure)
-    return max(same, key=lambda look: 0.0 if look.finding is None else look.finding.severity)
 
 
 def _against(recording: Recording, setup: BearingSetup, healthy: HealthyRun | None) -> BearingVerdict:
@@ -322,12 +346,12 @@ def analyse_bearings(
         setup: what is known.
         baseline: the healthy machine at the recording's rate, learnt by the same setup.
     """
-    samples = np.where(np.isfinite(recording.samples), recording.samples, np.nan)
     quality = _quality(recording, setup)
     source = None if baseline is None else baseline.source
     races: dict[str, RaceVerdict] = {}
     unfit: dict[str, str] = {}
-    for name, column in zip(recording.names, samples.T, strict=True):
+    for name in recording.names:
+        column = _finite(recording.samples[:, recording.names.index(name)])
         before = None if baseline is None else baseline.races[name]
         try:
             refuse_clipped(column)
@@ -362,7 +386,7 @@ def analyse_bearings(
     change: ResidualChange | None = None
     if healthy is not None:
         try:
-            change = _change(healthy, samples, recording, setup, tuple(races))
+            change = _change(healthy, _finite(recording.samples), recording, setup, tuple(races))
         except ValueError as error:
             return refuse(str(error))
     return BearingVerdict(
@@ -376,6 +400,11 @@ def analyse_bearings(
         healthy=healthy,
         change=change,
     )
+
+
+def _finite(samples: Floats) -> Floats:
+    """Samples as float64, NaN where they are not finite."""
+    return np.where(np.isfinite(samples), samples, np.nan).astype(np.float64, copy=False)
 
 
 def _quality(recording: Recording, setup: BearingSetup) -> DataQuality:

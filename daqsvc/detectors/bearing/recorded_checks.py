@@ -149,7 +149,7 @@ def with_offsets(quality: DataQuality, races: Mapping[str, RaceVerdict]) -> Data
 def _judged(recording: Recording, name: str, setup: BearingSetup, speed_rpm: float) -> RaceVerdict | str:
     """The race test of a channel by itself, or why there is none."""
     column = recording.samples[:, recording.names.index(name)]
-    column = np.where(np.isfinite(column), column, np.nan)
+    column = np.where(np.isfinite(column), column, np.nan).astype(np.float64, copy=False)
     try:
         refuse_clipped(column)
         return race_test(column, recording.rate_hz, speed_rpm, setup.bearings[name], setup.race)

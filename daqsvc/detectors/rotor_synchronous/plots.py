@@ -126,7 +126,7 @@ def draw(recording: Recording, setup: RotorSetup, analysis: RotorVerdict, prefix
         analysis=analysis,
         trace=analysis.trace,
         calibration=analysis.calibration,
-        xy=to_um(recording.samples[:, columns], setup.unit),
+        xy=to_um(recording.samples[:, columns].astype(np.float64), setup.unit),
         rate_hz=recording.rate_hz,
         clearance_um=setup.rotor.clearance_um,
     )

@@ -205,8 +205,10 @@ def samples_of(recording: Recording, setup: RotorSetup) -> Floats:
     Raises:
         RefusedError: a channel holds nothing, or one value only.
     """
-    samples = np.where(np.isfinite(recording.samples), recording.samples, np.nan)
-    samples = samples[:, [recording.names.index(name) for name in setup.names]]
+    samples = np.where(np.isfinite(recording.samples), recording.samples, np.nan).astype(
+        np.float64, copy=False
+    )
+    samples = samples[:, [recording.names.index(name) for name in setup.names]].astype(np.float64)
     samples[:, :2] = to_um(samples[:, :2], setup.unit)
     checks.refuse_unreadable(setup.names, samples)
     return samples

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from daqsvc.confined.spilled import let_go
 from daqsvc.dsp.quality import RefusedError, UnfitError
 from daqsvc.dsp.quality.clipped import (
     CLIPPED_REVOLUTION,
@@ -102,6 +103,10 @@ class DataQuality:
         }
 
 
+_BLOCK = 1 << 18
+"""Samples of a channel that are looked at at a time."""
+
+
 def count_bad(names: Sequence[str], samples: Floats) -> DataQuality:
     """Missing and infinite samples by channel.
 
@@ -109,7 +114,12 @@ def count_bad(names: Sequence[str], samples: Floats) -> DataQuality:
         names: of the channels.
         samples: float64 ``[n, channels]`` as they were recorded.
     """
-    missing, infinite = np.isnan(samples).sum(axis=0), np.isinf(samples).sum(axis=0)
+    missing, infinite = np.zeros(len(names), np.int64), np.zeros(len(names), np.int64)
+    for begin in range(0, len(samples), _BLOCK):
+        block = samples[begin : begin + _BLOCK]
+        missing += np.isnan(block).sum(axis=0)
+        infinite += np.isinf(block).sum(axis=0)
+        let_go(samples)
     quality = DataQuality(
         len(samples),
         missing=dict(zip(names, missing.tolist(), strict=True)),

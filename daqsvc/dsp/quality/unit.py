@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
+from daqsvc.confined.spilled import let_go
 from daqsvc.dsp.quality import UnfitError
 from daqsvc.dsp.quality.recorded import count_bad
 
@@ -200,11 +201,10 @@ def accelerometer_quality(names: Sequence[str], samples: Floats, unit: Accelerat
     """
     quality = count_bad(names, samples)
     for name, column in zip(names, samples.T, strict=True):
-        signal = column[np.isfinite(column)]
-        if not len(signal):
+        rms, swing = _spread(column)
+        if not np.isfinite(rms):
             continue
-        rms = float(signal.std())
-        if np.ptp(signal) == 0.0:
+        if swing == 0.0:
             continue  # dead: the race test says so; the rounding of its mean is no vibration
         m_s2 = rms * M_S2_PER_UNIT.get(unit, float("nan"))
         if m_s2 < _LEAST_M_S2 or m_s2 > _MOST_M_S2:
@@ -224,16 +224,38 @@ def unit_problems(names: Sequence[str], samples: Floats, unit: AccelerationUnit)
         unit: that they are said to be in.
     """
     for name, column in zip(names, samples.T, strict=True):
-        signal = column[np.isfinite(column)]
-        m_s2 = float(signal.std()) * M_S2_PER_UNIT.get(unit, np.nan) if len(signal) else np.nan
+        rms, _ = _spread(column)
+        m_s2 = rms * M_S2_PER_UNIT.get(unit, np.nan)
         g = m_s2 / M_S2_PER_UNIT["g"]
         if not (_LEAST_M_S2 <= m_s2 <= _MOST_M_S2) or _USUAL_G[0] <= g <= _USUAL_G[1]:
             continue
         how = "little" if g < 1.0 else "much"
         yield (
-            f"{name}: {float(signal.std()):.3g} {unit} r.m.s. is {how} for a running machine: it was taken "
+            f"{name}: {rms:.3g} {unit} r.m.s. is {how} for a running machine: it was taken "
             f"to be in {unit}; correct --unit if it is not"
         )
+
+
+_BLOCK = 1 << 18
+
+
+def _spread(column: NDArray[np.floating]) -> tuple[float, float]:
+    """Standard deviation and swing of what is finite of a column, block by block; NaN if nothing is."""
+
+    def blocks() -> Iterator[Floats]:
+        for begin in range(0, len(column), _BLOCK):
+            block = column[begin : begin + _BLOCK].astype(np.float64)
+            let_go(column)
+            yield block[np.isfinite(block)]
+
+    count = sum(len(block) for block in blocks())
+    if not count:
+        return float("nan"), float("nan")
+    mean = sum(float(block.sum()) for block in blocks()) / count
+    square = sum(float(np.square(block - mean).sum()) for block in blocks()) / count
+    most = max(float(block.max()) for block in blocks() if len(block))
+    least = min(float(block.min()) for block in blocks() if len(block))
+    return float(np.sqrt(square)), most - least
 
 
 def refuse_no_machine(samples: Floats, unit: AccelerationUnit, *, seen: bool) -> None:

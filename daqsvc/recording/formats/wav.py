@@ -33,7 +33,7 @@ ENCODINGS = {PCM: (8, 16, 24, 32), FLOAT: (32, 64)}
 
 
 def read_wav(path: Path, budget: Budget) -> Contents:
-    """Channels "0", "1", ... float64, integers scaled to a full scale of 1; and ``rate_hz``."""
+    """Channels "0", "1", ..., integers scaled to a full scale of 1; and ``rate_hz``."""
     content = path.read_bytes()
     chunks = _chunks(path, content)
     missing = [name for name in ("fmt ", "data") if name not in chunks]
@@ -100,13 +100,14 @@ def _format(path: Path, chunk: memoryview) -> tuple[int, int, int, int]:
     return encoding, bits, channels, rate_hz
 
 
-def _decoded(data: memoryview, encoding: int, bits: int) -> Floats:
+def _decoded(data: memoryview, encoding: int, bits: int) -> NDArray[np.floating]:
     """Samples of all channels in turn."""
     if encoding == FLOAT:
         with np.errstate(invalid="ignore"):  # signalling NaN
-            return np.frombuffer(data, f"<f{bits // 8}").astype(np.float64, copy=False)
+            return np.frombuffer(data, f"<f{bits // 8}")
+    # Integers of up to 24 bits are float32 without rounding.
     if bits == 8:
-        samples = np.frombuffer(data, np.uint8).astype(np.float64)
+        samples = np.frombuffer(data, np.uint8).astype(np.float32)
         samples -= 128.0
         samples /= 128.0
         return samples
@@ -114,9 +115,9 @@ def _decoded(data: memoryview, encoding: int, bits: int) -> Floats:
         # As the upper three bytes of 32 bits.
         widened = np.zeros((len(data) // 3, 4), np.uint8)
         widened[:, 1:] = np.frombuffer(data, np.uint8).reshape(-1, 3)
-        samples = widened.view("<i4").ravel().astype(np.float64)
+        samples = widened.view("<i4").ravel().astype(np.float32)
         samples /= 2.0**31
         return samples
-    samples = np.frombuffer(data, f"<i{bits // 8}").astype(np.float64)
+    samples = np.frombuffer(data, f"<i{bits // 8}").astype(np.float32 if bits == 16 else np.float64)
     samples /= 2.0 ** (bits - 1)
     return samples

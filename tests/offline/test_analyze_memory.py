@@ -1,0 +1,48 @@
+"""A long recording is judged piece by piece: what that takes does not grow with its length."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from support.paths import ROOT
+
+pytestmark = pytest.mark.integration
+RATE_HZ = 51_200
+MACHINE = ROOT / "config" / "machines" / "bearing.toml"
+PROGRAM_MB = 650
+"""What the program takes by itself with its compiled kernels (some 280), and the bearings' live detector
+while it learns the healthy machine from half a minute at this rate (some 280)."""
+SAMPLES_MB = 4e-6 * RATE_HZ * 600
+"""Of ten minutes, as they lie in the file."""
+
+MEASURE = """
+import resource, sys
+from daqsvc.cli import main
+code = main(sys.argv[1:])
+from daqsvc.recording.recording import stop_reading
+stop_reading()
+most = [resource.getrusage(who).ru_maxrss / 1e3 for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+print(code, *most, file=sys.stderr)
+"""
+
+
+@pytest.mark.long
+@pytest.mark.timeout(900)
+def test_ten_minutes_at_51200_hz(tmp_path):
+    path = tmp_path / "long.npz"
+    noise = np.random.default_rng(3).standard_normal(RATE_HZ * 600, np.float32)
+    np.savez(path, de=noise, fs=float(RATE_HZ))
+    arguments = ["analyze", MACHINE, path, "--map", "accel-de=de", "--json", "--jobs", "1"]
+    run = subprocess.run(
+        [sys.executable, "-c", MEASURE, *map(str, arguments)], capture_output=True, text=True, check=True
+    )
+    code, program_mb, reader_mb = map(float, run.stderr.splitlines()[-1].split())
+    found = json.loads(run.stdout)
+    assert code in {0, 3}
+    assert found["data_quality"]["samples"] == len(noise)
+    assert program_mb < PROGRAM_MB
+    assert reader_mb < 100 + SAMPLES_MB + 60  # Python and NumPy, the file, and flags of its samples
