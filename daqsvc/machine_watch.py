@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from daqsvc.acquisition.alignment import SETTLE_NS
 from daqsvc.acquisition.ring import RingReader, SampleRing
 from daqsvc.acquisition.standing import StreamState
-from daqsvc.detectors.make import detectors
+from daqsvc.detectors.make import change_setpoints, detectors
 from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.diagnosis.snapshots import alignment, at_once, patience
 from daqsvc.diagnosis.statements import said_of_silence
@@ -133,6 +133,12 @@ class MachineWatch:
         for name, stream in self.machine.streams.items():
             if stream.bus in buses and name in before.standings:
                 self.stand(name, before.standings[name])
+
+    def change_alarms(self, machine: MachineFile) -> None:
+        """Go on by a machine file in which nothing but alarms and setpoints is different."""
+        self.machine = machine
+        with self.supervisor.sparing_others("setpoints", "detectors judge by those of before"):
+            change_setpoints(machine, self.pipeline.detectors)
 
     def active_detectors(self) -> Mapping[str, Sequence[str]]:
         """The detectors that will make statements, with the sensors that these rest on."""

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
+
+from pydantic import BaseModel
 
 from daqsvc.control import ReloadRefusedError
 from daqsvc.outbox.limits import OutboxLimits
@@ -12,11 +15,13 @@ from daqsvc.settings.models import MachineFile
 from daqsvc.settings.sensors import TrendValue
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping
+    from collections.abc import Collection, Iterator
 
     from daqsvc.box import Box
 
 RESTART = "restart the service for that"
+MOST_PLACES, LONGEST_VALUE = 6, 60
+"""Places below a key that are said each; and how much of a value."""
 
 _OF_ALARMS = frozenset({"alarms", "alarm_handling"})
 _OF_BOX = frozenset({"schema_version", "site", "box", "buses", "store"})
@@ -30,17 +35,17 @@ class Changes:
         machines_gone: no longer watched.
         machines_new: watched from now on.
         machines_anew: watched on, by new detectors, and why: the keys that have changed.
-        alarms_anew: machines whose alarms have other rules, but whose detectors are as they were.
+        alarms_anew: machines whose alarms have other rules, but whose detectors go on, and what differs.
         buses_gone: closed.
         buses_new: opened.
         buses_anew: closed and opened again, and why.
-        outputs: the tables of outputs that have changed, or ``"what there is to tell"``; empty if none has.
+        outputs: the tables of outputs that have changed, or that what they show has; empty if none has.
     """
 
     machines_gone: tuple[str, ...] = ()
     machines_new: tuple[str, ...] = ()
     machines_anew: Mapping[str, str] = field(default_factory=dict)
-    alarms_anew: tuple[str, ...] = ()
+    alarms_anew: Mapping[str, str] = field(default_factory=dict)
     buses_gone: tuple[str, ...] = ()
     buses_new: tuple[str, ...] = ()
     buses_anew: Mapping[str, str] = field(default_factory=dict)
@@ -55,7 +60,7 @@ class Changes:
             *(f"machine {name} is no longer watched" for name in self.machines_gone),
             *(f"machine {name} is watched from now on" for name in self.machines_new),
             *(f"machine {name}: detectors begin anew ({why})" for name, why in self.machines_anew.items()),
-            *(f"machine {name}: other alarms or setpoints" for name in self.alarms_anew),
+            *(f"machine {name}: other alarms or setpoints ({why})" for name, why in self.alarms_anew.items()),
             *(f"bus {name} is closed" for name in self.buses_gone),
             *(f"bus {name} is opened" for name in self.buses_new),
             *(f"bus {name} is opened anew ({why})" for name, why in self.buses_anew.items()),
@@ -82,12 +87,16 @@ def changes(before: Box, after: Box) -> Changes:
         for name in common
         if (why := ", ".join([*_watched_otherwise(old[name], new[name]), *_read_by(new[name], buses_anew)]))
     }
-    alarms = [name for name in common if name not in anew and _differ(old[name], new[name], _OF_ALARMS)]
+    alarms = {
+        name: ", ".join(places)
+        for name in common
+        if name not in anew and (places := _differ(old[name], new[name], _OF_ALARMS))
+    }
     return Changes(
         machines_gone=tuple(name for name in old if name not in new),
         machines_new=tuple(name for name in new if name not in old),
         machines_anew=anew,
-        alarms_anew=tuple(alarms),
+        alarms_anew=alarms,
         buses_gone=tuple(name for name in old_buses if name not in new_buses),
         buses_new=tuple(name for name in new_buses if name not in old_buses),
         buses_anew=buses_anew,
@@ -116,7 +125,48 @@ def _needs_restart(before: Box, after: Box) -> Iterator[str]:
 
 
 def _differ(old: MachineFile, new: MachineFile, keys: frozenset[str]) -> list[str]:
-    return [key for key in sorted(keys) if getattr(old, key) != getattr(new, key)]
+    """What is different below these keys: each place with both values, or the key alone if that is much."""
+    found: list[str] = []
+    for key in sorted(keys):
+        places = [*_places(getattr(old, key), getattr(new, key), key)]
+        found += places if len(places) <= MOST_PLACES else [key]
+    return found
+
+
+def _places(old: Any, new: Any, path: str) -> Iterator[str]:
+    """Where two values differ, e.g. ``"alarms.vibration.alert 15.0 -> 16.0"``."""
+    if old == new:
+        return
+    before, after = _parts(old), _parts(new)
+    if before is None or after is None:
+        yield f"{path} {_words(old)} -> {_words(new)}"
+        return
+    for name in {**before, **after}:
+        below = f"{path}.{name}"
+        if name not in after:
+            yield f"{below} is gone"
+        elif name not in before:
+            yield f"{below} is new"
+        else:
+            yield from _places(before[name], after[name], below)
+
+
+def _parts(value: Any) -> dict[Any, Any] | None:
+    """A table by its keys, or a list of tables by their names; None of anything else."""
+    if isinstance(value, BaseModel):
+        return {name: getattr(value, name) for name in type(value).model_fields}
+    if isinstance(value, Mapping):
+        return dict(value)
+    if isinstance(value, list | tuple) and value:
+        named = {getattr(one, "name", None): one for one in value}
+        if None not in named and len(named) == len(value):
+            return named
+    return None
+
+
+def _words(value: Any) -> str:
+    words = "none" if value is None else repr(value) if isinstance(value, str) else f"{value}"
+    return words if len(words) <= LONGEST_VALUE else f"{words[:LONGEST_VALUE]}..."
 
 
 def _read_by(machine: MachineFile, buses: Collection[str]) -> Iterator[str]:
@@ -129,8 +179,10 @@ def _watched_otherwise(old: MachineFile, new: MachineFile) -> list[str]:
     keys = {*type(old).model_fields} - _OF_BOX - set(_output_tables(old))
     if not any(isinstance(sensor, TrendValue) for sensor in new.sensors):
         keys -= _OF_ALARMS  # the detector of trend values says which limit will be reached when
-    differ = _differ(old, new, frozenset(keys))
-    if old.layout_facts != new.layout_facts and "streams" not in differ:
+    # What a machine is called by people changes nothing of how it is watched.
+    described = new.machine.model_copy(update={"description": old.machine.description})
+    differ = _differ(old, new.model_copy(update={"machine": described}), frozenset(keys))
+    if old.layout_facts != new.layout_facts and old.streams == new.streams:
         differ.append("files that its streams name")
     return differ
 
@@ -164,7 +216,7 @@ def _outputs(before: Box, after: Box) -> Iterator[str]:
             yield f"[{key}]"
     speaks = any(getattr(after.own, key) is not None for key in _output_tables(after.own))
     if speaks and _told(before) != _told(after):
-        yield "what there is to tell"
+        yield "names and figures that they show"
 
 
 def _told(box: Box) -> Any:

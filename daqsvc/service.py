@@ -482,6 +482,8 @@ class Service:
 
     async def _change_alarms(self, box: Box, found: Changes) -> None:
         """Go on with the alarms of the new files, which stand as they did."""
+        for name in found.alarms_anew:
+            self.watches[name].change_alarms(box.machines[name])
         telling = [*self._parts.outputs.values()] if found.outputs else []
         if found.outputs:
             for part in telling:

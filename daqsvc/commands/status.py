@@ -72,12 +72,13 @@ class StatusCommand:
         return EXIT_OK
 
 
-def _shown(machines: list[dict[str, Any]], *, as_json: bool) -> str:
+def _shown(machines: list[dict[str, Any]], *, as_json: bool, is_live: bool = False) -> str:
     from daqsvc.commands.status_text import status_text  # noqa: PLC0415 - as above
 
     if as_json:
         return "\n".join(json.dumps(status) for status in machines)
-    return "\n\n".join(status_text(status, shutil.get_terminal_size().columns) for status in machines)
+    width = shutil.get_terminal_size().columns
+    return "\n\n".join(status_text(status, width, alarms_first=is_live) for status in machines)
 
 
 def _watch(store: Path, machine: str | None, *, as_json: bool) -> None:
@@ -88,16 +89,17 @@ def _watch(store: Path, machine: str | None, *, as_json: bool) -> None:
     """
     from daqsvc.control import AbsentError, ask_status  # noqa: PLC0415 - as above
 
-    picture = _Picture(is_live=not as_json and sys.stdout.isatty() and os.environ.get("TERM") != "dumb")
+    is_live = not as_json and sys.stdout.isatty() and os.environ.get("TERM") != "dumb"
+    picture = _Picture(is_live=is_live)
     before = {number: signal.signal(number, signal.default_int_handler) for number in signals_to_end()}
     try:
-        shown = _shown(ask_status(store, machine), as_json=as_json)
+        shown = _shown(ask_status(store, machine), as_json=as_json, is_live=is_live)
         with picture:
             picture.show(shown)
             while True:
                 time.sleep(EVERY_S)
                 try:
-                    shown = _shown(ask_status(store, machine), as_json=as_json)
+                    shown = _shown(ask_status(store, machine), as_json=as_json, is_live=is_live)
                 except AbsentError as error:
                     picture.wait(f"{error}; it is asked again every second", shown)
                 else:

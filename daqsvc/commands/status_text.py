@@ -16,22 +16,25 @@ LEAST_PROBABILITY = 0.005
 STATES = {"ok": "ok", "not_ok": "NOT OK", "missing": "missing", "unknown": "-"}
 
 
-def status_text(status: Document, width: int = 80) -> str:
+def status_text(status: Document, width: int = 80, *, alarms_first: bool = False) -> str:
     """How everything stands, from a `ServiceStatusPayload` by its keys in JSON.
 
     Args:
         status: what the service has answered.
         width: columns of the terminal.
+        alarms_first: whether alarms, outbox and broker stand above the rest, which a screen may not hold;
+            else below, where the eye is after a command.
     """
-    return "\n\n".join(_blocks(status, width))
-
-
-def _blocks(status: Document, width: int) -> Iterator[str]:
-    yield _filled(
+    head = _filled(
         f"{status['machine']} ({status['site']}/{status['box']}), daqsvc {status['version']}, "
         f"running for {_age(status['uptime_s'])}",
         width,
     )
+    tables, alarms = [*_tables(status, width)], [*_alarms_and_outputs(status, width)]
+    return "\n\n".join([head, *alarms, *tables] if alarms_first else [head, *tables, *alarms])
+
+
+def _tables(status: Document, width: int) -> Iterator[str]:
     buses = [[name, bus["driver"], bus["state"], bus["reason"]] for name, bus in status["buses"].items()]
     yield aligned(["BUS", "DRIVER", "STATE", "WHY"], buses, width)
     streams = [
@@ -50,6 +53,9 @@ def _blocks(status: Document, width: int) -> Iterator[str]:
         yield aligned(["LOST OR FAULTY", "SINCE THE START, BY CAUSE"], list(_faults(status["faults"])), width)
     if failures := status["figures"]["failures"]:
         yield aligned(["PART", "FAILURES"], [[name, f"{count}"] for name, count in failures.items()], width)
+
+
+def _alarms_and_outputs(status: Document, width: int) -> Iterator[str]:
     yield "\n".join(_filled(line, width) for line in (_alarms(status), _outbox(status), *_outputs(status)))
     if standing := status["alarms"]["standing"]:
         yield _standing(standing, width)
@@ -135,11 +141,10 @@ def _alarms(status: Document) -> str:
 def _outbox(status: Document) -> str:
     outbox = status["outbox"]
     events = outbox["depth"] + outbox["waiting"]
-    said = "outbox: " + (
-        f"{events:,} alarm event{' waits' if events == 1 else 's wait'} for the broker"
-        if events
-        else "nothing waits"
-    )
+    waits = "waits" if events == 1 else "wait"
+    # Without a broker they wait for one that a later machine file may have.
+    what = f"{waits} for the broker" if "mqtt" in status["outputs"] else "kept for a broker"
+    said = "outbox: " + (f"{events:,} alarm event{'s' * (events != 1)} {what}" if events else "nothing waits")
     if outbox["oldest_age_s"] is not None:
         said += f", the oldest for {_age(outbox['oldest_age_s'])}"
     if outbox["waiting"]:

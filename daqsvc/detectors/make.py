@@ -10,7 +10,7 @@ from daqsvc.settings.plugins import configured
 from daqsvc.settings.problems import AssemblyError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
     from pathlib import Path
 
     from daqsvc.diagnosis.detector import Detector
@@ -62,6 +62,17 @@ def detectors(machine: MachineFile, store: Path | None = None) -> list[Detector]
                 )
             made[detector.name] = detector
     return list(made.values())
+
+
+def change_setpoints(machine: MachineFile, running: Iterable[Detector]) -> None:
+    """Have the detectors of a machine judge by the setpoints of its file, which was read again.
+
+    Raises:
+        AssemblyError: a plugin fails.
+    """
+    for plugin, settings in plugins(machine):
+        with failing_in(machine.path):
+            plugin.change_setpoints(machine, settings, running)
 
 
 def check_files(machine: MachineFile) -> None:

@@ -79,6 +79,20 @@ class DetectorPlugin(PipelineTable[SettingsT]):
         """
         raise NotImplementedError
 
+    def change_setpoints(
+        self, machine: MachineFile, settings: SettingsT, running: Iterable[Detector]
+    ) -> None:
+        """Have detectors judge by the setpoints of a machine file that was read again; they know the rest.
+
+        Unless overridden nothing: only those that look at setpoints themselves need it.
+
+        Args:
+            machine: the machine file, in which nothing but alarms is different.
+            settings: the table.
+            running: all detectors of the machine, those of others too; each may be at work in its thread.
+        """
+        del machine, settings, running
+
     @may_raise(AssemblyError)
     def check_files(self, machine: MachineFile, settings: SettingsT) -> None:
         """See whether what the table names beside the machine file can be used.

@@ -71,6 +71,9 @@ def shown(wanted: Any) -> str:
         return shown(wanted.__bound__ or Any)
     if isinstance(wanted, type) and not get_args(wanted):
         return wanted.__name__
+    if get_origin(wanted) in {Union, UnionType}:
+        # Which of the two forms it has depends on who has asked for it before: typing remembers them as one.
+        return " | ".join(shown(one) for one in get_args(wanted))
     return re.sub(r"~(\w+)", lambda _: "Section", re.sub(r"\b(?:\w+\.)+(\w+)", r"\1", str(wanted)))
 
 

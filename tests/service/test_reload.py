@@ -20,7 +20,7 @@ from support.brokers import Consumer, running_mosquitto
 from support.can_gateway import daqsvc_run
 from support.live_service import running_box
 from support.machine_files import LAVAL
-from support.waiting import eventually
+from support.waiting import PATIENCE_S, eventually
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.alarms.commands import AlarmCommand, Verb
@@ -146,7 +146,7 @@ async def test_another_setpoint_leaves_buses_detectors_and_alarms_as_they_are(tm
         assert (await service.alarms.execute(bypass, "test")).accepted
         before = shown()
         put(file, ("alert = 5.0", "alert = 4.0"))
-        said = ["machine laval-rig: other alarms or setpoints"]
+        said = ["machine laval-rig: other alarms or setpoints (alarms.accel-high.alert 5.0 -> 4.0)"]
         answer = await asyncio.to_thread(ask_reload, tmp_path / "store", dry_run=True)
         assert (answer.accepted, list(answer.lines)) == (True, said)
         assert service.box.machines["laval-rig"].alarms[-1].alert == 5.0, "it was only asked"
@@ -161,6 +161,37 @@ async def test_another_setpoint_leaves_buses_detectors_and_alarms_as_they_are(tm
         await all_has_come(service, node)
 
 
+async def test_alarm_and_diagnosis_both_go_by_the_new_setpoint(tmp_path: Path) -> None:
+    file, of_x = tmp_path / "rig.toml", 'or "crest_factor"\nalert = '
+    put(file)
+
+    async def stands() -> tuple[str, str]:
+        status = json.loads(await service.reports["laval-rig"].line())
+        [levels] = [one for one in status["statements"] if one["detector"] == "levels/probe-x"]
+        high = [one for one in status["alarms"]["standing"] if one["alarm"] == "shaft-vibration-x"]
+        return levels["severity"], high[0]["level"] if high else "normal"
+
+    async def until(level: str) -> None:
+        async with asyncio.timeout(PATIENCE_S):
+            while await stands() != (level, level):
+                await asyncio.sleep(0.05)
+
+    async with serving(file, store=tmp_path / "store") as service, turning(service, "laval-rig") as node:
+        windows = lambda: service.watches["laval-rig"].pipeline.counters["levels/shaft"].windows  # noqa: E731
+        await eventually(lambda: windows() > 2, "its levels are known: 14 um")
+        assert await stands() == ("normal", "normal")
+        for limits, level in (
+            (("10.0", "60.0"), "alert"),
+            (("5.0", "12.0"), "danger"),
+            (("40.0", "60.0"), "normal"),
+        ):
+            put(file, (f"{of_x}40.0\ndanger = 60.0", f"{of_x}{limits[0]}\ndanger = {limits[1]}"))
+            [said] = await service.reload()
+            assert f" -> {limits[1]}" in said or level != "danger"
+            await until(level)
+        await all_has_come(service, node)
+
+
 async def test_another_sensor_costs_no_other_bus_a_sample(tmp_path: Path) -> None:
     file = tmp_path / "rig.toml"
     put(file)
@@ -169,7 +200,7 @@ async def test_another_sensor_costs_no_other_bus_a_sample(tmp_path: Path) -> Non
         shaft, casing = service.drivers
         put(file, more=ANOTHER)
         assert await service.reload() == [
-            "machine laval-rig: detectors begin anew (sensors, bus can1)",
+            "machine laval-rig: detectors begin anew (sensors.accel-nde is new, bus can1)",
             "bus can1 is opened anew (units)",
         ]
         assert service.drivers[0] is shaft
@@ -359,9 +390,11 @@ def test_what_is_different_is_said_with_its_reason(tmp_path: Path) -> None:
     before = read_box([file])
     assert not changes(before, read_box([file]))
     for change, said in {
-        ("ring_s = 30.0", "ring_s = 20.0"): ["machine laval-rig: detectors begin anew (pipeline)"],
+        ("ring_s = 30.0", "ring_s = 20.0"): [
+            "machine laval-rig: detectors begin anew (pipeline.ring_s 30.0 -> 20.0)"
+        ],
         ("id = 0x201", "id = 0x202"): [
-            "machine laval-rig: detectors begin anew (streams, bus can1)",
+            "machine laval-rig: detectors begin anew (streams.casing.layout.id 513 -> 514, bus can1)",
             "bus can1 is opened anew (its streams)",
         ],
         ('channel = "can1"', 'channel = "can2"'): [
@@ -369,7 +402,10 @@ def test_what_is_different_is_said_with_its_reason(tmp_path: Path) -> None:
             "bus can1 is opened anew (its table)",
         ],
         ("shelve_at_most_s = 28_800.0", "shelve_at_most_s = 60.0"): [
-            "machine laval-rig: other alarms or setpoints"
+            "machine laval-rig: other alarms or setpoints (alarm_handling.shelve_at_most_s 28800.0 -> 60.0)"
+        ],
+        ("latching = true  ", "latching = false  "): [
+            "machine laval-rig: other alarms or setpoints (alarms.rotor-fault.latching True -> False)"
         ],
     }.items():
         put(file, change)
@@ -383,7 +419,12 @@ def test_what_is_different_is_said_with_its_reason(tmp_path: Path) -> None:
         (["plant/a.toml", "plant/b.toml"], "plant/b.toml", (), False),
         (["plant"], "plant", (), False),
         (["plant"], "plant/a.toml", (), True),
-        (["plant"], "plant/a.toml", ("machine a: other alarms or setpoints",), False),
+        (
+            ["plant"],
+            "plant/a.toml",
+            ("machine a: other alarms or setpoints (alarms.a.alert 1.0 -> 2.0)",),
+            False,
+        ),
     ],
 )
 async def test_who_names_other_files_than_the_service_reads_is_told(
@@ -417,7 +458,8 @@ async def test_a_process_reloads_by_sighup_and_by_the_verb(tmp_path: Path) -> No
         await eventually(lambda: "watching laval-rig" in log.read_text(), "it runs")
         put(file, ("alert = 5.0", "alert = 4.0"))
         dry = await asyncio.to_thread(verb, [*reload, "--dry-run"])
-        assert (dry.returncode, dry.stdout) == (0, "machine laval-rig: other alarms or setpoints\n"), dry
+        said = "machine laval-rig: other alarms or setpoints (alarms.accel-high.alert 5.0 -> 4.0)\n"
+        assert (dry.returncode, dry.stdout) == (0, said), dry
         process.send_signal(signal.SIGHUP)
         await eventually(lambda: "reloaded: machine laval-rig: other" in log.read_text(), "it has reloaded")
         done = await asyncio.to_thread(verb, reload)

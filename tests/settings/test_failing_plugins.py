@@ -28,7 +28,7 @@ from daqsvc.acquisition.clock import SystemClock
 from daqsvc.api import Bus, DetectorPlugin, Device, DriverPlugin, OutputPlugin, StreamDriver, WindowDetector
 from daqsvc.box import Box
 from daqsvc.cli import main, start_logging
-from daqsvc.detectors.make import check_files, detectors
+from daqsvc.detectors.make import change_setpoints, check_files, detectors
 from daqsvc.publish.make import output_set, watched
 from daqsvc.service import Service
 from daqsvc.settings import describe, hooks, parse_machine_file, registry
@@ -73,6 +73,7 @@ BROUGHT = {
 }
 """For every contract of plugins something that keeps it, and the distribution that brings this."""
 NOT_ASKED = {
+    ("crest.CrestPlugin", "change_setpoints"): "at a reload",
     ("daqsvc.settings.packing.PackedLayout", "polled"): "where a trend is taken of it",
     ("daqsvc.diagnosis.recorded.RecordedLive", "sensors"): "where it gives a verdict",
     ("daqsvc.diagnosis.recorded.RecordedLive", "not_judged"): "likewise",
@@ -661,7 +662,12 @@ def test_a_driver_that_cannot_be_made_is_named_with_its_bus(monkeypatch: pytest.
 
 def test_a_detector_that_cannot_be_made_is_named_with_its_table(monkeypatch: pytest.MonkeyPatch) -> None:
     machine = parse_machine_file(TABLES, MACHINE)
-    for part, ask in (("build", detectors), ("check_files", check_files)):
+    asked = {
+        "build": detectors,
+        "check_files": check_files,
+        "change_setpoints": lambda one: change_setpoints(one, ()),
+    }
+    for part, ask in asked.items():
         break_(monkeypatch, "crest.CrestPlugin", part)
         said = (
             f"{MACHINE}: pipeline.crest: {part} of crest.CrestPlugin has failed: KeyError: 'no such thing' ("

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
@@ -124,6 +124,10 @@ class LevelDetector:
         self._band_hz = velocity_band_hz
         self._standstills = {channel.sensor: StandstillWatch() for channel in self._channels}
         self._next_index = 0
+
+    def change_setpoints(self, limits: Mapping[str, Sequence[Limits]]) -> None:
+        """Judge the next window, and what follows, by other setpoints of each sensor, by its name."""
+        self._channels = tuple(replace(channel, limits=limits[channel.sensor]) for channel in self._channels)
 
     def warm(self) -> None:
         """Make the taper and the band's weights; there is nothing to compile."""

@@ -24,7 +24,7 @@ from daqsvc.settings.models import (
 from daqsvc.settings.problems import Finding
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
     from pathlib import Path
 
     from daqsvc.detectors.levels.detector import GapCheck
@@ -60,6 +60,15 @@ class LevelsPlugin(DetectorPlugin[Levels]):
         del store
         for stream in machine.streams:
             yield from _of_stream(machine, settings, stream)
+
+    def change_setpoints(self, machine: MachineFile, settings: Levels, running: Iterable[Detector]) -> None:
+        """See `DetectorPlugin.change_setpoints`."""
+        from daqsvc.detectors.levels.detector import LevelDetector  # noqa: PLC0415 - brings SciPy
+
+        del settings
+        for detector in running:
+            if isinstance(detector, LevelDetector):
+                detector.change_setpoints({s.name: _limits(machine, s.name) for s in machine.sensors})
 
     def readings(self, machine: MachineFile, settings: Levels) -> Iterator[Reading]:
         """See `DetectorPlugin.readings`."""
