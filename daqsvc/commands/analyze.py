@@ -43,8 +43,9 @@ class AnalyzeCommand:
     help = "say what a machine's recordings show: which fault, how sure, since when"
     description = (
         "Run the detectors of the service over recordings (.npz, .mat, .csv[.gz], .wav, .parquet, .tdms, "
-        ".mf4, .uff, .h5; with a machine file CAN logs too: .blf, .asc, .log, .trc, or a folder of them), "
-        "faster than real time, and say which fault the rotor has, what else it might be, since when, and "
+        ".mf4, .uff, .h5, snapshots; with a machine file CAN logs too: .blf, .asc, .log, .trc, or a folder "
+        "of them), faster than real time, and say which fault the rotor has, what else it might be, since "
+        "when, and "
         "how large it is. Either the first file is a machine file (.toml), or options name probes, speed and "
         "rotor; the first revolutions of a recording are then the healthy machine. Accelerometers without a "
         "keyphasor are compared with a recording of the healthy machine (--channels, --baseline); with "

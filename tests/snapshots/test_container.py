@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,6 +15,8 @@ from support.examples import examples
 from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.confined.limits import ResourceLimits
 from daqsvc.confined.process import ConfinedProcess
+from daqsvc.recording import RecordingError
+from daqsvc.recording.recording import load_recording
 from daqsvc.snapshots.contents import ABOUT, ALARMS, SCHEMA, STANDING, Entry, Noted
 from daqsvc.snapshots.mcap import MAGIC, Attachment, Damage, McapError
 from daqsvc.snapshots.reading import SnapshotError, entries_of, read_snapshot
@@ -23,9 +26,11 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+    from daqsvc.snapshots.contents import Document
+
 RATE_HZ = 1000.0
 ROWS = 50
-ABOUT_IT = {
+ABOUT_IT: Document = {
     "schema": SCHEMA,
     "begin_ns": 1000,
     "machine": "rig",
@@ -191,6 +196,22 @@ def test_other_tools_read_it(tmp_path: Path) -> None:
     assert {one.name: one.data for one in made.iter_attachments()} == FILES
     [(_, _, first)] = list(made.iter_messages(topics=[ABOUT]))
     assert json.loads(first.data)["machine"] == "rig"
+
+
+def test_sensors_are_channels_of_a_recording(tmp_path: Path) -> None:
+    path = tmp_path / "one.mcap"
+    about = {**ABOUT_IT, "streams": {"shaft": {**ABOUT_IT["streams"]["shaft"], "sensors": ["probe-x", ""]}}}
+    writer = SnapshotWriter(path, about, {}, wall_ns=0)
+    writer.write([Entry(1, block(0)), Entry(2, replace(block(1), first_index=ROWS + 3, lost_before=3))])
+    writer.finish()
+    recording = load_recording(path)
+    assert (recording.names, recording.rate_hz) == (("probe-x", "y"), RATE_HZ)
+    assert recording.samples.shape == (2 * ROWS + 3, 2)
+    assert np.isnan(recording.samples[ROWS : ROWS + 3]).all()
+    assert (recording.samples[ROWS + 3 :] == block(1).samples).all()
+    path.write_bytes(path.read_bytes()[:40])
+    with pytest.raises(RecordingError, match="no snapshot of daqsvc"):
+        load_recording(path)
 
 
 def test_others_see_the_samples_as_numbers(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from daqsvc.recording.formats.matlab import read_mat
 from daqsvc.recording.formats.mdf import read_mdf
 from daqsvc.recording.formats.numpy_archive import read_npz
 from daqsvc.recording.formats.parquet import read_parquet
+from daqsvc.recording.formats.snapshot import read_snapshot_channels
 from daqsvc.recording.formats.tdms import read_tdms
 from daqsvc.recording.formats.uff import read_uff
 from daqsvc.recording.formats.wav import read_wav
@@ -37,6 +38,7 @@ READERS: Mapping[str, Callable[[Path, Budget], Contents]] = {
     ".unv": read_uff,
     ".h5": read_hdf5,
     ".hdf5": read_hdf5,
+    ".mcap": read_snapshot_channels,
 }
 
 
