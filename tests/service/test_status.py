@@ -325,7 +325,7 @@ def watched(
 
     terminal = Terminal(is_live=is_live)
     monkeypatch.setattr("daqsvc.control.ask_status", ask)
-    monkeypatch.setattr("daqsvc.commands.status_text.status_text", lambda status, _width: status["text"])
+    monkeypatch.setattr("daqsvc.commands.status_text.status_text", lambda status, _width, **_: status["text"])
     monkeypatch.setattr(verb, "EVERY_S", 0.0)
     monkeypatch.setattr(sys, "stdout", terminal)
     monkeypatch.setenv("TERM", "xterm")
