@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NoReturn
 from pydantic_core import to_json
 
 from daqsvc import __version__
-from daqsvc.acquisition.clock import NS_PER_S, DrivenClock
+from daqsvc.acquisition.clock import NS_PER_S, DrivenClock, iso_utc
 from daqsvc.acquisition.ring import RingClosed, RingError, RingReader
 from daqsvc.acquisition.samples import SampleBlock, Window
 from daqsvc.acquisition.standing import StreamState
@@ -50,8 +50,11 @@ STEP_NS = NS_PER_S // 4
 LONGEST_GAP_NS = 3600 * NS_PER_S
 """Between two entries of a snapshot: what is longer is damage."""
 ALARM_TICK_NS = NS_PER_S
+_LONGEST_REASON = 200
 _TURNS = 4
 """Of the event loop, after which whoever woke has done what there was to do."""
+_NOT_OURS = (KeyError, ValueError, TypeError, AttributeError, RecursionError, OverflowError)
+"""What comes of a document that this program has not written."""
 _NOT_COMPARED = ("time", "wall_ns", "id", "sequence", "occurrence")
 """Of an alarm event: its label of wall time, and what is new each time."""
 
@@ -148,7 +151,7 @@ def machine_of(snapshot: Snapshot, directory: Path) -> MachineFile:
     except MachineFileError as error:
         problem = error.problems[0]
         raise ReplayError(f"has a machine file that cannot be used here: {problem.message}") from None
-    except (KeyError, ValueError, TypeError, AttributeError, RecursionError, OSError):
+    except (*_NOT_OURS, OSError):
         raise ReplayError("has no machine file that can be used: name one behind it") from None
 
 
@@ -175,13 +178,14 @@ class Replay:
         about = snapshot.about
         try:
             self._begin_ns, self._wall_ns = int(about["begin_ns"]), int(about["wall_ns_at_0"])
+            iso_utc(self._begin_ns + self._wall_ns)  # there is such a time
             self._standings = {n: StreamState(**one) for n, one in dict(about["standings"]).items()}
             before = [alarm_event(json.dumps(one).encode()) for one in about["alarms"]]
             self._is_from_start = bool(about["from_start"])
             self._is_same = about["version"] == __version__ and machine_values(machine) == json.loads(
                 snapshot.files.get(MACHINE_JSON, b"null")
             )
-        except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
+        except _NOT_OURS as error:
             _refuse(error)
         self._memories = self._found_memories() if self._is_same else {}
         self._why_anew = (
@@ -281,7 +285,7 @@ class Replay:
                 document = entry.what.document
                 try:
                     found[str(document["detector"])] = int(document["end_index"]), Memory.of(document)
-                except (KeyError, ValueError, TypeError, MemoryNotFittingError) as error:
+                except (*_NOT_OURS, MemoryNotFittingError) as error:
                     _refuse(error)
         return found
 
@@ -319,7 +323,7 @@ class Replay:
                 self._watch.stand(document["stream"], StreamState(**told))
             elif noted.topic == WINDOWS and document["detector"] in self._readers:
                 await self._give(document["detector"], document)
-        except (KeyError, ValueError, TypeError, AttributeError) as error:
+        except _NOT_OURS as error:
             _refuse(error)
 
     async def _give(self, detector: str, document: Document) -> None:
@@ -410,7 +414,8 @@ def _comparable(document: Document) -> str:
 
 
 def _refuse(error: Exception) -> NoReturn:
-    raise ReplayError(f"holds what is none of daqsvc's ({type(error).__name__}: {error})") from None
+    words = " ".join(f"{error}".split())[:_LONGEST_REASON]
+    raise ReplayError(f"holds what is none of daqsvc's ({type(error).__name__}: {words})") from None
 
 
 async def replay(snapshot: Snapshot, machine: MachineFile | None, directory: Path) -> Replayed:
