@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from daqsvc.recording.formats import CAN_LOGS, named_as_can_log
@@ -105,8 +104,6 @@ def _unknown_format(file: Path) -> str:
 
     name = file.with_suffix("") if file.suffix.lower() == ".gz" else file
     suffix = name.suffix.lower()
-    if suffix == ".mf4" and find_spec("asammdf") is None:
-        return "install asammdf, or make a BLF of it"
     if suffix in MESSAGE_READERS and suffix not in _DATA_BASES:
         return ""
     return f"give a CAN log ({', '.join(CAN_LOGS)}; .gz behind it if zipped) or a table ({TABLES})"

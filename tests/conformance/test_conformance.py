@@ -26,6 +26,13 @@ if TYPE_CHECKING:
 
 pytestmark = pytest.mark.timeout(240)
 
+
+@pytest.fixture(autouse=True)
+def _gather_for_a_moment(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each frame is waited for, and simulated time stands still while bytes of a serial line gather."""
+    monkeypatch.setattr(reader, "GATHER_NS", 5_000_000)
+
+
 LOSSES = 100
 WARM_LOSSES = 10
 LEAK_BYTES_A_LOSS = 1500
@@ -331,11 +338,7 @@ async def test_a_counter_that_restarts_is_followed(transport: Transport) -> None
 
 @pytest.mark.long
 @pytest.mark.needs("overflow")
-async def test_a_consumer_that_cannot_keep_up_costs_samples_and_not_memory(
-    transport: Transport, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # Simulated time stands still while bytes gather: if that took longer, what it holds were a flood.
-    monkeypatch.setattr(reader, "GATHER_NS", 5_000_000)
+async def test_a_consumer_that_cannot_keep_up_costs_samples_and_not_memory(transport: Transport) -> None:
     async with Rig(transport) as rig:
         await rig.until_up()
         await rig.send(5)
@@ -354,11 +357,7 @@ async def test_a_consumer_that_cannot_keep_up_costs_samples_and_not_memory(
 
 
 @pytest.mark.long
-async def test_samples_get_the_time_at_which_they_were_taken(
-    transport: Transport, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # Each frame is waited for: of lines with one sample each that would be minutes.
-    monkeypatch.setattr(reader, "GATHER_NS", 5_000_000)
+async def test_samples_get_the_time_at_which_they_were_taken(transport: Transport) -> None:
     async with Rig(transport) as rig:
         await rig.until_up()
         frames = int(3.5 * transport.rate_hz / transport.samples_per_frame)

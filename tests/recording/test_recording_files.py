@@ -199,7 +199,7 @@ def test_an_unknown_rate_is_asked_for(tmp_path):
         (
             "a.sie",
             b"TDSm",
-            r"use .npz, .mat, .csv, .csv.gz, .wav, .parquet, .tdms, .mf4, .uff, .unv, .h5, .hdf5$",
+            r"use .npz, .mat, .csv, .csv.gz, .wav, .parquet, .tdms, .mf4, .uff, .unv, .h5, .hdf5, .mcap$",
         ),
     ],
 )

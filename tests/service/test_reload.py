@@ -161,6 +161,7 @@ async def test_another_setpoint_leaves_buses_detectors_and_alarms_as_they_are(tm
         await all_has_come(service, node)
 
 
+@pytest.mark.long
 async def test_alarm_and_diagnosis_both_go_by_the_new_setpoint(tmp_path: Path) -> None:
     file, of_x = tmp_path / "rig.toml", 'or "crest_factor"\nalert = '
     put(file)

@@ -123,3 +123,13 @@ def test_peak_to_peak_is_the_whole_range_also_of_what_is_not_symmetric() -> None
     assert found.peak == pytest.approx(30.0, abs=0.5)
     watching = detector(limits=[Limits("peak_to_peak", 35.0, 50.0, None, None)])
     assert watching.process(window(20.0 * np.sin(2 * np.pi * 50 * T[:500])))[0].severity == "alert"
+
+
+def test_after_a_reload_the_next_window_is_judged_by_the_new_setpoints() -> None:
+    rms_1 = np.sqrt(2.0) * np.sin(2 * np.pi * 20.0 * np.arange(640) / 640.0).astype(np.float32)[:, None]
+    detector = LevelDetector("rig", "shaft", 640.0, [LevelChannel("x", 0, "um", [Limits("rms", 2.0, 3.0)])])
+    said = [one.severity for one in detector.process(Window(0, rms_1, 10**9, 10**9 / 640))]
+    detector.change_setpoints({"x": [Limits("rms", 0.5, 0.9)], "keyphasor": []})
+    [*_, last] = detector.process(Window(640, rms_1, 2 * 10**9, 10**9 / 640))
+    assert {*said} == {"normal"}
+    assert (last.severity, last.thresholds) == ("danger", {"rms.alert": 0.5, "rms.danger": 0.9})
