@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import logging
 import socket
 import termios
@@ -192,6 +193,8 @@ class ModbusWire(ModbusProtocol):
             return "nobody listens there; start the server, or correct host and tcp_port"
         if isinstance(error, TimeoutError):
             return f"nobody answers there within {patience_s:g} s; correct host, or see to the network"
+        if isinstance(error, OSError) and error.errno in {errno.ENETUNREACH, errno.EHOSTUNREACH}:
+            return "no route leads there from this box; correct host, or see to its network"
         return f"{error}" or type(error).__name__
 
     def _begin_anew(self) -> None:

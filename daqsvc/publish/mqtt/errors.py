@@ -146,6 +146,8 @@ def in_words(error: Exception | None) -> str:
             words = "it does not answer"
         case MqttCodeError():
             words = _coded(error)
+        case FileNotFoundError() if error.filename is not None:
+            words = f"{error.filename} is missing; put it there, or correct its path in the machine file"
         case OSError() if error.strerror is not None:
             words = error.strerror if error.filename is None else f"{error.filename}: {error.strerror}"
     return words

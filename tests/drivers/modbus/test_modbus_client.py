@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import os
 import select
 import socket
@@ -125,6 +126,13 @@ def unknown(tmp_path):
 
 
 @contextlib.contextmanager
+def cut_off(tmp_path):
+    nowhere = mock.Mock(side_effect=OSError(errno.ENETUNREACH, "Network is unreachable"))
+    with mock.patch.object(asyncio.BaseEventLoop, "create_connection", nowhere):
+        yield modbus_bus(transport="tcp", host="192.0.2.20", tcp_port=502)
+
+
+@contextlib.contextmanager
 def unplugged(tmp_path):
     yield modbus_bus(transport="rtu", serial_port=str(tmp_path / "ttyUSB0"))
 
@@ -146,6 +154,7 @@ def in_use(tmp_path):
             unknown,
             r"it cannot be opened: no address of 'no-such-host\.invalid' is known",
         ),
+        (cut_off, r"it cannot be opened: no route leads there from this box; correct host"),
         (unplugged, r"cannot be opened: there is no .*ttyUSB0; plug the device in, or correct serial_port"),
         (in_use, r"cannot be opened: another program has it open; stop that program"),
     ],

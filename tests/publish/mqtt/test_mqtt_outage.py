@@ -37,6 +37,10 @@ def coded(number):
         (socket.gaierror(-2, "Name or service not known"), "its name is not known: Name or service"),
         (TimeoutError("timed out"), "it does not answer"),
         (OSError(errno.ENETUNREACH, "Network is unreachable"), "Network is unreachable"),
+        (
+            FileNotFoundError(errno.ENOENT, "No such file or directory", "/etc/daqsvc/mqtt-password"),
+            "/etc/daqsvc/mqtt-password is missing; put it there, or correct its path in the machine file",
+        ),
         (PermissionError(errno.EACCES, "Permission denied", "/etc/key"), "/etc/key: Permission denied"),
         (coded(135), "this client is not authorised"),
         (coded(134), "it refuses the user name or the password"),
