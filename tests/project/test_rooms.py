@@ -29,6 +29,12 @@ def test_a_room_is_a_package_or_a_module(room: str) -> None:
     assert any(place.exists() for place in places), places
 
 
+def test_no_two_files_of_tests_have_the_same_name() -> None:
+    """Pytest would not read the second of them, in a run of both."""
+    names = [file.name for file in TESTS.rglob("test_*.py")]
+    assert sorted(names) == sorted({*names})
+
+
 def test_no_test_lies_outside_a_room() -> None:
     assert "." not in ROOMS
     assert "drivers/can" in ROOMS
