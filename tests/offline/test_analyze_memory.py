@@ -5,10 +5,14 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from support.paths import ROOT
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 pytestmark = pytest.mark.integration
 RATE_HZ = 51_200
@@ -30,16 +34,21 @@ print(code, *most, file=sys.stderr)
 """
 
 
+def analyzed(path: Path, samples: np.ndarray) -> subprocess.CompletedProcess[str]:
+    """What the program says of samples in a file, and how much memory it has taken."""
+    np.savez(path, de=samples, fs=float(RATE_HZ))
+    arguments = ["analyze", MACHINE, path, "--map", "accel-de=de", "--json", "--jobs", "1"]
+    command = [sys.executable, "-c", MEASURE, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=True)
+
+
 @pytest.mark.long
 @pytest.mark.timeout(900)
 def test_ten_minutes_at_51200_hz(tmp_path):
-    path = tmp_path / "long.npz"
     noise = np.random.default_rng(3).standard_normal(RATE_HZ * 600, np.float32)
-    np.savez(path, de=noise, fs=float(RATE_HZ))
-    arguments = ["analyze", MACHINE, path, "--map", "accel-de=de", "--json", "--jobs", "1"]
-    run = subprocess.run(
-        [sys.executable, "-c", MEASURE, *map(str, arguments)], capture_output=True, text=True, check=True
-    )
+    # Once before: what compiles kernels, the first time on a computer, takes more.
+    analyzed(tmp_path / "short.npz", noise[: RATE_HZ * 45])
+    run = analyzed(tmp_path / "long.npz", noise)
     code, program_mb, reader_mb = map(float, run.stderr.splitlines()[-1].split())
     found = json.loads(run.stdout)
     assert code in {0, 3}

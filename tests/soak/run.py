@@ -405,12 +405,15 @@ class Soak:
     async def another_sensor(self) -> None:
         """A machine gets another sensor, and loses it again; its bus begins anew, and no other."""
         file = self.file_of("fan")
-        for text in (self.files["fan"] + ANOTHER_SENSOR, self.files["fan"]):
+        for text, how in ((self.files["fan"] + ANOTHER_SENSOR, "new"), (self.files["fan"], "gone")):
             file.write_text(text)
             async with self._anew("fan"):
                 asked_before = self.plant.answered
                 await self.reload(
-                    ["machine fan: detectors begin anew (sensors, bus tcp)", "bus tcp is opened anew (units)"]
+                    [
+                        f"machine fan: detectors begin anew (sensors.count is {how}, bus tcp)",
+                        "bus tcp is opened anew (units)",
+                    ]
                 )
                 self.ledger.open(self.plant.devices["fan"])
                 self.ledger.trend = TrendBook("fan/temperature", asked_before)
