@@ -13,7 +13,19 @@ import pytest
 from support.brokers import running_mosquitto
 from support.guide_commands import shell_blocks
 from support.paths import ROOT
-from support.systemd_units import IN_A_GUEST, UNIT, Shaft, alarm, journal, messages, say, sh, shown, until
+from support.systemd_units import (
+    IN_A_GUEST,
+    UNIT,
+    Shaft,
+    alarm,
+    journal,
+    let_go_of_files,
+    messages,
+    say,
+    sh,
+    shown,
+    until,
+)
 from support.unit_kernels import put_kernels
 from support.vcan_links import VcanLink
 
@@ -72,6 +84,7 @@ def do(command: str, folder: Path) -> str:
     begun_s = time.monotonic()
     said = sh("/bin/sh", "-ec", command, cwd=folder)
     say(f"{time.monotonic() - begun_s:5.1f} s: {command}")
+    let_go_of_files()
     return said
 
 
@@ -193,4 +206,6 @@ def test_what_goes_when_it_is_removed_and_what_stays(folder: Path) -> None:
     assert (MACHINE.exists(), ENABLED.is_symlink(), KERNELS.parent.exists()) == (True, False, False)
     assert state()[0] == stands[0]
     do(rest, folder)
-    assert sh("find", "/etc", "/usr", "/var", "-xdev", "-name", "*daqsvc*") == ""
+    for place in ("/etc", "/usr", "/var"):
+        assert sh("find", place, "-xdev", "-name", "*daqsvc*") == ""
+        let_go_of_files()
