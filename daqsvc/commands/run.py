@@ -112,6 +112,7 @@ class RunCommand:
 def _run(
     box: Box, files: Sequence[Path], store: Path | None, guard: ProcessGuard, manager: ServiceManager
 ) -> int:
+    from daqsvc.outbox.journal import refuse_store  # noqa: PLC0415
     from daqsvc.outbox.messages import (  # noqa: PLC0415
         NewerOutboxError,
         OutboxError,
@@ -125,6 +126,8 @@ def _run(
 
     try:
         store = store or store_directory(box)
+        # What comes next may compile kernels, on a small box for minutes.
+        refuse_store(store)
         _run_loop(_run_until_stopped(box, files, store, guard, manager))
     except (AssemblyError, LayoutError, NewerOutboxError, StoreNotFoundError, StorePathError) as error:
         log.critical("%s", error)
@@ -172,21 +175,38 @@ def _run_loop(work: Coroutine[Any, Any, None]) -> None:
         running.result()
 
 
-def _reload(service: Service, asked: list[Part]) -> None:
-    """Have the machine files read again, as SIGHUP asks; adds what does that."""
+class _Reloader:
+    """Has the machine files read again as SIGHUP asks; all that asks meanwhile makes one time more.
 
-    async def reload() -> None:
+    Args:
+        service: that goes on with them.
+
+    Attributes:
+        part: what does it; None before anybody has asked.
+    """
+
+    def __init__(self, service: Service) -> None:
+        self.part: Part | None = None
+        self._service = service
+        self._asked = False
+
+    def ask(self) -> None:
+        """Have them read again, soon."""
+        self._asked = True
+        if self.part is None or self.part.over.done():
+            self.part = self._service.supervisor.keep("reload", self._reload, may_end=lambda: True)
+
+    async def _reload(self) -> None:
         from daqsvc.control import ReloadRefusedError  # noqa: PLC0415 - as above
 
-        try:
-            if not await service.reload():
-                log.warning("SIGHUP: the machine files say nothing different")
-        except ReloadRefusedError as refused:
-            for reason in refused.reasons:
-                log.error("SIGHUP is refused, and the service goes on as it is: %s", reason)  # noqa: TRY400
-
-    asked[:] = [one for one in asked if not one.over.done()]
-    asked.append(service.supervisor.keep("reload", reload, may_end=lambda: True))
+        while self._asked:
+            self._asked = False
+            try:
+                if not await self._service.reload():
+                    log.warning("SIGHUP: the machine files say nothing different")
+            except ReloadRefusedError as refused:
+                for reason in refused.reasons:
+                    log.error("SIGHUP is refused, and the service goes on as it is: %s", reason)  # noqa: TRY400
 
 
 def _reloading(manager: ServiceManager, begins: bool) -> None:  # noqa: FBT001 - a callback
@@ -216,7 +236,8 @@ async def _run_until_stopped(
     guard.stop_by(asyncio.get_running_loop(), stop.set)
     running = asyncio.create_task(service.run(stop), name="service")
     follow = partial(manager.follow, service)
-    following = [service.supervisor.keep("service manager", follow, may_end=lambda: True)]
+    following = service.supervisor.keep("service manager", follow, may_end=lambda: True)
+    reloader = _Reloader(service)
     ready = asyncio.create_task(service.ready.wait(), name="ready")
     try:
         await asyncio.wait({running, ready}, return_when=asyncio.FIRST_COMPLETED)
@@ -225,11 +246,11 @@ async def _run_until_stopped(
             # What the start has made stays until the end. Looking through it for garbage, libraries and all
             # alarms, would hold up the event loop for some .1 s each time.
             gc.freeze()
-            guard.reload_by(partial(_reload, service, following))
+            guard.reload_by(reloader.ask)
             log.info("watching %s; the journal is in %s", box.names, store)
             call_in_thread(give_back, name="give back")
         await running
     finally:
         ready.cancel()
-        await stop_all(following, LOG_S)
+        await stop_all([following, *([reloader.part] if reloader.part else [])], LOG_S)
     log.info("stopped")

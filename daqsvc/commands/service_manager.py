@@ -11,11 +11,13 @@ import logging
 import os
 import socket
 import time
+from collections import Counter
 from typing import TYPE_CHECKING, Self
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from daqsvc.alarms.states import AlarmState
     from daqsvc.service import Service
 
 log = logging.getLogger(__name__)
@@ -186,16 +188,17 @@ def _in_short(service: Service) -> tuple[str, str]:
     up = f"{count - len(down)} of {count} buses up"
     if down:
         up += f" ({', '.join(f'{bus}: {reason[:LONGEST_REASON]}' for bus, reason in down.items())})"
-    shown = {state: number for state, number in service.alarms.manager.shown.items() if number}
-    alarms = ", ".join(f"{number} {state.in_words}" for state, number in shown.items() if state != "normal")
+    shown: Counter[AlarmState] = Counter()
+    for manager in service.alarms.managers.values():
+        shown.update(manager.shown)
+    alarms = ", ".join(f"{number} {state.in_words}" for state, number in shown.items() if number)
     said = [up, f"alarms: {alarms or 'none'}"]
     outbox = service.alarms.outbox.counters
     if outbox.shut or outbox.unbacked:
         said.append("the journal cannot be written")
-    brokers = [service.alarms.outputs[path].figures() for path in service.alarms.outputs]
-    said += [
-        f"broker {'connected' if figures['connected'] else 'not connected'}"
-        for figures in brokers
-        if "connected" in figures
-    ]
+    for output in service.alarms.outputs.values():
+        figures = output.figures()
+        if "connected" in figures:
+            why = f" ({output.reason[:LONGEST_REASON]})" * bool(output.reason)
+            said.append("broker connected" if figures["connected"] else f"broker not connected{why}")
     return "; ".join(said), f"{outbox.depth + outbox.waiting} alarm messages wait for the broker"

@@ -13,6 +13,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from daqsvc import heap
+
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
@@ -47,8 +49,7 @@ def give_back() -> None:
     with contextlib.suppress(OSError):
         for first, length in unchanged(Path("/proc/self/smaps").read_text(errors="replace").splitlines()):
             libc.madvise(ctypes.c_void_p(first), ctypes.c_size_t(length), _MADV_DONTNEED)
-    with contextlib.suppress(AttributeError):  # another C library than GNU's
-        libc.malloc_trim(0)
+    heap.give_back()
 
 
 def unchanged(smaps: Iterable[str]) -> Iterator[tuple[int, int]]:

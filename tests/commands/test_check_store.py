@@ -7,9 +7,11 @@ import contextlib
 import os
 import re
 import sqlite3
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import pytest
 from support.live_service import running
@@ -22,6 +24,7 @@ from daqsvc.commands import run as run_command
 from daqsvc.commands.service_manager import ServiceManager
 from daqsvc.control import ask_status
 from daqsvc.detectors.make import detectors
+from daqsvc.outbox.files import take_possession
 from daqsvc.settings import load_machine_file
 
 if TYPE_CHECKING:
@@ -97,6 +100,56 @@ def test_a_store_of_a_newer_version_is_refused_for_good_and_left_as_it_is(
     assert "install that version again" in caplog.text
     assert (store / "outbox.sqlite").read_bytes() == before
     assert (store / "outbox.sqlite.version").read_text() == "9.9.0\n"
+
+
+def newer(store: Path) -> None:
+    """Have a version of the future write a store."""
+    store.mkdir(mode=0o700)
+    with contextlib.closing(sqlite3.connect(store / "outbox.sqlite")) as file:
+        file.execute("PRAGMA user_version = 99")
+    (store / "outbox.sqlite.version").write_text("9.9.0\n")
+
+
+def test_check_says_that_a_newer_version_has_written_the_store(tmp_path: Path, check: Check) -> None:
+    newer(tmp_path / "alarms")
+    code, out, _ = check(tmp_path / "alarms")
+    assert code == 0
+    assert "could not start as" in out
+    assert "has schema version 99, written by daqsvc 9.9.0; this is daqsvc" in out
+
+
+def taken(store: Path) -> contextlib.closing[BinaryIO]:
+    """Have another service use a store."""
+    store.mkdir(mode=0o700)
+    return contextlib.closing(take_possession(store / "outbox.sqlite.lock"))
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "code", "said"),
+    [
+        (newer, 2, "written by daqsvc 9.9.0"),
+        (taken, 1, "another daqsvc uses the store"),
+        (Path.touch, 2, "is no directory, but a file"),
+    ],
+)
+def test_a_store_that_cannot_be_used_is_refused_before_any_kernel_is_compiled(
+    spoilt: Callable[[Path], Any], code: int, said: str, tmp_path: Path
+) -> None:
+    """On a small box that takes minutes, and systemd may have given up meanwhile."""
+    store, kernels = tmp_path / "alarms", tmp_path / "kernels"
+    with spoilt(store) or contextlib.nullcontext():
+        ended = subprocess.run(
+            [sys.executable, "-m", "daqsvc", "run", MACHINE, "--store", store],
+            env={**os.environ, "NUMBA_CACHE_DIR": f"{kernels}"},
+            capture_output=True,
+            text=True,
+            check=False,
+            cwd=ROOT,
+        )
+    assert ended.returncode == code, ended.stderr
+    assert said in ended.stderr
+    assert len(ended.stderr.splitlines()) == 1
+    assert not [path for path in kernels.rglob("*") if path.is_file()]
 
 
 @pytest.mark.parametrize(("name", "code"), [("laval-rig", 1), ("pump", 2)])

@@ -36,7 +36,9 @@ VERBS = (
     "trend",
     *PEOPLE,
     "analyze",
+    "fleet",
     "calibrate",
+    "export",
     "detectability",
     "example",
     "record",
@@ -100,7 +102,7 @@ def test_the_readme_names_every_verb() -> None:
     assert tuple(listed) == VERBS
     table = README.read_text(encoding="utf-8").split("## The verbs")[1].split("\n## ")[0]
     rows = re.findall(r"^\| (`[^|]*) \|.*\|$", table, flags=re.MULTILINE)
-    assert sorted(re.findall(r"`(\w+)", " ".join(rows))) == sorted(VERBS)
+    assert set(re.findall(r"`(\w+)", " ".join(rows))) == set(VERBS)
 
 
 @pytest.mark.parametrize("number", first_of(signal.SIGTERM, signal.SIGINT))

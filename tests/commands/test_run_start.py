@@ -48,6 +48,29 @@ async def test_what_the_start_has_made_is_not_looked_through_for_garbage_again(m
     assert len(reloads) == 1, "SIGHUP is obeyed from the start on, not before"
 
 
+async def test_however_often_sighup_comes_meanwhile_the_files_are_read_once_more(caplog):
+    """A queue of them would hold up whoever reloads next, and the event loop."""
+    may_go_on, reloads = asyncio.Event(), []
+
+    async def reload():
+        reloads.append(True)
+        await may_go_on.wait()
+        return []
+
+    reloader = run._Reloader(SimpleNamespace(supervisor=Supervisor(), reload=reload))
+    for _ in range(1000):
+        reloader.ask()
+        await asyncio.sleep(0)
+    assert len(reloads) == 1
+    may_go_on.set()
+    await reloader.part.over
+    assert len(reloads) == 2
+    reloader.ask()
+    await reloader.part.over
+    assert len(reloads) == 3
+    assert caplog.text.count("SIGHUP: the machine files say nothing different") == 3
+
+
 def test_a_hang_up_that_comes_before_the_service_has_its_handlers_ends_nothing():
     before = signal.getsignal(signal.SIGHUP)
     try:

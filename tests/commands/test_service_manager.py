@@ -138,7 +138,7 @@ def test_parts_are_held_to_the_watchdog_but_to_three_seconds_at_least(
         awaited=lambda *, patient: {},
         stalls=StallWatch(lambda: {"part": Progress(1)}),
         driver_reports=[],
-        alarms=SimpleNamespace(manager=SimpleNamespace(shown={}), outbox=outbox, outputs={}),
+        alarms=SimpleNamespace(managers={}, outbox=outbox, outputs={}),
     )
     follower = _Follower(manager, service)
     every_s, last_s = 0.25, 0.0
