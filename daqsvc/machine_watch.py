@@ -12,7 +12,7 @@ from daqsvc.detectors.make import change_setpoints, detectors
 from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.diagnosis.snapshots import alignment, at_once, patience
 from daqsvc.diagnosis.statements import said_of_silence
-from daqsvc.recorder import Recorder
+from daqsvc.recorder import MachineRecorder
 from daqsvc.settings.streams import Grid
 
 if TYPE_CHECKING:
@@ -76,7 +76,11 @@ class MachineWatch:
         self._grids = grids
         self.standings = dict.fromkeys(machine.streams, StreamState())
         settings = machine.recorder
-        self.recorder = None if settings is None else Recorder(machine, settings, store, clock, supervisor)
+        self.recorder: MachineRecorder | None = None
+        if settings is not None:
+            self.recorder = MachineRecorder(
+                machine, settings, store, clock, supervisor, lambda: self.pipeline.is_judging
+            )
         self.rings = {grid.name: _ring(machine, grid, watching) for grid in grids}
         self.alignment = alignment(machine, clock, self.deliver)
         self.pipeline = Pipeline(

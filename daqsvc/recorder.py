@@ -10,23 +10,25 @@ import asyncio
 import contextlib
 import json
 import logging
+import math
 import os
 import shutil
 from collections import deque
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, get_args
 
 from daqsvc import __version__
 from daqsvc.acquisition.clock import NS_PER_S, iso_utc
 from daqsvc.acquisition.samples import SampleBlock
 from daqsvc.alarms.conditions import is_condition
 from daqsvc.alarms.events import ANNUNCIATIONS, AlarmEvent, Identity
-from daqsvc.diagnosis.memory import MemoryNotTakenError, take
+from daqsvc.diagnosis.memory import MemoryNotTakenError, taken_memory
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.publish.payloads import alarm_document, statement_document
 from daqsvc.settings.models import MachineFile
 from daqsvc.settings.registry import configured
+from daqsvc.settings.speed_signals import RPM, speed_signals
 from daqsvc.snapshots.contents import (
     ALARMS,
     DIAGNOSES,
@@ -42,17 +44,18 @@ from daqsvc.snapshots.contents import (
     Entry,
     Noted,
 )
+from daqsvc.snapshots.speed_steps import SpeedSteps
 from daqsvc.snapshots.writing import SnapshotWriter
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
     from pathlib import Path
 
     from daqsvc.acquisition.clock import Clock
     from daqsvc.acquisition.samples import Window
     from daqsvc.acquisition.standing import StreamState
     from daqsvc.diagnosis.detector import Detector
-    from daqsvc.diagnosis.memory import Memory
+    from daqsvc.diagnosis.memory import DetectorMemory
     from daqsvc.settings.recorder import Recorder as RecorderTable
     from daqsvc.settings.streams import Grid
     from daqsvc.snapshots.contents import Document
@@ -60,7 +63,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-Kind = Literal["alarm", "asked", "scheduled"]
+Kind = Literal["alarm", "asked", "speed", "scheduled", "continuous"]
+"""Why a file is written, the weightiest first."""
 
 FOLDER = "snapshots"
 """Of the machine's part of the store."""
@@ -78,6 +82,12 @@ MOST_ASKED = 16
 """People who wait for a snapshot at a time."""
 LONGEST_FILE = 16_000_000
 """Of a file that goes into a snapshot."""
+PATIENCE_NS = 5 * NS_PER_S
+"""How much longer a snapshot lasts, at most, for detectors to say what they make of its samples."""
+HOLD_NS = 2 * MEMORY_EVERY_NS + SPARE_NS
+"""How long the change to the next file waits for detectors to say what they remember."""
+AGAIN_NS = 10 * NS_PER_S
+"""After so long continuous recording is tried again where the disk has refused it."""
 END_S = 0.25
 """What the end of the service leaves for the last of a snapshot."""
 
@@ -130,7 +140,7 @@ class _Remembered(NamedTuple):
     detector: str
     stream: str
     end_index: int
-    memory: Memory
+    memory: DetectorMemory
 
 
 _Happened: TypeAlias = "SampleBlock | Diagnosis | AlarmEvent | _Read | _Stands | _Remembered"
@@ -145,7 +155,7 @@ class _Item(NamedTuple):
 
 @dataclass(slots=True)
 class _Open:
-    """The snapshot that is being written.
+    """A file that is being written.
 
     Attributes:
         kind: why; of several causes the weightiest.
@@ -154,6 +164,9 @@ class _Open:
         until_ns: its end, as it looks now.
         causes: in words.
         about: its first message, but for the causes.
+        waiting: what is to be written to it.
+        waiting_bytes: the samples among that.
+        writing: what a thread is writing now; its file, if that is complete then.
         writer: its file; None before that is open.
     """
 
@@ -163,7 +176,22 @@ class _Open:
     until_ns: int
     causes: list[str]
     about: Document
+    waiting: list[_Item] = field(default_factory=list)
+    waiting_bytes: int = 0
+    writing: asyncio.Future[Path | None] | None = None
     writer: SnapshotWriter | None = None
+
+    def give(self, items: Iterable[_Item]) -> None:
+        """Have it hold more."""
+        for item in items:
+            self.waiting.append(item)
+            self.waiting_bytes += _size(item)
+
+    def hand_out(self, end: int | None = None) -> list[_Item]:
+        """What waits, as far as an end; the rest waits on."""
+        taken, self.waiting = self.waiting[:end], [] if end is None else self.waiting[end:]
+        self.waiting_bytes = sum(map(_size, self.waiting))
+        return taken
 
 
 @dataclass(slots=True)
@@ -181,7 +209,7 @@ class _Kept:
     since_begin: bool = True
 
 
-class Recorder:
+class MachineRecorder:
     """Records one machine. All methods belong to the event loop.
 
     Args:
@@ -190,6 +218,7 @@ class Recorder:
         store: directory of the machine's part of the store.
         clock: the service's clock.
         supervisor: of the machine; told once of each kind of trouble.
+        is_judging: whether a detector has samples of which it has not said yet what it makes of them.
 
     Attributes:
         counters: what it has done.
@@ -198,9 +227,16 @@ class Recorder:
     """
 
     def __init__(
-        self, machine: MachineFile, settings: RecorderTable, store: Path, clock: Clock, supervisor: Supervisor
+        self,
+        machine: MachineFile,
+        settings: RecorderTable,
+        store: Path,
+        clock: Clock,
+        supervisor: Supervisor,
+        is_judging: Callable[[], bool] = lambda: False,
     ) -> None:
         self.counters = RecorderCounters()
+        self._is_judging = is_judging
         self.directory = store / FOLDER
         self.is_writing = False
         self._machine = machine
@@ -214,15 +250,20 @@ class Recorder:
         self._history: deque[_Item] = deque()
         self._kept = _Kept()
         self._open: _Open | None = None
-        self._waiting: list[_Item] = []
-        """What is to be written to the snapshot that is open."""
-        self._waiting_bytes = 0
+        """The snapshot that is being written."""
+        self._continuous: _Open | None = None
+        """The file of the continuous recording."""
+        self._continuous_from_ns = 0
+        self._steps = None if settings.every_rpm is None else SpeedSteps(settings.every_rpm)
+        self._speeds = {} if self._steps is None else speed_signals(machine)
         self._asked: list[asyncio.Future[Path]] = []
         self._due_ns: int | None = None
         self._is_well = True
         self._memories: dict[str, deque[_Remembered]] = {}
         """Of each detector, the newest last; its thread adds to them."""
-        self._memories_kept = 2 + self._before_ns // MEMORY_EVERY_NS
+        self._memories_kept = 3 + self._before_ns // MEMORY_EVERY_NS
+        self._memory_wanted_ns = 0
+        """What was remembered earlier is too old, however young it is."""
 
     def take_over(self, events: Iterable[AlarmEvent]) -> None:
         """Take in how alarms stand from before the recorder was made."""
@@ -235,10 +276,11 @@ class Recorder:
         memories = self._memories.get(detector.name)
         if memories is None:
             memories = self._memories[detector.name] = deque(maxlen=self._memories_kept)
-        if memories and now_ns - memories[-1].at_ns < MEMORY_EVERY_NS:
+        last_ns = memories[-1].at_ns if memories else -MEMORY_EVERY_NS
+        if now_ns - last_ns < MEMORY_EVERY_NS and last_ns >= self._memory_wanted_ns:
             return
         try:
-            memory = take(detector)
+            memory = taken_memory(detector)
         except MemoryNotTakenError:
             self.counters.memories_not_taken += 1
             return
@@ -268,6 +310,11 @@ class Recorder:
     def diagnosis(self, diagnosis: Diagnosis) -> None:
         """A detector has made a statement."""
         self._note(diagnosis)
+        for name in self._speeds.get(diagnosis.detector, ()):
+            if self._steps is not None and diagnosis.units.get(name) == RPM:
+                speed_rpm = diagnosis.statistics.get(name, math.nan)
+                if self._steps.is_new(speed_rpm):
+                    self._cause("speed", f"speed {speed_rpm:.4g} rpm")
 
     def alarm(self, event: AlarmEvent) -> None:
         """An alarm has changed: one that calls for a person is a cause."""
@@ -307,38 +354,60 @@ class Recorder:
         """What it has done, and how much waits for the disk."""
         return {
             **asdict(self.counters),
-            "recording": int(self._open is not None),
-            "waiting_bytes": self._waiting_bytes,
+            "recording": int(self._open is not None or self._continuous is not None),
+            "waiting_bytes": sum(one.waiting_bytes for one in self._written()),
         }
 
     def _note(self, what: _Happened, size_bytes: int = 0) -> None:
         item = _Item(self._clock.monotonic_ns(), what)
         self._history.append(item)
-        if self._open is not None:
-            if self._waiting_bytes + size_bytes > MOST_WAITING_BYTES:
+        for one in self._written():
+            if one.waiting_bytes + size_bytes > MOST_WAITING_BYTES:
                 self.counters.blocks_dropped += 1
-                return
-            self._waiting.append(item)
-            self._waiting_bytes += size_bytes
+            else:
+                one.waiting.append(item)
+                one.waiting_bytes += size_bytes
+
+    def _written(self) -> list[_Open]:
+        """The files that are being written."""
+        return [one for one in (self._open, self._continuous) if one is not None]
 
     def _cause(self, kind: Kind, words: str) -> None:
         """Begin a snapshot, or let the one that is open last longer."""
         now_ns = self._clock.monotonic_ns()
         if self._open is None:
-            history = list(self._history)
-            first, memories = self._begin(history, now_ns - self._before_ns)
-            begin_ns = history[first].at_ns if first < len(history) else now_ns
-            about = self._about(history[:first], begin_ns, memories)
-            self._open = _Open(kind, now_ns, begin_ns, now_ns + self._after_ns, [words], about)
-            self._waiting = [*(_Item(begin_ns, one) for one in memories), *history[first:]]
-            self._waiting_bytes = sum(map(_size, self._waiting))
+            self._open = self._begun(kind, words, now_ns - self._before_ns, now_ns + self._after_ns)
             return
         most_ns = self._open.begin_ns + round(self._settings.longest_s * NS_PER_S)
         self._open.until_ns = max(self._open.until_ns, min(now_ns + self._after_ns, most_ns))
         if len(self._open.causes) < MOST_CAUSES:
             self._open.causes.append(words)
-        if kind == "alarm" or (kind == "asked" and self._open.kind == "scheduled"):
-            self._open.kind = kind
+        self._open.kind = min(kind, self._open.kind, key=get_args(Kind).index)
+
+    def _begun(self, kind: Kind, words: str, begin_ns: int, until_ns: int) -> _Open:
+        """A file that reaches back to a time, or a little further."""
+        now_ns = self._clock.monotonic_ns()
+        history = list(self._history)
+        first, memories = self._begin(history, begin_ns)
+        return self._made(kind, words, history, first, memories, (now_ns, until_ns))
+
+    def _made(
+        self,
+        kind: Kind,
+        words: str,
+        history: Sequence[_Item],
+        first: int,
+        memories: Sequence[_Remembered],
+        cause_until_ns: tuple[int, int],
+    ) -> _Open:
+        """A file that begins with an item of the history."""
+        cause_ns, until_ns = cause_until_ns
+        begin_ns = history[first].at_ns if first < len(history) else self._clock.monotonic_ns()
+        about = self._about(history[:first], begin_ns, memories)
+        made = _Open(kind, cause_ns, begin_ns, until_ns, [words], about)
+        made.give(_Item(begin_ns, one) for one in memories)
+        made.give(history[first:])
+        return made
 
     def _begin(self, history: Sequence[_Item], begin_ns: int) -> tuple[int, list[_Remembered]]:
         """Where a snapshot begins that reaches back to a time, and what detectors remembered there.
@@ -360,6 +429,9 @@ class Recorder:
     def _trim(self, now_ns: int) -> None:
         """Forget what no snapshot would begin with any more, but for how alarms and streams stood."""
         oldest_ns = now_ns - self._before_ns - MEMORY_EVERY_NS - SPARE_NS
+        if self._continuous is not None and self._continuous.waiting:
+            # The next file may begin with that.
+            oldest_ns = min(oldest_ns, self._continuous.waiting[0].at_ns)
         history, kept = self._history, self._kept
         while history and history[0].at_ns < oldest_ns:
             what = history.popleft().what
@@ -377,68 +449,121 @@ class Recorder:
             if self._due_ns is not None:
                 self._cause("scheduled", "scheduled")
             self._due_ns = now_ns + round(every_s * NS_PER_S)
-        if self._open is not None:
-            await self._write_on(self._open, now_ns)
+        if (snapshot := self._open) is not None:
+            late_ns = now_ns - snapshot.until_ns
+            is_over = late_ns >= 0 and (late_ns >= PATIENCE_NS or not self._is_judging())
+            await self._write_on(snapshot, snapshot.hand_out(), is_over=is_over)
+        if self._settings.continuous:
+            await self._continue(self._clock.monotonic_ns())
 
-    async def _write_on(self, snapshot: _Open, now_ns: int) -> None:
-        items, self._waiting, self._waiting_bytes = self._waiting, [], 0
-        is_over = now_ns >= snapshot.until_ns
-        try:
-            if snapshot.writer is None:
-                snapshot.writer = await asyncio.to_thread(self._open_file, snapshot)
-            await asyncio.to_thread(self._put, snapshot.writer, items)
-            if not is_over:
+    async def _continue(self, now_ns: int) -> None:
+        """Write on what is recorded continuously, and begin the next file in time."""
+        one, length_ns = self._continuous, round(self._settings.continuous_s * NS_PER_S)
+        if one is None:
+            if now_ns < self._continuous_from_ns:
                 return
-            path = await asyncio.to_thread(self._finish, snapshot)
+            one = self._continuous = self._begun("continuous", "continuous", now_ns, now_ns + length_ns)
+        if now_ns < one.until_ns:
+            await self._write_on(one, one.hand_out(), is_over=False)
+            return
+        self._memory_wanted_ns = one.until_ns
+        if (found := self._next_begin(one, now_ns)) is None:
+            return
+        end, memories = found
+        history = list(self._history)
+        begin = one.waiting[end] if end < len(one.waiting) else None
+        first = next((k for k, item in enumerate(history) if item is begin), len(history))
+        times = history[first].at_ns if first < len(history) else now_ns, now_ns + length_ns
+        following = self._made("continuous", "continuous", history, first, memories, times)
+        items = one.hand_out(end)
+        one.hand_out()
+        self._continuous = following
+        await self._write_on(one, items, is_over=True)
+
+    def _next_begin(self, one: _Open, now_ns: int) -> tuple[int, list[_Remembered]] | None:
+        """With which of the items that wait the next file begins, and what detectors remember there.
+
+        It begins where each detector goes on with samples that it has not judged, so that no sample need be
+        in both files. None while it is worth waiting for that.
+        """
+        firsts: list[int] = []
+        chosen: list[_Remembered] = []
+        is_complete = True
+        for memories in [*self._memories.values()]:
+            newest = memories[-1]
+            first = _first_after(one.waiting, newest) if newest.at_ns >= one.until_ns else None
+            if first is None or first == len(one.waiting):
+                is_complete = False
+            else:
+                firsts.append(first)
+                chosen.append(newest)
+        if not is_complete and now_ns - one.until_ns < HOLD_NS:
+            return None
+        return min(firsts, default=len(one.waiting)), chosen
+
+    async def _write_on(self, snapshot: _Open, items: list[_Item], *, is_over: bool) -> None:
+        # A thread goes on when nobody waits for it any more: the end of the service must know of it.
+        snapshot.writing = asyncio.ensure_future(
+            asyncio.to_thread(self._write, snapshot, items, is_over=is_over)
+        )
+        try:
+            path = await asyncio.shield(snapshot.writing)
         except (OSError, ValueError) as error:
+            snapshot.writing = None
             self._give_up(snapshot, error)
             return
-        self._open = None
-        self._waiting, self._waiting_bytes = [], 0
+        snapshot.writing = None
+        if path is None:
+            return
         self.counters.snapshots += 1
         if not self._is_well:
             self._is_well = True
             log.warning("snapshots of %s are written again", self._identity.machine)
-        asked, self._asked = self._asked, []
-        for one in asked:
-            if not one.done():
-                one.set_result(path)
+        if snapshot is self._open:
+            self._open = None
+            asked, self._asked = self._asked, []
+            for one in asked:
+                if not one.done():
+                    one.set_result(path)
 
     def _give_up(self, snapshot: _Open, error: Exception) -> None:
         """The disk takes no more of a snapshot: what it has got stays, and the service goes on."""
         self.counters.write_failures += 1
         self.counters.snapshots_failed += 1
-        self._open = None
-        self._waiting, self._waiting_bytes = [], 0
+        if snapshot is self._continuous:
+            self._continuous = None
+            self._continuous_from_ns = self._clock.monotonic_ns() + AGAIN_NS
         if snapshot.writer is not None:
             with contextlib.suppress(OSError):
                 snapshot.writer.abandon()
         if self._is_well:
             self._is_well = False
             log.error("a snapshot of %s is lost: %s", self._identity.machine, _in_words(error))
-        asked, self._asked = self._asked, []
-        for one in asked:
-            if not one.done():
-                one.set_exception(SnapshotRefusedError(f"the snapshot is lost: {_in_words(error)}"))
+        if snapshot is self._open:
+            self._open = None
+            asked, self._asked = self._asked, []
+            for one in asked:
+                if not one.done():
+                    one.set_exception(SnapshotRefusedError(f"the snapshot is lost: {_in_words(error)}"))
 
     async def _end(self) -> None:
         """No more is written: bring what is under way to its end, if the disk is quick."""
-        snapshot, self._open = self._open, None
+        ending = self._written()
+        self._open = self._continuous = None
         for one in self._asked:
             if not one.done():
                 one.set_exception(SnapshotRefusedError("the service ends"))
-        if snapshot is None or snapshot.writer is None:
-            return
-        items, self._waiting, writer = self._waiting, [], snapshot.writer
+        await asyncio.gather(*(self._end_of(one) for one in ending))
 
-        def finish() -> None:
-            self._put(writer, items)
-            self._finish(snapshot)
-
+    async def _end_of(self, snapshot: _Open) -> None:
         with contextlib.suppress(OSError, ValueError, TimeoutError):
-            await asyncio.wait_for(asyncio.to_thread(finish), END_S)
+            async with asyncio.timeout(END_S):
+                # One thread writes to a file at a time; what it has been given already comes first.
+                if snapshot.writing is None or await asyncio.shield(snapshot.writing) is None:
+                    await asyncio.to_thread(self._write, snapshot, snapshot.hand_out(), is_over=True)
+                self.counters.snapshots += 1
 
-    def _about(self, before: Iterable[_Item], begin_ns: int, memories: Iterable[_Remembered]) -> Document:
+    def _about(self, before: Sequence[_Item], begin_ns: int, memories: Iterable[_Remembered]) -> Document:
         """The first message of a snapshot: whose it is, and how things stood at its begin."""
         wall_ns = self._clock.wall_ns() - self._clock.monotonic_ns()
         alarms, standings = dict(self._kept.alarms), dict(self._kept.standings)
@@ -456,7 +581,7 @@ class Recorder:
             "begin_ns": begin_ns,
             "begin": iso_utc(begin_ns + wall_ns),
             "wall_ns_at_0": wall_ns,
-            "from_start": self._kept.since_begin,
+            "from_start": self._kept.since_begin and not before,
             "remembered": {one.detector: one.end_index for one in memories},
             "streams": dict(self._streams()),
             "standings": {name: one._asdict() for name, one in standings.items()},
@@ -480,6 +605,20 @@ class Recorder:
             )
         for grid in machine.grids:
             yield grid.name, _of_grid(grid)
+
+    def _write(self, snapshot: _Open, items: Iterable[_Item], *, is_over: bool) -> Path | None:
+        """Write what has happened, and the end of the file if it is over; blocks.
+
+        Returns:
+            The file, if that is complete.
+
+        Raises:
+            OSError: the disk does not take it.
+        """
+        if snapshot.writer is None:
+            snapshot.writer = self._open_file(snapshot)
+        self._put(snapshot.writer, items)
+        return self._finish(snapshot) if is_over else None
 
     def _open_file(self, snapshot: _Open) -> SnapshotWriter:
         """Make the file; blocks.
@@ -561,10 +700,12 @@ class Recorder:
         """
         kept: list[tuple[bool, str, int]] = []
         oldest = self._clock.wall_ns() - self._settings.keep_days * 86_400 * NS_PER_S
-        writing = self._open.writer.path.name if self._open is not None and self._open.writer else ""
+        writing = {one.writer.path.name for one in self._written() if one.writer is not None}
         with os.scandir(self.directory) as found:
             for one in found:
-                if one.name.endswith(SUFFIX) and one.is_file(follow_symlinks=False) and one.name != writing:
+                if one.name in writing or not one.name.endswith(SUFFIX):
+                    continue
+                if one.is_file(follow_symlinks=False):
                     status = one.stat()
                     if status.st_mtime_ns < oldest:
                         self._delete(one.name)

@@ -41,7 +41,7 @@ class MemoryNotFittingError(Exception):
     """What was remembered does not fit a detector, as it is of another version."""
 
 
-class Memory(NamedTuple):
+class DetectorMemory(NamedTuple):
     """What a detector remembers.
 
     Attributes:
@@ -61,7 +61,7 @@ class Memory(NamedTuple):
         return {"tree": self.tree, "arrays": arrays}
 
     @classmethod
-    def of(cls, document: dict[str, Any]) -> Memory:
+    def of(cls, document: dict[str, Any]) -> DetectorMemory:
         """What `document` has told.
 
         Raises:
@@ -81,17 +81,17 @@ def _array(dtype: str, shape: list[int], text: str) -> NDArray[Any]:
     return np.frombuffer(base64.b64decode(text), kind).reshape(shape).copy()
 
 
-def take(detector: object) -> Memory:
+def taken_memory(detector: object) -> DetectorMemory:
     """What a detector remembers now; from the thread that it computes in, or while it does not.
 
     Raises:
         MemoryNotTakenError: it is too much.
     """
     taker = _Taker(_packages(detector))
-    return Memory(taker.tree_of(detector, 0), taker.arrays)
+    return DetectorMemory(taker.tree_of(detector, 0), taker.arrays)
 
 
-def put(detector: object, memory: Memory) -> None:
+def put(detector: object, memory: DetectorMemory) -> None:
     """Have a detector that was just made of the same machine file remember that.
 
     Raises:
@@ -168,7 +168,7 @@ _MISSING = object()
 class _Putter:
     """Puts values back into what is there, or makes new ones of them."""
 
-    def __init__(self, memory: Memory, packages: frozenset[str]) -> None:
+    def __init__(self, memory: DetectorMemory, packages: frozenset[str]) -> None:
         self._arrays = memory.arrays
         self._packages = packages
         self._made: dict[int, object] = {}

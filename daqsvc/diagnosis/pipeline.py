@@ -323,6 +323,11 @@ class Pipeline:
         """Samples that the slowest detector has not read yet."""
         return max((reader.behind for reader in self.readers.values()), default=0)
 
+    @property
+    def is_judging(self) -> bool:
+        """Whether a window is being processed of which nothing has been said yet."""
+        return bool(self._under_way)
+
     def progress(self) -> dict[str, Progress]:
         """How far each detector has come with the samples that wait for it."""
         parts: dict[str, Progress] = {}

@@ -16,7 +16,13 @@ from daqsvc.settings.alarm_checks import alarm_checks
 from daqsvc.settings.error_messages import dotted
 from daqsvc.settings.failures import BrokenContractError
 from daqsvc.settings.hooks import PluginFailedError
-from daqsvc.settings.plugins import bus_tables, configured, configured_outputs, driver_of_layout
+from daqsvc.settings.plugins import (
+    bus_tables,
+    configured,
+    configured_outputs,
+    detector_tables,
+    driver_of_layout,
+)
 from daqsvc.settings.problems import Finding, choice, unique
 from daqsvc.settings.registry import broken_drivers
 from daqsvc.settings.rotor_physics import physics_checks
@@ -28,6 +34,7 @@ from daqsvc.settings.sensor_checks import (
     check_sensitivity,
     check_voltages,
 )
+from daqsvc.settings.speed_signals import speed_signals
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Hashable, Iterator, Mapping
@@ -116,6 +123,7 @@ def _checks(draft: MachineFile, facts: Mapping[str, Any]) -> Iterator[Iterator[F
     yield from _sensor_checks(draft, facts)
     yield _check_memory(draft)
     yield _names(draft)
+    yield _check_speed_steps(draft)
     yield from physics_checks(draft)
     with suppress(UnusableValueError):
         for _, detector, settings in configured(draft.pipeline, valid_only=True):
@@ -317,6 +325,8 @@ def _fine_enough(draft: MachineFile, max_error_us: float) -> Iterator[Finding]:
 SAMPLE_BYTES = 4
 _HISTORY_SPARE_S = 8.0
 """What the recorder remembers beyond the begin of a snapshot."""
+_CONTINUOUS_SPARE_S = 16.0
+"""Likewise, where it records continuously: what waits for the next file."""
 _MOST_SHARE = 0.5
 """Of the memory: the rest is for detectors, outbox, operating system and whoever else there is."""
 _CGROUP_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
@@ -350,11 +360,25 @@ def needed_bytes(draft: MachineFile) -> dict[str, float]:
             row_bytes = SAMPLE_BYTES * len(stream.layout.channel_names)
             kept_s = pipeline.ring_s * rings[name] + stream.reorder_window_ms / 1e3
             if (recorder := draft.recorder) is not None:
-                kept_s += (recorder.before_s + _HISTORY_SPARE_S) * rings[name]
+                spare_s = _CONTINUOUS_SPARE_S if recorder.continuous else _HISTORY_SPARE_S
+                kept_s += (recorder.before_s + spare_s) * rings[name]
             needed[name] = stream.rate_hz * kept_s * row_bytes
             if (block := stream.layout.block) is not None:
                 needed[name] += block.buffer_bytes
     return needed
+
+
+def _check_speed_steps(draft: MachineFile) -> Iterator[Finding]:
+    """Where snapshots are to be made by the speed, that is known."""
+    recorder = draft.recorder
+    if recorder is None or recorder.every_rpm is None or speed_signals(draft):
+        return
+    tables = [f"[pipeline.{key}]" for key, plugin in detector_tables().items() if plugin.states_speed]
+    yield Finding(
+        ("recorder", "every_rpm"),
+        "asks for snapshots by the speed, and no detector of this machine states one",
+        f'write a table {" or ".join(tables)}, a sensor of type "trend" in rpm, or remove every_rpm',
+    )
 
 
 def _check_memory(draft: MachineFile) -> Iterator[Finding]:

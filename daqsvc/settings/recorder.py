@@ -24,6 +24,13 @@ class Recorder(Section):
     every_s: Annotated[float, Field(ge=10.0, le=3.2e7)] | None = Field(
         default=None, description="how often one is made without a cause", examples=[3600.0]
     )
+    every_rpm: Annotated[float, Field(ge=1.0, le=1e6)] | None = Field(
+        default=None, description="at which steps of the speed one is made, up and down", examples=[100.0]
+    )
+    continuous: bool = Field(default=False, description="says that everything is recorded, file after file")
+    continuous_s: Annotated[float, Field(ge=1.0, le=86_400.0)] = Field(
+        default=600.0, description="how long each of these files is"
+    )
     max_mb: Annotated[int, Field(ge=1, le=10_000_000)] = Field(
         default=1000,
         description="size of all, beyond which the oldest are deleted, those of alarms last",

@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 
 CHUNK_BYTES = 1 << 18
 """A cut takes no more than the chunk that it is in."""
+FLAGS = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
+MODE = 0o640
+"""Samples and machine files are for the service and its group."""
 MEDIA_TYPES = {".toml": "application/toml", ".json": "application/json"}
 
 
@@ -50,7 +53,7 @@ class SnapshotWriter:
     def __init__(self, path: Path, about: Document, files: Mapping[str, bytes], wall_ns: int) -> None:
         self.path = path
         self._wall_ns = wall_ns
-        self._file = path.open("xb")
+        self._file = os.fdopen(os.open(path, FLAGS, MODE), "wb")
         try:
             self._mcap = McapWriter(self._file, f"daqsvc {__version__}")
             for topic in (ABOUT, ALARMS, DIAGNOSES, STANDING, WINDOWS, STATES):

@@ -11,7 +11,13 @@ from support.machine_files import MACHINES
 
 from daqsvc.acquisition.samples import Window
 from daqsvc.detectors.make import detectors
-from daqsvc.diagnosis.memory import Memory, MemoryNotFittingError, MemoryNotTakenError, put, take
+from daqsvc.diagnosis.memory import (
+    DetectorMemory,
+    MemoryNotFittingError,
+    MemoryNotTakenError,
+    put,
+    taken_memory,
+)
 from daqsvc.publish.payloads import statement_document
 from daqsvc.settings import load_machine_file
 from sim_hw.demo.machines import laval_rig
@@ -66,11 +72,11 @@ def goes_on_alike(machine: MachineFile, name: str, samples: Samples, share: floa
     all_windows = list(windows(one, samples, rate_hz))
     cut = round(share * len(all_windows))
     told(one, all_windows[:cut])
-    memory = Memory.of(json.loads(json.dumps(take(one).document())))
+    memory = DetectorMemory.of(json.loads(json.dumps(taken_memory(one).document())))
     put(other, memory)
     rest = told(one, all_windows[cut:])
     assert rest == told(other, all_windows[cut:])
-    assert json.dumps(take(one).document()) == json.dumps(take(other).document())
+    assert json.dumps(taken_memory(one).document()) == json.dumps(taken_memory(other).document())
     return rest
 
 
@@ -126,11 +132,11 @@ def test_it_fits_its_own_kind_only() -> None:
     )
     told(levels, list(windows(levels, samples, 640.0))[:2])
     with pytest.raises(MemoryNotFittingError):
-        put(bank, Memory(["object", "daqsvc.box:Box", {}, 0], []))
+        put(bank, DetectorMemory(["object", "daqsvc.box:Box", {}, 0], []))
     with pytest.raises(MemoryNotFittingError):
-        put(bank, Memory(["object", "os:_Environ", {}, 0], []))
+        put(bank, DetectorMemory(["object", "os:_Environ", {}, 0], []))
     with pytest.raises(MemoryNotFittingError):
-        Memory.of({"tree": 0, "arrays": [["O", [1], ""]]})
+        DetectorMemory.of({"tree": 0, "arrays": [["O", [1], ""]]})
 
 
 def test_what_is_too_much_is_not_taken() -> None:
@@ -141,4 +147,4 @@ def test_what_is_too_much_is_not_taken() -> None:
             self.all = np.zeros(2_000_000)
 
     with pytest.raises(MemoryNotTakenError, match="8 MB"):
-        take(Hoarder())
+        taken_memory(Hoarder())

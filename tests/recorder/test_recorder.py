@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import errno
 import os
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,16 +20,17 @@ from daqsvc.acquisition.standing import StreamState
 from daqsvc.alarms.events import AlarmEvent, EventKind, Identity
 from daqsvc.alarms.states import AlarmState, Level
 from daqsvc.diagnosis.record import Diagnosis
-from daqsvc.recorder import MOST_WAITING_BYTES, Recorder, SnapshotRefusedError
+from daqsvc.recorder import MOST_WAITING_BYTES, MachineRecorder, SnapshotRefusedError
 from daqsvc.snapshots.mcap import Attachment, Damage
 from daqsvc.snapshots.reading import entries_of
+from daqsvc.snapshots.writing import SnapshotWriter
 from daqsvc.supervision import Supervisor
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Iterable
     from pathlib import Path
 
-    from daqsvc.snapshots.contents import Document
+    from daqsvc.snapshots.contents import Document, Entry
 
 ROWS = 64
 
@@ -40,19 +42,28 @@ class Bench:
         machine, _ = recorded_rig("unused", **{"before_s": 1.0, "after_s": 1.0, **table})
         assert machine.recorder is not None
         self.clock = DrivenClock(wall_start_ns=1_800_000_000 * NS_PER_S)
-        self.recorder = Recorder(machine, machine.recorder, store, self.clock, Supervisor())
+        self.is_judging = False
+        self.recorder = MachineRecorder(
+            machine, machine.recorder, store, self.clock, Supervisor(), lambda: self.is_judging
+        )
         self._index = 0
+        self.rows = ROWS
 
     async def passes(self, seconds: float) -> None:
         for _ in range(round(10 * seconds)):
             self.clock.advance_to(self.clock.monotonic_ns() + NS_PER_S // 10)
-            samples = np.full((ROWS, 3), self._index, np.float32)
+            samples = np.full((self.rows, 3), self._index, np.float32)
             now_ns = self.clock.monotonic_ns()
             self.recorder.block(SampleBlock("shaft", self._index, samples, now_ns, 1.5e6))
-            self._index += ROWS
+            self._index += self.rows
             await asyncio.sleep(0)
             await asyncio.sleep(0)
             await eventually(lambda: not self.recorder.is_writing, "what has come is written")
+
+    def states_speed(self, speed_rpm: float, detector: str = "rotor-bank") -> None:
+        now_ns = self.clock.monotonic_ns()
+        told = Diagnosis("laval-rig", detector, now_ns, "shaft", 0, 1, "N")
+        self.recorder.diagnosis(replace(told, statistics={"speed": speed_rpm}, units={"speed": "rpm"}))
 
     def alarm(self, name: str = "rotor-fault", kind: EventKind = EventKind.RAISED) -> None:
         now_ns = self.clock.monotonic_ns()
@@ -90,6 +101,12 @@ def held(path: Path) -> tuple[Document, float, float, Damage]:
     return read[0].what.document, min(times), max(times), damage
 
 
+def firsts_in(path: Path) -> list[int]:
+    """Where each block of a snapshot begins."""
+    read = [e for e in entries_of(memoryview(path.read_bytes()), Damage()) if not isinstance(e, Attachment)]
+    return [e.what.first_index for e in read if isinstance(e.what, SampleBlock)]
+
+
 async def test_a_snapshot_is_from_before_to_after_its_cause(tmp_path: Path) -> None:
     async with bench(tmp_path) as one:
         await one.passes(30.0)
@@ -104,6 +121,26 @@ async def test_a_snapshot_is_from_before_to_after_its_cause(tmp_path: Path) -> N
     assert at_s - 1.0 == pytest.approx(begin_s, abs=0.11)
     assert at_s + 1.0 == pytest.approx(end_s, abs=0.3)
     assert one.recorder.counters.snapshots == 1
+    assert path.stat().st_mode & 0o777 == 0o640
+    assert path.parent.stat().st_mode & 0o777 == 0o750
+
+
+@pytest.mark.parametrize(("busy_s", "lasts_s"), [(3.0, 3.0), (60.0, 6.0)])
+async def test_a_snapshot_lasts_until_detectors_have_judged_it(
+    tmp_path: Path, busy_s: float, lasts_s: float
+) -> None:
+    async with bench(tmp_path) as one:
+        await one.passes(10.0)
+        at_s = one.clock.monotonic_ns() / NS_PER_S
+        one.is_judging = True
+        one.alarm()
+        await one.passes(busy_s)
+        one.is_judging = False
+        await one.passes(1.0)
+        [path] = one.files
+    assert one.recorder.counters.snapshots == 1
+    _, _, end_s, _ = held(path)
+    assert at_s + lasts_s == pytest.approx(end_s, abs=0.3)
 
 
 async def test_causes_that_overlap_make_one_snapshot_up_to_a_length(tmp_path: Path) -> None:
@@ -134,6 +171,78 @@ async def test_snapshots_come_by_the_clock(tmp_path: Path) -> None:
     async with bench(tmp_path, every_s=10.0) as one:
         await one.passes(32.0)
         assert [path.name.rpartition("-")[2] for path in one.files] == 3 * ["scheduled.mcap"]
+
+
+async def test_a_snapshot_is_made_at_each_step_of_the_speed(tmp_path: Path) -> None:
+    async with bench(tmp_path, every_rpm=100.0, before_s=0.0, after_s=0.5) as one:
+        for speed_rpm in [0.0, *np.arange(10.0, 400.0, 5.0), *np.arange(400.0, 130.0, -5.0)]:
+            one.states_speed(speed_rpm)
+            await one.passes(0.2)
+        one.states_speed(float("nan"))
+        await one.passes(1.0)
+        files = one.files
+    causes = [held(path)[0]["causes"] for path in files]
+    # A quarter of a step beyond each boundary, up and down.
+    assert causes == [[f"speed {rpm} rpm"] for rpm in (125, 225, 325, 270, 170)]
+    assert {path.name.rpartition("-")[2] for path in files} == {"speed.mcap"}
+
+
+async def test_a_speed_that_wanders_about_a_step_makes_no_snapshots(tmp_path: Path) -> None:
+    async with bench(tmp_path, every_rpm=100.0, before_s=0.0, after_s=0.2) as one:
+        for speed_rpm in 1000.0 + 20.0 * np.sin(np.arange(100.0)):
+            one.states_speed(-speed_rpm)
+            await one.passes(0.2)
+        assert not one.files
+        one.states_speed(1130.0, "levels/probe-x")
+        await one.passes(1.0)
+        assert not one.files, "that is no detector that knows the speed"
+
+
+async def test_files_of_a_continuous_recording_join_over_an_alarm(tmp_path: Path) -> None:
+    async with bench(tmp_path, continuous=True, continuous_s=5.0) as one:
+        await one.passes(12.0)
+        one.alarm()
+        await one.passes(10.0)
+    kinds = [path.name.rpartition("-")[2] for path in one.files]
+    assert kinds == [*3 * ["continuous.mcap"], "alarm.mcap", *2 * ["continuous.mcap"]]
+    files = [path for path in one.files if path.name.endswith("-continuous.mcap")]
+    assert [index for path in files for index in firsts_in(path)] == [ROWS * k for k in range(220)]
+    assert [held(path)[0]["from_start"] for path in files] == [True, *4 * [False]]
+    begins = [held(path)[0]["begin_ns"] / NS_PER_S for path in files]
+    assert np.diff(begins) == pytest.approx(5.0, abs=0.4)
+
+
+async def test_a_continuous_recording_goes_on_when_the_disk_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with bench(tmp_path, continuous=True, continuous_s=5.0) as one:
+        await one.passes(3.0)
+        with monkeypatch.context() as patched:
+
+            def refuse(*_: object) -> None:
+                raise OSError(errno.ENOSPC, "No space left on device")
+
+            patched.setattr("daqsvc.snapshots.writing.SnapshotWriter.write", refuse)
+            await one.passes(6.0)
+        assert one.recorder.counters.write_failures == 1, "it is not tried at every turn"
+        await one.passes(10.0)
+        assert one.recorder.figures()["recording"]
+    broken, *whole = one.files
+    assert held(broken)[3].ends_early
+    assert [held(path)[3] for path in whole] == [Damage()] * len(whole)
+    assert whole
+    assert [record.levelname for record in caplog.records] == ["ERROR", "WARNING"]
+
+
+async def test_continuous_files_are_deleted_before_those_of_alarms(tmp_path: Path) -> None:
+    async with bench(tmp_path, continuous=True, continuous_s=2.0, max_mb=1) as one:
+        one.alarm()
+        await one.passes(3.0)
+        [alarm] = [path for path in one.files if path.name.endswith("-alarm.mcap")]
+        one.rows = 6_000
+        await one.passes(6.0)
+        assert one.recorder.counters.snapshots_deleted >= 1
+        assert alarm in one.files
 
 
 async def test_the_oldest_go_first_and_those_of_alarms_last(tmp_path: Path) -> None:
@@ -204,7 +313,7 @@ async def test_a_disk_that_hangs_holds_up_nobody(tmp_path: Path, monkeypatch: py
         hanging.wait()
 
     async with bench(tmp_path) as one:
-        monkeypatch.setattr("daqsvc.recorder.Recorder._see_space", hang)
+        monkeypatch.setattr("daqsvc.recorder.MachineRecorder._see_space", hang)
         one.alarm()
         one.clock.advance_to(one.clock.monotonic_ns() + NS_PER_S)
         await eventually(lambda: one.recorder.is_writing, "it hangs")
@@ -215,6 +324,42 @@ async def test_a_disk_that_hangs_holds_up_nobody(tmp_path: Path, monkeypatch: py
         assert one.recorder.counters.blocks_dropped >= 4
         hanging.set()
         await eventually(lambda: not one.recorder.is_writing, "it is over")
+
+
+async def test_the_end_of_the_service_waits_for_what_a_thread_writes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import threading
+
+    may_go_on = threading.Event()
+    write = SnapshotWriter.write
+
+    def slow(self: SnapshotWriter, entries: Iterable[Entry]) -> None:
+        entries = iter(entries)
+        write(self, [next(entries)])
+        may_go_on.wait()
+        write(self, entries)
+
+    async with bench(tmp_path) as one:
+        await one.passes(3.0)
+        monkeypatch.setattr(SnapshotWriter, "write", slow)
+        one.alarm()
+        one.clock.advance_to(one.clock.monotonic_ns() + NS_PER_S // 2)
+        await eventually(lambda: one.recorder.is_writing, "a thread writes")
+        one.recorder.block(SampleBlock("shaft", 30 * ROWS, np.zeros((ROWS, 3), np.float32), 0, 1.5e6))
+        asyncio.get_running_loop().call_later(0.05, may_go_on.set)
+    [path] = one.files
+    assert held(path)[3] == Damage()
+    assert firsts_in(path) == [ROWS * k for k in range(31)]
+    assert one.recorder.counters.snapshots == 1
+
+
+async def test_an_alarm_at_the_very_end_leaves_its_snapshot(tmp_path: Path) -> None:
+    async with bench(tmp_path) as one:
+        await one.passes(3.0)
+        one.alarm()
+    [path] = one.files
+    assert held(path)[3] == Damage()
 
 
 async def test_the_end_of_the_service_closes_what_is_open(tmp_path: Path) -> None:

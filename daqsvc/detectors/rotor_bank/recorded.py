@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, cast
 
 from daqsvc.detectors.rotor_bank.build import bank_detector
 from daqsvc.detectors.rotor_bank.settings import RotorBank
-from daqsvc.detectors.shaft.verdict import Instant, RotorVerdict, Step
+from daqsvc.detectors.shaft.verdict import Instant, ModeStep, RotorVerdict
 from daqsvc.diagnosis.recorded import Evaluated, RecordedDetector, statements_of
 from daqsvc.dsp.quality.recorded import complaints, known_against
 
@@ -127,9 +127,9 @@ def _faults(diagnosis: Diagnosis, faults: Mapping[str, str]) -> tuple[RotorFault
 
 def _history(
     judged: Sequence[Diagnosis], faults: Mapping[str, str]
-) -> tuple[tuple[Step, ...], Diagnosis | None, int | None, Diagnosis | None]:
+) -> tuple[tuple[ModeStep, ...], Diagnosis | None, int | None, Diagnosis | None]:
     """Changes of the verdict; the statements that raised the alarm and gave the last name, and the onset."""
-    steps: list[Step] = []
+    steps: list[ModeStep] = []
     departed = named = None
     onset: int | None = None
     for diagnosis in judged:
@@ -143,7 +143,7 @@ def _history(
             departed, onset = diagnosis, diagnosis.first_index
         if settled and group != ("normal",) and (named is None or set(_faults(named, faults)) != set(group)):
             named = diagnosis
-        step = Step(math.floor(diagnosis.revolutions or 0.0), group[0], group, settled)
+        step = ModeStep(math.floor(diagnosis.revolutions or 0.0), group[0], group, settled)
         if not steps or (steps[-1].group, steps[-1].named) != (step.group, step.named):
             steps.append(step)
     return tuple(steps), departed, onset, named

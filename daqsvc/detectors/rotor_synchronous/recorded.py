@@ -26,7 +26,7 @@ from daqsvc.detectors.rotor_synchronous.recorded_speed import (
     too_short,
 )
 from daqsvc.detectors.rotor_synchronous.settings import RotorSynchronous
-from daqsvc.detectors.shaft.verdict import Instant, RotorAlarm, RotorVerdict, Step, Trace
+from daqsvc.detectors.shaft.verdict import Instant, ModeStep, RotorAlarm, RotorVerdict, Trace
 from daqsvc.diagnosis.detector import Window
 from daqsvc.diagnosis.recorded import Evaluated, RecordedDetector, known
 from daqsvc.dsp.probes import Probe
@@ -417,16 +417,16 @@ class _Conclusion:
         return likelihoods(change, variance, calibration.healthy, calibration.baseline + change)
 
 
-def history(reports: Sequence[WatchReport], last: Identification | None) -> tuple[Step, ...]:
+def history(reports: Sequence[WatchReport], last: Identification | None) -> tuple[ModeStep, ...]:
     """Every change of what the watch said, and at the end the last look if it said something else."""
-    steps: list[Step] = []
+    steps: list[ModeStep] = []
     for report in reports:
         before = steps[-1] if steps else None
         identification = report.identification
         if report.departed and (before is None or before.verdict == "normal"):
-            steps.append(Step(report.revolution, None))
+            steps.append(ModeStep(report.revolution, None))
         elif report.state == "watching" and before is not None and before.verdict != "normal":
-            steps.append(Step(report.revolution, "normal", ("normal",), named=True))
+            steps.append(ModeStep(report.revolution, "normal", ("normal",), named=True))
         elif report.looked and identification is not None:
             _add_look(steps, report.revolution, identification)
     if last is not None and reports:
@@ -434,7 +434,7 @@ def history(reports: Sequence[WatchReport], last: Identification | None) -> tupl
     return tuple(steps)
 
 
-def _add_look(steps: list[Step], revolution: int, identification: Identification) -> None:
+def _add_look(steps: list[ModeStep], revolution: int, identification: Identification) -> None:
     before = steps[-1] if steps else None
     if before is None or (before.verdict, before.group, before.named) != (
         identification.verdict,
@@ -442,7 +442,7 @@ def _add_look(steps: list[Step], revolution: int, identification: Identification
         identification.named,
     ):
         steps.append(
-            Step(
+            ModeStep(
                 revolution,
                 identification.verdict,
                 identification.group,

@@ -88,7 +88,7 @@ class RotorAlarm:
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class ModeStep:
     """A change of what is said about the machine, at the end of a revolution.
 
     Attributes:
@@ -176,7 +176,7 @@ class RotorVerdict(Verdict):
     reference_revolutions: int | None = None
     speed_rpm: float | None = None
     revolutions: int = 0
-    history: tuple[Step, ...] = ()
+    history: tuple[ModeStep, ...] = ()
     trace: Trace | None = None
 
     @classmethod
