@@ -22,6 +22,7 @@ from daqsvc.alarms.commands import CommandOutcome
 from daqsvc.alarms.conditions import Condition
 from daqsvc.alarms.states import AlarmState, CommandNotAllowedError, Level
 from daqsvc.audit import AuditError, AuditLog, Refusals
+from daqsvc.control import SnapshotNotMadeError
 from daqsvc.outbox.limits import OutboxLimits
 from daqsvc.outbox.messages import OutboxError, event_id
 from daqsvc.outbox.store import Outbox
@@ -36,9 +37,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daqsvc.acquisition.clock import Clock
-    from daqsvc.alarms.commands import AlarmCommand
+    from daqsvc.alarms.commands import AlarmCommand, SnapshotRequest
     from daqsvc.alarms.events import AlarmEvent
     from daqsvc.alarms.manager import AlarmManager
+    from daqsvc.control import TakeSnapshot
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.outbox.messages import OutboxMessage
     from daqsvc.publish.output import Output
@@ -111,6 +113,7 @@ class AlarmService:
         supervisor: counts what outputs do wrong.
         stalls: finds the parts of the service that have stalled, for outputs that tell it.
         heard: told, on the event loop, of each event that comes about.
+        snapshot: makes snapshots of machines. None if nobody may ask for one.
     """
 
     def __init__(
@@ -127,6 +130,7 @@ class AlarmService:
         supervisor: Supervisor | None = None,
         stalls: StallWatch | None = None,
         heard: Callable[[AlarmEvent], None] = lambda _event: None,
+        snapshot: TakeSnapshot | None = None,
     ) -> None:
         limits = limits or OutboxLimits()
         stalls = stalls or StallWatch(dict)
@@ -152,6 +156,7 @@ class AlarmService:
             outbox=self.outbox,
             topics=self.topics,
             commands=self.execute,
+            snapshots=self.take_snapshot,
             earlier=EarlierState(self._witness, self._take_witness),
             progress=stalls.progress,
             stalls=stalls,
@@ -163,6 +168,8 @@ class AlarmService:
         self._clock = clock
         self._supervisor = supervisor or Supervisor()
         self._heard = heard
+        self._snapshot = snapshot
+        self._snapshots_waiting = 0
         self._log = AlarmLog(clock, of_several=len(self.managers) > 1)
         self._conditions_of_outputs = asked.conditions
         self._conditions = [*conditions(buses or {}), *asked.conditions]
@@ -273,12 +280,13 @@ class AlarmService:
         own = self.manager.identity.machine
         for manager in anew:
             machine = manager.identity.machine
+            before = self.managers.get(machine)
             self.managers[machine] = manager
             if machine == own:
                 self.manager = manager
             known = self._conditions if machine == own else ()
             events = manager.resume(newest.get(machine, ()), active_detectors.get(machine, {}), known)
-            for event in events:
+            for event in [*events, *(manager.follow(before) if before is not None else ())]:
                 self._post(event)
         for machine in gone:
             del self.managers[machine]
@@ -467,6 +475,24 @@ class AlarmService:
         self._watch(work)
         return await asyncio.shield(work)
 
+    async def take_snapshot(self, command: SnapshotRequest, source: str) -> CommandOutcome:
+        """Have a snapshot made for a person: written down, made, answered once it is complete.
+
+        Commands to alarms do not wait for it.
+
+        Args:
+            command: what is asked; whoever calls has made sure that it may be asked.
+            source: the way it came, for the audit log.
+        """
+        if self._stopping:
+            return self._refuse(STOPPING)
+        if self._snapshots_waiting >= MOST_COMMANDS:
+            return self._refuse(f"{MOST_COMMANDS} others wait for snapshots already; ask again later")
+        self._snapshots_waiting += 1
+        work = asyncio.create_task(self._made_snapshot(command, source), name="command snapshot")
+        self._watch(work)
+        return await asyncio.shield(work)
+
     def figures(self) -> dict[str, Any]:
         """How many alarms stand, are covered or unacknowledged by now, and what has happened so far."""
         figures: Counter[str] = Counter()
@@ -538,6 +564,38 @@ class AlarmService:
         finally:
             self._commands_waiting -= 1
 
+    async def _made_snapshot(self, command: SnapshotRequest, source: str) -> CommandOutcome:
+        try:
+            if self._refusals.flooding:
+                # What has not been written down is not done, and a flood is not written down.
+                refusal = "too many commands were refused lately; ask again in a minute, or at the box"
+                self._refusals.count(command, source, refusal)
+                return self._refuse(refusal)
+            entry = await self.audit.asked(command, source)
+            outcome = await self._snapshot_outcome(command, source)
+            if not outcome.accepted:
+                self._refusals.written()
+            await self._write_down(entry, command, source, outcome)
+        except AuditError as error:
+            logger.error("a snapshot of %s was refused: %s", command.machine, error)  # noqa: TRY400
+            self.commands.unwritten += 1
+            return self._refuse(f"{error}")
+        else:
+            return outcome
+        finally:
+            self._snapshots_waiting -= 1
+
+    async def _snapshot_outcome(self, command: SnapshotRequest, source: str) -> CommandOutcome:
+        if self._snapshot is None:
+            return self._refuse("nobody makes snapshots here")
+        why = f": {command.reason}" if command.reason else ""
+        try:
+            path = await self._snapshot(command.machine, f"asked for by {command.by} ({source}){why}")
+        except SnapshotNotMadeError as refused:
+            return self._refuse(f"{refused}")
+        self.commands.accepted += 1
+        return CommandOutcome(accepted=True, path=path)
+
     def _manager_of(self, command: AlarmCommand) -> AlarmManager:
         """The alarms that a command is about.
 
@@ -580,7 +638,7 @@ class AlarmService:
         )
 
     async def _write_down(
-        self, entry: str, command: AlarmCommand, source: str, outcome: CommandOutcome
+        self, entry: str, command: AlarmCommand | SnapshotRequest, source: str, outcome: CommandOutcome
     ) -> None:
         """Write down what came of a command: too late to take it back if that fails."""
         try:

@@ -26,12 +26,13 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 from daqsvc.acquisition.clock import NS_PER_S, iso_utc
+from daqsvc.alarms.commands import AlarmCommand
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from daqsvc.acquisition.clock import Clock
-    from daqsvc.alarms.commands import AlarmCommand, CommandOutcome
+    from daqsvc.alarms.commands import CommandOutcome, SnapshotRequest
 
 SCHEMA = "daqsvc.audit/1"
 MODE = 0o600
@@ -66,7 +67,7 @@ class AuditLog:
         self._quota_bytes = quota_bytes
         self._one_at_a_time = asyncio.Lock()
 
-    async def asked(self, command: AlarmCommand, source: str) -> str:
+    async def asked(self, command: AlarmCommand | SnapshotRequest, source: str) -> str:
         """Write down that a command has come, before it is obeyed.
 
         Args:
@@ -83,7 +84,9 @@ class AuditLog:
         await self._append(self._line(entry, "asked", command, source))
         return entry
 
-    async def answered(self, entry: str, command: AlarmCommand, source: str, outcome: CommandOutcome) -> None:
+    async def answered(
+        self, entry: str, command: AlarmCommand | SnapshotRequest, source: str, outcome: CommandOutcome
+    ) -> None:
         """Write down what came of a command.
 
         Args:
@@ -97,7 +100,8 @@ class AuditLog:
         """
         what: Literal["accepted", "refused"] = "accepted" if outcome.accepted else "refused"
         line = self._line(entry, what, command, source)
-        await self._append(line | {"answer": outcome.reason, "events": list(outcome.events)})
+        made = {"path": outcome.path} if outcome.path else {}
+        await self._append(line | {"answer": outcome.reason, "events": list(outcome.events)} | made)
 
     async def refused(self, refusals: Refusals) -> None:
         """Write down how many commands were refused without a line of their own, if any, and forget them.
@@ -134,7 +138,7 @@ class AuditLog:
         self,
         entry: str,
         outcome: Literal["asked", "accepted", "refused"],
-        command: AlarmCommand,
+        command: AlarmCommand | SnapshotRequest,
         source: str,
     ) -> dict[str, Any]:
         return self._stamp(entry, outcome) | {
@@ -142,9 +146,7 @@ class AuditLog:
             "by": command.by,
             "verb": command.verb.value,
             **({} if command.machine is None else {"machine": command.machine}),
-            "alarm": command.alarm,
-            "occurrence": command.occurrence,
-            "duration_s": _in_json(command.duration_s),
+            **(_of_alarm(command) if isinstance(command, AlarmCommand) else {}),
             "reason": command.reason,
         }
 
@@ -215,7 +217,7 @@ class Refusals:
         """One was written down in full."""
         self._left -= 1
 
-    def count(self, command: AlarmCommand, source: str, reason: str) -> None:
+    def count(self, command: AlarmCommand | SnapshotRequest, source: str, reason: str) -> None:
         """One was refused for ``reason`` without being written down."""
         many = self._many = self._many or RefusedMany(self._clock.wall_ns())
         known = source in many.sources or len(many.sources) < SOURCES
@@ -239,6 +241,14 @@ class Refusals:
             earlier.verbs += later.verbs
             earlier.answer = later.answer
         self._many = earlier
+
+
+def _of_alarm(command: AlarmCommand) -> dict[str, Any]:
+    return {
+        "alarm": command.alarm,
+        "occurrence": command.occurrence,
+        "duration_s": _in_json(command.duration_s),
+    }
 
 
 def _in_json(number: float | None) -> float | str | None:

@@ -22,7 +22,7 @@ from daqsvc.alarms.states import (
 from daqsvc.alarms.status import AlarmStatus, HandlingRequest
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from daqsvc.alarms.events import Identity
     from daqsvc.alarms.rules import RuleFinding
@@ -98,6 +98,9 @@ class ChatterWatch:
 
 CHANGES_NS = 5 * NS_PER_S
 """A doubt about a sensor may have another reason each time: that makes an event no more often than this."""
+
+LIMITS_NOW = "; since then its limits are "
+"""What follows in a message on what was found by earlier limits."""
 
 FINDINGS = frozenset(
     {EventKind.RAISED, EventKind.ESCALATED, EventKind.LOWERED, EventKind.CHANGED, EventKind.RECURRED}
@@ -208,6 +211,30 @@ class Alarm:
             self._last_message = self._saying(event.to_level, sentence)
         self._chatter.resume(chattering=event.chattering)
         self._since, self._message = since, event.message
+
+    @property
+    def found(self) -> str:
+        """The message that says what is found by now; empty if that is not known."""
+        return self._last_message
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Of the measures of its cause that have one."""
+        return {} if self._cause is None else self._cause.units
+
+    def change_limits(self, limits: str, found: str, at: ClockReading) -> AlarmEvent:
+        """Say that other limits hold from now on; the next good diagnosis is judged by them.
+
+        Args:
+            limits: in words.
+            found: what was found by the earlier ones, as `found`; empty if that is not known.
+            at: now.
+        """
+        assert self._cause is not None  # noqa: S101 - one that stands has a cause
+        found = (found or self._last_message).partition(LIMITS_NOW)[0]
+        found = found or f"{self.name} is {self._state.in_words}"
+        self._last_message = f"{found}{LIMITS_NOW}{limits}"
+        return self._event(EventKind.CHANGED, self._cause, HandlingRequest("", at), self._last_message)
 
     def withdraw(self, reason: str, cause: Diagnosis, at: ClockReading) -> AlarmEvent:
         """Return to normal, from any state, because no rule judges the alarm any more."""

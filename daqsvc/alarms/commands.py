@@ -1,4 +1,4 @@
-"""What a person may ask of an alarm, how that is written whichever way it comes, and what comes of it."""
+"""What a person may ask of an alarm or a machine, how that is written, and what comes of it."""
 
 from __future__ import annotations
 
@@ -56,6 +56,30 @@ class AlarmCommand:
     machine: str | None = None
 
 
+class MachineVerb(StrEnum):
+    """What is asked of a machine as a whole."""
+
+    SNAPSHOT = "snapshot"
+    """Write down what it does now."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SnapshotRequest:
+    """One wish for a snapshot.
+
+    Attributes:
+        machine: of which machine.
+        by: who asks.
+        reason: why, in the person's words; it stands in the snapshot and in the audit log.
+        verb: what is asked.
+    """
+
+    machine: str
+    by: str
+    reason: str = ""
+    verb: MachineVerb = MachineVerb.SNAPSHOT
+
+
 def printable(text: str) -> str:
     """Text that does to a terminal, or to the order of the letters about it, nothing but stand there.
 
@@ -85,17 +109,10 @@ Reason: TypeAlias = Annotated[Line, Field(max_length=500)]
 DurationS: TypeAlias = Annotated[float, Field(gt=0)]
 
 
-class CommandMessage(BaseModel):
-    """A command as JSON: what all ways in have in common. The keys in their order are those of each way."""
+class JsonCommand(BaseModel):
+    """A command as JSON."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
-
-    if TYPE_CHECKING:
-        alarm: str
-        by: str
-        duration_s: float | None
-        occurrence: str | None
-        reason: str
 
     @classmethod
     def read(cls, raw: bytes) -> Self:
@@ -108,6 +125,17 @@ class CommandMessage(BaseModel):
         message = cls.model_validate_json(raw)
         json.loads(raw, object_pairs_hook=_once)
         return message
+
+
+class CommandMessage(JsonCommand):
+    """A command to an alarm: what all ways in have in common. The keys in their order are each way's."""
+
+    if TYPE_CHECKING:
+        alarm: str
+        by: str
+        duration_s: float | None
+        occurrence: str | None
+        reason: str
 
     def command(self, verb: Verb, machine: str | None = None) -> AlarmCommand:
         """What it asks for by ``verb``, of a machine if it says of which."""
@@ -126,7 +154,7 @@ def faults_of(error: ValidationError, whole: str) -> list[str]:
     """What is wrong with a command, each with its key.
 
     Args:
-        error: what `CommandMessage` says.
+        error: what `JsonCommand` says.
         whole: what the command as a whole is called.
     """
     return [
@@ -174,11 +202,13 @@ class CommandOutcome:
         accepted: whether it was carried out.
         reason: why it was refused; empty if it was not.
         events: ids of the alarm events that followed (`AlarmPayload.id`).
+        path: file of the snapshot that was made, on the box.
     """
 
     accepted: bool
     reason: str = ""
     events: tuple[str, ...] = ()
+    path: str = ""
 
 
 class CommandHandler(Protocol):
@@ -190,6 +220,19 @@ class CommandHandler(Protocol):
         Args:
             command: what is asked.
             source: the way it came, for the audit log, e.g. ``"mqtt"``.
+        """
+        ...
+
+
+class SnapshotHandler(Protocol):
+    """Has snapshots made for a way in that has authorised them."""
+
+    async def __call__(self, command: SnapshotRequest, source: str) -> CommandOutcome:
+        """Have one made, and wait until it is complete; a refusal is an outcome, not an exception.
+
+        Args:
+            command: what is asked.
+            source: the way it came, for the audit log.
         """
         ...
 

@@ -31,7 +31,7 @@ class EventKind(StrEnum):
     LOWERED = "lowered"
     """The level has fallen, but not to normal."""
     CHANGED = "changed"
-    """The cause is known better, or has become another, at the same level."""
+    """The cause is known better, or has become another, at the same level; or the limits are others."""
     RETURNED = "returned"
     """The condition has gone."""
     LATCHED = "latched"

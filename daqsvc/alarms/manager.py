@@ -242,6 +242,24 @@ class AlarmManager:
                 self._doubts.unsettle(ruled.rule)
         return withdrawn
 
+    def follow(self, before: AlarmManager) -> list[AlarmEvent]:
+        """Say of each alarm that stands if its limits are others than they were; after `resume`.
+
+        What was said when it was raised names the limit of then, and would mislead whoever reads it now.
+
+        Args:
+            before: the alarms of the same machine until now.
+        """
+        events = []
+        for ruled in self._ruled:
+            was, alarm = before._ruled.named(ruled.alarm.name), ruled.alarm
+            if was is None or alarm.status.own_state is AlarmState.NORMAL:
+                continue
+            limits = ruled.rule.limits(alarm.units)
+            if limits != was.rule.limits(alarm.units):
+                events.append(alarm.change_limits(limits, was.alarm.found, self._now()))
+        return self._tell(events)
+
     def withdraw(self, events: Iterable[AlarmEvent]) -> list[AlarmEvent]:
         """Return alarms to normal that nobody will judge any more, of whichever machine.
 

@@ -11,7 +11,7 @@ from daqsvc.alarms.setpoints import SetpointMonitor
 from daqsvc.alarms.states import Level
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping
     from collections.abc import Set as AbstractSet
 
     from daqsvc.alarms.events import AlarmEvent
@@ -131,6 +131,14 @@ class Rule(Protocol):
     @property
     def spare(self) -> int: ...  # noqa: D102
 
+    def limits(self, units: Mapping[str, str]) -> str:
+        """The limits that it judges by, in words; empty if it has none.
+
+        Args:
+            units: of measures that have one.
+        """
+        ...
+
     def watch(self) -> Watch:
         """A fresh memory for this rule."""
         ...
@@ -173,6 +181,10 @@ class LevelRule:
         """None: without its sensor the alarm is suppressed."""
         return 0
 
+    def limits(self, units: Mapping[str, str]) -> str:
+        """See `Rule.limits`."""
+        return self.setpoint.in_words(units.get(self.measure, ""))
+
     def watch(self) -> Watch:
         """A fresh memory for this rule."""
         return _LevelWatch(self)
@@ -211,6 +223,11 @@ class DiagnosisRule:
     def spare(self) -> int:
         """None: the detector needs all of its sensors."""
         return 0
+
+    def limits(self, units: Mapping[str, str]) -> str:
+        """None: the detector judges."""
+        del units
+        return ""
 
     def watch(self) -> Watch:
         """A fresh memory for this rule."""

@@ -87,6 +87,12 @@ class Setpoint:
         )
         return tuple(Limit(level, at, lower) for level, at, lower in described if at is not None)
 
+    def in_words(self, unit: str) -> str:
+        """All limits for a person, e.g. ``"alert 15 um and danger 25 um"``."""
+        upwards = sorted(self.limits, key=lambda limit: limit.at)
+        words = [f"{'lower ' * one.lower}{one.level.label} {one.at:.4g} {unit}".rstrip() for one in upwards]
+        return " and ".join([", ".join(words[:-1]), words[-1]] if words[1:] else words)
+
     @property
     def lowest(self) -> float | None:
         """The upper limit that is reached first; None if there is none."""

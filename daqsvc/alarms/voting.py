@@ -16,6 +16,8 @@ from daqsvc.alarms.rules import MACHINE_GROUP, MeasureWatch, RuleFinding
 from daqsvc.alarms.states import Level
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from daqsvc.alarms.events import AlarmEvent
     from daqsvc.alarms.rules import Circumstances, Watch
     from daqsvc.alarms.setpoints import Setpoint
@@ -69,6 +71,10 @@ class VotingRule:
     def spare(self) -> int:
         """How many sensors may be not OK before a vote cannot be reached."""
         return len(self.sensors) - self.vote
+
+    def limits(self, units: Mapping[str, str]) -> str:
+        """See `Rule.limits`."""
+        return self.setpoint.in_words(units.get(self.measure, ""))
 
     def watch(self) -> Watch:
         """A fresh memory for this rule."""

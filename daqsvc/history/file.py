@@ -21,7 +21,7 @@ from daqsvc.history.points import (
     RECORD,
     DamagedChunkError,
     Step,
-    Trend,
+    TrendPoints,
     gathered,
     merge,
     pack,
@@ -145,7 +145,7 @@ class HistoryReader:
         """The figures that there are, of one machine or all, by name."""
         return sorted(one for one in self._ids if machine in {None, one.machine})
 
-    def trend(self, series: Series, step: Step, since_s: float, until_s: float) -> Trend:
+    def trend(self, series: Series, step: Step, since_s: float, until_s: float) -> TrendPoints:
         """A figure over time.
 
         Args:
@@ -174,7 +174,7 @@ class HistoryReader:
         parts.append(summed_up(recent, step))
         found = summed_up(np.concatenate(parts), step)
         found = found[(found["t_s"] >= since_s) & (found["t_s"] < until_s)]
-        return Trend(found["t_s"], found["low"], found["mean"], found["high"])
+        return TrendPoints(found["t_s"], found["low"], found["mean"], found["high"])
 
     def events(self, machine: str | None, since_s: float, until_s: float) -> list[Event]:
         """Alarm events of a machine, or of all, in order.

@@ -53,7 +53,7 @@ class DamagedChunkError(Exception):
     """A chunk is not what was written."""
 
 
-class Trend(NamedTuple):
+class TrendPoints(NamedTuple):
     """A figure over time; only where it was measured there is a point.
 
     Attributes:

@@ -5,6 +5,7 @@ Whatever an output does wrong, acquisition, diagnosis, alarms and the other outp
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daqsvc.acquisition.clock import Clock
-    from daqsvc.alarms.commands import CommandHandler
+    from daqsvc.alarms.commands import CommandHandler, SnapshotHandler
     from daqsvc.alarms.conditions import Condition
     from daqsvc.diagnosis.reading import Reading
     from daqsvc.diagnosis.record import Diagnosis
@@ -81,6 +82,7 @@ class OutputPort:
             by ``await outbox.next_following(sequence, most)``. Open while `Output.run` runs.
         topics: of the box, whose site and name they have; by them events are known in the outbox.
         commands: carries out what people ask of alarms; an output has to see that they may.
+        snapshots: has snapshots of machines made for people; likewise.
         earlier: what a broker is asked for before it is told anything; None for nothing.
         progress: says how far each part of the service has come that can stall.
         stalls: finds those that have.
@@ -92,19 +94,35 @@ class OutputPort:
     outbox: Outbox
     topics: Topics
     commands: CommandHandler | None = None
+    snapshots: SnapshotHandler | None = None
     earlier: EarlierState | None = None
     progress: Callable[[], Mapping[str, Progress]] = dict
     stalls: StallWatch = field(default_factory=lambda: StallWatch(dict))
 
 
 class Output:
-    """Tells others what the service finds. Every method is called by the event loop and must not block it.
+    """Tells others what the service finds. Every method is called by the event loop and must not block it."""
 
-    Attributes:
-        reason: why it reaches nobody at present, for a person; empty if it does, or that is not known.
-    """
+    _reason = ""
+    _away_since_s: float | None = None
 
-    reason: str = ""
+    @property
+    def reason(self) -> str:
+        """Why it reaches nobody at present, for a person; empty if it does, or that is not known."""
+        return self._reason
+
+    @reason.setter
+    def reason(self, reason: str) -> None:
+        if not reason:
+            self._away_since_s = None
+        elif not self._reason:
+            self._away_since_s = time.monotonic()
+        self._reason = reason
+
+    @property
+    def away_s(self) -> float | None:
+        """For how long it has reached nobody, for whatever `reason`; None if it reaches somebody."""
+        return None if self._away_since_s is None else time.monotonic() - self._away_since_s
 
     async def run(self) -> None:
         """Tell, until `stop` or until cancelled; begun again if it fails or ends before."""

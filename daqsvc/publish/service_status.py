@@ -80,6 +80,7 @@ class StandingAlarmPayload(JsonPayload):
     level: Severity
     occurrence: str | None
     age_s: Number = Field(description="since it changed last")
+    shelved_until_wall_ns: int | None = Field(None, description="when shelving ends; null if not shelved")
     message: str
 
 
@@ -104,6 +105,9 @@ class OutputPayload(JsonPayload):
 
     connected: bool | None = Field(description="null for one that has no connection")
     reason: str = Field("", description="why it reaches nobody at present; empty if it does")
+    away_s: Number = Field(
+        None, description="for how long it has reached nobody; null if it reaches somebody"
+    )
 
 
 class ServiceStatusPayload(Stamped):

@@ -5,19 +5,25 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
+from support.alarm_desk import alarm_service
 
 from daqsvc.acquisition.clock import DrivenClock
+from daqsvc.alarms.commands import AlarmCommand, Verb
 from daqsvc.alarms.events import EventKind, Identity
 from daqsvc.alarms.manager import AlarmManager, DiagnosisRule, LevelRule
 from daqsvc.alarms.setpoints import Setpoint
 from daqsvc.alarms.states import AlarmState, Level
+from daqsvc.alarms.voting import VotingRule
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.outbox.store import OutboxMessage
 from daqsvc.publish.payloads import alarm_event, alarm_payload, restore_alarms
 from daqsvc.publish.topics import Topics
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 RIG = Identity("lab", "edge-1", "rig")
 LEVEL = LevelRule("vibration-x", "probe-x", "rms", Setpoint(alert=40.0, danger=60.0, deadband=2.0))
@@ -294,3 +300,48 @@ def test_a_sensor_that_is_not_ok_again_in_the_same_words_stays_so_over_a_restart
     third.resume(list(journal.values()), speakers)
     assert ("vibration-x", K.UNSUPPRESSED) not in journal.take(third, rms(1.0)), "the other one has clipped"
     assert ("vibration-x", K.UNSUPPRESSED) in journal.take(third, bearing("good"))
+
+
+@pytest.mark.parametrize("handled", [False, True])
+async def test_an_alarm_that_stands_does_not_go_on_naming_a_limit_that_a_reload_has_changed(
+    tmp_path: Path, *, handled: bool
+) -> None:
+    """What was said when it was raised is history and stays; what is shown as present names both."""
+    level = dataclasses.replace(LEVEL, setpoint=Setpoint(alert=15.0, danger=25.0))
+    clock, voted = DrivenClock(), VotingRule("either", ("probe-x", "probe-y"), 1, "rms", level.setpoint)
+    service = alarm_service(RIG, [level, voted, ROTOR], tmp_path, clock)
+
+    def reload(setpoint: Setpoint) -> list[str]:
+        rules = [dataclasses.replace(level, setpoint=setpoint), voted, ROTOR]
+        anew = AlarmManager(RIG, rules, clock)
+        service.change([anew], gone=(), buses={}, active_detectors=SPEAKERS, outputs=None)
+        return [anew.alarms[name].message for name in ("vibration-x", "either", "rotor-fault")]
+
+    await service.open()
+    try:
+        service.take(dataclasses.replace(rms(19.6), units={"rms": "um"}))
+        service.take(mode("F1", "alert"))
+        _, of_vote, of_mode = [one.message for one in service.manager.alarms.values()]
+        if handled:
+            await service.execute(AlarmCommand(verb=Verb.ACKNOWLEDGE, alarm="vibration-x", by="ann"), "test")
+        found = "vibration-x alert: rms of probe-x is 19.6 um, alert limit 15 um"
+        for setpoint, said in (
+            (Setpoint(alert=16.0, danger=30.0), "alert 16 um and danger 30 um"),
+            (
+                Setpoint(alert=17.0, alert_low=2.0),
+                "lower alert 2 um and alert 17 um",
+            ),
+        ):
+            assert reload(setpoint) == [f"{found}; since then its limits are {said}", of_vote, of_mode]
+        assert reload(setpoint)[0].endswith(said), "the same again says nothing new"
+        events = [json.loads(one.payload) for one in await service.outbox.following(0, 100)]
+        told = [(event["kind"], event["state"]) for event in events if event["alarm"] == "vibration-x"]
+        state = "active_acknowledged" if handled else "active_unacknowledged"
+        acknowledged = [("acknowledged", state)] * handled
+        assert told == [("raised", "active_unacknowledged"), *acknowledged, *[("changed", state)] * 2]
+        assert events[0]["message"] == found
+        service.take(dataclasses.replace(rms(10.0), units={"rms": "um"}))
+        assert "returned to normal" in service.manager.alarms["vibration-x"].message
+    finally:
+        await service.settle(5.0)
+        await service.close(5.0)

@@ -86,7 +86,7 @@ class _Figures:
         self._t_s = 0
         self._said: dict[Series, list[float]] = {}
 
-    def take(self, diagnosis: Diagnosis, t_s: int) -> list[_Second]:
+    def add(self, diagnosis: Diagnosis, t_s: int) -> list[_Second]:
         """Take in a statement; returns the second before, if that is over."""
         over = self.finish() if t_s != self._t_s else []
         self._t_s = t_s
@@ -144,6 +144,8 @@ class HistoryOutput(Output):
         self._packed_hour: int | None = None
         self._last_event = 0
         self._busy: Future[Any] | None = None
+        self._handed: tuple[Future[None], list[_Second]] | None = None
+        """Seconds of which it is not known yet whether they are on the disk."""
         self._has_ended = asyncio.Event()
         self._written = self._lost = self._events = self._damaged = 0
 
@@ -154,7 +156,7 @@ class HistoryOutput(Output):
             return
         clock = self._port.clock
         t_ns = clock.wall_ns() - (clock.monotonic_ns() - diagnosis.t_ns)
-        self._wait_for_disk(figures.take(diagnosis, t_ns // NS_PER_S))
+        self._wait_for_disk(figures.add(diagnosis, t_ns // NS_PER_S))
 
     def _wait_for_disk(self, seconds: list[_Second]) -> None:
         self._waiting.extend(seconds)
@@ -213,6 +215,7 @@ class HistoryOutput(Output):
             NoRoomError: the rest of the disk is for alarms.
             NewerHistoryError: the file was written by a newer version.
         """
+        await self._see_through()
         if self._file is None:
             self._file = await self._in_thread(lambda: HistoryFile(self._path))
             self._last_event = await self._in_thread(lambda: _open(self._file).last_sequence)
@@ -220,22 +223,37 @@ class HistoryOutput(Output):
         for figures in self._by_detector.values():
             if everything or figures.is_over(now_s):
                 self._wait_for_disk(figures.finish())
-        seconds, file = list(self._waiting), self._file
+        messages = await self._new_events()
+        file, seconds = self._file, list(self._waiting)
         self._waiting.clear()
-        try:
-            messages = await self._new_events()
-            await self._in_thread(lambda: self._write_to(file, seconds, messages))
-        except BaseException:
-            self._waiting.extendleft(reversed(seconds))
-            self._wait_for_disk([])
-            raise
-        self._written += len(seconds)
+        self._busy = call_in_thread(lambda: self._write_to(file, seconds, messages), name="history")
+        self._handed = self._busy, seconds
+        await self._see_through()
         if messages:
             self._last_event = messages[-1].sequence
         hour = int((now_s - SETTLED_S) // HOUR_S)
         if hour != self._packed_hour and not everything:
             self._damaged += await self._in_thread(lambda: _tidy(file, now_s, self._keeping))
             self._packed_hour = hour
+
+    async def _see_through(self) -> None:
+        """See what becomes of the seconds that were handed to a thread; it goes on if this is cancelled.
+
+        Raises:
+            Exception: what has kept them from the disk; they wait again.
+        """
+        if self._handed is None:
+            return
+        busy, seconds = self._handed
+        try:
+            await asyncio.wrap_future(busy)
+        except Exception:
+            self._handed = None
+            self._waiting.extendleft(reversed(seconds))
+            self._wait_for_disk([])
+            raise
+        self._handed = None
+        self._written += len(seconds)
 
     async def _new_events(self) -> list[OutboxMessage]:
         """Alarm events that are not in the file yet; none while the journal cannot be read."""

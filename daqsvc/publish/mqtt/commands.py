@@ -13,7 +13,7 @@ import logging
 import re
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias, get_args
 
 from pydantic import AwareDatetime, Field, ValidationError
 
@@ -22,9 +22,12 @@ from daqsvc.alarms.commands import (
     CommandMessage,
     CommandOutcome,
     DurationS,
+    JsonCommand,
     Line,
+    MachineVerb,
     Person,
     Reason,
+    SnapshotRequest,
     Verb,
     faults_of,
 )
@@ -36,7 +39,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
     from daqsvc.acquisition.clock import Clock
-    from daqsvc.alarms.commands import AlarmCommand, CommandHandler
+    from daqsvc.alarms.commands import AlarmCommand, CommandHandler, SnapshotHandler
     from daqsvc.outbox.command_ids import CommandIds
     from daqsvc.publish.mqtt.connection import Incoming
     from daqsvc.publish.mqtt.settings import MqttCommands
@@ -55,26 +58,46 @@ _RESERVED = ("$", "daqsvc/", "homeassistant/", "spBv1.0/", "STATE/")
 brokers."""
 
 _SHOWN_FAULTS = 500
+_VERBS = (*Verb, *MachineVerb)
+
+
+CommandId: TypeAlias = Annotated[
+    str,
+    Field(
+        pattern=r"^[A-Za-z0-9_.:-]{1,64}$",
+        description="chosen by the sender, new for every command, e.g. a UUID",
+    ),
+]
+IssuedAt: TypeAlias = Annotated[AwareDatetime, Field(description="when, ISO 8601 with the offset from UTC")]
+ExpiresS: TypeAlias = Annotated[float, Field(gt=0)]
+_EXPIRES = "how old the command may become, if less than the machine file allows"
 
 
 class CommandPayload(CommandMessage):
     """One command; what is asked, and of which machine, stands in the topic."""
 
     schema_: Literal["daqsvc.command/1"] = Field(alias="schema")
-    id: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.:-]{1,64}$")] = Field(
-        description="chosen by the sender, new for every command, e.g. a UUID"
-    )
+    id: CommandId
     alarm: Annotated[str, Field(pattern=r"^[A-Za-z0-9_./-]{1,200}$")] = Field(description="name of the alarm")
     by: Person = Field(description="who asks")
-    issued_at: AwareDatetime = Field(description="when, ISO 8601 with the offset from UTC")
-    expires_s: Annotated[float, Field(gt=0)] | None = Field(
-        default=None, description="how old the command may become, if less than the machine file allows"
-    )
+    issued_at: IssuedAt
+    expires_s: ExpiresS | None = Field(default=None, description=_EXPIRES)
     duration_s: DurationS | None = Field(default=None, description="how long to shelve; for shelve only")
     occurrence: Annotated[Line, Field(min_length=1, max_length=64)] | None = Field(
         default=None, description="refuse the command if another activation stands by now"
     )
     reason: Reason = Field(default="", description="why")
+
+
+class SnapshotCommandPayload(JsonCommand):
+    """A wish for a snapshot; of which machine stands in the topic."""
+
+    schema_: Literal["daqsvc.snapshot-command/1"] = Field(alias="schema")
+    id: CommandId
+    by: Person = Field(description="who asks")
+    issued_at: IssuedAt
+    expires_s: ExpiresS | None = Field(default=None, description=_EXPIRES)
+    reason: Reason = Field(default="", description="why; it stands in the snapshot")
 
 
 class ResponsePayload(Stamped):
@@ -87,6 +110,7 @@ class ResponsePayload(Stamped):
     accepted: bool
     reason: str = Field(description="why it was refused; empty if it was not")
     events: tuple[str, ...] = Field(description="ids of the alarm events that followed")
+    path: str = Field(default="", description="file of the snapshot on the box; empty if none was made")
 
 
 class CommandRefusedError(Exception):
@@ -143,6 +167,7 @@ class CommandIntake:
         clock: its wall clock tells how old a command is.
         ids: those of the commands that have come.
         reserved: topics below which no answer goes, besides the box's own, e.g. a discovery prefix.
+        snapshots: has snapshots made; None if there are none.
     """
 
     def __init__(
@@ -154,16 +179,23 @@ class CommandIntake:
         clock: Clock,
         ids: CommandIds,
         reserved: Iterable[str] = (),
+        snapshots: SnapshotHandler | None = None,
     ) -> None:
         self.counters = IntakeCounters()
         self._settings = settings
         self._machines = machines
         self._topics = topics
         self._handler = handler
+        self._snapshots = snapshots
         self._clock = clock
         self._ids = ids
         self._reserved = (*_RESERVED, f"{topics.root}/", *(f"{prefix}/" for prefix in reserved))
         self._quiet_until_ns = clock.monotonic_ns()
+
+    def lasts(self, message: Incoming) -> bool:
+        """Whether what a message asks for takes a while: others must not wait for that."""
+        topic = self._topics.command_of(message.topic)
+        return topic is not None and not topic.is_answer and topic.verb == MachineVerb.SNAPSHOT
 
     async def take(self, message: Incoming) -> Answer | None:
         """Carry out the command of a message, or refuse it; the answer says which.
@@ -180,7 +212,7 @@ class CommandIntake:
             self._log(message.topic, refusal)
             outcome = CommandOutcome(accepted=False, reason=str(refusal))
         else:
-            outcome = await self._handler(command, f"mqtt {message.topic}")
+            outcome = await self._carried_out(command, f"mqtt {message.topic}")
             if outcome.accepted:
                 self.counters.accepted += 1
             else:
@@ -193,8 +225,16 @@ class CommandIntake:
             accepted=outcome.accepted,
             reason=outcome.reason,
             events=outcome.events,
+            path=outcome.path,
         )
         return Answer(self._answer_topic(message), response.to_json(), message.correlation)
+
+    async def _carried_out(self, command: AlarmCommand | SnapshotRequest, source: str) -> CommandOutcome:
+        if not isinstance(command, SnapshotRequest):
+            return await self._handler(command, source)
+        if self._snapshots is None:
+            return CommandOutcome(accepted=False, reason="nobody makes snapshots here")
+        return await self._snapshots(command, source)
 
     def _log(self, topic: str, refusal: CommandRefusedError) -> None:
         """Say it, but not for each of a flood: the counters and the answers tell of the others."""
@@ -205,7 +245,7 @@ class CommandIntake:
         if loud:
             self._quiet_until_ns = now_ns + QUIET_NS
 
-    async def _command(self, topic: CommandTopic, message: Incoming) -> AlarmCommand:
+    async def _command(self, topic: CommandTopic, message: Incoming) -> AlarmCommand | SnapshotRequest:
         """What is asked.
 
         Raises:
@@ -219,11 +259,11 @@ class CommandIntake:
                 f"this box takes no commands for machine {machine[:_SHOWN_TOPIC]!r}; it watches "
                 f"{', '.join(self._machines)}"
             )
-        if verb not in set(Verb):
+        if verb not in _VERBS:
             self.counters.malformed += 1
             raise CommandRefusedError(
                 f"there is no verb {verb[:_SHOWN_TOPIC]!r}; the last part of a command's topic is one of "
-                f"{', '.join(Verb)}"
+                f"{', '.join(_VERBS)}"
             )
         if verb not in self._settings.allow:
             self.counters.unauthorised += 1
@@ -231,7 +271,7 @@ class CommandIntake:
                 f"{verb!r} is not allowed over MQTT; allowed: {allowed}. Add it to mqtt.commands.allow in "
                 "the machine file, or do it at the box"
             )
-        request = self._read(message.payload)
+        request = self._read(message.payload, verb)
         if message.retain:
             self.counters.stale += 1
             raise CommandRefusedError(
@@ -240,27 +280,31 @@ class CommandIntake:
             )
         self._check_age(request)
         await self._check_new(machine, request)
+        if isinstance(request, SnapshotCommandPayload):
+            return SnapshotRequest(machine=machine, by=request.by, reason=request.reason)
         return request.command(Verb(verb), machine)
 
-    def _read(self, asked: bytes) -> CommandPayload:
+    def _read(self, asked: bytes, verb: str) -> CommandPayload | SnapshotCommandPayload:
+        wanted = SnapshotCommandPayload if verb == MachineVerb.SNAPSHOT else CommandPayload
         if len(asked) > self._settings.max_bytes:
             self.counters.malformed += 1
             raise CommandRefusedError(
                 f"it has {len(asked)} bytes; a command has at most {self._settings.max_bytes}"
             )
         try:
-            return CommandPayload.read(asked)
+            return wanted.read(asked)
         except ValidationError as error:
             self.counters.malformed += 1
             # The names of unknown keys are the sender's: nothing of them may write a line into a log.
             faults = "; ".join(faults_of(error, "payload")[:5])
             shown = re.sub(r"[^ -~]", "?", faults)[:_SHOWN_FAULTS]
-            raise CommandRefusedError(f"it is no command of schema daqsvc.command/1: {shown}") from error
+            [schema] = get_args(wanted.model_fields["schema_"].annotation)
+            raise CommandRefusedError(f"it is no command of schema {schema}: {shown}") from error
         except ValueError as error:
             self.counters.malformed += 1
             raise CommandRefusedError(f"{error}") from error
 
-    def _check_age(self, message: CommandPayload) -> None:
+    def _check_age(self, message: CommandPayload | SnapshotCommandPayload) -> None:
         now_ns = self._clock.wall_ns()
         age_s = now_ns / NS_PER_S - message.issued_at.timestamp()
         limit_s = self._settings.max_age_s
@@ -275,7 +319,7 @@ class CommandIntake:
             "send it again, or set the clocks"
         )
 
-    async def _check_new(self, machine: str, message: CommandPayload) -> None:
+    async def _check_new(self, machine: str, message: CommandPayload | SnapshotCommandPayload) -> None:
         """Write down that this command has come; before it is obeyed, for afterwards may be too late."""
         if self._ids.is_from_before(round(message.issued_at.timestamp() * NS_PER_S)):
             self.counters.stale += 1

@@ -99,6 +99,7 @@ class MqttPublisher(Output):
                 port.clock,
                 port.outbox.command_ids,
                 reserved,
+                port.snapshots,
             )
         self._expiry: dict[str, int] = {}
         """When certificates end, wall clock in ns since 1970, as far as they were seen: ``client`` is the

@@ -38,6 +38,8 @@ LOOK_AGAIN_S = 86_400.0
 EARLIER_S = 3.0
 """How long delivery waits for the broker to say what it has kept of an earlier run."""
 
+MOST_LASTING = 64
+"""Commands of which the answer takes a while, at a time."""
 ANSWER_EXPIRY_S = 60.0
 """How long the answer to a command is of use."""
 
@@ -145,6 +147,8 @@ class Session:
         self._stopping = stopping
         self._earlier = earlier
         self._said_refused: set[str] = set()
+        self._lasting: set[asyncio.Task[None]] = set()
+        """Answers to commands that take a while."""
 
     async def run(self, left_s: Callable[[], float]) -> None:
         """Publish and listen until `stopping` is set and everything is handed over, or time is up.
@@ -182,9 +186,10 @@ class Session:
             await self._until_stopped(deliveries, others)
             await self._hand_over(deliveries, others, left_s)
         finally:
-            for task in deliveries | others:
+            ending = deliveries | others | self._lasting
+            for task in ending:
                 task.cancel()
-            await asyncio.gather(*deliveries, *others, return_exceptions=True)
+            await asyncio.gather(*ending, return_exceptions=True)
 
     async def _ask_for_earlier(self) -> None:
         """Have the broker send what it has kept of an earlier run, before this one takes its place.
@@ -306,7 +311,24 @@ class Session:
             # Brokers send what was never subscribed to: from a session of long ago, or out of malice.
             self._counters.count_ignored()
             return
-        answer = await self._intake.take(message)
+        if not self._intake.lasts(message):
+            await self._answer(self._intake, message)
+        elif len(self._lasting) < MOST_LASTING:
+            # Whoever acknowledges an alarm does not wait for somebody's snapshot.
+            lasting = asyncio.create_task(self._answer(self._intake, message), name="mqtt-snapshot")
+            self._lasting.add(lasting)
+            lasting.add_done_callback(self._lasted)
+        else:
+            self._counters.count_overlooked()
+
+    def _lasted(self, lasting: asyncio.Task[None]) -> None:
+        self._lasting.discard(lasting)
+        error = None if lasting.cancelled() else lasting.exception()
+        if isinstance(error, Exception):
+            self._faults.note("an answer did not reach the broker", error)
+
+    async def _answer(self, intake: CommandIntake, message: Incoming) -> None:
+        answer = await intake.take(message)
         if answer is None:
             return
         try:
@@ -318,7 +340,7 @@ class Session:
                 correlation=answer.correlation,
             )
         except PublishRefusedError as error:
-            self._intake.counters.unanswered += 1
+            intake.counters.unanswered += 1
             log.warning("an answer on %.200r is not taken: %s", answer.topic, error)
 
     async def _look_after_credentials(self) -> None:

@@ -88,17 +88,17 @@ def is_tls(url: str) -> bool:
     return urlsplit(url).scheme == "mqtts"
 
 
-Command: TypeAlias = Literal["acknowledge", "reset", "shelve", "unshelve", "bypass", "unbypass"]
-"""What may be asked of an alarm."""
+Command: TypeAlias = Literal["acknowledge", "reset", "shelve", "unshelve", "bypass", "unbypass", "snapshot"]
+"""What may be asked of an alarm, or of a machine."""
 
 
 class MqttCommands(Section):
-    """What may be asked of alarms over the broker; who may ask is the broker's access list."""
+    """What may be asked of alarms and machines over the broker; who may ask is the broker's access list."""
 
     enabled: bool = Field(default=False, description="says that commands are taken from the broker")
     allow: Annotated[tuple[Command, ...], Field(strict=False, max_length=16)] = Field(
         default=("acknowledge",),
-        description="what may be asked: acknowledge, reset, shelve, unshelve, bypass, unbypass",
+        description="what may be asked: acknowledge, reset, shelve, unshelve, bypass, unbypass, snapshot",
     )
     max_age_s: Annotated[float, Field(ge=0.1, le=3600)] = Field(
         default=60.0, description="how old a command may be when it arrives"

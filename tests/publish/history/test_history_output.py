@@ -258,6 +258,40 @@ async def test_a_disk_that_hangs_holds_up_nobody(tmp_path: Path, monkeypatch: py
     await outbox.close()
 
 
+async def test_what_a_thread_still_writes_when_the_task_is_cancelled_is_not_written_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hangs, release = threading.Event(), threading.Event()
+    write = HistoryFile.write
+
+    def hang(file: HistoryFile, trends: Any, events: Any) -> None:
+        if trends and not release.is_set():
+            hangs.set()
+            release.wait(60)
+        write(file, trends, events)
+
+    monkeypatch.setattr(HistoryFile, "write", hang)
+    bench = Bench(tmp_path)
+    outbox = Outbox(tmp_path / "outbox.sqlite", SystemClock())
+    await outbox.open()
+    output = HistoryOutput(History(), output_port(outbox, RIG, clock=bench.clock), reserve_mb=0)
+    bench.output = output
+    bench.say(1.0)
+    bench.clock.advance(5.0)
+    first = asyncio.create_task(output.run())
+    await eventually(hangs.is_set)
+    first.cancel()
+    await asyncio.wait({first})
+    bench.say(4.0)
+    release.set()
+    again = asyncio.create_task(output.run())
+    await output.stop(60.0)
+    await again
+    await outbox.close()
+    assert bench.trend(RMS) == [(0, 1, 1, 1), (5, 4, 4, 4)]
+    assert bench.trend(RMS, Step.MINUTE) == [(0, 1, 2.5, 4)], "each second counts once"
+
+
 async def test_a_service_keeps_it_and_daqsvc_trend_shows_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
