@@ -8,6 +8,7 @@ from daqsvc.settings.alarms import AlarmHandling
 from daqsvc.settings.checks import bus_checks, failure, memory_bytes, memory_share, needed_bytes
 from daqsvc.settings.error_messages import dotted
 from daqsvc.settings.hooks import PluginFailedError
+from daqsvc.settings.locate import line_of
 from daqsvc.settings.models import Machine, MachineFile, Origin
 from daqsvc.settings.plugins import bus_tables, configured_outputs
 from daqsvc.settings.problems import MachineFileError, Problem
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from daqsvc.settings.buses import Bus
-    from daqsvc.settings.problems import Finding
+    from daqsvc.settings.problems import Finding, KeyPath
     from drivers.plugin import DriverPlugin
 
 BOX = "box"
@@ -62,7 +63,7 @@ class Box:
         problems = [*_of_the_box(files), *_buses(files)]
         if not problems:
             own = _own(files)
-            problems = [*_together(own, files), *_outputs_of_several(own), *_memory(files)]
+            problems = [*_together(own, files), *_outputs_of_several(own, files), *_memory(files)]
         if problems:
             raise MachineFileError(problems)
         return cls({one.machine.name: one for one in files}, own)
@@ -87,8 +88,11 @@ class Box:
         return stream if self.is_single else f"{machine}/{stream}"
 
 
-def _problem(file: MachineFile, key: str, value: object, message: str, remedy: str) -> Problem:
-    return Problem(file.path, None, key, f"{value}", message, remedy)
+def _problem(file: MachineFile, path: KeyPath, value: object, message: str, remedy: str) -> Problem:
+    """Of one file; ``path`` is that of a key, or of a table of the box, and empty for the whole file."""
+    key = f"[{path[0]}]" if len(path) == 1 and path[0] in [*_tables(file)] else dotted(path)
+    line = line_of(file.text, path) if path else None
+    return Problem(file.path, line, key, f"{value}", message, remedy)
 
 
 def _of_the_box(files: Sequence[MachineFile]) -> Iterator[Problem]:
@@ -101,15 +105,15 @@ def _of_the_box(files: Sequence[MachineFile]) -> Iterator[Problem]:
             if mine != theirs:
                 words = f'but {first.path} says "{theirs}", and one process is one box'
                 yield _problem(
-                    file, key, f'"{mine}"', words, f'write {key} = "{theirs}", or run it by itself'
+                    file, (key,), f'"{mine}"', words, f'write {key} = "{theirs}", or run it by itself'
                 )
         name = file.machine.name
         if name == BOX:
             words = "stands for the service itself where it watches several machines"
-            yield _problem(file, "machine.name", f'"{name}"', words, "choose another name")
+            yield _problem(file, ("machine", "name"), f'"{name}"', words, "choose another name")
         if name in names:
             words = f"is the name of the machine of {names[name].path} already"
-            yield _problem(file, "machine.name", f'"{name}"', words, "give each machine its own name")
+            yield _problem(file, ("machine", "name"), f'"{name}"', words, "give each machine its own name")
         names.setdefault(name, file)
     yield from _tables_once(files)
 
@@ -125,11 +129,11 @@ def _tables_once(files: Sequence[MachineFile]) -> Iterator[Problem]:
                 remedy = (
                     f"one box has one [{key}]: write it in one of the files only, or in all of them alike"
                 )
-                yield _problem(file, f"[{key}]", "", words, remedy)
+                yield _problem(file, (key,), "", words, remedy)
     for file in holders[1:]:
         if file.path.parent.absolute() != holders[0].path.parent.absolute():
             words = f"has tables of the box ({', '.join(_holds(file))}), and so has {holders[0].path}"
-            yield _problem(file, "", "", words, "write these in files of one directory")
+            yield _problem(file, (), "", words, "write these in files of one directory")
 
 
 def _holds(file: MachineFile) -> list[str]:
@@ -149,7 +153,7 @@ def _buses(files: Sequence[MachineFile]) -> Iterator[Problem]:
                 here, there = (getattr(table, differ[0], None) for table in (mine, theirs))
                 words = f"the bus of that name in {owner.path} has {differ[0]} = {there!r}"
                 remedy = f"files of one box mean one bus by one name: write its table alike, or rename {name}"
-                yield _problem(file, f"buses.{name}.{differ[0]}", f"{here!r}", words, remedy)
+                yield _problem(file, ("buses", name, differ[0]), f"{here!r}", words, remedy)
 
 
 def _absolute(file: MachineFile, name: str) -> Bus:
@@ -208,17 +212,21 @@ def _together(own: MachineFile, files: Sequence[MachineFile]) -> Iterator[Proble
         if finding.fatal:
             named = f"{finding.path[1]}".partition("/")[0] if len(finding.path) > 1 else ""
             file = by_name.get(named) or next((f for f in files if named in f.buses), own)
-            yield Problem(file.path, None, dotted(finding.path), "", finding.message, finding.remedy)
+            path = tuple(step.removeprefix(f"{named}/") for step in map(str, finding.path))
+            line = line_of(file.text, path) if file is not own else None
+            yield Problem(file.path, line, dotted(finding.path), "", finding.message, finding.remedy)
 
 
-def _outputs_of_several(own: MachineFile) -> Iterator[Problem]:
+def _outputs_of_several(own: MachineFile, files: Sequence[MachineFile]) -> Iterator[Problem]:
+    text = next(file.text for file in files if file.path == own.path)
     for _, plugin, settings in configured_outputs(own):
         try:
             findings = [*plugin.several_checks(settings)]
         except PluginFailedError as failed:
             findings = [failure(own, failed)]
         for finding in findings:
-            yield Problem(own.path, None, dotted(finding.path), "", finding.message, finding.remedy)
+            line = line_of(text, finding.path)
+            yield Problem(own.path, line, dotted(finding.path), "", finding.message, finding.remedy)
 
 
 def _memory(files: Sequence[MachineFile]) -> Iterator[Problem]:
@@ -229,7 +237,7 @@ def _memory(files: Sequence[MachineFile]) -> Iterator[Problem]:
         most = max(files, key=lambda file: needed[file.machine.name])
         yield _problem(
             most,
-            "pipeline.ring_s",
+            ("pipeline", "ring_s"),
             most.pipeline.ring_s,
             f"the rings of all {len(files)} machines would take {together / 1e9:.3g} GB, and this computer "
             f"has {there / 1e9:.3g} GB",

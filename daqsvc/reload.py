@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel
@@ -11,15 +13,20 @@ from pydantic import BaseModel
 from daqsvc.control import ReloadRefusedError
 from daqsvc.outbox.limits import OutboxLimits
 from daqsvc.publish.make import topic_root, watched
+from daqsvc.settings.error_messages import dotted
+from daqsvc.settings.locate import line_of
 from daqsvc.settings.models import MachineFile
+from daqsvc.settings.problems import Problem
 from daqsvc.settings.sensors import TrendValue
+from daqsvc.settings.store import Store
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Collection, Iterator, Sequence
 
     from daqsvc.box import Box
+    from daqsvc.settings.problems import KeyPath
 
-RESTART = "restart the service for that"
+RESTART = "restart the service for that, or take it back"
 MOST_PLACES, LONGEST_VALUE = 6, 60
 """Places below a key that are said each; and how much of a value."""
 
@@ -74,8 +81,8 @@ def changes(before: Box, after: Box) -> Changes:
     Raises:
         ReloadRefusedError: that cannot be done while the service runs.
     """
-    if reasons := list(_needs_restart(before, after)):
-        raise ReloadRefusedError(reasons)
+    if problems := list(_needs_restart(before, after)):
+        raise ReloadRefusedError([f"{problem}" for problem in problems])
     old, new = before.machines, after.machines
     common = [name for name in new if name in old]
     old_buses, new_buses = (dict(_buses(box)) for box in (before, after))
@@ -104,24 +111,50 @@ def changes(before: Box, after: Box) -> Changes:
     )
 
 
-def _needs_restart(before: Box, after: Box) -> Iterator[str]:
+def _needs_restart(before: Box, after: Box) -> Iterator[Problem]:
+    """What no service can change while it runs, at its place in the files."""
+    files = [*after.machines.values()]
     for key in ("site", "box"):
         was, wanted = getattr(before.own, key), getattr(after.own, key)
         if was != wanted:
-            yield f"{key} is {was!r} and would become {wanted!r}: {RESTART}"
+            yield _restart(files, (key,), wanted, was)
     if before.is_single and [*before.machines] != [*after.machines]:
-        was, wanted = before.own.machine.name, after.own.machine.name
-        yield f"machine.name is {was!r} and would become {wanted!r}: {RESTART}"
+        yield _restart(files, ("machine", "name"), after.own.machine.name, before.own.machine.name)
     root, wanted_root = topic_root(before.own), topic_root(after.own)
     if root != wanted_root:
-        yield f"topic_root is {root!r} and would become {wanted_root!r}: {RESTART}"
-    store, wanted_store = (
-        None if one.own.store is None else one.own.resolve(one.own.store.directory) for one in (before, after)
-    )
-    if store != wanted_store:
-        yield f"store.directory is {store} and would become {wanted_store}: {RESTART}"
+        yield _restart(files, ("mqtt", "topic_root"), wanted_root, root)
+    old, new = _directory(before), _directory(after)
+    if old != new:
+        yield _restart(files, ("store", "directory"), new, old)
     elif OutboxLimits.of(before.own.store) != OutboxLimits.of(after.own.store):
-        yield f"the limits in [store] are others: {RESTART}"
+        # Without the table all keys have their defaults.
+        was, wanted = ((one.own.store or Store(directory=Path())).model_dump() for one in (before, after))
+        for key in was:
+            if key != "directory" and was[key] != wanted[key]:
+                yield _restart(files, ("store", key), wanted[key], was[key])
+
+
+def _directory(box: Box) -> str | None:
+    """Of the store, if the files name one."""
+    return None if box.own.store is None else f"{box.own.resolve(box.own.store.directory)}"
+
+
+def _restart(files: Sequence[MachineFile], path: KeyPath, wanted: object, was: object) -> Problem:
+    """That the value at a place would have to become another one."""
+    file = next((one for one in files if getattr(one, f"{path[0]}", None) is not None), files[0])
+    message = f"the service runs with {_json(was)}, and changes that only when it starts"
+    return Problem(
+        file.path,
+        line_of(file.text, path),
+        dotted(path),
+        "" if wanted is None else _json(wanted),
+        message,
+        RESTART,
+    )
+
+
+def _json(value: object) -> str:
+    return "none" if value is None else json.dumps(value, ensure_ascii=False)
 
 
 def _differ(old: MachineFile, new: MachineFile, keys: frozenset[str]) -> list[str]:

@@ -182,6 +182,7 @@ class Service:
             supervisor=self.supervisor,
             stalls=self.stalls,
             heard=self._record_alarm,
+            snapshot=self.snapshot,
         )
         self.reports = {name: self._status_report(name) for name in self.watches}
         self.control = ControlServer(

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.driver_reports import DriverReports
     from daqsvc.machine_watch import MachineWatch
+    from daqsvc.publish.output import Output
     from daqsvc.publish.service_status import SensorState
     from daqsvc.settings.sensors import Sensor
 
@@ -165,7 +166,7 @@ class StatusReport:
                 _statement(seen.latest[name], seen.measured.get(name), seen.now_ns)
                 for name in sorted(seen.latest)
             ],
-            "alarms": _standing(seen.alarms, seen.now_ns),
+            "alarms": _standing(seen.alarms, seen.now_ns, stamp["wall_ns"] - stamp["monotonic_ns"]),
             "outbox": {
                 "depth": outbox["depth"],
                 "waiting": outbox["waiting"],
@@ -175,8 +176,7 @@ class StatusReport:
                 "journal": _journal(outbox),
             },
             "outputs": {
-                path: _output(path, seen.figures, output.reason)
-                for path, output in self._alarms.outputs.items()
+                path: _output(path, seen.figures, output) for path, output in self._alarms.outputs.items()
             },
             "faults": _faults(seen.figures),
             "figures": seen.figures,
@@ -279,7 +279,8 @@ def _statement(latest: Diagnosis, measured: Diagnosis | None, now_ns: int) -> Do
     }
 
 
-def _standing(alarms: Mapping[str, AlarmStatus], now_ns: int) -> Document:
+def _standing(alarms: Mapping[str, AlarmStatus], now_ns: int, wall_of_ns: int) -> Document:
+    """The alarms, where ``wall_of_ns`` makes a time of the wall clock of one of the monotonic clock."""
     by_state = dict.fromkeys((state.value for state in AlarmState), 0)
     standing = []
     for name, status in alarms.items():
@@ -296,6 +297,9 @@ def _standing(alarms: Mapping[str, AlarmStatus], now_ns: int) -> Document:
                 "level": status.level.label,
                 "occurrence": status.occurrence,
                 "age_s": _age_s(status.since.t_ns, now_ns) if status.since else None,
+                "shelved_until_wall_ns": None
+                if status.shelved_until_ns is None
+                else status.shelved_until_ns + wall_of_ns,
                 "message": status.message,
             }
             for name, status in standing
@@ -307,9 +311,14 @@ def _journal(outbox: Mapping[str, Any]) -> str:
     return "not open" if outbox["shut"] else "not written" if outbox["unbacked"] else "written"
 
 
-def _output(path: str, figures: Mapping[str, Any], reason: str) -> Document:
+def _output(path: str, figures: Mapping[str, Any], output: Output) -> Document:
     connected = figures.get(path.rpartition(".")[2], {}).get("connected")
-    return {"connected": None if connected is None else bool(connected), "reason": reason}
+    away_s = output.away_s
+    return {
+        "connected": None if connected is None else bool(connected),
+        "reason": output.reason,
+        "away_s": None if away_s is None else round(away_s, 3),
+    }
 
 
 def _faults(figures: Mapping[str, Any]) -> Document:

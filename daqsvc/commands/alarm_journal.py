@@ -7,11 +7,9 @@ from __future__ import annotations
 
 import json
 import sys
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.commands.tables import ago, aligned
+from daqsvc.commands.tables import ago, aligned, local_time
 from daqsvc.outbox.reading import read_journal, read_pasts
 
 if TYPE_CHECKING:
@@ -151,7 +149,7 @@ def current_table(alarms: Sequence[AlarmView], now_ns: int) -> str:
             *_machine(event, machines),
             event["alarm"],
             (event["occurrence"] or "-")[:ID_LENGTH],
-            f"{_local(since_ns)} ({ago(now_ns - since_ns)})",
+            f"{local_time(since_ns)} ({ago(now_ns - since_ns)})",
             message,
         ]
         for event, since_ns, message in worst_first
@@ -164,7 +162,7 @@ def history_table(events: Sequence[EventDocument]) -> str:
     machines = _machine_title(events)
     rows = [
         [
-            _local(event["wall_ns"]),
+            local_time(event["wall_ns"]),
             event["kind"],
             event["level"],
             _state(event),
@@ -185,7 +183,7 @@ _LEVELS = ("normal", "alert", "danger")
 def _state(event: EventDocument) -> str:
     words = str(event["state"]).replace("_", " ")
     if event["state"] == "shelved" and (until_ns := event.get("shelved_until_wall_ns")):
-        words += f" until {_local(until_ns)}"
+        words += f" until {local_time(until_ns)}"
     if event.get("covered"):
         words += f" (over {str(event['covered']).replace('_', ' ')})"
     if event.get("first_out") and event["state"] != "normal":
@@ -202,8 +200,3 @@ def _machine(event: EventDocument, machines: Sequence[str]) -> list[str]:
 def _machine_title(events: Iterable[EventDocument]) -> list[str]:
     """A column for the machine, where there are several."""
     return ["MACHINE"] if len({event["machine"] for event in events}) > 1 else []
-
-
-def _local(wall_ns: int) -> str:
-    moment = datetime.fromtimestamp(wall_ns // NS_PER_S, UTC).astimezone()
-    return moment.strftime("%Y-%m-%d %H:%M:%S")

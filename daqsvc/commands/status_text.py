@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.commands.tables import ago, aligned, harmless, wrapped
+from daqsvc.commands.tables import ago, aligned, harmless, local_time, wrapped
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -63,15 +63,20 @@ def _alarms_and_outputs(status: Document, width: int) -> Iterator[str]:
 
 def _standing(alarms: Sequence[Document], width: int) -> str:
     """A line for each alarm, and what it says below."""
-    rows = [
-        [one["level"], one["state"].replace("_", " "), one["alarm"], _age(one["age_s"])] for one in alarms
-    ]
+    rows = [[one["level"], _alarm_state(one), one["alarm"], _age(one["age_s"])] for one in alarms]
     title, *lines = aligned(["LEVEL", "STATE", "ALARM", "SINCE"], rows).splitlines()
     told = [title]
     for line, one in zip(lines, alarms, strict=True):
         message = one["message"].removeprefix(f"{one['alarm']} {one['level']}: ")
         told += [line, *(f"    {part}" for part in wrapped(harmless(message), width - 4))]
     return "\n".join(told)
+
+
+def _alarm_state(alarm: Document) -> str:
+    words = str(alarm["state"]).replace("_", " ")
+    # Services of earlier versions do not say it.
+    until_ns = alarm.get("shelved_until_wall_ns")
+    return f"{words} until {local_time(until_ns)}" if until_ns and alarm["state"] == "shelved" else words
 
 
 def _by_sensor(statements: Iterable[Document]) -> dict[str, list[Document]]:
@@ -157,13 +162,15 @@ def _outputs(status: Document) -> Iterator[str]:
         yield "broker: none is configured"
     for path, output in status["outputs"].items():
         name = "broker" if path == "mqtt" else path
-        # Services of earlier versions give no reason.
-        reason = output.get("reason", "")
-        if output["connected"] is not None:
-            why = f" ({reason})" * bool(reason)
-            yield f"{name}: {'connected' if output['connected'] else f'NOT CONNECTED{why}'}"
+        # Services of earlier versions give no reason, and say not for how long.
+        reason, away_s = output.get("reason", ""), output.get("away_s")
+        lasting = "" if away_s is None else f" for {_age(away_s)}"
+        if output["connected"]:
+            yield f"{name}: connected"
+        elif output["connected"] is not None:
+            yield f"{name}: NOT CONNECTED{lasting}{f' ({reason})' * bool(reason)}"
         elif reason:
-            yield f"{name}: {reason}"
+            yield f"{name}: {reason}{f' ({lasting.strip()})' * bool(lasting)}"
 
 
 def _rate(stream: Document) -> str:

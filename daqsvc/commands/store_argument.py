@@ -69,7 +69,8 @@ def store_doubts(machine: MachineFile) -> Iterator[str]:
     Raises:
         AssemblyError: nobody could: it is no directory.
     """
-    from daqsvc.outbox.messages import StorePathError  # noqa: PLC0415 - each verb imports only what it needs
+    from daqsvc.outbox.messages import NewerOutboxError, StorePathError  # noqa: PLC0415 - only what a verb needs
+    from daqsvc.outbox.reading import refuse_newer  # noqa: PLC0415
     from daqsvc.outbox.safety import account, unusable  # noqa: PLC0415
     from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415
 
@@ -77,7 +78,12 @@ def store_doubts(machine: MachineFile) -> Iterator[str]:
         return
     at = f"{machine.path}: store.directory = {str(machine.store.directory)!r}"
     try:
-        why = unusable(machine.resolve(machine.store.directory))
+        store = machine.resolve(machine.store.directory)
+        why = unusable(store)
+        if not why:
+            refuse_newer(store / JOURNAL)
+    except NewerOutboxError as error:
+        why = f"{error}"
     except StorePathError as error:
         raise AssemblyError(f"{at}: {error}") from None
     if why:

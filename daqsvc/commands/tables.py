@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from daqsvc.acquisition.clock import NS_PER_S
@@ -45,6 +46,11 @@ def wrapped(text: str, width: int) -> list[str]:
 def harmless(text: str) -> str:
     """The text without control characters, which could change the state of a terminal."""
     return "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)
+
+
+def local_time(wall_ns: int) -> str:
+    """A time of the wall clock where the reader is, to the second."""
+    return datetime.fromtimestamp(wall_ns // NS_PER_S, UTC).astimezone().strftime("%Y-%m-%d %H:%M:%S")
 
 
 def ago(age_ns: int) -> str:

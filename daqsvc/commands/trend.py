@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from daqsvc.commands.machine_files import Load
     from daqsvc.history.file import HistoryReader, Series
-    from daqsvc.history.points import Step, Trend
+    from daqsvc.history.points import Step, TrendPoints
 
 SINCE = "1d"
 SECONDS_UP_TO_S, MINUTES_UP_TO_S = 2 * 3600, 10 * 86_400
@@ -39,9 +39,9 @@ class NoTrendError(Exception):
     """There is nothing to show; the text says why, and what to do."""
 
 
-class _Shown(NamedTuple):
+class _ShownSeries(NamedTuple):
     series: Series
-    trend: Trend
+    trend: TrendPoints
 
 
 class TrendCommand:
@@ -165,7 +165,7 @@ def _tell(
             return
         chosen = _chosen(reader, machine, arguments.reading)
         step = _step(arguments.step, until_s - since_s)
-        shown = [_Shown(one, reader.trend(one, step, since_s, until_s)) for one in chosen]
+        shown = [_ShownSeries(one, reader.trend(one, step, since_s, until_s)) for one in chosen]
     finally:
         reader.close()
     shown = [one for one in shown if len(one.trend.t_s)]
@@ -212,7 +212,7 @@ def _step(name: str | None, shown_s: float) -> Step:
     return Step.MINUTE if shown_s <= MINUTES_UP_TO_S else Step.HOUR
 
 
-def _text(shown: list[_Shown], step: Step, since_s: float, until_s: float, width: int) -> str:
+def _text(shown: list[_ShownSeries], step: Step, since_s: float, until_s: float, width: int) -> str:
     from daqsvc.commands.tables import aligned, harmless  # noqa: PLC0415 - as above
 
     blocks = []
@@ -234,7 +234,7 @@ def _text(shown: list[_Shown], step: Step, since_s: float, until_s: float, width
     return "\n\n".join(blocks)
 
 
-def _bars(trend: Trend, since_s: float, until_s: float, bars: int) -> str:
+def _bars(trend: TrendPoints, since_s: float, until_s: float, bars: int) -> str:
     """The means as a row of bars from the least to the greatest; a blank where nothing was measured."""
     import numpy as np  # noqa: PLC0415 - as above
 
@@ -250,7 +250,7 @@ def _local(t_s: float) -> str:
     return datetime.fromtimestamp(t_s).astimezone().strftime("%Y-%m-%d %H:%M")
 
 
-def _document(one: _Shown, step: Step) -> dict[str, Any]:
+def _document(one: _ShownSeries, step: Step) -> dict[str, Any]:
     series, trend = one
     return {
         "schema": "daqsvc.trend/1",
@@ -265,13 +265,13 @@ def _document(one: _Shown, step: Step) -> dict[str, Any]:
     }
 
 
-def _rows(shown: Iterable[_Shown]) -> Iterator[tuple[Any, ...]]:
+def _rows(shown: Iterable[_ShownSeries]) -> Iterator[tuple[Any, ...]]:
     for series, trend in shown:
         for t_s, low, mean, high in zip(*(column.tolist() for column in trend), strict=True):
             yield t_s, series.machine, series.name, series.unit, low, mean, high
 
 
-def _write_csv(path: Path, shown: list[_Shown]) -> None:
+def _write_csv(path: Path, shown: list[_ShownSeries]) -> None:
     file = sys.stdout if str(path) == "-" else path.open("w", encoding="utf-8", newline="")
     try:
         table = csv.writer(file, lineterminator="\n")
@@ -288,7 +288,7 @@ def _utc(t_s: float) -> datetime:
     return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=t_s)
 
 
-def _write_parquet(path: Path, shown: list[_Shown]) -> None:
+def _write_parquet(path: Path, shown: list[_ShownSeries]) -> None:
     import numpy as np  # noqa: PLC0415 - as above
     import pyarrow as pa  # noqa: PLC0415 - an extra
     import pyarrow.parquet as pq  # noqa: PLC0415 - as above
@@ -305,13 +305,13 @@ def _write_parquet(path: Path, shown: list[_Shown]) -> None:
     pq.write_table(pa.table(columns), path)
 
 
-def _plot(path: Path, shown: list[_Shown]) -> None:
+def _plot(path: Path, shown: list[_ShownSeries]) -> None:
     import matplotlib as mpl  # noqa: PLC0415 - an extra
 
     mpl.use("Agg")
     import matplotlib.pyplot as plt  # noqa: PLC0415 - as above
 
-    panels: dict[tuple[str, str, str], list[_Shown]] = {}
+    panels: dict[tuple[str, str, str], list[_ShownSeries]] = {}
     for one in shown:
         panels.setdefault((one.series.machine, one.series.detector, one.series.unit), []).append(one)
     figure, axes = plt.subplots(

@@ -5,11 +5,11 @@ from __future__ import annotations
 import contextlib
 import logging
 import sqlite3
+import time
 from dataclasses import replace
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from daqsvc import __version__
 from daqsvc.outbox.ballast import Ballast
 from daqsvc.outbox.files import (
     FileError,
@@ -26,9 +26,9 @@ from daqsvc.outbox.files import (
     used_bytes,
 )
 from daqsvc.outbox.known_topics import KnownTopics
+from daqsvc.outbox.limits import OutboxLimits
 from daqsvc.outbox.log_copy import LogCopy
 from daqsvc.outbox.messages import (
-    NewerOutboxError,
     OutboxAwayError,
     OutboxError,
     OutboxMessage,
@@ -36,8 +36,8 @@ from daqsvc.outbox.messages import (
     checksum,
     is_sound,
 )
-from daqsvc.outbox.reading import opened_to_read
-from daqsvc.outbox.renewal import Damage, Renewal
+from daqsvc.outbox.reading import JOURNAL_NAME, opened_to_read, refuse_newer
+from daqsvc.outbox.renewal import JournalDamage, Renewal
 from daqsvc.outbox.safety import (
     refuse_link,
     refuse_no_directory,
@@ -51,18 +51,16 @@ from daqsvc.outbox.tables import (
     FILL_LATEST,
     SCHEMA_VERSION,
     bring_up_to_date,
-    newer_writer,
-    version_of,
+    known_version,
 )
 from daqsvc.outbox.unwritten import Unwritten
-from daqsvc.outbox.written_by import note_version, written_by
+from daqsvc.outbox.written_by import note_version
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
     from pathlib import Path
     from typing import BinaryIO
 
-    from daqsvc.outbox.limits import OutboxLimits
     from daqsvc.outbox.messages import Draft
     from daqsvc.outbox.unwritten import Acknowledged
 
@@ -300,7 +298,7 @@ class Journal:
                 connection.execute(FILL_LATEST)
             self._next = max(self._next, max(row[0] for row in rows) + 1)
             self.quarantined += 1
-            self._renewal.remember(Damage(self.quarantined, self.vanished))
+            self._renewal.remember(JournalDamage(self.quarantined, self.vanished))
             log.warning("outbox %s: %d messages were saved from %s", self.path, len(rows), aside)
 
     def _prove(self) -> None:
@@ -349,7 +347,7 @@ class Journal:
         self._next = max(self._next, self._mark.first_free(None, self._wall_ns()))
         in_log = [row for number, row in self._log_copy.rows().items() if number < begun]
         count = self._renewal.save(self.path, begun, self._mark.used, self._wall_ns(), in_log)
-        aside = self._renewal.replace(Damage(self.quarantined + 1, self.vanished))
+        aside = self._renewal.replace(JournalDamage(self.quarantined + 1, self.vanished))
         self.quarantined += 1
         log.error(
             "outbox %s is corrupt (%s); set aside as %s, going on with the %d messages that can be read",
@@ -399,7 +397,7 @@ class Journal:
                 gone = max(gone, 1)  # what was in the journal but not in the log, nobody knows
         if gone:
             self.vanished += gone
-            self._renewal.remember(Damage(self.quarantined, self.vanished))
+            self._renewal.remember(JournalDamage(self.quarantined, self.vanished))
             log.error(
                 "outbox %s %s, but numbers up to %d were used: %d messages are gone from the disk; it was "
                 "damaged, deleted, or is an older copy",
@@ -472,14 +470,7 @@ class Journal:
 
     def _prepare(self, connection: sqlite3.Connection) -> int | None:
         """Bring the tables up to date; the highest number that the file knows, None if it is new."""
-        writer = written_by(self.path)
-        version = version_of(connection, writer)
-        if version > SCHEMA_VERSION:
-            raise NewerOutboxError(
-                f"outbox {self.path} has schema version {version}, written by {newer_writer(writer)}; this "
-                f"is daqsvc {__version__}, which knows {SCHEMA_VERSION}: install that version again, or give "
-                f"the service another store"
-            )
+        version = known_version(connection, self.path)
         if version < SCHEMA_VERSION:
             bring_up_to_date(connection, version, self._wall_ns())
         used = connection.execute("SELECT seq FROM sqlite_sequence WHERE name = 'messages'").fetchone()
@@ -830,6 +821,24 @@ class Journal:
         except sqlite3.Error as error:
             log.warning("outbox %s cannot be made smaller: %s", self.path, error)
         self._ballast.allocate()
+
+
+def refuse_store(store: Path) -> None:
+    """Find a store that no start can use, before anything is done that takes long; blocks.
+
+    All that it leaves in the store are the directory and its lock file, as `Journal.hold` does.
+
+    Raises:
+        OutboxError: as of `Journal.open`, if that will not pass by itself.
+    """
+    journal = Journal(store / JOURNAL_NAME, time.time_ns, OutboxLimits())
+    try:
+        journal.hold()
+        refuse_newer(journal.path)
+    except OutboxAwayError:
+        return  # it may be back by the time the journal is opened
+    finally:
+        journal.close()
 
 
 @contextlib.contextmanager

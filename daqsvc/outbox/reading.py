@@ -21,7 +21,7 @@ from urllib.parse import quote
 from daqsvc.outbox.files import FileError, remedy
 from daqsvc.outbox.messages import OutboxError, is_sound
 from daqsvc.outbox.safety import refuse_link
-from daqsvc.outbox.tables import SCHEMA_VERSION, newer_writer, version_of
+from daqsvc.outbox.tables import SCHEMA_VERSION, known_version, newer_writer, version_of
 from daqsvc.outbox.written_by import written_by
 
 if TYPE_CHECKING:
@@ -213,6 +213,17 @@ def _sound(rows: Iterable[tuple[int, str, bytes, int, int, int, int | None]]) ->
         for sequence, topic, payload, retain, sent, wall_ns, check in rows
         if is_sound(sequence, topic, payload, check)
     ]
+
+
+def refuse_newer(path: Path) -> None:
+    """See whose version a journal is, if it is there and can be read; nothing is changed in it.
+
+    Raises:
+        NewerOutboxError: a newer version of the program has written it.
+    """
+    # What else may be wrong with it, the service finds and mends when it opens it.
+    with contextlib.suppress(*FileError), opened_to_read(path) as connection:
+        known_version(connection, path)
 
 
 @contextlib.contextmanager

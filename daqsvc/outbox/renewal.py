@@ -50,7 +50,7 @@ _INSERT = "INSERT OR IGNORE INTO messages VALUES (?, ?, ?, ?, ?, ?, ?)"
 
 
 @dataclass(frozen=True, slots=True)
-class Damage:
+class JournalDamage:
     """Damage to a journal that no alarm has reported yet.
 
     Attributes:
@@ -126,7 +126,7 @@ class Renewal:
         sync_directory(self._path.parent)
         return count
 
-    def replace(self, damage: Damage) -> Path:
+    def replace(self, damage: JournalDamage) -> Path:
         """Put what was saved in the place of the corrupt journal.
 
         Args:
@@ -157,23 +157,23 @@ class Renewal:
             delete(each)
         return bool(old)
 
-    def remember(self, damage: Damage) -> None:
+    def remember(self, damage: JournalDamage) -> None:
         """Keep what is to be told over a crash."""
         try:
             replace_durably(self._note, json.dumps(asdict(damage)).encode())
         except OSError as error:
             log.warning("outbox %s: a crash will make forget its damage: %s", self._path, error)
 
-    def untold(self) -> Damage:
+    def untold(self) -> JournalDamage:
         """What an earlier run could not tell any more."""
         try:
             note = json.loads(read_whole(self._note, 1024))
-            return Damage(int(note["quarantined"]), int(note["vanished"]))
+            return JournalDamage(int(note["quarantined"]), int(note["vanished"]))
         except FileNotFoundError:
-            return Damage()
+            return JournalDamage()
         except (OSError, ValueError, KeyError, TypeError) as error:
             log.info("what is said of damage in %s cannot be read: %s", self._note, error)
-            return Damage(quarantined=1)
+            return JournalDamage(quarantined=1)
 
     def is_told(self) -> None:
         """It is told."""
@@ -203,7 +203,7 @@ class Renewal:
 
     def _swap(self) -> Path:
         if not self._note.exists():
-            self.remember(Damage(quarantined=1))
+            self.remember(JournalDamage(quarantined=1))
         aside = self._aside_name()
         for suffix in (*SIDE_FILES[1:], ""):
             part = _part(self._path, suffix)

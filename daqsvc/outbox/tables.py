@@ -6,10 +6,12 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from daqsvc import __version__
 from daqsvc.outbox.files import corruption, pragma
-from daqsvc.outbox.messages import checksum, is_sound
+from daqsvc.outbox.messages import NewerOutboxError, checksum, is_sound
+from daqsvc.outbox.written_by import written_by
 
 if TYPE_CHECKING:
     import sqlite3
+    from pathlib import Path
 
 Row: TypeAlias = tuple[int, str, bytes, int, int, int, int]
 """Number, topic, payload, whether it is retained, whether it is sent, ns since the Unix epoch, checksum."""
@@ -80,6 +82,23 @@ def version_of(connection: sqlite3.Connection, writer: str) -> int:
     is_ours = version < SCHEMA_VERSION or writer in {"", __version__}
     if version < 0 or (is_ours and set(connection.execute(_FOUND)) == _PARTS):
         raise corruption(f"schema version {version} with the tables of {SCHEMA_VERSION}")
+    return version
+
+
+def known_version(connection: sqlite3.Connection, path: Path) -> int:
+    """See `version_of`.
+
+    Raises:
+        NewerOutboxError: this program does not know it.
+    """
+    writer = written_by(path)
+    version = version_of(connection, writer)
+    if version > SCHEMA_VERSION:
+        raise NewerOutboxError(
+            f"outbox {path} has schema version {version}, written by {newer_writer(writer)}; this "
+            f"is daqsvc {__version__}, which knows {SCHEMA_VERSION}: install that version again, or give "
+            f"the service another store"
+        )
     return version
 
 

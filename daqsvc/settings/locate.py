@@ -76,6 +76,22 @@ def locate(text: str, *, most_depth: int = 100, most_values: int = 1_000_000) ->
     return _Scanner(text.replace("\r\n", "\n"), most_depth, most_values).scan()
 
 
+def line_of(text: str, path: KeyPath) -> int | None:
+    """The line of a key of a valid TOML text, or of the nearest table above it if that is not there.
+
+    Args:
+        text: what `tomllib.loads` accepted; empty for values that came from no text.
+        path: of the key.
+
+    Returns:
+        From 1; None if there is no text.
+    """
+    if not text:
+        return None
+    spots = locate(text.removeprefix("\ufeff"))
+    return next(spots[path[:end]].line for end in range(len(path), -1, -1) if path[:end] in spots)
+
+
 class _Scanner:
     def __init__(self, text: str, most_depth: int, most_values: int) -> None:
         self._text = text

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, NamedTuple
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pytest
-from support.many_machines import PER_BUS, watched
+from support.many_machines import PER_BUS, SAMPLES_PER_FRAME, watched
+from support.waiting import eventually_blocking
 
 from daqsvc.diagnosis.pipeline import THREADS
 
@@ -15,6 +17,7 @@ if TYPE_CHECKING:
 
 pytestmark = [pytest.mark.integration, pytest.mark.long]
 SETTLED_S = 8.0
+LEAST = 640 * SETTLED_S / 2
 MOST_FIRST_MB = 150.0
 MOST_FURTHER_MB = 4.0
 
@@ -29,18 +32,35 @@ def taken(folder: Path, machines: int) -> Taken:
     """What so many machines take; whatever their devices send comes to every detector."""
     folder.mkdir()
     with watched(folder, machines) as plant:
+
+        def figures(machine: int) -> dict[str, Any]:
+            told: dict[str, Any] = plant.status(machine)["figures"]
+            return told
+
+        def has_received(machine: int) -> bool:
+            return bool(figures(machine)["streams"]["shaft"]["samples_received"] > LEAST)
+
+        def has_judged(machine: int, samples: int) -> bool:
+            there = figures(machine)["detectors"].values()
+            return all(one["samples"] + one["samples_withheld"] > samples - 640 for one in there)
+
         time.sleep(SETTLED_S)
+        for machine in range(machines):
+            eventually_blocking(partial(has_received, machine), "its device has sent for some seconds")
         found = Taken(plant.resident_mb(), plant.threads(), plant.descriptors())
         sent = plant.silence()
-        assert not sent.refused
+        lost = 0
         for machine, samples in enumerate(sent.samples):
-            figures = plant.status(machine)["figures"]
-            stream = figures["streams"]["shaft"]
-            assert samples > 640.0 * SETTLED_S / 2
-            assert (stream["samples_received"], stream["samples_lost"]) == (samples, 0)
-            for name, detector in figures["detectors"].items():
-                assert detector["samples_skipped"] == 0
-                assert detector["samples"] + detector["samples_withheld"] > samples - 640, name
+            eventually_blocking(
+                partial(has_judged, machine, samples), "all that its device has sent is judged"
+            )
+            last = figures(machine)
+            stream = last["streams"]["shaft"]
+            assert stream["samples_received"] == samples
+            lost += stream["samples_lost"]
+            assert not any(one["samples_skipped"] for one in last["detectors"].values())
+        # On a busy computer a bus may stand still for so long that devices find no room; else there is none.
+        assert lost <= sent.refused * SAMPLES_PER_FRAME
     return found
 
 

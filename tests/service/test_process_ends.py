@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from support.examples import first_of
 from support.machine_files import LAVAL
 from support.ports import free_port
 from support.waiting import PATIENCE_S, eventually_blocking
@@ -150,7 +151,7 @@ def closed(tmp_path: Path) -> bool:
     return (store / "outbox.sqlite").exists() and not (store / "outbox.sqlite-wal").exists()
 
 
-@pytest.mark.parametrize("hangs", ["loop", "task", *(_long(name) for name in ("busy loop", "thread"))])
+@pytest.mark.parametrize("hangs", ["loop", *(_long(name) for name in ("task", "busy loop", "thread"))])
 def test_a_stop_is_obeyed_whatever_hangs_and_the_journal_is_closed(hangs: str, tmp_path: Path) -> None:
     with service(tmp_path, FAULTS[hangs], process_guard.STOP_TURNS) as process:
         if "loop" in hangs:
@@ -260,7 +261,7 @@ def test_a_store_of_a_newer_version_is_refused_for_good(tmp_path: Path) -> None:
     assert "Traceback" not in done.stderr
 
 
-@pytest.mark.parametrize("why", LOSSES)
+@pytest.mark.parametrize("why", first_of(*LOSSES))
 def test_what_cannot_be_started_again_ends_the_process_with_its_own_code(why: str, tmp_path: Path) -> None:
     with service(tmp_path, LOSSES[why]) as process:
         said = rest_of(process)

@@ -30,6 +30,7 @@ from daqsvc.commands.machine_files import read_box
 from daqsvc.commands.reload import other_files
 from daqsvc.control import ControlServer, ReloadRefusedError, ask_reload
 from daqsvc.reload import changes
+from daqsvc.settings import MachineFileError, load_machine_file
 from drivers.can.plugin import frame_layout
 from sim_hw.nodes.can_node import CanNode
 from sim_hw.nodes.pacing import RealTimePacer
@@ -365,16 +366,30 @@ async def test_what_cannot_be_is_refused_whole(tmp_path: Path) -> None:
         watch, box = service.watches["laval-rig"], service.box
         for words, change in {
             'rate_hz = "fast": must be a number': ("rate_hz = 3200.0", 'rate_hz = "fast"'),
-            "site is 'lab' and would become 'plant': restart": ('site = "lab"', 'site = "plant"'),
-            "topic_root is 'daqsvc' and would become 'x': restart": ("[pipeline]", MQTT_ELSEWHERE),
-            "machine.name is 'laval-rig' and would become 'x': restart": ('name = "laval-rig"', 'name = "x"'),
+            'site = "plant": the service runs with "lab", and changes that only when it starts. Remedy: '
+            "restart the service": ('site = "lab"', 'site = "plant"'),
+            'mqtt.topic_root = "x": the service runs with "daqsvc"': ("[pipeline]", MQTT_ELSEWHERE),
+            'machine.name = "x": the service runs with "laval-rig"': ('name = "laval-rig"', 'name = "x"'),
         }.items():
             put(file, change, ("alert = 5.0", "alert = 4.0"))
             with pytest.raises(ReloadRefusedError) as refused:
                 await service.reload()
-            assert words in str(refused.value), refused.value
+            [reason] = refused.value.reasons
+            assert words in reason
+            place, line, _ = reason.split(":", 2)
+            assert place == f"{file}"
+            written = words.partition(" =")[0].rpartition(".")[2]
+            assert written in file.read_text().splitlines()[int(line) - 1], reason
+        put(file, ("rate_hz = 3200.0", 'rate_hz = "fast"'), ("gap_ok_v", "gap"))
+        with pytest.raises(ReloadRefusedError) as refused:
+            await service.reload()
+        with pytest.raises(MachineFileError) as unsound:
+            load_machine_file(file)
+        assert refused.value.reasons == [f"{problem}" for problem in unsound.value.problems], "as check says"
         put(file, more=f'\n[store]\ndirectory = "{tmp_path}/other"\n')
-        with pytest.raises(ReloadRefusedError, match=r"store\.directory is None and would become"):
+        with pytest.raises(
+            ReloadRefusedError, match=r'store\.directory = "/.*/other": the service runs with none'
+        ):
             await service.reload()
         file.unlink()
         with pytest.raises(ReloadRefusedError, match="no such file"):
@@ -383,6 +398,18 @@ async def test_what_cannot_be_is_refused_whole(tmp_path: Path) -> None:
         assert service.watches["laval-rig"] is watch
         assert box.machines["laval-rig"].alarms[-1].alert == 5.0
         await all_has_come(service, node)
+
+
+def test_a_limit_of_the_store_that_needs_a_restart_is_named_with_its_place(tmp_path: Path) -> None:
+    file, store = tmp_path / "rig.toml", '\n[store]\ndirectory = "/x"\n'
+    put(file, more=store)
+    before = read_box([file])
+    put(file, more=f"{store}reserve_mb = 1\n")
+    with pytest.raises(ReloadRefusedError) as refused:
+        changes(before, read_box([file]))
+    lines = file.read_text().splitlines()
+    place = f"{file}:{lines.index('reserve_mb = 1') + 1}: store.reserve_mb = 1"
+    assert refused.value.reasons[0].startswith(f"{place}: the service runs with 64, and")
 
 
 def test_what_is_different_is_said_with_its_reason(tmp_path: Path) -> None:

@@ -32,6 +32,7 @@ from daqsvc.alarms.commands import AlarmCommand, Verb
 from daqsvc.alarms.states import AlarmState, Level
 from daqsvc.box import BOX, Box
 from daqsvc.cli import main
+from daqsvc.commands.service_manager import _in_short
 from daqsvc.control import ControlError, ask_status
 from daqsvc.diagnosis.pipeline import THREADS
 from daqsvc.settings import MachineFileError, parse_machine_file
@@ -99,6 +100,9 @@ def test_files_that_do_not_make_one_box_are_refused_with_what_is_wrong() -> None
         said = refused(machine("one", 1), machine("two", 2, "", change))
         assert words in said, said
         assert "Remedy: " in said
+        _, line, *_ = said.split(":")
+        key = words.partition(" ")[0].rpartition(".")[2]
+        assert key in machine("two", 2, "", change).text.splitlines()[int(line) - 1], said
     other_name = machine("two", 2, "", ("buses.can0", "buses.b"), ('bus = "can0"', 'bus = "b"'))
     assert 'channel: belongs to bus "can0" already' in refused(machine("one", 1), other_name)
     one = machine("one", 1, store.format("a"))
@@ -108,7 +112,7 @@ def test_files_that_do_not_make_one_box_are_refused_with_what_is_wrong() -> None
     assert "write these in files of one directory" in refused(one, away)
     sparkplug = f'{MQTT.format(port=1883)}[mqtt.sparkplug]\ndevice = "fan"\n'
     said = refused(machine("one", 1), machine("two", 2, sparkplug))
-    assert 'two.toml: mqtt.sparkplug.device: "fan" names one device' in said, said
+    assert 'mqtt.sparkplug.device: "fan" names one device' in said, said
     with pytest.MonkeyPatch.context() as small:
         small.setattr("daqsvc.box.memory_bytes", lambda: 20_000_000)
         said = refused(machine("one", 1, "", long), machine("two", 2))
@@ -202,6 +206,7 @@ async def test_the_service_speaks_of_itself_once(tmp_path: Path, monkeypatch: py
         }
         assert states == {"one": AlarmState.NORMAL, "two": AlarmState.OUT_OF_SERVICE}
         assert (await service.alarms.execute(wish(alarm="store/disk"), "test")).accepted
+        assert "; alarms: 2 out of service" in _in_short(service)[0], "systemd hears of all machines"
         outcome = await service.alarms.execute(wish(alarm="store/disk", machine="four"), "test")
         assert outcome.reason == "no machine is named 'four'; there are: box, one, two"
 

@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import time
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 import jsonschema
@@ -26,6 +27,7 @@ from support.waiting import PATIENCE_S, eventually
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import SampleBlock
+from daqsvc.alarms.commands import AlarmCommand, Verb
 from daqsvc.alarms.states import Level
 from daqsvc.cli import main
 from daqsvc.commands import status as verb
@@ -120,6 +122,31 @@ async def test_newest_samples_and_statements_are_told(
         assert "alert active unacknowledged sensor-ok/probe-x" in text
 
 
+async def test_until_when_an_alarm_is_shelved_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("daqsvc.status_report.FRESH_S", -1.0)
+    async with running(rig(), tmp_path / "store") as service:
+        shelve = AlarmCommand(verb=Verb.SHELVE, alarm="rotor-fault", by="ann", duration_s=3600.0)
+        before_ns = service.clock.wall_ns()
+        assert (await service.alarms.execute(shelve, "test")).accepted
+        status = await told(tmp_path / "store")
+        [alarm] = status["alarms"]["standing"]
+        assert (alarm["alarm"], alarm["state"]) == ("rotor-fault", "shelved")
+        until_ns = alarm["shelved_until_wall_ns"]
+        assert 3600 * NS_PER_S <= until_ns - before_ns <= (3600 + PATIENCE_S) * NS_PER_S
+        shown = datetime.fromtimestamp(until_ns // NS_PER_S, UTC).astimezone()
+        assert f"shelved until {shown:%Y-%m-%d %H:%M:%S}  rotor-fault" in status_text(status, 80)
+        del alarm["shelved_until_wall_ns"]
+        assert "shelved  rotor-fault" in status_text(status, 80), "of a service of an earlier version"
+
+        unshelve = AlarmCommand(verb=Verb.UNSHELVE, alarm="rotor-fault", by="ann")
+        assert (await service.alarms.execute(unshelve, "test")).accepted
+        service.alarms.manager.condition("store/disk", Level.ALERT, "x")
+        [disk] = (await told(tmp_path / "store"))["alarms"]["standing"]
+        assert disk["shelved_until_wall_ns"] is None
+
+
 @pytest.mark.long
 async def test_the_newest_sample_is_the_last_that_the_figures_count(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -174,7 +201,12 @@ async def test_all_is_told_that_the_service_knows(tmp_path: Path) -> None:
         status = await told_when(
             store, lambda now: now["outputs"]["mqtt"]["reason"], "why the broker is away"
         )
+        away_s = status["outputs"]["mqtt"].pop("away_s")
         assert status["outputs"] == {"mqtt": {"connected": False, "reason": away}}
+        later = await told_when(
+            store, lambda now: now["outputs"]["mqtt"]["away_s"] > away_s + 0.3, "it is away for longer"
+        )
+        assert later["outputs"]["mqtt"]["reason"] == away, "also if it was tried again meanwhile"
 
         # Then the bus goes with a reason that no terminal should be given, an alarm stands, frames were lost.
         driver = service.drivers[0]
@@ -213,11 +245,12 @@ async def test_all_is_told_that_the_service_knows(tmp_path: Path) -> None:
             "probe-x missing",
             "- of 640",
             "frames_unknown 3",
-            f"broker: NOT CONNECTED ({away})",
+            f" s ({away})",
             "alert active unacknowledged sensor-ok/probe-x",
             "for the broker, the oldest for",
         ):
             assert said in words, text
+        assert re.search(r"broker: NOT CONNECTED for \d+\.\d s \(", words), text
         assert re.search(r"probe-x +missing.* rms 7\.\d+ um", text), text
 
 
