@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_type_h
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
+from daqsvc import heap
 from daqsvc.bearing.geometry import BearingOrders
 from daqsvc.bearing.identify import (
     BANDS,
@@ -111,15 +112,18 @@ def learn_baseline(
     try:
         for name, orders in bearings.items():
             names = (name,)
+            heap.give_back()
             races[name] = race_baseline(samples[name], rate_hz, speed_rpm, orders)
         for names in together:
             columns = np.column_stack([samples[name] for name in names])
+            heap.give_back()
             residuals[names] = learn_healthy(columns, rate_hz, highest=highest)
         for names, model in (pairs or {}).items():
             columns = np.column_stack([samples[name] for name in names]) * model.m_s2_per_unit
             healthy_pairs[names] = learn_pair(model.parameters, rate_hz, columns)
     except (NotIdentifiableError, UnfitError, ValueError) as error:
         raise NotIdentifiableError(f"{', '.join(names)}: {error}") from None
+    heap.give_back()
     return BearingBaseline(
         rate_hz=rate_hz,
         speed_rpm=speed_rpm,

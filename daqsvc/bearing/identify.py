@@ -21,6 +21,8 @@ import numpy as np
 from scipy.fft import next_fast_len
 from scipy.special import chdtrc, stdtrit
 
+from daqsvc import heap
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -156,7 +158,11 @@ def identify(samples: Floats, rate_hz: float, most_order: int = MOST_ORDER) -> I
     coefficients = scale[:, np.newaxis] * step.coefficients / scale
     covariance = scale[:, np.newaxis] * step.covariance * scale
     model = InnovationsModel(coefficients, covariance, rate_hz, Whiteness(1.0, 0.0))
+    # Of long recordings each step takes some hundred MB for a moment.
+    heap.give_back()
     residual = model.innovations(np.where(there[:, np.newaxis], centred, np.nan))
+    del centred
+    heap.give_back()
     model = InnovationsModel(coefficients, covariance, rate_hz, whiteness(residual))
     if not model.spectral_radius < 1.0:
         raise NotIdentifiableError(
@@ -229,8 +235,10 @@ def _autocovariance(samples: Floats, lags: int, count: int, there: Flags | None 
     covariances = np.empty((lags + 1, m, m))
     for i in range(m):
         for j in range(m):
-            cross = np.fft.irfft(spectrum[:, i] * spectrum[:, j].conj(), size)
-            covariances[:, i, j] = cross[: lags + 1] / count / np.maximum(pairs, _LEAST_PAIRS)
+            product = spectrum[:, j].conj()
+            product *= spectrum[:, i]
+            cross = np.fft.irfft(product, size)[: lags + 1].copy()
+            covariances[:, i, j] = cross / count / np.maximum(pairs, _LEAST_PAIRS)
     covariances[0] += _WHITE_NOISE * np.diag(np.diag(covariances[0]))
     return covariances
 

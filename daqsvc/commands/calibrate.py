@@ -16,11 +16,11 @@ from daqsvc.commands.recording_options import (
     calibrates_bearing,
     split_files,
 )
+from daqsvc.commands.with_kernels import VerbWithKernels
 
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Callable, Sequence
-    from pathlib import Path
 
     from daqsvc.bearing.baseline import BearingBaseline
     from daqsvc.offline.runner import Runner
@@ -30,13 +30,8 @@ if TYPE_CHECKING:
     from daqsvc.settings import MachineFile
 
 
-class CalibrateCommand:
-    """``daqsvc calibrate [MACHINE] [RECORDING...]``.
-
-    Args:
-        load: reads a machine file; None after its errors have been printed.
-        prepare_kernel_cache: says where compiled kernels are kept.
-    """
+class CalibrateCommand(VerbWithKernels):
+    """``daqsvc calibrate [MACHINE] [RECORDING...]``."""
 
     help = "learn the healthy machine from recordings or the live bus, and write it to a file"
     description = (
@@ -46,12 +41,6 @@ class CalibrateCommand:
         "--channels, or a machine file with [pipeline.bearing], the healthy state of rolling bearings. Data "
         "that cannot be a healthy machine are refused, and nothing is written."
     )
-
-    def __init__(
-        self, load: Callable[[Path], MachineFile | None], prepare_kernel_cache: Callable[[], None]
-    ) -> None:
-        self._load = load
-        self._prepare_kernel_cache = prepare_kernel_cache
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `Command.add_arguments`."""

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, positive
+from daqsvc.commands.with_kernels import VerbWithKernels
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Callable
 
     from daqsvc.diagnosis.plugin import DetectorPlugin
     from daqsvc.settings import MachineFile
@@ -22,13 +22,8 @@ MOST_FALSE_ALARMS = 10.0
 """Per 1000 revolutions: what a machine file may say."""
 
 
-class DetectabilityCommand:
-    """``daqsvc detectability MACHINE``.
-
-    Args:
-        load: reads a machine file; None after its errors have been printed.
-        prepare_kernel_cache: says where compiled kernels are kept.
-    """
+class DetectabilityCommand(VerbWithKernels):
+    """``daqsvc detectability MACHINE``."""
 
     help = "say what can be told apart on a machine's rotor, how soon, and from which change on"
     description = (
@@ -37,12 +32,6 @@ class DetectabilityCommand:
         "change of every kind, and which modes look the same at this speed. Without a rotor bank, what the "
         "synchronous vector of [pipeline.rotor_synchronous] can see: by its calibration, or by --noise-um."
     )
-
-    def __init__(
-        self, load: Callable[[Path], MachineFile | None], prepare_kernel_cache: Callable[[], None]
-    ) -> None:
-        self._load = load
-        self._prepare_kernel_cache = prepare_kernel_cache
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `Command.add_arguments`."""

@@ -11,6 +11,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from daqsvc.commands.analyze_fleet import cluster_address
 from daqsvc.commands.arguments import (
     add_max_memory,
     calibration_length,
@@ -66,6 +67,7 @@ def add_analyze_options(parser: argparse.ArgumentParser) -> None:
     _add_bearings(parser)
     _add_about_recordings(parser)
     _add_output(parser)
+    _add_fleet(parser)
 
 
 def add_calibrate_options(parser: argparse.ArgumentParser) -> None:
@@ -272,7 +274,7 @@ def _add_bearings(parser: argparse.ArgumentParser) -> None:
 def _add_about_recordings(parser: argparse.ArgumentParser) -> None:
     """Options that both forms know."""
     both = parser.add_argument_group("about the recordings")
-    _add_channel_map(both.add_argument)
+    add_channel_map(both.add_argument)
     both.add_argument(
         "--unit",
         choices=(*LENGTH_UNITS, *ACCELERATION_UNITS),
@@ -307,9 +309,32 @@ def _add_output(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _add_fleet(parser: argparse.ArgumentParser) -> None:
+    """What is said of the archive of a fleet."""
+    fleet = parser.add_argument_group("the archive of a fleet (docs/fleet.md)")
+    fleet.add_argument(
+        "--cluster",
+        type=cluster_address,
+        metavar="ADDRESS",
+        help="judge an archive on Dask: local (processes of this computer, as many as it has cores), "
+        "local:N, or the scheduler tcp://HOST:8786",
+    )
+    fleet.add_argument(
+        "--results",
+        metavar="PLACE",
+        help="folder or URL of the table; what it holds is not judged again (default: ARCHIVE-results)",
+    )
+    fleet.add_argument(
+        "--verify",
+        action="store_true",
+        help="read all files to see whether they hold what they held, whatever their sizes and times say",
+    )
+    fleet.add_argument("--retry", action="store_true", help="try again what could not be judged")
+
+
 def _add_about_healthy_recordings(parser: argparse.ArgumentParser) -> None:
     about = parser.add_argument_group("about the recordings")
-    _add_channel_map(about.add_argument)
+    add_channel_map(about.add_argument)
     about.add_argument("--unit", choices=LENGTH_UNITS, help="unit of the probes' samples (default: um)")
     about.add_argument(
         "--sweep-rpm",
@@ -351,7 +376,7 @@ class _MergedMap(argparse.Action):
         setattr(namespace, self.dest, merged)
 
 
-def _add_channel_map(add: Callable[..., argparse.Action]) -> None:
+def add_channel_map(add: Callable[..., argparse.Action]) -> None:
     """What the recordings call their channels, and how fast they were sampled.
 
     Args:

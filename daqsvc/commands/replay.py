@@ -9,41 +9,31 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_REFUSED, EXIT_USAGE
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_REFUSED, EXIT_USAGE, positive
+from daqsvc.commands.with_kernels import VerbWithKernels
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
 
+    from daqsvc.alarms.events import AlarmEvent
     from daqsvc.offline.replay import Comparison, Replayed
-    from daqsvc.settings import MachineFile
 
 _SHOWN = 5
 """Differences that are shown one by one."""
 
 
-class ReplayCommand:
-    """``daqsvc replay SNAPSHOT [MACHINE]``.
-
-    Args:
-        load: reads a machine file; None after its errors have been printed.
-        prepare_kernel_cache: says where compiled kernels are kept.
-    """
+class ReplayCommand(VerbWithKernels):
+    """``daqsvc replay SNAPSHOT [MACHINE]``."""
 
     help = "judge a snapshot again: the same detectors and alarms over the same samples"
     description = (
         "Play the samples of a snapshot into the rings, detectors and alarms of the service, as fast as it "
-        "goes, print the alarms that come of it, and hold them and every statement of the detectors against "
-        "what the service said then, to the last bit. With a machine file that judges instead of the one in "
-        "the snapshot. Exit code: 0 if it was judged, with --check 1 if anything differs, 3 if it cannot be "
-        "read or judged, 2 for wrong usage."
+        "goes or at a speed, print the alarms that come of it, and hold them and every statement of the "
+        "detectors against what the service said then, to the last bit. With a machine file that judges "
+        "instead of the one in the snapshot. Exit code: 0 if it was judged, with --check 1 if anything "
+        "differs, 3 if it cannot be read or judged, 2 for wrong usage."
     )
-
-    def __init__(
-        self, load: Callable[[Path], MachineFile | None], prepare_kernel_cache: Callable[[], None]
-    ) -> None:
-        self._load = load
-        self._prepare_kernel_cache = prepare_kernel_cache
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `daqsvc.cli.Command.add_arguments`."""
@@ -51,13 +41,19 @@ class ReplayCommand:
         parser.add_argument(
             "machine", type=Path, nargs="?", metavar="MACHINE", help="a machine file to judge by instead"
         )
+        parser.add_argument(
+            "--speed",
+            type=positive,
+            metavar="X",
+            help="X times as fast as it was; 1 in real time (default: as fast as it goes)",
+        )
         parser.add_argument("--check", action="store_true", help="exit with 1 if anything differs")
         parser.add_argument("--json", action="store_true", help="one JSON object instead of text")
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `daqsvc.cli.Command.run`."""
         from daqsvc.confined.limits import ResourceLimits  # noqa: PLC0415 - each verb imports what it needs
-        from daqsvc.offline.replay import ReplayError, replay  # noqa: PLC0415
+        from daqsvc.offline.replay import Pace, ReplayError, replay  # noqa: PLC0415
         from daqsvc.snapshots.reading import SnapshotError, read_snapshot  # noqa: PLC0415
 
         machine = None
@@ -66,8 +62,10 @@ class ReplayCommand:
         self._prepare_kernel_cache()
         try:
             snapshot = read_snapshot(arguments.snapshot, ResourceLimits())
+            pace = None if arguments.speed is None else Pace(arguments.speed)
+            heard = _nothing if arguments.json else _print_alarm
             with tempfile.TemporaryDirectory(prefix="daqsvc-replay-") as directory:
-                replayed = asyncio.run(replay(snapshot, machine, Path(directory)))
+                replayed = asyncio.run(replay(snapshot, machine, Path(directory), pace, heard))
         except SnapshotError as error:
             print(f"daqsvc replay: {error}", file=sys.stderr)  # noqa: T201 - errors go to stderr
             return EXIT_REFUSED
@@ -79,14 +77,22 @@ class ReplayCommand:
         return EXIT_FAILED if arguments.check and not replayed.is_equal else EXIT_OK
 
 
-def _lines(replayed: Replayed) -> Iterator[str]:
+def _nothing(_event: AlarmEvent) -> None:
+    """All is in the one object at the end."""
+
+
+def _print_alarm(event: AlarmEvent) -> None:
     from daqsvc.acquisition.clock import iso_utc  # noqa: PLC0415 - only what a verb needs
 
+    print(  # noqa: T201 - this is what the verb is for
+        f"{iso_utc(event.wall_ns)} {event.alarm} {event.kind.value}: {event.message}", flush=True
+    )
+
+
+def _lines(replayed: Replayed) -> Iterator[str]:
     yield from replayed.notes
     for detector, why in replayed.anew.items():
         yield f"{detector} is judged anew: {why}"
-    for event in replayed.alarms:
-        yield f"{iso_utc(event.wall_ns)} {event.alarm} {event.kind.value}: {event.message}"
     if not replayed.alarms:
         yield "no alarm changes"
     for words, comparison in (("statements", replayed.said), ("alarm events", replayed.alarmed)):

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import heapq
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
+import can
 import numpy as np
 
 from daqsvc.acquisition.assembler import StreamAssembler
@@ -17,6 +20,7 @@ from daqsvc.recording import RecordingError
 from daqsvc.recording.formats import CAN_LOGS, named_as_can_log
 from daqsvc.recording.rate import MOST_STRETCHED
 from daqsvc.recording.recording import Recording
+from daqsvc.recording.streams import LongGapsError, RecordedStream, of_blocks
 from drivers.base import StreamSpec
 from drivers.can.adapter import batch_of
 from drivers.can.batches import FrameDemultiplexer
@@ -29,7 +33,6 @@ from drivers.replay.files import RecordedLogError as LogError
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    import can
     from numpy.typing import NDArray
 
     from daqsvc.acquisition.samples import SampleBlock
@@ -41,6 +44,8 @@ if TYPE_CHECKING:
 _SPAN_NS = NS_PER_S // 20
 _NS_PER_MS = 1_000_000
 _MOST_OFF_RATE = 0.05
+_SURELY_SINCE_1970_NS = 10**17
+"""Times of 1973 and later; others count from somewhere else."""
 _LONG_ENOUGH_S = 1.0
 """A shorter log does not tell the rate of a stream."""
 _NAMED_IDS = 8
@@ -66,6 +71,16 @@ def load_can_log(
         RecordingError: it cannot be read, holds no samples of the machine, or not at the rates that the
             machine file says.
     """
+    playing = _played(machine, path)
+    return _recording(machine, path, playing, rate_hz, watched)
+
+
+def _played(machine: MachineFile, path: str) -> _Playing:
+    """All logs of a recording, decoded.
+
+    Raises:
+        RecordingError: see `load_can_log`.
+    """
     playing = _Playing(machine, path)
     playing.play()
     if not playing.blocks:
@@ -78,7 +93,67 @@ def load_can_log(
             f"{path} has no frame of a stream of {machine.path}{playing.seen_instead()}; {why}"
         )
     playing.check_rates()
-    return _recording(machine, path, playing, rate_hz, watched)
+    return playing
+
+
+def load_can_streams(machine: MachineFile, path: str) -> tuple[list[RecordedStream], list[str]]:
+    """All streams of a machine in a CAN log, or in all logs of a folder, each at its own rate.
+
+    Args:
+        machine: the machine file.
+        path: the log or folder.
+
+    Returns:
+        The streams in the order of the machine file, in the units of the sensors; and what of a log is
+        damaged. Channels without a sensor have their own names.
+
+    Raises:
+        RecordingError: see `load_can_log`.
+    """
+    playing = _played(machine, path)
+    sensors = {(one.stream, one.channel): one for one in machine.sensors}
+    begun_ns = _log_begin_ns(path)
+    streams = []
+    for name, stream in machine.streams.items():
+        if name not in playing.blocks:
+            continue
+        try:
+            samples, t_ns, period_ns = of_blocks(playing.blocks[name], MOST_STRETCHED)
+        except LongGapsError as error:
+            raise RecordingError(
+                f"{path} {error} of stream {name!r}; give the logs of one time without long gaps between"
+            ) from None
+        channels = stream.layout.channel_names
+        known = [sensors.get((name, channel)) for channel in channels]
+        # Times of some formats count from the first frame; a date that they say is in their header.
+        start_ns = t_ns if t_ns > _SURELY_SINCE_1970_NS else None if begun_ns is None else begun_ns + t_ns
+        streams.append(
+            RecordedStream(
+                name,
+                stream.rate_hz,
+                tuple(c if s is None else s.name for s, c in zip(known, channels, strict=True)),
+                tuple("" if s is None else s.unit for s in known),
+                samples,
+                start_ns,
+                NS_PER_S / period_ns,
+            )
+        )
+    return streams, playing.notes
+
+
+def _log_begin_ns(path: str) -> int | None:
+    """When a log in ASC format began, by its header; None of any other, or if it does not say."""
+    log = Path(path)
+    if log.suffix.lower() != ".asc":
+        return None
+    begins = []
+    for relative in (False, True):
+        with (
+            contextlib.suppress(ValueError, OSError),
+            can.ASCReader(log, relative_timestamp=relative) as reader,
+        ):
+            begins += [message.timestamp for message in itertools.islice(reader, 1)]
+    return round((begins[0] - begins[1]) * 1000) * _NS_PER_MS if len(begins) == 2 else None
 
 
 @dataclass(slots=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import time
 from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NoReturn
@@ -23,7 +24,7 @@ from daqsvc.acquisition.standing import StreamState
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.make import alarm_rule
 from daqsvc.alarms.manager import AlarmManager
-from daqsvc.diagnosis.memory import Memory, MemoryNotFittingError, put
+from daqsvc.diagnosis.memory import DetectorMemory, MemoryNotFittingError, put
 from daqsvc.diagnosis.pipeline import THREADS, KernelThreads, kernel_failed
 from daqsvc.diagnosis.statements import said_of_silence
 from daqsvc.machine_watch import MachineWatch
@@ -35,7 +36,7 @@ from daqsvc.snapshots.contents import ALARMS, DIAGNOSES, FILES, MACHINE_JSON, ST
 from daqsvc.supervision import Supervisor
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Awaitable, Callable, Sequence
     from pathlib import Path
 
     from daqsvc.acquisition.ring import SampleRing
@@ -155,6 +156,34 @@ def machine_of(snapshot: Snapshot, directory: Path) -> MachineFile:
         raise ReplayError("has no machine file that can be used: name one behind it") from None
 
 
+class Pace:
+    """How fast a replay goes.
+
+    Args:
+        speed: time of the snapshot over real time.
+        now_s: a clock, s.
+        sleep: waits, s.
+    """
+
+    def __init__(
+        self,
+        speed: float,
+        now_s: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
+    ) -> None:
+        self._speed, self._now_s, self._sleep = speed, now_s, sleep
+        self._begun_s: float | None = None
+
+    async def __call__(self, into_ns: int) -> None:
+        """Wait until it is time for what came so long after the begin."""
+        now_s = self._now_s()
+        if self._begun_s is None:
+            self._begun_s = now_s
+        left_s = self._begun_s + into_ns / NS_PER_S / self._speed - now_s
+        if left_s > 0.0:
+            await self._sleep(left_s)
+
+
 class Replay:
     """One replay of a snapshot.
 
@@ -162,14 +191,25 @@ class Replay:
         snapshot: as read.
         machine: the machine file to judge by.
         directory: for what detectors keep.
+        pace: how fast it goes; None for as fast as it can.
+        heard: told of each alarm event when it comes about.
 
     Raises:
         ReplayError: the snapshot is none that can be replayed.
         AssemblyError: the detectors cannot be made.
     """
 
-    def __init__(self, snapshot: Snapshot, machine: MachineFile, directory: Path) -> None:
+    def __init__(
+        self,
+        snapshot: Snapshot,
+        machine: MachineFile,
+        directory: Path,
+        pace: Pace | None = None,
+        heard: Callable[[AlarmEvent], None] = lambda _event: None,
+    ) -> None:
         self._snapshot = snapshot
+        self._pace = pace
+        self._heard = heard
         self._machine = machine.model_copy(update={"recorder": None})
         self._directory = directory
         self._result = Replayed(notes=list(snapshot.notes))
@@ -204,10 +244,16 @@ class Replay:
             handling=machine.alarm_handling,
         )
         self._before = before
+        self._names = {
+            name: detector.name
+            for detector in self._watch.pipeline.detectors
+            for name in _names(detector, self._begin_ns)
+        }
+        """By detector of a statement, the one that makes it."""
         self._ticked_ns = self._begin_ns
 
     async def run(self) -> Replayed:
-        """Replay it, as fast as it goes.
+        """Replay it.
 
         Raises:
             ReplayError: it is damaged.
@@ -223,6 +269,8 @@ class Replay:
             for reader in self._readers.values():
                 await reader.asks.wait()
             for entry in self._snapshot.entries:
+                if self._pace is not None:
+                    await self._pace(min(entry.at_ns - self._begin_ns, LONGEST_GAP_NS))
                 await self._go_on_to(entry.at_ns)
                 if isinstance(entry.what, SampleBlock):
                     self._write(entry.what)
@@ -278,13 +326,13 @@ class Replay:
                 self._result.anew[detector.name] = self._why_anew
         return ""
 
-    def _found_memories(self) -> dict[str, tuple[int, Memory]]:
-        found: dict[str, tuple[int, Memory]] = {}
+    def _found_memories(self) -> dict[str, tuple[int, DetectorMemory]]:
+        found: dict[str, tuple[int, DetectorMemory]] = {}
         for entry in self._snapshot.entries:
             if not isinstance(entry.what, SampleBlock) and entry.what.topic == STATES:
                 document = entry.what.document
                 try:
-                    found[str(document["detector"])] = int(document["end_index"]), Memory.of(document)
+                    found[str(document["detector"])] = int(document["end_index"]), DetectorMemory.of(document)
                 except (*_NOT_OURS, MemoryNotFittingError) as error:
                     _refuse(error)
         return found
@@ -303,7 +351,7 @@ class Replay:
             for _ in range(_TURNS):
                 await asyncio.sleep(0)
             if (due_ns - self._begin_ns) % ALARM_TICK_NS < STEP_NS:
-                self._result.alarms += self._alarms.tick()
+                self._take(self._alarms.tick())
 
     def _write(self, block: SampleBlock) -> None:
         """Samples come, of a stream or of a grid: grids are as they were made then."""
@@ -321,6 +369,9 @@ class Replay:
             if noted.topic == STANDING and document["stream"] in self._watch.standings:
                 told = {key: value for key, value in document.items() if key != "stream"}
                 self._watch.stand(document["stream"], StreamState(**told))
+            elif noted.topic == ALARMS and not document.get("by") and self._is_earlier(document):
+                event = alarm_event(json.dumps(document).encode())
+                self._alarms.resume([event], self._watch.active_detectors())
             elif noted.topic == WINDOWS and document["detector"] in self._readers:
                 await self._give(document["detector"], document)
         except _NOT_OURS as error:
@@ -356,35 +407,48 @@ class Replay:
 
     def _report(self, diagnosis: Diagnosis) -> None:
         self._result.statements.append(diagnosis)
-        self._result.alarms += self._alarms.take(diagnosis)
+        self._take(self._alarms.take(diagnosis))
+
+    def _take(self, events: Sequence[AlarmEvent]) -> None:
+        self._result.alarms += events
+        for event in events:
+            self._heard(event)
 
     def _compare(self) -> None:
         """Hold what was said then against what is said now."""
-        names = {
-            name: detector.name
-            for detector in self._watch.pipeline.detectors
-            for name in _names(detector, self._begin_ns)
-        }
         said, alarmed = [], []
         for entry in self._snapshot.entries:
             if isinstance(entry.what, SampleBlock):
                 continue
             document = entry.what.document
-            if entry.what.topic == DIAGNOSES and self._is_replayed(document, names):
+            if entry.what.topic == DIAGNOSES and self._is_replayed(document):
                 said.append(document)
-            elif entry.what.topic == ALARMS and not document.get("by"):
+            elif entry.what.topic == ALARMS and not document.get("by") and not self._is_earlier(document):
                 alarmed.append(document)
         _hold(self._result.said, said, [statement_document(one) for one in self._result.statements])
-        of_data = [event for event in self._result.alarms if not event.by]
+        # What follows of statements that came after the end of the file came after it, too.
+        later = {_comparable(one) for one in self._result.said.added}
+        of_data = [
+            event
+            for event in self._result.alarms
+            if not event.by and _comparable(statement_document(event.cause)) not in later
+        ]
         _hold(self._result.alarmed, alarmed, [alarm_document(one) for one in of_data])
 
-    def _is_replayed(self, document: Document, names: Mapping[str, str]) -> bool:
+    def _is_replayed(self, document: Document) -> bool:
         """Whether a statement of then rests on samples that were judged again."""
         try:
-            since = self._since.get(names[document["detector"]])
+            since = self._since.get(self._names[document["detector"]])
             return since is not None and document["window"]["end_index"] > since
         except (KeyError, TypeError):
             return False
+
+    def _is_earlier(self, alarm: Document) -> bool:
+        """Whether an alarm event of then follows of samples that its detector had judged by the begin."""
+        cause = alarm.get("cause")
+        if not isinstance(cause, dict) or cause.get("detector") not in self._names:
+            return False
+        return not self._is_replayed(cause)
 
 
 def _names(detector: Detector, t_ns: int) -> set[str]:
@@ -418,13 +482,21 @@ def _refuse(error: Exception) -> NoReturn:
     raise ReplayError(f"holds what is none of daqsvc's ({type(error).__name__}: {words})") from None
 
 
-async def replay(snapshot: Snapshot, machine: MachineFile | None, directory: Path) -> Replayed:
+async def replay(
+    snapshot: Snapshot,
+    machine: MachineFile | None,
+    directory: Path,
+    pace: Pace | None = None,
+    heard: Callable[[AlarmEvent], None] = lambda _event: None,
+) -> Replayed:
     """Judge a snapshot again.
 
     Args:
         snapshot: as read.
         machine: the machine file to judge by; None for that of the snapshot.
         directory: empty; for files.
+        pace: how fast it goes; None for as fast as it can.
+        heard: told of each alarm event when it comes about.
 
     Raises:
         ReplayError: it cannot be replayed.
@@ -436,6 +508,6 @@ async def replay(snapshot: Snapshot, machine: MachineFile | None, directory: Pat
             (directory / "store" / name.rpartition("/")[2]).write_bytes(data)
     try:
         judged_by = machine or machine_of(snapshot, directory / "files")
-        return await Replay(snapshot, judged_by, directory / "store").run()
+        return await Replay(snapshot, judged_by, directory / "store", pace, heard).run()
     except AssemblyError as error:
         raise ReplayError(f"has detectors that cannot be made here: {error}") from None

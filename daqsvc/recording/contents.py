@@ -23,6 +23,15 @@ NUMERIC = "iuf"
 MOST_LISTED = 50
 """Entries of a file that a message names."""
 
+STATED_RATE, STATED_START, STATED_UNIT = "fs_hz", "start_time", "unit"
+"""How files of `daqsvc export` call rate, begin and unit of their samples."""
+MEASURED_RATE = "rate_measured_hz"
+"""The rate by the clock of the box, which is not the rate that samples are counted by."""
+GROUP_TIME = "time of "
+"""In front of a group's name, the name of its time."""
+WAV_SCHEMA = "daqsvc.wav/1"
+"""Of the comment in its WAV files."""
+
 LONGEST_NAME = 80
 """Characters of a name in a message."""
 

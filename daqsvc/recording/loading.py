@@ -14,9 +14,10 @@ from daqsvc.confined.limits import ResourceLimits
 from daqsvc.dsp.quality import UnfitError
 from daqsvc.dsp.quality.unit import refuse_beyond_any_unit
 from daqsvc.recording import RecordingError
-from daqsvc.recording.contents import NUMERIC
+from daqsvc.recording.contents import GROUP_TIME, NUMERIC, STATED_START
 from daqsvc.recording.formats import read
 from daqsvc.recording.rate import place_at, time_column, timing_of
+from daqsvc.recording.streams import ns_of_iso
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -74,6 +75,93 @@ def load(
         _refuse_impossible(file, list(channels), samples)
     about["nan_count"], about["infinity_count"] = _count_bad(samples)
     return about, (samples,)
+
+
+def load_all(
+    path: str,
+    channels: Mapping[str, str] | None,
+    rate_hz: float | None,
+    memory_bytes: int,
+) -> tuple[dict[str, Any], list[Samples]]:
+    """Read all channels, those of each rate and length together.
+
+    Args:
+        path: the file.
+        channels: what some channels are called from now on, and what they are called in the file.
+        rate_hz: see `daqsvc.recording.recording.load_recording`.
+        memory_bytes: what may be taken.
+
+    Returns:
+        ``streams``, for each its ``name`` (empty if the file has none), ``names``, ``units``, ``rate_hz`` and
+        ``start_ns`` (None if the file says none); ``notes`` on what is wrong; and the samples of each.
+
+    Raises:
+        RecordingError: see there.
+    """
+    file = Path(path)
+    contents = read(file, ResourceLimits(memory_bytes))
+    called = {_variable(contents, variable): name for name, variable in (channels or {}).items()}
+    for variable in called:
+        _channel(file, contents, variable)
+    groups = _groups(file, contents)
+    streams: list[dict[str, Any]] = []
+    loaded: list[Samples] = []
+    notes: list[str] = []
+    for name, members in groups.items():
+        columns = {called.get(one, one): contents.entries[one] for one in members}
+        length = len(contents.entries[members[0]])
+        try:
+            timing = timing_of(file, contents, length, rate_hz, members)
+        except RecordingError as error:
+            if not streams and name == list(groups)[-1]:
+                raise
+            notes.append(f"left out {', '.join(members)} ({length:,} samples): {error}")
+            continue
+        notes += timing.notes
+        units = [contents.units.get(one, "") for one in members]
+        facts = {"name": name, "names": list(columns), "units": units, "rate_hz": timing.rate_hz}
+        streams.append({**facts, "start_ns": _start_ns(contents, members, length)})
+        loaded.append(_together(columns, length, timing.rows, narrow=True))
+    return {"streams": streams, "notes": notes}, loaded
+
+
+def _groups(path: Path, contents: Contents) -> dict[str, list[str]]:
+    """Channels that have one time, by the name of their group; the longest group first."""
+    lengths = _lengths(contents)
+    found: dict[tuple[str, float, int], list[str]] = {}
+    for name, length in lengths.items():
+        key = (contents.times.get(name, ""), contents.rates_hz.get(name, 0.0), length)
+        found.setdefault(key, []).append(name)
+    groups: dict[str, list[str]] = {}
+    for (times, rate_hz, length), members in sorted(found.items(), key=lambda one: -one[0][2]):
+        time = None if times else time_column(contents, length)
+        there = [name for name in members if name != time]
+        if not there:
+            continue
+        label = times.removeprefix(GROUP_TIME) if times.startswith(GROUP_TIME) else ""
+        label = label or (f"{rate_hz:g}-hz" if rate_hz else f"{length}-samples") if len(found) > 1 else label
+        groups[label if label not in groups else f"{label}-{len(groups) + 1}"] = there
+    if not groups:
+        _longest(path, contents)  # says what there is instead
+        raise RecordingError(f"{path} holds no channel; it holds {contents.listing()}")
+    return groups
+
+
+def _start_ns(contents: Contents, members: Sequence[str], length: int) -> int | None:
+    """Wall time of the first sample: by a column of dates, or by what the file says of its begin."""
+    stated = ns_of_iso(contents.texts().get(STATED_START, ""))
+    times = contents.times.get(members[0])
+    if times is not None and stated is not None and contents.entries[times].dtype.kind == "f":
+        first_s = float(contents.entries[times][0])
+        return stated + round(first_s * 1e9) if np.isfinite(first_s) else stated
+    dates = [
+        values
+        for values in contents.entries.values()
+        if values.dtype.kind == "M" and values.ndim == 1 and len(values) == length and not np.isnat(values[0])
+    ]
+    if dates:
+        return int(dates[0][0].astype("datetime64[ns]").astype(np.int64))
+    return stated
 
 
 def load_streams(

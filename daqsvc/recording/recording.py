@@ -11,6 +11,7 @@ from daqsvc.confined.limits import ResourceLimits
 from daqsvc.confined.process import ConfinedError, RaisedThereError, shared
 from daqsvc.recording import RecordingError
 from daqsvc.recording.formats import find
+from daqsvc.recording.streams import RecordedStream
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -131,6 +132,45 @@ def load_recording(
     )
     about["names"], about["notes"] = tuple(about["names"]), tuple(about["notes"])
     return Recording(samples=samples, source=path, **about)
+
+
+def load_all(
+    path: Path | str, channels: Mapping[str, str] | None = None, rate_hz: float | None = None
+) -> tuple[list[RecordedStream], list[str]]:
+    """Read all channels of a file, at each rate that it has.
+
+    Args:
+        path: the file, see `load_recording`.
+        channels: what some channels are called from now on, and what they are called in the file; others keep
+            their names.
+        rate_hz: see `load_recording`.
+
+    Returns:
+        The streams, the longest first, large ones in files instead of in memory; and notes as in `Recording`.
+        A stream that the file does not name has its name.
+
+    Raises:
+        RecordingError: see `load_recording`.
+    """
+    path = Path(path)
+    about, samples = _there(
+        "load_all",
+        path,
+        {"channels": None if channels is None else dict(channels), "rate_hz": rate_hz},
+        spill=True,
+    )
+    streams = [
+        RecordedStream(
+            name=one["name"] or path.name.partition(".")[0],
+            rate_hz=one["rate_hz"],
+            names=tuple(one["names"]),
+            units=tuple(one["units"]),
+            samples=taken,
+            start_ns=one["start_ns"],
+        )
+        for one, taken in zip(about["streams"], samples, strict=True)
+    ]
+    return streams, about["notes"]
 
 
 def load_streams(

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from support.examples import first_of
 from support.orbit_files import OPTIONS, UNBALANCE, Orbit
 from support.paths import ROOT
 from support.race_signals import RATE_HZ, SPEED_RPM, strikes
@@ -47,7 +48,7 @@ def assert_whole(figure, least_width=0.75):
     assert max(box.x1 for box in shown) - min(box.x0 for box in shown) >= least_width * page.width
 
 
-@pytest.mark.parametrize("name", ["run.npz", LONG])
+@pytest.mark.parametrize("name", first_of(LONG, "run.npz"))
 def test_figures_of_a_rotor(analyze, drawn, tmp_path, name):
     run = Orbit(400, change=UNBALANCE).save(tmp_path / name)
     code, _, _ = analyze(run, *OPTIONS, "--plot", tmp_path)
@@ -57,7 +58,7 @@ def test_figures_of_a_rotor(analyze, drawn, tmp_path, name):
         assert_whole(figure)
 
 
-@pytest.mark.parametrize("has_mean", [True, False])
+@pytest.mark.parametrize("has_mean", first_of(True, False))
 def test_the_legend_of_innovations_names_lines_that_are_there(analyze, drawn, tmp_path, has_mean):
     orbit = Orbit(400, change=UNBALANCE)
     if has_mean:
@@ -76,7 +77,7 @@ def test_the_legend_of_innovations_names_lines_that_are_there(analyze, drawn, tm
     assert all(np.nanmax(line.get_ydata()) > upper.get_ylim()[0] for line in upper.get_lines())
 
 
-@pytest.mark.parametrize("name", ["run.npz", LONG])
+@pytest.mark.parametrize("name", first_of(LONG, "run.npz"))
 def test_figures_of_a_bearing(analyze, drawn, tmp_path, name):
     path = tmp_path / name
     np.savez(path, de=strikes("inner"), fs=RATE_HZ)

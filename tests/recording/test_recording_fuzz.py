@@ -9,7 +9,7 @@ import can
 import numpy as np
 import pytest
 from support import damaged_recordings
-from support.examples import first_of
+from support.examples import ALL, first_of
 from support.fuzz_bytes import mutated
 from support.orbit_files import OPTIONS, Orbit
 from support.paths import ROOT
@@ -99,9 +99,9 @@ def test_damaged_recordings_cost_a_line_each(tmp_path, capsys, jobs):
     stop_reading()
     sound = Orbit().save(tmp_path / "sound.npz")
     spoilt = []
-    for name, content in STRUCTURES.items():
+    for name in [*STRUCTURES][:: 1 if ALL else 3]:
         spoilt.append(tmp_path / name)
-        spoilt[-1].write_bytes(content)
+        spoilt[-1].write_bytes(STRUCTURES[name])
     files = [*spoilt[:10], sound, *spoilt[10:]]
     code = main(["analyze", *map(str, files), *OPTIONS, "--json", "--jobs", str(jobs)])
     captured = capsys.readouterr()

@@ -19,7 +19,7 @@ import numpy as np
 
 from daqsvc.confined.limits import CountedFile, TooLargeError
 from daqsvc.recording import RecordingError
-from daqsvc.recording.contents import LONGEST_NAME, Contents
+from daqsvc.recording.contents import LONGEST_NAME, LONGEST_TEXT, STATED_START, Contents
 from daqsvc.recording.formats.table_layout import SNIFFED_LINES, is_number, layout_of
 from daqsvc.recording.formats.written_times import in_turn, times_of
 
@@ -38,6 +38,10 @@ if TYPE_CHECKING:
 
 STATEMENT = re.compile(r"#\s*([A-Za-z]\w*)\s*[=:]\s*([-+.\deE]+)\s*")
 """A number in a comment, e.g. ``# fs = 25600``."""
+UNIT = re.compile(r"#\s*unit of (.+?) = (\S.*)")
+"""The unit of a column in a comment, as `daqsvc export` writes it: ``# unit of probe-x = um``."""
+START = re.compile(rf"#\s*{STATED_START} = (\S+)")
+"""The begin in a comment, likewise."""
 
 LONGEST_LINE = 1_000_000
 """Characters; what is longer among the first lines is no table."""
@@ -69,6 +73,8 @@ class _DelimitedTable:
         self._file = file
         self._layout = layout_of(self._first_lines())
         self._stated: dict[str, float] = {}
+        self._units: dict[str, str] = {}
+        self._texts: dict[str, str] = {}
 
     def read(self) -> Contents:
         """What it holds.
@@ -91,7 +97,10 @@ class _DelimitedTable:
         entries |= self._times(len(numbers))
         for name, number in {**layout.scalars, **self._stated}.items():
             entries.setdefault(name, np.array(number))
-        return Contents(entries, is_table=True, has_header=layout.has_header)
+        for name, text in self._texts.items():
+            entries.setdefault(name, np.array(text))
+        units = {name: unit for name, unit in self._units.items() if name in entries}
+        return Contents(entries, is_table=True, has_header=layout.has_header, units=units)
 
     def _times(self, length: int) -> dict[str, NDArray[np.generic]]:
         """The columns of times, datetime64[ns]; a date and the time of the day beside it are one."""
@@ -182,7 +191,12 @@ class _DelimitedTable:
             yield row if empty is None else empty.sub("nan", row.removesuffix("\n"))
 
     def _note(self, comment: str) -> None:
-        stated = STATEMENT.fullmatch(comment.strip())
+        comment = comment.strip()
+        if (unit := UNIT.fullmatch(comment)) is not None and len(self._units) < _MOST_STATEMENTS:
+            self._units.setdefault(unit[1][:LONGEST_TEXT], unit[2][:LONGEST_NAME])
+        if (start := START.fullmatch(comment)) is not None:
+            self._texts.setdefault(STATED_START, start[1][:LONGEST_TEXT])
+        stated = STATEMENT.fullmatch(comment)
         if stated is not None and is_number(stated[2]) and len(self._stated) < _MOST_STATEMENTS:
             self._stated.setdefault(stated[1], float(stated[2]))
 

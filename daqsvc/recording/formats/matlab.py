@@ -11,12 +11,23 @@ import struct
 import zlib
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+
 from daqsvc.recording import RecordingError
-from daqsvc.recording.contents import Contents, check_columns, flattened
+from daqsvc.recording.contents import (
+    STATED_RATE,
+    STATED_START,
+    Contents,
+    check_columns,
+    flattened,
+    names_of_groups,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
     from pathlib import Path
+
+    from numpy.typing import NDArray
 
     from daqsvc.confined.limits import Budget
 
@@ -39,14 +50,56 @@ def read_mat(path: Path, budget: Budget) -> Contents:
         raise RecordingError(
             f"{path} is a MATLAB v7.3 file, which cannot be read; save it in MATLAB with save(..., '-v7')"
         ) from None
+    variables = {name: variable for name, variable in variables.items() if not name.startswith("__")}
+    streams = {name: one for name, variable in variables.items() if (one := _stream(variable)) is not None}
     entries = {
         entry: values
         for name, variable in variables.items()
-        if not name.startswith("__")
+        if name not in streams
         for entry, values in flattened(name, variable)
     }
+    entries |= _with_start(streams)
+    names = names_of_groups([(one.name, name) for one in streams.values() for name in one.channels])
+    channels = [(one, name) for one in streams.values() for name in one.channels]
+    rates_hz, units = {}, {}
+    for entry, (one, name) in zip(names, channels, strict=True):
+        entries[entry], rates_hz[entry] = one.channels[name], one.rate_hz
+        if one.units[name]:
+            units[entry] = one.units[name]
     check_columns(len(entries))
-    return Contents(entries)
+    return Contents(entries, rates_hz=rates_hz, units=units)
+
+
+class _Stream(NamedTuple):
+    """A struct as `daqsvc export` writes it for each stream."""
+
+    name: str
+    rate_hz: float
+    start: str
+    channels: Mapping[str, NDArray[np.generic]]
+    units: Mapping[str, str]
+
+
+def _stream(variable: object) -> _Stream | None:
+    """What a struct of `daqsvc export` holds; None of any other variable."""
+    if not {"fields", "names", "units", "stream", STATED_RATE} <= set(getattr(variable, "_fieldnames", ())):
+        return None
+    lists = [np.atleast_1d(getattr(variable, key)).ravel() for key in ("names", "fields", "units")]
+    try:
+        names, fields, units = ([str(one) if np.size(one) else "" for one in texts] for texts in lists)
+        samples = [np.atleast_1d(getattr(variable, field)) for field in fields]
+        rate_hz = float(getattr(variable, STATED_RATE))
+        start, name = (getattr(variable, key, "") for key in (STATED_START, "stream"))
+        channels = dict(zip(names, samples, strict=True))
+        of_channels = dict(zip(names, units, strict=True))
+    except (AttributeError, TypeError, ValueError):
+        return None
+    return _Stream(f"{name}", rate_hz, f"{start}" if np.size(start) else "", channels, of_channels)
+
+
+def _with_start(streams: Mapping[str, _Stream]) -> dict[str, NDArray[np.generic]]:
+    starts = sorted(one.start for one in streams.values() if one.start)
+    return {STATED_START: np.array(starts[0])} if starts else {}
 
 
 HEADER_BYTES = 128

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import logging
+from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from daqsvc.recording import RecordingError
-from daqsvc.recording.contents import Contents, check_columns, names_of_groups
+from daqsvc.recording.contents import GROUP_TIME, STATED_START, Contents, check_columns, names_of_groups
 from daqsvc.recording.formats.extras import needed
 from daqsvc.recording.formats.mdf_structure import FORMULA, check_mdf_structure
 
@@ -27,6 +28,7 @@ _TIME = 1
 """Kind of a master channel that holds seconds, and not angles or distances."""
 
 _ITEM_BYTES = 8
+_NS_PER_S = 1_000_000_000
 
 
 def read_mdf(path: Path, budget: Budget) -> Contents:
@@ -93,11 +95,21 @@ class _Groups:
             if not mine or master is None:
                 continue
             if self._mdf.groups[g].channels[master].sync_type == _TIME:
-                time = f"time of {label}" if f"time of {label}" not in entries else f"time of group {g}"
+                time = f"{GROUP_TIME}{label}"
+                time = time if time not in entries else f"{GROUP_TIME}group {g}"
                 entries[time] = np.asarray(self._mdf.get_master(g), np.float64)
                 times |= dict.fromkeys(mine, time)
-        entries.setdefault("start_time", np.array(self._mdf.header.start_time.isoformat()))
+        entries.setdefault(STATED_START, np.array(self._start()))
         return Contents(entries, times=times, units=units)
+
+    def _start(self) -> str:
+        """When the recording began, with the nanoseconds that a date of Python's has not."""
+        start, abs_ns = self._mdf.header.start_time, int(self._mdf.header.abs_time)
+        whole = datetime(1970, 1, 1, tzinfo=start.tzinfo or UTC) + timedelta(seconds=abs_ns // _NS_PER_S)
+        if start.tzinfo is not None:
+            whole += start.utcoffset()
+        zone = start.isoformat()[len("2026-01-31T12:00:00") :].lstrip(".0123456789")
+        return f"{whole:%Y-%m-%dT%H:%M:%S}.{abs_ns % _NS_PER_S:09d}{zone}"
 
     def _samples(self, group: int, index: int) -> NDArray[np.generic]:
         samples, invalid = self._mdf.get(

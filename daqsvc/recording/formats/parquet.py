@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from daqsvc.recording import RecordingError
-from daqsvc.recording.contents import Contents, check_columns, column_names
+from daqsvc.recording.contents import STATED_UNIT, Contents, check_columns, column_names
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -60,7 +60,12 @@ def read_parquet(path: Path, budget: Budget) -> Contents:
         name, text = key.decode(), value.decode()
         if name not in OF_LIBRARIES:
             entries.setdefault(name, _scalar(text))
-    return Contents(entries, is_table=True)
+    units = {
+        name: unit.decode()
+        for name, field in zip(column_names(schema.names), schema, strict=True)
+        if (unit := (field.metadata or {}).get(STATED_UNIT.encode()))
+    }
+    return Contents(entries, is_table=True, units=units)
 
 
 def _is_read(kind: Any) -> bool:

@@ -8,7 +8,8 @@ import numpy as np
 
 from daqsvc.acquisition.samples import SampleBlock
 from daqsvc.recording import RecordingError
-from daqsvc.recording.contents import Contents, check_columns
+from daqsvc.recording.contents import STATED_START, Contents, check_columns
+from daqsvc.recording.streams import iso_ns
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -54,15 +55,18 @@ def read_snapshot_channels(path: Path, budget: Budget) -> Contents:
         raise RecordingError(f"{path} holds no samples of any sensor; give another snapshot")
     begin_ns = max(blocks[name][0].t_first_ns for name in fastest)
     entries: dict[str, NDArray[np.generic]] = {}
+    units: dict[str, str] = {}
     for name, one in fastest.items():
         samples = _joined(blocks[name], begin_ns, budget)
         sensors = [sensor or channel for sensor, channel in zip(one["sensors"], one["channels"], strict=True)]
         entries |= dict(zip(sensors, samples.T, strict=True))
+        units |= dict(zip(sensors, map(str, one.get("units", ())), strict=False))
     shortest = min(map(len, entries.values()))
     check_columns(len(entries))
-    return Contents(
-        {name: values[:shortest] for name, values in entries.items()} | {RATE: np.array(float(rate_hz))}
-    )
+    cut = {name: values[:shortest] for name, values in entries.items()} | {RATE: np.array(float(rate_hz))}
+    if isinstance(wall_ns := about.get("wall_ns_at_0"), int):
+        cut[STATED_START] = np.array(iso_ns(wall_ns + begin_ns))
+    return Contents(cut, units={name: unit for name, unit in units.items() if unit})
 
 
 def _joined(blocks: list[SampleBlock], begin_ns: int, budget: Budget) -> NDArray[np.float32]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from daqsvc.recording import RecordingError
-from daqsvc.recording.contents import Contents, check_columns, column_names
+from daqsvc.recording.contents import STATED_RATE, STATED_START, Contents, check_columns, column_names
 from daqsvc.recording.formats.extras import needed
 from daqsvc.recording.rate import rate_of_step
 
@@ -40,6 +41,9 @@ DIRECTIONS = {0: "", 1: "+X", 2: "+Y", 3: "+Z", 4: "+RX", 5: "+RY", 6: "+RZ"} | 
 _STEP_DIGITS = 6
 """Of the time between two samples in an ASCII file: E13.5."""
 
+EXACT = re.compile(rf"(?:{STATED_START} = (\S+), )?{STATED_RATE} = ([\d.e+-]+)")
+"""What `daqsvc export` says in the fourth header line: begin and rate with all their digits."""
+
 _EXPANSION = 2
 """A number of four bytes becomes one of eight."""
 
@@ -69,14 +73,15 @@ def read_uff(path: Path, budget: Budget) -> Contents:
             )
         entries[name] = samples
         if int(one["abscissa_spacing"]) == 1:
-            rates_hz[name] = rate_of_step(float(one["abscissa_inc"]), _STEP_DIGITS)
+            rates_hz[name] = _rate(one)
         else:
             times[name] = f"abscissa of {name}"
             entries[times[name]] = np.asarray(one["x"])
         if unit := _text(one.get("ordinate_axis_units_lab")):
             units[name] = unit
-    if start := _text(sets[0].get("id3")):
-        entries.setdefault("start_time", np.array(start))
+    exact = EXACT.fullmatch(_text(sets[0].get("id4")))
+    if start := (exact and exact[1]) or _text(sets[0].get("id3")):
+        entries.setdefault(STATED_START, np.array(start))
     return Contents(entries, rates_hz=rates_hz, times=times, units=units)
 
 
@@ -85,6 +90,17 @@ def _without_abscissa(one: dict[str, Any]) -> dict[str, Any]:
     if int(one["abscissa_spacing"]) == 1:
         one.pop("x", None)
     return one
+
+
+def _rate(one: Mapping[str, Any]) -> float:
+    """Samples per second by the abscissa, or what is said of them elsewhere where that agrees with it."""
+    rate_hz = rate_of_step(float(one["abscissa_inc"]), _STEP_DIGITS)
+    exact = EXACT.fullmatch(_text(one.get("id4")))
+    try:
+        stated_hz = float(exact[2]) if exact else rate_hz
+    except ValueError:
+        return rate_hz
+    return stated_hz if abs(stated_hz / rate_hz - 1.0) < 10.0 ** (1 - _STEP_DIGITS) else rate_hz
 
 
 def _is_recording(one: Mapping[str, Any]) -> bool:

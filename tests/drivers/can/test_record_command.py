@@ -17,6 +17,7 @@ from support.paths import ROOT
 from support.ports import free_port
 from support.waiting import PATIENCE_S, eventually_blocking
 
+from daqsvc.cli import main
 from daqsvc.commands.arguments import signals_to_end
 from daqsvc.commands.record import ENDINGS
 from sim_hw.bus_socket import UnixBus
@@ -61,12 +62,11 @@ def recording(*arguments: str | Path) -> Iterator[subprocess.Popen[str]]:
         process.communicate()
 
 
-def refused(*arguments: str | Path) -> str:
-    command = [sys.executable, "-m", "daqsvc", "record", *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
-    assert done.returncode == 2
-    assert len(done.stderr.splitlines()) == 1
-    return done.stderr
+def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
+    assert main(["record", *map(str, arguments)]) == 2
+    said = capsys.readouterr().err
+    assert len(said.splitlines()) == 1
+    return said
 
 
 def send(bus: UnixBus, first: int, frames: int) -> None:
@@ -148,17 +148,19 @@ def test_it_ends_after_the_time_that_is_given(bus: UnixBus, machine: Path, tmp_p
     assert bus.recv(0) is None
 
 
-def test_what_cannot_be_recorded_is_said_in_one_line(machine: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_recorded_is_said_in_one_line(
+    machine: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     taken = tmp_path / "taken.blf"
     taken.write_bytes(b"")
-    assert "is there already" in refused(machine, "--out", taken)
-    assert "ends in none of .blf, .asc, .log" in refused(machine, "--out", tmp_path / "run.mf4")
-    assert "there is no folder" in refused(machine, "--out", tmp_path / "nowhere" / "run.log")
+    assert "is there already" in refused(capsys, machine, "--out", taken)
+    assert "ends in none of .blf, .asc, .log" in refused(capsys, machine, "--out", tmp_path / "run.mf4")
+    assert "there is no folder" in refused(capsys, machine, "--out", tmp_path / "nowhere" / "run.log")
     assert "has no CAN bus of this name; CAN buses" in refused(
-        machine, "--bus", "can1", "--out", tmp_path / "run.log"
+        capsys, machine, "--bus", "can1", "--out", tmp_path / "run.log"
     )
     modbus = RIG.parent / "modbus-gap-voltages.toml"
-    assert "there is none" in refused(modbus, "--out", tmp_path / "run.log")
+    assert "there is none" in refused(capsys, modbus, "--out", tmp_path / "run.log")
 
 
 @pytest.mark.long

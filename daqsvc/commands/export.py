@@ -1,0 +1,163 @@
+"""``daqsvc export``: a recording or snapshot as a file of another tool."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_REFUSED, EXIT_USAGE
+from daqsvc.commands.recording_options import add_channel_map, split_files
+from daqsvc.commands.with_kernels import VerbWithKernels
+
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import Mapping, Sequence
+
+    from daqsvc.recording.streams import RecordedStream
+
+
+class ExportCommand(VerbWithKernels):
+    """``daqsvc export [MACHINE] RECORDING --to FILE``."""
+
+    help = "write a recording, CAN log or snapshot as Parquet, CSV, WAV, MATLAB, UFF58 or MDF4"
+    description = (
+        "Write the samples of a recording, or of a snapshot of the service, as a file of another tool: "
+        "Parquet, CSV, WAV, MATLAB, universal file (data sets 58) or MDF 4, by the suffix of FILE. It reads "
+        "whatever daqsvc analyze reads; a CAN log needs the machine file (.toml) in front of it. Names, "
+        "units, rate, begin and gaps go with the samples. Of several streams .mat, .uff and .mf4 hold all; "
+        "of the others a file is written for each, with the stream's name behind that of FILE."
+    )
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """See `daqsvc.cli.Command.add_arguments`."""
+        self._parser = parser
+        parser.epilog = (
+            "Exit code: 0 if it was written, 3 if the recording cannot be read or the format cannot hold it, "
+            "2 for wrong usage or a file that is there, 1 if it cannot be written."
+        )
+        parser.add_argument(
+            "files",
+            nargs="+",
+            metavar="FILE",
+            help="a machine file (.toml) if there is one, then a recording",
+        )
+        parser.add_argument(
+            "--to",
+            type=Path,
+            required=True,
+            metavar="FILE",
+            help="the new file: .parquet, .csv, .wav, .mat, .uff or .mf4",
+        )
+        parser.add_argument("--stream", metavar="NAME", help="this stream only (default: all)")
+        parser.add_argument("--force", action="store_true", help="replace a file that is there")
+        parser.add_argument("--json", action="store_true", help="say what was written as one JSON object")
+        add_channel_map(parser.add_argument)
+
+    def run(self, arguments: argparse.Namespace) -> int:
+        """See `daqsvc.cli.Command.run`."""
+        machine, recordings = split_files(arguments)
+        if len(recordings) > 1 and machine is None and recordings[-1].lower().endswith(".toml"):
+            machine, recordings = Path(recordings[-1]), recordings[:-1]
+        if len(recordings) != 1:
+            self._parser.error(
+                f"{len(recordings)} recordings: name one, with a machine file in front if there is one"
+            )
+        from daqsvc.recording import RecordingError  # noqa: PLC0415 - each verb imports what it needs
+        from daqsvc.recording.recording import set_memory, stop_reading  # noqa: PLC0415
+        from daqsvc.recording.writers import ExportUsageError  # noqa: PLC0415
+
+        set_memory(arguments.max_memory)
+        try:
+            return self._export(arguments, machine, recordings[0])
+        except ExportUsageError as error:
+            return _fail(error, EXIT_USAGE)
+        except RecordingError as error:
+            return _fail(error, EXIT_REFUSED)
+        except OSError as error:
+            # Libraries put words of their own around the reason.
+            why = os.strerror(error.errno) if error.errno else error
+            return _fail(f"{arguments.to} is not written: {why}", EXIT_FAILED)
+        finally:
+            stop_reading()
+
+    def _export(self, arguments: argparse.Namespace, machine: Path | None, recording: str) -> int:
+        """Do it.
+
+        Raises:
+            ExportUsageError: nothing can be written there.
+            RecordingError: it cannot be read, or the format cannot hold it.
+            OSError: it cannot be written.
+        """
+        from daqsvc.offline.exports import read_streams  # noqa: PLC0415 - as above
+        from daqsvc.recording.writers import (  # noqa: PLC0415
+            ExportUsageError,
+            refuse_existing,
+            targets_of,
+            write_all,
+            writer_of,
+        )
+        from daqsvc.settings.problems import choice  # noqa: PLC0415
+
+        writer_of(arguments.to)
+        if not arguments.force:
+            refuse_existing([arguments.to])
+        loaded = None
+        if machine is not None and (loaded := self._load(machine)) is None:
+            return EXIT_USAGE
+        self._prepare_kernel_cache()
+        exported = read_streams(recording, loaded, arguments.map, arguments.fs)
+        streams = exported.streams
+        if arguments.stream is not None:
+            streams = [one for one in streams if one.name == arguments.stream]
+            if not streams:
+                remedy = choice(arguments.stream, [one.name for one in exported.streams])
+                raise ExportUsageError(f"{recording} has no stream {arguments.stream!r}; {remedy}")
+        files = targets_of(arguments.to, streams)
+        notes = exported.notes + write_all(files, exported.about, force=arguments.force)
+        for note in notes:
+            print(f"daqsvc export: {note}", file=sys.stderr)  # noqa: T201 - stdout is for what was written
+        document = _document(files, notes)
+        print(json.dumps(document) if arguments.json else "\n".join(map(_line, document["files"])))  # noqa: T201
+        return EXIT_OK
+
+
+def _document(files: Mapping[Path, Sequence[RecordedStream]], notes: list[str]) -> dict[str, Any]:
+    return {
+        "schema": "daqsvc.export/1",
+        "files": [
+            {
+                "file": str(path),
+                "streams": [
+                    {
+                        "stream": one.name,
+                        "channels": list(one.names),
+                        "units": list(one.units),
+                        "rate_hz": one.rate_hz,
+                        "start_time": one.start or None,
+                        "samples": len(one.samples),
+                        "missing": one.missing(),
+                    }
+                    for one in streams
+                ],
+            }
+            for path, streams in files.items()
+        ],
+        "notes": notes,
+    }
+
+
+def _line(written: dict[str, Any]) -> str:
+    return "\n".join(
+        f"{written['file']}: {one['stream']}, {', '.join(one['channels'])} at {one['rate_hz']:g} Hz, "
+        f"{one['samples'] / one['rate_hz']:.4g} s"
+        + (f", {one['missing']:,} samples missing" if one["missing"] else "")
+        for one in written["streams"]
+    )
+
+
+def _fail(message: object, code: int) -> int:
+    print(f"daqsvc export: {message}", file=sys.stderr)  # noqa: T201 - errors of the command line go to stderr
+    return code
