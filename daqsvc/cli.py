@@ -21,6 +21,8 @@ from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, Argument
 from daqsvc.commands.calibrate import CalibrateCommand
 from daqsvc.commands.detectability import DetectabilityCommand
 from daqsvc.commands.example import ExampleCommand
+from daqsvc.commands.export import ExportCommand
+from daqsvc.commands.fleet import FleetCommand
 from daqsvc.commands.machine_files import load_box
 from daqsvc.commands.record import RecordCommand
 from daqsvc.commands.reload import ReloadCommand
@@ -181,7 +183,9 @@ def commands() -> dict[str, Command]:
         "alarms": AlarmsCommand(load),
         **alarm_verbs(load),
         "analyze": AnalyzeCommand(load, kernel_cache.prepare),
+        "fleet": FleetCommand(),
         "calibrate": CalibrateCommand(load, kernel_cache.prepare),
+        "export": ExportCommand(load, kernel_cache.prepare),
         "detectability": DetectabilityCommand(load, kernel_cache.prepare),
         "example": ExampleCommand(),
         "record": RecordCommand(load, start_logging),

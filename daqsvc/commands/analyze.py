@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
+from daqsvc.commands.analyze_fleet import fleet_misuse, run_fleet
 from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_REFUSED, EXIT_USAGE
 from daqsvc.commands.recording_options import (
     add_analyze_options,
@@ -19,6 +20,7 @@ from daqsvc.commands.recording_options import (
     by_orders,
     split_files,
 )
+from daqsvc.commands.with_kernels import VerbWithKernels
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -32,13 +34,8 @@ _FEW_PER_PROCESS = 3
 """A process of its own costs as much as so many short recordings."""
 
 
-class AnalyzeCommand:
-    """``daqsvc analyze [MACHINE] RECORDING...``.
-
-    Args:
-        load: reads a machine file; None after its errors have been printed.
-        prepare_kernel_cache: says where compiled kernels are kept.
-    """
+class AnalyzeCommand(VerbWithKernels):
+    """``daqsvc analyze [MACHINE] RECORDING...``."""
 
     help = "say what a machine's recordings show: which fault, how sure, since when"
     description = (
@@ -52,12 +49,9 @@ class AnalyzeCommand:
         "--bearing or --orders they say which part of a rolling bearing is damaged. Verdicts: "
         "normal, unbalance, damping_loss, static_load, stiffness_loss, rub, unmodelled (changed, but none "
         "of these), small_change (too small for a name); of a bearing: normal, changed, inner, outer, ball, "
-        "inner_or_outer."
+        "inner_or_outer. With --cluster FILE is the archive of a fleet: a folder or a URL with a folder for "
+        "each machine, which is judged on Dask into a table of Parquet files."
     )
-
-    def __init__(self, load: Load, prepare_kernel_cache: Callable[[], None]) -> None:
-        self._load = load
-        self._prepare_kernel_cache = prepare_kernel_cache
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `Command.add_arguments`."""
@@ -70,6 +64,10 @@ class AnalyzeCommand:
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `Command.run`."""
+        if wrong := fleet_misuse(arguments):
+            self._parser.error(wrong)
+        if arguments.cluster is not None:
+            return run_fleet(arguments)
         machine, recordings = split_files(arguments)
         if wrong := analyze_misuse(arguments, machine, recordings):
             self._parser.error(wrong)

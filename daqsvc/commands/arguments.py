@@ -24,7 +24,7 @@ EXIT_FAILED = 1
 EXIT_USAGE = 2
 """Wrong arguments, or a machine file that cannot be used."""
 EXIT_REFUSED = 3
-"""Of `analyze` and `calibrate`: a recording cannot be judged."""
+"""Of `analyze`, `calibrate` and `export`: a recording cannot be judged, or read."""
 EXIT_LOST = 3
 """Of `run`: something without which the service is useless was lost while it ran."""
 EXIT_HUNG = 4

@@ -1,0 +1,209 @@
+"""``daqsvc fleet report RESULTS``: what the recordings of a fleet say, of each machine and of all."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from daqsvc.commands.analyze_fleet import lacking_extra
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, duration, not_negative
+from daqsvc.commands.tables import aligned, harmless, wrapped
+
+if TYPE_CHECKING:
+    import argparse
+
+    from daqsvc.fleet.report import FleetReport, MachineReport
+
+WIDTH = 100
+_MOST_SHOWN = 20
+"""Lines of a kind; --json has all."""
+_LONGEST_NAME = 24
+_LONGEST_FILE = 36
+
+
+class FleetCommand:
+    """``daqsvc fleet report RESULTS``."""
+
+    help = "what the archive of a fleet shows: changes, missed faults, false alarms and their cost"
+    description = (
+        "Report on the results that daqsvc analyze ARCHIVE --cluster wrote: of each machine where its "
+        "verdict changed, and, against a CSV table of known faults, what was missed, and what false alarms "
+        "there were and what they cost (docs/fleet.md)."
+    )
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """See `daqsvc.cli.Command.add_arguments`."""
+        parser.add_argument("what", choices=("report",), metavar="report", help="what is wanted")
+        parser.add_argument("results", metavar="RESULTS", help="the folder of the results, or its URL")
+        parser.add_argument(
+            "--truth",
+            type=Path,
+            metavar="FILE",
+            help="known faults: a CSV table of machine, fault, first and last (recordings or times)",
+        )
+        parser.add_argument(
+            "--false-alarm-cost", type=not_negative, metavar="N", help="of one false alarm, in any currency"
+        )
+        parser.add_argument(
+            "--interval",
+            type=duration,
+            metavar="TIME",
+            help="how long each recording stands for, e.g. 1d (default: by the dates in their names)",
+        )
+        parser.add_argument("--json", action="store_true", help="one JSON object")
+
+    def run(self, arguments: argparse.Namespace) -> int:
+        """See `daqsvc.cli.Command.run`."""
+        if wrong := lacking_extra():
+            return _fail(wrong)
+        from daqsvc.fleet import FleetError  # noqa: PLC0415 - each verb imports what it needs
+        from daqsvc.fleet.report import fleet_report, read_truth  # noqa: PLC0415
+        from daqsvc.fleet.results import Results  # noqa: PLC0415
+
+        try:
+            truth = None if arguments.truth is None else read_truth(arguments.truth)
+            report = fleet_report(
+                Results(arguments.results),
+                truth,
+                cost=arguments.false_alarm_cost,
+                interval_s=arguments.interval,
+            )
+        except FleetError as error:
+            return _fail(f"{error}")
+        print(json.dumps(report.as_json()) if arguments.json else report_text(report))  # noqa: T201
+        return EXIT_OK
+
+
+def report_text(report: FleetReport) -> str:
+    """The report for a terminal of 100 columns."""
+    parts = [_machines(report), _changes(report)]
+    if report.has_truth:
+        parts += [_missed(report), _false_alarms(report)]
+    parts += [_not_judged(report), _fleet(report)]
+    return "\n\n".join(part for part in parts if part)
+
+
+def _machines(report: FleetReport) -> str:
+    titles = ["machine", "judged", "now", "alarms"]
+    if report.has_truth:
+        titles += ["faults", "missed", "false"]
+    # A machine of which there is something to say first, so that a fleet of thousands fits.
+    told = sorted(report.machines, key=lambda one: not _is_remarkable(one))
+    rows = []
+    for one in told[:_MOST_SHOWN]:
+        row = [
+            _short(one.machine),
+            f"{one.judged} of {one.recordings}",
+            _short(one.now or "-"),
+            f"{len(one.alarms)}",
+        ]
+        if report.has_truth:
+            row += [f"{len(one.seen)}", f"{len(one.missed)}", f"{len(one.false_alarms)}"]
+        rows.append(row)
+    return aligned(titles, rows) + _more(len(told), "machines")
+
+
+def _is_remarkable(one: MachineReport) -> bool:
+    return bool(one.alarms or one.missed or one.judged < one.recordings)
+
+
+def _changes(report: FleetReport) -> str:
+    """Where a verdict is not that of the machine's recording before; a first normal one is no news."""
+    rows = [
+        [
+            _short(one.machine),
+            _short(change.file, _LONGEST_FILE),
+            f"{change.before or 'none'} -> {change.now}",
+        ]
+        for one in report.machines
+        for change in one.changes
+        if change.before is not None or change.now != "normal"
+    ]
+    if not rows:
+        return "No verdict changed."
+    return aligned(["changed", "at", "verdict"], rows[:_MOST_SHOWN], WIDTH) + _more(len(rows), "changes")
+
+
+def _missed(report: FleetReport) -> str:
+    rows = [
+        [
+            _short(one.machine),
+            _short(seen.fault.fault),
+            f"{seen.fault.first or 'first'} to {seen.fault.last or 'last'}, {seen.recordings} recordings",
+        ]
+        for one in report.machines
+        for seen in one.missed
+    ]
+    if not rows:
+        return "No known fault was missed."
+    return aligned(["missed", "fault", "from"], rows[:_MOST_SHOWN], WIDTH) + _more(len(rows), "faults")
+
+
+def _false_alarms(report: FleetReport) -> str:
+    rows = [
+        [_short(one.machine), _short(file, 2 * _LONGEST_FILE)]
+        for one in report.machines
+        for file in one.false_alarms
+    ]
+    if not rows:
+        return "No false alarm."
+    return aligned(["false alarm", "from"], rows[:_MOST_SHOWN], WIDTH) + _more(len(rows), "false alarms")
+
+
+def _not_judged(report: FleetReport) -> str:
+    rows = [
+        # A long path in a reason must not make the line longer than the terminal.
+        [
+            _short(one.machine),
+            f"{number}",
+            " ".join(_short(word, 2 * _LONGEST_NAME) for word in reason.split()),
+        ]
+        for one in report.machines
+        for reason, number in one.reasons.most_common()
+    ]
+    if not rows:
+        return ""
+    return aligned(["not judged", "times", "reason"], rows[:_MOST_SHOWN], WIDTH) + _more(len(rows), "reasons")
+
+
+def _fleet(report: FleetReport) -> str:
+    fleet = report.as_json()["fleet"]
+    years = "times not known" if report.years is None else f"{report.years:,.3g} machine-years"
+    judged = f"{fleet['judged']:,} of {fleet['recordings']:,} recordings judged"
+    lines = [f"Fleet: {fleet['machines']:,} machines, {judged}, {years}, {fleet['alarms']:,} alarms"]
+    if report.has_truth:
+        lines.append(
+            f"{fleet['known_faults']:,} known faults, {fleet['missed']:,} missed, "
+            f"{fleet['without_recordings']:,} without a recording that was judged; "
+            f"false alarms: {report.false_alarms:,}"
+        )
+        rate = report.false_alarms_per_year
+        if rate is None:
+            lines.append(
+                "How many that is a year is not known: dates in the names, or --interval, would tell"
+            )
+        else:
+            cost = report.cost_per_year
+            lines.append(
+                f"{rate:,.3g} false alarms a machine and year"
+                + ("" if cost is None else f", at {report.cost:,.10g} each they cost {cost:,.0f}")
+            )
+    if report.unknown:
+        lines.append(f"Of known faults there are no results of: {', '.join(report.unknown[:5])}")
+    return "\n".join(line for text in lines for line in wrapped(harmless(text), WIDTH))
+
+
+def _more(number: int, what: str) -> str:
+    return f"\n... of {number:,} {what}; --json has all" if number > _MOST_SHOWN else ""
+
+
+def _short(text: str, longest: int = _LONGEST_NAME) -> str:
+    """A text that leaves room for others; the end of a long name tells more than its beginning."""
+    return text if len(text) <= longest else f"...{text[3 - longest :]}"
+
+
+def _fail(message: str) -> int:
+    print(f"daqsvc fleet: {message}", file=sys.stderr)  # noqa: T201 - errors of the command line go to stderr
+    return EXIT_FAILED

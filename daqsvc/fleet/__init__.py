@@ -1,0 +1,5 @@
+"""The archive of a fleet: the recordings of many machines, judged on Dask into one table."""
+
+
+class FleetError(Exception):
+    """An archive, a cluster or a table of results cannot be used; the text says why, and what to do."""

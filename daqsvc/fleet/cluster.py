@@ -1,0 +1,94 @@
+"""The cluster that judges: one of this computer's processes, or one that somebody has started."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import tempfile
+from typing import TYPE_CHECKING, Any
+
+from daqsvc.fleet import FleetError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+CONNECT_S = 15.0
+"""How long a scheduler, and then its first worker, is waited for."""
+_LOCAL = re.compile(r"local(?::([1-9][0-9]{0,2}))?")
+_REMOTE = re.compile(r"(tcp|tls|ws|wss|ucx)://[^/\s]+")
+
+
+def cluster_problem(name: str) -> str:
+    """What is wrong with the name of a cluster; empty if nothing is."""
+    if _LOCAL.fullmatch(name) or _REMOTE.fullmatch(name):
+        return ""
+    return f"{name!r} is no cluster; write local, local:N with up to 999 workers, or tcp://scheduler:8786"
+
+
+@contextlib.contextmanager
+def connected(name: str, cores: int) -> Iterator[Any]:
+    """A client of the cluster, for as long as it is needed.
+
+    Args:
+        name: ``local``, ``local:N`` with N workers, or the address of a scheduler.
+        cores: workers of ``local``.
+
+    Raises:
+        FleetError: there is nobody, or nobody who works.
+    """
+    local = _LOCAL.fullmatch(name)
+    if local is None:
+        with _remote(name) as client:
+            yield client
+        return
+    with _local(int(local[1] or cores)) as client:
+        yield client
+
+
+@contextlib.contextmanager
+def _local(workers: int) -> Iterator[Any]:
+    """Processes that only this one can talk to: on loopback, by certificates of their own."""
+    import dask  # noqa: PLC0415 - of the extra
+    from distributed import Client, LocalCluster  # noqa: PLC0415
+
+    with (
+        # Who starts a worker anew is itself given up if that takes longer, as on a busy computer.
+        dask.config.set({"distributed.deploy.lost-worker-timeout": "10 minutes"}),
+        tempfile.TemporaryDirectory(prefix="daqsvc-fleet-", ignore_cleanup_errors=True) as folder,
+        LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            host="127.0.0.1",
+            dashboard_address="127.0.0.1:0",
+            worker_dashboard_address=None,
+            local_directory=folder,
+            security=True,
+            silence_logs="CRITICAL",
+        ) as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+        yield client
+
+
+@contextlib.contextmanager
+def _remote(address: str) -> Iterator[Any]:
+    from distributed import Client  # noqa: PLC0415 - of the extra
+
+    try:
+        client = Client(address, timeout=CONNECT_S, set_as_default=False)
+    except (OSError, ValueError, TypeError, RuntimeError) as error:
+        # The libraries below say why in several lines, and of an address without a port by a TypeError.
+        why = " ".join(f"{error}".split())[:200]
+        raise FleetError(
+            f"no Dask scheduler answers at {address} ({why}); start one there (dask scheduler), or use "
+            "--cluster local"
+        ) from None
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=CONNECT_S)
+        except TimeoutError:
+            raise FleetError(
+                f"the scheduler at {address} has no worker; start one: dask worker {address} --nthreads 1"
+            ) from None
+        yield client

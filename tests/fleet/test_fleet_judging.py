@@ -1,0 +1,149 @@
+"""What a worker makes of recordings, in this process: rows as `daqsvc analyze` would have it."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from support.file_bombs import write as write_bomb
+from support.fleet_archives import add_hostile, add_machine, add_recordings
+from support.orbit_files import Orbit
+
+import daqsvc
+from daqsvc.confined.limits import ResourceLimits
+from daqsvc.diagnosis.recorded import RecordingOptions
+from daqsvc.fleet.archive import Archive
+from daqsvc.fleet.judging import Judged, OtherVersionError, RecordingBatch, describe_machine, judge_batch
+from daqsvc.fleet.table import COLUMNS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+pytestmark = pytest.mark.integration
+
+
+def batch_of(
+    url: str, machine: str = "pump", version: str = daqsvc.__version__, **known: Any
+) -> RecordingBatch:
+    archive = Archive(url)
+    found = archive.machine(machine)
+    assert found is not None
+    options = RecordingOptions()
+    digest, wrong = describe_machine(archive, found, options)
+    limits = ResourceLimits(1_000_000_000)
+    description, recordings = found.description, found.recordings
+    return RecordingBatch(
+        url, machine, description, digest, wrong, options, limits, version, recordings, known.get("known", {})
+    )
+
+
+def by_file(judged: Judged) -> dict[str, dict[str, Any]]:
+    return {row["file"]: row for row in judged.rows}
+
+
+def test_a_row_is_what_analyze_says_of_the_recording(analyze: Callable[..., Any], tmp_path: Path) -> None:
+    add_recordings(add_machine(tmp_path, "pump"), 2, changed_from=1)
+    found = by_file(judge_batch(batch_of(str(tmp_path))))
+    files = sorted(tmp_path.glob("pump/recordings/*"))
+    _, told, _ = analyze(tmp_path / "pump" / "machine.toml", *files)
+    assert [one["verdict"] for one in told] == ["normal", "unbalance"]
+    for file, one in zip(files, told, strict=True):
+        row = found[file.name]
+        one["recording"] = f"pump/recordings/{file.name}"
+        assert json.loads(row["analysis"]) == one
+        assert tuple(row) == COLUMNS
+        assert (row["verdict"], row["group"]) == (one["verdict"], one["group"])
+        assert row["probability"] == one["probabilities"][one["verdict"]]
+        assert (row["judged"], row["reason"], row["size_bytes"]) == (True, None, file.stat().st_size)
+    assert found["2026-03-02.npz"]["alarms"] == 1
+    assert found["2026-03-02.npz"]["recorded"].isoformat() == "2026-03-02T00:00:00+00:00"
+
+
+def test_a_file_that_is_corrupt_cut_hostile_or_enormous_costs_its_row(tmp_path: Path) -> None:
+    recordings = add_machine(tmp_path, "pump")
+    reasons = add_hostile(recordings)
+    found = by_file(judge_batch(batch_of(str(tmp_path))))
+    assert found.pop("sound.npz")["verdict"] == "normal"
+    assert set(found) == set(reasons)
+    for file, part in reasons.items():
+        assert found[file]["judged"] is False
+        assert found[file]["reason"]
+        assert part in found[file]["reason"], file
+        assert str(tmp_path) not in found[file]["reason"], file
+
+
+def test_a_store_of_objects_gives_the_same_rows(tmp_path: Path) -> None:
+    import fsspec
+
+    recordings = add_machine(tmp_path, "pump")
+    add_recordings(recordings, 1)
+    write_bomb(recordings, "a.npz")
+    store = fsspec.filesystem("memory")
+    store.put(str(tmp_path / "pump"), "/fleet-of-rows/pump", recursive=True)
+    try:
+        here = by_file(judge_batch(batch_of(str(tmp_path))))
+        there = by_file(judge_batch(batch_of("memory://fleet-of-rows")))
+    finally:
+        store.rm("/fleet-of-rows", recursive=True)
+    assert len(here) == 2
+    for file, row in here.items():
+        assert {**row, "stamp": ""} == {**there[file], "stamp": ""}
+
+
+def test_a_machine_file_that_cannot_be_used_costs_the_rows_of_its_machine(tmp_path: Path) -> None:
+    recordings = add_machine(tmp_path, "pump")
+    add_recordings(recordings, 2)
+    machine = tmp_path / "pump" / "machine.toml"
+    machine.write_text(machine.read_text().replace("rate_hz = 1600.0", "rate_hz = -1.0"))
+    rows = judge_batch(batch_of(str(tmp_path))).rows
+    assert [row["judged"] for row in rows] == [False, False]
+    assert all("pump/machine.toml" in row["reason"] and "rate_hz" in row["reason"] for row in rows)
+    assert all(str(tmp_path) not in row["reason"] for row in rows)
+    machine.unlink()
+    rows = judge_batch(batch_of(str(tmp_path))).rows
+    assert ["has no machine.toml" in row["reason"] for row in rows] == [True, True]
+
+
+def test_what_holds_what_it_held_is_not_judged_again(tmp_path: Path) -> None:
+    recordings = add_machine(tmp_path, "pump")
+    add_recordings(recordings, 2)
+    first = judge_batch(batch_of(str(tmp_path)))
+    known = {row["file"]: row["digest"] for row in first.rows}
+    Orbit(seed=50).save(recordings / "2026-03-02.npz")
+    again = judge_batch(batch_of(str(tmp_path), known=known))
+    assert list(by_file(again)) == ["2026-03-02.npz"]
+    assert list(again.unchanged) == ["2026-03-01.npz"]
+
+
+def test_the_digest_of_a_machine_is_of_all_that_lies_beside_its_file(tmp_path: Path) -> None:
+    recordings = add_machine(tmp_path, "pump")
+    add_recordings(recordings, 1)
+    digests = [batch_of(str(tmp_path)).machine_digest]
+    (recordings / "notes.txt").write_text("a recording more or less is not the machine")
+    assert batch_of(str(tmp_path)).machine_digest == digests[0]
+    for text in ("a", "b"):
+        (tmp_path / "pump" / "healthy.toml").write_text(text)
+        digests.append(batch_of(str(tmp_path)).machine_digest)
+    assert len(set(digests)) == 3
+
+
+def test_can_logs_of_a_folder_are_one_recording(tmp_path: Path) -> None:
+    recordings = add_machine(tmp_path, "pump")
+    for name in ("monday/can0.blf", "monday/can1.blf", "single.log", "monday/run.npz"):
+        (recordings / name).parent.mkdir(exist_ok=True)
+        (recordings / name).write_bytes(b"x")
+    found = Archive(str(tmp_path)).machine("pump")
+    assert found is not None
+    assert sorted((one.file, len(one.parts)) for one in found.recordings) == [
+        ("monday", 2),
+        ("monday/run.npz", 1),
+        ("single.log", 1),
+    ]
+
+
+def test_another_version_of_a_worker_judges_nothing(tmp_path: Path) -> None:
+    add_machine(tmp_path, "pump")
+    with pytest.raises(OtherVersionError, match=r"a worker has daqsvc .* and this is 0\.0\.9"):
+        judge_batch(batch_of(str(tmp_path), version="0.0.9"))

@@ -1,0 +1,152 @@
+"""``daqsvc fleet report``: changes, missed faults, false alarms and what they cost, from a table made up."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from daqsvc.cli import main
+from daqsvc.fleet.report import natural
+from daqsvc.fleet.results import Results, folder_of
+from daqsvc.fleet.table import COLUMNS, recorded_at
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+FAN = "nnnnunnuuu"
+"""A day each: a false alarm on the fifth, and an unbalance that is real from the eighth on."""
+PUMP = "nnnnnnnn-n"
+"""One that could not be judged; a fault that nobody saw."""
+WORDS = {"n": "normal", "u": "unbalance", "i": "inner"}
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> Path:
+    """Two machines."""
+    place = tmp_path / "results"
+    for machine, days in (("fan", FAN), ("pump", PUMP)):
+        Results(str(place)).add(
+            [row(machine, day, code) for day, code in enumerate(days, 1)], folder_of(machine)
+        )
+    return place
+
+
+@pytest.fixture
+def truth(tmp_path: Path) -> Path:
+    """What is known of them."""
+    file = tmp_path / "truth.csv"
+    file.write_text(
+        "machine, fault, first, last\n"
+        "fan,unbalance,2026-03-08.npz,\n"
+        "pump,crack,2026-03-05,2026-03-07\n"
+        "pump,looseness,2027-01-01,\n"
+        "mixer,rub,,\n"
+    )
+    return file
+
+
+def row(machine: str, day: int, code: str) -> dict[str, Any]:
+    file = f"2026-03-{day:02}.npz"
+    values = {"machine": machine, "file": file, "recorded": recorded_at(file), "judged": code != "-"}
+    if code == "-":
+        return {**dict.fromkeys(COLUMNS), **values, "reason": f"{file} is cut"}
+    return {**dict.fromkeys(COLUMNS), **values, "verdict": WORDS[code], "group": [WORDS[code]]}
+
+
+def test_changes_misses_false_alarms_and_cost(verb: Callable[..., Any], results: Path, truth: Path) -> None:
+    code, (said,), err = verb("fleet", "report", results, "--truth", truth, "--false-alarm-cost", 2000)
+    assert (code, err) == (0, "")
+    fan, pump = said["machines"]
+    assert fan["changes"] == [
+        {"file": "2026-03-01.npz", "before": None, "now": "normal"},
+        {"file": "2026-03-05.npz", "before": "normal", "now": "unbalance"},
+        {"file": "2026-03-06.npz", "before": "unbalance", "now": "normal"},
+        {"file": "2026-03-08.npz", "before": "normal", "now": "unbalance"},
+    ]
+    assert fan["alarms"] == ["2026-03-05.npz", "2026-03-08.npz"]
+    assert fan["false_alarms"] == ["2026-03-05.npz"]
+    (unbalance,) = fan["known_faults"]
+    assert (unbalance["recordings"], unbalance["alarming"], unbalance["named"]) == (3, 3, 3)
+    assert (unbalance["first_alarm"], unbalance["missed"]) == ("2026-03-08.npz", False)
+    crack, looseness = pump["known_faults"]
+    assert (crack["recordings"], crack["first_alarm"], crack["missed"]) == (3, None, True)
+    assert (looseness["recordings"], looseness["missed"]) == (0, False)
+    assert pump["not_judged"] == {"2026-03-09.npz is cut": 1}
+    fleet = said["fleet"]
+    assert (fleet["recordings"], fleet["judged"], fleet["alarms"]) == (20, 19, 2)
+    assert (fleet["known_faults"], fleet["missed"], fleet["without_recordings"]) == (3, 1, 1)
+    assert fleet["machine_years"] == pytest.approx(20 / 365.25)
+    assert fleet["false_alarms_per_machine_year"] == pytest.approx(365.25 / 20)
+    assert fleet["false_alarm_cost_per_machine_year"] == pytest.approx(2000 * 365.25 / 20)
+    assert fleet["unknown_machines"] == ["mixer"]
+
+
+def test_the_text_fits_a_terminal_of_100_columns(
+    results: Path, truth: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    long = "x" * 150 + "-2026-03-11.npz"
+    told = {**row("fan", 11, "i"), "file": long, "machine": "fan"}
+    Results(str(results)).add([told], folder_of("fan"))
+    arguments = ["fleet", "report", str(results), "--truth", str(truth), "--false-alarm-cost", "2000"]
+    assert main(arguments) == 0
+    text = capsys.readouterr().out
+    assert max(map(len, text.splitlines())) <= 100
+    for part in (
+        "unbalance -> inner",
+        "pump    crack  2026-03-05 to 2026-03-07, 3 recordings",
+        "false alarm",
+        "Fleet: 2 machines, 20 of 21 recordings judged",
+        "3 known faults, 1 missed, 1 without a recording",
+        "at 2,000 each they cost 34,786",
+        "no results of: mixer",
+    ):
+        assert part in text, text
+
+
+def test_without_truth_nothing_is_called_false(verb: Callable[..., Any], results: Path) -> None:
+    _, (said,), _ = verb("fleet", "report", results, "--interval", "1h")
+    assert [one["false_alarms"] for one in said["machines"]] == [[], []]
+    assert said["fleet"]["false_alarms"] is said["fleet"]["missed"] is None
+    assert said["fleet"]["machine_years"] == pytest.approx(20 / 24 / 365.25)
+
+
+def test_the_bearings_of_a_machine_count_as_well(verb: Callable[..., Any], tmp_path: Path) -> None:
+    rows = [row("fan", day, "n") for day in (1, 2, 3)]
+    rows[1].update(bearing_verdict="outer", bearing_group=["outer"])
+    rows[2].update(verdict="rub", bearing_verdict="outer")
+    Results(str(tmp_path)).add(rows, folder_of("fan"))
+    _, (said,), _ = verb("fleet", "report", tmp_path)
+    assert [one["now"] for one in said["machines"][0]["changes"]] == ["normal", "outer", "rub and outer"]
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("pump,crack\n", "has no column machine; its first line names machine, fault, first, last"),
+        ("machine,fault\n,crack\n", "line 2: machine or fault is empty"),
+        ('machine,fault\npump,"crack\n', "is no CSV table"),
+        (b"machine,fault\n\xff\n", "it is no text in UTF-8"),
+        (None, "No such file or directory"),
+    ],
+)
+def test_a_table_of_faults_that_cannot_be_read_is_named(
+    verb: Callable[..., Any], results: Path, tmp_path: Path, text: str | bytes | None, why: str
+) -> None:
+    file = tmp_path / "bad.csv"
+    if text is not None:
+        file.write_bytes(text if isinstance(text, bytes) else text.encode())
+    code, said, err = verb("fleet", "report", results, "--truth", file)
+    assert (code, said) == (1, [])
+    assert why in err
+
+
+def test_a_folder_without_results_is_named(verb: Callable[..., Any], tmp_path: Path) -> None:
+    code, _, err = verb("fleet", "report", tmp_path / "none")
+    assert code == 1
+    assert "holds no results; give the folder that daqsvc analyze --cluster wrote" in err
+
+
+def test_numbers_in_names_count() -> None:
+    assert sorted(["run-10", "run-9", "run-9b", "a"], key=natural) == ["a", "run-9", "run-9b", "run-10"]
