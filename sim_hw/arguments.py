@@ -37,7 +37,8 @@ def add_recording(group: Group) -> None:
         "--recording",
         type=Path,
         metavar="FILE",
-        help="play a measured recording (.npz, .mat, .csv[.gz], .wav, .parquet) instead of a scenario",
+        help="play a measured recording instead of a scenario: whatever daqsvc analyze reads, CAN logs and "
+        "snapshots too",
     )
     group.add_argument(
         "--map",

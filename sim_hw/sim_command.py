@@ -249,10 +249,17 @@ def _script(
     faults = None if scenario is None else scenario.node_faults(arguments.seed)
     signals: Signals
     if arguments.recording is not None:
-        from daqsvc.recording.recording import load_recording, set_memory, stop_reading  # noqa: PLC0415
+        from daqsvc.recording.recording import set_memory, stop_reading  # noqa: PLC0415
+        from sim_hw.recordings import load_played  # noqa: PLC0415
 
         set_memory(arguments.max_memory)
-        recording = load_recording(arguments.recording, arguments.map, arguments.fs)
+        recording = load_played(
+            arguments.recording,
+            arguments.map,
+            arguments.fs,
+            machine if is_machine else None,
+            "name that in place of the scenario",
+        )
         stop_reading()
         for note in recording.notes:
             logging.getLogger(__name__).warning("%s: %s", recording.source, note)

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from types import FrameType
 
     from daqsvc.recording.recording import Recording
+    from daqsvc.settings import MachineFile
     from sim_hw.demo.machines import AlarmLimits
     from sim_hw.demo.session import DemoOutcome, Received, Script
     from sim_hw.scenario import BearingScenario
@@ -56,6 +57,12 @@ class DemoCommand:
         )
         add_random(what)
         add_recording(what)
+        what.add_argument(
+            "--machine",
+            type=Path,
+            metavar="FILE",
+            help="the machine file that knows the layout of the frames, where the recording is a CAN log",
+        )
         what.add_argument("--unit", choices=UNITS, help="unit of the recording's channels (default: g)")
         what.add_argument(
             "--baseline",
@@ -85,6 +92,13 @@ class DemoCommand:
             type=broker_url,
             metavar="URL",
             help="publish to this broker, mqtt://HOST[:PORT], without TLS (default: one in the process)",
+        )
+        how.add_argument(
+            "--snapshots",
+            type=Path,
+            metavar="DIR",
+            help="keep the snapshots that alarms leave in this folder, for daqsvc replay "
+            "(default: they go with the demo)",
         )
         how.add_argument(
             "--json",
@@ -187,7 +201,11 @@ def _play(script: Script, arguments: argparse.Namespace) -> dict[str, Any]:
 
     def play(on_message: Callable[[Received], None]) -> DemoOutcome:
         session = DemoSession(
-            script, speed=arguments.speed, broker_url=arguments.broker, on_message=on_message
+            script,
+            speed=arguments.speed,
+            broker_url=arguments.broker,
+            on_message=on_message,
+            snapshots=arguments.snapshots,
         )
         return asyncio.run(_interruptible(session.run()))
 
@@ -201,6 +219,7 @@ def _play(script: Script, arguments: argparse.Namespace) -> dict[str, Any]:
         outcome = play(view.on_message)
     summary = summarise(script, outcome, speed=arguments.speed)
     view.show_summary(summary)
+    view.show_snapshots(summary)
     return summary
 
 
@@ -285,12 +304,17 @@ def _from_recording(arguments: argparse.Namespace) -> Script:
     from sim_hw.demo.session import Script  # noqa: PLC0415
 
     set_memory(arguments.max_memory)
-    recording = playable(_load(arguments.recording, arguments.map, arguments.fs, "--map"))
+    machine = None
+    if arguments.machine is not None:
+        from daqsvc.settings import load_machine_file  # noqa: PLC0415
+
+        machine = load_machine_file(arguments.machine)
+    recording = playable(_load(arguments.recording, arguments.map, arguments.fs, "--map", machine))
     limits: AlarmLimits = {}
     if arguments.baseline is not None:
         rate_hz = arguments.baseline_fs or arguments.fs
         healthy = _load(
-            arguments.baseline, arguments.baseline_map or arguments.map, rate_hz, "--baseline-map"
+            arguments.baseline, arguments.baseline_map or arguments.map, rate_hz, "--baseline-map", machine
         )
         healthy = playable(healthy)
         limits = setpoints(healthy, recording.rate_hz)
@@ -315,10 +339,16 @@ def _from_recording(arguments: argparse.Namespace) -> Script:
     )
 
 
-def _load(path: Path, channels: Mapping[str, str] | None, rate_hz: float | None, option: str) -> Recording:
-    from daqsvc.recording.recording import load_recording  # noqa: PLC0415
+def _load(
+    path: Path,
+    channels: Mapping[str, str] | None,
+    rate_hz: float | None,
+    option: str,
+    machine: MachineFile | None,
+) -> Recording:
+    from sim_hw.recordings import load_played  # noqa: PLC0415
 
-    recording = load_recording(path, channels, rate_hz)
+    recording = load_played(path, channels, rate_hz, machine, "name that with --machine")
     if recording.left_out:
         left_out = ", ".join(f"{name} ({length} samples)" for name, length in recording.left_out.items())
         _say(
@@ -334,6 +364,7 @@ OF_RECORDINGS = (
     "map",
     "fs",
     "max_memory",
+    "machine",
     "unit",
     "baseline",
     "baseline_map",

@@ -189,6 +189,9 @@ ring_s = 10.0
 [pipeline.levels]
 window_s = 0.5
 velocity_band_hz = [10.0, {min(1000.0, 0.4 * recording.rate_hz)!r}]
+[recorder]
+after_s = 5.0
+max_mb = 100
 [mqtt]
 url = "{url}"
 insecure = true

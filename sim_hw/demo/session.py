@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import json
 import logging
+import shutil
 import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,7 +22,9 @@ import can
 from daqsvc.acquisition.clock import DrivenClock, SystemClock
 from daqsvc.box import Box
 from daqsvc.detectors.rotor_bank.settings import ROTOR_BANK
+from daqsvc.recorder import FOLDER
 from daqsvc.service import Service
+from daqsvc.snapshots.contents import SUFFIX
 from drivers.can.plugin import frame_layout
 from drivers.fields import LayoutError
 from sim_hw.demo.broker import EmbeddedBroker
@@ -188,6 +191,8 @@ class DemoOutcome:
         complete: whether the consumer received the last message of the service.
         alarms: alarm events that it got.
         real_s: how long the playing took.
+        snapshots: files of the snapshots that alarms have left, and that are kept.
+        snapshots_gone: how many are not kept, as nobody has asked for them.
     """
 
     diagnoses: list[dict[str, Any]] = field(default_factory=list)
@@ -200,6 +205,8 @@ class DemoOutcome:
     complete: bool = False
     alarms: int = 0
     real_s: float = 0.0
+    snapshots: list[Path] = field(default_factory=list)
+    snapshots_gone: int = 0
 
 
 class DemoSession:
@@ -210,6 +217,7 @@ class DemoSession:
         speed: simulated over real time; 1 for real time, on the real clock.
         broker_url: an MQTT broker; None to start one inside the process.
         on_message: called with each message that came back from the broker.
+        snapshots: where the snapshots are kept that alarms leave; None: they go with the demo.
     """
 
     def __init__(
@@ -219,6 +227,7 @@ class DemoSession:
         speed: float,
         broker_url: str | None,
         on_message: Callable[[Received], None],
+        snapshots: Path | None = None,
     ) -> None:
         self.script = script
         self.speed = speed
@@ -227,12 +236,14 @@ class DemoSession:
         self.outcome = DemoOutcome()
         self._broker_url = broker_url
         self._on_message = on_message
+        self._snapshots = snapshots
 
     async def run(self) -> DemoOutcome:
         """Play it from the beginning to the end.
 
         Raises:
-            DemoError: the broker cannot be reached or was lost, or the service did not start.
+            DemoError: the broker cannot be reached or was lost, the service did not start, or there is no
+                folder for the snapshots.
             Exception: what ``on_message`` raised; the service has been stopped.
         """
         async with contextlib.AsyncExitStack() as stack:
@@ -241,6 +252,8 @@ class DemoSession:
                 url = (await stack.enter_async_context(EmbeddedBroker())).url
             machine = self.script.machine(url)
             store = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="daqsvc-demo-")))
+            # Also of what is broken off.
+            stack.push_async_callback(self._keep_snapshots, await asyncio.to_thread(self._folder), store)
             listener = Listener(url, f"daqsvc/{machine.site}/{machine.box}", self._take)
             listening = await stack.enter_async_context(_task(listener.run()))
             await _first(listener.subscribed(), listening, f"the broker {url} does not answer", LINK_UP_S)
@@ -254,6 +267,34 @@ class DemoSession:
                 ) from error
             self.outcome.messages = listener.messages
         return self.outcome
+
+    def _folder(self) -> Path | None:
+        """Make the folder for snapshots, if they are to be kept; blocks.
+
+        Raises:
+            DemoError: it cannot be made.
+        """
+        if self._snapshots is not None:
+            try:
+                self._snapshots.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                named = f"--snapshots: the folder {self._snapshots}"
+                raise DemoError(f"{named} cannot be made: {error.strerror}; name another") from error
+        return self._snapshots
+
+    async def _keep_snapshots(self, folder: Path | None, store: Path) -> None:
+        made = sorted((store / FOLDER).glob(f"*{SUFFIX}"))
+        if folder is None:
+            self.outcome.snapshots_gone = len(made)
+            return
+        try:
+            for one in made:
+                kept = await asyncio.to_thread(shutil.move, one, folder / one.name)
+                self.outcome.snapshots.append(Path(kept))
+        except OSError as error:
+            raise DemoError(
+                f"--snapshots: {folder} does not take the snapshots: {error.strerror}; name another folder"
+            ) from error
 
     async def _serve(self, machine: MachineFile, store: Path) -> None:
         clock = SystemClock() if self.speed == 1 else DrivenClock()
@@ -453,6 +494,8 @@ def summarise(script: Script, outcome: DemoOutcome, *, speed: float) -> dict[str
         "loop_lag_ms": figures["loop_lag_ms"],
         "alarm_events": outcome.alarms,
         "messages": outcome.messages,
+        "snapshots": [f"{path}" for path in outcome.snapshots],
+        "snapshots_gone": outcome.snapshots_gone,
         "complete": outcome.complete,
     }
 

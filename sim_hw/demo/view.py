@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections import deque
 from typing import TYPE_CHECKING, Any
 
@@ -251,6 +252,18 @@ class View:
             f"{summary['alarm_events']} alarm events among {summary['messages']} messages "
             f"through the broker; {summary['simulated_s']:.1f} s played in {summary['real_s']:.1f} s"
         )
+
+    def show_snapshots(self, summary: dict[str, Any]) -> None:
+        """Print where the snapshots of alarms are, and what they are good for."""
+        for path in summary["snapshots"]:
+            self._console.print("snapshot of an alarm, to be judged again with:")
+            # A line that can be copied, however long it is.
+            self._console.print(f"daqsvc replay {shlex.quote(path)}", soft_wrap=True)
+        if gone := summary["snapshots_gone"]:
+            self._console.print(
+                f"alarms left {'a snapshot' if gone == 1 else f'{gone} snapshots'}, which went with the "
+                "demo: --snapshots DIR keeps them for daqsvc replay"
+            )
 
 
 def _figure(value: float | None, unit: str) -> str:
