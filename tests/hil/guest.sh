@@ -8,7 +8,7 @@
 # The guest sees this machine's files read-only under a layer in memory: what the command writes is gone
 # when it ends, but for its output and what it puts into $HIL_OUT. This keeps the machine clean; it is no
 # security boundary. HIL_LIMIT_S (300) bounds the run, HIL_MEMORY (1500M) the guest's memory, a sparse
-# file in /dev/shm.
+# file in /dev/shm; HIL_CPU is the number of the processor that it runs on, else the last one.
 set -uo pipefail
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 limit_s=${HIL_LIMIT_S:-300}
@@ -32,7 +32,7 @@ rm -f "$out/exit-code" "$out/console"
 # The guest has one processor and changes between host processes at every system call: on one processor
 # of the host that takes a quarter of the time. In a process namespace of their own all of them end with
 # the first, however it ends.
-cpu=$(taskset -pc $$ | sed 's/.*[^0-9]//')
+cpu=${HIL_CPU:-$(taskset -pc $$ | sed 's/.*[^0-9]//')}
 sockets=$(mktemp -d "${TMPDIR:-/tmp}/uml.XXXXXX")
 unshare --pid --fork --kill-child -- taskset -c "$cpu" linux.uml \
     mem="${HIL_MEMORY:-1500M}" umid=hil uml_dir="$sockets" con=null con0=null,fd:1 ssl=null panic=-1 loglevel=4 \
