@@ -49,7 +49,7 @@ $(READY): requirements-dev.lock pyproject.toml
 	@touch $@
 
 demo: $(READY)
-	@$(BIN)/daqsvc demo $(ARGS)
+	@$(BIN)/daqsvc demo --snapshots build/demo $(ARGS)
 
 test: $(READY)
 	@$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal -m "not long" $(TESTS) $(ARGS)
@@ -68,7 +68,7 @@ check: $(READY)
 	@$(BIN)/lint-imports
 
 bench: $(READY)
-	@missed=; for bench in tests/bench/bench_*.py; do PYTHONPATH=tests $(BIN)/python $$bench || missed="$$missed $$bench"; done; \
+	@missed=; for bench in tests/bench/bench_*.py; do PYTHONPATH=$(CURDIR):tests $(BIN)/python $$bench || missed="$$missed $$bench"; done; \
 	if [ -n "$$missed" ]; then echo "make: targets were missed by$$missed"; exit 1; fi
 
 # Built with what requirements-dev.lock pins: nothing is fetched meanwhile. Times are those of the commit, so that

@@ -2,8 +2,10 @@
 
 Run by ``make bench``. 1, 4, 16 and 64 paper rotors (two probes and a keyphasor at 640 Hz, levels, a bank of
 ten models), eight on a CAN FD bus, send in real time from a process of their own. ``daqsvc run`` watches them
-in another, which may run on one core only. CPU time counts, all threads and the kernel included: the least of
-some rounds, as what else the host does only adds to it. The lag is that of a timer every 10 ms.
+in another, which may run on one core only. On a busy computer give the terminal priority: as root,
+``echo -20 > /proc/self/autogroup``, for ``nice`` counts within one terminal only. CPU time counts, all
+threads and the kernel included: the least of some rounds, as what else the host does only adds to it. The
+lag is that of a timer every 10 ms.
 """
 
 # ruff: noqa: T201 - printing is what it is for
@@ -54,9 +56,12 @@ class Rung(NamedTuple):
     sent: int
 
 
-def measured(machines: int, core: int) -> Rung:
-    """What so many machines take."""
-    with tempfile.TemporaryDirectory() as folder, watched(Path(folder), machines, core=core) as plant:
+def measured(machines: int, core: int, more: str = "") -> Rung:
+    """What so many machines take; ``more`` are tables of each machine file."""
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        watched(Path(folder), machines, core=core, more=more) as plant,
+    ):
         time.sleep(SETTLED_S)
         costs = []
         for _ in range(ROUNDS):

@@ -95,6 +95,14 @@ analyze absent.npz --bearing 6205-2RS --channels a --speed-rpm 600 --baseline-fs
 analyze absent.npz --bearing 6205-2RS --channels a --speed-rpm 600 --baseline absent.npz
 analyze absent.npz --bearing 6205-2RS --channels a --speed-rpm 600 --calibration absent.toml
 analyze absent.npz --bearing 6205-2RS --channels a --speed-rpm 600 --unit um
+export absent.npz
+export absent.npz --to run.csv
+export absent.npz --to run.paquet
+export absent.npz --to no/such/folder/run.csv
+export absent.npz other.npz --to run.csv
+export machines/laval-rig.toml --to run.csv
+export machines/laval-rig.toml absent.blf --to run.csv --map a=b
+export absent.mcap --to run.csv --fs 100
 calibrate machines/laval-rig.toml
 calibrate machines/laval-rig.toml run.npz
 calibrate machines/absent.toml run.npz

@@ -23,7 +23,9 @@ async def test_clean():
 
 def test_leaks_fail_the_test_that_leaves_them(tmp_path: Path) -> None:
     here = ROOT / "tests"
-    (tmp_path / "conftest.py").write_text((here / "conftest.py").read_text())
+    guards = (here / "conftest.py").read_text()
+    assert "GRACE_S = 30.0" in guards
+    (tmp_path / "conftest.py").write_text(guards.replace("GRACE_S = 30.0", "GRACE_S = 1.0"))
     (tmp_path / "test_leaky.py").write_text(LEAKY)
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-o", "asyncio_mode=auto"]
     command.append(str(tmp_path))

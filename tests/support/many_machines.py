@@ -98,6 +98,11 @@ class Watched:
         [status] = ask_status(self._store, name_of(machine))
         return status
 
+    def kill(self) -> None:
+        """End the service as a power cut does: kill -9."""
+        self._process.kill()
+        self._process.wait()
+
     def silence(self) -> Sent:
         """End the devices, and wait until what they have sent has come to the detectors."""
         self._sender.send_signal(signal.SIGTERM)

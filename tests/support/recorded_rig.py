@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daqsvc.acquisition.samples import Samples
-    from daqsvc.recorder import Recorder
+    from daqsvc.recorder import MachineRecorder
     from daqsvc.service import Service
     from daqsvc.settings import MachineFile
 
@@ -63,7 +63,7 @@ async def recording(machine: MachineFile, store: Path) -> AsyncIterator[tuple[Se
         yield service, clock
 
 
-def recorder_of(service: Service) -> Recorder:
+def recorder_of(service: Service) -> MachineRecorder:
     """The recorder of the one machine of a service."""
     recorder = watch_of(service).recorder
     assert recorder is not None
@@ -77,8 +77,11 @@ async def play(service: Service, clock: DrivenClock, samples: Samples) -> None:
     with can.Bus(interface="virtual", channel=channel, protocol=can.CanProtocol.CAN_FD) as bus:
         node = CanNode(bus, frame_layout(machine, "shaft"), samples, RATE_HZ)
         counters = service.drivers[0].streams["shaft"][0]
+        recorder = recorder_of(service)
 
         def backlog() -> int:
+            if recorder.is_writing:
+                return len(samples)  # driven time waits for the disk, as real time has no need to
             on_the_way = node.frames_sent - counters.frames_received
             return on_the_way * node.samples_per_frame + watch_of(service).pipeline.behind_samples
 

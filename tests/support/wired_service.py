@@ -9,16 +9,17 @@ from __future__ import annotations
 import json
 import socket
 import sys
+from importlib import import_module
 from typing import TYPE_CHECKING
 
-from daqsvc import service
+from daqsvc import kernel_cache
 from daqsvc.cli import main
-from drivers.can import driver
-from drivers.can.socketcan import SocketCan
+from daqsvc.kernel_compiler import compile_apart
 
 if TYPE_CHECKING:
     from daqsvc.acquisition.clock import Clock
     from drivers.can.settings import CanBus
+    from drivers.can.socketcan import SocketCan
 
 LAG_EVERY_S = 0.01
 LAG_SECONDS = 10.0
@@ -33,13 +34,22 @@ def run(wires: dict[str, int], arguments: list[str]) -> int:
         arguments: of the command line.
     """
 
+    # As `daqsvc run` does before it imports kernels: else this process compiles those that are not kept, and
+    # keeps what that takes.
+    kernel_cache.prepare()
+    compile_apart()
+    service, driver, socketcan = map(
+        import_module, ("daqsvc.service", "drivers.can.driver", "drivers.can.socketcan")
+    )
+
     def open_wire(bus: CanBus, _matches: object, clock: Clock, *, recorded: bool = False) -> SocketCan:
         del recorded
-        return SocketCan(socket.socket(fileno=wires[bus.channel]).dup(), clock)
+        made: SocketCan = socketcan.SocketCan(socket.socket(fileno=wires[bus.channel]).dup(), clock)
+        return made
 
     vars(driver)["open_socketcan"] = open_wire
-    service.LAG_EVERY_S = LAG_EVERY_S
-    service.LAG_REMEMBERED = round(LAG_SECONDS / LAG_EVERY_S)
+    vars(service)["LAG_EVERY_S"] = LAG_EVERY_S
+    vars(service)["LAG_REMEMBERED"] = round(LAG_SECONDS / LAG_EVERY_S)
     return main(arguments)
 
 
