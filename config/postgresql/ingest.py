@@ -36,6 +36,14 @@ SESSION_S = 7 * 86_400
 """How long the broker keeps messages for this ingester while it is away."""
 GATHER_S = 0.2
 RETRY_S = 1.0
+MOST_KEY_BYTES = 2000
+"""Of what makes up a key: an entry of an index of PostgreSQL has room for 2704."""
+LONGEST_REASON = 2000
+AWAY = {"08", "25", "28", "3D", "3F", "40", "53", "55", "57", "58"}
+"""Classes of SQLSTATE that tell of the server, not of a message: connection, read-only standby, login,
+missing database or schema, serialization, resources, object in use, shutdown, system."""
+NOT_SET_UP = {"42501", "42P01", "42703"}
+"""A right, a table or a column that is not there: schema.sql has not been run, or not with this version."""
 
 ALARM = """INSERT INTO daqsvc.alarm_events
     (id, site, box, machine, alarm, sequence, occurrence, at, kind, state, level, message, event)
@@ -57,17 +65,88 @@ def row_of(payload: bytes | bytearray) -> tuple[str, tuple[Any, ...]]:
     """The statement and the values of a message.
 
     Raises:
-        KeyError, TypeError, ValueError: it is none that is known here.
+        KeyError, TypeError, ValueError, RecursionError: it is none that is known here, or holds what
+            PostgreSQL cannot.
     """
-    document, text = json.loads(payload), payload.decode()
-    machine = tuple(document[name] for name in ("site", "box", "machine"))
+    text = payload.decode()
+    document = json.loads(text)
     if document["schema"] == "daqsvc.alarm/1":
-        names = ("alarm", "sequence", "occurrence", "time", "kind", "state", "level", "message")
-        return ALARM, (document["id"], *machine, *(document[name] for name in names), text)
+        names = ("kind", "state", "level", "message")
+        machine, alarm = _texts(document, "site", "box", "machine"), _text(document, "alarm")
+        event = _text(document, "id")
+        _check_key(event)
+        _check_key(*machine, alarm)
+        occurrence = None if document["occurrence"] is None else _text(document, "occurrence")
+        place = (event, *machine, alarm, _whole(document, "sequence"), occurrence)
+        return ALARM, (*place, _text(document, "time"), *_texts(document, *names), text)
     if document["schema"] == "daqsvc.diagnosis/1":
-        said = (document[name] for name in ("detector", "monotonic_ns", "decision", "severity", "quality"))
-        return DIAGNOSIS, (document["time"], *machine, *said, json.dumps(document["statistics"]), text)
+        machine, detector = _texts(document, "site", "box", "machine"), _text(document, "detector")
+        _check_key(*machine, detector)
+        place = (_text(document, "time"), *machine, detector, _whole(document, "monotonic_ns"))
+        said = _texts(document, "decision", "severity", "quality")
+        return DIAGNOSIS, (*place, *said, json.dumps(document["statistics"]), text)
     raise ValueError(f"schema {document['schema']!r:.60} is not known here")
+
+
+def _text(document: Any, name: str) -> str:
+    """A text of a message.
+
+    Raises:
+        KeyError, TypeError: it is not there, or no text.
+        ValueError: PostgreSQL has no such characters.
+    """
+    value = document[name]
+    if not isinstance(value, str):
+        raise TypeError(f"{name} is no text")
+    value.encode()  # half of a surrogate pair is not Unicode
+    if "\0" in value:
+        raise ValueError(f"{name} holds a NUL")
+    return value
+
+
+def _texts(document: Any, *names: str) -> tuple[str, ...]:
+    return tuple(_text(document, name) for name in names)
+
+
+def _whole(document: Any, name: str) -> int:
+    """A whole number that a bigint holds.
+
+    Raises:
+        KeyError, TypeError, ValueError: it is none.
+    """
+    value = document[name]
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise TypeError(f"{name} is no whole number")
+    if not -(2**63) <= value < 2**63:
+        raise ValueError(f"{name} is too large")
+    return value
+
+
+def _check_key(*parts: str) -> None:
+    """See that an index has room for a key.
+
+    Raises:
+        ValueError: it has not.
+    """
+    if sum(len(part.encode()) for part in parts) > MOST_KEY_BYTES:
+        raise ValueError(f"what names it is longer than {MOST_KEY_BYTES} bytes: {parts[-1]!r:.60}")
+
+
+def is_of_message(error: psycopg.Error) -> bool:
+    """Whether a message is to blame; else PostgreSQL is away, and the message comes in when it is back.
+
+    What the server says of a value, or psycopg before it is sent, is of the message, whatever class of errors
+    it is: ProgramLimitExceeded is an OperationalError as a lost connection is.
+    """
+    if error.sqlstate is None:
+        return not isinstance(error, psycopg.OperationalError | psycopg.InterfaceError)
+    return error.sqlstate[:2] not in AWAY and error.sqlstate not in NOT_SET_UP
+
+
+def _reason(error: Exception) -> str:
+    """Why a message is rejected, in characters that PostgreSQL has."""
+    text = f"{type(error).__name__}: {error}".replace("\0", "\\0")
+    return text.encode(errors="backslashreplace").decode()[:LONGEST_REASON]
 
 
 class Ingester:
@@ -150,9 +229,10 @@ class Ingester:
             try:
                 self._insert(self._connected(), batch)
                 self._acknowledge(batch)
-            except psycopg.OperationalError as error:
+            except psycopg.Error as error:
+                # Of a message it is not: such are taken one by one and rejected.
                 log.warning("PostgreSQL is away, and nothing is acknowledged: %s", f"{error}".strip())
-                self._database_link = None
+                self._disconnect()
                 time.sleep(RETRY_S)
             else:
                 return
@@ -161,6 +241,11 @@ class Ingester:
         if self._database_link is None or self._database_link.closed:
             self._database_link = psycopg.connect(self._database, connect_timeout=10, autocommit=True)
         return self._database_link
+
+    def _disconnect(self) -> None:
+        if self._database_link is not None:
+            self._database_link.close()
+            self._database_link = None
 
     def _insert(self, connection: psycopg.Connection[Any], batch: list[Arrived]) -> None:
         rows: dict[str, list[tuple[Any, ...]]] = {ALARM: [], DIAGNOSIS: [], REJECTED: []}
@@ -172,7 +257,9 @@ class Ingester:
                 for statement, several in rows.items():
                     if several:
                         cursor.executemany(statement, several)
-        except (psycopg.DataError, psycopg.IntegrityError):
+        except psycopg.Error as error:
+            if not is_of_message(error):
+                raise
             for one in batch:
                 self._insert_one(connection, one.message)
 
@@ -181,15 +268,17 @@ class Ingester:
         try:
             with connection.transaction():
                 connection.execute(statement, values)
-        except (psycopg.DataError, psycopg.IntegrityError) as error:
+        except psycopg.Error as error:
+            if not is_of_message(error):
+                raise
             with connection.transaction():
-                connection.execute(REJECTED, (message.topic, message.payload, f"{error}"))
+                connection.execute(REJECTED, (message.topic, message.payload, _reason(error)))
 
     def _row(self, message: paho.MQTTMessage) -> tuple[str, tuple[Any, ...]]:
         try:
             return row_of(message.payload)
-        except (KeyError, TypeError, ValueError) as error:
-            return REJECTED, (message.topic, message.payload, f"{type(error).__name__}: {error}")
+        except (KeyError, TypeError, ValueError, RecursionError) as error:
+            return REJECTED, (message.topic, message.payload, _reason(error))
 
     def _acknowledge(self, batch: list[Arrived]) -> None:
         """Over the connection that a message came by: over the next its number may be another message's."""
