@@ -67,6 +67,11 @@ class Postgres:
             "start",
         )
 
+    @property
+    def is_running(self) -> bool:
+        """Whether it was started and has not ended."""
+        return (self._directory / "data" / "postmaster.pid").exists()
+
     def crash(self) -> None:
         """End at once, as a kill or a power cut would."""
         self._run("pg_ctl", "-D", f"{self._directory}/data", "-m", "immediate", "-w", "stop")

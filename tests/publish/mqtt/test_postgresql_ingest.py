@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import argparse
+import importlib.util
 import json
 import os
 import re
@@ -48,7 +50,8 @@ def postgres(guide):
             owner.execute(guide)
         yield server
     finally:
-        server.crash()
+        if server.is_running:  # a test that fails may have left it crashed
+            server.crash()
         shutil.rmtree(base)
 
 
@@ -100,6 +103,21 @@ def alarm(number):
     }
 
 
+POISON = {
+    "an object as id": (json.dumps({**alarm(1), "id": {"a": 1}}), "id is no text"),
+    "a number as time": (json.dumps({**alarm(2), "time": 5}), "time is no text"),
+    "no time": (json.dumps({**alarm(3), "time": "yesterday at noon"}), "invalid input syntax"),
+    "half a surrogate pair": (json.dumps({**alarm(4), "message": "\ud800"}), "can't encode"),
+    "half of one elsewhere": (json.dumps({**alarm(5), "more": "\ud800"}), "invalid input syntax"),
+    "too deep": ("[" * 100_000, "recursion"),
+    "deep, but JSON": (json.dumps({**alarm(6), "more": 0})[:-2] + "[" * 900 + "]" * 900 + "}", None),
+    "an id of 18 kB": (json.dumps({**alarm(7), "id": "".join(map(str, range(4500)))}), "longer than"),
+    "a sequence beyond bigint": (json.dumps({**alarm(8), "sequence": 2**63}), "sequence is too large"),
+    "no object": ("5", "TypeError"),
+}
+"""Messages that must not stop an ingester, and a part of why they are rejected; None: they are taken."""
+
+
 def publisher(broker):
     client = paho.Client(CallbackAPIVersion.VERSION2, client_id="box", protocol=paho.MQTTv5)
     client.reconnect_delay_set(1, 1)
@@ -131,10 +149,11 @@ def subscribed(broker_log, count):
     )
 
 
-def test_every_event_stands_once_whatever_falls_over(tmp_path, broker, postgres, ingesters):
-    first = ingesters("ingest-1")
-    ingesters("ingest-2")
-    subscribed(tmp_path / "mosquitto.log", 2)
+@pytest.mark.parametrize("names", [("ingest-1",), ("ingest-1", "ingest-2")], ids=["one", "two"])
+def test_every_event_stands_once_whatever_falls_over(tmp_path, broker, postgres, ingesters, names):
+    """By one ingester: by two, each of which gets every event, what one loses the other still writes."""
+    first, *_ = [ingesters(name) for name in names]
+    subscribed(tmp_path / "mosquitto.log", len(names))
     box = publisher(broker)
     try:
 
@@ -168,6 +187,33 @@ def test_every_event_stands_once_whatever_falls_over(tmp_path, broker, postgres,
     numbers = rows(postgres, "SELECT sequence, count(*) FROM daqsvc.alarm_events GROUP BY 1 ORDER BY 1")
     assert numbers == [(number, 1) for number in range(EVENTS)]
     assert rows(postgres, "SELECT count(*) FROM daqsvc.rejected") == [(0,)]
+
+
+def test_nothing_is_acknowledged_before_it_is_committed(tmp_path, broker, postgres, ingesters):
+    """What an ingester holds while PostgreSQL is away comes again after it was killed."""
+    log = tmp_path / "mosquitto.log"
+    first = ingesters("ingest-1")
+    subscribed(log, 1)
+    postgres.crash()
+    box = publisher(broker)
+    try:
+        for number in range(50):
+            say(box, json.dumps(alarm(number)), f"edge-{number % 7}")
+        for _ in range(2):  # between two attempts there is time for what it must not do
+            while "PostgreSQL is away" not in first.stderr.readline():
+                assert first.poll() is None
+        assert "Received PUBACK from daqsvc-ingest-1" not in log.read_text(errors="replace")
+        first.kill()
+        first.communicate()
+        postgres.start()
+        ingesters("ingest-1")
+        until(lambda: rows(postgres, "SELECT count(*) FROM daqsvc.alarm_events"), [(50,)])
+        until(
+            lambda: log.read_text(errors="replace").count("Received PUBACK from daqsvc-ingest-1") >= 50, True
+        )
+    finally:
+        box.disconnect()
+        box.loop_stop()
 
 
 def statement(number):
@@ -230,3 +276,87 @@ def test_telemetry_the_present_state_and_what_is_rejected(tmp_path, broker, post
         assert reader.execute("SELECT count(*) FROM daqsvc.alarms_now").fetchone() == (1,)
         with pytest.raises(psycopg.errors.InsufficientPrivilege):
             reader.execute("DELETE FROM daqsvc.alarm_events")
+
+
+@pytest.fixture(scope="module")
+def ingest():
+    """The program, as a module."""
+    spec = importlib.util.spec_from_file_location("ingest", FOLDER / "ingest.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_no_message_stops_an_ingester(tmp_path, broker, postgres, ingesters):
+    running = ingesters("ingest-1")
+    subscribed(tmp_path / "mosquitto.log", 1)
+    box = publisher(broker)
+    taken = [payload for payload, why in POISON.values() if why is None]
+    try:
+        for payload, _ in POISON.values():
+            say(box, payload)
+        say(box, json.dumps(alarm(100)))
+        until(lambda: rows(postgres, "SELECT count(*) FROM daqsvc.alarm_events"), [(1 + len(taken),)])
+        until(lambda: rows(postgres, "SELECT count(*) FROM daqsvc.rejected"), [(len(POISON) - len(taken),)])
+    finally:
+        box.disconnect()
+        box.loop_stop()
+    assert running.poll() is None
+    reasons = dict(rows(postgres, "SELECT payload, reason FROM daqsvc.rejected"))
+    for what, (payload, why) in POISON.items():
+        if why is not None:
+            assert why in reasons[payload.encode()], what
+
+
+def test_what_only_the_server_finds_wrong_is_rejected_too(ingest, postgres, monkeypatch):
+    """A message that its checks let through, by each class of errors of psycopg."""
+    sound = ingest.row_of(json.dumps(alarm(100)).encode())
+    values = {
+        "ProgrammingError": ({"a": 1}, *sound[1][1:]),  # psycopg knows no such type
+        "UntranslatableCharacter": (*sound[1][:-1], '"\\u0000"'),
+        "StatementTooComplex": (*sound[1][:-1], "[" * 100_000),
+        "ProgramLimitExceeded": (os.urandom(9000).hex(), *sound[1][1:]),
+    }
+    rows_of = [*((ingest.ALARM, one) for one in values.values()), sound]
+    monkeypatch.setattr(ingest, "row_of", lambda payload: rows_of[int(payload)])
+    options = argparse.Namespace(id="x", user=None, ca=None)
+    ingester = ingest.Ingester(options, postgres.url_of("daqsvc_ingest"))
+    batch = []
+    for number in range(len(rows_of)):
+        message = paho.MQTTMessage(mid=number, topic=b"t")
+        message.payload = b"%d" % number
+        batch.append(ingest.Arrived(0, message))
+    ingester._insert(ingester._connected(), batch)
+    ingester._disconnect()
+    assert rows(postgres, "SELECT sequence FROM daqsvc.alarm_events") == [(100,)]
+    reasons = [reason for (reason,) in rows(postgres, "SELECT reason FROM daqsvc.rejected ORDER BY payload")]
+    assert [reason.partition(":")[0] for reason in reasons] == list(values)
+
+
+@pytest.mark.parametrize(
+    ("code", "is_of_message"),
+    [
+        *(("22P02", True), ("23502", True), ("42804", True), ("54000", True), ("0A000", True)),
+        *(("08006", False), ("53100", False), ("57P01", False), ("40001", False), ("25006", False)),
+        *(("42501", False), ("42P01", False), ("28P01", False), ("58030", False)),
+    ],
+)
+def test_what_is_of_the_message_and_what_of_the_server(ingest, code, is_of_message):
+    assert ingest.is_of_message(psycopg.errors.lookup(code)("why")) is is_of_message
+
+
+def test_what_a_right_is_missing_for_waits_for_it(tmp_path, broker, postgres, ingesters):
+    with psycopg.connect(postgres.url, autocommit=True) as owner:
+        owner.execute("REVOKE INSERT ON daqsvc.alarm_events FROM daqsvc_ingest")
+        running = ingesters("ingest-1")
+        subscribed(tmp_path / "mosquitto.log", 1)
+        box = publisher(broker)
+        try:
+            say(box, json.dumps(alarm(1)))
+            assert "permission denied" in running.stderr.readline()
+            owner.execute("GRANT INSERT ON daqsvc.alarm_events TO daqsvc_ingest")
+            until(lambda: rows(postgres, "SELECT count(*) FROM daqsvc.alarm_events"), [(1,)])
+        finally:
+            box.disconnect()
+            box.loop_stop()
+    assert rows(postgres, "SELECT count(*) FROM daqsvc.rejected") == [(0,)]
