@@ -24,8 +24,24 @@ command -v linux.uml >/dev/null || missing linux.uml
 command -v modprobe >/dev/null || missing kmod
 [ -x /lib/systemd/systemd ] || missing systemd
 command -v dh >/dev/null || missing dh
-has_vcan() { unshare --net ip link add dev probe type vcan 2>/dev/null; }
 status=0
+package=
+told=$(mktemp)
+trap '[ -z "$package" ] || kill "$package" 2>/dev/null; rm -f "$told"' EXIT
+if [ "$#" = 0 ]; then
+    DAQSVC_DEBS=$(PYTHONPATH=tests python -m support.deb_package)
+    DAQSVC_HOST_S=$(PYTHONPATH=tests python -m support.unit_kernels)
+    export DAQSVC_DEBS DAQSVC_HOST_S HIL_LIMIT_S=${HIL_LIMIT_S:-600}
+    # Never on this machine itself: the unit is installed, killed and hung. An upgrade has both versions on the disk,
+    # which is in memory; what is installed then is gone with the guest, so the unit has another one.
+    # The package needs no clock to be true, so its guest runs beside the tests of the bus, on the first processor;
+    # the unit is held to seconds, and runs alone.
+    echo "hil: the package under systemd, in a guest, beside what follows"
+    first=$(taskset -pc $$ | sed 's/.*: *//; s/[^0-9].*//')
+    HIL_CPU=$first HIL_MEMORY=${HIL_MEMORY:-2500M} "$here/guest.sh" --systemd "${unit[@]}" tests/hil/test_package.py >"$told" 2>&1 &
+    package=$!
+fi
+has_vcan() { unshare --net ip link add dev probe type vcan 2>/dev/null; }
 if [ -z "${HIL_GUEST:-}" ] && { has_vcan || { modprobe -a can-raw vcan 2>/dev/null && has_vcan; }; }; then
     echo "hil: vcan of this kernel ($(uname -r)), in a network namespace of its own"
     unshare --net -- sh -c 'ip link set lo up; exec "$@"' sh "${suite[@]}" || status=$?
@@ -34,25 +50,10 @@ else
     "$here/guest.sh" "${suite[@]}" || status=$?
 fi
 if [ "$#" = 0 ]; then
-    # Never on this machine itself: the unit is installed, killed and hung.
-    echo "hil: the package and its unit under systemd, in a guest"
-    DAQSVC_DEBS=$(PYTHONPATH=tests python -m support.deb_package)
-    DAQSVC_HOST_S=$(PYTHONPATH=tests python -m support.unit_kernels)
-    export DAQSVC_DEBS DAQSVC_HOST_S
-    export HIL_LIMIT_S=${HIL_LIMIT_S:-600} HIL_MEMORY=${HIL_MEMORY:-2500M}
-    # An upgrade has both versions on the disk, which is in memory; what is installed then is gone with the guest.
-    # So there are two, each on a processor of its own where there are two: the first of them, and the last.
-    processors=$(taskset -pc $$)
-    first=$(sed 's/.*: *//; s/[^0-9].*//' <<<"$processors")
-    last=$(sed 's/.*[^0-9]//' <<<"$processors")
-    told=$(mktemp)
-    trap 'rm -f "$told"' EXIT
-    HIL_CPU=$first "$here/guest.sh" --systemd "${unit[@]}" tests/hil/test_package.py >"$told" 2>&1 &
-    package=$!
-    trap 'kill $package 2>/dev/null; rm -f "$told"' EXIT
-    [ "$first" != "$last" ] || wait $package || status=$?
-    "$here/guest.sh" --systemd "${unit[@]}" tests/hil/test_systemd.py || status=$?
-    [ "$first" = "$last" ] || wait $package || status=$?
+    wait "$package" || status=$?
+    package=
     cat "$told"
+    echo "hil: the unit under systemd, in a guest"
+    HIL_MEMORY=${HIL_MEMORY:-2500M} "$here/guest.sh" --systemd "${unit[@]}" tests/hil/test_systemd.py || status=$?
 fi
 exit "$status"
