@@ -1,7 +1,8 @@
 """What a table of results says of a fleet: what changed, what was missed, what false alarms cost.
 
-A recording *alarms* if its verdict, or that of its bearings, is not ``normal``. Alarming recordings of a
-machine that follow each other are one *alarm*: a person goes there once.
+A recording *alarms* if its verdict, or that of its bearings, is not ``normal``. Where it has neither, as of a
+machine with levels only, the most severe statement of its detectors counts. Alarming recordings of a machine
+that follow each other are one *alarm*: a person goes there once.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ MOST_TRUTH_BYTES = 50_000_000
 _NORMAL = "normal"
 _COLUMNS = (
     *("machine", "file", "recorded", "judged", "reason", "verdict", "group", "bearing_verdict"),
-    "bearing_group",
+    *("bearing_group", "worst_severity"),
 )
 _DIGITS = re.compile(r"(\d+)")
 
@@ -345,8 +346,15 @@ def machine_report(
 
 
 def verdict_of(row: Mapping[str, Any]) -> str:
-    """What a recording says of its machine: of rotor and bearings the one that is not normal, or both."""
+    """What a recording says of its machine: of rotor and bearings the one that is not normal, or both.
+
+    Of a machine without such verdicts, as one with levels only: the most severe statement, ``alert`` or
+    ``danger``.
+    """
     words = [word for word in (row["verdict"], row["bearing_verdict"]) if word is not None]
+    if not words:
+        worst: str | None = row["worst_severity"]
+        return worst or _NORMAL
     telling = [word for word in words if word != _NORMAL]
     return " and ".join(dict.fromkeys(telling)) or _NORMAL
 

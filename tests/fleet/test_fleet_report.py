@@ -121,6 +121,24 @@ def test_the_bearings_of_a_machine_count_as_well(verb: Callable[..., Any], tmp_p
     assert [one["now"] for one in said["machines"][0]["changes"]] == ["normal", "outer", "rub and outer"]
 
 
+def test_a_machine_with_levels_only_alarms_by_them(verb: Callable[..., Any], tmp_path: Path) -> None:
+    levels = {2: "alert", 3: "danger", 4: "normal", 5: None}
+    rows = [
+        {**row("fan", day, "n"), "verdict": None, "group": [], "worst_severity": worst}
+        for day, worst in levels.items()
+    ]
+    rows.append({**row("fan", 6, "n"), "worst_severity": "danger"})
+    Results(str(tmp_path / "results")).add(rows, folder_of("fan"))
+    truth = tmp_path / "truth.csv"
+    truth.write_text("machine,fault,first\nfan,looseness,2026-03-03\n")
+    _, (said,), _ = verb("fleet", "report", tmp_path / "results", "--truth", truth)
+    (fan,) = said["machines"]
+    assert [one["now"] for one in fan["changes"]] == ["alert", "danger", "normal"]
+    assert (fan["alarms"], fan["verdict"]) == (["2026-03-02.npz"], "normal")
+    assert fan["false_alarms"] == ["2026-03-02.npz"]
+    assert [(one["alarming"], one["missed"]) for one in fan["known_faults"]] == [(1, False)]
+
+
 @pytest.mark.parametrize(
     ("text", "why"),
     [
