@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import re
 import tempfile
 from typing import TYPE_CHECKING, Any
@@ -75,16 +76,7 @@ def _local(workers: int) -> Iterator[Any]:
 def _remote(address: str) -> Iterator[Any]:
     from distributed import Client  # noqa: PLC0415 - of the extra
 
-    try:
-        client = Client(address, timeout=CONNECT_S, set_as_default=False)
-    except (OSError, ValueError, TypeError, RuntimeError) as error:
-        # The libraries below say why in several lines, and of an address without a port by a TypeError.
-        why = " ".join(f"{error}".split())[:200]
-        raise FleetError(
-            f"no Dask scheduler answers at {address} ({why}); start one there (dask scheduler), or use "
-            "--cluster local"
-        ) from None
-    with client:
+    with _silent(), _client(Client, address) as client:
         try:
             client.wait_for_workers(1, timeout=CONNECT_S)
         except TimeoutError:
@@ -92,3 +84,32 @@ def _remote(address: str) -> Iterator[Any]:
                 f"the scheduler at {address} has no worker; start one: dask worker {address} --nthreads 1"
             ) from None
         yield client
+
+
+def _client(make: Any, address: str) -> Any:
+    """A client of a scheduler that somebody has started.
+
+    Raises:
+        FleetError: it does not answer.
+    """
+    try:
+        return make(address, timeout=CONNECT_S, set_as_default=False)
+    except (OSError, ValueError, TypeError, RuntimeError) as error:
+        # The libraries below say why in several lines, and of an address without a port by a TypeError.
+        why = " ".join(f"{error}".split())[:200]
+        raise FleetError(
+            f"no Dask scheduler answers at {address} ({why}); start one there (dask scheduler), or use "
+            "--cluster local"
+        ) from None
+
+
+@contextlib.contextmanager
+def _silent() -> Iterator[None]:
+    """Have Dask log nothing: what there is to say of a cluster that is lost is said in a sentence."""
+    with contextlib.ExitStack() as stack:
+        # Some have a level and a handler of their own, so that to silence their parent is not enough.
+        for name, logger in list(logging.root.manager.loggerDict.items()):
+            if name.partition(".")[0] == "distributed" and isinstance(logger, logging.Logger):
+                stack.callback(logger.setLevel, logger.level)
+                logger.setLevel(logging.CRITICAL)
+        yield
