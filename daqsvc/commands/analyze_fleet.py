@@ -98,7 +98,7 @@ def run_fleet(arguments: argparse.Namespace) -> int:
         print(json.dumps({**summary.as_json(), "results": results}))  # noqa: T201 - this is what the verb is for
     else:
         print(_text(summary, results))  # noqa: T201
-    return EXIT_REFUSED if summary.refused else EXIT_OK
+    return EXIT_REFUSED if summary.refused or summary.failed else EXIT_OK
 
 
 def _judged(arguments: argparse.Namespace) -> tuple[CampaignSummary, str]:
@@ -131,12 +131,16 @@ def _text(summary: CampaignSummary, results: str) -> str:
         *(f"  {verdict}: {number:,}" for verdict, number in summary.verdicts.most_common()),
     ]
     if summary.refused:
-        lines.append(f"  not judged: {summary.refused:,} (column reason says why)")
+        lines.append(f"  not judged: {summary.refused:,} (column reason says why; --retry tries again)")
     if summary.others:
         lines.append(f"{summary.others:,} files among the recordings are of other kinds")
     if summary.left_out:
         shown = ", ".join(summary.left_out[:5]) + (", ..." if len(summary.left_out) > 5 else "")
         lines.append(f"left out, as no machine's: {shown}")
+    failed = list(summary.failed.items())
+    lines += [f"not looked at: {name}: {why}" for name, why in failed[:5]]
+    if len(failed) > 5:
+        lines.append(f"... of {len(failed):,} machines that were not looked at; --json has all")
     return "\n".join([*lines, f"results: {results}"])
 
 

@@ -113,6 +113,11 @@ class Archive:
         protocol = self._fs.protocol
         return "file" in ((protocol,) if isinstance(protocol, str) else protocol)
 
+    @cached_property
+    def address(self) -> str:
+        """What reaches it from any process: of a folder the whole path, wherever that process works."""
+        return self.root if self.is_local else self.url
+
     def machines(self) -> list[str]:
         """The folders of the archive that may be machines.
 
@@ -148,10 +153,10 @@ class Archive:
                 others += 1
             elif about is None:
                 wrong = f"{rest} is no regular file; archive what it leads to"
-                found.append(ArchivedRecording(_printable(rest), path, (), wrong))
+                found.append(ArchivedRecording(printable(rest), path, (), wrong))
             else:
                 file = _file(path, rest, about)
-                found.append(ArchivedRecording(_printable(rest), path, (file,)))
+                found.append(ArchivedRecording(printable(rest), path, (file,)))
         if not (is_machine or found):
             return None
         return ArchivedMachine(name, tuple(description), tuple(_with_folders(found)), others)
@@ -204,7 +209,7 @@ class Archive:
             listed = _scan(folder) if self.is_local else self._list(folder)
         except OSError as error:
             raise FleetError(
-                f"{_printable(folder)} cannot be listed: {error.strerror or error}; correct the path"
+                f"{printable(folder)} cannot be listed: {error.strerror or error}; correct the path"
             ) from None
         return [entry for entry in listed if not entry[0].startswith(".")]
 
@@ -252,6 +257,9 @@ def _with_folders(found: list[ArchivedRecording]) -> Iterator[ArchivedRecording]
         yield ArchivedRecording(folder, str(PurePosixPath(logs[0].path).parent), parts, wrong)
 
 
-def _printable(name: str) -> str:
+def printable(name: str) -> str:
     """A name that may be no Unicode, as text that a table can hold."""
-    return os.fsencode(name).decode("utf-8", "backslashreplace")
+    try:
+        return os.fsencode(name).decode("utf-8", "backslashreplace")
+    except UnicodeEncodeError:  # half a surrogate pair, which is no byte of a file system's name either
+        return name.encode("utf-8", "backslashreplace").decode()

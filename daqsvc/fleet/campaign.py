@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import daqsvc
 from daqsvc.fleet import FleetError
+from daqsvc.fleet.archive import printable
 from daqsvc.fleet.judging import OtherVersionError, RecordingBatch, describe_machine, judge_batch
 from daqsvc.fleet.results import folder_of
 from daqsvc.fleet.table import KEYS, begun_row
+from daqsvc.settings.failures import one_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -57,6 +59,7 @@ class CampaignSummary:
         verdicts: of all in the archive, how many have each.
         others: files among the recordings that are of no kind that is judged.
         left_out: folders that are no machine's.
+        failed: machines that could not be looked at, and why; what the results have of them stays.
     """
 
     machines: int = 0
@@ -67,6 +70,7 @@ class CampaignSummary:
     verdicts: Counter[str] = field(default_factory=Counter)
     others: int = 0
     left_out: list[str] = field(default_factory=list)
+    failed: dict[str, str] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:
         """A JSON object."""
@@ -79,6 +83,7 @@ class CampaignSummary:
             "verdicts": dict(sorted(self.verdicts.items())),
             "files_of_other_kinds": self.others,
             "folders_left_out": self.left_out,
+            "machines_failed": self.failed,
         }
 
 
@@ -102,7 +107,11 @@ class Wanted:
 
 
 class _MachineRun:
-    """A machine while its recordings are judged."""
+    """A machine while its recordings are judged.
+
+    Raises:
+        FleetError: its machine file or its results cannot be read.
+    """
 
     def __init__(self, archive: Archive, machine: ArchivedMachine, results: Results, wanted: Wanted) -> None:
         self.folder = folder_of(machine.name)
@@ -114,26 +123,31 @@ class _MachineRun:
         self._there = {recording.file for recording in machine.recordings}
         self._current: dict[str, Key] = {}
         self._renewed: dict[str, tuple[int, str]] = {}
-        known = {
-            row["file"]: row
-            for row in results.rows(self.folder, KEYS)
-            if (row["machine_digest"], row["version"]) == (digest, daqsvc.__version__)
-            and row["digest"] is not None
-            and (row["judged"] or not wanted.retry)
-        }
+        self._newest: dict[str, str] = {}
+        known: dict[str, Row] = {}
+        for row in results.rows(self.folder, KEYS):
+            if (
+                (row["machine_digest"], row["version"]) == (digest, daqsvc.__version__)
+                and row["digest"] is not None
+                and (row["judged"] or not wanted.retry)
+            ):
+                other = known.get(row["file"])
+                # As `Results.compact` has it: of what holds the same, the row that was judged.
+                if other is None or row["judged"] or other["digest"] != row["digest"]:
+                    known[row["file"]] = row
         self.todo: list[ArchivedRecording] = []
         for recording in machine.recordings:
-            row = known.get(recording.file)
+            there = known.get(recording.file)
             if (
-                row is None
+                there is None
                 or wanted.verify
-                or (row["size_bytes"], row["stamp"]) != (recording.size_bytes, recording.stamp)
+                or (there["size_bytes"], there["stamp"]) != (recording.size_bytes, recording.stamp)
             ):
                 self.todo.append(recording)
             else:
-                self._current[recording.file] = Key(row["digest"], digest, daqsvc.__version__)
+                self._current[recording.file] = Key(there["digest"], digest, daqsvc.__version__)
         self._batch = RecordingBatch(
-            archive.url,
+            archive.address,
             machine.name,
             machine.description,
             digest,
@@ -164,7 +178,8 @@ class _MachineRun:
     def add(self, judged: Judged) -> None:
         """Write down what came back."""
         if judged.rows:
-            self._results.add(judged.rows, self.folder)
+            name = self._results.add(judged.rows, self.folder)
+            self._newest.update((row["file"], name) for row in judged.rows)
         for row in judged.rows:
             self._current[row["file"]] = Key(row["digest"], row["machine_digest"], row["version"])
         for file, seen in judged.unchanged.items():
@@ -183,7 +198,7 @@ class _MachineRun:
                 return {**row, "size_bytes": size, "stamp": stamp}
             return row
 
-        self._results.compact(self.folder, change)
+        self._results.compact(self.folder, change, self._newest)
         for row in self._results.rows(self.folder, ("file", "judged", "verdict")):
             if row["file"] not in self._there:
                 continue
@@ -219,6 +234,7 @@ class Campaign:
         self._say = say
         self._done = 0
         self._suspects: list[tuple[_MachineRun, RecordingBatch]] = []
+        self._folders: dict[str, str] = {}
         self.summary = CampaignSummary()
 
     def run(self, client: Callable[[], Any]) -> CampaignSummary:
@@ -250,19 +266,41 @@ class Campaign:
         return self.summary
 
     def _machines(self) -> Iterator[_MachineRun]:
+        failed = self.summary.failed
         for name in self._archive.machines():
-            machine = self._archive.machine(name)
-            if machine is None:
-                self.summary.left_out.append(name)
+            try:
+                run = self._machine(name)
+            except (FleetError, OSError) as error:  # of one machine: the others are judged all the same
+                failed[printable(name)] = one_line(printable(f"{error}"))
                 continue
-            self.summary.machines += 1
-            self.summary.recordings += len(machine.recordings)
-            self.summary.others += machine.others
-            yield _MachineRun(self._archive, machine, self._results, self._wanted)
+            if run is not None:
+                yield run
+        if not self.summary.machines and failed:
+            raise FleetError(next(iter(failed.values())))
         if not self.summary.machines:
             raise FleetError(
                 f"no folder of {self._archive.url} has a machine.toml and recordings/ in it; lay them out so"
             )
+
+    def _machine(self, name: str) -> _MachineRun | None:
+        """A machine; None if the folder is no machine's.
+
+        Raises:
+            FleetError, OSError: it cannot be judged.
+        """
+        machine = self._archive.machine(name)
+        if machine is None:
+            self.summary.left_out.append(printable(name))
+            return None
+        folder = folder_of(name)
+        if folder in self._folders:
+            raise FleetError(f"{name} is written as {self._folders[folder]} is; give it another name")
+        run = _MachineRun(self._archive, machine, self._results, self._wanted)
+        self._folders[folder] = name
+        self.summary.machines += 1
+        self.summary.recordings += len(machine.recordings)
+        self.summary.others += machine.others
+        return run
 
     def _judge(self, client: Any, machines: Iterable[_MachineRun], todo: int) -> None:
         workers = max(1, sum(client.nthreads().values()))
@@ -350,7 +388,7 @@ class Campaign:
         if not alone:
             return None
         (recording,) = batch.recordings
-        row = begun_row(batch.machine, batch.machine_digest, batch.version, recording)
+        row = begun_row(printable(batch.machine), batch.machine_digest, batch.version, recording)
         row["reason"] = (
             "each process that judged it was killed, several in a row (out of memory?); give workers more "
             "memory, or cut it into shorter ones"

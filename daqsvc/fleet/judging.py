@@ -17,7 +17,9 @@ from threading import Lock
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import daqsvc
-from daqsvc.fleet.archive import MACHINE_FILE, MOST_DESCRIPTION_BYTES, RECORDINGS, Archive
+from daqsvc.fleet import FleetError
+from daqsvc.fleet.archive import MACHINE_FILE, MOST_DESCRIPTION_BYTES, RECORDINGS, Archive, printable
+from daqsvc.fleet.failures import is_passing
 from daqsvc.fleet.table import add_analysis, begun_row
 from daqsvc.settings.failures import error_text, one_line
 
@@ -27,8 +29,8 @@ if TYPE_CHECKING:
     from daqsvc.confined.limits import ResourceLimits
     from daqsvc.diagnosis.recorded import RecordingOptions
     from daqsvc.fleet.archive import ArchivedFile, ArchivedMachine, ArchivedRecording
+    from daqsvc.fleet.reading import PatientRunner
     from daqsvc.fleet.table import Row
-    from daqsvc.offline.runner import Runner
 
     T = TypeVar("T")
 
@@ -48,7 +50,7 @@ class RecordingBatch:
     """Recordings of one machine, and what judging them depends on.
 
     Attributes:
-        archive: where it is.
+        archive: where it is, for any process.
         machine: name of the machine.
         description: its machine file and what lies beside it; empty if that is not to be used.
         machine_digest: of these; see `describe_machine`.
@@ -91,18 +93,23 @@ def describe_machine(
     """The digest of a machine file and all that lies beside it; and why it cannot be used, or nothing.
 
     What options say of the recordings is part of the digest.
+
+    Raises:
+        FleetError: one of them cannot be read. There is no digest then, and no row can be told from others.
     """
-    digest = hashlib.sha256()
+    digest, name = hashlib.sha256(), printable(machine.name)
     if any((options.channels, options.rate_hz is not None, options.unit is not None)):
         digest.update(repr((sorted(options.channels.items()), options.rate_hz, options.unit)).encode())
     names = [file.name for file in machine.description]
     if MACHINE_FILE not in names:
-        return digest.hexdigest(), f"{machine.name} has no {MACHINE_FILE} beside {RECORDINGS}/; put it there"
+        return digest.hexdigest(), one_line(
+            f"{name} has no {MACHINE_FILE} beside {RECORDINGS}/; put it there"
+        )
     wrong = ""
     if len(names) > _MOST_FILES or sum(f.size_bytes for f in machine.description) > MOST_DESCRIPTION_BYTES:
         wrong = (
-            f"beside {machine.name}/{MACHINE_FILE} lie more than {_MOST_FILES} files or "
-            f"{MOST_DESCRIPTION_BYTES // 10**6} MB; move recordings into {machine.name}/{RECORDINGS}"
+            f"beside {name}/{MACHINE_FILE} lie more than {_MOST_FILES} files or "
+            f"{MOST_DESCRIPTION_BYTES // 10**6} MB; move recordings into {name}/{RECORDINGS}"
         )
         names = [MACHINE_FILE]
     for file in machine.description:
@@ -110,8 +117,10 @@ def describe_machine(
             try:
                 content = archive.read(file.path, MOST_DESCRIPTION_BYTES)
             except OSError as error:
-                wrong = wrong or f"{machine.name}/{file.name} cannot be read: {error.strerror or error}"
-                content = b""
+                raise FleetError(
+                    f"{name}/{printable(file.name)} cannot be read: {error.strerror or error}; what is known "
+                    "of this machine stays, and the next run tries it again"
+                ) from None
             digest.update(repr((file.name, hashlib.sha256(content).hexdigest())).encode())
     return digest.hexdigest(), one_line(wrong)
 
@@ -164,28 +173,28 @@ def _own_limits(limits: ResourceLimits) -> Iterator[None]:
 
 def _judge(batch: RecordingBatch, folder: Path) -> Judged:
     archive = Archive(batch.archive)
-    runner, wrong = None, batch.wrong
+    runner, wrong, passing = None, batch.wrong, False
     if not wrong:
         try:
             runner = _runner(archive, batch)
         except Exception as error:  # noqa: BLE001 - a machine file of somebody else: its rows say so
-            wrong = _told(f"{batch.machine}/{MACHINE_FILE} cannot be used: {error}", archive, _kept_in(batch))
+            passing = is_passing(error)
+            wrong = f"{batch.machine}/{MACHINE_FILE} cannot be used: {error}"
+            wrong = _told(_again(wrong) if passing else wrong, archive, _kept_in(batch))
     rows: list[Row] = []
     unchanged: dict[str, tuple[int, str]] = {}
     for recording in batch.recordings:
-        row = begun_row(batch.machine, batch.machine_digest, batch.version, recording)
+        row = begun_row(printable(batch.machine), batch.machine_digest, batch.version, recording)
         row["reason"] = recording.wrong or wrong or _too_large(recording, batch.limits)
-        if recording.wrong or _too_large(recording, batch.limits):
+        if recording.wrong or passing or _too_large(recording, batch.limits):
             rows.append(row)
             continue
         try:
             path, row["digest"] = _fetched(archive, batch.machine, recording, folder)
-        except OSError as error:
-            row["reason"] = _told(
-                f"{batch.machine}/{RECORDINGS}/{recording.file} cannot be read: "
-                f"{error.strerror or error}; it is tried again with the next run",
-                archive,
-            )
+        except (OSError, MemoryError) as error:
+            why = (error.strerror or error) if isinstance(error, OSError) else "memory ran out"
+            where = f"{batch.machine}/{RECORDINGS}/{recording.file}"
+            row["reason"] = _told(_again(f"{where} cannot be read: {why}"), archive)
             rows.append(row)
             continue
         if batch.known.get(recording.file) == row["digest"]:
@@ -199,13 +208,34 @@ def _judge(batch: RecordingBatch, folder: Path) -> Judged:
     return Judged(rows, unchanged)
 
 
-def _add_judgement(row: Row, runner: Runner, path: Path, places: tuple[Archive, Path, Path]) -> None:
+def _add_judgement(row: Row, runner: PatientRunner, path: Path, places: tuple[Archive, Path, Path]) -> None:
+    """Fill in what the runner says; without a digest if another run may get further with the same bytes."""
+    found = dict(row)
     try:
         analysis = runner.judge(str(path), None).json
+        add_analysis(found, _archived(analysis, _prefixes(*places)))
     except Exception as error:  # noqa: BLE001 - whatever a file brings about costs its row
-        row["reason"] = _told(f"daqsvc failed at it: {error_text(error)}; report this", *places)
+        passing = is_passing(error)
+        reason = f"daqsvc failed at it: {error_text(error)}" + ("" if passing else "; report this")
+        row["reason"] = _told(reason, *places)
+    else:
+        row.update(found)
+        passing = runner.is_passing
+    if row["judged"]:
         return
-    add_analysis(row, _archived(analysis, _prefixes(*places)))
+    if passing:
+        row.update(digest=None, reason=_again(row["reason"]))
+    elif _MORE_MEMORY in row["reason"]:
+        row["reason"] = f"{row['reason']}; then have it tried again (--retry)"
+
+
+_MORE_MEMORY = "--max-memory"
+"""In a reason: with this option it may be judged."""
+
+
+def _again(reason: str) -> str:
+    """A reason that is none of what the recording holds."""
+    return f"{reason}; the next run tries it again"
 
 
 def _too_large(recording: ArchivedRecording, limits: ResourceLimits) -> str:
@@ -274,27 +304,29 @@ def _kept_folder(_process: int) -> Path:
     return folder
 
 
-def _runner(archive: Archive, batch: RecordingBatch) -> Runner:
+def _runner(archive: Archive, batch: RecordingBatch) -> PatientRunner:
     """The runner of the machine, made once a process.
 
     Raises:
         Exception: the machine file cannot be read or used.
     """
-    kept = _runners.get(batch.machine_digest)
+    # Machines may have equal files, and what a runner says names the machine.
+    key = (batch.machine_digest, batch.machine)
+    kept = _runners.get(key)
     if kept is None:
         kept = _made_runner(archive, batch)
         if len(_runners) >= _MOST_RUNNERS:
             _runners.pop(next(iter(_runners)))
-        _runners[batch.machine_digest] = kept
+        _runners[key] = kept
     return kept
 
 
 _MOST_RUNNERS = 8
-_runners: dict[str, Runner] = {}
+_runners: dict[tuple[str, str], PatientRunner] = {}
 
 
-def _made_runner(archive: Archive, batch: RecordingBatch) -> Runner:
-    from daqsvc.offline.runner import Runner  # noqa: PLC0415 - brings all detectors
+def _made_runner(archive: Archive, batch: RecordingBatch) -> PatientRunner:
+    from daqsvc.fleet.reading import PatientRunner  # noqa: PLC0415 - brings all detectors
     from daqsvc.settings import MachineFileError, load_machine_file  # noqa: PLC0415
 
     folder = _kept_in(batch) / batch.machine
@@ -302,7 +334,7 @@ def _made_runner(archive: Archive, batch: RecordingBatch) -> Runner:
         place = folder / file.name
         place.parent.mkdir(parents=True, exist_ok=True)
         place.write_bytes(archive.read(file.path, MOST_DESCRIPTION_BYTES))
-    runner = Runner(partial(load_machine_file, folder / MACHINE_FILE), batch.options)
+    runner = PatientRunner(partial(load_machine_file, folder / MACHINE_FILE), batch.options)
     try:
         runner.prepare()
     except MachineFileError as error:
@@ -332,5 +364,5 @@ def _archived(value: Any, prefixes: tuple[str, ...]) -> Any:
     if isinstance(value, str):
         for prefix in prefixes:
             value = value.replace(prefix, "")
-        return value.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+        return printable(value)
     return value

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from urllib.parse import quote
 
 from daqsvc.fleet import FleetError
+from daqsvc.fleet.archive import printable
 from daqsvc.fleet.places import place_of
 from daqsvc.fleet.table import COLUMNS, schema
 
@@ -34,6 +35,9 @@ TABLE = "table"
 _RUNS, _COMPACTING, _WRITING = "runs", "compacting", "writing"
 _PUTS_WHOLE = {"memory", "s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "adl", "oss"}
 """Stores in which an object is there as a whole or not at all."""
+
+_LONGEST_FOLDER = 200
+"""Of the 255 bytes that file systems allow, with room for what stands before and behind."""
 
 Change: TypeAlias = Callable[["Row"], "Row | None"]
 """What becomes of a row; None if it is superseded."""
@@ -90,7 +94,7 @@ class Results:
         return [name for name in names if name.startswith("machine=")]
 
     def rows(self, folder: str, columns: Sequence[str] = COLUMNS) -> list[Row]:
-        """The rows of a machine, by file.
+        """The rows of a machine, by file; of one file those that were added last behind.
 
         Args:
             folder: of the machine, one of `folders`, or `folder_of` it.
@@ -100,14 +104,17 @@ class Results:
             FleetError: a file is no table of results.
         """
         rows: list[Row] = []
-        for path in self._tables(folder):
+        for path in self._tables(folder):  # finished ones first: what was added later stands behind
             rows += self._read(path, columns)
         rows.sort(key=lambda row: row["file"])
         return rows
 
-    def add(self, rows: Iterable[Row], folder: str) -> None:
-        """Write rows; when this returns they are there."""
-        self._write_table(list(rows), folder, "part")
+    def add(self, rows: Iterable[Row], folder: str) -> str:
+        """Write rows; when this returns they are there, in the file of this name."""
+        content = _parquet(list(rows))
+        name = f"part-{_name(content)}.parquet"
+        self._put(f"{self.root}/{TABLE}/{folder}/{name}", content)
+        return name
 
     def repair(self, folder: str) -> None:
         """Finish what an earlier run has begun with the files of a machine."""
@@ -119,19 +126,28 @@ class Results:
             self._remove(f"{self.root}/{TABLE}/{folder}/{name}" for name in begun["superseded"])
         self._remove([journal])
 
-    def compact(self, folder: str, change: Change) -> None:
+    def compact(self, folder: str, change: Change, newest: Mapping[str, str] | None = None) -> None:
         """Make one table of the files of a machine, in the order of its recordings, each with one row.
+
+        Of rows that depend on the same, the one of a recording that was judged is kept, and else the last: a
+        run that tried again what could not be judged may have been killed.
 
         Args:
             folder: of the machine.
             change: what becomes of each row.
+            newest: by recording, the file that `add` put its row into; any other row of it is superseded.
         """
+        newest = newest or {}
         before = self._tables(folder)
         rows: dict[tuple[str, str, str, str], Row] = {}
-        for row in self.rows(folder):
-            if (kept := change(row)) is not None:
+        for path in before:
+            name = path.rpartition("/")[2]
+            for row in self._read(path, COLUMNS):
+                if newest.get(row["file"], name) != name or (kept := change(row)) is None:
+                    continue
                 key = (kept["file"], kept["digest"] or "", kept["machine_digest"], kept["version"])
-                rows[key] = kept
+                if kept["judged"] or key not in rows or not rows[key]["judged"]:
+                    rows[key] = kept
         ordered = [rows[key] for key in sorted(rows)]
         pieces = [ordered[k : k + ROWS_PER_FILE] for k in range(0, len(ordered), ROWS_PER_FILE)]
         tables = {f"table-{_name(content)}.parquet": content for content in map(_parquet, pieces)}
@@ -158,7 +174,9 @@ class Results:
         return {protocol} if isinstance(protocol, str) else set(protocol)
 
     def _tables(self, folder: str) -> list[str]:
-        return [path for path in self._list(f"{self.root}/{TABLE}/{folder}") if path.endswith(".parquet")]
+        """The files of a machine, finished tables before what was added to them."""
+        paths = [path for path in self._list(f"{self.root}/{TABLE}/{folder}") if path.endswith(".parquet")]
+        return sorted(paths, key=lambda path: not path.rpartition("/")[2].startswith("table-"))
 
     def _list(self, folder: str) -> list[str]:
         try:
@@ -184,10 +202,6 @@ class Results:
             raise FleetError(f"{path} lacks columns of results; remove it, and what it held is judged again")
         rows: list[Row] = table
         return rows
-
-    def _write_table(self, rows: list[Row], folder: str, kind: str) -> None:
-        content = _parquet(rows)
-        self._put(f"{self.root}/{TABLE}/{folder}/{kind}-{_name(content)}.parquet", content)
 
     def _put(self, path: str, content: bytes) -> None:
         """Write a file so that it is there as a whole or not at all.
@@ -219,8 +233,19 @@ class Results:
 
 
 def folder_of(machine: str) -> str:
-    """The folder of a machine, named as Hive and its kin name partitions."""
-    return f"machine={quote(machine, safe=' ')}"
+    """The folder of a machine, named as Hive and its kin name partitions.
+
+    A name that would be too long for a file system is cut, and told from others by its digest.
+    """
+    text = printable(machine)
+    quoted = quote(text, safe=" ")
+    if len(quoted) > _LONGEST_FOLDER:
+        digest = hashlib.sha256(text.encode()).hexdigest()[:16]
+        while len(quoted) + 1 + len(digest) > _LONGEST_FOLDER:
+            text = text[:-1]
+            quoted = quote(text, safe=" ")
+        quoted = f"{quoted}~{digest}"
+    return f"machine={quoted}"
 
 
 def _put_local(path: Path, beside: Path, content: bytes) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -11,11 +13,16 @@ from support.fleet_archives import add_hostile, add_machine, add_recordings
 from support.orbit_files import Orbit
 
 import daqsvc
+from daqsvc.confined import process
 from daqsvc.confined.limits import ResourceLimits
 from daqsvc.diagnosis.recorded import RecordingOptions
+from daqsvc.fleet import FleetError, judging
 from daqsvc.fleet.archive import Archive
+from daqsvc.fleet.failures import is_passing
 from daqsvc.fleet.judging import Judged, OtherVersionError, RecordingBatch, describe_machine, judge_batch
 from daqsvc.fleet.table import COLUMNS
+from daqsvc.offline.runner import Runner
+from daqsvc.recording import RecordingError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -104,6 +111,127 @@ def test_a_machine_file_that_cannot_be_used_costs_the_rows_of_its_machine(tmp_pa
     machine.unlink()
     rows = judge_batch(batch_of(str(tmp_path))).rows
     assert ["has no machine.toml" in row["reason"] for row in rows] == [True, True]
+
+
+def test_machines_with_equal_files_are_each_named(tmp_path: Path) -> None:
+    for name in ("pump-1", "pump-2"):
+        (add_machine(tmp_path, name) / "other.csv").write_text("a,b\n1,2\n2,3\n3,5\n")
+        (row,) = judge_batch(batch_of(str(tmp_path), name)).rows
+        assert f"{name}/machine.toml" in row["reason"]
+
+
+def test_a_machine_file_that_cannot_be_read_at_the_moment_is_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    add_recordings(add_machine(tmp_path, "pump"), 2)
+    batch = batch_of(str(tmp_path))
+
+    def fail(*_: object) -> bytes:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(judging, "_runners", {})
+    with monkeypatch.context() as patch:
+        patch.setattr(Archive, "read", fail)
+        rows = judge_batch(batch).rows
+        with pytest.raises(FleetError, match=r"pump/machine\.toml cannot be read: Input/output error; what"):
+            batch_of(str(tmp_path))
+    assert [(row["judged"], row["digest"]) for row in rows] == [(False, None)] * 2
+    assert all(row["reason"].endswith("the next run tries it again") for row in rows)
+    assert [row["judged"] for row in judge_batch(batch).rows] == [True, True]
+
+
+@pytest.mark.parametrize(("kills", "judged"), [(1, True), (2, False)])
+def test_a_reader_that_is_killed_is_not_the_recording(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    kills: int,
+    judged: bool,  # noqa: FBT001 - a parameter of the test
+) -> None:
+    """The process that reads is really killed, while it is asked; once is made good at once."""
+    add_recordings(add_machine(tmp_path, "pump"), 1)
+    batch = batch_of(str(tmp_path))
+    assert judge_batch(batch).rows[0]["judged"]
+    left, ask = kills, process._ask
+
+    def killing(running: Any, *arguments: Any, **named: Any) -> Any:
+        nonlocal left
+        if left:
+            left -= 1
+            running.process.kill()
+        return ask(running, *arguments, **named)
+
+    monkeypatch.setattr(process, "_ask", killing)
+    # Its channels are listed before it is read: the first of both meets the kill.
+    (row,) = judge_batch(batch).rows
+    assert left == 0
+    assert row["judged"] is judged, row["reason"]
+    assert (row["digest"] is None) is not judged
+    if not judged:
+        assert "SIGKILL" in row["reason"]
+        assert row["reason"].endswith("the next run tries it again")
+
+
+def raised(cause: Exception) -> Exception:
+    """What a caller sees of an error that it is not shown the cause of."""
+
+    def fail() -> None:
+        raise cause
+
+    def read() -> None:
+        try:
+            fail()
+        except Exception:  # noqa: BLE001 - it is what is looked at
+            raise RecordingError("cannot be read") from None
+
+    with pytest.raises(RecordingError) as error:
+        read()
+    return error.value
+
+
+def there(message: str) -> Exception:
+    """What the process that reads says."""
+    return process.RaisedThereError("RecordingError", f"/a/b.npz cannot be read: {message}")
+
+
+@pytest.mark.parametrize(
+    ("error", "passing"),
+    [
+        (raised(process.ConfinedError("memory", "too much")), True),
+        (raised(process.ConfinedError("time", "it takes more processor time than it may")), True),
+        (raised(process.ConfinedError("crash", "its reader was ended by SIGKILL")), True),
+        (raised(process.ConfinedError("crash", "its reader was ended by SIGTERM")), True),
+        (raised(process.ConfinedError("crash", "its reader was ended by SIGSEGV")), False),
+        (raised(there("Input/output error; copy it anew")), True),
+        (raised(there("Invalid argument; copy it anew")), False),
+        (raised(there("it is cut short")), False),
+        (raised(OSError(errno.EIO, "x")), True),
+        (raised(OSError("CRC check failed")), False),
+        (raised(MemoryError()), True),
+        (ValueError("no verdict"), False),
+    ],
+)
+def test_what_passes_and_what_is_of_the_recording(
+    error: Exception,
+    passing: bool,  # noqa: FBT001 - a parameter of the test
+) -> None:
+    assert is_passing(error) is passing
+
+
+def test_text_that_is_no_unicode_costs_no_more_than_itself(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    add_recordings(add_machine(tmp_path, "pump"), 1)
+    batch = batch_of(str(tmp_path))
+    judge = Runner.judge
+
+    def said(self: Runner, *arguments: Any) -> Any:
+        outcome = judge(self, *arguments)
+        outcome.json["data_quality"]["problems"].append("half of a pair: \ud800")
+        return outcome
+
+    monkeypatch.setattr(Runner, "judge", said)
+    (row,) = judge_batch(batch).rows
+    assert row["problems"][-1] == "half of a pair: \\ud800"
 
 
 def test_what_holds_what_it_held_is_not_judged_again(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import json
 import os
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
+from urllib.parse import unquote
 
 import pytest
 from support.fleet_archives import parts
@@ -42,6 +43,29 @@ def test_parts_become_one_table_in_the_order_of_the_recordings(url: str, tmp_pat
     results.add([row("b", digest="new")], PUMP)
     results.compact(PUMP, lambda one: None if one["digest"] == "b" else one)
     assert [one["digest"] for one in results.rows(PUMP)] == ["a", "new", "c"]
+
+
+@pytest.mark.parametrize("name", ["x", "y", "z", "v"])
+def test_what_was_tried_again_replaces_what_could_not_be_judged(name: str, tmp_path: Path) -> None:
+    """Whatever the files are called, of the same recording by the same machine file and version."""
+    results = Results(str(tmp_path))
+    refused = row("a", judged=False, verdict=None, reason="no memory")
+    results.add([refused], PUMP)
+    results.compact(PUMP, lambda one: one)
+    part = results.add([row("a", verdict=name)], PUMP)
+    assert [one["verdict"] for one in results.rows(PUMP)] == [None, name], "the last stands behind"
+    killed = [row["verdict"] for row in after_compaction(tmp_path, {})]
+    assert killed == [name], "a run that was killed before it had made one table"
+    results.add([refused, row("b")], PUMP)
+    again = {**refused, "reason": "no time"}
+    part = results.add([again], PUMP)
+    assert [row["reason"] for row in after_compaction(tmp_path, {"a": part})] == ["no time", None]
+
+
+def after_compaction(place: Path, newest: dict[str, str]) -> list[dict[str, Any]]:
+    results = Results(str(place))
+    results.compact(PUMP, lambda one: one, newest)
+    return results.rows(PUMP)
 
 
 def test_a_table_does_not_depend_on_the_parts_that_it_came_in(tmp_path: Path) -> None:
@@ -126,6 +150,13 @@ def test_a_machine_of_any_name_has_a_folder() -> None:
     assert folder_of("fan 1") == "machine=fan 1"
     assert folder_of("a=b/c%") == "machine=a%3Db%2Fc%25"
     assert os.sep not in folder_of("../x")
+    assert folder_of(os.fsdecode(b"caf\xe9")) == "machine=caf%5Cxe9"
+    assert folder_of("\ud800") == "machine=%5Cud800"
+    long = {
+        folder_of(cut + "\N{CYRILLIC SMALL LETTER EN}" * 60 + end) for cut in ("", "a", "ab") for end in "xy"
+    }
+    assert len(long) == 6
+    assert all(len(name) <= 208 and "\N{REPLACEMENT CHARACTER}" not in unquote(name) for name in long)
 
 
 @pytest.mark.parametrize(

@@ -79,6 +79,7 @@ def test_an_archive_is_judged_once(tmp_path: Path) -> None:
         "verdicts": {"normal": 1, "unbalance": 1},
         "files_of_other_kinds": 1,
         "folders_left_out": ["other"],
+        "machines_failed": {},
         "results": results,
     }
     before = contents(tmp_path / "archive-results")
@@ -157,6 +158,7 @@ def test_a_scheduler_that_is_lost_loses_nothing(
             code, _, err = ended(run)
     assert code == 1
     assert "scheduler of the cluster was lost; what was judged is written" in err
+    assert err.count("\n") == 2, "what there is to do, and that"
     written = [row for row in rows(results) if row["digest"] is not None]
     code, summary, err = ended(start_analyze(archive, "--cluster", "local:1", "--results", results))
     assert (code, summary["judged_now"]) == (3, count - len(written)), err
@@ -226,6 +228,67 @@ def test_other_programs_read_the_table(judged: tuple[Path, int, dict[str, bytes]
     assert sorted(tuple(map(str, row)) for row in frame.rows()) == sorted(key)
 
 
+@pytest.mark.long
+def test_what_is_tried_again_with_more_memory_is_judged(tmp_path: Path) -> None:
+    recordings = add_machine(tmp_path / "archive", "pump")
+    add_recordings(recordings, 1)
+    Orbit(30_000, seed=5).save(recordings / "2026-03-02.npz")
+    results = tmp_path / "archive-results"
+
+    def run(*options: str) -> tuple[int, int]:
+        code, summary, err = ended(start_analyze(tmp_path / "archive", "--cluster", "local:1", *options))
+        assert code in {0, 3}, err
+        return code, summary["judged_now"]
+
+    assert run("--max-memory", "0.05") == (3, 2)
+    _, large = rows(results)
+    assert large["reason"].endswith("; then have it tried again (--retry)"), large["reason"]
+    assert run("--max-memory", "1", "--retry") == (0, 1)
+    assert [row["judged"] for row in rows(results)] == [True, True]
+
+
+@pytest.mark.long
+def test_the_working_folders_of_workers_do_not_matter(tmp_path: Path) -> None:
+    add_recordings(add_machine(tmp_path / "archive", "pump"), 1)
+    (tmp_path / "archive" / "pump" / "recordings" / "cut.npz").write_bytes(b"PK")
+    (tmp_path / "elsewhere").mkdir()
+    expected = {}
+    with (
+        dask(tmp_path, "scheduler") as (_, address),
+        dask(tmp_path / "elsewhere", "worker", address, "--nthreads", "1", "--no-dashboard"),
+    ):
+        for cluster in (address, "local:1"):
+            options = ("archive", "--cluster", cluster, "--results", cluster[:5])
+            code, _, err = ended(start_analyze(*options, cwd=tmp_path))
+            assert code == 3, err
+            expected[cluster[:5]] = contents(tmp_path / cluster[:5])
+    assert [row["verdict"] for row in rows(tmp_path / "local")] == ["normal", None]
+    assert expected["tcp:/"] == expected["local"]
+
+
+@pytest.mark.long
+def test_one_machine_that_cannot_be_named_or_read_does_not_stop_the_others(tmp_path: Path) -> None:
+    archive = tmp_path / "archive"
+    long = "насос-на-линии-розлива-номер-один-в-цехе-семь"
+    latin = os.fsdecode(b"caf\xe9")
+    for name in ("pump", long, latin, "caf\\xe9", "broken"):
+        add_recordings(add_machine(archive, name), 1)
+    (archive / "broken" / "machine.toml").unlink()
+    (archive / "broken" / "machine.toml").symlink_to("/proc/self/mem")
+    (archive / os.fsdecode(b"left-\xe9")).mkdir()
+    code, summary, err = ended(start_analyze(archive, "--cluster", "local:1"))
+    assert code == 3, err
+    assert summary["verdicts"] == {"normal": 3}
+    assert summary["folders_left_out"] == ["left-\\xe9"]
+    failed = summary["machines_failed"]
+    assert set(failed) == {"broken", "caf\\xe9"}
+    assert "broken/machine.toml cannot be read: Input/output error" in failed["broken"]
+    assert "is written as" in failed["caf\\xe9"]
+    assert {row["machine"] for row in rows(tmp_path / "archive-results")} == {"pump", long, "caf\\xe9"}
+    code, summary, _ = ended(start_analyze(archive, "--cluster", "local:1"))
+    assert (code, summary["judged_now"]) == (3, 0)
+
+
 def is_running(pid: int) -> bool:
     import psutil
 
@@ -255,6 +318,7 @@ class dask:  # noqa: N801 - reads as the program that it runs
                 stderr=log,
                 stdout=log,
                 env={**os.environ, "PYTHONPATH": str(ROOT)},
+                cwd=self._folder,
             )
         if self._what == "worker":
             return self._process, ""

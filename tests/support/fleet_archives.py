@@ -70,8 +70,8 @@ def add_hostile(recordings: Path) -> dict[str, str]:
     }
 
 
-def start_program(*arguments: object) -> subprocess.Popen[str]:
-    """Start `support.fleet_program`."""
+def start_program(*arguments: object, cwd: Path | None = None) -> subprocess.Popen[str]:
+    """Start `support.fleet_program`, in this folder unless another is given."""
     path = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
     return subprocess.Popen(
         [sys.executable, _PROGRAM, *map(str, arguments)],
@@ -79,12 +79,15 @@ def start_program(*arguments: object) -> subprocess.Popen[str]:
         stderr=subprocess.PIPE,
         text=True,
         env={**os.environ, "PYTHONPATH": path},
+        cwd=cwd,
     )
 
 
-def start_analyze(*arguments: object, connect_s: float = 60.0) -> subprocess.Popen[str]:
+def start_analyze(
+    *arguments: object, connect_s: float = 60.0, cwd: Path | None = None
+) -> subprocess.Popen[str]:
     """Start ``daqsvc analyze ... --json`` with batches of one recording."""
-    return start_program(connect_s, "analyze", *arguments, "--json")
+    return start_program(connect_s, "analyze", *arguments, "--json", cwd=cwd)
 
 
 def ended(process: subprocess.Popen[str]) -> tuple[int, dict[str, Any], str]:
