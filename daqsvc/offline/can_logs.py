@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
+import gzip
 import heapq
-import itertools
+import re
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
-import can
 import numpy as np
 
 from daqsvc.acquisition.assembler import StreamAssembler
@@ -20,7 +20,7 @@ from daqsvc.recording import RecordingError
 from daqsvc.recording.formats import CAN_LOGS, named_as_can_log
 from daqsvc.recording.rate import MOST_STRETCHED
 from daqsvc.recording.recording import Recording
-from daqsvc.recording.streams import LongGapsError, RecordedStream, of_blocks
+from daqsvc.recording.streams import LongGapsError, RecordedStream, ns_of_iso, of_blocks
 from drivers.base import StreamSpec
 from drivers.can.adapter import batch_of
 from drivers.can.batches import FrameDemultiplexer
@@ -33,6 +33,7 @@ from drivers.replay.files import RecordedLogError as LogError
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
+    import can
     from numpy.typing import NDArray
 
     from daqsvc.acquisition.samples import SampleBlock
@@ -49,6 +50,18 @@ _SURELY_SINCE_1970_NS = 10**17
 _LONG_ENOUGH_S = 1.0
 """A shorter log does not tell the rate of a stream."""
 _NAMED_IDS = 8
+_HEAD_BYTES = 1 << 16
+"""Of an ASC log, in which its header ends."""
+_ASC_DATE = re.compile(r"\s*(?:date|begin\s+triggerblock)\s+\w+\.?\s+(?P<date>.+)", re.IGNORECASE)
+_ASC_FRAME = re.compile(r"\s*\d+\.\d+\s+(?:CANFD|\d+\s+(?:\w+\s+[TR]x|ErrorFrame))", re.ASCII | re.IGNORECASE)
+_ASC_WRITTEN = re.compile(
+    r"(?P<month>\w+)\.?\s+(?P<day>\d{1,2})\s+(?P<hour>\d{1,2}):(?P<rest>\d\d:\d\d(?:\.\d{1,9})?)\s+"
+    r"(?:(?P<half>[ap]m)\s+)?(?P<year>\d{4})",
+    re.IGNORECASE,
+)
+_ENGLISH = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
+_MONTHS = dict(zip(_ENGLISH, range(1, 13), strict=True)) | {"mär": 3, "mai": 5, "okt": 10, "dez": 12}
+"""Of the tools of Vector, which write English or German."""
 _LAYOUTS = "ids and lengths of its layouts"
 
 
@@ -138,22 +151,49 @@ def load_can_streams(machine: MachineFile, path: str) -> tuple[list[RecordedStre
                 NS_PER_S / period_ns,
             )
         )
-    return streams, playing.notes
+    notes = list(playing.notes)
+    if any(one.start_ns is None for one in streams):
+        notes.append(f"{path} does not say when it began, and neither does what is made of it")
+    return streams, notes
 
 
 def _log_begin_ns(path: str) -> int | None:
-    """When a log in ASC format began, by its header; None of any other, or if it does not say."""
+    """When a log in ASC format began, by its header; None of any other, or if it does not say.
+
+    The header names no zone. It is taken as UTC, so that a log begins at one time wherever it is read.
+    """
     log = Path(path)
-    if log.suffix.lower() != ".asc":
+    zipped = log.suffix.lower() == ".gz"
+    if (log.with_suffix("") if zipped else log).suffix.lower() != ".asc":
         return None
-    begins = []
-    for relative in (False, True):
-        with (
-            contextlib.suppress(ValueError, OSError),
-            can.ASCReader(log, relative_timestamp=relative) as reader,
-        ):
-            begins += [message.timestamp for message in itertools.islice(reader, 1)]
-    return round((begins[0] - begins[1]) * 1000) * _NS_PER_MS if len(begins) == 2 else None
+    try:
+        with gzip.open(log) if zipped else log.open("rb") as file:
+            head = file.read(_HEAD_BYTES).decode("utf-8", errors="replace")
+    except (OSError, EOFError, zlib.error):
+        return None  # the frames that could be read are taken all the same
+    begin_ns = None
+    for line in head.splitlines():
+        if _ASC_FRAME.match(line):
+            break
+        # Where the logger waited for a trigger, times count from there.
+        if dated := _ASC_DATE.match(line):
+            begin_ns = _ns_of_asc(dated["date"]) or begin_ns
+    return begin_ns
+
+
+def _ns_of_asc(text: str) -> int | None:
+    """A date as ASC logs have it, ``Nov 23 02:58:31.123 pm 2026``, ns since the Unix epoch in UTC."""
+    written = _ASC_WRITTEN.fullmatch(text.strip())
+    month = _MONTHS.get(written["month"].lower()) if written else None
+    if written is None or month is None:
+        return None
+    hour, half = int(written["hour"]), (written["half"] or "").lower()
+    if half and not 1 <= hour <= 12:
+        return None
+    if half:
+        hour = hour % 12 + (12 if half == "pm" else 0)
+    date = f"{written['year']}-{month:02}-{int(written['day']):02}T{hour:02}:{written['rest']}"
+    return ns_of_iso(date)
 
 
 @dataclass(slots=True)
