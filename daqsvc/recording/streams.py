@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+import unicodedata
+from collections import Counter
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
+from daqsvc.recording import RecordingError
+
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
@@ -19,6 +23,10 @@ if TYPE_CHECKING:
     Samples: TypeAlias = NDArray[np.float64] | NDArray[np.float32]
 
 NS_PER_S = 1_000_000_000
+FIRST_NS, LAST_NS = -9_214_560_000_000_000_000, 9_214_646_400_000_000_000
+"""Wall times of the years 1678 to 2261: what a count of nanoseconds in 64 bits holds in whole years."""
+PIECE_VALUES = 1 << 22
+"""Samples times channels that are looked at together."""
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _WRITTEN = re.compile(
     r"(?P<second>\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:[.,](?P<part>\d{1,9})\d*)?\s*"
@@ -59,7 +67,11 @@ class RecordedStream:
 
     def missing(self) -> int:
         """Samples that are NaN in at least one channel."""
-        return int(sum(np.isnan(piece).any(axis=1).sum() for piece in self.pieces(1 << 18)))
+        return int(sum(np.isnan(piece).any(axis=1).sum() for piece in self.pieces(self.piece_rows())))
+
+    def piece_rows(self, values: int = PIECE_VALUES) -> int:
+        """Rows of a piece that holds so many values at most: with many channels, fewer; one at least."""
+        return max(1, values // max(1, len(self.names)))
 
     def pieces(self, rows: int) -> Sequence[Samples]:
         """The samples, so many rows at a time."""
@@ -74,6 +86,80 @@ class RecordedStream:
         """
         steps = np.arange(first, first + count, dtype=np.float64) * (NS_PER_S / self.rate_hz)
         return np.rint(steps).astype(np.int64) + (self.start_ns or 0)
+
+
+def checked(stream: RecordedStream, recording: str) -> tuple[RecordedStream, list[str]]:
+    """A stream as any format can take it, as files may say what they like.
+
+    Args:
+        stream: as it was read.
+        recording: what it was read from, for messages.
+
+    Returns:
+        The stream, its names unique and its texts without control characters and lone surrogates, without a
+        begin where no count of nanoseconds holds it; and notes on what is not as it was, in sentences.
+
+    Raises:
+        RecordingError: its names, units and samples do not belong together, or its rate is none.
+    """
+    channels = stream.samples.shape[1] if stream.samples.ndim == 2 else 0
+    if not channels or not len(stream.names) == len(stream.units) == channels:
+        raise RecordingError(
+            f"{recording} cannot be read: stream {printable(stream.name):.80} has {len(stream.names)} names "
+            f"and {len(stream.units)} units of {channels} channels; it may be damaged: copy it anew"
+        )
+    if not 0.0 < stream.rate_hz < np.inf or len(stream.samples) / stream.rate_hz > LAST_NS / NS_PER_S:
+        raise RecordingError(
+            f"{recording} cannot be read: stream {printable(stream.name):.80} is said to have "
+            f"{stream.rate_hz!r} samples a second; it may be damaged: copy it anew"
+        )
+    notes = []
+    start_ns, length_ns = stream.start_ns, round(len(stream.samples) / stream.rate_hz * NS_PER_S)
+    if start_ns is not None and not FIRST_NS <= start_ns <= LAST_NS - length_ns:
+        start_ns = None
+        notes.append(
+            f"{recording} says a begin outside of the years 1678 to 2261, and it is left out; check the clock"
+        )
+    measured_hz = stream.measured_hz
+    if measured_hz is not None and not 0.0 < measured_hz < np.inf:
+        measured_hz = None
+    names = unique([printable(name) for name in stream.names])
+    units = [printable(unit) for unit in stream.units]
+    notes += [
+        f"the name of a channel of {recording} is taken or no text, and written as {new}"
+        for old, new in zip(stream.names, names, strict=True)
+        if old != new
+    ]
+    return replace(
+        stream,
+        name=printable(stream.name),
+        names=tuple(names),
+        units=tuple(units),
+        start_ns=start_ns,
+        measured_hz=measured_hz,
+    ), notes
+
+
+def unique(names: Sequence[str], taken: Iterable[str] = ()) -> list[str]:
+    """Names with a number behind those that came before, or are taken."""
+    used, left = set(taken), Counter(names)
+    made = []
+    for name in names:
+        one, number = name, 1
+        left[name] -= 1
+        while one in used or (one != name and left[one]):
+            number += 1
+            one = f"{name}_{number}"
+        used.add(one)
+        made.append(one)
+    return made
+
+
+def printable(text: str) -> str:
+    """Text that every file and terminal takes: control characters and lone surrogates as escapes."""
+    return "".join(
+        ascii(letter)[1:-1] if unicodedata.category(letter) in {"Cc", "Cs"} else letter for letter in text
+    )
 
 
 def of_blocks(blocks: Sequence[SampleBlock], most_stretched: int) -> tuple[NDArray[np.float32], int, float]:

@@ -12,6 +12,8 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from daqsvc.recording import RecordingError
+from daqsvc.recording.streams import unique
 from daqsvc.recording.writers.delimited import write_csv
 from daqsvc.recording.writers.matlab import write_mat
 from daqsvc.recording.writers.mdf import write_mdf
@@ -23,6 +25,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from daqsvc.recording.streams import RecordedStream
+
+LONGEST_PART = 120
+"""Bytes of a stream's name in that of a file."""
+LONGEST_REASON = 300
 
 
 class ExportUsageError(Exception):
@@ -83,11 +89,24 @@ def targets_of(target: Path, streams: Sequence[RecordedStream]) -> dict[Path, Se
     """The files that are written, with the streams in each: where a file holds one only, a file for each."""
     if len(streams) < 2 or writer_of(target).several:
         return {target: streams}
-    return {target.with_name(f"{target.stem}-{_plain(s.name)}{target.suffix}"): [s] for s in streams}
+    # Some file systems take capital and small letters for the same.
+    names = unique_files([_plain(stream.name) for stream in streams])
+    return {
+        target.with_name(f"{target.stem}-{name}{target.suffix}"): [stream]
+        for name, stream in zip(names, streams, strict=True)
+    }
+
+
+def unique_files(names: Sequence[str]) -> list[str]:
+    """Parts of file names with a number behind those that came before, in whatever letters."""
+    folded = unique([name.casefold() for name in names])
+    return [name + made.removeprefix(name.casefold()) for name, made in zip(names, folded, strict=True)]
 
 
 def _plain(name: str) -> str:
-    return "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in name)
+    plain = "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in name)
+    # A file name has 255 bytes, and a letter up to four.
+    return plain.encode()[:LONGEST_PART].decode(errors="ignore")
 
 
 def refuse_existing(targets: Sequence[Path]) -> None:
@@ -126,12 +145,38 @@ def write_all(
     notes = []
     with _folder_beside(next(iter(files)).parent) as folder:
         for target, streams in files.items():
-            notes += writer_of(target).write(folder / target.name, streams, about)
+            notes += _write(target, folder / target.name, streams, about)
             with (folder / target.name).open("rb") as written:
                 os.fsync(written.fileno())
         for target in files:
             _put(folder / target.name, target, force=force)
     return notes
+
+
+def _write(
+    target: Path, path: Path, streams: Sequence[RecordedStream], about: Mapping[str, str]
+) -> list[str]:
+    """Write one file; arguments and result as of `Writer.write`.
+
+    Raises:
+        RecordingError: the format cannot hold these samples.
+        OSError: they cannot be written.
+    """
+    try:
+        return writer_of(target).write(path, streams, about)
+    except (OSError, RecordingError, ExportUsageError):
+        raise
+    except MemoryError:
+        raise RecordingError(
+            f"{target.name} takes more memory than there is; write .parquet or .csv, or one stream "
+            "alone with --stream"
+        ) from None
+    except Exception as error:
+        # What names, rates and times a format cannot hold its library says in words of its own.
+        why = " ".join(str(error).split())[:LONGEST_REASON] or type(error).__name__
+        raise RecordingError(
+            f"{target.name} cannot hold this recording: {why}; write another format"
+        ) from error
 
 
 @contextmanager

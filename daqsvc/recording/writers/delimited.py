@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.recording.contents import MEASURED_RATE, STATED_RATE, STATED_START
+from daqsvc.recording.writers.gaps import beside_times
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -17,15 +18,22 @@ if TYPE_CHECKING:
 
     from daqsvc.recording.streams import RecordedStream, Samples
 
-PIECE_ROWS = 1 << 14
+PIECE_CELLS = 1 << 18
+"""Samples times channels that are text in memory at once."""
 SINGLE_DIGITS, DOUBLE_DIGITS = 9, 17
 """Digits that a float32 and a float64 can be got back from, bit by bit."""
 
 
 def write_csv(path: Path, streams: Sequence[RecordedStream], about: Mapping[str, str]) -> list[str]:
-    """Write one stream: UTF-8, commas, decimal points; a missing sample is ``nan``."""
+    """Write one stream: UTF-8, commas, decimal points; a missing sample is ``nan``.
+
+    Returns:
+        Which channels are called otherwise, as the times have their name, in sentences.
+    """
     (stream,) = streams
     dated = stream.start_ns is not None
+    times = "time" if dated else "time_s"
+    names, notes = beside_times(path, stream, times)
     with path.open("w", encoding="utf-8", newline="") as file:
         said = {**about, "stream": stream.name, STATED_RATE: f"{stream.rate_hz!r}"}
         if stream.measured_hz is not None:
@@ -34,16 +42,17 @@ def write_csv(path: Path, streams: Sequence[RecordedStream], about: Mapping[str,
             said[STATED_START] = stream.start
         for key, text in said.items():
             file.write(f"# {key} = {' '.join(text.split())}\n")
-        for name, unit in zip(stream.names, stream.units, strict=True):
+        for name, unit in zip(names, stream.units, strict=True):
             if unit:
                 file.write(f"# unit of {' '.join(name.split())} = {unit}\n")
-        csv.writer(file, lineterminator="\n").writerow(["time" if dated else "time_s", *stream.names])
+        csv.writer(file, lineterminator="\n").writerow([times, *names])
         digits = SINGLE_DIGITS if stream.samples.dtype == np.float32 else DOUBLE_DIGITS
-        row = ",".join(["%s", *[f"%.{digits}g"] * len(stream.names)]) + "\n"
-        for number, piece in enumerate(stream.pieces(PIECE_ROWS)):
-            times_ns = stream.times_ns(number * PIECE_ROWS, len(piece))
+        row = ",".join(["%s", *[f"%.{digits}g"] * len(names)]) + "\n"
+        rows = stream.piece_rows(PIECE_CELLS)
+        for number, piece in enumerate(stream.pieces(rows)):
+            times_ns = stream.times_ns(number * rows, len(piece))
             file.write(_rows(row, _written(times_ns) if dated else (times_ns / 1e9).astype(str), piece))
-    return []
+    return notes
 
 
 def _written(times_ns: NDArray[np.int64]) -> NDArray[np.str_]:

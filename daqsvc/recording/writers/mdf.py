@@ -14,13 +14,16 @@ if TYPE_CHECKING:
 
     from daqsvc.recording.streams import RecordedStream
 
-VERSION = "4.10"
-PIECE_ROWS = 1 << 18
+VERSION, SUFFIX = "4.10", ".mf4"
 _NS_PER_S = 1_000_000_000
 
 
 def write_mdf(path: Path, streams: Sequence[RecordedStream], about: Mapping[str, str]) -> list[str]:
-    """Write all streams; times are seconds from the begin of the first stream on; a missing sample is NaN."""
+    """Write all streams; times are seconds from the begin of the first stream on; a missing sample is NaN.
+
+    Returns:
+        That nobody says the begin, which the file must have, or that it is before any that it can have.
+    """
     import asammdf  # noqa: PLC0415 - an extra, and only this format needs it
 
     logging.getLogger("asammdf").disabled = True
@@ -29,8 +32,9 @@ def write_mdf(path: Path, streams: Sequence[RecordedStream], about: Mapping[str,
     with asammdf.MDF(version=VERSION) as mdf:
         for group, stream in enumerate(streams):
             behind_s = 0.0 if stream.start_ns is None else (stream.start_ns - begin_ns) / _NS_PER_S
-            for number, piece in enumerate(stream.pieces(PIECE_ROWS)):
-                first = number * PIECE_ROWS
+            rows = stream.piece_rows()
+            for number, piece in enumerate(stream.pieces(rows)):
+                first = number * rows
                 times = behind_s + np.arange(first, first + len(piece)) / stream.rate_hz
                 columns = [np.ascontiguousarray(column) for column in piece.T]
                 if number:
@@ -46,10 +50,15 @@ def write_mdf(path: Path, streams: Sequence[RecordedStream], about: Mapping[str,
                     comment=_comment(stream),
                     common_timebase=True,
                 )
-        mdf.start_time = datetime.fromtimestamp(begin_ns // _NS_PER_S, UTC)
-        mdf.header.abs_time = begin_ns  # of which the date above has whole seconds only
+        since_1970_ns = max(begin_ns, 0)  # the header counts from there, without a sign
+        mdf.start_time = datetime.fromtimestamp(since_1970_ns // _NS_PER_S, UTC)
+        mdf.header.abs_time = since_1970_ns  # of which the date above has whole seconds only
         mdf.header.comment = "; ".join(f"{key}: {text}" for key, text in about.items())
-        mdf.save(path, overwrite=True)
+        # Of whatever name asammdf makes one that ends in small letters.
+        written = mdf.save(path.with_suffix(SUFFIX), overwrite=True)
+    written.replace(path)
+    if begin_ns < 0:
+        return [f"{path.name}: begins in 1970, as no MDF file begins before"]
     return [] if starts else [f"{path.name}: begins in 1970, as the recording does not say when it began"]
 
 

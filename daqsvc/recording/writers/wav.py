@@ -25,24 +25,32 @@ IEEE_FLOAT = 3
 MOST_BYTES = 2**32 - 1
 """The size of a file and its samples has 32 bits."""
 MOST_CHANNELS = 2**16 - 1
-PIECE_ROWS = 1 << 18
+MOST_RATE_BYTES = 2**32 - 1
+"""The bytes of a second, too."""
 _WHOLE = 1e-9
 
 
 def write_wav(path: Path, streams: Sequence[RecordedStream], about: Mapping[str, str]) -> list[str]:
     """Write one stream; a missing sample is 0, as a NaN ends most players.
 
+    Returns:
+        How many samples are 0 that were missing, infinite or beyond float32, in sentences.
+
     Raises:
-        RecordingError: the rate is no whole number of Hz, or there are more samples than a WAV file holds.
+        RecordingError: the rate is no whole number of Hz, or rate or samples are more than a WAV file holds.
     """
     (stream,) = streams
-    rate_hz = round(stream.rate_hz)
-    if abs(stream.rate_hz / rate_hz - 1.0) > _WHOLE:
+    rate_hz, channels = round(stream.rate_hz), len(stream.names)
+    if rate_hz < 1 or abs(stream.rate_hz / rate_hz - 1.0) > _WHOLE:
         raise RecordingError(
             f"stream {stream.name} has {stream.rate_hz!r} samples a second, and a WAV file says whole "
-            "numbers only; write .parquet, .mf4 or .mat"
+            "numbers only; write .parquet, .mf4 or .mat, or another stream alone with --stream"
         )
-    channels = len(stream.names)
+    if 4 * channels * rate_hz > MOST_RATE_BYTES:
+        raise RecordingError(
+            f"stream {stream.name} has {stream.rate_hz:g} samples a second of {channels} channels, and a WAV "
+            "file says 4.29 GB a second at most; write .parquet, .mf4 or .mat"
+        )
     data_bytes = 4 * channels * len(stream.samples)
     comment = _comment(stream, about)
     head = _head(rate_hz, channels, len(stream.samples), comment)
@@ -51,12 +59,15 @@ def write_wav(path: Path, streams: Sequence[RecordedStream], about: Mapping[str,
             f"stream {stream.name} has {data_bytes / 1e9:.3g} GB of samples, and a WAV file holds 4.29; "
             "write .parquet or .mf4"
         )
+    infinite = 0
     with path.open("wb") as file:
         # Where the samples of a file have an odd size a byte comes behind; of four bytes each they have not.
         file.write(b"RIFF" + struct.pack("<I", len(head) + data_bytes - 8) + head[8:])
-        for piece in stream.pieces(PIECE_ROWS):
-            file.write(filled(piece, np.float32).data)
-    return notes_on_gaps(path, streams, "WAV")
+        for piece in stream.pieces(stream.piece_rows()):
+            finite, replaced = filled(piece, np.float32)
+            file.write(finite.data)
+            infinite += replaced
+    return notes_on_gaps(path, streams, "WAV", [infinite])
 
 
 def _comment(stream: RecordedStream, about: Mapping[str, str]) -> bytes:
