@@ -3,3 +3,7 @@
 
 class RecordingError(ValueError):
     """A recording cannot be read, or does not hold what is asked of it."""
+
+
+class NamesError(RecordingError):
+    """Channels cannot be called so; says why, and what to do."""

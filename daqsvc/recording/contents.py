@@ -66,6 +66,8 @@ class Contents:
         rates_hz: samples per second of single channels, by their names.
         times: for single channels the entry that holds the time of each sample, in seconds or as dates.
         units: of single channels, as the file spells them.
+        starts_ns: wall time of the first sample of single channels, ns since the Unix epoch, where the file
+            says one for each.
     """
 
     entries: Mapping[str, NDArray[np.generic]]
@@ -74,6 +76,7 @@ class Contents:
     rates_hz: Mapping[str, float] = field(default_factory=dict)
     times: Mapping[str, str] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
+    starts_ns: Mapping[str, int] = field(default_factory=dict)
 
     def vectors(self) -> dict[str, NDArray[np.generic]]:
         """Numeric entries of one dimension, of any length."""

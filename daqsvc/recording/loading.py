@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -13,11 +14,11 @@ import numpy as np
 from daqsvc.confined.limits import ResourceLimits
 from daqsvc.dsp.quality import UnfitError
 from daqsvc.dsp.quality.unit import refuse_beyond_any_unit
-from daqsvc.recording import RecordingError
+from daqsvc.recording import NamesError, RecordingError
 from daqsvc.recording.contents import GROUP_TIME, NUMERIC, STATED_START
 from daqsvc.recording.formats import read
 from daqsvc.recording.rate import place_at, time_column, timing_of
-from daqsvc.recording.streams import ns_of_iso
+from daqsvc.recording.streams import FIRST_NS, LAST_NS, NS_PER_S, iso_ns, ns_of_iso
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -55,7 +56,7 @@ def load(
     columns, length = _channels(file, contents, channels)
     in_file = [_variable(contents, variable) for variable in channels.values()]
     timing = timing_of(file, contents, length, rate_hz, in_file)
-    about = {
+    about: dict[str, Any] = {
         "names": list(columns),
         "rate_hz": timing.rate_hz,
         "left_out": left_out,
@@ -69,8 +70,11 @@ def load(
             if variable in contents.units
         },
     }
+    begins = _Begins.of(contents, in_file, timing.rate_hz)
+    if begins.shifts and FIRST_NS <= begins.latest_ns <= LAST_NS:
+        about["texts"][STATED_START] = iso_ns(begins.latest_ns)
     del contents
-    samples = _together(columns, length, timing.rows, narrow=narrow)
+    samples = begins.aligned(file, _together(columns, length, timing.rows, narrow=narrow))
     if named:  # what nobody asked for may be anything, e.g. a time in nanoseconds
         _refuse_impossible(file, list(channels), samples)
     about["nan_count"], about["infinity_count"] = _count_bad(samples)
@@ -96,13 +100,12 @@ def load_all(
         ``start_ns`` (None if the file says none); ``notes`` on what is wrong; and the samples of each.
 
     Raises:
+        NamesError: see there.
         RecordingError: see there.
     """
     file = Path(path)
     contents = read(file, ResourceLimits(memory_bytes))
-    called = {_variable(contents, variable): name for name, variable in (channels or {}).items()}
-    for variable in called:
-        _channel(file, contents, variable)
+    called = _called(file, contents, channels or {})
     groups = _groups(file, contents)
     streams: list[dict[str, Any]] = []
     loaded: list[Samples] = []
@@ -125,15 +128,39 @@ def load_all(
     return {"streams": streams, "notes": notes}, loaded
 
 
+def _called(path: Path, contents: Contents, channels: Mapping[str, str]) -> dict[str, str]:
+    """What channels are called from now on, by their names in the file.
+
+    Raises:
+        NamesError: a channel would have two names, or one that another has.
+        RecordingError: one is not there.
+    """
+    called: dict[str, str] = {}
+    for name, variable in channels.items():
+        _channel(path, contents, variable)
+        one = _variable(contents, variable)
+        if one in called:
+            raise NamesError(f"{one} of {path} cannot be both {called[one]} and {name}: map it once")
+        called[one] = name
+    there = _lengths(contents)
+    for one, name in called.items():
+        if name in there and name not in called:
+            raise NamesError(
+                f"{one} of {path} cannot be called {name}, as another channel of the file is: give it a name "
+                f"of its own, or map that, too: --map {name}={one},OTHER={name}"
+            )
+    return called
+
+
 def _groups(path: Path, contents: Contents) -> dict[str, list[str]]:
-    """Channels that have one time, by the name of their group; the longest group first."""
+    """Channels that have one time and begin, by the name of their group; the longest group first."""
     lengths = _lengths(contents)
-    found: dict[tuple[str, float, int], list[str]] = {}
+    found: dict[tuple[str, float, int | None, int], list[str]] = {}
     for name, length in lengths.items():
-        key = (contents.times.get(name, ""), contents.rates_hz.get(name, 0.0), length)
-        found.setdefault(key, []).append(name)
+        rate_hz, start_ns = contents.rates_hz.get(name, 0.0), contents.starts_ns.get(name)
+        found.setdefault((contents.times.get(name, ""), rate_hz, start_ns, length), []).append(name)
     groups: dict[str, list[str]] = {}
-    for (times, rate_hz, length), members in sorted(found.items(), key=lambda one: -one[0][2]):
+    for (times, rate_hz, _, length), members in sorted(found.items(), key=lambda one: -one[0][3]):
         time = None if times else time_column(contents, length)
         there = [name for name in members if name != time]
         if not there:
@@ -148,7 +175,13 @@ def _groups(path: Path, contents: Contents) -> dict[str, list[str]]:
 
 
 def _start_ns(contents: Contents, members: Sequence[str], length: int) -> int | None:
-    """Wall time of the first sample: by a column of dates, or by what the file says of its begin."""
+    """Wall time of the first sample: by a column of dates, or by what the file says of its begin.
+
+    Where it says one for each stream, that of these channels and no other; but for the groups of an MDF file
+    that have no time, which begin with the file.
+    """
+    if contents.starts_ns and (members[0] in contents.starts_ns or not contents.times):
+        return contents.starts_ns.get(members[0])
     stated = ns_of_iso(contents.texts().get(STATED_START, ""))
     times = contents.times.get(members[0])
     if times is not None and stated is not None and contents.entries[times].dtype.kind == "f":
@@ -160,8 +193,54 @@ def _start_ns(contents: Contents, members: Sequence[str], length: int) -> int | 
         if values.dtype.kind == "M" and values.ndim == 1 and len(values) == length and not np.isnat(values[0])
     ]
     if dates:
-        return int(dates[0][0].astype("datetime64[ns]").astype(np.int64))
+        # In two parts, as nanoseconds hold no date of the year 9999.
+        second = dates[0][0].astype("datetime64[s]")
+        part_ns = (dates[0][0] - second).astype("timedelta64[ns]").astype(np.int64)
+        return int(second.astype(np.int64)) * NS_PER_S + int(part_ns)
     return stated
+
+
+@dataclass(frozen=True, slots=True)
+class _Begins:
+    """When channels begin that are taken together.
+
+    Attributes:
+        shifts: for each channel, samples that it has before the one that begins last; empty if none has any.
+        latest_ns: wall time of that begin, ns since the Unix epoch.
+    """
+
+    shifts: tuple[int, ...] = ()
+    latest_ns: int = 0
+
+    @classmethod
+    def of(cls, contents: Contents, in_file: Sequence[str], rate_hz: float) -> _Begins:
+        """The begins of channels by their names in the file; those that say none begin with the others."""
+        known = {name: contents.starts_ns[name] for name in in_file if name in contents.starts_ns}
+        if not known:
+            return cls()
+        latest_ns = max(known.values())
+        shifts = tuple(
+            round((latest_ns - known.get(name, latest_ns)) * rate_hz / NS_PER_S) for name in in_file
+        )
+        return cls(shifts if any(shifts) else (), latest_ns)
+
+    def aligned(self, path: Path, samples: Any) -> Any:
+        """Samples ``[n, channels]`` from the last begin on, to where the first channel ends.
+
+        Raises:
+            RecordingError: the channels have no time in common.
+        """
+        if not self.shifts:
+            return samples
+        length = len(samples) - max(self.shifts)
+        if length < 2:
+            raise RecordingError(
+                f"the channels of {path} were not taken at the same time: one begins after another has "
+                "ended; map only channels taken together"
+            )
+        for column, shift in enumerate(self.shifts):
+            samples[:length, column] = samples[shift : shift + length, column]
+        return samples[:length]
 
 
 def load_streams(
@@ -183,7 +262,7 @@ def load_streams(
         columns, length = _channels(file, contents, channels)
         in_file = [_variable(contents, variable) for variable in channels.values()]
         rows, noted = place_at(file, contents, length, rate_hz, in_file)
-        samples = _together(columns, length, rows)
+        samples = _Begins.of(contents, in_file, rate_hz).aligned(file, _together(columns, length, rows))
         _refuse_impossible(file, list(channels), samples)
         notes.append(noted)
         loaded.append(samples)

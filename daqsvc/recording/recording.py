@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from daqsvc.confined.limits import ResourceLimits
 from daqsvc.confined.process import ConfinedError, RaisedThereError, shared
-from daqsvc.recording import RecordingError
+from daqsvc.recording import NamesError, RecordingError
 from daqsvc.recording.formats import find
 from daqsvc.recording.streams import RecordedStream
 
@@ -150,6 +150,7 @@ def load_all(
         A stream that the file does not name has its name.
 
     Raises:
+        NamesError: two channels would have one name, or one of them two.
         RecordingError: see `load_recording`.
     """
     path = Path(path)
@@ -289,8 +290,9 @@ def _there(
             spill=spill,
         )
     except RaisedThereError as error:
-        if error.kind == RecordingError.__name__:
-            raise RecordingError(error.message) from None
+        for known in (RecordingError, NamesError):
+            if error.kind == known.__name__:
+                raise known(error.message) from None
         raise RecordingError(
             f"{path} cannot be read: {error}; it may be damaged: copy or save it anew"
         ) from None

@@ -22,6 +22,7 @@ from daqsvc.recording.contents import (
     flattened,
     names_of_groups,
 )
+from daqsvc.recording.streams import ns_of_iso
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -61,13 +62,15 @@ def read_mat(path: Path, budget: Budget) -> Contents:
     entries |= _with_start(streams)
     names = names_of_groups([(one.name, name) for one in streams.values() for name in one.channels])
     channels = [(one, name) for one in streams.values() for name in one.channels]
-    rates_hz, units = {}, {}
+    rates_hz, units, starts_ns = {}, {}, {}
     for entry, (one, name) in zip(names, channels, strict=True):
         entries[entry], rates_hz[entry] = one.channels[name], one.rate_hz
         if one.units[name]:
             units[entry] = one.units[name]
+        if (start_ns := ns_of_iso(one.start)) is not None:
+            starts_ns[entry] = start_ns
     check_columns(len(entries))
-    return Contents(entries, rates_hz=rates_hz, units=units)
+    return Contents(entries, rates_hz=rates_hz, units=units, starts_ns=starts_ns)
 
 
 class _Stream(NamedTuple):
@@ -86,7 +89,10 @@ def _stream(variable: object) -> _Stream | None:
         return None
     lists = [np.atleast_1d(getattr(variable, key)).ravel() for key in ("names", "fields", "units")]
     try:
-        names, fields, units = ([str(one) if np.size(one) else "" for one in texts] for texts in lists)
+        # Of one channel whose unit nobody says nothing at all is left.
+        names, fields, units = (
+            [str(one) if np.size(one) else "" for one in texts] or [""] for texts in lists
+        )
         samples = [np.atleast_1d(getattr(variable, field)) for field in fields]
         rate_hz = float(getattr(variable, STATED_RATE))
         start, name = (getattr(variable, key, "") for key in (STATED_START, "stream"))

@@ -12,6 +12,7 @@ from daqsvc.recording import RecordingError
 from daqsvc.recording.contents import GROUP_TIME, STATED_START, Contents, check_columns, names_of_groups
 from daqsvc.recording.formats.extras import needed
 from daqsvc.recording.formats.mdf_structure import FORMULA, check_mdf_structure
+from daqsvc.recording.streams import ns_of_iso
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -99,8 +100,16 @@ class _Groups:
                 time = time if time not in entries else f"{GROUP_TIME}group {g}"
                 entries[time] = np.asarray(self._mdf.get_master(g), np.float64)
                 times |= dict.fromkeys(mine, time)
-        entries.setdefault(STATED_START, np.array(self._start()))
-        return Contents(entries, times=times, units=units)
+        start = self._start()
+        entries.setdefault(STATED_START, np.array(start))
+        starts_ns = {}
+        if (start_ns := ns_of_iso(start)) is not None:
+            firsts_s = {time: float(entries[time][0]) for time in times.values() if len(entries[time])}
+            known_ns = {
+                time: start_ns + round(s * _NS_PER_S) for time, s in firsts_s.items() if np.isfinite(s)
+            }
+            starts_ns = {name: known_ns.get(time, start_ns) for name, time in times.items()}
+        return Contents(entries, times=times, units=units, starts_ns=starts_ns)
 
     def _start(self) -> str:
         """When the recording began, with the nanoseconds that a date of Python's has not."""

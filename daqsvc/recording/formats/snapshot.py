@@ -9,7 +9,7 @@ import numpy as np
 from daqsvc.acquisition.samples import SampleBlock
 from daqsvc.recording import RecordingError
 from daqsvc.recording.contents import STATED_START, Contents, check_columns
-from daqsvc.recording.streams import iso_ns
+from daqsvc.recording.streams import FIRST_NS, LAST_NS, iso_ns
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -64,7 +64,8 @@ def read_snapshot_channels(path: Path, budget: Budget) -> Contents:
     shortest = min(map(len, entries.values()))
     check_columns(len(entries))
     cut = {name: values[:shortest] for name, values in entries.items()} | {RATE: np.array(float(rate_hz))}
-    if isinstance(wall_ns := about.get("wall_ns_at_0"), int):
+    wall_ns = about.get("wall_ns_at_0")
+    if isinstance(wall_ns, int) and FIRST_NS <= wall_ns + begin_ns <= LAST_NS:
         cut[STATED_START] = np.array(iso_ns(wall_ns + begin_ns))
     return Contents(cut, units={name: unit for name, unit in units.items() if unit})
 

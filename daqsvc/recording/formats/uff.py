@@ -11,6 +11,7 @@ from daqsvc.recording import RecordingError
 from daqsvc.recording.contents import STATED_RATE, STATED_START, Contents, check_columns, column_names
 from daqsvc.recording.formats.extras import needed
 from daqsvc.recording.rate import rate_of_step
+from daqsvc.recording.streams import ns_of_iso
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -58,7 +59,7 @@ def read_uff(path: Path, budget: Budget) -> Contents:
         raise RecordingError(f"{path} holds no function; save the time signals in it as data sets 58")
     check_columns(len(numbers))
     entries: dict[str, NDArray[np.generic]] = {}
-    rates_hz, times, units = {}, {}, {}
+    rates_hz, times, units, starts_ns = {}, {}, {}, {}
     sets: list[Mapping[str, Any]] = [_without_abscissa(file.read_sets(i)) for i in numbers]
     names = _names(sets)
     for name, one in zip(names, sets, strict=True):
@@ -79,10 +80,13 @@ def read_uff(path: Path, budget: Budget) -> Contents:
             entries[times[name]] = np.asarray(one["x"])
         if unit := _text(one.get("ordinate_axis_units_lab")):
             units[name] = unit
+        own = EXACT.fullmatch(_text(one.get("id4")))
+        if own and (start_ns := ns_of_iso(own[1] or "")) is not None:
+            starts_ns[name] = start_ns
     exact = EXACT.fullmatch(_text(sets[0].get("id4")))
     if start := (exact and exact[1]) or _text(sets[0].get("id3")):
         entries.setdefault(STATED_START, np.array(start))
-    return Contents(entries, rates_hz=rates_hz, times=times, units=units)
+    return Contents(entries, rates_hz=rates_hz, times=times, units=units, starts_ns=starts_ns)
 
 
 def _without_abscissa(one: dict[str, Any]) -> dict[str, Any]:
