@@ -150,8 +150,12 @@ def _document(files: Mapping[Path, Sequence[RecordedStream]], notes: list[str]) 
 
 
 def _line(written: dict[str, Any]) -> str:
+    from daqsvc.recording.streams import printable  # noqa: PLC0415 - as above
+
+    # The name of a file may be bytes that are no text.
+    file = printable(written["file"])
     return "\n".join(
-        f"{written['file']}: {one['stream']}, {', '.join(one['channels'])} at {one['rate_hz']:g} Hz, "
+        f"{file}: {one['stream']}, {', '.join(one['channels'])} at {one['rate_hz']:g} Hz, "
         f"{one['samples'] / one['rate_hz']:.4g} s"
         + (f", {one['missing']:,} samples missing" if one["missing"] else "")
         for one in written["streams"]

@@ -8,19 +8,23 @@ from typing import TYPE_CHECKING, Any
 
 from daqsvc import __version__
 from daqsvc.acquisition.samples import SampleBlock
-from daqsvc.recording import RecordingError
+from daqsvc.recording import NamesError, RecordingError
 from daqsvc.recording.formats import named_as_can_log
 from daqsvc.recording.rate import MOST_STRETCHED
 from daqsvc.recording.recording import get_limits, list_channels, load_all, matching
-from daqsvc.recording.streams import NS_PER_S, LongGapsError, RecordedStream, of_blocks
+from daqsvc.recording.streams import NS_PER_S, LongGapsError, RecordedStream, checked, of_blocks, printable
+from daqsvc.recording.writers import ExportUsageError
 from daqsvc.snapshots.contents import SUFFIX
 from daqsvc.snapshots.reading import SnapshotError, read_snapshot
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Collection, Mapping
 
     from daqsvc.settings import MachineFile
     from daqsvc.snapshots.contents import Document, Snapshot
+
+ABOUT_MACHINE: tuple[str, ...] = ("site", "box", "machine")
+"""What a snapshot says of where it is from."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,10 +57,33 @@ def read_streams(
         rate_hz: samples per second of a file that does not say it.
 
     Raises:
+        ExportUsageError: two of its channels would have one name, or one of them two.
         RecordingError: it cannot be read.
     """
     path = Path(recording)
-    about = {"recording": path.name, "written_by": f"daqsvc {__version__}"}
+    read = _read(path, recording, machine, channels or {}, rate_hz)
+    streams, notes = [], list(read.notes)
+    for one in read.streams:
+        stream, noted = checked(one, printable(str(path)))
+        streams.append(stream)
+        notes += [note for note in noted if note not in notes]
+    about = {"recording": path.name, "written_by": f"daqsvc {__version__}", **read.about}
+    return Exported(streams, {key: printable(text) for key, text in about.items()}, notes)
+
+
+def _read(
+    path: Path,
+    recording: str,
+    machine: MachineFile | None,
+    channels: Mapping[str, str],
+    rate_hz: float | None,
+) -> Exported:
+    """What a recording holds, as it says itself; see `read_streams`.
+
+    Raises:
+        ExportUsageError: names for its channels do not fit.
+        RecordingError: it cannot be read.
+    """
     of_machine = {} if machine is None else {"machine": machine.machine.name}
     is_can_log = path.is_dir() or named_as_can_log(path)
     is_snapshot = path.name.lower().endswith(SUFFIX)
@@ -69,7 +96,7 @@ def read_streams(
         from daqsvc.offline.can_logs import load_can_streams  # noqa: PLC0415 - brings python-can and kernels
 
         streams, notes = load_can_streams(machine, recording)
-        return Exported(streams, about | of_machine, notes)
+        return Exported(streams, of_machine, notes)
     if path.is_dir():
         raise RecordingError(
             f"{path} is a folder, of which only CAN logs are read, by the layouts of a machine file: name "
@@ -80,10 +107,11 @@ def read_streams(
             snapshot = read_snapshot(path, get_limits())
         except SnapshotError as error:
             raise RecordingError(f"{error}") from None
-        said = {key: str(snapshot.about[key]) for key in ("site", "box", "machine") if key in snapshot.about}
-        return Exported(_of_snapshot(path, snapshot), about | said, list(snapshot.notes))
-    streams, notes = _of_table(recording, machine, channels or {}, rate_hz)
-    return Exported(streams, about | of_machine, notes)
+        about = snapshot.about
+        said = {key: str(about[key]) for key in ABOUT_MACHINE if key in about}
+        return Exported(_of_snapshot(path, snapshot), said, list(snapshot.notes))
+    streams, notes = _of_table(recording, machine, channels, rate_hz)
+    return Exported(streams, of_machine, notes)
 
 
 def _of_snapshot(path: Path, snapshot: Snapshot) -> list[RecordedStream]:
@@ -100,7 +128,7 @@ def _of_snapshot(path: Path, snapshot: Snapshot) -> list[RecordedStream]:
         ]
     except LongGapsError as error:
         raise RecordingError(f"{path} {error}; give a snapshot of a shorter time") from None
-    except (AttributeError, KeyError, TypeError, ValueError, ZeroDivisionError) as error:
+    except (ArithmeticError, AttributeError, KeyError, TypeError, ValueError) as error:
         raise RecordingError(f"{path} cannot be read: {error}; it may be damaged: copy it anew") from None
     if not streams:
         raise RecordingError(f"{path} holds no samples of any sensor; give another snapshot")
@@ -122,17 +150,19 @@ def _of_table(
     recording: str, machine: MachineFile | None, channels: Mapping[str, str], rate_hz: float | None
 ) -> tuple[list[RecordedStream], list[str]]:
     """A file of another kind; by a machine file, its sensors have their names, and units if it says none."""
-    if machine is None:
-        return load_all(recording, channels, rate_hz)
-    there = list_channels(recording)
-    wanted = {name: matching(recording, variable, there) for name, variable in channels.items()}
-    units = {}
-    for sensor in machine.sensors:
-        mapped = wanted.pop(sensor.channel, None) if sensor.name not in wanted else wanted[sensor.name]
-        variable = mapped or next((one for one in (sensor.name, sensor.channel) if one in there), None)
-        if variable is not None:
-            wanted[sensor.name], units[sensor.name] = variable, sensor.unit
-    streams, notes = load_all(recording, wanted, rate_hz)
+    wanted, units = dict(channels), {}
+    if machine is not None:
+        there = list_channels(recording)
+        # A number is that of a column, and no end of a name.
+        wanted = {
+            name: variable if variable.isdecimal() else matching(recording, variable, there)
+            for name, variable in channels.items()
+        }
+        units = _add_sensors(wanted, machine, there)
+    try:
+        streams, notes = load_all(recording, wanted, rate_hz)
+    except NamesError as error:
+        raise ExportUsageError(f"{error}") from None
     in_units = [
         replace(
             one,
@@ -141,3 +171,32 @@ def _of_table(
         for one in streams
     ]
     return in_units, notes
+
+
+def _add_sensors(wanted: dict[str, str], machine: MachineFile, there: Collection[str]) -> dict[str, str]:
+    """Add the sensors of a machine that a file has, and tell their units.
+
+    Args:
+        wanted: channels of the file by their names from now on; sensors come to it.
+        machine: the machine file.
+        there: the channels of the file.
+
+    Raises:
+        ExportUsageError: a channel may be several sensors.
+    """
+    sensors = {one.name: wanted.get(one.name, one.name) for one in machine.sensors}
+    sensors = {name: one for name, one in sensors.items() if name in wanted or one in there}
+    for channel in dict.fromkeys(one.channel for one in machine.sensors):
+        rivals = [s.name for s in machine.sensors if s.channel == channel and s.name not in sensors]
+        variable = wanted.get(channel, channel)
+        if not rivals or variable in sensors.values() or (channel not in wanted and channel not in there):
+            continue
+        if len(rivals) > 1:
+            raise ExportUsageError(
+                f"channel {variable} may be {' or '.join(rivals)} of {machine.path}: say which with "
+                f"--map {rivals[0]}={variable}"
+            )
+        wanted.pop(channel, None)
+        sensors[rivals[0]] = variable
+    wanted |= sensors
+    return {sensor.name: sensor.unit for sensor in machine.sensors if sensor.name in sensors}
