@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import csv
 import json
+import signal
 import struct
 import subprocess
 import sys
+import time
 from datetime import UTC, datetime
 
 import asammdf
@@ -379,11 +381,16 @@ def test_a_kill_leaves_nothing_half_under_the_name(tmp_path):
     target = tmp_path / "long.csv"
     running = subprocess.Popen([sys.executable, "-m", "daqsvc", "export", source, "--to", target])
     try:
-        while running.poll() is None and not list(tmp_path.glob(".daqsvc-export-*/long.csv")):
-            pass
+        while running.poll() is None and not any(
+            file.stat().st_size for file in tmp_path.glob(".daqsvc-export-*/long.csv")
+        ):
+            time.sleep(0.005)
     finally:
         running.kill()
         running.wait()
+    assert running.returncode == -signal.SIGKILL  # it was at it, and had not ended by itself
+    (half,) = tmp_path.glob(".daqsvc-export-*/long.csv")
+    assert 0 < half.stat().st_size < 3_000_000 * len("0.0,0\n")
     assert not target.exists()
 
 
