@@ -9,6 +9,7 @@ import subprocess
 import sys
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 from support.fleet_archives import (
     add_hostile,
@@ -231,8 +232,9 @@ def test_other_programs_read_the_table(judged: tuple[Path, int, dict[str, bytes]
 @pytest.mark.long
 def test_what_is_tried_again_with_more_memory_is_judged(tmp_path: Path) -> None:
     recordings = add_machine(tmp_path / "archive", "pump")
-    add_recordings(recordings, 1)
-    Orbit(30_000, seed=5).save(recordings / "2026-03-02.npz")
+    add_recordings(recordings, 2)
+    with np.load(recordings / "2026-03-02.npz") as short:
+        np.savez(recordings / "2026-03-02.npz", **short, ballast=np.zeros(4_000_000))
     results = tmp_path / "archive-results"
 
     def run(*options: str) -> tuple[int, int]:
