@@ -12,7 +12,7 @@ import contextlib
 import itertools
 import json
 import logging
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -56,6 +56,9 @@ DISK_TICKS = 10
 COMMIT_S = 5.0
 """How long an answer waits for the disk before it says that the disk has not got it yet."""
 MOST_COMMANDS = 64
+MOST_SNAPSHOTS = 6
+"""That others may have made of one machine in `SNAPSHOTS_NS`: files of older ones go for newer ones."""
+SNAPSHOTS_NS = 600 * NS_PER_S
 """Commands that may wait at a time; further ones are refused."""
 GRACE_S = 0.1
 """What outputs may take beyond their deadline before they are left behind."""
@@ -169,7 +172,8 @@ class AlarmService:
         self._supervisor = supervisor or Supervisor()
         self._heard = heard
         self._snapshot = snapshot
-        self._snapshots_waiting = 0
+        self._snapshots: dict[str, deque[int]] = {}
+        """By machine, when others had some made lately, monotonic."""
         self._log = AlarmLog(clock, of_several=len(self.managers) > 1)
         self._conditions_of_outputs = asked.conditions
         self._conditions = [*conditions(buses or {}), *asked.conditions]
@@ -486,9 +490,17 @@ class AlarmService:
         """
         if self._stopping:
             return self._refuse(STOPPING)
-        if self._snapshots_waiting >= MOST_COMMANDS:
-            return self._refuse(f"{MOST_COMMANDS} others wait for snapshots already; ask again later")
-        self._snapshots_waiting += 1
+        now_ns = self._clock.monotonic_ns()
+        lately = self._snapshots.setdefault(command.machine, deque(maxlen=MOST_SNAPSHOTS))
+        if len(lately) == MOST_SNAPSHOTS and now_ns - lately[0] < SNAPSHOTS_NS:
+            # Nor is that written down: it may be a flood.
+            refusal = (
+                f"{MOST_SNAPSHOTS} snapshots of {command.machine} were asked for within "
+                f"{SNAPSHOTS_NS // NS_PER_S} s; ask again later, or at the box"
+            )
+            self._refusals.count(command, source, refusal)
+            return self._refuse(refusal)
+        lately.append(now_ns)
         work = asyncio.create_task(self._made_snapshot(command, source), name="command snapshot")
         self._watch(work)
         return await asyncio.shield(work)
@@ -582,8 +594,6 @@ class AlarmService:
             return self._refuse(f"{error}")
         else:
             return outcome
-        finally:
-            self._snapshots_waiting -= 1
 
     async def _snapshot_outcome(self, command: SnapshotRequest, source: str) -> CommandOutcome:
         if self._snapshot is None:

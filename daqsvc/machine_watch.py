@@ -141,6 +141,8 @@ class MachineWatch:
     def change_alarms(self, machine: MachineFile) -> None:
         """Go on by a machine file in which nothing but alarms and setpoints is different."""
         self.machine = machine
+        if self.recorder is not None:
+            self.recorder.change_machine(machine)
         with self.supervisor.sparing_others("setpoints", "detectors judge by those of before"):
             change_setpoints(machine, self.pipeline.detectors)
 

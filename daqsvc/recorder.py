@@ -11,11 +11,8 @@ import contextlib
 import json
 import logging
 import math
-import os
-import shutil
 from collections import deque
 from dataclasses import asdict, dataclass, field
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, get_args
 
 from daqsvc import __version__
@@ -39,13 +36,12 @@ from daqsvc.snapshots.contents import (
     STANDING,
     STATES,
     STORE,
-    SUFFIX,
     WINDOWS,
     Entry,
     Noted,
 )
+from daqsvc.snapshots.folder import SnapshotFolder
 from daqsvc.snapshots.speed_steps import SpeedSteps
-from daqsvc.snapshots.writing import SnapshotWriter
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -59,6 +55,7 @@ if TYPE_CHECKING:
     from daqsvc.settings.recorder import Recorder as RecorderTable
     from daqsvc.settings.streams import Grid
     from daqsvc.snapshots.contents import Document
+    from daqsvc.snapshots.writing import SnapshotWriter
     from daqsvc.supervision import Supervisor
 
 log = logging.getLogger(__name__)
@@ -66,18 +63,20 @@ log = logging.getLogger(__name__)
 Kind = Literal["alarm", "asked", "speed", "scheduled", "continuous"]
 """Why a file is written, the weightiest first."""
 
-FOLDER = "snapshots"
-"""Of the machine's part of the store."""
 TURN_NS = NS_PER_S // 4
 """How often what has come is handed to the thread that writes."""
 SPARE_NS = NS_PER_S
 """What the history holds beyond what a snapshot begins with: a cause is seen a turn late."""
 MOST_WAITING_BYTES = 64_000_000
-"""Samples that wait for a disk that is slow, at most."""
+"""Samples that wait for a disk that is slow, at most, beside those that the history holds anyway."""
+MOST_WAITING = 50_000
+"""Likewise items of every kind."""
 MOST_CAUSES = 100
 """Of one snapshot that are written down."""
 MEMORY_EVERY_NS = 5 * NS_PER_S
 """How often detectors are asked what they remember."""
+MOST_MEMORY_BYTES = 16_000_000
+"""What is kept of what one detector remembered, at most; the newest is kept however large it is."""
 MOST_ASKED = 16
 """People who wait for a snapshot at a time."""
 LONGEST_FILE = 16_000_000
@@ -88,8 +87,18 @@ HOLD_NS = 2 * MEMORY_EVERY_NS + SPARE_NS
 """How long the change to the next file waits for detectors to say what they remember."""
 AGAIN_NS = 10 * NS_PER_S
 """After so long continuous recording is tried again where the disk has refused it."""
+CONTINUOUS_SHARE = 0.25
+"""Of the size of all, that one file of a continuous recording may have: there are several then."""
+SNAPSHOT_SHARE = 0.5
+"""Likewise any other file."""
+ROOM_SHARE = 0.05
+"""Of the size of all, after which it is seen to that what is there is not more."""
 END_S = 0.25
 """What the end of the service leaves for the last of a snapshot."""
+
+
+ENDS = "nothing more is recorded: the service ends, or goes on by another machine file"
+"""What people are told who wait for a snapshot then."""
 
 
 class SnapshotRefusedError(Exception):
@@ -103,7 +112,6 @@ class RecorderCounters:
     Attributes:
         snapshots: written to their end.
         snapshots_failed: begun or due, and not written to their end.
-        snapshots_deleted: to keep within age and size.
         bytes_written: in snapshots.
         blocks_dropped: blocks that a snapshot lacks, as the disk was too slow.
         memories_not_taken: how often a detector remembered too much for a snapshot to begin with.
@@ -112,7 +120,6 @@ class RecorderCounters:
 
     snapshots: int = 0
     snapshots_failed: int = 0
-    snapshots_deleted: int = 0
     bytes_written: int = 0
     blocks_dropped: int = 0
     memories_not_taken: int = 0
@@ -163,9 +170,11 @@ class _Open:
         begin_ns: its begin.
         until_ns: its end, as it looks now.
         causes: in words.
+        machine: the machine file that was in force.
         about: its first message, but for the causes.
         waiting: what is to be written to it.
-        waiting_bytes: the samples among that.
+        came_bytes: the samples among that, but for those that the history had.
+        asked: who waits for it.
         writing: what a thread is writing now; its file, if that is complete then.
         writer: its file; None before that is open.
     """
@@ -175,23 +184,43 @@ class _Open:
     begin_ns: int
     until_ns: int
     causes: list[str]
+    machine: MachineFile
     about: Document
-    waiting: list[_Item] = field(default_factory=list)
-    waiting_bytes: int = 0
+    waiting: list[_Item]
+    came_bytes: int = 0
+    _held: int = field(init=False)
+    asked: list[asyncio.Future[Path]] = field(default_factory=list)
     writing: asyncio.Future[Path | None] | None = None
     writer: SnapshotWriter | None = None
 
-    def give(self, items: Iterable[_Item]) -> None:
-        """Have it hold more."""
-        for item in items:
-            self.waiting.append(item)
-            self.waiting_bytes += _size(item)
+    def __post_init__(self) -> None:
+        self._held = len(self.waiting)
+
+    def take_in(self, item: _Item, size_bytes: int) -> bool:
+        """Have it hold something that has just come; whether there is room."""
+        too_many_samples = size_bytes and self.came_bytes + size_bytes > MOST_WAITING_BYTES
+        if too_many_samples or len(self.waiting) >= MOST_WAITING + self._held:
+            return False
+        self.waiting.append(item)
+        self.came_bytes += size_bytes
+        return True
 
     def hand_out(self, end: int | None = None) -> list[_Item]:
-        """What waits, as far as an end; the rest waits on."""
-        taken, self.waiting = self.waiting[:end], [] if end is None else self.waiting[end:]
-        self.waiting_bytes = sum(map(_size, self.waiting))
+        """What waits, as far as an end; nothing waits then."""
+        taken, self.waiting = self.waiting[:end], []
+        self.came_bytes = self._held = 0
         return taken
+
+    def answer(self, outcome: Path | SnapshotRefusedError) -> None:
+        """Tell those who wait for it what has come of it."""
+        for one in self.asked:
+            if one.done():
+                continue
+            if isinstance(outcome, SnapshotRefusedError):
+                one.set_exception(outcome)
+            else:
+                one.set_result(outcome)
+        self.asked.clear()
 
 
 @dataclass(slots=True)
@@ -222,7 +251,7 @@ class MachineRecorder:
 
     Attributes:
         counters: what it has done.
-        directory: where the snapshots are.
+        folder: where the snapshots are; for the thread that writes.
         is_writing: whether a thread writes what has come.
     """
 
@@ -237,7 +266,7 @@ class MachineRecorder:
     ) -> None:
         self.counters = RecorderCounters()
         self._is_judging = is_judging
-        self.directory = store / FOLDER
+        self.folder = SnapshotFolder(store, settings.max_mb, settings.keep_days, settings.reserve_mb)
         self.is_writing = False
         self._machine = machine
         self._identity = Identity(machine.site, machine.box, machine.machine.name)
@@ -247,16 +276,28 @@ class MachineRecorder:
         self._supervisor = supervisor
         self._before_ns = round(settings.before_s * NS_PER_S)
         self._after_ns = round(settings.after_s * NS_PER_S)
+        # A cause and the next one fit into one, however short they are to be.
+        least_ns = self._before_ns + 2 * self._after_ns
+        self._longest_ns = max(round(settings.longest_s * NS_PER_S), least_ns)
         self._history: deque[_Item] = deque()
         self._kept = _Kept()
+        self._trimmed_ns = 0
+        self._changed_ns: int | None = None
+        """When the machine file came into force, if another one was before."""
         self._open: _Open | None = None
-        """The snapshot that is being written."""
+        """The snapshot that further causes make longer."""
+        self._ending: list[_Open] = []
+        """Snapshots that are as long as they may be, and wait for detectors."""
         self._continuous: _Open | None = None
         """The file of the continuous recording."""
+        self._finishing: list[_Open] = []
+        """Files that get nothing more, and are being closed."""
+        self._is_over = False
         self._continuous_from_ns = 0
-        self._steps = None if settings.every_rpm is None else SpeedSteps(settings.every_rpm)
-        self._speeds = {} if self._steps is None else speed_signals(machine)
-        self._asked: list[asyncio.Future[Path]] = []
+        self._steps: dict[tuple[str, str], SpeedSteps] = {}
+        """By detector and the name of its statistic: shafts of one machine may turn at several speeds."""
+        self._speeds = {} if settings.every_rpm is None else speed_signals(machine)
+        self._unswept_bytes = 0
         self._due_ns: int | None = None
         self._is_well = True
         self._memories: dict[str, deque[_Remembered]] = {}
@@ -264,6 +305,22 @@ class MachineRecorder:
         self._memories_kept = 3 + self._before_ns // MEMORY_EVERY_NS
         self._memory_wanted_ns = 0
         """What was remembered earlier is too old, however young it is."""
+
+    def change_machine(self, machine: MachineFile) -> None:
+        """Go on by a machine file in which nothing but alarms and setpoints is different.
+
+        A file holds one machine file: those that are being written end now.
+        """
+        now_ns = self._clock.monotonic_ns()
+        self._machine, self._changed_ns = machine, now_ns
+        before, self._open = self._open, None
+        if before is not None and before.until_ns > now_ns:
+            self._open = self._begun(before.kind, "other limits", now_ns - self._before_ns, before.until_ns)
+            self._open.asked, before.asked = before.asked, []
+        if before is not None:
+            self._ending.append(before)
+        for one in (*self._ending, *([self._continuous] if self._continuous else [])):
+            one.until_ns = min(one.until_ns, now_ns)
 
     def take_over(self, events: Iterable[AlarmEvent]) -> None:
         """Take in how alarms stand from before the recorder was made."""
@@ -274,8 +331,6 @@ class MachineRecorder:
         """A detector has processed a window; on the thread that it computes in."""
         now_ns = self._clock.monotonic_ns()
         memories = self._memories.get(detector.name)
-        if memories is None:
-            memories = self._memories[detector.name] = deque(maxlen=self._memories_kept)
         last_ns = memories[-1].at_ns if memories else -MEMORY_EVERY_NS
         if now_ns - last_ns < MEMORY_EVERY_NS and last_ns >= self._memory_wanted_ns:
             return
@@ -285,7 +340,14 @@ class MachineRecorder:
             self.counters.memories_not_taken += 1
             return
         end_index = window.first_index + len(window.samples)
-        memories.append(_Remembered(now_ns, detector.name, detector.stream, end_index, memory))
+        newest = _Remembered(now_ns, detector.name, detector.stream, end_index, memory)
+        if memories is None:
+            # Whoever finds it finds something in it: that is another thread.
+            self._memories[detector.name] = deque([newest], maxlen=self._memories_kept)
+            return
+        memories.append(newest)
+        while len(memories) > 1 and sum(one.memory.nbytes for one in memories) > MOST_MEMORY_BYTES:
+            memories.popleft()
 
     def block(self, block: SampleBlock) -> None:
         """Samples have come, of a stream or of a grid."""
@@ -311,10 +373,8 @@ class MachineRecorder:
         """A detector has made a statement."""
         self._note(diagnosis)
         for name in self._speeds.get(diagnosis.detector, ()):
-            if self._steps is not None and diagnosis.units.get(name) == RPM:
-                speed_rpm = diagnosis.statistics.get(name, math.nan)
-                if self._steps.is_new(speed_rpm):
-                    self._cause("speed", f"speed {speed_rpm:.4g} rpm")
+            if diagnosis.units.get(name) == RPM:
+                self._see_speed(diagnosis.detector, name, diagnosis.statistics.get(name, math.nan))
 
     def alarm(self, event: AlarmEvent) -> None:
         """An alarm has changed: one that calls for a person is a cause."""
@@ -331,15 +391,17 @@ class MachineRecorder:
         Raises:
             SnapshotRefusedError: it was not made.
         """
-        if len(self._asked) >= MOST_ASKED:
+        if self._is_over:
+            raise SnapshotRefusedError(ENDS)
+        if sum(len(one.asked) for one in (*self._written(), *self._finishing)) >= MOST_ASKED:
             raise SnapshotRefusedError(f"{MOST_ASKED} others wait for a snapshot already; ask again later")
         asked: asyncio.Future[Path] = asyncio.get_running_loop().create_future()
-        self._asked.append(asked)
-        self._cause("asked", reason)
+        self._cause("asked", reason).asked.append(asked)
         return await asked
 
     async def run(self) -> None:
         """Write what there is cause to write, until cancelled."""
+        self._is_over = False
         try:
             while True:
                 await self._clock.sleep_ns(TURN_NS)
@@ -352,37 +414,53 @@ class MachineRecorder:
 
     def figures(self) -> dict[str, int]:
         """What it has done, and how much waits for the disk."""
+        written = self._written()
         return {
             **asdict(self.counters),
-            "recording": int(self._open is not None or self._continuous is not None),
-            "waiting_bytes": sum(one.waiting_bytes for one in self._written()),
+            "snapshots_deleted": self.folder.deleted,
+            "recording": int(bool(written)),
+            "waiting_bytes": sum(one.came_bytes for one in written),
         }
 
     def _note(self, what: _Happened, size_bytes: int = 0) -> None:
         item = _Item(self._clock.monotonic_ns(), what)
         self._history.append(item)
+        if item.at_ns - self._trimmed_ns >= TURN_NS:
+            # Here, for what writes may wait for the disk.
+            self._trim(item.at_ns)
         for one in self._written():
-            if one.waiting_bytes + size_bytes > MOST_WAITING_BYTES:
+            if not one.take_in(item, size_bytes):
                 self.counters.blocks_dropped += 1
-            else:
-                one.waiting.append(item)
-                one.waiting_bytes += size_bytes
 
     def _written(self) -> list[_Open]:
-        """The files that are being written."""
-        return [one for one in (self._open, self._continuous) if one is not None]
+        """The files that get what happens."""
+        return [*self._ending, *(one for one in (self._open, self._continuous) if one is not None)]
 
-    def _cause(self, kind: Kind, words: str) -> None:
+    def _see_speed(self, detector: str, name: str, speed_rpm: float) -> None:
+        every_rpm = self._settings.every_rpm
+        if every_rpm is not None:
+            steps = self._steps.setdefault((detector, name), SpeedSteps(every_rpm))
+            if steps.is_new(speed_rpm):
+                self._cause("speed", f"{detector}: speed {speed_rpm:.4g} rpm")
+
+    def _cause(self, kind: Kind, words: str) -> _Open:
         """Begin a snapshot, or let the one that is open last longer."""
         now_ns = self._clock.monotonic_ns()
-        if self._open is None:
-            self._open = self._begun(kind, words, now_ns - self._before_ns, now_ns + self._after_ns)
-            return
-        most_ns = self._open.begin_ns + round(self._settings.longest_s * NS_PER_S)
-        self._open.until_ns = max(self._open.until_ns, min(now_ns + self._after_ns, most_ns))
-        if len(self._open.causes) < MOST_CAUSES:
-            self._open.causes.append(words)
-        self._open.kind = min(kind, self._open.kind, key=get_args(Kind).index)
+        until_ns = now_ns + self._after_ns
+        one = self._open
+        if one is not None and until_ns > one.cause_ns - self._before_ns + self._longest_ns:
+            # It has no room for what comes after this cause.
+            one.until_ns = min(one.until_ns, now_ns)
+            self._ending.append(one)
+            one = None
+        if one is None:
+            self._open = one = self._begun(kind, words, now_ns - self._before_ns, until_ns)
+            return one
+        one.until_ns = max(one.until_ns, until_ns)
+        if len(one.causes) < MOST_CAUSES:
+            one.causes.append(words)
+        one.kind = min(kind, one.kind, key=get_args(Kind).index)
+        return one
 
     def _begun(self, kind: Kind, words: str, begin_ns: int, until_ns: int) -> _Open:
         """A file that reaches back to a time, or a little further."""
@@ -404,10 +482,8 @@ class MachineRecorder:
         cause_ns, until_ns = cause_until_ns
         begin_ns = history[first].at_ns if first < len(history) else self._clock.monotonic_ns()
         about = self._about(history[:first], begin_ns, memories)
-        made = _Open(kind, cause_ns, begin_ns, until_ns, [words], about)
-        made.give(_Item(begin_ns, one) for one in memories)
-        made.give(history[first:])
-        return made
+        waiting = [*(_Item(begin_ns, one) for one in memories), *history[first:]]
+        return _Open(kind, cause_ns, begin_ns, until_ns, [words], self._machine, about, waiting)
 
     def _begin(self, history: Sequence[_Item], begin_ns: int) -> tuple[int, list[_Remembered]]:
         """Where a snapshot begins that reaches back to a time, and what detectors remembered there.
@@ -428,10 +504,11 @@ class MachineRecorder:
 
     def _trim(self, now_ns: int) -> None:
         """Forget what no snapshot would begin with any more, but for how alarms and streams stood."""
+        self._trimmed_ns = now_ns
         oldest_ns = now_ns - self._before_ns - MEMORY_EVERY_NS - SPARE_NS
         if self._continuous is not None and self._continuous.waiting:
-            # The next file may begin with that.
-            oldest_ns = min(oldest_ns, self._continuous.waiting[0].at_ns)
+            # The next file may begin with that, unless a disk hangs.
+            oldest_ns = min(oldest_ns, max(self._continuous.waiting[0].at_ns, oldest_ns - 2 * HOLD_NS))
         history, kept = self._history, self._kept
         while history and history[0].at_ns < oldest_ns:
             what = history.popleft().what
@@ -449,9 +526,16 @@ class MachineRecorder:
             if self._due_ns is not None:
                 self._cause("scheduled", "scheduled")
             self._due_ns = now_ns + round(every_s * NS_PER_S)
-        if (snapshot := self._open) is not None:
+        for snapshot in [*self._ending, *([self._open] if self._open else [])]:
             late_ns = now_ns - snapshot.until_ns
             is_over = late_ns >= 0 and (late_ns >= PATIENCE_NS or not self._is_judging())
+            if is_over and snapshot is self._open:
+                # What is a cause while it is being closed begins another one.
+                self._open = None
+            elif is_over:
+                self._ending.remove(snapshot)
+            elif self._is_too_large(snapshot, SNAPSHOT_SHARE):
+                snapshot.until_ns = min(snapshot.until_ns, now_ns)
             await self._write_on(snapshot, snapshot.hand_out(), is_over=is_over)
         if self._settings.continuous:
             await self._continue(self._clock.monotonic_ns())
@@ -463,6 +547,8 @@ class MachineRecorder:
             if now_ns < self._continuous_from_ns:
                 return
             one = self._continuous = self._begun("continuous", "continuous", now_ns, now_ns + length_ns)
+        if self._is_too_large(one, CONTINUOUS_SHARE):
+            one.until_ns = min(one.until_ns, now_ns)
         if now_ns < one.until_ns:
             await self._write_on(one, one.hand_out(), is_over=False)
             return
@@ -473,12 +559,13 @@ class MachineRecorder:
         history = list(self._history)
         begin = one.waiting[end] if end < len(one.waiting) else None
         first = next((k for k, item in enumerate(history) if item is begin), len(history))
+        if begin is not None and first == len(history):
+            # A disk has hung for so long that the history has it no more.
+            end, memories = len(one.waiting), []
         times = history[first].at_ns if first < len(history) else now_ns, now_ns + length_ns
         following = self._made("continuous", "continuous", history, first, memories, times)
-        items = one.hand_out(end)
-        one.hand_out()
         self._continuous = following
-        await self._write_on(one, items, is_over=True)
+        await self._write_on(one, one.hand_out(end), is_over=True)
 
     def _next_begin(self, one: _Open, now_ns: int) -> tuple[int, list[_Remembered]] | None:
         """With which of the items that wait the next file begins, and what detectors remember there.
@@ -491,8 +578,10 @@ class MachineRecorder:
         is_complete = True
         for memories in [*self._memories.values()]:
             newest = memories[-1]
-            first = _first_after(one.waiting, newest) if newest.at_ns >= one.until_ns else None
-            if first is None or first == len(one.waiting):
+            first = _first_after(one.waiting, newest)
+            # Nothing has come for it since: then it remembers what it did, however long ago that was.
+            is_silent = first == len(one.waiting)
+            if first is None or not (is_silent or newest.at_ns >= one.until_ns):
                 is_complete = False
             else:
                 firsts.append(first)
@@ -501,7 +590,12 @@ class MachineRecorder:
             return None
         return min(firsts, default=len(one.waiting)), chosen
 
+    def _is_too_large(self, one: _Open, share: float) -> bool:
+        return one.writer is not None and one.writer.size > share * self.folder.most_bytes
+
     async def _write_on(self, snapshot: _Open, items: list[_Item], *, is_over: bool) -> None:
+        if is_over:
+            self._finishing.append(snapshot)
         # A thread goes on when nobody waits for it any more: the end of the service must know of it.
         snapshot.writing = asyncio.ensure_future(
             asyncio.to_thread(self._write, snapshot, items, is_over=is_over)
@@ -510,58 +604,60 @@ class MachineRecorder:
             path = await asyncio.shield(snapshot.writing)
         except (OSError, ValueError) as error:
             snapshot.writing = None
-            self._give_up(snapshot, error)
+            await self._give_up(snapshot, error)
             return
         snapshot.writing = None
         if path is None:
             return
+        self._finishing.remove(snapshot)
         self.counters.snapshots += 1
         if not self._is_well:
             self._is_well = True
             log.warning("snapshots of %s are written again", self._identity.machine)
-        if snapshot is self._open:
-            self._open = None
-            asked, self._asked = self._asked, []
-            for one in asked:
-                if not one.done():
-                    one.set_result(path)
+        snapshot.answer(path)
 
-    def _give_up(self, snapshot: _Open, error: Exception) -> None:
+    async def _give_up(self, snapshot: _Open, error: Exception) -> None:
         """The disk takes no more of a snapshot: what it has got stays, and the service goes on."""
         self.counters.write_failures += 1
         self.counters.snapshots_failed += 1
         if snapshot is self._continuous:
             self._continuous = None
             self._continuous_from_ns = self._clock.monotonic_ns() + AGAIN_NS
-        if snapshot.writer is not None:
-            with contextlib.suppress(OSError):
-                snapshot.writer.abandon()
+        if snapshot is self._open:
+            self._open = None
+        for those in (self._ending, self._finishing):
+            if snapshot in those:
+                those.remove(snapshot)
         if self._is_well:
             self._is_well = False
             log.error("a snapshot of %s is lost: %s", self._identity.machine, _in_words(error))
-        if snapshot is self._open:
-            self._open = None
-            asked, self._asked = self._asked, []
-            for one in asked:
-                if not one.done():
-                    one.set_exception(SnapshotRefusedError(f"the snapshot is lost: {_in_words(error)}"))
+        snapshot.answer(SnapshotRefusedError(f"the snapshot is lost: {_in_words(error)}"))
+        if snapshot.writer is not None:
+            with contextlib.suppress(OSError):
+                await asyncio.to_thread(snapshot.writer.abandon)
 
     async def _end(self) -> None:
         """No more is written: bring what is under way to its end, if the disk is quick."""
-        ending = self._written()
+        self._is_over = True
+        ending = [*self._finishing, *self._written()]
         self._open = self._continuous = None
-        for one in self._asked:
-            if not one.done():
-                one.set_exception(SnapshotRefusedError("the service ends"))
+        self._ending.clear()
+        self._finishing.clear()
         await asyncio.gather(*(self._end_of(one) for one in ending))
 
     async def _end_of(self, snapshot: _Open) -> None:
-        with contextlib.suppress(OSError, ValueError, TimeoutError):
-            async with asyncio.timeout(END_S):
-                # One thread writes to a file at a time; what it has been given already comes first.
-                if snapshot.writing is None or await asyncio.shield(snapshot.writing) is None:
-                    await asyncio.to_thread(self._write, snapshot, snapshot.hand_out(), is_over=True)
-                self.counters.snapshots += 1
+        path = None
+        try:
+            with contextlib.suppress(OSError, ValueError, TimeoutError):
+                async with asyncio.timeout(END_S):
+                    # One thread writes to a file at a time; what it has been given already comes first.
+                    path = None if snapshot.writing is None else await asyncio.shield(snapshot.writing)
+                    if path is None:
+                        items = snapshot.hand_out()
+                        path = await asyncio.to_thread(self._write, snapshot, items, is_over=True)
+                    self.counters.snapshots += 1
+        finally:
+            snapshot.answer(path or SnapshotRefusedError(ENDS))
 
     def _about(self, before: Sequence[_Item], begin_ns: int, memories: Iterable[_Remembered]) -> Document:
         """The first message of a snapshot: whose it is, and how things stood at its begin."""
@@ -582,6 +678,7 @@ class MachineRecorder:
             "begin": iso_utc(begin_ns + wall_ns),
             "wall_ns_at_0": wall_ns,
             "from_start": self._kept.since_begin and not before,
+            "changed_ns": self._changed_ns,
             "remembered": {one.detector: one.end_index for one in memories},
             "streams": dict(self._streams()),
             "standings": {name: one._asdict() for name, one in standings.items()},
@@ -626,18 +723,14 @@ class MachineRecorder:
         Raises:
             OSError: it cannot be made.
         """
-        self.directory.mkdir(mode=0o750, exist_ok=True)
-        self._make_room()
-        self._see_space()
         about = {**snapshot.about, "causes": list(snapshot.causes)}
-        wall_ns = about["wall_ns_at_0"]
-        cause = datetime.fromtimestamp((snapshot.cause_ns + wall_ns) / NS_PER_S, UTC)
-        name = f"{cause:%Y%m%dT%H%M%S}.{cause.microsecond:06d}Z-{snapshot.kind}{SUFFIX}"
-        return SnapshotWriter(self.directory / name, about, self._files(), wall_ns)
+        files = self._files(snapshot.machine)
+        writer = self.folder.new(snapshot.kind, snapshot.cause_ns, about, files)
+        self._make_room({writer.path.name})
+        return writer
 
-    def _files(self) -> dict[str, bytes]:
+    def _files(self, machine: MachineFile) -> dict[str, bytes]:
         """What a replay needs beside samples: the machine file, and files that detectors use; blocks."""
-        machine = self._machine
         values = machine_values(machine)
         files = {MACHINE_JSON: json.dumps(values, indent=1).encode()}
         if machine.text:
@@ -659,10 +752,13 @@ class MachineRecorder:
         """
         if not items:
             return
-        self._see_space()
+        self.folder.see_space()
         before = writer.size
         writer.write(self._entry(item) for item in items)
         self.counters.bytes_written += writer.size - before
+        self._unswept_bytes += writer.size - before
+        if self._unswept_bytes > ROOM_SHARE * self.folder.most_bytes:
+            self._make_room({writer.path.name})
 
     def _finish(self, snapshot: _Open) -> Path:
         """Close the file, and give it the name of its cause; blocks.
@@ -671,56 +767,16 @@ class MachineRecorder:
             OSError: the disk does not take it.
         """
         assert snapshot.writer is not None  # noqa: S101 - for the type checker
-        path = snapshot.writer.path
-        snapshot.writer.finish()
-        stem = path.name.rpartition("-")[0]
-        path = path.rename(path.with_name(f"{stem}-{snapshot.kind}{SUFFIX}"))
-        self._make_room()
+        path = self.folder.finish(snapshot.writer, snapshot.kind)
+        self._make_room({path.name})
         return path
 
-    def _see_space(self) -> None:
-        """Leave the alarms room on the disk.
-
-        Raises:
-            OSError: there is too little.
-        """
-        free = shutil.disk_usage(self.directory).free
-        reserve = self._settings.reserve_mb * 1_000_000
-        if free < reserve:
-            raise OSError(
-                f"{self.directory} has {free / 1e6:.0f} MB free, of which reserve_mb = "
-                f"{self._settings.reserve_mb} in [recorder] belong to the alarms; make room on the disk"
-            )
-
-    def _make_room(self) -> None:
-        """Delete what is too old or too much, the oldest first, and those of alarms last; blocks.
-
-        Raises:
-            OSError: the folder cannot be read.
-        """
-        kept: list[tuple[bool, str, int]] = []
-        oldest = self._clock.wall_ns() - self._settings.keep_days * 86_400 * NS_PER_S
-        writing = {one.writer.path.name for one in self._written() if one.writer is not None}
-        with os.scandir(self.directory) as found:
-            for one in found:
-                if one.name in writing or not one.name.endswith(SUFFIX):
-                    continue
-                if one.is_file(follow_symlinks=False):
-                    status = one.stat()
-                    if status.st_mtime_ns < oldest:
-                        self._delete(one.name)
-                    else:
-                        kept.append((one.name.endswith(f"-alarm{SUFFIX}"), one.name, status.st_size))
-        total = sum(size for _, _, size in kept)
-        for _, name, size in sorted(kept):
-            if total <= self._settings.max_mb * 1_000_000:
-                break
-            self._delete(name)
-            total -= size
-
-    def _delete(self, name: str) -> None:
-        (self.directory / name).unlink(missing_ok=True)
-        self.counters.snapshots_deleted += 1
+    def _make_room(self, spared: set[str]) -> None:
+        """Delete what is too old or too much, but for what is being written; blocks."""
+        self._unswept_bytes = 0
+        others = [*self._written(), *self._finishing]
+        spared |= {one.writer.path.name for one in others if one.writer is not None}
+        self.folder.make_room(self._clock.wall_ns(), spared)
 
     def _entry(self, item: _Item) -> Entry:
         """An item as it is written."""
@@ -790,11 +846,6 @@ def _first_after(history: Sequence[_Item], memory: _Remembered) -> int | None:
             if block.end_index > memory.end_index:
                 return number
     return len(history)
-
-
-def _size(item: _Item) -> int:
-    """Bytes of samples."""
-    return item.what.samples.nbytes if isinstance(item.what, SampleBlock) else 0
 
 
 def _in_words(error: Exception) -> str:

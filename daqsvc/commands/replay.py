@@ -102,6 +102,8 @@ def _lines(replayed: Replayed) -> Iterator[str]:
             yield f"  only then: {_in_short(document)}"
         for document in comparison.added[:_SHOWN]:
             yield f"  only now: {_in_short(document)}"
+        if comparison.later:
+            yield f"  {comparison.later} more are of samples at the end, of which the file has none"
 
 
 def _in_short(document: dict[str, Any]) -> str:

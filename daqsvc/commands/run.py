@@ -183,10 +183,12 @@ class _Reloader:
 
     Attributes:
         part: what does it; None before anybody has asked.
+        is_over: whether the service stops.
     """
 
     def __init__(self, service: Service) -> None:
         self.part: Part | None = None
+        self.is_over = False
         self._service = service
         self._asked = False
 
@@ -195,6 +197,12 @@ class _Reloader:
         self._asked = True
         if self.part is None or self.part.over.done():
             self.part = self._service.supervisor.keep("reload", self._reload, may_end=lambda: True)
+            self.part.over.add_done_callback(self._ask_again)
+
+    def _ask_again(self, over: asyncio.Future[None]) -> None:
+        """Somebody may have asked just when nobody looked any more."""
+        if self._asked and not over.cancelled() and not self.is_over:
+            self.ask()
 
     async def _reload(self) -> None:
         from daqsvc.control import ReloadRefusedError  # noqa: PLC0415 - as above
@@ -252,5 +260,6 @@ async def _run_until_stopped(
         await running
     finally:
         ready.cancel()
+        reloader.is_over = True
         await stop_all([following, *([reloader.part] if reloader.part else [])], LOG_S)
     log.info("stopped")

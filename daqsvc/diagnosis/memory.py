@@ -52,6 +52,11 @@ class DetectorMemory(NamedTuple):
     tree: Tree
     arrays: list[NDArray[Any]]
 
+    @property
+    def nbytes(self) -> int:
+        """Of its arrays."""
+        return sum(array.nbytes for array in self.arrays)
+
     def document(self) -> dict[str, Any]:
         """The same as JSON can say it."""
         arrays = [

@@ -72,9 +72,11 @@ class Comparison:
         equal: said then and now, to the last bit.
         changed: said then and not now.
         added: said now and not then.
+        later: said now of samples of which the file has no statement any more, as it ended.
     """
 
     equal: int = 0
+    later: int = 0
     changed: list[Document] = field(default_factory=list)
     added: list[Document] = field(default_factory=list)
 
@@ -102,7 +104,7 @@ class Replayed:
     @property
     def is_equal(self) -> bool:
         """Whether all that was said then is said now, and nothing else."""
-        return not (self.said.changed or self.alarmed.changed or self.alarmed.added)
+        return not (self.said.changed or self.said.added or self.alarmed.changed or self.alarmed.added)
 
 
 class GivenWindows(RingReader):
@@ -221,6 +223,12 @@ class Replay:
             iso_utc(self._begin_ns + self._wall_ns)  # there is such a time
             self._standings = {n: StreamState(**one) for n, one in dict(about["standings"]).items()}
             before = [alarm_event(json.dumps(one).encode()) for one in about["alarms"]]
+            changed_ns = about.get("changed_ns")
+            if changed_ns is not None and int(changed_ns) > self._begin_ns:
+                self._result.notes.append(
+                    f"other limits came into force at {iso_utc(int(changed_ns) + self._wall_ns)}: what was "
+                    "before is judged by them too, and may differ from what was said then"
+                )
             self._is_from_start = bool(about["from_start"])
             self._is_same = about["version"] == __version__ and machine_values(machine) == json.loads(
                 snapshot.files.get(MACHINE_JSON, b"null")
@@ -270,7 +278,8 @@ class Replay:
                 await reader.asks.wait()
             for entry in self._snapshot.entries:
                 if self._pace is not None:
-                    await self._pace(min(entry.at_ns - self._begin_ns, LONGEST_GAP_NS))
+                    self._see_gap(entry.at_ns)
+                    await self._pace(entry.at_ns - self._begin_ns)
                 await self._go_on_to(entry.at_ns)
                 if isinstance(entry.what, SampleBlock):
                     self._write(entry.what)
@@ -337,11 +346,14 @@ class Replay:
                     _refuse(error)
         return found
 
+    def _see_gap(self, at_ns: int) -> None:
+        if at_ns - self._clock.monotonic_ns() > LONGEST_GAP_NS:
+            raise ReplayError("is damaged: its time leaps by more than an hour")
+
     async def _go_on_to(self, at_ns: int) -> None:
         """Let time pass."""
         clock = self._clock
-        if at_ns - clock.monotonic_ns() > LONGEST_GAP_NS:
-            raise ReplayError("is damaged: its time leaps by more than an hour")
+        self._see_gap(at_ns)
         while (now_ns := clock.monotonic_ns()) < at_ns:
             due_ns = self._ticked_ns + STEP_NS
             clock.advance_to(min(at_ns, max(due_ns, now_ns)))
@@ -427,7 +439,11 @@ class Replay:
                 alarmed.append(document)
         _hold(self._result.said, said, [statement_document(one) for one in self._result.statements])
         # What follows of statements that came after the end of the file came after it, too.
-        later = {_comparable(one) for one in self._result.said.added}
+        ends = _ends(said)
+        of_later = [one for one in self._result.said.added if _end_of(one) > ends.get(one["detector"], -1)]
+        later = {_comparable(one) for one in of_later}
+        self._result.said.added = [one for one in self._result.said.added if _comparable(one) not in later]
+        self._result.said.later = len(of_later)
         of_data = [
             event
             for event in self._result.alarms
@@ -453,6 +469,21 @@ class Replay:
 
 def _names(detector: Detector, t_ns: int) -> set[str]:
     return {detector.name, *(one.detector for one in said_of_silence(detector, 0.0, t_ns))}
+
+
+def _end_of(statement: Document) -> int:
+    """The index behind the samples that a statement rests on."""
+    window = statement.get("window")
+    end: int = window["end_index"] if isinstance(window, dict) else -1
+    return end
+
+
+def _ends(statements: list[Document]) -> dict[str, int]:
+    """How far each detector had come by the end of the file."""
+    ends: dict[str, int] = {}
+    for one in statements:
+        ends[one["detector"]] = max(ends.get(one["detector"], -1), _end_of(one))
+    return ends
 
 
 def _hold(comparison: Comparison, then: list[Document], now: list[Document]) -> None:

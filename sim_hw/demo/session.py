@@ -22,9 +22,9 @@ import can
 from daqsvc.acquisition.clock import DrivenClock, SystemClock
 from daqsvc.box import Box
 from daqsvc.detectors.rotor_bank.settings import ROTOR_BANK
-from daqsvc.recorder import FOLDER
 from daqsvc.service import Service
 from daqsvc.snapshots.contents import SUFFIX
+from daqsvc.snapshots.folder import FOLDER
 from drivers.can.plugin import frame_layout
 from drivers.fields import LayoutError
 from sim_hw.demo.broker import EmbeddedBroker

@@ -6,33 +6,62 @@ import asyncio
 import contextlib
 import errno
 import os
+import threading
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 from support.recorded_rig import recorded_rig
-from support.waiting import eventually
+from support.waiting import PATIENCE_S, eventually
 
 from daqsvc.acquisition.clock import NS_PER_S, DrivenClock
-from daqsvc.acquisition.samples import SampleBlock
+from daqsvc.acquisition.samples import SampleBlock, Window
 from daqsvc.acquisition.standing import StreamState
 from daqsvc.alarms.events import AlarmEvent, EventKind, Identity
 from daqsvc.alarms.states import AlarmState, Level
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.recorder import MOST_WAITING_BYTES, MachineRecorder, SnapshotRefusedError
+from daqsvc.snapshots.contents import MACHINE_JSON
 from daqsvc.snapshots.mcap import Attachment, Damage
 from daqsvc.snapshots.reading import entries_of
 from daqsvc.snapshots.writing import SnapshotWriter
 from daqsvc.supervision import Supervisor
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterable
+    from collections.abc import AsyncIterator, Iterable, Iterator, Sequence
     from pathlib import Path
+
+    from numpy.typing import NDArray
 
     from daqsvc.snapshots.contents import Document, Entry
 
 ROWS = 64
+
+
+@pytest.fixture(autouse=True)
+def slow_disks_are_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No test of these depends on how fast the disk is."""
+    monkeypatch.setattr("daqsvc.recorder.END_S", PATIENCE_S)
+
+
+class Remembering:
+    """A detector that does nothing but remember."""
+
+    block = 1
+
+    def __init__(self, name: str, stream: str, memory: NDArray[np.float64]) -> None:
+        self.name, self.stream, self.memory = name, stream, memory
+
+    def warm(self) -> None: ...
+
+    def process(self, window: Window) -> Sequence[Diagnosis]:
+        del window
+        return ()
+
+    def silent(self, silence_s: float, t_ns: int) -> Sequence[Diagnosis]:
+        del silence_s, t_ns
+        return ()
 
 
 class Bench:
@@ -49,13 +78,22 @@ class Bench:
         self._index = 0
         self.rows = ROWS
 
+    def comes(self) -> None:
+        """A block comes, and nobody else gets round to anything."""
+        self.clock.advance_to(self.clock.monotonic_ns() + NS_PER_S // 10)
+        samples = np.full((self.rows, 3), self._index, np.float32)
+        now_ns = self.clock.monotonic_ns()
+        self.recorder.block(SampleBlock("shaft", self._index, samples, now_ns, 1.5e6))
+        self._index += self.rows
+
+    def processes(self, detector: str, *, stream: str, memory: NDArray[np.float64]) -> None:
+        """A detector has processed all that has come of a stream."""
+        window = Window(self._index - 1, np.zeros((1, 3), np.float32), self.clock.monotonic_ns(), 1.5e6)
+        self.recorder.processed(Remembering(detector, stream, memory), window)
+
     async def passes(self, seconds: float) -> None:
         for _ in range(round(10 * seconds)):
-            self.clock.advance_to(self.clock.monotonic_ns() + NS_PER_S // 10)
-            samples = np.full((self.rows, 3), self._index, np.float32)
-            now_ns = self.clock.monotonic_ns()
-            self.recorder.block(SampleBlock("shaft", self._index, samples, now_ns, 1.5e6))
-            self._index += self.rows
+            self.comes()
             await asyncio.sleep(0)
             await asyncio.sleep(0)
             await eventually(lambda: not self.recorder.is_writing, "what has come is written")
@@ -75,7 +113,8 @@ class Bench:
 
     @property
     def files(self) -> list[Path]:
-        return sorted(self.recorder.directory.glob("*")) if self.recorder.directory.exists() else []
+        folder = self.recorder.folder.directory
+        return sorted(folder.glob("*")) if folder.exists() else []
 
 
 @contextlib.asynccontextmanager
@@ -99,6 +138,12 @@ def held(path: Path) -> tuple[Document, float, float, Damage]:
     times = [one.at_ns / NS_PER_S for one in read if isinstance(one.what, SampleBlock)]
     assert not isinstance(read[0].what, SampleBlock)
     return read[0].what.document, min(times), max(times), damage
+
+
+def values_in(path: Path) -> str:
+    """The machine file of a snapshot, by its values."""
+    read = entries_of(memoryview(path.read_bytes()), Damage())
+    return next(bytes(e.data).decode() for e in read if isinstance(e, Attachment) and e.name == MACHINE_JSON)
 
 
 def firsts_in(path: Path) -> list[int]:
@@ -146,6 +191,7 @@ async def test_a_snapshot_lasts_until_detectors_have_judged_it(
 async def test_causes_that_overlap_make_one_snapshot_up_to_a_length(tmp_path: Path) -> None:
     async with bench(tmp_path, longest_s=5.0) as one:
         await one.passes(10.0)
+        begun_s = one.clock.monotonic_ns() / NS_PER_S
         asked = asyncio.create_task(one.recorder.snapshot("somebody"))
         await asyncio.sleep(0)
         for _ in range(8):
@@ -156,8 +202,12 @@ async def test_causes_that_overlap_make_one_snapshot_up_to_a_length(tmp_path: Pa
         first, second = one.files
     about, begin_s, end_s, _ = held(first)
     assert about["causes"][0] == "somebody"
-    assert end_s - begin_s == pytest.approx(5.0, abs=0.3)
-    assert held(second)[2] > end_s
+    assert 3.9 <= end_s - begin_s <= 5.3
+    # The alarm that has no room for a second after it is the cause of another one, which has what it needs.
+    other, other_begin_s, other_end_s, _ = held(second)
+    assert other_begin_s == pytest.approx(end_s - 1.15, abs=0.3)
+    assert other_end_s == pytest.approx(begun_s + 7 * 0.8 + 1.0, abs=0.3)
+    assert other["causes"] == ["rotor-fault: raised"]
 
 
 async def test_what_calls_for_nobody_is_no_cause(tmp_path: Path) -> None:
@@ -183,7 +233,7 @@ async def test_a_snapshot_is_made_at_each_step_of_the_speed(tmp_path: Path) -> N
         files = one.files
     causes = [held(path)[0]["causes"] for path in files]
     # A quarter of a step beyond each boundary, up and down.
-    assert causes == [[f"speed {rpm} rpm"] for rpm in (125, 225, 325, 270, 170)]
+    assert causes == [[f"rotor-bank: speed {rpm} rpm"] for rpm in (125, 225, 325, 270, 170)]
     assert {path.name.rpartition("-")[2] for path in files} == {"speed.mcap"}
 
 
@@ -241,7 +291,7 @@ async def test_continuous_files_are_deleted_before_those_of_alarms(tmp_path: Pat
         [alarm] = [path for path in one.files if path.name.endswith("-alarm.mcap")]
         one.rows = 6_000
         await one.passes(6.0)
-        assert one.recorder.counters.snapshots_deleted >= 1
+        assert one.recorder.folder.deleted >= 1
         assert alarm in one.files
 
 
@@ -263,7 +313,7 @@ async def test_the_oldest_go_first_and_those_of_alarms_last(tmp_path: Path) -> N
     assert kept[0] == names[2]
     assert kept[1].startswith("2027")
     assert kept[2:] == ["notes.txt"]
-    assert one.recorder.counters.snapshots_deleted == 4
+    assert one.recorder.folder.deleted == 4
 
 
 async def test_a_disk_that_is_full_costs_the_snapshot_only(
@@ -304,33 +354,197 @@ async def test_a_disk_that_fails_amid_a_snapshot_leaves_what_it_has(
     assert not held(whole)[3].ends_early
 
 
+@contextlib.contextmanager
+def hanging_disk(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Whoever looks at the disk waits until this is over."""
+    over = threading.Event()
+    with monkeypatch.context() as patched:
+        patched.setattr("daqsvc.snapshots.folder.SnapshotFolder.see_space", lambda _: over.wait())
+        try:
+            yield
+        finally:
+            over.set()
+
+
 async def test_a_disk_that_hangs_holds_up_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import threading
+    async with bench(tmp_path) as one:
+        with hanging_disk(monkeypatch):
+            one.alarm()
+            one.clock.advance_to(one.clock.monotonic_ns() + NS_PER_S // 2)
+            await eventually(lambda: one.recorder.is_writing, "it hangs")
+            rows = np.zeros((MOST_WAITING_BYTES // 12 // 4, 3), np.float32)
+            for number in range(8):
+                one.recorder.block(SampleBlock("shaft", number * len(rows), rows, 0, 1.0))
+            assert one.recorder.figures()["waiting_bytes"] <= MOST_WAITING_BYTES
+            assert one.recorder.counters.blocks_dropped >= 4
+        await eventually(lambda: not one.recorder.is_writing, "it is over")
 
-    hanging = threading.Event()
 
-    def hang(*_: object) -> None:
-        hanging.wait()
+@pytest.mark.parametrize("continuous", [False, True])
+async def test_a_disk_that_hangs_for_an_hour_costs_no_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, continuous: bool
+) -> None:
+    async with bench(tmp_path, continuous=continuous, continuous_s=5.0) as one:
+        await one.passes(2.0)
+        with hanging_disk(monkeypatch):
+            one.alarm()
+            one.clock.advance_to(one.clock.monotonic_ns() + NS_PER_S)
+            await eventually(lambda: one.recorder.is_writing, "it hangs")
+            for _ in range(36_000):
+                one.comes()
+            assert one.clock.monotonic_ns() - one.recorder._history[0].at_ns < 40 * NS_PER_S
+        await eventually(lambda: not one.recorder.is_writing, "it is over")
+        await one.passes(20.0)
+        before = one.recorder.counters.snapshots
+        one.alarm()
+        await one.passes(5.0)
+        assert one.recorder.counters.snapshots > before
+
+
+async def test_an_alarm_while_a_snapshot_is_being_closed_leaves_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    may_go_on, finish = threading.Event(), SnapshotWriter.finish
+
+    def slow(self: SnapshotWriter) -> None:
+        may_go_on.wait()
+        finish(self)
 
     async with bench(tmp_path) as one:
-        monkeypatch.setattr("daqsvc.recorder.MachineRecorder._see_space", hang)
+        await one.passes(5.0)
         one.alarm()
-        one.clock.advance_to(one.clock.monotonic_ns() + NS_PER_S)
-        await eventually(lambda: one.recorder.is_writing, "it hangs")
-        rows = np.zeros((MOST_WAITING_BYTES // 12 // 4, 3), np.float32)
-        for number in range(8):
-            one.recorder.block(SampleBlock("shaft", number * len(rows), rows, 0, 1.0))
-        assert one.recorder.figures()["waiting_bytes"] <= MOST_WAITING_BYTES
-        assert one.recorder.counters.blocks_dropped >= 4
-        hanging.set()
-        await eventually(lambda: not one.recorder.is_writing, "it is over")
+        with monkeypatch.context() as patched:
+            patched.setattr(SnapshotWriter, "finish", slow)
+            for _ in range(12):
+                one.comes()
+                await asyncio.sleep(0.01)
+            await eventually(lambda: not one.recorder.figures()["recording"], "it is being closed")
+            asked = asyncio.create_task(one.recorder.snapshot("somebody"))
+            one.alarm("shaft-vibration-x")
+            await asyncio.sleep(0)
+            may_go_on.set()
+        await one.passes(3.0)
+        path = await asked
+        first, second = one.files
+    assert held(first)[0]["causes"] == ["rotor-fault: raised"]
+    assert held(second)[0]["causes"] == ["shaft-vibration-x: raised"] or path == second
+    assert held(second)[2] > held(first)[2]
+    assert second.name.endswith("-alarm.mcap")
+
+
+async def test_a_detector_that_cannot_be_asked_ends_no_recording(tmp_path: Path) -> None:
+    async with bench(tmp_path, continuous=True, continuous_s=5.0) as one:
+        for _ in range(20):
+            one.processes("rotor-bank", stream="shaft", memory=np.zeros(2_000_000))
+            one.processes("levels", stream="shaft", memory=np.zeros(3))
+            await one.passes(1.0)
+        assert one.recorder.counters.memories_not_taken > 0
+    files = one.files
+    assert [index for path in files for index in firsts_in(path)] == [ROWS * k for k in range(200)]
+    assert [held(path)[3] for path in files] == [Damage()] * len(files)
+    assert list(held(files[1])[0]["remembered"]) == ["levels"]
+
+
+async def test_a_silent_stream_does_not_hold_up_a_continuous_recording(tmp_path: Path) -> None:
+    async with bench(tmp_path, continuous=True, continuous_s=5.0) as one:
+        one.processes("trend", stream="slow", memory=np.zeros(3))
+        for _ in range(20):
+            one.processes("levels", stream="shaft", memory=np.zeros(3))
+            await one.passes(1.0)
+    begins = [held(path)[0]["begin_ns"] / NS_PER_S for path in one.files]
+    assert np.diff(begins) == pytest.approx(5.0, abs=1.3)
+    assert [sorted(held(path)[0]["remembered"]) for path in one.files[1:]] == 3 * [["levels", "trend"]]
+
+
+async def test_a_long_time_before_the_cause_costs_nothing_after_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("daqsvc.recorder.MOST_WAITING_BYTES", 20 * ROWS * 3 * 4)
+    async with bench(tmp_path, before_s=10.0) as one:
+        await one.passes(12.0)
+        one.alarm()
+        one.alarm("shaft-vibration-x")
+        await one.passes(2.0)
+        assert one.recorder.counters.blocks_dropped == 0
+    [path] = one.files
+    firsts = firsts_in(path)
+    assert np.diff(firsts).tolist() == [ROWS] * (len(firsts) - 1)
+    assert held(path)[0]["causes"] == ["rotor-fault: raised", "shaft-vibration-x: raised"]
+
+
+async def test_two_shafts_have_steps_of_their_own(tmp_path: Path) -> None:
+    async with bench(tmp_path, every_rpm=100.0, before_s=0.0, after_s=0.2) as one:
+        one.recorder._speeds["levels/gear"] = ("speed",)
+        for _ in range(30):
+            one.states_speed(1510.0)
+            one.states_speed(310.0, "levels/gear")
+            await one.passes(0.2)
+        assert not one.files
+        one.states_speed(440.0, "levels/gear")
+        await one.passes(1.0)
+        [path] = one.files
+    assert held(path)[0]["causes"] == ["levels/gear: speed 440 rpm"]
+
+
+async def test_large_files_keep_within_the_size_of_all(tmp_path: Path) -> None:
+    most = 0
+    async with bench(tmp_path, continuous=True, continuous_s=600.0, max_mb=2) as one:
+        one.rows = 2_000
+        for _ in range(60):
+            await one.passes(0.5)
+            most = max(most, sum(path.stat().st_size for path in one.files))
+        files = one.files
+    assert one.recorder.folder.deleted > 5
+    assert len(files) >= 3, "not one file that is deleted when it is finished"
+    assert most < 2.6e6
+
+
+async def test_a_snapshot_larger_than_all_may_be_is_there_when_it_is_answered(tmp_path: Path) -> None:
+    async with bench(tmp_path, max_mb=1, after_s=3.0) as one:
+        one.rows = 6_000
+        asked = asyncio.create_task(one.recorder.snapshot("somebody"))
+        await asyncio.sleep(0)
+        one.alarm()
+        await one.passes(5.0)
+        assert (await asked).exists()
+
+
+async def test_a_file_holds_the_limits_that_were_in_force(tmp_path: Path) -> None:
+    async with bench(tmp_path, continuous=True) as one:
+        await one.passes(10.0)
+        raised_s = one.clock.monotonic_ns() / NS_PER_S
+        one.alarm()
+        await one.passes(0.5)
+        machine = one.recorder._machine
+        alarms = tuple(alarm.model_copy(update={"on_delay_s": 1.75}) for alarm in machine.alarms)
+        one.recorder.change_machine(machine.model_copy(update={"alarms": alarms}))
+        await one.passes(2.0)
+        changed_ns = one.recorder._changed_ns
+    before, after = (
+        [path for path in one.files if ("1.75" in values_in(path)) == is_after] for is_after in (False, True)
+    )
+    assert [path.name.rpartition("-")[2] for path in before] == ["continuous.mcap", "alarm.mcap"]
+    assert sorted(path.name.rpartition("-")[2] for path in after) == ["alarm.mcap", "continuous.mcap"]
+    [alarm] = [path for path in after if path.name.endswith("-alarm.mcap")]
+    about, begin_s, end_s, _ = held(alarm)
+    assert about["changed_ns"] == changed_ns
+    assert begin_s == pytest.approx(raised_s - 0.5, abs=0.2)
+    assert end_s == pytest.approx(raised_s + 1.0, abs=0.3), "as long as it would have been"
+    assert all(held(path)[2] < changed_ns / NS_PER_S + 0.6 for path in before)
+
+
+async def test_nobody_waits_for_a_recorder_that_is_over(tmp_path: Path) -> None:
+    async with bench(tmp_path) as one:
+        asked = asyncio.create_task(one.recorder.snapshot("somebody"))
+        await one.passes(0.5)
+    assert (await asked).exists(), "it was finished, so that is the answer"
+    with pytest.raises(SnapshotRefusedError, match="nothing more is recorded"):
+        await one.recorder.snapshot("somebody else")
 
 
 async def test_the_end_of_the_service_waits_for_what_a_thread_writes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import threading
-
     may_go_on = threading.Event()
     write = SnapshotWriter.write
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +14,7 @@ from support.waiting import PATIENCE_S
 from daqsvc.acquisition.samples import SampleBlock
 from daqsvc.confined.limits import ResourceLimits
 from daqsvc.offline.replay import replay
-from daqsvc.snapshots.contents import ALARMS, MACHINE_JSON, MACHINE_TOML
+from daqsvc.snapshots.contents import ALARMS, DIAGNOSES, MACHINE_JSON, MACHINE_TOML
 from daqsvc.snapshots.reading import read_snapshot
 
 if TYPE_CHECKING:
@@ -21,13 +22,21 @@ if TYPE_CHECKING:
 
     from daqsvc.offline.replay import Replayed
     from daqsvc.service import Service
-    from daqsvc.snapshots.contents import Snapshot
+    from daqsvc.snapshots.contents import Document, Snapshot
 
 pytestmark = pytest.mark.integration
 
 
 def snapshots(service: Service) -> list[Path]:
-    return sorted(recorder_of(service).directory.glob("*.mcap"))
+    return sorted(recorder_of(service).folder.directory.glob("*.mcap"))
+
+
+def is_statement(what: object, statement: Document) -> bool:
+    """Whether an entry is that statement of a detector."""
+    if getattr(what, "topic", "") != DIAGNOSES:
+        return False
+    document = getattr(what, "document", {})
+    return all(document[key] == statement[key] for key in ("detector", "decision", "monotonic_ns"))
 
 
 async def again(snapshot: Snapshot, folder: Path) -> Replayed:
@@ -64,6 +73,29 @@ async def test_an_alarm_leaves_a_snapshot_that_replays_to_the_same_alarm(tmp_pat
     assert replayed.said.equal > 20
     assert replayed.alarmed.equal == len(alarms) > 0
     assert not replayed.said.added
+    assert not replayed.notes
+
+    # An alarm that is raised now and was not then shows as such, wherever it is in the file.
+    raised = next(
+        entry.what.document
+        for entry in snapshot.entries
+        if getattr(entry.what, "topic", "") == ALARMS and entry.what.document["kind"] == "raised"
+    )
+    statement = {key: one for key, one in raised["cause"].items() if key not in {"schema", "site", "box"}}
+    hidden = [
+        entry
+        for entry in snapshot.entries
+        if getattr(entry.what, "document", None) is not raised and not is_statement(entry.what, statement)
+    ]
+    assert len(hidden) == len(snapshot.entries) - 2
+    without = await again(replace(snapshot, entries=hidden), tmp_path / "without")
+    assert not without.is_equal
+    assert [one["decision"] for one in without.said.added] == [statement["decision"]]
+
+    # Limits that came into force within it are told.
+    about = {**snapshot.about, "changed_ns": snapshot.about["begin_ns"] + 1}
+    changed = await again(replace(snapshot, about=about), tmp_path / "changed")
+    assert changed.notes[0].startswith("other limits came into force at 20")
 
 
 @pytest.mark.long

@@ -16,6 +16,7 @@ from support.mqtt_publishing import commands, mqtt, say
 from support.recorded_rig import recorded_rig
 from support.waiting import eventually
 
+from daqsvc.alarm_service import MOST_SNAPSHOTS
 from daqsvc.confined.limits import ResourceLimits
 from daqsvc.snapshots.reading import read_snapshot
 
@@ -113,6 +114,27 @@ async def test_a_snapshot_has_to_be_allowed(tmp_path: Path) -> None:
     assert not (tmp_path / "store" / "audit.jsonl").exists()
 
 
+async def test_who_asks_again_and_again_is_refused(tmp_path: Path) -> None:
+    async with commanded(tmp_path, "mqtt-quota", "snapshot", before_s=0.0, after_s=0.1) as (
+        service,
+        mosquitto,
+        live,
+    ):
+        for number in range(MOST_SNAPSHOTS):
+            await asyncio.to_thread(say, mosquitto.port, SNAPSHOT, wish(f"s{number}"))
+            assert (await answer(live))["accepted"]
+        await asyncio.to_thread(say, mosquitto.port, SNAPSHOT, wish("more"))
+        told = await answer(live)
+        assert not told["accepted"]
+        assert told["reason"].startswith(
+            f"{MOST_SNAPSHOTS} snapshots of laval-rig were asked for within 600 s"
+        )
+        assert service.figures()["recorders"]["laval-rig"]["snapshots"] == MOST_SNAPSHOTS
+        # At the box people are not held up by that.
+        made = await service.snapshot(None, "somebody at the box")
+        assert made.endswith("-asked.mcap")
+
+
 async def test_nobody_waits_for_the_snapshots_of_others(tmp_path: Path) -> None:
     async with commanded(tmp_path, "mqtt-lasting", "snapshot", "acknowledge", after_s=600.0) as (
         service,
@@ -127,4 +149,6 @@ async def test_nobody_waits_for_the_snapshots_of_others(tmp_path: Path) -> None:
         assert (await answer(live, "acknowledge"))["id"] == "a1"
         assert not live.on("snapshot/response")
     last = audited(tmp_path / "store")[-1]
-    assert (last["verb"], last["answer"]) == ("snapshot", "the service ends")
+    assert (last["verb"], last["outcome"]) == ("snapshot", "accepted"), (
+        "it was finished, as the service ended"
+    )

@@ -324,7 +324,10 @@ class Session:
     def _lasted(self, lasting: asyncio.Task[None]) -> None:
         self._lasting.discard(lasting)
         error = None if lasting.cancelled() else lasting.exception()
-        if isinstance(error, Exception):
+        if isinstance(error, MqttError) and self._intake is not None:
+            # The connection is lost, or the broker silent: whoever delivers alarms says so.
+            self._intake.counters.unanswered += 1
+        elif isinstance(error, Exception):
             self._faults.note("an answer did not reach the broker", error)
 
     async def _answer(self, intake: CommandIntake, message: Incoming) -> None:
