@@ -6,6 +6,7 @@ import json
 import math
 import subprocess
 import sys
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -89,6 +90,24 @@ def test_a_stated_speed_that_the_harmonics_show_to_be_wrong_is_noted(
             f"({off} %): the former is used; correct the speed"
         )
         assert noted == ([note] if off else [])
+
+
+@pytest.mark.parametrize("part", ["normal", "inner"])
+def test_what_is_too_long_to_be_judged_at_one_go_is_watched(
+    verb: Run, tmp_path: Path, files: dict[str, Path], monkeypatch: pytest.MonkeyPatch, part: str
+) -> None:
+    monkeypatch.setattr("daqsvc.detectors.bearing.recorded.MOST_AT_ONCE", 1000)
+    monkeypatch.setattr("daqsvc.detectors.bearing.recorded.analyse_bearings", None)
+    housing = Housing(seed=6) if part == "normal" else Housing(order=INNER, seed=6)
+    recording = replace(housing, seconds=40.0).save(tmp_path / "long.npz")
+    for baseline in ((), ("--baseline", files["baseline"])):
+        code, (found,), err = verb("analyze", recording, *OPTIONS, *baseline, "--jobs", 1)
+        assert (code, err) == (0, "")
+        assert (found["verdict"], found["group"]) == (part, [part])
+        assert found["speed_rpm"] == pytest.approx(1797.0, rel=2e-3)
+        assert found["data_quality"]["samples"] == 40 * RATE_HZ
+        if baseline:
+            assert (found["baseline"], found["residual"] is not None) == (str(files["baseline"]), True)
 
 
 def test_without_a_healthy_run_a_healthy_machine_is_normal(verb: Run, files: dict[str, Path]) -> None:

@@ -35,7 +35,11 @@ SAME_RATE = 1e-3
 
 
 def bearing_detector(
-    machine: MachineFile, settings: Bearing, store: Path | None, calibration: Path | None = None
+    machine: MachineFile,
+    settings: Bearing,
+    store: Path | None,
+    calibration: Path | None = None,
+    healthy: BearingBaseline | None = None,
 ) -> BearingDetector:
     """The detector that ``[pipeline.bearing]`` asks for.
 
@@ -44,6 +48,7 @@ def bearing_detector(
         settings: its bearings.
         store: directory of the state that survives restarts; None to begin without any and leave none.
         calibration: file with the healthy machine, in place of what the machine file names.
+        healthy: the healthy machine, in place of any file.
 
     Raises:
         ValueError: a bearing is not in the catalogue, its orders contradict each other, or a file with the
@@ -56,9 +61,11 @@ def bearing_detector(
     keyphasor = None if settings.keyphasor is None else _keyphasor(machine, settings.keyphasor)
     # A measured speed tells by itself when the healthy machine's is another one.
     same_speed_rpm = speed_rpm if keyphasor is None else None
-    baseline: BearingBaseline | None = None
+    baseline = healthy
     kept: Path | None = None
-    if calibration is not None:
+    if baseline is not None:
+        pass
+    elif calibration is not None:
         baseline = _fitting(calibration, bearings, rate_hz, same_speed_rpm)
     elif settings.calibration is not None:
         try:

@@ -1,7 +1,8 @@
 """From a recording of accelerometers to a verdict about the bearings of a machine.
 
 With a machine file the live detector watches the recording from its first sample to its last. What options
-tell of is judged at one go (`analyse_bearings`), by the tests inside the detector.
+tell of is judged at one go (`analyse_bearings`), by the tests inside the detector, unless it is too long for
+that: then it is watched, too.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from daqsvc.recording import RecordingError
 from daqsvc.recording.recording import load_matching
 
 if TYPE_CHECKING:
-    from collections.abc import Container, Iterator, Sequence
+    from collections.abc import Callable, Container, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -56,6 +57,11 @@ if TYPE_CHECKING:
     from daqsvc.settings.models import MachineFile
 
     Floats = NDArray[np.float64]
+    Judge = Callable[[BearingBaseline | None], BearingVerdict]
+    """Judges one recording against a healthy machine, or by itself."""
+
+MOST_AT_ONCE = 1 << 22
+"""Samples of all channels that are judged at one go; that takes some 55 bytes for each."""
 
 
 class RecordedBearings(RecordedDetector[Bearing]):
@@ -137,7 +143,12 @@ class RecordedBearings(RecordedDetector[Bearing]):
         statements: tuple[Statements, ...] = ()
         setup = setup_of(recorded.machine, settings)
         if self.options.in_memory:
-            verdict = self._judged_whole(recorded, settings, setup)
+            recording = recorded.recording
+            if recording.samples.size <= MOST_AT_ONCE:
+                judge = partial(analyse_bearings, recording, setup)
+            else:
+                judge = partial(_watched_against, recorded, settings, setup)
+            verdict = self._judged(recorded, settings, setup, judge)
         else:
             detector = bearing_detector(recorded.machine, settings, None, self.options.calibration)
             diagnoses, looks = _watched(detector, recorded)
@@ -146,16 +157,18 @@ class RecordedBearings(RecordedDetector[Bearing]):
         draw = partial(_draw, verdict) if verdict.races else None
         return Evaluated(statements=statements, verdict=verdict, draw=draw)
 
-    def _judged_whole(self, recorded: Recorded, settings: Bearing, setup: BearingSetup) -> BearingVerdict:
-        """Judge a recording at one go, against the healthy machine if options tell of one."""
+    def _judged(
+        self, recorded: Recorded, settings: Bearing, setup: BearingSetup, judge: Judge
+    ) -> BearingVerdict:
+        """Judge a recording against the healthy machine, if options tell of one."""
         path = self.options.calibration
         if path is None:
-            return _against(recorded.recording, setup, self._healthy)
+            return _against(recorded.recording.rate_hz, judge, self._healthy)
         baseline = healthy_machine(recorded.machine, settings, path)
         if len(setup.channels) > 1 and setup.channels not in baseline.residuals:
             lacking = f"nothing of {' and '.join(setup.channels)} together"
             raise ValueError(f"{path}: holds {lacking}; calibrate with --channels {','.join(setup.channels)}")
-        return analyse_bearings(recorded.recording, setup, baseline)
+        return judge(baseline)
 
 
 def setup_of(machine: MachineFile, settings: Bearing) -> BearingSetup:
@@ -184,6 +197,15 @@ def _draw(verdict: BearingVerdict, prefix: str) -> None:
     from daqsvc.detectors.bearing.plots import draw_envelopes  # noqa: PLC0415 - brings matplotlib
 
     draw_envelopes(verdict, prefix)
+
+
+def _watched_against(
+    recorded: Recorded, settings: Bearing, setup: BearingSetup, baseline: BearingBaseline | None = None
+) -> BearingVerdict:
+    """What the live detector says of a recording whose healthy machine, if any, is known."""
+    detector = bearing_detector(recorded.machine, settings, None, healthy=baseline)
+    diagnoses, looks = _watched(detector, recorded)
+    return _concluded(setup, recorded.recording, detector, diagnoses, looks)
 
 
 def _watched(detector: BearingDetector, recorded: Recorded) -> tuple[list[Diagnosis], _Looks]:
@@ -308,26 +330,26 @@ def _concluded(
     )
 
 
-def _against(recording: Recording, setup: BearingSetup, healthy: HealthyRun | None) -> BearingVerdict:
+def _against(rate_hz: float, judge: Judge, healthy: HealthyRun | None) -> BearingVerdict:
     """Judge against the healthy run, unless that is none: it must not hide anything."""
     if healthy is None:
-        return analyse_bearings(recording, setup)
+        return judge(None)
     source = healthy.recording.source
     damage, doubt = healthy.against
     if damage:
-        return analyse_bearings(recording, setup).with_problem(
+        return judge(None).with_problem(
             f"the healthy run {source} is not used: {damage}; give one of the machine in good order"
         )
     try:
-        baseline = healthy.at(recording.rate_hz)
+        baseline = healthy.at(rate_hz)
     except NotIdentifiableError as error:
-        alone = analyse_bearings(recording, setup)
+        alone = judge(None)
         return alone.with_problem(f"the healthy run {source} is not used: {error}")
-    analysis = analyse_bearings(recording, setup, baseline)
+    analysis = judge(baseline)
     if not doubt:
         return analysis
     if analysis.leading is not None and analysis.leading.speed_seen:
-        return analyse_bearings(recording, setup).with_problem(
+        return judge(None).with_problem(
             f"the healthy run {source} is not used: {doubt}, as those of the recording do; correct "
             "--baseline-fs, or give one at this speed"
         )
