@@ -6,6 +6,7 @@ import asyncio
 import inspect
 import os
 import signal
+import sys
 import threading
 import time
 from pathlib import Path
@@ -31,6 +32,9 @@ settings.load_profile("daqsvc")
 if not ROAM:
     # Else numbers that stand in our modules are drawn, too, and which are loaded is different in each worker.
     providers._get_local_constants = providers.Constants
+
+# jsonschema would build 38 grammars of addresses, which no schema of ours has: five seconds in each process.
+sys.modules.setdefault("rfc3987_syntax", None)  # type: ignore[arg-type]
 
 DATA = Path(os.environ.get("DAQSVC_DATA", ROOT / ".." / "shared" / "data")).resolve()
 GRACE_S = 30.0

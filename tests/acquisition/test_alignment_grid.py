@@ -296,6 +296,7 @@ def demodulated(samples):
     return np.convolve(turning, np.ones(50) / 50.0, mode="valid")
 
 
+@pytest.mark.long
 @settings(max_examples=examples(6))
 @given(seed=st.integers(0, 2**31), ppm=st.floats(-50, 50), lost=st.floats(0, 0.05))
 def test_devices_with_clocks_of_their_own_end_up_on_one_grid(seed, ppm, lost) -> None:

@@ -105,6 +105,7 @@ def test_the_readme_names_every_verb() -> None:
     assert set(re.findall(r"`(\w+)", " ".join(rows))) == set(VERBS)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", first_of(signal.SIGTERM, signal.SIGINT))
 def test_run_stops_even_if_the_broker_is_dead(number: int, tmp_path: Path) -> None:
     text = (CONFIG / "laval-rig.toml").read_text()

@@ -253,6 +253,7 @@ async def test_what_was_done_about_an_alarm_does_not_hide_what_it_is_and_since_w
     assert out.endswith("  shaking danger: 9 g; shaking acknowledged by ann\n")
 
 
+@pytest.mark.long
 async def test_history_is_newest_last_and_as_long_as_is_asked(tmp_path: Path) -> None:
     events = [{"kind": "raised"}, {"kind": "acknowledged"}, {"kind": "returned", "state": "normal"}]
     await write_journal(tmp_path, *events)
@@ -274,6 +275,7 @@ async def test_the_beginning_of_an_id_must_be_one_alarms(tmp_path: Path) -> None
     assert "no daqsvc runs on the store" in err, "that was one, but nobody is there to obey"
 
 
+@pytest.mark.long
 async def test_a_store_that_is_not_there_is_told_with_the_remedy(tmp_path: Path) -> None:
     for verb in (("alarms",), ("ack", "shaking")):
         code, out, err = await daqsvc(*verb, "--store", tmp_path / "none")
@@ -285,6 +287,7 @@ async def test_a_store_that_is_not_there_is_told_with_the_remedy(tmp_path: Path)
     assert (await daqsvc("alarms", bad))[0] == 2
 
 
+@pytest.mark.long
 async def test_the_store_is_found_as_run_finds_it(tmp_path: Path) -> None:
     state = tmp_path / "state" / "daqsvc"
     xdg = {"XDG_STATE_HOME": str(tmp_path / "state"), "STATE_DIRECTORY": ""}

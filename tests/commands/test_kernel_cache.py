@@ -96,6 +96,7 @@ def test_an_account_without_a_home_can_use_every_verb(verb: str, tmp_path: Path)
         assert (stat.S_IMODE(kept.stat().st_mode), kept.stat().st_uid) == (0o700, NOBODY)
 
 
+@pytest.mark.long
 def test_where_nothing_can_be_written_kernels_are_compiled_and_not_kept(tmp_path: Path) -> None:
     """Every kernel there is can be imported, and one is used."""
     use = (
@@ -121,6 +122,7 @@ def test_where_nothing_can_be_written_kernels_are_compiled_and_not_kept(tmp_path
     assert said.startswith("compiled kernels cannot be kept, and every start compiles them: ")
 
 
+@pytest.mark.long
 def test_that_kernels_are_compiled_is_said_once_and_only_if_none_are_kept(tmp_path: Path) -> None:
     kernels = "from daqsvc.kernels import njit\n" + "".join(
         f"@njit(cache=True)\ndef {name}(x):\n    return x + 1\n" for name in ("f", "g")

@@ -116,6 +116,7 @@ def check_said(records: list[logging.LogRecord], minutes: int = 1) -> None:
     assert said, "something was said"
 
 
+@pytest.mark.long
 async def test_the_worst_on_all_buses_at_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     await all_do_their_worst(KINDS, tmp_path, 0.4)
     check_said(caplog.records)

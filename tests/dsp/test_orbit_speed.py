@@ -35,6 +35,7 @@ def test_clean_orbit_among_harmonics_and_dc(off, stated):
     assert found.direction == "forward"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("snr_db", "bound"), first_of((20, 1.36e-5), (0, 1.36e-4)))
 def test_noise_costs_what_it_must_and_the_uncertainty_says_so(snr_db, bound):
     # Cramer-Rao: sqrt(6 s^2 / (A^2 N^3)) rad per sample, s^2 = A^2 at 0 dB, N = 3200, 0.098 rad per sample.

@@ -59,6 +59,7 @@ def judged(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int, dict[st
     return made_once(tmp_path_factory, "fleet", make)
 
 
+@pytest.mark.long
 def test_an_archive_is_judged_once(tmp_path: Path) -> None:
     """The short form of all that follows: a run, what it says, and one that finds nothing to do."""
     archive = tmp_path / "archive"

@@ -130,6 +130,7 @@ def test_the_orbit_itself_can_tell_the_speed(analyze: Callable[..., Any], tmp_pa
     assert found["speed_rpm"] == pytest.approx(SPEED_RPM, rel=1e-3)
 
 
+@pytest.mark.long
 def test_many_recordings_come_out_in_order_whatever_becomes_of_each(
     analyze: Callable[..., Any], tmp_path: Path
 ) -> None:
@@ -201,6 +202,7 @@ def test_the_start_is_quick(tmp_path: Path) -> None:
     assert done.stdout.splitlines()[-1] == "0 []"
 
 
+@pytest.mark.long
 @pytest.mark.data
 @pytest.mark.parametrize(
     ("name", "rpm", "group"),

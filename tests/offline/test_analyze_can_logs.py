@@ -193,6 +193,7 @@ def two_buses(tmp_path):
     return machine, of_x, of_y
 
 
+@pytest.mark.long
 def test_two_buses_are_put_on_one_grid(analyze, tmp_path):
     machine, of_x, of_y = two_buses(tmp_path)
     both = write(tmp_path / "both.log", sorted([*of_x, *of_y], key=lambda message: message.timestamp))

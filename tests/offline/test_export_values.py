@@ -105,6 +105,7 @@ def test_units_and_names_are_spelled_in_ascii(tmp_path, capsys):
     assert kinds[:4] == [0, 12, 8, 8]  # acceleration, and displacement
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("suffix", "channels", "rows", "most"),
     [

@@ -100,6 +100,7 @@ def test_a_flipped_bit_in_the_log_costs_no_message(killed, place, caplog):
     assert {p.name for p in path.parent.iterdir() if "log" in p.name or "corrupt" in p.name} == set()
 
 
+@pytest.mark.long
 def test_a_flipped_bit_costs_at_most_the_message_that_it_is_in_wherever_it_is(killed, tmp_path):
     path, standing, numbers = killed
     size = log_of(path).stat().st_size

@@ -128,6 +128,7 @@ def _quick(monkeypatch):
     monkeypatch.setattr(writer, "RETRY_MOST_S", 0.05)
 
 
+@pytest.mark.long
 async def test_what_is_published_is_on_the_disk_whenever_that_fails(tmp_path, caplog):
     await rounds(tmp_path, range(3), caplog)
 

@@ -78,6 +78,7 @@ def test_the_oldest_that_are_sent_go_beyond_the_size_and_the_file_stays_within(t
     assert path.stat().st_size < 5 * MIB  # after 8 MB: the pages are used again
 
 
+@pytest.mark.long
 def test_a_file_that_was_large_gives_its_room_back(tmp_path, wall):
     """A backlog of a long outage is gone in the end, and so is the room that it took."""
     path = tmp_path / "outbox.sqlite"

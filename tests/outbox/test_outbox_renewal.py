@@ -104,6 +104,7 @@ def killed_at_each(damaged, tmp_path, steps):
     return step
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("_one_place")
 def test_a_kill_at_any_step_loses_nothing_that_can_be_read(damaged, tmp_path):
     done = killed_at_each(damaged, tmp_path, range(1, 10_000, 16))

@@ -50,6 +50,7 @@ def delays(change, seeds=40):
     return np.array([seen_after(change, seed) for seed in range(seeds)])
 
 
+@pytest.mark.long
 def test_the_smallest_change_is_seen_at_last_and_half_of_it_is_not():
     assert FOUND.smallest_um[0] == pytest.approx(
         math.sqrt(THRESHOLD_NATS * (2.0 / 64.0 * (1 / 50 + 1 / 128) + (0.002 * HEALTHY.amplitude_um) ** 2))

@@ -115,6 +115,7 @@ def test_a_change_too_small_for_a_name_gets_none():
     assert reports[-1].identification.group == ("small_change",)
 
 
+@pytest.mark.long
 def test_the_baseline_grows_while_the_machine_is_healthy():
     """What 50 revolutions cannot see, 600 can: the reference is the limit, not patience."""
     small = with_change(forward=0.06 * HEALTHY[1])

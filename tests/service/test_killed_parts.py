@@ -195,6 +195,7 @@ def kill_thread(thread: threading.Thread, error: type[BaseException]) -> None:
 left_open = pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning")
 
 
+@pytest.mark.long
 @left_open
 async def test_all_at_once(tmp_path: Path, mosquitto: Mosquitto) -> None:
     async with victim(tmp_path, mosquitto, "at-once") as there:

@@ -141,6 +141,7 @@ window_s = 0.5
 """
 
 
+@pytest.mark.long
 async def test_waveforms_of_a_device_that_is_asked_now_and_then_are_judged_block_by_block(
     tmp_path: Path,
 ) -> None:

@@ -171,6 +171,7 @@ def test_a_stop_is_obeyed_whatever_hangs_and_the_journal_is_closed(hangs: str, t
     assert "Traceback" not in said
 
 
+@pytest.mark.long
 def test_the_guard_and_the_log_outlive_what_kills_their_threads(tmp_path: Path) -> None:
     fault = (
         "import ctypes\n"

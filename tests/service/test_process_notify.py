@@ -214,6 +214,7 @@ def test_it_is_ready_when_what_it_must_have_delivers_and_tells_how_it_stands(tmp
         assert process.wait(PATIENCE_S) == 0, log_of(tmp_path)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "part",
     ["detector levels/casing", *(pytest.param(n, marks=pytest.mark.long) for n in [*HANGS][1:])],

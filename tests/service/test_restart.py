@@ -92,6 +92,7 @@ async def test_what_cleared_while_the_service_was_dead_does_not_stay_active_at_t
     assert state.payload["previous"] == {"state": "active_unacknowledged", "level": "alert"}
 
 
+@pytest.mark.long
 async def test_a_latching_alarm_keeps_its_occurrence_over_restarts(tmp_path: Path) -> None:
     file = machine(free_port(), latching=True)
     async with running(file, tmp_path) as service:

@@ -233,6 +233,7 @@ async def test_what_fails_of_one_machine_touches_no_other(tmp_path: Path) -> Non
         assert {"one: detector rotor-bank", "two: detector rotor-bank", "driver can0", "outbox"} <= set(parts)
 
 
+@pytest.mark.long
 async def test_detectors_that_hang_hold_up_no_other_machine(tmp_path: Path) -> None:
     box = Box.several([machine("one", 1), machine("two", 2)])
     may_end = threading.Event()

@@ -70,6 +70,7 @@ async def shake(service: Service, rms: float) -> None:
     await play(service, noise(rms), RATE_HZ)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("step_ns", first_of(-HOUR_NS, HOUR_NS))
 async def test_a_wall_clock_that_steps_moves_no_alarm(step_ns: int, tmp_path: Path) -> None:
     recording = Recording(("accel",), noise(1.0), RATE_HZ, __file__, 0)  # type: ignore[arg-type]

@@ -215,6 +215,7 @@ async def test_a_lost_broker_ends_it_and_is_said(tmp_path: Path) -> None:
         assert f"the broker {embedded.url} was lost" in str(playing.error)  # type: ignore[attr-defined]
 
 
+@pytest.mark.long
 async def test_kernels_may_take_their_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(session, "LINK_UP_S", 2.0)
     run = Service.run
@@ -241,6 +242,7 @@ async def test_a_port_that_is_taken_meanwhile_is_replaced(monkeypatch: pytest.Mo
             await EmbeddedBroker(first.port).__aenter__()
 
 
+@pytest.mark.long
 def test_a_closed_pipe_ends_it_quietly(tmp_path: Path) -> None:
     path = save(tmp_path / "rig.npz", a=noise(600))
     with demo("--recording", str(path), "--json", "--speed", "2", env=elsewhere(tmp_path)) as running:
@@ -266,6 +268,7 @@ def test_an_alarm_is_shown_once_where_no_terminal_is(form: list[str], tmp_path: 
     assert said.count("danger limit") == 1, said
 
 
+@pytest.mark.long
 # In the everyday run SIGTERM is that of the job in the background.
 @pytest.mark.parametrize("number", first_of(signal.SIGINT, signal.SIGTERM, signal.SIGHUP))
 def test_signals_end_it_in_order(number: int, tmp_path: Path) -> None:

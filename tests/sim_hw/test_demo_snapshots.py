@@ -23,6 +23,7 @@ def told(capsys: pytest.CaptureFixture[str]) -> list[dict[str, Any]]:
     return [json.loads(line) for line in capsys.readouterr().out.splitlines()]
 
 
+@pytest.mark.long
 def test_a_snapshot_of_the_demo_replays_to_the_alarms_that_it_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

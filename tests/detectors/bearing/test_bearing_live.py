@@ -274,6 +274,7 @@ def test_a_louder_machine_is_changed_and_no_race_is_named(pair) -> None:
     )
 
 
+@pytest.mark.long
 def test_a_fault_that_stands_at_a_restart_is_no_healthy_machine(pair, tmp_path) -> None:
     """What tells the races by direction is kept with the healthy state, and comes back to the last bit."""
     before = with_pair()

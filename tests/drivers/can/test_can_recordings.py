@@ -76,6 +76,7 @@ def played(log: Path, specs: list[StreamSpec[FrameLayout]]) -> list[DecodedBatch
         recording.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("recording", first_of(*RECORDINGS))
 def test_every_signal_of_every_frame_is_what_cantools_reads(data: Path, recording: str) -> None:
     log_path, dbc_path, frames = RECORDINGS[recording]

@@ -235,6 +235,7 @@ def test_a_ring_is_read_once_and_its_books_are_exact(seed, count, restarts, dept
     assert rig.driver.streams["s"][1].restarts <= restarts
 
 
+@pytest.mark.long
 @settings(max_examples=examples(15), deadline=None)
 @given(
     st.integers(0, 2**32),

@@ -45,6 +45,7 @@ def now_s():
     return LoopClock().monotonic_ns() / NS_PER_S - 1000
 
 
+@pytest.mark.long
 @settings(max_examples=examples(40))
 @given(st.integers(0, 2**32), st.integers(1, 2))
 def test_no_late_reply_becomes_the_value_of_another_stream_however_often_the_line_is_opened(

@@ -47,6 +47,7 @@ def test_every_record_of_every_motor_is_read_as_it_is_written(data: Path) -> Non
         assert sum(part.notes["frames_malformed"] for part in found) == 0
 
 
+@pytest.mark.long
 def test_every_record_of_every_motor_comes_through_the_driver_in_its_place(data: Path) -> None:
     """Up to four records share a stamp, which is from a clock of 16.8 or 33.6 ms."""
     for file in sorted((data / "mrecio_motors").rglob("*.dat")):

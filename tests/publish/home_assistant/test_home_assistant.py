@@ -208,6 +208,7 @@ async def test_without_its_section_the_machine_is_taken_away_too(mosquitto, outb
     assert await retained(mosquitto.port, SUMMARY) == []
 
 
+@pytest.mark.long
 async def test_under_another_prefix_the_old_one_is_taken_away(mosquitto, outbox):
     async with publishing(outbox, mosquitto.port, **RIG):
         await eventually_told(mosquitto, "rotor-fault")

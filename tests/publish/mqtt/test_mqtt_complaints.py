@@ -226,6 +226,7 @@ class Subscriber5:
         return [message for message in self.messages if part in message.topic]
 
 
+@pytest.mark.long
 @pytest.mark.mosquitto
 async def test_stale_telemetry_is_delivered_after_hours(mosquitto, outbox):
     """ism7mqtt#79, zigbee2mqtt#3740: what was measured before the outage comes as if it were new."""

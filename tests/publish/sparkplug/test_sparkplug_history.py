@@ -17,6 +17,7 @@ from support.waiting import eventually
 pytestmark = [pytest.mark.integration, pytest.mark.mosquitto]
 
 
+@pytest.mark.long
 async def test_alarms_of_an_outage_come_as_history_after_the_births(outbox, tmp_path) -> None:
     """Nothing that was raised while no broker was there is lost, and the order holds."""
     machine = Machine(outbox)
