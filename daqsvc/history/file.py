@@ -28,6 +28,7 @@ from daqsvc.history.points import (
     spread,
     summed_up,
     unpack,
+    weighed,
 )
 from daqsvc.outbox.files import SIDE_FILES, create, restrict, used_bytes
 
@@ -65,6 +66,10 @@ CREATE INDEX IF NOT EXISTS event_by_machine ON event (machine, wall_ns);
 
 class NewerHistoryError(Exception):
     """The file was written by a newer version; the text says so."""
+
+
+class EmptyHistoryError(Exception):
+    """The file holds no history, not even an empty one; the text says so."""
 
 
 class Series(NamedTuple):
@@ -121,12 +126,14 @@ class HistoryReader:
     Raises:
         sqlite3.Error: it cannot be opened, or is damaged.
         NewerHistoryError: a newer version wrote it.
+        EmptyHistoryError: no service has written anything into it.
     """
 
     def __init__(self, path: Path) -> None:
         self._sql = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True, timeout=BUSY_S)
         try:
             _check_version(self._sql, path)
+            _refuse_empty(self._sql, path)
             self._ids = {Series(*row[1:]): int(row[0]) for row in self._sql.execute("SELECT * FROM series")}
         except BaseException:
             self._sql.close()
@@ -171,10 +178,11 @@ class HistoryReader:
             except DamagedChunkError:
                 continue  # as if nothing had been measured
         recent = self._pieces(number, since_s - 2 * HOUR_S, until_s)
-        parts.append(summed_up(recent, step))
-        found = summed_up(np.concatenate(parts), step)
+        found = summed_up(weighed(np.concatenate(parts), summed_up(recent, step)), step)
         found = found[(found["t_s"] >= since_s) & (found["t_s"] < until_s)]
-        return TrendPoints(found["t_s"], found["low"], found["mean"], found["high"])
+        return TrendPoints(
+            found["t_s"], found["low"], found["mean"], found["high"], found["n"].astype(np.int64)
+        )
 
     def events(self, machine: str | None, since_s: float, until_s: float) -> list[Event]:
         """Alarm events of a machine, or of all, in order.
@@ -362,6 +370,15 @@ def _check_version(connection: sqlite3.Connection, path: Path) -> None:
         raise NewerHistoryError(
             f"{path} was written by a newer version of daqsvc (its form is {version}, this version knows "
             f"{VERSION}); install that again, or move the file away to begin anew"
+        )
+
+
+def _refuse_empty(connection: sqlite3.Connection, path: Path) -> None:
+    """See that the tables are there; a writer would make them."""
+    if connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'series'").fetchone() is None:
+        raise EmptyHistoryError(
+            f"{path} holds nothing yet; start the service with [history] in the machine file, which fills "
+            "it, or name another store with --store"
         )
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import zlib
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from daqsvc.history.points import (
+    FORM,
     MANTISSA_BITS,
     MOST,
     RECORD,
@@ -20,6 +23,7 @@ from daqsvc.history.points import (
     spread,
     summed_up,
     unpack,
+    weighed,
 )
 
 values = st.floats(width=32, allow_infinity=False, allow_subnormal=False).filter(lambda v: not abs(v) >= MOST)
@@ -89,3 +93,49 @@ def test_where_a_clock_was_set_back_extremes_of_both_stay() -> None:
     first = spread(records((0, 1, 1, 2, 3), (60, 1, 1, 1, 1)), Step.MINUTE, 0)
     second = spread(records((0, 1, 2, 4, 9)), Step.MINUTE, 0)
     assert gathered(merge(first, second), Step.MINUTE, 0).tolist() == [(0, 1, 1, 4, 9), (60, 1, 1, 1, 1)]
+
+
+def test_how_many_statements_there_were_is_kept_with_their_mean() -> None:
+    for step in Step:
+        points = records((0, 7, 2, 2, 2), (step, 123_456, 3, 3, 3))
+        found = gathered(unpack(pack(spread(points, step, 0)), step), step, 0)
+        assert found["n"].tolist() == pytest.approx([7, 123_456], rel=2e-5)
+        later = spread(records((step, 2, 4, 4, 4)), step, 0)
+        assert gathered(merge(spread(points, step, 0), later), step, 0)["n"].tolist() == [7, 2]
+
+
+def without_numbers(chunk: bytes) -> bytes:
+    """As it was written before numbers were kept."""
+    return FORM + zlib.compress(zlib.decompressobj().decompress(chunk[1:]))
+
+
+@pytest.mark.parametrize(("step", "rows"), [(Step.SECOND, 1), (Step.MINUTE, 3), (Step.HOUR, 3)])
+def test_chunks_of_old_are_read_and_those_of_today_by_versions_of_old(step: Step, rows: int) -> None:
+    chunk = pack(spread(records((0, 7, 1, 2, 3), (step, 9, 4, 5, 6)), step, 0))
+    # What a version of old asks of a chunk.
+    unzip = zlib.decompressobj()
+    assert len(unzip.decompress(chunk[1:], rows * 4 * step.span_s // step)) == rows * 4 * step.span_s // step
+    assert unzip.eof
+    assert not unzip.unconsumed_tail
+    found = gathered(unpack(without_numbers(chunk), step), step, 0)
+    assert found["mean"].tolist() == [2, 5]
+    assert found["n"].tolist() == [0, 0], "not known"
+
+
+def test_points_without_a_number_weigh_as_a_usual_one() -> None:
+    packed = records((0, 0, 1, 1, 1), (60, 0, 2, 2, 2), (120, 50, 3, 3, 3))
+    assert weighed(packed, records((180, 60, 4, 4, 4), (240, 2, 5, 5, 5)))["n"].tolist() == [
+        50,
+        50,
+        50,
+        60,
+        2,
+    ]
+    assert weighed(packed[:2], records())["n"].tolist() == [1, 1]
+
+
+@pytest.mark.parametrize("count", [0.0, -1.0, np.nan, np.inf, 1e20])
+def test_a_number_that_cannot_be_is_not_known(count: float) -> None:
+    dense = spread(records((0, 7, 1, 2, 3)), Step.HOUR, 0)
+    dense[-1, 0] = count
+    assert gathered(dense, Step.HOUR, 0).tolist() == [(0, 0, 1, 2, 3)]
