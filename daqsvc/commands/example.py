@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from importlib import resources
 from pathlib import Path
@@ -81,6 +82,10 @@ class ExampleCommand:
     def run(self, arguments: argparse.Namespace) -> int:
         """See `daqsvc.cli.Command.run`."""
         known = examples()
+        if arguments.name is None and arguments.out is not None:
+            words = "which one is to be written? name it before --out; daqsvc example lists them"
+            print(f"daqsvc example: {words}", file=sys.stderr)  # noqa: T201 - errors go to stderr
+            return EXIT_USAGE
         if arguments.name is None:
             for folder, what in _FOLDERS.items():
                 print(f"{what[0].upper()}{what[1:]}")  # noqa: T201 - this is what the verb is for
@@ -102,21 +107,31 @@ class ExampleCommand:
 
 
 def _copy(example: Example, out: Path) -> int:
-    """Write an example, and beside it the DBC files that it names."""
+    """Write an example, and beside it the DBC files that it names; all, or none if one is in the way."""
     target = out / f"{example.name}.toml" if out.is_dir() else out
     files = {target: example.text.replace(f'"{_DEVICES}', '"')}
-    for device in example.devices:
-        content = (_root() / "devices" / device).read_text(encoding="utf-8")
-        files[target.parent / device] = content
+    path = target
     try:
+        for device in example.devices:
+            path = target.parent / device
+            content = (_root() / "devices" / device).read_text(encoding="utf-8")
+            # Another example may have brought the same file.
+            if not path.exists() or path.read_bytes() != content.encode():
+                files[path] = content
+        if in_the_way := [path for path in files if os.path.lexists(path)]:
+            return _is_there(in_the_way[0])
         for path, text in files.items():
             with path.open("x", encoding="utf-8") as file:
                 file.write(text)
             print(path)  # noqa: T201 - says what was written
     except FileExistsError:
-        print(f"daqsvc example: {path} is there already; give another name", file=sys.stderr)  # noqa: T201
-        return EXIT_FAILED
+        return _is_there(path)
     except OSError as error:
         print(f"daqsvc example: {path} cannot be written: {error.strerror}", file=sys.stderr)  # noqa: T201
         return EXIT_FAILED
     return EXIT_OK
+
+
+def _is_there(path: Path) -> int:
+    print(f"daqsvc example: {path} is there already; give another name", file=sys.stderr)  # noqa: T201
+    return EXIT_FAILED

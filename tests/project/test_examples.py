@@ -19,7 +19,7 @@ from sim_hw.scenario import load_any_scenario
 pytestmark = pytest.mark.integration
 CONFIG = ROOT / "config"
 # test_systemd_unit.py, test_metrics.py and test_postgresql_ingest.py have the others.
-ELSEWHERE = {"systemd", "prometheus", "postgresql"}
+ELSEWHERE = {"systemd", "prometheus", "postgresql", "__pycache__"}
 FILES = sorted(path for path in CONFIG.rglob("*") if path.is_file() and path.parent.name not in ELSEWHERE)
 
 
@@ -64,6 +64,28 @@ def test_an_example_is_copied_with_the_files_that_it_needs(tmp_path, capsys, nam
     assert main(["example", name, "--out", str(copy)]) == 1
     assert "there already" in capsys.readouterr().err
     assert copy.read_text() == "mine"
+
+
+def test_two_examples_may_have_a_file_in_common(tmp_path, capsys):
+    first, second, third = (tmp_path / f"{name}.toml" for name in ("first", "second", "third"))
+    dbc = tmp_path / "triaxial-accelerometer.dbc"
+    assert main(["example", "dbc-triaxial", "--out", f"{first}"]) == 0
+    assert capsys.readouterr().out.splitlines() == [f"{first}", f"{dbc}"]
+    assert main(["example", "replay-fan", "--out", f"{second}"]) == 0
+    assert capsys.readouterr().out.splitlines() == [f"{second}"]
+    assert load_machine_file(second).warnings == ()
+    # One that says something else is in the way: then nothing is written.
+    dbc.write_text("mine")
+    assert main(["example", "replay-fan", "--out", f"{third}"]) == 1
+    assert f"{dbc} is there already" in capsys.readouterr().err
+    assert not third.exists()
+
+
+def test_without_a_name_nothing_is_written(tmp_path, capsys):
+    assert main(["example", "--out", f"{tmp_path / 'x.toml'}"]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert "name it before --out" in said.err
 
 
 def test_what_cannot_be_had_is_said_in_a_line(tmp_path, capsys):
