@@ -201,4 +201,6 @@ def _in_short(service: Service) -> tuple[str, str]:
         if "connected" in figures:
             why = f" ({output.reason[:LONGEST_REASON]})" * bool(output.reason)
             said.append("broker connected" if figures["connected"] else f"broker not connected{why}")
-    return "; ".join(said), f"{outbox.depth + outbox.waiting} alarm messages wait for the broker"
+    messages = outbox.depth + outbox.waiting
+    wait = "1 alarm message waits" if messages == 1 else f"{messages} alarm messages wait"
+    return "; ".join(said), f"{wait} for the broker"
