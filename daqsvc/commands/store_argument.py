@@ -67,9 +67,10 @@ def store_doubts(machine: MachineFile) -> Iterator[str]:
     """Why the service could not use the store that a machine file names, if this account ran it.
 
     Raises:
-        AssemblyError: nobody could: it is no directory.
+        AssemblyError: nobody could: it is no directory, or a newer version of the program has written it.
     """
-    from daqsvc.outbox.messages import NewerOutboxError, StorePathError  # noqa: PLC0415 - only what a verb needs
+    from daqsvc.outbox.files import is_read_only  # noqa: PLC0415 - only what a verb needs
+    from daqsvc.outbox.messages import NewerOutboxError, StorePathError  # noqa: PLC0415
     from daqsvc.outbox.reading import refuse_newer  # noqa: PLC0415
     from daqsvc.outbox.safety import account, unusable  # noqa: PLC0415
     from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415
@@ -82,11 +83,11 @@ def store_doubts(machine: MachineFile) -> Iterator[str]:
         why = unusable(store)
         if not why:
             refuse_newer(store / JOURNAL)
-    except NewerOutboxError as error:
-        why = f"{error}"
-    except StorePathError as error:
+    except (NewerOutboxError, StorePathError) as error:
         raise AssemblyError(f"{at}: {error}") from None
-    if why:
+    if why and is_read_only(store):
+        yield f"{at}: daqsvc run would keep the alarms in memory only, and lose them at its end: {why}"
+    elif why:
         yield f"{at}: daqsvc run could not start as {account()}: {why}"
 
 
@@ -131,8 +132,14 @@ def chosen_store(arguments: argparse.Namespace, load: Load, *, all_sound: bool =
 
     Raises:
         BadFileError: the machine file cannot be read.
-        StoreNotFoundError: nothing was named, and there is not exactly one store.
+        StoreNotFoundError: nothing was named, and there is not exactly one store; or it is no directory.
     """
+    chosen = _chosen(arguments, load, all_sound=all_sound)
+    _refuse_file(chosen.directory)
+    return chosen
+
+
+def _chosen(arguments: argparse.Namespace, load: Load, *, all_sound: bool) -> ChosenStore:
     machine: str | None = getattr(arguments, "machine", None)
     if arguments.store is not None:
         return ChosenStore(arguments.store, machine)
@@ -143,6 +150,18 @@ def chosen_store(arguments: argparse.Namespace, load: Load, *, all_sound: bool =
     return ChosenStore(_only_store(_state_directory()), machine)
 
 
+def _refuse_file(store: Path) -> None:
+    from daqsvc.outbox.messages import StorePathError  # noqa: PLC0415 - only what a verb needs
+    from daqsvc.outbox.safety import refuse_no_directory  # noqa: PLC0415
+
+    try:
+        refuse_no_directory(store)
+    except StorePathError as error:
+        raise StoreNotFoundError(f"{error}") from None
+    except OSError:
+        return  # whoever opens the journal says what this account may not do
+
+
 def _of_file(path: Path, load: Load, machine: str | None, *, all_sound: bool) -> ChosenStore:
     from daqsvc.box import BOX  # noqa: PLC0415 - each verb imports only what it needs
 
@@ -150,14 +169,22 @@ def _of_file(path: Path, load: Load, machine: str | None, *, all_sound: bool) ->
     if box is None:
         if all_sound:
             raise BadFileError
-        return ChosenStore(_of_sound(path, sound), machine, (*(one.machine.name for one in sound), BOX))
+        try:
+            store = _of_sound(path, sound)
+        except BadFileError:
+            # The service may run well by what the file was before.
+            print("or name the store with --store DIR", file=sys.stderr)  # noqa: T201 - after the errors
+            raise
+        return ChosenStore(store, machine, (*(one.machine.name for one in sound), BOX))
     store = store_directory(box)
     if not box.is_single:
         return ChosenStore(store, machine, (*box.machines, BOX))
+    # Also where the file names the store: other files may name the same one.
+    machine = machine or box.own.machine.name
     if box.own.store is None and not _is_used(store):
         for other in _of_its_box(path, box.own):
             if _is_used(other):
-                return ChosenStore(other, machine or box.own.machine.name)
+                return ChosenStore(other, machine)
     return ChosenStore(store, machine, tuple(box.machines))
 
 

@@ -112,10 +112,10 @@ def newer(store: Path) -> None:
 
 def test_check_says_that_a_newer_version_has_written_the_store(tmp_path: Path, check: Check) -> None:
     newer(tmp_path / "alarms")
-    code, out, _ = check(tmp_path / "alarms")
-    assert code == 0
-    assert "could not start as" in out
-    assert "has schema version 99, written by daqsvc 9.9.0; this is daqsvc" in out
+    code, out, err = check(tmp_path / "alarms")
+    assert (code, out) == (2, ""), "as daqsvc run ends"
+    assert f"machine.toml: store.directory = '{tmp_path}/alarms': " in err
+    assert "has schema version 99, written by daqsvc 9.9.0; this is daqsvc" in err
 
 
 def taken(store: Path) -> contextlib.closing[BinaryIO]:
@@ -197,7 +197,12 @@ def test_a_store_that_may_not_be_written_is_a_warning(
     assert run(MACHINE, store) == 2
     monkeypatch.undo()
     monkeypatch.setattr("daqsvc.outbox.safety.is_read_only", lambda path: path == store)
-    assert f"the store {store} cannot be written: " in check(store)[1]
+    monkeypatch.setattr("daqsvc.outbox.files.is_read_only", lambda path: path == store)
+    code, out, _ = check(store)
+    assert code == 0
+    assert "daqsvc run would keep the alarms in memory only, and lose them at its end: the store" in out
+    assert f"the store {store} cannot be written: " in out
+    assert "could not start" not in out
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a directory away")
@@ -222,6 +227,14 @@ def test_detectors_leave_it_to_the_outbox_to_refuse_a_store_that_may_not_be_sear
             assert [type(detector) for detector in detectors(machine, tmp_path)] == there
         finally:
             os.seteuid(0)
+
+
+def test_a_store_where_no_directory_can_be_made_is_not_tried_again_and_again(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    assert run(MACHINE, Path("/proc/alarms")) == 2
+    said = "the store /proc/alarms cannot be made there: name another in [store] of the machine file, or with"
+    assert caplog.messages == [f"{said} --store"]
 
 
 def test_an_account_without_a_place_for_a_store_is_not_started_again_and_again(

@@ -175,3 +175,51 @@ async def test_sound_files_without_a_store_mean_the_default_one_where_it_is(
     code, out, _ = verb(capsys, "alarms", "--json", plant)
     assert (code, out.count("\n")) == (0, 1)
     assert verb(capsys, "alarms", plant / "fan.toml")[0] == 2
+
+
+async def test_a_file_with_a_store_of_its_own_means_its_machine_there_too(
+    tmp_path: Path, capsys: Captured
+) -> None:
+    """Several files may each have the same [store]."""
+    two = machines(tmp_path / "two", pump=STORE, fan=STORE)
+    store = two / "store"
+    await write_journal(store, {"machine": "pump", "alarm": "hot"}, {"machine": "fan", "alarm": "hot"})
+    assert alarms_of(capsys, two / "fan.toml") == ["fan"]
+    assert alarms_of(capsys, two / "fan.toml", "--machine", "pump") == ["pump"]
+    service = Service(store, "pump", "fan")
+    assert (await service.asked(capsys, "ack", "hot", two / "pump.toml"))[0] == 0
+    assert (await service.asked(capsys, "ack", "hot", two))[0] == 0
+    assert service.told == [("pump", "hot"), (None, "hot")]
+
+
+async def test_a_broken_file_leaves_its_store_to_be_named(tmp_path: Path, capsys: Captured) -> None:
+    """The service may run well by what the file was before."""
+    (tmp_path / "rig.toml").write_text(BROKEN)
+    for words in (["status"], ["ack", "hot"]):
+        code, _, err = verb(capsys, *words, tmp_path / "rig.toml")
+        assert code == 2
+        assert err.endswith("\nor name the store with --store DIR\n")
+    code, _, err = verb(capsys, "reload", tmp_path / "rig.toml")
+    assert (code, "--store" in err) == (2, False), "that would not be accepted either"
+
+
+@pytest.mark.parametrize("words", [["alarms"], ["status"], ["reload"], ["snapshot"], ["ack", "hot"]])
+def test_a_store_that_is_a_file_is_said_in_a_sentence(
+    words: list[str], tmp_path: Path, capsys: Captured
+) -> None:
+    (tmp_path / "file").touch()
+    code, _, err = verb(capsys, *words, "--store", tmp_path / "file")
+    assert code == 1
+    assert err == (
+        f"daqsvc {words[0]}: the store {tmp_path}/file is no directory, but a file: name a directory in "
+        "[store] of the machine file, or with --store\n"
+    )
+
+
+def test_one_file_of_a_service_is_enough(capsys: Captured) -> None:
+    for words in (["reload"], ["status"], ["ack", "hot"]):
+        with pytest.raises(SystemExit) as ended:
+            main([*words, "a.toml", "b.toml"])
+        assert ended.value.code == 2
+        said = "unrecognized arguments: b.toml: one file of the service is enough, or the directory of them"
+        assert said in capsys.readouterr().err
