@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from daqsvc.commands import early_signals  # before all that takes long
+
+# isort: split
 import atexit
 import contextlib
 import errno
@@ -223,14 +226,21 @@ def _chosen(root: argparse.ArgumentParser, arguments: Sequence[str] | None) -> a
     """
     chosen, rest = root.parse_known_args(arguments)
     files = getattr(chosen, "files", None)
+    if "" in rest and not any(one.startswith("-") for one in rest):
+        root.error("argument FILE: must not be empty")
     if any(one.startswith("-") for one in rest):
         root.parse_args(arguments)  # says what is wrong
     elif rest and files is not None:
-        chosen.files = [*files, *rest]
+        chosen.files = [*files, *(rest if isinstance(files[0], str) else map(Path, rest))]
     elif len(rest) == 1 and {"file", "store"} <= vars(chosen).keys() and chosen.file is None:
         if chosen.store is not None:
             root.error("argument FILE: not allowed with argument --store")
         chosen.file = Path(rest[0])
+    elif rest and getattr(chosen, "file", None) is not None and "store" in chosen:
+        root.error(
+            f"unrecognized arguments: {' '.join(rest)}: one file of the service is enough, or the directory "
+            "of them"
+        )
     elif rest:
         root.parse_args(arguments)  # as above
     return chosen
@@ -238,11 +248,12 @@ def _chosen(root: argparse.ArgumentParser, arguments: Sequence[str] | None) -> a
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of the console script; returns the exit code."""
-    _ignore_until_heard(sys.argv[1:] if arguments is None else arguments)
+    early_signals.ignore_until_heard(sys.argv[1:] if arguments is None else arguments)
     if arguments is None:
         # Before it ends, the interpreter takes its handlers back, and a late SIGHUP would end the process.
         atexit.register(_ignore_from_here, sys.argv[1:])
     try:
+        early_signals.imported()
         chosen = _chosen(parser(commands()), arguments)
         command: Command = chosen.command
         code = command.run(chosen)
@@ -271,19 +282,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(one_line(f"{error}"), file=sys.stderr)  # noqa: T201
         return EXIT_USAGE
     return code
-
-
-def _ignore_until_heard(arguments: Sequence[str]) -> None:
-    """From here on, let a SIGHUP that asks the service for a reload not end it, nor SIGUSR1 and SIGUSR2.
-
-    Whoever starts and reloads it in one go is too quick for its own handler (`ProcessGuard`). A handler, and
-    not SIG_IGN: that says that the service is to outlive its terminal.
-    """
-    if arguments[:1] != ["run"]:
-        return
-    for number in (signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2):
-        if signal.getsignal(number) is signal.SIG_DFL:
-            signal.signal(number, lambda *_: None)
 
 
 def _ignore_from_here(arguments: Sequence[str]) -> None:

@@ -11,6 +11,7 @@ import re
 import signal
 from dataclasses import dataclass
 from decimal import Decimal
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from daqsvc.confined.limits import GIGABYTE
@@ -40,10 +41,19 @@ class ArgumentParser(argparse.ArgumentParser):
         super().__init__(*args, **kwargs)
         # "-5m" is a wrong value, not an unknown option.
         self._negative_number_matcher = re.compile(r"-\.?\d")
+        # An empty path, as of a variable that is not set, would be the working directory.
+        self.register("type", Path, path)
 
     def error(self, message: str) -> NoReturn:
         """Say what is wrong and where help is, and exit with 2."""
         self.exit(EXIT_USAGE, f"{self.prog}: {message}; see {self.prog} --help\n")
+
+
+def path(text: str) -> Path:
+    """A file or directory; what ``type=Path`` of an argument means here."""
+    if not text:
+        raise argparse.ArgumentTypeError("must not be empty")
+    return Path(text)
 
 
 def signals_to_end() -> tuple[signal.Signals, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import gc
 import logging
 import os
@@ -37,6 +38,9 @@ LOG_S = 0.3
 """What the last lines of the log may take to be written."""
 
 STDERR = 2
+
+LOCK = "outbox.sqlite.lock"
+"""The file of a store that a service holds, as `daqsvc.outbox.journal.Journal.hold` does."""
 
 SWITCH_S = 0.001
 """How long a thread that computes may keep the interpreter from another that waits for it: the event loop."""
@@ -112,9 +116,11 @@ class RunCommand:
 def _run(
     box: Box, files: Sequence[Path], store: Path | None, guard: ProcessGuard, manager: ServiceManager
 ) -> int:
+    from daqsvc.outbox.files import take_possession  # noqa: PLC0415
     from daqsvc.outbox.journal import refuse_store  # noqa: PLC0415
     from daqsvc.outbox.messages import (  # noqa: PLC0415
         NewerOutboxError,
+        OutboxAwayError,
         OutboxError,
         StoreInUseError,
         StorePathError,
@@ -126,9 +132,14 @@ def _run(
 
     try:
         store = store or store_directory(box)
-        # What comes next may compile kernels, on a small box for minutes.
+        # What comes next may compile kernels, on a small box for minutes: meanwhile the store is held, which
+        # says to others that a service starts.
         refuse_store(store)
-        _run_loop(_run_until_stopped(box, files, store, guard, manager))
+        with contextlib.ExitStack() as held:
+            # What the disk cannot do now, it may by the time the journal is opened.
+            with contextlib.suppress(OSError):
+                held.enter_context(take_possession(store / LOCK))
+            _run_loop(_run_until_stopped(box, files, store, guard, manager, held.close))
     except (AssemblyError, LayoutError, NewerOutboxError, StoreNotFoundError, StorePathError) as error:
         log.critical("%s", error)
         return EXIT_USAGE
@@ -138,8 +149,13 @@ def _run(
         watched = {*box.machines} if store is None else _watched(store) or {*box.machines}
         return EXIT_USAGE if watched.isdisjoint(box.machines) else EXIT_FAILED
     except (DeviceAbsentError, OutboxError) as error:
-        log.critical("%s", error)
-        return EXIT_FAILED
+        # Some file systems, such as /proc, have no room for directories, ever.
+        is_placeless = isinstance(error.__cause__, FileNotFoundError) and not isinstance(
+            error, OutboxAwayError
+        )
+        remedy = "name another in [store] of the machine file, or with --store"
+        log.critical("%s", f"the store {store} cannot be made there: {remedy}" if is_placeless else error)
+        return EXIT_USAGE if is_placeless else EXIT_FAILED
     except EssentialLostError as error:
         log.critical("%s; the service ends, and must be started again", error)
         return EXIT_LOST
@@ -206,6 +222,7 @@ class _Reloader:
 
     async def _reload(self) -> None:
         from daqsvc.control import ReloadRefusedError  # noqa: PLC0415 - as above
+        from daqsvc.service import ENDS  # noqa: PLC0415
 
         while self._asked:
             self._asked = False
@@ -213,6 +230,9 @@ class _Reloader:
                 if not await self._service.reload():
                     log.warning("SIGHUP: the machine files say nothing different")
             except ReloadRefusedError as refused:
+                if refused.reasons == [ENDS]:
+                    log.info("SIGHUP is ignored: %s", ENDS)
+                    return
                 for reason in refused.reasons:
                     log.error("SIGHUP is refused, and the service goes on as it is: %s", reason)  # noqa: TRY400
 
@@ -224,8 +244,26 @@ def _reloading(manager: ServiceManager, begins: bool) -> None:  # noqa: FBT001 -
 
 
 async def _run_until_stopped(
-    box: Box, files: Sequence[Path], store: Path, guard: ProcessGuard, manager: ServiceManager
+    box: Box,
+    files: Sequence[Path],
+    store: Path,
+    guard: ProcessGuard,
+    manager: ServiceManager,
+    let_go: Callable[[], object] = lambda: None,
 ) -> None:
+    """Run the service.
+
+    Args:
+        box: the machine files.
+        files: as they were named.
+        store: directory of the journal.
+        guard: of the process.
+        manager: that is told of the service.
+        let_go: lets go of the store, which the service takes itself.
+
+    Raises:
+        AssemblyError, DeviceAbsentError, EssentialLostError, LayoutError, OutboxError: see `Service`.
+    """
     from daqsvc.service import Service  # noqa: PLC0415
     from daqsvc.supervision import stop_all  # noqa: PLC0415
 
@@ -242,6 +280,7 @@ async def _run_until_stopped(
     )
     guard.protect(service.alarms.outbox.close_from_outside)
     guard.stop_by(asyncio.get_running_loop(), stop.set)
+    let_go()
     running = asyncio.create_task(service.run(stop), name="service")
     follow = partial(manager.follow, service)
     following = service.supervisor.keep("service manager", follow, may_end=lambda: True)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 import pytest
 
+from daqsvc import cli
+from daqsvc.cli import main
 from daqsvc.commands.arguments import channel_map, sampling_rate_hz
 
 
@@ -36,3 +39,34 @@ def test_what_is_no_sampling_rate(text):
 
 def test_sampling_rate():
     assert sampling_rate_hz("25.6e3") == 25_600
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["run", ""], "FILE"),
+        (["run", "m.toml", "--store", ""], "--store"),
+        (["run", "m.toml", "-v", ""], "FILE"),
+        (["check", "m.toml", ""], "FILE"),
+        (["status", ""], "FILE"),
+        (["alarms", "--store="], "--store"),
+        (["ack", "hot", "--by", "me", ""], "FILE"),
+        (["trend", "hot", "--store", ""], "--store"),
+        (["reload", ""], "FILE"),
+        (["record", "", "--out", "x"], "FILE"),
+        (["example", "laval-rig", "--out", ""], "--out"),
+    ],
+)
+def test_an_empty_path_is_not_the_working_directory(words, named, capsys):
+    """A variable of a script that is not set would put the journal there."""
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 2
+    assert f"argument {named}: must not be empty; see daqsvc" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("verb", "kind"), [("run", Path), ("analyze", str)])
+def test_files_after_an_option_are_as_those_before(verb, kind):
+    option = {"run": "-v", "analyze": "--json"}[verb]
+    chosen = cli._chosen(cli.parser(cli.commands()), [verb, "a.toml", option, "b.toml"])
+    assert chosen.files == [kind("a.toml"), kind("b.toml")]

@@ -5,12 +5,17 @@ from __future__ import annotations
 import asyncio
 import gc
 import signal
+import subprocess
+import sys
 from types import SimpleNamespace
 
+import pytest
+
 import daqsvc.service
-from daqsvc import cli
-from daqsvc.commands import run
+from daqsvc.commands import early_signals, run
 from daqsvc.commands.service_manager import ServiceManager
+from daqsvc.control import ReloadRefusedError
+from daqsvc.outbox.files import is_possessed
 from daqsvc.supervision import Supervisor
 
 
@@ -75,13 +80,84 @@ def test_a_hang_up_that_comes_before_the_service_has_its_handlers_ends_nothing()
     before = signal.getsignal(signal.SIGHUP)
     try:
         signal.signal(signal.SIGHUP, signal.SIG_DFL)
-        cli._ignore_until_heard(["check", "machine.toml"])
+        early_signals.ignore_until_heard(["check", "machine.toml"])
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_DFL
-        cli._ignore_until_heard(["run", "machine.toml"])
+        early_signals.ignore_until_heard(["run", "machine.toml"])
         signal.raise_signal(signal.SIGHUP)
         # Whoever has asked for it (nohup) keeps a service that outlives its terminal.
         signal.signal(signal.SIGHUP, signal.SIG_IGN)
-        cli._ignore_until_heard(["run", "machine.toml"])
+        early_signals.ignore_until_heard(["run", "machine.toml"])
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+def test_the_store_is_held_while_the_service_is_made(monkeypatch, tmp_path):
+    """Which may compile kernels for minutes: who asks is told that a service starts."""
+    held = []
+
+    class Service:
+        def __init__(self, *_, **__):
+            held.append(is_possessed(tmp_path / "store" / "outbox.sqlite.lock"))
+            self.ready = asyncio.Event()
+            self.alarms = SimpleNamespace(outbox=SimpleNamespace(close_from_outside=None))
+            self.supervisor = Supervisor()
+
+        async def run(self, stop):
+            # It takes possession itself.
+            held.append(is_possessed(tmp_path / "store" / "outbox.sqlite.lock"))
+
+    monkeypatch.setattr(daqsvc.service, "Service", Service)
+    guard = SimpleNamespace(stopping=None, protect=lambda _: None, stop_by=lambda *_: None)
+    box = SimpleNamespace(names="rig")
+    assert run._run(box, [], tmp_path / "store", guard, ServiceManager()) == 0
+    assert held == [True, False]
+
+
+async def test_a_hang_up_right_before_the_end_is_no_error(caplog):
+    async def reload():
+        raise ReloadRefusedError([daqsvc.service.ENDS])
+
+    reloader = run._Reloader(SimpleNamespace(supervisor=Supervisor(), reload=reload))
+    reloader.ask()
+    await reloader.part.over
+    assert caplog.text == ""
+
+
+IMPORTING = """
+import signal, sys
+sys.argv = {argv!r}
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        if name == "daqsvc.commands.alarms":
+            signal.raise_signal({number})
+sys.meta_path.insert(0, Finder())
+import daqsvc.cli
+daqsvc.cli.early_signals.imported()
+print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)
+"""
+
+
+@pytest.mark.parametrize(
+    ("argv", "number", "code", "out"),
+    [
+        (["/usr/bin/daqsvc", "run", "m.toml"], signal.SIGINT, 130, ""),
+        (["/x/daqsvc/__main__.py", "status"], signal.SIGINT, 130, ""),
+        (["daqsvc", "run", "m.toml"], signal.SIGHUP, 0, "True\n"),
+        (["daqsvc", "status"], signal.SIGHUP, -signal.SIGHUP, ""),
+    ],
+)
+def test_signals_while_the_program_is_imported_are_no_tracebacks(argv, number, code, out):
+    script = IMPORTING.format(argv=argv, number=int(number))
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (code, out, "")
+
+
+def test_what_is_not_the_program_keeps_its_signals(monkeypatch):
+    before = signal.getsignal(signal.SIGINT)
+    early_signals.begin(["/usr/bin/pytest", "run"])
+    early_signals.begin(["/usr/bin/daqsvc-sim", "run"])
+    # A worker that verbs begin.
+    monkeypatch.setitem(sys.modules, "multiprocessing", sys)
+    early_signals.begin(["/usr/bin/daqsvc", "run"])
+    assert signal.getsignal(signal.SIGINT) is before
