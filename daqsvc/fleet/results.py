@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 ROWS_PER_FILE = 50_000
 TABLE = "table"
 _RUNS, _COMPACTING, _WRITING = "runs", "compacting", "writing"
+_LOCK = ".lock"
 _PUTS_WHOLE = {"memory", "s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "adl", "oss"}
 """Stores in which an object is there as a whole or not at all."""
 
@@ -61,15 +62,19 @@ class Results:
     def lock(self) -> Iterator[None]:
         """Be the only one that writes, where files can be locked: in a folder of this computer.
 
+        A folder in which nothing was written, as its archive or its cluster is not there, is left as it was.
+
         Raises:
             FleetError: another run is writing, or the folder cannot be written.
         """
         if not self._is_local:
             yield
             return
+        folder = Path(self.root)
         try:
-            Path(self.root).mkdir(parents=True, exist_ok=True)
-            lock = (Path(self.root) / ".lock").open("w")
+            made = [one for one in (folder, *folder.parents) if not one.exists()]
+            folder.mkdir(parents=True, exist_ok=True)
+            lock = (folder / _LOCK).open("w")
         except OSError as error:
             raise FleetError(
                 f"{self.url} cannot be written: {error.strerror}; name another with --results"
@@ -77,12 +82,19 @@ class Results:
         with lock:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                # A run that wrote nothing may have removed it since: it keeps nobody away any more.
+                is_held = os.path.samestat(os.fstat(lock.fileno()), (folder / _LOCK).stat())
             except OSError:
+                is_held = False
+            if not is_held:
                 raise FleetError(
                     f"another run is writing into {self.url}; wait for its end, or name another with "
                     "--results"
-                ) from None
-            yield
+                )
+            try:
+                yield
+            finally:
+                _remove_unused(folder, made)
 
     def folders(self) -> list[str]:
         """The folders of the machines that there are results of, in order.
@@ -246,6 +258,15 @@ def folder_of(machine: str) -> str:
             quoted = quote(text, safe=" ")
         quoted = f"{quoted}~{digest}"
     return f"machine={quoted}"
+
+
+def _remove_unused(folder: Path, made: Iterable[Path]) -> None:
+    """Remove the lock of a folder that holds nothing else, and of the folders above those that were made."""
+    with contextlib.suppress(OSError):  # somebody else writes there, or it is read-only now: it stays
+        if [one.name for one in folder.iterdir()] == [_LOCK]:
+            (folder / _LOCK).unlink()
+            for one in made:
+                one.rmdir()
 
 
 def _put_local(path: Path, beside: Path, content: bytes) -> None:

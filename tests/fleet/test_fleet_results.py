@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 from datetime import UTC, datetime
@@ -124,6 +125,33 @@ def test_nothing_but_whole_tables_lies_where_readers_look(tmp_path: Path) -> Non
     found = [path for path in (tmp_path / "table").rglob("*") if path.is_file()]
     assert [path.suffix for path in found] == [".parquet"]
     assert json.loads((tmp_path / "runs" / "now.json").read_text()) == {"judged": 1}
+
+
+def test_a_folder_in_which_nothing_was_written_is_left_as_it_was(tmp_path: Path) -> None:
+    place = tmp_path / "made" / "results"
+    with Results(str(place)).lock():
+        assert (place / ".lock").exists()
+    assert not any(tmp_path.iterdir())
+    place.mkdir(parents=True)
+    with Results(str(place)).lock():
+        pass
+    assert not any(place.iterdir())
+    with Results(str(place)).lock():
+        Results(str(place)).note_run("now", {})
+    assert (place / ".lock").exists(), "what holds results keeps it"
+
+
+def test_a_lock_that_was_removed_meanwhile_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two runs that both found one, of which the first has removed it, and then a third."""
+    lock = fcntl.flock
+
+    def late(file: Any, how: int) -> None:
+        (tmp_path / ".lock").unlink()
+        lock(file, how)
+
+    monkeypatch.setattr(fcntl, "flock", late)
+    with pytest.raises(FleetError, match="another run is writing into"), Results(str(tmp_path)).lock():
+        pass
 
 
 def test_what_is_no_table_is_named(tmp_path: Path) -> None:
