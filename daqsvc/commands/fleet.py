@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daqsvc.commands.analyze_fleet import lacking_extra
-from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, duration, not_negative
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, duration, not_negative
 from daqsvc.commands.tables import aligned, harmless, wrapped
 
 if TYPE_CHECKING:
@@ -20,7 +20,10 @@ WIDTH = 100
 _MOST_SHOWN = 20
 """Lines of a kind; --json has all."""
 _LONGEST_NAME = 24
+_SHORTER_NAME = 14
+"""Of a machine, where there are eight columns."""
 _LONGEST_FILE = 36
+_MOST_NAMES = 5
 
 
 class FleetCommand:
@@ -57,9 +60,9 @@ class FleetCommand:
     def run(self, arguments: argparse.Namespace) -> int:
         """See `daqsvc.cli.Command.run`."""
         if wrong := lacking_extra():
-            return _fail(wrong)
+            return _fail(wrong, EXIT_USAGE)
         from daqsvc.fleet import FleetError  # noqa: PLC0415 - each verb imports what it needs
-        from daqsvc.fleet.report import fleet_report, read_truth  # noqa: PLC0415
+        from daqsvc.fleet.report import TruthError, fleet_report, read_truth  # noqa: PLC0415
         from daqsvc.fleet.results import Results  # noqa: PLC0415
 
         try:
@@ -70,8 +73,10 @@ class FleetCommand:
                 cost=arguments.false_alarm_cost,
                 interval_s=arguments.interval,
             )
+        except TruthError as error:
+            return _fail(f"{error}", EXIT_USAGE)
         except FleetError as error:
-            return _fail(f"{error}")
+            return _fail(f"{error}", EXIT_FAILED)
         print(json.dumps(report.as_json()) if arguments.json else report_text(report))  # noqa: T201
         return EXIT_OK
 
@@ -89,18 +94,23 @@ def _machines(report: FleetReport) -> str:
     titles = ["machine", "judged", "now", "alarms"]
     if report.has_truth:
         titles += ["faults", "missed", "false"]
+    has_cost = report.false_alarm_cost is not None
+    if has_cost:
+        titles.append("cost")
     # A machine of which there is something to say first, so that a fleet of thousands fits.
     told = sorted(report.machines, key=lambda one: not _is_remarkable(one))
     rows = []
     for one in told[:_MOST_SHOWN]:
         row = [
-            _short(one.machine),
+            _short(one.machine, _SHORTER_NAME if has_cost else _LONGEST_NAME),
             f"{one.judged} of {one.recordings}",
             _short(one.now or "-"),
             f"{len(one.alarms)}",
         ]
         if report.has_truth:
             row += [f"{len(one.seen)}", f"{len(one.missed)}", f"{len(one.false_alarms)}"]
+        if has_cost:
+            row.append(_money(one.cost))
         rows.append(row)
     return aligned(titles, rows) + _more(len(told), "machines")
 
@@ -110,16 +120,16 @@ def _is_remarkable(one: MachineReport) -> bool:
 
 
 def _changes(report: FleetReport) -> str:
-    """Where a verdict is not that of the machine's recording before; a first normal one is no news."""
+    """Where a verdict is not that of the machine's recording before; the first has none before it."""
     rows = [
         [
             _short(one.machine),
             _short(change.file, _LONGEST_FILE),
-            f"{change.before or 'none'} -> {change.now}",
+            f"{change.before} -> {change.now}",
         ]
         for one in report.machines
         for change in one.changes
-        if change.before is not None or change.now != "normal"
+        if change.before is not None
     ]
     if not rows:
         return "No verdict changed."
@@ -127,11 +137,14 @@ def _changes(report: FleetReport) -> str:
 
 
 def _missed(report: FleetReport) -> str:
+    from daqsvc.fleet.wording import counted  # noqa: PLC0415 - each verb imports what it needs
+
     rows = [
         [
             _short(one.machine),
             _short(seen.fault.fault),
-            f"{seen.fault.first or 'first'} to {seen.fault.last or 'last'}, {seen.recordings} recordings",
+            f"{seen.fault.first or 'first'} to {seen.fault.last or 'last'}, "
+            + counted(seen.recordings, "recording"),
         ]
         for one in report.machines
         for seen in one.missed
@@ -169,30 +182,55 @@ def _not_judged(report: FleetReport) -> str:
 
 
 def _fleet(report: FleetReport) -> str:
+    from daqsvc.fleet.wording import counted  # noqa: PLC0415 - each verb imports what it needs
+
     fleet = report.as_json()["fleet"]
     years = "times not known" if report.years is None else f"{report.years:,.3g} machine-years"
-    judged = f"{fleet['judged']:,} of {fleet['recordings']:,} recordings judged"
-    lines = [f"Fleet: {fleet['machines']:,} machines, {judged}, {years}, {fleet['alarms']:,} alarms"]
+    judged = f"{fleet['judged']:,} of {counted(fleet['recordings'], 'recording')} judged"
+    machines, alarms = counted(fleet["machines"], "machine"), counted(fleet["alarms"], "alarm")
+    lines = [f"Fleet: {machines}, {judged}, {years}, {alarms}"]
     if report.has_truth:
         lines.append(
-            f"{fleet['known_faults']:,} known faults, {fleet['missed']:,} missed, "
-            f"{fleet['without_recordings']:,} without a recording that was judged; "
-            f"false alarms: {report.false_alarms:,}"
+            f"{counted(fleet['known_faults'], 'known fault')}, {fleet['missed']:,} missed, "
+            f"{fleet['without_recordings']:,} without a recording that was judged"
         )
-        rate = report.false_alarms_per_year
-        if rate is None:
-            lines.append(
-                "How many that is a year is not known: dates in the names, or --interval, would tell"
-            )
-        else:
-            cost = report.cost_per_year
-            lines.append(
-                f"{rate:,.3g} false alarms a machine and year"
-                + ("" if cost is None else f", at {report.cost:,.10g} each they cost {cost:,.0f}")
-            )
+        lines.append(_cost(report))
+    elif report.cost is not None:
+        lines.append("What false alarms cost is not known: --truth says which alarms are false")
+    if report.years is not None and report.without_times:
+        several = len(report.without_times) > 1
+        lines.append(
+            f"The time{'s' * several} of {_names(report.without_times)} {'are' if several else 'is'} not "
+            "known: judged recordings with dates in their names, or --interval, would tell"
+        )
     if report.unknown:
-        lines.append(f"Of known faults there are no results of: {', '.join(report.unknown[:5])}")
+        lines.append(f"Of known faults there are no results of: {_names(report.unknown)}")
     return "\n".join(line for text in lines for line in wrapped(harmless(text), WIDTH))
+
+
+def _cost(report: FleetReport) -> str:
+    """How many false alarms there were and what they cost, first what is certain and then a year of it."""
+    from daqsvc.fleet.wording import counted  # noqa: PLC0415 - each verb imports what it needs
+
+    said = counted(report.false_alarms, "false alarm")
+    if report.false_alarm_cost is not None:
+        said += f" cost{'s' * (report.false_alarms == 1)} {_money(report.false_alarm_cost)}"
+    rate = report.false_alarms_per_year
+    if rate is None:
+        return f"{said}; how many that is a year is not known: dates in the names, or --interval, would tell"
+    where = "of the machines whose times are known " if report.without_times else ""
+    cost = "" if report.cost_per_year is None else f", or {report.cost_per_year:,.0f},"
+    return f"{said}; {where}that is {rate:,.3g}{cost} a machine and year"
+
+
+def _money(cost: float | None) -> str:
+    return "-" if cost is None else f"{cost:,.10g}"
+
+
+def _names(machines: list[str]) -> str:
+    """Some of the names, and how many more there are."""
+    shown = ", ".join(map(_short, machines[:_MOST_NAMES]))
+    return shown + (f" and {len(machines) - _MOST_NAMES:,} more" if len(machines) > _MOST_NAMES else "")
 
 
 def _more(number: int, what: str) -> str:
@@ -204,6 +242,6 @@ def _short(text: str, longest: int = _LONGEST_NAME) -> str:
     return text if len(text) <= longest else f"...{text[3 - longest :]}"
 
 
-def _fail(message: str) -> int:
+def _fail(message: str, code: int) -> int:
     print(f"daqsvc fleet: {message}", file=sys.stderr)  # noqa: T201 - errors of the command line go to stderr
-    return EXIT_FAILED
+    return code

@@ -12,12 +12,11 @@ import io
 import re
 from collections import Counter
 from dataclasses import dataclass, field
-from datetime import datetime, timedelta
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from daqsvc.fleet import FleetError
-from daqsvc.fleet.table import recorded_at
+from daqsvc.fleet.table import bound_at
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -29,12 +28,17 @@ if TYPE_CHECKING:
 YEAR_S = 365.25 * 86_400
 TRUTH_COLUMNS = ("machine", "fault", "first", "last")
 MOST_TRUTH_BYTES = 50_000_000
+VERDICT_COLUMNS = ("verdict", "bearing_verdict", "worst_severity")
+"""What `verdict_of` reads."""
 _NORMAL = "normal"
-_COLUMNS = (
-    *("machine", "file", "recorded", "judged", "reason", "verdict", "group", "bearing_verdict"),
-    *("bearing_group", "worst_severity"),
-)
+_COLUMNS = ("machine", "file", "recorded", "judged", "reason", "group", "bearing_group", *VERDICT_COLUMNS)
 _DIGITS = re.compile(r"(\d+)")
+_Key: TypeAlias = "tuple[Any, ...]"
+"""Of `_order`; without its end, which is the name of the recording, it is a time."""
+
+
+class TruthError(FleetError):
+    """A table of known faults says what cannot be, or names what the results do not have."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,29 +50,30 @@ class KnownFault:
         fault: what it was; any text, a verdict's name where there is one for it.
         first: the first recording that it is in, or a time; empty: from the beginning.
         last: the last one, or a time; empty: to the end.
+        where: table and line that say so.
     """
 
     machine: str
     fault: str
     first: str
     last: str
+    where: str = "--truth"
+
+
+@dataclass(frozen=True, slots=True)
+class _Span:
+    """From where to where a known fault reaches, in the order of the recordings; None is without a bound."""
+
+    fault: KnownFault
+    first: _Key | None
+    last: _Key | None
 
     def covers(self, row: Row) -> bool:
         """Whether a recording is one with this fault."""
-        return self._reaches(row, self.first, 1) and self._reaches(row, self.last, -1)
-
-    @staticmethod
-    def _reaches(row: Row, bound: str, sign: int) -> bool:
-        if not bound:
-            return True
-        at = recorded_at(bound)
-        if at is None or row["recorded"] is None or row["file"] == bound:
-            key, limit = natural(row["file"]), natural(bound)
-            return key >= limit if sign > 0 else key <= limit
-        if sign < 0 and not re.search(r"\d[T _]\d", bound):
-            at += timedelta(days=1) - timedelta(microseconds=1)  # a day without a clock, to its end
-        seen: datetime = row["recorded"]
-        return seen >= at if sign > 0 else seen <= at
+        key = _order(row)
+        return (self.first is None or key[: len(self.first)] >= self.first) and (
+            self.last is None or key[: len(self.last)] <= self.last
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,8 +125,9 @@ class MachineReport:
         false_alarms: of these, the ones outside of every known fault; empty without known faults.
         false_recordings: alarming recordings outside of every known fault.
         seen: the known faults.
-        years: that the recordings stand for; None if no time is known.
+        years: that the recordings that were judged stand for; None if no time is known.
         reasons: why recordings were not judged, each once.
+        cost: of its false alarms; None: nothing is known of it.
     """
 
     machine: str
@@ -136,6 +142,7 @@ class MachineReport:
     seen: list[Seen] = field(default_factory=list)
     years: float | None = None
     reasons: Counter[str] = field(default_factory=Counter)
+    cost: float | None = None
 
     @property
     def missed(self) -> list[Seen]:
@@ -154,6 +161,7 @@ class MachineReport:
             "alarms": self.alarms,
             "false_alarms": self.false_alarms,
             "false_recordings": self.false_recordings,
+            "false_alarm_cost": self.cost,
             "known_faults": [
                 {
                     "fault": one.fault.fault,
@@ -190,9 +198,14 @@ class FleetReport:
 
     @property
     def years(self) -> float | None:
-        """Machine-years that the recordings stand for; None if not known of each machine."""
-        years = [one.years for one in self.machines if one.recordings]
-        return None if None in years or not years else sum(year for year in years if year is not None)
+        """Machine-years, of the machines of which they are known; None if they are of none."""
+        years = [one.years for one in self.machines if one.years is not None]
+        return sum(years) if years else None
+
+    @property
+    def without_times(self) -> list[str]:
+        """The machines of which it is not known how long they were watched."""
+        return [one.machine for one in self.machines if one.years is None]
 
     @property
     def false_alarms(self) -> int:
@@ -201,8 +214,15 @@ class FleetReport:
 
     @property
     def false_alarms_per_year(self) -> float | None:
-        """Per machine and year; None if that is not known."""
-        return self.false_alarms / self.years if self.has_truth and self.years else None
+        """Per machine and year, of the machines whose times are known; None if there is none."""
+        if not (self.has_truth and self.years):
+            return None
+        return sum(len(one.false_alarms) for one in self.machines if one.years is not None) / self.years
+
+    @property
+    def false_alarm_cost(self) -> float | None:
+        """Of all false alarms; None if that of one, or the known faults, are not given."""
+        return self.false_alarms * self.cost if self.has_truth and self.cost is not None else None
 
     @property
     def cost_per_year(self) -> float | None:
@@ -227,6 +247,8 @@ class FleetReport:
                 "missed": sum(len(one.missed) for one in self.machines) if self.has_truth else None,
                 "without_recordings": sum(not one.recordings for one in seen) if self.has_truth else None,
                 "false_alarms": self.false_alarms if self.has_truth else None,
+                "false_alarm_cost": self.false_alarm_cost,
+                "times_not_known": self.without_times,
                 "false_alarms_per_machine_year": self.false_alarms_per_year,
                 "false_alarm_cost_per_machine_year": self.cost_per_year,
                 "unknown_machines": self.unknown,
@@ -274,7 +296,7 @@ def read_truth(path: Path) -> list[KnownFault]:
                 raise FleetError(
                     f"--truth {path}, line {table.line_num}: machine or fault is empty; fill it in"
                 )
-            known.append(KnownFault(**values))
+            known.append(KnownFault(**values, where=f"--truth {path}, line {table.line_num}"))
     except csv.Error as error:
         raise FleetError(f"--truth {path} is no CSV table: {error}; save it anew") from None
     return known
@@ -297,6 +319,7 @@ def fleet_report(
 
     Raises:
         FleetError: the results cannot be read, or there are none.
+        TruthError: a known fault begins or ends at what is neither a time nor a recording, or ends too early.
     """
     machines: list[MachineReport] = []
     for folder in results.folders():
@@ -304,32 +327,42 @@ def fleet_report(
         if rows:
             name = rows[0]["machine"]
             known = None if truth is None else [one for one in truth if one.machine == name]
-            machines.append(machine_report(name, rows, known, interval_s))
+            report = machine_report(name, rows, known, interval_s)
+            if known is not None and cost is not None:
+                report.cost = len(report.false_alarms) * cost
+            machines.append(report)
     if not machines:
         raise FleetError(
             f"{results.url} holds no results; give the folder that daqsvc analyze --cluster wrote"
         )
     machines.sort(key=lambda one: natural(one.machine))
     names = {one.machine for one in machines}
-    unknown = sorted({one.machine for one in truth or () if one.machine not in names})
-    return FleetReport(machines, truth is not None, cost, unknown)
+    unknown = [one for one in truth or () if one.machine not in names]
+    for fault in unknown:
+        _span(fault, ())
+    return FleetReport(machines, truth is not None, cost, sorted({one.machine for one in unknown}))
 
 
 def machine_report(
     machine: str, rows: Iterable[Row], truth: Sequence[KnownFault] | None, interval_s: float | None
 ) -> MachineReport:
-    """What the rows of a machine say; arguments as of `fleet_report`."""
+    """What the rows of a machine say; arguments as of `fleet_report`.
+
+    Raises:
+        TruthError: as `fleet_report`.
+    """
     ordered = sorted(rows, key=_order)
     judged = [row for row in ordered if row["judged"]]
     report = MachineReport(machine, len(ordered), len(judged))
     report.reasons = Counter(row["reason"] or "" for row in ordered if not row["judged"])
-    report.years = _years(ordered, interval_s)
+    report.years = _years(judged, interval_s)
+    spans = [_span(one, ordered) for one in truth or ()]
     was_alarming = was_false = False
     before: str | None = None
     for row in judged:
         now = verdict_of(row)
         alarming = now != _NORMAL
-        is_false = alarming and truth is not None and not any(one.covers(row) for one in truth)
+        is_false = alarming and truth is not None and not any(one.covers(row) for one in spans)
         report.verdicts[now] += 1
         if now != before:
             report.changes.append(Changed(row["file"], before, now))
@@ -341,7 +374,7 @@ def machine_report(
                 report.false_alarms.append(row["file"])
         before, was_alarming, was_false = now, alarming, is_false
     report.now = before
-    report.seen = [_seen(one, judged) for one in truth or ()]
+    report.seen = [_seen(one, judged) for one in spans]
     return report
 
 
@@ -359,8 +392,53 @@ def verdict_of(row: Mapping[str, Any]) -> str:
     return " and ".join(dict.fromkeys(telling)) or _NORMAL
 
 
-def _seen(fault: KnownFault, judged: Sequence[Row]) -> Seen:
-    rows = [row for row in judged if fault.covers(row)]
+def _span(fault: KnownFault, ordered: Sequence[Row]) -> _Span:
+    """Where a known fault reaches.
+
+    Args:
+        fault: what is known.
+        ordered: the recordings of its machine, judged or not; empty: its bounds cannot be held against any.
+
+    Raises:
+        TruthError: a bound is neither a time nor a recording, or the last one is before the first.
+    """
+    first = _bound(fault, fault.first, ordered, 0)
+    last = _bound(fault, fault.last, ordered, 1)
+    if first is not None and last is not None:
+        shorter = min(len(first), len(last))
+        if first[:shorter] > last[:shorter]:
+            raise TruthError(
+                f"{fault.where}: first, {fault.first!r}, is after last, {fault.last!r}; correct the line"
+            )
+    return _Span(fault, first, last)
+
+
+def _bound(fault: KnownFault, bound: str, ordered: Sequence[Row], which: int) -> _Key | None:
+    """The key of the recording or time; ``which`` end of a day is meant is 0 or 1."""
+    if not bound:
+        return None
+    for row in ordered:
+        if row["file"] == bound:
+            return _order(row)
+    at = bound_at(bound)
+    if at is not None and ordered and all(row["recorded"] is None for row in ordered):
+        raise TruthError(
+            f"{fault.where}: {bound!r} is a time, and no recording of {fault.machine} has one in its name; "
+            f"name recordings, e.g. {ordered[0]['file']!r}"
+        )
+    if at is not None:
+        return (False, at[which].timestamp())
+    if ordered:
+        raise TruthError(
+            f"{fault.where}: {bound!r} is neither a time nor a recording of {fault.machine}; write a time as "
+            f"2026-03-01 or 2026-03-01T06:00, or a recording as {ordered[0]['file']!r}"
+        )
+    return None
+
+
+def _seen(span: _Span, judged: Sequence[Row]) -> Seen:
+    fault = span.fault
+    rows = [row for row in judged if span.covers(row)]
     alarming = [row for row in rows if verdict_of(row) != _NORMAL]
     named = sum(fault.fault in (*(row["group"] or ()), *(row["bearing_group"] or ())) for row in alarming)
     return Seen(fault, len(rows), len(alarming), named, alarming[0]["file"] if alarming else None)
@@ -372,14 +450,14 @@ def _order(row: Row) -> tuple[Any, ...]:
     return (recorded is None, recorded.timestamp() if recorded is not None else 0.0, natural(row["file"]))
 
 
-def _years(ordered: Sequence[Row], interval_s: float | None) -> float | None:
-    """How long a machine was watched.
+def _years(judged: Sequence[Row], interval_s: float | None) -> float | None:
+    """How long a machine was watched: a recording that was not judged cannot alarm, and so does not count.
 
     By times, from the first recording to the last, and once more what is usual between two.
     """
     if interval_s is not None:
-        return len(ordered) * interval_s / YEAR_S
-    times = [row["recorded"] for row in ordered]
+        return len(judged) * interval_s / YEAR_S
+    times = [row["recorded"] for row in judged]
     if None in times or len(times) < 2:
         return None
     steps = sorted((b - a).total_seconds() for a, b in pairwise(times))

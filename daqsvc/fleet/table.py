@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from functools import cache
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -95,6 +95,19 @@ def recorded_at(file: str) -> datetime | None:
         except ValueError:  # the 31st of a shorter month
             continue
     return None
+
+
+def bound_at(text: str) -> tuple[datetime, datetime] | None:
+    """The first and the last instant of a time that somebody wrote: of a day without a clock, all of it; UTC.
+
+    Args:
+        text: a time and nothing else, e.g. ``2026-03-08`` or ``2026-03-08T10:00``; None comes of any other.
+    """
+    text = text.removesuffix("Z").removesuffix("+00:00")
+    found, begin = _TIME_IN_NAME.fullmatch(text), recorded_at(text)
+    if found is None or begin is None:
+        return None
+    return begin, begin if found[4] else begin + timedelta(days=1) - timedelta(microseconds=1)
 
 
 def begun_row(machine: str, machine_digest: str, version: str, recording: ArchivedRecording) -> Row:
