@@ -11,7 +11,7 @@ import signal
 import sys
 from typing import TYPE_CHECKING, Any
 
-from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_REFUSED
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_REFUSED, EXIT_USAGE
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -86,14 +86,14 @@ def default_results(archive: str) -> str:
 def run_fleet(arguments: argparse.Namespace) -> int:
     """Judge the archive; returns the exit code."""
     if wrong := lacking_extra():
-        return _fail(wrong)
+        return _fail(wrong, EXIT_USAGE)
     from daqsvc.fleet import FleetError  # noqa: PLC0415 - each verb imports what it needs
 
     try:
         with _ended_by_signal():
             summary, results = _judged(arguments)
     except FleetError as error:
-        return _fail(f"{error}")
+        return _fail(f"{error}", EXIT_FAILED)
     if arguments.json:
         print(json.dumps({**summary.as_json(), "results": results}))  # noqa: T201 - this is what the verb is for
     else:
@@ -126,14 +126,18 @@ def _judged(arguments: argparse.Namespace) -> tuple[CampaignSummary, str]:
 
 
 def _text(summary: CampaignSummary, results: str) -> str:
+    from daqsvc.fleet.wording import counted  # noqa: PLC0415 - each verb imports what it needs
+
+    recordings, machines = counted(summary.recordings, "recording"), counted(summary.machines, "machine")
     lines = [
-        f"{summary.recordings:,} recordings of {summary.machines:,} machines, {summary.judged:,} judged now",
+        f"{recordings} of {machines}, {summary.judged:,} judged now",
         *(f"  {verdict}: {number:,}" for verdict, number in summary.verdicts.most_common()),
     ]
     if summary.refused:
         lines.append(f"  not judged: {summary.refused:,} (column reason says why; --retry tries again)")
     if summary.others:
-        lines.append(f"{summary.others:,} files among the recordings are of other kinds")
+        kinds = "is of another kind" if summary.others == 1 else "are of other kinds"
+        lines.append(f"{counted(summary.others, 'file')} among the recordings {kinds}")
     if summary.left_out:
         shown = ", ".join(summary.left_out[:5]) + (", ..." if len(summary.left_out) > 5 else "")
         lines.append(f"left out, as no machine's: {shown}")
@@ -162,6 +166,6 @@ def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)  # noqa: T201 - what goes on is no result
 
 
-def _fail(message: str) -> int:
+def _fail(message: str, code: int) -> int:
     print(f"daqsvc analyze: {message}", file=sys.stderr)  # noqa: T201 - errors of the command line go to stderr
-    return EXIT_FAILED
+    return code

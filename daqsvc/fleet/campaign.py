@@ -14,8 +14,10 @@ import daqsvc
 from daqsvc.fleet import FleetError
 from daqsvc.fleet.archive import printable
 from daqsvc.fleet.judging import OtherVersionError, RecordingBatch, describe_machine, judge_batch
+from daqsvc.fleet.report import VERDICT_COLUMNS, verdict_of
 from daqsvc.fleet.results import folder_of
 from daqsvc.fleet.table import KEYS, begun_row
+from daqsvc.fleet.wording import counted
 from daqsvc.settings.failures import one_line
 
 if TYPE_CHECKING:
@@ -56,7 +58,7 @@ class CampaignSummary:
         before: of these, judged by an earlier run.
         judged: judged by this one.
         refused: that could not be judged, by an earlier run or this one.
-        verdicts: of all in the archive, how many have each.
+        verdicts: of all in the archive, how many have each, as `daqsvc.fleet.report.verdict_of` has it.
         others: files among the recordings that are of no kind that is judged.
         left_out: folders that are no machine's.
         failed: machines that could not be looked at, and why; what the results have of them stays.
@@ -199,11 +201,11 @@ class _MachineRun:
             return row
 
         self._results.compact(self.folder, change, self._newest)
-        for row in self._results.rows(self.folder, ("file", "judged", "verdict")):
+        for row in self._results.rows(self.folder, ("file", "judged", *VERDICT_COLUMNS)):
             if row["file"] not in self._there:
                 continue
             if row["judged"]:
-                summary.verdicts[row["verdict"] or "without a verdict"] += 1
+                summary.verdicts[verdict_of(row)] += 1
             else:
                 summary.refused += 1
 
@@ -304,8 +306,8 @@ class Campaign:
 
     def _judge(self, client: Any, machines: Iterable[_MachineRun], todo: int) -> None:
         workers = max(1, sum(client.nthreads().values()))
-        who = f"{workers} worker{'s' * (workers > 1)}"
-        self._say(f"{todo:,} recordings to judge, {who}; dashboard: {client.dashboard_link}")
+        what = f"{counted(todo, 'recording')} to judge, {counted(workers, 'worker')}"
+        self._say(f"{what}; dashboard: {client.dashboard_link}")
         most = min(MOST_RECORDINGS, max(1, todo // (BATCHES_PER_WORKER * workers)))
         batches = ((machine, batch) for machine in machines for batch in machine.batches(most))
         self._work(client, batches)

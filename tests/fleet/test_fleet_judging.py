@@ -18,9 +18,11 @@ from daqsvc.confined.limits import ResourceLimits
 from daqsvc.diagnosis.recorded import RecordingOptions
 from daqsvc.fleet import FleetError, judging
 from daqsvc.fleet.archive import Archive
+from daqsvc.fleet.campaign import Campaign, Wanted
 from daqsvc.fleet.failures import is_passing
 from daqsvc.fleet.judging import Judged, OtherVersionError, RecordingBatch, describe_machine, judge_batch
-from daqsvc.fleet.table import COLUMNS
+from daqsvc.fleet.results import Results, folder_of
+from daqsvc.fleet.table import COLUMNS, begun_row
 from daqsvc.offline.runner import Runner
 from daqsvc.recording import RecordingError
 
@@ -275,3 +277,28 @@ def test_another_version_of_a_worker_judges_nothing(tmp_path: Path) -> None:
     add_machine(tmp_path, "pump")
     with pytest.raises(OtherVersionError, match=r"a worker has daqsvc .* and this is 0\.0\.9"):
         judge_batch(batch_of(str(tmp_path), version="0.0.9"))
+
+
+def test_a_run_counts_a_recording_by_what_it_says_of_its_machine(tmp_path: Path) -> None:
+    """Levels and bearings among it, as the report has it."""
+    archive = Archive(str(tmp_path / "archive"))
+    recordings = add_machine(tmp_path / "archive", "pump")
+    said: tuple[dict[str, Any], ...] = (
+        {"worst_severity": "alert"},
+        {"worst_severity": "normal"},
+        {"verdict": "normal", "bearing_verdict": "outer"},
+    )
+    for k in range(len(said)):
+        (recordings / f"{k}.csv").write_text("as it was")
+    machine = archive.machine("pump")
+    assert machine is not None
+    digest, _ = describe_machine(archive, machine, RecordingOptions())
+    rows = [
+        {**begun_row("pump", digest, daqsvc.__version__, recording), "digest": "d", "judged": True, **values}
+        for recording, values in zip(machine.recordings, said, strict=True)
+    ]
+    results = Results(str(tmp_path / "results"))
+    results.add(rows, folder_of("pump"))
+    campaign = Campaign(archive, results, Wanted(RecordingOptions(), ResourceLimits()))
+    summary = campaign.run(lambda: pytest.fail("there is nothing to judge"))
+    assert (summary.before, summary.verdicts) == (3, {"alert": 1, "normal": 1, "outer": 1})

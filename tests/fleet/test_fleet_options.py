@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from support.fleet_archives import add_machine, add_recordings, ended, start_analyze
 
+from daqsvc.commands.analyze_fleet import _text
+
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
@@ -48,7 +50,7 @@ def test_a_missing_extra_is_named(
         importlib.util, "find_spec", lambda name, *more: None if name == "distributed" else find(name, *more)
     )
     code, _, err = verb(*arguments)
-    assert code == 1
+    assert code == 2
     assert err.endswith(
         "the archive of a fleet needs distributed; install them with: pip install 'daqsvc[fleet]'\n"
     )
@@ -65,6 +67,7 @@ def test_an_archive_that_holds_no_machine_is_named(analyze: Callable[..., Any], 
     (tmp_path / "empty" / "photos").mkdir()
     code, _, err = analyze(tmp_path / "empty", "--cluster", "local:1")
     assert (code, "has a machine.toml and recordings/ in it" in err) == (1, True), err
+    assert [one.name for one in tmp_path.iterdir()] == ["empty"], "no folder for results is left"
 
 
 @pytest.mark.integration
@@ -76,6 +79,14 @@ def test_a_scheduler_that_is_not_there_is_named_in_time(tmp_path: Path) -> None:
     assert err.startswith("daqsvc analyze: no Dask scheduler answers at tcp://127.0.0.1:9 (")
     assert err.endswith("start one there (dask scheduler), or use --cluster local\n")
     assert err.count("\n") == 1
+    assert [one.name for one in tmp_path.iterdir()] == ["archive"], "no folder for results is left"
+
+
+def test_one_of_a_thing_is_one() -> None:
+    from daqsvc.fleet.campaign import CampaignSummary
+
+    text = _text(CampaignSummary(machines=1, recordings=1, judged=1, others=1), "there")
+    assert "1 recording of 1 machine, 1 judged now\n1 file among the recordings is of another kind\n" in text
 
 
 def test_the_command_line_is_loaded_without_dask() -> None:
