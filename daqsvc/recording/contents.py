@@ -12,7 +12,7 @@ import numpy as np
 from daqsvc.confined.limits import TooLargeError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -55,6 +55,26 @@ def check_columns(count: int) -> None:
         )
 
 
+RATE_NAMES = frozenset(
+    {"fs", "fs_hz", "sr", "rate_hz", "samplerate", "sample_rate", "sample_rate_hz", "sampling_rate"}
+)
+"""Names under which a file may state its sampling rate in Hz."""
+_SAID = {*RATE_NAMES, STATED_START}
+
+
+@dataclass(frozen=True, slots=True)
+class Elsewhere:
+    """A channel that a file holds beside those of its `Contents`, as it was not taken together with them.
+
+    Attributes:
+        why: what is said behind the channel and the file, where it cannot be had together with others.
+        read: makes the contents that have it.
+    """
+
+    why: str
+    read: Callable[[], Contents]
+
+
 @dataclass(frozen=True, slots=True)
 class Contents:
     """Everything in a file by name, in the file's order.
@@ -68,6 +88,10 @@ class Contents:
         units: of single channels, as the file spells them.
         starts_ns: wall time of the first sample of single channels, ns since the Unix epoch, where the file
             says one for each.
+        elsewhere: channels that are not among the entries, by their names.
+        notes: what is wrong with the file, in sentences.
+        unread: entries that have their length and zeros for samples, as they are too large and nobody wants
+            them.
     """
 
     entries: Mapping[str, NDArray[np.generic]]
@@ -77,6 +101,18 @@ class Contents:
     times: Mapping[str, str] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
     starts_ns: Mapping[str, int] = field(default_factory=dict)
+    elsewhere: Mapping[str, Elsewhere] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    unread: frozenset[str] = frozenset()
+
+    def holding(self, names: Iterable[str]) -> Contents:
+        """The contents that have all channels of these names, as far as any has; else these."""
+        names = list(names)
+        there = next((self.elsewhere[one] for one in names if one in self.elsewhere), None)
+        if there is None:
+            return self
+        other = there.read()
+        return other if all(one in other.entries for one in names) else self
 
     def vectors(self) -> dict[str, NDArray[np.generic]]:
         """Numeric entries of one dimension, of any length."""
@@ -103,8 +139,12 @@ class Contents:
         }
 
     def listing(self) -> str:
-        """What the file holds, in words."""
-        lines = [_told(name, values) for name, values in self.entries.items()]
+        """What the file holds, in words, but for what it says of its rate and begin."""
+        lines = [
+            _told(name, values)
+            for name, values in self.entries.items()
+            if values.ndim or last_part(name).lower() not in _SAID
+        ]
         if len(lines) > MOST_LISTED:
             lines[MOST_LISTED:] = [f"and {len(lines) - MOST_LISTED} more"]
         return ", ".join(lines) or "nothing"

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -48,9 +48,10 @@ def load(
         RecordingError: see there.
     """
     file = Path(path)
-    contents = read(file, ResourceLimits(memory_bytes))
-    left_out: dict[str, int] = {}
     named = bool(channels)
+    wanted = list((channels or {}).values())
+    contents = read(file, ResourceLimits(memory_bytes), wanted if named else None).holding(wanted)
+    left_out: dict[str, int] = {}
     if not channels:
         channels, left_out = _longest(file, contents)
     columns, length = _channels(file, contents, channels)
@@ -61,7 +62,7 @@ def load(
         "rate_hz": timing.rate_hz,
         "left_out": left_out,
         "rate_source": timing.source,
-        "notes": timing.notes,
+        "notes": [*contents.notes, *timing.notes],
         "scalars": contents.scalars(),
         "texts": contents.texts(),
         "units": {
@@ -104,12 +105,16 @@ def load_all(
         RecordingError: see there.
     """
     file = Path(path)
-    contents = read(file, ResourceLimits(memory_bytes))
+    contents = read(file, ResourceLimits(memory_bytes), list(channels.values()) if channels else None)
+    notes = list(contents.notes)
+    if unread := contents.unread:
+        notes.append(f"left out {', '.join(sorted(unread))}: too large to be read")
+        there = {name: values for name, values in contents.entries.items() if name not in unread}
+        contents = replace(contents, entries=there)
     called = _called(file, contents, channels or {})
     groups = _groups(file, contents)
     streams: list[dict[str, Any]] = []
     loaded: list[Samples] = []
-    notes: list[str] = []
     for name, members in groups.items():
         columns = {called.get(one, one): contents.entries[one] for one in members}
         length = len(contents.entries[members[0]])
@@ -255,16 +260,18 @@ def load_streams(
         RecordingError: see there.
     """
     file = Path(path)
-    contents = read(file, ResourceLimits(memory_bytes))
+    wanted = [variable for channels, _ in streams for variable in channels.values()]
+    whole = read(file, ResourceLimits(memory_bytes), wanted)
     notes: list[Sequence[str]] = []
     loaded: list[Floats] = []
     for channels, rate_hz in streams:
+        contents = whole.holding(channels.values())
         columns, length = _channels(file, contents, channels)
         in_file = [_variable(contents, variable) for variable in channels.values()]
         rows, noted = place_at(file, contents, length, rate_hz, in_file)
         samples = _Begins.of(contents, in_file, rate_hz).aligned(file, _together(columns, length, rows))
         _refuse_impossible(file, list(channels), samples)
-        notes.append(noted)
+        notes.append([*contents.notes, *noted])
         loaded.append(samples)
     return notes, loaded
 
@@ -276,9 +283,9 @@ def channels_of(path: str, expected: Sequence[str], memory_bytes: int) -> tuple[
         RecordingError: see there.
     """
     file = Path(path)
-    contents = read(file, ResourceLimits(memory_bytes))
+    contents = read(file, ResourceLimits(memory_bytes), ())
     for name in expected:
-        if name in contents.entries:
+        if name in contents.entries or name in contents.elsewhere:
             _channels(file, contents, {name: name})
     return _lengths(contents), ()
 
@@ -335,6 +342,8 @@ def _channel(path: Path, contents: Contents, variable: str) -> NDArray[np.generi
     entries = contents.entries
     variable = _variable(contents, variable)
     holds = f"it holds {contents.listing()}"
+    if variable not in entries and variable in contents.elsewhere:
+        raise RecordingError(f"{variable} of {path} {contents.elsewhere[variable].why}")
     if variable not in entries:
         raise RecordingError(f"{path} has no channel {variable!r}; {holds}")
     values = entries[variable]

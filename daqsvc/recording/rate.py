@@ -10,7 +10,7 @@ import numpy as np
 
 from daqsvc.dsp.quality.rate import SAME_RATE, StampedRate, rate_of_stamps
 from daqsvc.recording import RecordingError
-from daqsvc.recording.contents import last_part
+from daqsvc.recording.contents import RATE_NAMES, last_part
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
@@ -25,11 +25,6 @@ if TYPE_CHECKING:
 LEAST_RATE_HZ = 1.0
 MOST_RATE_HZ = 10e6
 """Sampling rates outside of these are mistakes: a rate in kHz, or a period in its place."""
-
-RATE_NAMES = frozenset(
-    {"fs", "fs_hz", "sr", "rate_hz", "samplerate", "sample_rate", "sample_rate_hz", "sampling_rate"}
-)
-"""Names under which a file may state its sampling rate in Hz."""
 
 TIME_NAME = re.compile(
     # A capital T alone is a temperature or a torque.

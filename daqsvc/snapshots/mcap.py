@@ -235,7 +235,11 @@ def read(data: memoryview, damage: Damage) -> Iterator[Message | Attachment]:
     Raises:
         McapError: it is no such file, or not one that is read here.
     """
-    if bytes(data[: len(MAGIC)]) != MAGIC:
+    begin = bytes(data[: len(MAGIC)])
+    if begin and begin != MAGIC and MAGIC.startswith(begin):
+        damage.ends_early = True
+        return
+    if begin != MAGIC:
         raise McapError("is no MCAP file: it does not begin as one")
     topics: dict[int, str] = {}
     for kind, content in _records(data, damage):

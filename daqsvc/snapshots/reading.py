@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from daqsvc.confined.limits import ResourceLimits
     from daqsvc.snapshots.contents import Document
 
+WAS_CUT = "was cut before any sample was written in it; copy it anew, or give another one"
+"""What is said behind a snapshot of which only the begin is there."""
 _REMEDY = "it may be damaged: copy it anew, or give another one"
 
 
@@ -115,6 +117,8 @@ def load(path: str) -> tuple[Document, list[NDArray[np.float32]]]:
         raise SnapshotError(f"{path} cannot be read: {error.strerror or error}; correct the path") from None
     except (McapError, ValueError) as error:
         raise SnapshotError(f"{path} cannot be read: it {error}; {_REMEDY}") from None
+    if damage.ends_early and not rows:
+        raise SnapshotError(f"{path} {WAS_CUT}")
     if about is None or about.get("schema") != SCHEMA or not isinstance(about.get("streams"), dict):
         raise SnapshotError(
             f"{path} is no snapshot of daqsvc, or one of another version: its first message is not {SCHEMA}"
@@ -147,7 +151,9 @@ def notes_of(damage: Damage) -> list[str]:
     if damage.ends_early:
         notes.append("the snapshot ends early: it was cut, or is still being written")
     if damage.damaged_chunks:
-        notes.append(f"{damage.damaged_chunks} parts of the snapshot are damaged and left out")
+        count = damage.damaged_chunks
+        parts = "1 part of the snapshot is" if count == 1 else f"{count:,} parts of the snapshot are"
+        notes.append(f"{parts} damaged and left out")
     return notes
 
 

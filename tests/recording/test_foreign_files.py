@@ -16,7 +16,7 @@ from daqsvc.confined.limits import Budget, ResourceLimits
 from daqsvc.recording import RecordingError
 from daqsvc.recording.formats import READERS
 from daqsvc.recording.formats.hdf5 import read_hdf5
-from daqsvc.recording.recording import list_channels, load_recording
+from daqsvc.recording.recording import list_channels, load_all, load_recording
 
 RATE_HZ = 51_200.0
 SAMPLES = np.random.default_rng(8).normal(size=(300, 2)).astype(np.float32)
@@ -216,6 +216,27 @@ def test_hdf5_that_says_more_than_it_holds_takes_no_memory(tmp_path):
         file.create_dataset("x", (10**11,), "f8", chunks=(1000,))
     with pytest.raises(RecordingError, match="says that it unpacks to 800 GB"):
         load_recording(path, rate_hz=RATE_HZ)
+
+
+def test_hdf5_that_nobody_wants_may_say_more_than_it_holds(tmp_path):
+    path = tmp_path / "rig.h5"
+    with h5py.File(path, "w") as file:
+        file.create_dataset("huge", (10**11,), "f8", chunks=(1000,))
+        file.create_dataset("table", (10**11,), [("x", "f4"), ("y", "f4")], chunks=(1000,))
+        file.create_dataset("square", (10**9, 2), "f8", chunks=(1000, 2))
+        file["run/accel"] = SAMPLES
+        file["run/time"] = np.arange(len(SAMPLES)) / RATE_HZ
+    there = list_channels(path)
+    assert (there["huge"], there["table.x"], there["square[1]"]) == (10**11, 10**11, 10**9)
+    assert there["run/accel[1]"] == len(SAMPLES)
+    recording = load_recording(path, {"x": "run/accel[1]"})
+    assert np.array_equal(recording.samples[:, 0], SAMPLES[:, 1])
+    assert recording.rate_hz == pytest.approx(RATE_HZ)
+    (stream,), notes = load_all(path, {"x": "run/accel[1]"})
+    assert stream.names == ("run/accel[0]", "x")
+    assert notes == ["left out huge, square[0], square[1], table.x, table.y: too large to be read"]
+    with pytest.raises(RecordingError, match="says that it unpacks to 800 GB"):
+        load_recording(path, {"x": "huge"})
 
 
 def test_hdf5_loads_no_code_to_unpack_what_it_holds(tmp_path, monkeypatch):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.io import savemat
+from scipy.io import savemat, wavfile
 from support.paths import ROOT
 
 from daqsvc.recording import RecordingError
@@ -191,6 +191,11 @@ def test_an_unknown_rate_is_asked_for(tmp_path):
         ("a.mat", b"", "cannot be read"),
         ("a.npz", b"PK no such thing", "cannot be read"),
         ("a.npz", b"\x80\x04no pickle either", "cannot be read: it is not a zip archive"),
+        (
+            "a.npz",
+            _npz(x=A)[:1000],
+            "cannot be read: it is cut short, as the directory at its end is missing",
+        ),
         ("a.npz", _npz(x=np.array([{"a": 1}])), r"no numeric channel; it holds x \(not numeric\)"),
         ("a.npz", _npz(x=np.array([1.0])), "is too short: no channel has two samples"),
         ("a.npz", _npz(x=np.array([])), "is too short"),
@@ -208,6 +213,28 @@ def test_files_that_cannot_be_read(tmp_path, name, content, message):
     path.write_bytes(content)
     with pytest.raises(RecordingError, match=message):
         load_recording(path, rate_hz=1)
+
+
+@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
+def test_a_table_of_far_too_many_columns_is_called_so(tmp_path, delimiter):
+    """Its lines are longer than a cell may be."""
+    header = delimiter.join(f"c{i}" for i in range(100_000))
+    path = write_csv(tmp_path, f"{header}\n" + 2 * (delimiter.join(["0"] * 100_000) + "\n"))
+    with pytest.raises(RecordingError, match="has 100,000 columns or variables, and at most 4,096 are read"):
+        load_recording(path, rate_hz=1)
+
+
+@pytest.mark.parametrize("ending", [".npz", ".wav", ".csv"])
+def test_a_rate_is_not_told_as_a_channel(tmp_path, ending):
+    path = tmp_path / f"a{ending}"
+    if ending == ".npz":
+        np.savez(path, **{"0": A, "rate_hz": 100})
+    elif ending == ".wav":
+        wavfile.write(path, 100, A)
+    else:
+        path.write_text("# rate_hz = 100\n" + "\n".join(map(str, A)))
+    with pytest.raises(RecordingError, match=r"has no channel 'de'; it holds 0 \(500\)$"):
+        load_recording(path, {"x": "de"})
 
 
 def test_one_sample_asked_for_by_name_is_too_short(tmp_path):

@@ -19,7 +19,7 @@ from daqsvc.recording.formats.uff import read_uff
 from daqsvc.recording.formats.wav import read_wav
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Collection, Mapping
     from pathlib import Path
 
     from daqsvc.confined.limits import ResourceLimits
@@ -86,8 +86,14 @@ def find(path: Path) -> tuple[Callable[[Path, Budget], Contents], int]:
     return reader, status.st_size
 
 
-def read(path: Path, limits: ResourceLimits) -> Contents:
+def read(path: Path, limits: ResourceLimits, wanted: Collection[str] | None = None) -> Contents:
     """Everything in a file.
+
+    Args:
+        path: the file.
+        limits: of reading it.
+        wanted: the channels whose samples are looked at; None: all. Of others, where they are too large,
+            some formats tell the length only.
 
     Raises:
         RecordingError: the file cannot be read.
@@ -95,7 +101,8 @@ def read(path: Path, limits: ResourceLimits) -> Contents:
     """
     reader, _ = find(path)
     try:
-        return reader(path, Budget.of(path, limits))
+        budget = Budget.of(path, limits)
+        return read_hdf5(path, budget, wanted) if reader is read_hdf5 else reader(path, budget)
     except (RecordingError, MemoryError):
         raise
     except TooLargeError as error:

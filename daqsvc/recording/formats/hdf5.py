@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daqsvc.recording.contents import NUMERIC, Contents, check_columns, flattened, last_part
+from daqsvc.recording.contents import NUMERIC, RATE_NAMES, Contents, check_columns, flattened, last_part
 from daqsvc.recording.formats.extras import needed
-from daqsvc.recording.rate import RATE_NAMES, TIME_NAME, rate_of_step
+from daqsvc.recording.rate import TIME_NAME, rate_of_step
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Collection, Iterator, Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -28,13 +28,20 @@ UNITS = frozenset({"unit", "units", "unit_string"})
 _MOST_DIMENSIONS = 2
 
 
-def read_hdf5(path: Path, budget: Budget) -> Contents:
-    """All numeric data sets of one or two dimensions that lie in the file; its own attributes as scalars."""
+def read_hdf5(path: Path, budget: Budget, wanted: Collection[str] | None = None) -> Contents:
+    """All numeric data sets of one or two dimensions that lie in the file; its own attributes as scalars.
+
+    Args:
+        path: the file.
+        budget: of it.
+        wanted: the channels whose samples are looked at; None: all. Where others would take too much, zeros
+            stand for the largest, which take no memory.
+    """
     # Before the library is loaded: no code is loaded to unpack what a file holds.
     os.environ["HDF5_PLUGIN_PRELOAD"] = "::"
     h5py = needed(path, "h5py", "h5py")
     with h5py.File(path, "r") as file:
-        return _Tree(h5py, file, budget).read()
+        return _Tree(h5py, file, budget).read(wanted)
 
 
 class _Tree:
@@ -59,16 +66,18 @@ class _Tree:
             check_columns(len(self._sets) + 1)
             self._sets[name] = item
 
-    def read(self) -> Contents:
-        """What they hold."""
+    def read(self, wanted: Collection[str] | None) -> Contents:
+        """What they hold; see `read_hdf5`."""
         sets = {name: data for name, data in self._sets.items() if _is_read(data)}
+        unread = set() if wanted is None else self._too_large(sets, wanted)
         self._budget.check_declared(
-            float(sum(float(data.size) * data.dtype.itemsize for data in sets.values()))
+            sum(_declared_bytes(data) for name, data in sets.items() if name not in unread)
         )
         entries: dict[str, NDArray[np.generic]] = {}
         rates_hz: dict[str, float] = {}
         times: dict[str, str] = {}
         units: dict[str, str] = {}
+        stand_ins: set[str] = set()
         for name, data in self._sets.items():
             if name not in sets:
                 entries[name] = np.empty(1, dtype=object)
@@ -77,11 +86,16 @@ class _Tree:
             rate_hz = self._rate_hz(data, said)
             time = self._time(name, data)
             unit = next((value for key, value in said.items() if key.lower() in UNITS), None)
-            values = data[()]
-            self._budget.spend(values.nbytes)
+            if name in unread:
+                values = np.broadcast_to(np.zeros((), data.dtype), data.shape)
+            else:
+                values = data[()]
+                self._budget.spend(values.nbytes)
             check_columns(len(entries) + min(values.shape, default=0) * (values.ndim == _MOST_DIMENSIONS))
             for entry, column in _columns(name, values):
                 entries[entry] = column
+                if name in unread:
+                    stand_ins.add(entry)
                 if rate_hz is not None:
                     rates_hz[entry] = rate_hz
                 if time is not None:
@@ -90,7 +104,23 @@ class _Tree:
                     units[entry] = unit
         for key, value in _attributes(self._file).items():
             entries.setdefault(key, np.array(value))
-        return Contents(entries, rates_hz=rates_hz, times=times, units=units)
+        return Contents(entries, rates_hz=rates_hz, times=times, units=units, unread=frozenset(stand_ins))
+
+    def _too_large(self, sets: Mapping[str, Any], wanted: Collection[str]) -> set[str]:
+        """Of the data sets that nobody wants the largest, so that the others fit in the budget."""
+        kept = {
+            name
+            for name in sets
+            if any(one == name or one.startswith((f"{name}[", f"{name}.")) for one in wanted)
+        }
+        kept |= {time for name in kept if (time := self._time(name, sets[name])) is not None}
+        left, unread = self._budget.left_bytes - sum(map(_declared_bytes, sets.values())), set()
+        for name in sorted(set(sets) - kept, key=lambda one: -_declared_bytes(sets[one])):
+            if left >= 0:
+                break
+            left += _declared_bytes(sets[name])
+            unread.add(name)
+        return unread
 
     def _rate_hz(self, data: Any, said: Mapping[str, float | str]) -> float | None:
         """What a data set, or the groups that it lies in, says of its rate; the root speaks for all."""
@@ -137,13 +167,21 @@ def _is_read(data: Any) -> bool:
     )
 
 
+def _declared_bytes(data: Any) -> float:
+    return float(data.size) * float(data.dtype.itemsize)
+
+
 def _columns(name: str, values: NDArray[Any]) -> Iterator[tuple[str, NDArray[np.generic]]]:
     """A data set as entries: fields of records have dotted names."""
     if values.dtype.names is None:
         yield from flattened(name, values)
         return
     for field in values.dtype.names:
-        yield from flattened(f"{name}.{field}", np.ascontiguousarray(values[field]))
+        column = values[field]
+        # A stand-in, whose steps are 0, takes no memory as long as it is not copied.
+        yield from flattened(
+            f"{name}.{field}", np.ascontiguousarray(column) if any(column.strides) else column
+        )
 
 
 def _attributes(item: Any) -> dict[str, float | str]:

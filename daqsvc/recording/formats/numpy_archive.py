@@ -16,12 +16,20 @@ if TYPE_CHECKING:
 
 ARRAY = ".npy"
 """How the names of members end that are arrays."""
+ZIP_BEGIN = b"PK\x03\x04"
+"""How archives begin."""
 
 
 def read_npz(path: Path, budget: Budget) -> Contents:
     """All arrays; Python objects stay unread, as they could run code."""
     with path.open("rb") as file:
         if not zipfile.is_zipfile(file):
+            file.seek(0)
+            if file.read(len(ZIP_BEGIN)) == ZIP_BEGIN:
+                raise RecordingError(
+                    f"{path} cannot be read: it is cut short, as the directory at its end is missing; copy "
+                    "it anew, or give another file"
+                )
             raise RecordingError(
                 f"{path} cannot be read: it is not a zip archive, as numpy.savez writes; "
                 "save it anew, or give it the suffix of what it is"

@@ -1,41 +1,82 @@
-"""Snapshots of the service's recorder: a channel a sensor, of the streams that are sampled fastest."""
+"""Snapshots of the service's recorder: a channel a sensor, of streams that were sampled together.
+
+Those are the streams that are sampled fastest, or the grid that the service has put several streams on. Other
+streams are read where their channels are asked for by name.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from daqsvc.acquisition.samples import SampleBlock
 from daqsvc.recording import RecordingError
-from daqsvc.recording.contents import STATED_START, Contents, check_columns
+from daqsvc.recording.contents import STATED_START, Contents, Elsewhere, check_columns
 from daqsvc.recording.streams import FIRST_NS, LAST_NS, iso_ns
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     from daqsvc.confined.limits import Budget
+    from daqsvc.snapshots.mcap import Damage
 
 RATE = "fs_hz"
 """How the rate is called."""
+GRID = "+"
+"""Between the names of the streams of a grid."""
 
 
 def read_snapshot_channels(path: Path, budget: Budget) -> Contents:
     """Samples in the sensors' units, NaN where they are missing, by the names of sensors; and the rate.
 
-    Of streams of several rates those of the highest are read. Streams of that rate begin and end together.
+    Of streams of several rates those of the highest are read, or the first grid that one of them is on: its
+    sensors are at one rate, and the service's detectors take them from there. Streams of one rate begin and
+    end together. The others' channels are `Contents.elsewhere`.
     """
-    from daqsvc.snapshots.contents import ABOUT, SCHEMA  # noqa: PLC0415 - brings protobuf
+    from daqsvc.snapshots.contents import SCHEMA  # noqa: PLC0415 - brings protobuf
+    from daqsvc.snapshots.reading import WAS_CUT, notes_of  # noqa: PLC0415
+
+    budget.spend(path.stat().st_size)
+    about, blocks, damage = _read(path)
+    if damage.ends_early and not blocks:
+        raise RecordingError(f"{path} {WAS_CUT}")
+    if about.get("schema") != SCHEMA:
+        raise RecordingError(f"{path} is no snapshot of daqsvc: its first message is not {SCHEMA}")
+    streams = _Streams(about, blocks, budget, tuple(notes_of(damage)))
+    groups = streams.groups()
+    if not groups:
+        raise RecordingError(f"{path} holds no samples of any sensor; give another snapshot")
+    contents = streams.read(groups[0])
+    elsewhere: dict[str, Elsewhere] = {}
+    for group in groups[1:]:
+        one = Elsewhere(streams.why_not(group, groups[0]), partial(streams.read, group))
+        for name in streams.names(group):
+            if name not in contents.entries:
+                elsewhere.setdefault(name, one)
+    return replace(contents, elsewhere=elsewhere)
+
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, list[SampleBlock]], Damage]:
+    """The first message of a snapshot, its samples by stream or grid, and what is wrong with it.
+
+    Raises:
+        RecordingError: it is none.
+    """
+    from daqsvc.snapshots.contents import ABOUT  # noqa: PLC0415 - brings protobuf
     from daqsvc.snapshots.mcap import Attachment, Damage, McapError  # noqa: PLC0415
     from daqsvc.snapshots.reading import entries_of  # noqa: PLC0415
 
-    budget.spend(path.stat().st_size)
     about: dict[str, Any] = {}
     blocks: dict[str, list[SampleBlock]] = {}
+    damage = Damage()
     try:
-        for one in entries_of(memoryview(path.read_bytes()), Damage()):
+        for one in entries_of(memoryview(path.read_bytes()), damage):
             if isinstance(one, Attachment):
                 continue
             if isinstance(one.what, SampleBlock):
@@ -46,28 +87,87 @@ def read_snapshot_channels(path: Path, budget: Budget) -> Contents:
         raise RecordingError(
             f"{path} cannot be read: it {error}; copy it anew, or give another one"
         ) from None
-    if about.get("schema") != SCHEMA:
-        raise RecordingError(f"{path} is no snapshot of daqsvc: its first message is not {SCHEMA}")
-    facts = {name: one for name, one in about["streams"].items() if name in blocks and any(one["sensors"])}
-    rate_hz = max((one["rate_hz"] for one in facts.values()), default=0.0)
-    fastest = {name: one for name, one in facts.items() if one["rate_hz"] == rate_hz}
-    if not fastest:
-        raise RecordingError(f"{path} holds no samples of any sensor; give another snapshot")
-    begin_ns = max(blocks[name][0].t_first_ns for name in fastest)
-    entries: dict[str, NDArray[np.generic]] = {}
-    units: dict[str, str] = {}
-    for name, one in fastest.items():
-        samples = _joined(blocks[name], begin_ns, budget)
-        sensors = [sensor or channel for sensor, channel in zip(one["sensors"], one["channels"], strict=True)]
-        entries |= dict(zip(sensors, samples.T, strict=True))
-        units |= dict(zip(sensors, map(str, one.get("units", ())), strict=False))
-    shortest = min(map(len, entries.values()))
-    check_columns(len(entries))
-    cut = {name: values[:shortest] for name, values in entries.items()} | {RATE: np.array(float(rate_hz))}
-    wall_ns = about.get("wall_ns_at_0")
-    if isinstance(wall_ns, int) and FIRST_NS <= wall_ns + begin_ns <= LAST_NS:
-        cut[STATED_START] = np.array(iso_ns(wall_ns + begin_ns))
-    return Contents(cut, units={name: unit for name, unit in units.items() if unit})
+    return about, blocks, damage
+
+
+class _Streams:
+    """The streams of a snapshot, and the grids that some of them are on.
+
+    Args:
+        about: its first message.
+        blocks: samples by stream or grid.
+        budget: of the file.
+        notes: what is wrong with the file, in sentences.
+    """
+
+    def __init__(
+        self,
+        about: dict[str, Any],
+        blocks: dict[str, list[SampleBlock]],
+        budget: Budget,
+        notes: tuple[str, ...],
+    ) -> None:
+        self._blocks = blocks
+        self._budget = budget
+        self._notes = notes
+        self._wall_ns = about.get("wall_ns_at_0")
+        self._facts: dict[str, Any] = {name: one for name, one in about["streams"].items() if name in blocks}
+        self._sensors: dict[str, list[str]] = {}
+        self._units: dict[str, str] = {}
+        on_grids: dict[str, str] = {}
+        for name, one in about["streams"].items():
+            sensors = [s or channel for s, channel in zip(one["sensors"], one["channels"], strict=True)]
+            if any(one["sensors"]):
+                self._sensors[name] = sensors
+                self._units |= dict(zip(sensors, map(str, one.get("units", ())), strict=False))
+                on_grids |= {
+                    f"{name}.{c}": s for c, s in zip(one["channels"], one["sensors"], strict=True) if s
+                }
+        for name in self._facts:
+            if GRID in name and name not in self._sensors:
+                self._sensors[name] = [on_grids.get(one, one) for one in self._facts[name]["channels"]]
+
+    def groups(self) -> list[list[str]]:
+        """What is read together, streams of one rate or a grid alone; first what is read by default."""
+        streams = [name for name in self._facts if any(self._facts[name]["sensors"])]
+        rates = sorted({self._facts[name]["rate_hz"] for name in streams}, reverse=True)
+        of_rates = [[name for name in streams if self._facts[name]["rate_hz"] == rate] for rate in rates]
+        fastest, slower = of_rates[:1], of_rates[1:]
+        grids = [[name] for name in self._facts if name not in streams and name in self._sensors]
+        first = [one for one in grids if fastest and set(fastest[0]) & set(one[0].split(GRID))]
+        # A sensor that is on a grid is taken from there, as the detectors do.
+        return [*first, *fastest, *(one for one in grids if one not in first), *slower]
+
+    def names(self, group: Sequence[str]) -> list[str]:
+        """The channels of streams: their sensors, or what they are called themselves."""
+        return [name for stream in group for name in self._sensors[stream]]
+
+    def why_not(self, group: Sequence[str], read: Sequence[str]) -> str:
+        """Why channels of a group are not read together with those of another."""
+        own_hz, hz = (self._facts[one[0]]["rate_hz"] for one in (group, read))
+        instead = (
+            "the fastest streams are read" if read[0] not in self._grids() else f"the grid {read[0]} is read"
+        )
+        return f"is sampled at {own_hz:g} Hz, and {instead}, at {hz:g} Hz; daqsvc replay judges all of them"
+
+    def _grids(self) -> set[str]:
+        return {name for name in self._facts if not any(self._facts[name]["sensors"])}
+
+    def read(self, group: Sequence[str]) -> Contents:
+        """The samples of a group, from where all its streams have begun to where the first one ends."""
+        begin_ns = max(self._blocks[name][0].t_first_ns for name in group)
+        entries: dict[str, NDArray[np.generic]] = {}
+        for name in group:
+            samples = _joined(self._blocks[name], begin_ns, self._budget)
+            entries |= dict(zip(self._sensors[name], samples.T, strict=True))
+        shortest = min(map(len, entries.values()))
+        check_columns(len(entries))
+        rate_hz = float(self._facts[group[0]]["rate_hz"])
+        cut = {name: values[:shortest] for name, values in entries.items()} | {RATE: np.array(rate_hz)}
+        if isinstance(self._wall_ns, int) and FIRST_NS <= self._wall_ns + begin_ns <= LAST_NS:
+            cut[STATED_START] = np.array(iso_ns(self._wall_ns + begin_ns))
+        units = {name: self._units[name] for name in entries if self._units.get(name)}
+        return Contents(cut, units=units, notes=self._notes)
 
 
 def _joined(blocks: list[SampleBlock], begin_ns: int, budget: Budget) -> NDArray[np.float32]:

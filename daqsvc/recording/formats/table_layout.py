@@ -231,6 +231,8 @@ def split(line: str, delimiter: str | None) -> list[str]:
         return [line.strip().strip('"')]
     if delimiter == " ":
         return [cell.strip('"') for cell in line.split()]
+    if delimiter not in line and len(line) > csv.field_size_limit():
+        return [line.strip().strip('"')]  # a long line of another delimiter, which csv would refuse
     cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
     return [cell.strip() for cell in cells]
 
