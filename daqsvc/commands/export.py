@@ -116,6 +116,11 @@ class ExportCommand(VerbWithKernels):
                 remedy = choice(arguments.stream, [one.name for one in exported.streams])
                 raise ExportUsageError(f"{recording} has no stream {arguments.stream!r}; {remedy}")
         files = targets_of(arguments.to, streams)
+        for target in files:
+            if target.exists() and target.samefile(recording):
+                raise ExportUsageError(
+                    f"{target} is the recording itself, which --force does not replace; give another name"
+                )
         notes = exported.notes + write_all(files, exported.about, force=arguments.force)
         for note in notes:
             print(f"daqsvc export: {note}", file=sys.stderr)  # noqa: T201 - stdout is for what was written

@@ -318,6 +318,20 @@ def test_nothing_is_written_over(snapshot, tmp_path, capsys):
     assert target.read_text().startswith("#")
 
 
+def test_force_does_not_replace_the_recording_itself(tmp_path, capsys):
+    source, link = tmp_path / "de.csv", tmp_path / "link.csv"
+    source.write_text("# fs = 100\nx\n1\n2\n")
+    link.symlink_to(source)
+    for target in (source, link):
+        assert export(source, "--to", target, "--force") == 2
+        assert capsys.readouterr().err == (
+            f"daqsvc export: {target} is the recording itself, which --force does not replace; give another "
+            "name\n"
+        )
+    assert source.read_text() == "# fs = 100\nx\n1\n2\n"
+    assert link.is_symlink()
+
+
 @pytest.mark.parametrize(
     ("name", "message"),
     [
