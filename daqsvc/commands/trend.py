@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import argparse
 import csv
+import errno
 import fnmatch
 import importlib.util
 import json
+import os
 import shutil
+import stat
 import sys
+import tempfile
 import time
+from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -19,6 +24,7 @@ from daqsvc.commands.store_argument import BadFileError, StoreNotFoundError, add
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
+    from typing import TextIO
 
     from daqsvc.commands.machine_files import Load
     from daqsvc.history.file import HistoryReader, Series
@@ -33,10 +39,13 @@ FIGURES = ("low", "mean", "high")
 COLUMNS = ("time", "machine", "reading", "unit", *FIGURES)
 EXTRAS = {"parquet": ("pyarrow", "parquet"), "plot": ("matplotlib", "plot")}
 """By option, the library that it needs, and the extra that brings it."""
+PICTURES = (".png", ".svg", ".pdf")
+OF_STDOUT = {errno.EPIPE, errno.ENOSPC, errno.EIO}
+"""What `daqsvc.cli.main` says of standard output in its own words."""
 
 
 class NoTrendError(Exception):
-    """There is nothing to show; the text says why, and what to do."""
+    """There is nothing to show, or no place for it; the text says why, and what to do."""
 
 
 class _ShownSeries(NamedTuple):
@@ -84,13 +93,14 @@ class TrendCommand:
         form.add_argument("--parquet", type=Path, metavar="FILE", help="write a Parquet table")
         form.add_argument("--plot", type=Path, metavar="FILE", help="draw a picture (.png, .svg, .pdf)")
         form.add_argument("--events", action="store_true", help="the alarm events instead, one JSON a line")
+        parser.add_argument("--force", action="store_true", help="replace a file that is there")
         add_store(parser)
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `daqsvc.cli.Command.run`."""
         import sqlite3  # noqa: PLC0415 - each verb imports only what it needs
 
-        from daqsvc.history.file import NewerHistoryError  # noqa: PLC0415
+        from daqsvc.history.file import EmptyHistoryError, NewerHistoryError  # noqa: PLC0415
 
         now_s = time.time()
         since_s, until_s = arguments.since, arguments.until or now_s
@@ -102,14 +112,18 @@ class TrendCommand:
             _tell(store, machine, arguments, since_s, until_s)
         except BadFileError:
             return EXIT_USAGE
-        except (StoreNotFoundError, NoTrendError, NewerHistoryError) as error:
+        except (StoreNotFoundError, NoTrendError, NewerHistoryError, EmptyHistoryError) as error:
             print(f"daqsvc trend: {error}", file=sys.stderr)  # noqa: T201
             return EXIT_FAILED
         except sqlite3.Error as error:
             print(f"daqsvc trend: the history in {store} cannot be read: {error}", file=sys.stderr)  # noqa: T201
             return EXIT_FAILED
         except OSError as error:
-            print(f"daqsvc trend: {error.filename}: {error.strerror}", file=sys.stderr)  # noqa: T201
+            # Of a target all is said already (`_put_whole`): without a name it is standard output.
+            if error.filename is None and error.errno in OF_STDOUT:
+                raise
+            where = "standard output" if error.filename is None else error.filename
+            print(f"daqsvc trend: {where}: {error.strerror or error}", file=sys.stderr)  # noqa: T201
             return EXIT_FAILED
         return EXIT_OK
 
@@ -135,7 +149,32 @@ def _unusable(arguments: argparse.Namespace, since_s: float, until_s: float) -> 
             return f"--{option} needs {library}; install it with: pip install 'daqsvc[{extra}]'"
     if since_s >= until_s:
         return "--since is not before --until; write the earlier one as --since"
-    return None
+    if arguments.plot is not None and arguments.plot.suffix.lower() not in PICTURES:
+        return f"--plot {arguments.plot}: write a name that ends in one of {', '.join(PICTURES)}"
+    if str(arguments.parquet) == "-":
+        return "--parquet -: write the name of a file; --csv - writes to standard output"
+    return _taken(arguments)
+
+
+def _taken(arguments: argparse.Namespace) -> str | None:
+    """Why nothing may be written where the options say; None if it may."""
+    target: Path | None = arguments.csv or arguments.parquet or arguments.plot
+    if target is None or str(target) == "-":
+        return None
+    try:
+        mode = target.stat().st_mode
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        return f"{target}: {error.strerror}; give another name"
+    problem = None
+    if stat.S_ISDIR(mode):
+        problem = f"{target} is a folder; name a file in it"
+    elif not stat.S_ISREG(mode) and arguments.csv is None:  # a pipe or a device takes a table as it comes
+        problem = f"{target} is no regular file; give another name, or write a table to it with --csv"
+    elif stat.S_ISREG(mode) and not arguments.force:
+        problem = f"{target} is there already; give another name, or --force to replace it"
+    return problem
 
 
 def _tell(
@@ -146,8 +185,9 @@ def _tell(
     Raises:
         NoTrendError: there is nothing.
         NewerHistoryError: a newer version wrote the file.
+        EmptyHistoryError: no service has written anything into it.
         sqlite3.Error: it cannot be read.
-        OSError: what was asked for cannot be written.
+        OSError: it cannot be opened, or standard output takes no more.
     """
     from daqsvc.history.file import NAME, HistoryReader  # noqa: PLC0415 - brings SQLite and NumPy
 
@@ -155,7 +195,7 @@ def _tell(
     if not path.is_file():
         raise NoTrendError(
             f"there is no history in {store}; write [history] into the machine file, and start the service "
-            "with it"
+            "with it, or name its store with --store"
         )
     reader = HistoryReader(path)
     try:
@@ -178,11 +218,13 @@ def _tell(
         for one in shown:
             print(json.dumps(_document(one, step)))  # noqa: T201 - as above
     elif arguments.csv is not None:
-        _write_csv(arguments.csv, shown)
+        _write_csv(arguments.csv, shown, force=arguments.force)
     elif arguments.parquet is not None:
-        _write_parquet(arguments.parquet, shown)
+        with _put_whole(arguments.parquet, force=arguments.force) as path:
+            _write_parquet(path, shown)
     elif arguments.plot is not None:
-        _plot(arguments.plot, shown)
+        with _put_whole(arguments.plot, force=arguments.force) as path:
+            _plot(path, shown)
     else:
         print(_text(shown, step, since_s, until_s, shutil.get_terminal_size().columns))  # noqa: T201
 
@@ -213,13 +255,17 @@ def _step(name: str | None, shown_s: float) -> Step:
 
 
 def _text(shown: list[_ShownSeries], step: Step, since_s: float, until_s: float, width: int) -> str:
-    from daqsvc.commands.tables import aligned, harmless  # noqa: PLC0415 - as above
+    import numpy as np  # noqa: PLC0415 - as above
+
+    from daqsvc.commands.tables import aligned, harmless  # noqa: PLC0415
 
     blocks = []
     for machine in dict.fromkeys(one.series.machine for one in shown):
         rows = []
         for series, trend in (one for one in shown if one.series.machine == machine):
-            figures = (trend.mean[-1], trend.low.min(), trend.mean.mean(), trend.high.max())
+            # A minute with little in it counts for little: the mean is the same at every step.
+            mean = np.average(trend.mean.astype(float), weights=trend.n)
+            figures = (trend.mean[-1], trend.low.min(), mean, trend.high.max())
             rows.append([series.name, *(f"{figure:.4g}" for figure in figures), series.unit])
         titles = ["reading", "last", "least", "mean", "greatest", "unit"]
         table = aligned([*titles, ""], [[*row, ""] for row in rows]).splitlines()
@@ -239,8 +285,8 @@ def _bars(trend: TrendPoints, since_s: float, until_s: float, bars: int) -> str:
     import numpy as np  # noqa: PLC0415 - as above
 
     place = ((trend.t_s - since_s) / (until_s - since_s) * bars).astype(int).clip(0, bars - 1)
-    counts = np.bincount(place, minlength=bars)
-    means = np.bincount(place, trend.mean, minlength=bars) / np.maximum(counts, 1)
+    counts = np.bincount(place, trend.n, minlength=bars)
+    means = np.bincount(place, trend.mean * trend.n, minlength=bars) / np.maximum(counts, 1)
     least, most = means[counts > 0].min(), means[counts > 0].max()
     height = np.round((means - least) / (most - least or 1.0) * (len(BARS) - 1)).astype(int)
     return "".join(BARS[h] if n else " " for h, n in zip(height.clip(0, len(BARS) - 1), counts, strict=True))
@@ -267,21 +313,94 @@ def _document(one: _ShownSeries, step: Step) -> dict[str, Any]:
 
 def _rows(shown: Iterable[_ShownSeries]) -> Iterator[tuple[Any, ...]]:
     for series, trend in shown:
-        for t_s, low, mean, high in zip(*(column.tolist() for column in trend), strict=True):
+        columns = (trend.t_s, trend.low, trend.mean, trend.high)
+        for t_s, low, mean, high in zip(*(column.tolist() for column in columns), strict=True):
             yield t_s, series.machine, series.name, series.unit, low, mean, high
 
 
-def _write_csv(path: Path, shown: list[_ShownSeries]) -> None:
-    file = sys.stdout if str(path) == "-" else path.open("w", encoding="utf-8", newline="")
+@contextmanager
+def _put_whole(target: Path, *, force: bool) -> Iterator[Path]:
+    """A path beside a target to write to; the file comes to its place when it is whole and on the disk.
+
+    Raises:
+        NoTrendError: it cannot be written, or is there meanwhile.
+    """
+    with _named(target):
+        # What a link leads to is replaced, not the link.
+        place = Path(os.path.realpath(target))
+        with tempfile.TemporaryDirectory(
+            prefix=".daqsvc-trend-", dir=place.parent, ignore_cleanup_errors=True
+        ) as folder:
+            path = Path(folder) / place.name
+            yield path
+            with path.open("rb") as written:
+                os.fsync(written.fileno())
+            _put(path, place, force=force)
+
+
+def _put(path: Path, place: Path, *, force: bool) -> None:
+    """Put a file in its place, without force never over one that has come there meanwhile.
+
+    Raises:
+        OSError: one has come, or the disk refuses.
+    """
+    if not force:
+        try:
+            place.hardlink_to(path)
+        except FileExistsError:
+            raise
+        except OSError:
+            pass  # a file system without hard links
+        else:
+            return
+    path.replace(place)
+
+
+@contextmanager
+def _named(target: Path) -> Iterator[None]:
+    """What goes wrong here is said of the target, as the option names it: libraries have words of their own.
+
+    Raises:
+        NoTrendError: instead of an OSError.
+        BrokenPipeError: whoever read from a pipe has had enough, which is no failure.
+    """
     try:
-        table = csv.writer(file, lineterminator="\n")
-        table.writerow(COLUMNS)
-        for t_s, *names, low, mean, high in _rows(shown):
-            figures = (f"{figure:.6g}" for figure in (low, mean, high))
-            table.writerow([_utc(t_s).isoformat().replace("+00:00", "Z"), *names, *figures])
-    finally:
-        if file is not sys.stdout:
-            file.close()
+        yield
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        why = os.strerror(error.errno) if error.errno else " ".join(f"{error}".split())
+        raise NoTrendError(f"{target}: {why}") from error
+
+
+def _write_csv(path: Path, shown: list[_ShownSeries], *, force: bool) -> None:
+    """Write a table: to standard output, a pipe or a device as it comes, else to a file when it is whole.
+
+    Raises:
+        NoTrendError: it cannot be written.
+        OSError: standard output takes no more.
+    """
+    if str(path) == "-":
+        _write_table(sys.stdout, shown)
+    elif path.exists() and not path.is_file():
+        with _named(path):
+            _write_to(path, shown)
+    else:
+        with _put_whole(path, force=force) as beside:
+            _write_to(beside, shown)
+
+
+def _write_to(path: Path, shown: list[_ShownSeries]) -> None:
+    with path.open("w", encoding="utf-8", newline="") as file:
+        _write_table(file, shown)
+
+
+def _write_table(file: TextIO, shown: list[_ShownSeries]) -> None:
+    table = csv.writer(file, lineterminator="\n")
+    table.writerow(COLUMNS)
+    for t_s, *names, low, mean, high in _rows(shown):
+        figures = (f"{figure:.6g}" for figure in (low, mean, high))
+        table.writerow([_utc(t_s).isoformat().replace("+00:00", "Z"), *names, *figures])
 
 
 def _utc(t_s: float) -> datetime:
@@ -329,13 +448,13 @@ def _plot(path: Path, shown: list[_ShownSeries]) -> None:
             axis.fill_between(times, trend.low, trend.high, alpha=0.2, color=line.get_color(), linewidth=0)
         axis.set_title(f"{machine}: {detector}", loc="left", fontsize=9)
         axis.set_ylabel(unit)
+        # Figures as they are, and not what they exceed a number by that stands above the axis.
+        axis.ticklabel_format(axis="y", useOffset=False)
         axis.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
         axis.grid(alpha=0.3)
     axes[-1, 0].set_xlabel("time (UTC)")
     figure.autofmt_xdate()
     try:
         figure.savefig(path)
-    except ValueError as error:
-        raise NoTrendError(f"{path}: {error}") from error
     finally:
         plt.close(figure)
