@@ -29,6 +29,7 @@ COLUMNS = 100
 _INDENT = "  "
 _GAP = "  "
 _NO_BREAK = "\N{NO-BREAK SPACE}"
+_HOUR_S = 3600.0
 
 
 def describe(machine: MachineFile, doubts: Iterable[str] = (), own: MachineFile | None = None) -> str:
@@ -46,7 +47,7 @@ def describe(machine: MachineFile, doubts: Iterable[str] = (), own: MachineFile 
         ["Sensors", *_table(_SENSOR_HEADER, [_sensor(sensor) for sensor in machine.sensors])],
         ["Detectors", *_table([], list(_detectors(machine)))],
         ["Alarms", *_table(_ALARM_HEADER, list(_alarms(machine)))],
-        _facts(_outlets(own or machine)),
+        _facts([*_outlets(own or machine), *_recorder(machine)]),
     ]
     warnings = [
         textwrap.fill(
@@ -215,6 +216,21 @@ def _outlets(machine: MachineFile) -> Iterator[tuple[str, str]]:
         "Store",
         "no directory configured" if machine.store is None else str(machine.resolve(machine.store.directory)),
     )
+
+
+def _recorder(machine: MachineFile) -> Iterator[tuple[str, str]]:
+    """What is recorded of this machine, also where others share its outputs and its store."""
+    if (recorder := machine.recorder) is None:
+        return
+    parts = [f"{recorder.before_s:g} s before and {recorder.after_s:g} s after each alarm"]
+    if recorder.every_s is not None:
+        parts.append("each hour" if recorder.every_s == _HOUR_S else f"every {recorder.every_s:g} s")
+    if recorder.every_rpm is not None:
+        parts.append(f"each {recorder.every_rpm:g} rpm of speed")
+    if recorder.continuous:
+        parts.append(f"everything, in files of {recorder.continuous_s:g} s")
+    kept = f"{recorder.max_mb} MB, {recorder.keep_days:g} days"
+    yield "recorder", "; ".join([*parts, kept, f"{recorder.reserve_mb} MB left free"])
 
 
 def _facts(facts: Iterable[tuple[str, str]]) -> list[str]:
