@@ -423,6 +423,9 @@ class MqttPublisher(Output):
         """A connection has been of use for a while."""
         self._suspects.settled()
         self._has_ever_lasted = True
+        if self._outage.is_told:  # `_connected` did not believe that it would last
+            self._outage.end()
+            log.warning("MQTT broker %s is back", self._name)
         connection.widen(IN_FLIGHT)
 
     def _suspect(self, connection: Connection) -> None:

@@ -18,7 +18,7 @@ from support.waiting import PATIENCE_S, eventually
 from daqsvc.outbox.store import Outbox
 from daqsvc.publish.mqtt import credentials
 from daqsvc.publish.mqtt.delivery import IN_FLIGHT
-from daqsvc.publish.mqtt.publisher import FIRST_RETRY_NS
+from daqsvc.publish.mqtt.publisher import FIRST_RETRY_NS, SUSPICIOUS_LOSSES
 
 pytestmark = pytest.mark.integration
 ALARM = "daqsvc/lab/edge-1/rig/alarms/rotor-fault"
@@ -139,6 +139,31 @@ async def test_availability_flaps_when_two_boxes_share_a_client_id(tmp_path, mos
         weary._judge(11.0, OSError("lost"))
         assert weary._backoff.ceiling_ns >= FIRST_RETRY_NS * 2**3, "eleven seconds are no peace yet"
     await other.close()
+
+
+@pytest.mark.mosquitto
+async def test_the_last_word_of_a_broker_that_flapped_is_that_it_is_back(
+    mosquitto, outbox, caplog, monkeypatch
+):
+    """After the third quick loss a connection is not believed at once, but when it has lasted."""
+    monkeypatch.setattr("daqsvc.publish.mqtt.publisher.STABLE_S", 0.5)
+    monkeypatch.setattr("daqsvc.publish.mqtt.publisher.FIRST_RETRY_NS", 10_000_000)
+    async with TcpProxy(mosquitto.port) as wire, publishing(outbox, wire.port) as publisher:
+        for connections in range(1, SUSPICIOUS_LOSSES + 2):
+            await eventually(lambda n=connections: publisher.counters.connections == n, "it is there")
+            await eventually(lambda: publisher.counters.connected, "connected")
+            if connections <= SUSPICIOUS_LOSSES:
+                wire.cut()
+        assert publisher._outage.is_told
+        assert "because of another client" in caplog.text
+        await eventually(lambda: not publisher._outage.is_told, "it has lasted")
+        assert caplog.messages[-1] == f"MQTT broker 127.0.0.1:{wire.port} is back"
+        caplog.clear()
+        wire.cut()
+        await eventually(lambda: publisher.counters.connections == connections + 1, "once more")
+        away, *_, back = caplog.messages
+        assert "is away" in away, "another outage, told anew"
+        assert back.endswith("is back")
 
 
 @pytest.mark.mosquitto
