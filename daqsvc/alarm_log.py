@@ -44,7 +44,9 @@ class AlarmLog:
             self._left_out += 1
             return
         self._left -= 1
-        loud = logging.WARNING if event.to_level is not Level.NORMAL else logging.INFO
+        # Where only warnings are shown, who has read that an alarm stands reads that it is over, too.
+        is_quiet = event.from_level is event.to_level is Level.NORMAL
+        loud = logging.INFO if is_quiet else logging.WARNING
         name = f"{event.alarm} of {event.identity.machine}" if self._of_several else event.alarm
         logger.log(loud, "alarm %s %s: %s", name, event.kind, event.message)
 

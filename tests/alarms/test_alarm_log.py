@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 
 from support.alarm_rig import AlarmRig
@@ -9,6 +10,7 @@ from support.alarm_rig import AlarmRig
 from daqsvc.alarm_log import LINE_EVERY_NS, LINES, AlarmLog
 from daqsvc.alarms.manager import LevelRule
 from daqsvc.alarms.setpoints import Setpoint
+from daqsvc.alarms.states import Level
 
 
 def test_a_flood_is_counted_once_a_second_and_what_comes_after_it_is_named(caplog):
@@ -34,7 +36,11 @@ def test_a_flood_is_counted_once_a_second_and_what_comes_after_it_is_named(caplo
     log.say(returned)
     log.say(returned)
     (record,) = caplog.records
-    assert (record.levelname, returned.message in record.getMessage()) == ("INFO", True)
+    assert (record.levelname, returned.message in record.getMessage()) == ("WARNING", True)
+    rig.clock.t_ns += LINE_EVERY_NS
+    caplog.clear()
+    log.say(dataclasses.replace(returned, from_level=Level.NORMAL))
+    assert [record.levelname for record in caplog.records] == ["INFO"], "as of one that is shelved"
     rig.clock.t_ns += 10 * LINES * LINE_EVERY_NS
     caplog.clear()
     for _ in range(2 * LINES):
