@@ -6,6 +6,7 @@ It answers also while the event loop stands still, and whatever a client does co
 from __future__ import annotations
 
 import contextlib
+import io
 import logging
 import math
 import socket
@@ -124,6 +125,15 @@ def _handler(registry: Collector, unhealthy: Callable[[], Sequence[str]]) -> typ
                 self._tell_health()
             else:
                 self.send_error(HTTPStatus.NOT_FOUND, explain="there are /metrics and /healthz")
+
+        def do_HEAD(self) -> None:  # noqa: N802 - likewise
+            self.do_GET()
+
+        def end_headers(self) -> None:
+            """See the base class; to who asks with HEAD nothing more is sent."""
+            super().end_headers()
+            if self.command == "HEAD":
+                self.wfile = io.BytesIO()
 
         def _tell_health(self) -> None:
             reasons = unhealthy()

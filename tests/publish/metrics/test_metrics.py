@@ -281,6 +281,13 @@ async def test_other_paths_and_methods_are_refused(tmp_path: Path) -> None:
     async with serving(tmp_path, port) as output:
         await eventually(lambda: output._link.state == "up", "it is served")
         assert (await asyncio.to_thread(get, port, "/"))[0] == 404
+        for path, kind in (("/healthz", b"text/plain"), ("/metrics", b"text/plain"), ("/", b"text/html")):
+            reader, writer = await asyncio.open_connection(LOOPBACK, port)
+            writer.write(b"HEAD %s HTTP/1.0\r\n\r\n" % path.encode())
+            head, _, body = (await reader.read()).partition(b"\r\n\r\n")
+            assert (b" 404 " if path == "/" else b" 200 ") in head
+            assert (kind in head, body) == (True, b"")
+            writer.close()
         reader, writer = await asyncio.open_connection(LOOPBACK, port)
         writer.write(b"POST /metrics HTTP/1.0\r\n\r\n")
         assert b" 501 " in await reader.readline()
