@@ -80,6 +80,8 @@ _RELOADS = {
 }
 """The questions, and whether nothing is to be changed."""
 _SNAPSHOT_VERB = b'{"schema": "daqsvc.control/1", "verb": "snapshot"'
+_QUESTIONS = "'status', 'reload' or 'snapshot'"
+"""Those that the documents tell of, as a person reads them."""
 _ANSWER: Literal["daqsvc.control-answer/1"] = "daqsvc.control-answer/1"
 
 
@@ -273,6 +275,8 @@ class ControlServer:
         self._snapshot = snapshot
         self._server: asyncio.Server | None = None
         self._inode: int | None = None
+        self._refused = ""
+        """Why the socket or its link could not be made the last time."""
         self._clients: list[_Client] = []
         """The one that has been quiet for longest first."""
 
@@ -292,17 +296,28 @@ class ControlServer:
                 listening.close()
                 _remove(self.path, inode)
             raise
+        except ControlError as error:
+            self._refused = f"{error}"
+            raise
+        self._refused = ""
         self._server = await asyncio.start_unix_server(self._welcome, sock=listening, limit=LONGEST_LINE)
 
     async def serve(self) -> None:
-        """Listen until cancelled, and begin again where that fails, or where the socket is taken away."""
+        """Listen until cancelled, and begin again where that fails, or where the socket is taken away.
+
+        Each new reason why it fails is said, but for one that `open` has told its caller.
+        """
         backoff, is_reported = Backoff(), self._server is None
         try:
             while True:
                 if self._server is None:
+                    known = self._refused
                     try:
                         await self.open()
-                    except ControlError:
+                    except ControlError as error:
+                        if self._refused != known:
+                            log.error("no commands on this box until this is mended: %s", error)  # noqa: TRY400
+                        is_reported = True
                         await asyncio.sleep(backoff.next_ns() / NS_PER_S)
                         continue
                     if is_reported:
@@ -313,8 +328,29 @@ class ControlServer:
                     is_reported = True
                     log.warning("the control socket %s was taken away; another one is made", self.path)
                     await self.close()
+                elif self._link is not None and not await asyncio.to_thread(_leads, self._link, self.path):
+                    await self._mend_link(self._link)
         finally:
             await self.close()
+
+    async def _mend_link(self, link: Path) -> None:
+        """Make the link in the store again, by which people find the socket; say once why that fails."""
+        try:
+            await asyncio.to_thread(_make_link, link, self.path)
+        except (ControlError, OSError) as error:
+            why = f"{error}" if isinstance(error, ControlError) else error.strerror or f"{error}"
+            if why != self._refused:
+                log.error(  # noqa: TRY400  the message says it all
+                    "the control socket has no link %s any more, by which commands on this box find it, and "
+                    "none can be made: %s; that is tried again every %g s",
+                    link,
+                    why,
+                    LOOK_S,
+                )
+            self._refused = why
+        else:
+            self._refused = ""
+            log.warning("the link %s to the control socket was taken away; it is made again", link)
 
     async def close(self) -> None:
         """Stop listening, end every connection at once, and take the socket away."""
@@ -466,7 +502,10 @@ def parse_request(line: bytes, machines: Collection[str]) -> ControlRequest:
     try:
         request = ControlRequest.read(line)
     except ValidationError as error:
-        raise ValueError(f"the request is not valid, {faults_of(error, 'it')[0]}") from None
+        fault = faults_of(error, "it")[0]
+        if fault.startswith("verb: must be "):
+            fault += f"; or a question, as it is documented to the letter: {_QUESTIONS}"
+        raise ValueError(f"the request is not valid, {fault}") from None
     if request.machine is not None and request.machine not in machines:
         watched = ", ".join(repr(machine) for machine in machines)
         raise ValueError(f"this service watches {watched}, not {request.machine!r}")
@@ -653,7 +692,10 @@ def _absence(store: Path) -> AbsentError:
     if is_read_only(store):
         why = "it cannot make it on a read-only file system: mount it writable again, or ask over MQTT"
     else:
-        why = "it starts or stops, or cannot make it, which its log says: make room on the disk, or try again"
+        why = (
+            f"it starts or stops, or it was taken away and is made again within {LOOK_S:g} s: try again "
+            "then; the service's log says why, if it cannot be made"
+        )
     return UnreachableError(
         f"the daqsvc of {store} runs, but has no control socket {store / SOCKET} to take commands at: {why}"
     )
@@ -713,11 +755,7 @@ def _bind(path: Path, link: Path | None) -> tuple[socket.socket, int]:
         draft.chmod(MODE)
         draft.rename(path)
         if link is not None:
-            _check_free(link)
-            draft = link.with_name(".control")
-            draft.unlink(missing_ok=True)
-            draft.symlink_to(path)
-            draft.rename(link)
+            _make_link(link, path)
         return made, path.lstat().st_ino
     except OSError as error:
         made.close()
@@ -728,6 +766,30 @@ def _bind(path: Path, link: Path | None) -> tuple[socket.socket, int]:
     except BaseException:
         made.close()
         raise
+
+
+def _make_link(link: Path, path: Path) -> None:
+    """Have a link lead to the socket, in place of one that was left over; blocks.
+
+    Raises:
+        ControlError: something else is in its place.
+        OSError: it cannot be made.
+    """
+    _check_free(link)
+    draft = link.with_name(".control")
+    draft.unlink(missing_ok=True)
+    draft.symlink_to(path)
+    draft.rename(link)
+
+
+def _leads(link: Path, path: Path) -> bool:
+    """Whether the link that was made is still there; one that cannot be looked at may be."""
+    try:
+        return link.is_symlink() and link.readlink() == path
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
 
 
 def _check_free(path: Path) -> None:

@@ -135,7 +135,10 @@ async def test_the_client_and_the_server_understand_each_other(tmp_path: Path) -
         (b"\xff\xfe\n", "not valid"),
         (b"null\n", "not valid"),
         (wish(schema="daqsvc.control/2"), "schema"),
-        (wish(verb="delete"), "verb"),
+        (
+            wish(verb="delete"),
+            "'unbypass'; or a question, as it is documented to the letter: 'status', 'reload'",
+        ),
         (wish(verb=None), "verb"),
         (wish(alarm=""), "alarm"),
         (wish(alarm=7), "alarm"),
@@ -304,6 +307,64 @@ async def test_a_socket_that_is_taken_away_or_cannot_be_made_comes_back(
     serving.cancel()
     await asyncio.wait({serving})
     assert not server.path.exists()
+
+
+async def test_a_link_that_is_taken_away_is_made_again_and_why_not_is_said_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(control, "LOOK_S", 0.01)
+    store, runtime = tmp_path / "store", tmp_path / "run"
+    store.mkdir()
+    runtime.mkdir()
+    link = store / "control.sock"
+    server = ControlServer(store, (MACHINE,), Desk(), lambda: 7, runtime)
+    await server.open()
+    inode = server._inode
+    serving = asyncio.create_task(server.serve())
+    try:
+        link.unlink()
+        await eventually(link.is_symlink, "there is a link")
+        assert await asyncio.to_thread(events_waiting, store) == 7
+        link.unlink()
+        link.write_text("in the way")
+        await eventually(lambda: "none can be made" in caplog.text, "it is said")
+        await asyncio.sleep(0.1)
+        link.unlink()
+        await eventually(link.is_symlink, "there is a link again")
+        await eventually(lambda: caplog.messages[-1].endswith("is made again"), "that is said as well")
+    finally:
+        serving.cancel()
+        await asyncio.wait({serving})
+    assert server._inode == inode, "the socket was none the worse for it"
+    again = f"the link {link} to the control socket was taken away; it is made again"
+    first, why, *rest = caplog.messages
+    assert f"{link} is in the way of the control socket and is none; move it away; that is tried again" in why
+    assert [first, *rest] == [again, again]
+
+
+async def test_why_the_socket_cannot_be_made_is_said_once_by_whoever_learns_it_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(control, "LOOK_S", 0.01)
+    monkeypatch.setattr("daqsvc.acquisition.link.Backoff.next_ns", lambda _: 1_000_000)
+    (tmp_path / "control.sock").write_text("in the way")
+    server = ControlServer(tmp_path, (MACHINE,), Desk())
+    with pytest.raises(ControlError):
+        await server.open()
+    serving = asyncio.create_task(server.serve())
+    await asyncio.sleep(0.05)
+    assert not caplog.messages, "the caller of `open` has said it"
+    for _ in range(2):
+        (tmp_path / "control.sock").unlink()
+        await eventually(lambda: server._server is not None, "there is a socket")
+        (tmp_path / "control.sock").unlink()
+        (tmp_path / "control.sock").write_text("in the way")
+        await eventually(lambda: "until this is mended" in caplog.text, "it is said")
+        await asyncio.sleep(0.05)
+        assert caplog.text.count("until this is mended") == 1
+        caplog.clear()
+    serving.cancel()
+    await asyncio.wait({serving})
 
 
 async def test_a_store_that_can_no_longer_be_written_is_one_line_at_the_end(
