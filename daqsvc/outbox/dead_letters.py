@@ -13,7 +13,7 @@ import logging
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
-from daqsvc.outbox.files import FileError, connect, is_corrupt
+from daqsvc.outbox.files import FileError, NewerFileError, connect, is_corrupt, put_by, refuse_newer
 from daqsvc.outbox.messages import OutboxError, OutboxMessage, checksum, is_sound
 from daqsvc.outbox.rescue import finish, rescue
 
@@ -29,6 +29,9 @@ log = logging.getLogger(__name__)
 
 MOST_OF_A_TOPIC = 1000
 """Letters of one topic that are kept; beyond that the oldest are dropped, counted, and that is said."""
+
+SCHEMA_VERSION = 0
+"""What SQLite gives to a file that nobody has given a version; changes of the table count from here."""
 
 _REASON_LETTERS = 300
 
@@ -144,6 +147,9 @@ class DeadLetters:
         try:
             try:
                 return self._with_file(work, *args, **options)
+            except NewerFileError as newer:
+                put_by(self._path, newer.version, self._wall_ns())
+                return self._with_file(work, *args, **options)
             except FileError as error:
                 if not is_corrupt(error):
                     raise
@@ -157,6 +163,7 @@ class DeadLetters:
     ) -> _T:
         finish(self._path, self._wall_ns())
         with contextlib.closing(connect(self._path, synchronous="FULL")) as connection:
+            refuse_newer(connection, SCHEMA_VERSION)
             connection.execute("BEGIN IMMEDIATE")
             connection.execute(_TABLE)
             result = work(connection, *args, **options)

@@ -50,6 +50,19 @@ _DAMAGED = {
     sqlite3.SQLITE_FORMAT,
 }
 
+
+class NewerFileError(sqlite3.DatabaseError):
+    """A newer version of the program has written a database.
+
+    Args:
+        version: of its tables.
+    """
+
+    def __init__(self, version: int) -> None:
+        super().__init__(f"its form is {version}, which a newer version of daqsvc has written")
+        self.version = version
+
+
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT}
 
 _MAY_PASS = {
@@ -224,11 +237,18 @@ def _device_of(handle: int) -> str:
 
 
 def is_read_only(directory: Path) -> bool:
-    """Whether a directory is on a file system that is mounted read-only; no if it cannot be asked."""
-    try:
-        return bool(os.statvfs(directory).f_flag & os.ST_RDONLY)
-    except OSError:
-        return False
+    """Whether a directory is on a file system that is mounted read-only; no if it cannot be asked.
+
+    For one that is not there, the nearest directory above it is asked: it would be made there.
+    """
+    for at in (directory, *directory.parents):
+        try:
+            return bool(os.statvfs(at).f_flag & os.ST_RDONLY)
+        except (FileNotFoundError, NotADirectoryError):
+            continue
+        except OSError:
+            return False
+    return False
 
 
 def remedy(directory: Path) -> str:
@@ -333,6 +353,59 @@ def set_aside(path: Path, wall_ns: int) -> Path:
             delete(old)
     sync_directory(path.parent)
     return aside
+
+
+def put_by(path: Path, version: int, wall_ns: int) -> Path:
+    """Rename a sound database whose tables are of a newer version; such files are never deleted.
+
+    Args:
+        path: the database, which nobody has open.
+        version: of its tables.
+        wall_ns: wall clock, ns since the Unix epoch.
+
+    Returns:
+        The new name.
+
+    Raises:
+        OSError: it cannot be renamed.
+    """
+    stamp = wall_ns // NS_PER_MS
+    while (aside := path.with_name(f"{path.name}.version-{version}-{stamp}")).exists():
+        stamp += 1
+    # The database last: what a crash leaves under the old name is found, and put by, at the next start.
+    for suffix in reversed(SIDE_FILES):
+        part = path.with_name(path.name + suffix)
+        if part.exists():
+            part.rename(aside.with_name(aside.name + suffix))
+    sync_directory(path.parent)
+    log.warning(
+        "%s was written by a newer version of daqsvc (its form is %d); it is kept as %s, and a new one is "
+        "begun; to have what waits in it sent, install that version again and, with the service stopped, "
+        "give the file its old name",
+        path,
+        version,
+        aside.name,
+    )
+    return aside
+
+
+def refuse_newer(connection: sqlite3.Connection, known: int) -> int:
+    """The version that a database gives for its tables.
+
+    Args:
+        connection: to the database.
+        known: the newest version that this program knows.
+
+    Raises:
+        NewerFileError: a newer program has written it.
+        sqlite3.DatabaseError: no program gives such a version.
+    """
+    version = pragma(connection, "user_version")
+    if version > known:
+        raise NewerFileError(version)
+    if version < 0:
+        raise corruption(f"schema version {version}")
+    return version
 
 
 def delete(path: Path) -> None:

@@ -79,11 +79,16 @@ def refuse_unsafe(store: Path) -> None:
         store: its directory, which exists.
 
     Raises:
-        StoreRefusedError: somebody can, or has; the text says who and what to do.
+        StoreRefusedError: somebody can, or has; or this account may not look. The text says what to do.
         OSError: it cannot be looked at.
     """
     _refuse_path(store)
-    for path in store.iterdir():
+    try:
+        paths = list(store.iterdir())
+    except PermissionError:
+        refuse_unwritable(store)
+        raise
+    for path in paths:
         if path.name.startswith(JOURNAL):
             refuse_link(path)
         elif path.name.startswith(BESIDE) and (owner := path.lstat().st_uid) not in _trusted():
@@ -95,11 +100,21 @@ def refuse_unwritable(store: Path) -> None:
 
     Raises:
         StoreRefusedError: it may not; the text says what to do.
+        OSError: it cannot be looked at.
     """
-    if not is_read_only(store) and not os.access(store, os.R_OK | os.W_OK | os.X_OK, effective_ids=True):
-        raise StoreRefusedError(
-            f"the store {store} may not be written by {_user(os.geteuid())}: chmod u+rwx {store}, or chown it"
+    if is_read_only(store) or os.access(store, os.R_OK | os.W_OK | os.X_OK, effective_ids=True):
+        return
+    status = store.stat()
+    us, owner = _user(os.geteuid()), _user(status.st_uid)
+    if status.st_uid == os.geteuid():
+        # Its owner may give himself the right; anybody else needs another owner.
+        helps = f"chmod u+rwx {store}"
+    else:
+        helps = (
+            f"it belongs to {owner} and has mode {stat.S_IMODE(status.st_mode):04o}: "
+            f"chown -R {account()} {store}, run the service as {owner}, or give it a directory of its own"
         )
+    raise StoreRefusedError(f"the store {store} may not be written by {us}: {helps}")
 
 
 def restrict_files(store: Path) -> None:

@@ -15,12 +15,15 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from daqsvc.outbox.files import (
     FileError,
+    NewerFileError,
     connect,
     corruption,
     delete,
     free_bytes,
     is_corrupt,
     pragma,
+    put_by,
+    refuse_newer,
     used_bytes,
 )
 from daqsvc.outbox.messages import TelemetryMessage, checksum, is_sound
@@ -228,6 +231,9 @@ class TelemetryFile:
         finish(self._path, self._clock.wall_ns())
         try:
             self._connection = self._connect()
+        except NewerFileError as newer:
+            put_by(self._path, newer.version, self._clock.wall_ns())
+            self._connection = self._connect()
         except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
             if not is_corrupt(error):
                 raise
@@ -240,7 +246,7 @@ class TelemetryFile:
     def _connect(self) -> sqlite3.Connection:
         connection = connect(self._path, synchronous="OFF", wal_pages=WAL_PAGES)
         try:
-            version = _known_version(connection)
+            version = refuse_newer(connection, SCHEMA_VERSION)
             connection.execute("BEGIN IMMEDIATE")
             if version == 0:
                 _create(connection)
@@ -361,14 +367,6 @@ class TelemetryFile:
             if connection.in_transaction:
                 connection.execute("ROLLBACK")
             raise
-
-
-def _known_version(connection: sqlite3.Connection) -> int:
-    """The version of the tables, 0 for a new file; that of a newer program is as good as corrupt."""
-    version = pragma(connection, "user_version")
-    if version not in {0, SCHEMA_VERSION}:
-        raise corruption(f"schema version {version}, this program knows {SCHEMA_VERSION}")
-    return version
 
 
 def _is_row_sound(row: tuple[Any, ...]) -> bool:

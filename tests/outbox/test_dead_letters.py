@@ -80,6 +80,22 @@ async def test_a_damaged_file_is_set_aside_and_said(path, caplog):
     assert list(path.parent.glob("refused.sqlite.corrupt-*"))
 
 
+async def test_a_file_of_a_newer_version_is_kept_for_it_and_is_no_damage(path, caplog):
+    await at(path).put(message(1), "x")
+    with contextlib.closing(sqlite3.connect(path)) as file:
+        file.execute("PRAGMA user_version = 99")
+    letters = at(path)
+    await letters.put(message(2), "x")
+    assert (letters.waiting, letters.dropped) == (1, 0)
+    [kept] = path.parent.glob("refused.sqlite.version-99-*")
+    [told] = [record.getMessage() for record in caplog.records]
+    assert told.startswith(f"{path} was written by a newer version of daqsvc")
+    kept.rename(path)
+    with contextlib.closing(sqlite3.connect(path)) as file:
+        file.execute("PRAGMA user_version = 0")
+    assert (await at(path).oldest("a")).sequence == 1, "as the newer version finds it"
+
+
 async def test_a_letter_that_has_changed_on_the_disk_is_not_sent(path, caplog):
     letters = at(path)
     await letters.put(message(1), "x")

@@ -15,6 +15,7 @@ from support.paths import ROOT
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.alarms.commands import AlarmCommand, Verb
 from daqsvc.audit import AuditError, AuditLog
+from daqsvc.outbox.files import is_read_only, remedy
 from daqsvc.outbox.journal import Journal
 from daqsvc.outbox.limits import OutboxLimits
 from daqsvc.outbox.messages import OutboxError, StoreRefusedError
@@ -140,7 +141,14 @@ def test_what_belongs_to_another_user_is_refused(tmp_path, whose):
         ),
         ("above", STRANGER + 1, 0o700, "/above, above the store "),
         ("above/store", STRANGER, 0o500, "/store may not be written by user 61234: chmod u+rwx "),
-        ("above/store", STRANGER, 0o000, "cannot open the outbox "),
+        ("above/store", STRANGER, 0o000, "/store may not be written by user 61234: chmod u+rwx "),
+        (
+            "above/store",
+            0,
+            0o700,
+            "/store may not be written by user 61234: it belongs to root and has mode 0700: chown -R 61234 ",
+        ),
+        ("above/store", 0, 0o755, "it belongs to root and has mode 0755: chown -R 61234 "),
         ("above", 0, 0o700, "cannot open the outbox "),
     ],
 )
@@ -157,6 +165,20 @@ async def test_a_store_that_this_account_may_not_use_is_refused_for_good(
     finally:
         os.seteuid(0)
         await outbox.close()
+
+
+def test_of_a_directory_that_is_not_there_the_one_above_tells_whether_it_can_be_made(tmp_path, monkeypatch):
+    asked = os.statvfs
+
+    def statvfs(path):
+        told = list(asked(path))
+        told[8] |= os.ST_RDONLY
+        return os.statvfs_result(told)
+
+    assert not is_read_only(tmp_path / "none" / "of" / "these")
+    monkeypatch.setattr(os, "statvfs", statvfs)
+    assert is_read_only(tmp_path / "none" / "of" / "these")
+    assert "mount it writable again" in remedy(tmp_path / "none")
 
 
 @is_root

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import sqlite3
 
 import pytest
@@ -28,6 +29,11 @@ async def outbox(tmp_path):
     outbox = await opened(tmp_path)
     yield outbox
     await outbox.close()
+
+
+def version_is(path, number):
+    with contextlib.closing(sqlite3.connect(path)) as other:
+        other.execute(f"PRAGMA user_version = {number}")
 
 
 async def payloads(outbox):
@@ -128,7 +134,7 @@ async def test_a_restart_keeps_it_with_what_is_left_of_its_time(tmp_path, wall_s
     await outbox.close()
 
 
-@pytest.mark.parametrize("damage", ["garbage", "torn", "version"])
+@pytest.mark.parametrize("damage", ["garbage", "torn", "version -1"])
 async def test_a_corrupt_file_is_set_aside_and_the_alarms_do_not_notice(tmp_path, damage, caplog):
     outbox = await opened(tmp_path)
     alarm = await outbox.append("alarm", lambda n: b"alarm", retain=True)
@@ -138,9 +144,9 @@ async def test_a_corrupt_file_is_set_aside_and_the_alarms_do_not_notice(tmp_path
     await outbox.close()
     path = tmp_path / FILE
     whole = path.read_bytes()
-    if damage == "version":
+    if damage == "version -1":
         with sqlite3.connect(path) as other:
-            other.execute("PRAGMA user_version = 99")
+            other.execute("PRAGMA user_version = -1")
         other.close()
     else:
         path.write_bytes(
@@ -154,13 +160,40 @@ async def test_a_corrupt_file_is_set_aside_and_the_alarms_do_not_notice(tmp_path
     *saved, newest = await payloads(outbox)
     assert newest == b"new"
     assert set(saved) <= {b"telemetry" * 300}
-    assert {"garbage": not saved, "torn": len(saved) < 20, "version": len(saved) == 20}[damage]
+    assert {"garbage": not saved, "torn": len(saved) < 20, "version -1": len(saved) == 20}[damage]
     assert outbox.counters.telemetry.quarantined == 1
     assert outbox.counters.telemetry.in_memory == 0
     assert len(list(tmp_path.glob(f"{FILE}.corrupt-*"))) >= 1
     assert "set aside as" in caplog.text
     assert outbox.counters.quarantined == 0
     assert [m.sequence for m in await outbox.pending(0, 10)] == [alarm]
+    await outbox.close()
+
+
+async def test_a_file_of_a_newer_version_is_kept_for_it_and_is_no_damage(tmp_path, caplog):
+    outbox = await opened(tmp_path)
+    outbox.telemetry(TOPIC, b"theirs")
+    await outbox.pending_telemetry(0, 1)
+    await outbox.close()
+    path = tmp_path / FILE
+    version_is(path, 99)
+    outbox = await opened(tmp_path)
+    outbox.telemetry(TOPIC, b"ours")
+    assert await payloads(outbox) == [b"ours"]
+    counted = outbox.counters.telemetry
+    assert (counted.quarantined, counted.dropped, counted.in_memory) == (0, 0, 0)
+    assert not outbox.has_set_aside
+    await outbox.close()
+    [kept] = tmp_path.glob(f"{FILE}.version-99-*")
+    said = f"{path} was written by a newer version of daqsvc (its form is 99); it is kept as {kept.name}"
+    [told] = [record.getMessage() for record in caplog.records]
+    assert told.startswith(said)
+    assert "install that version again" in told
+    version_is(kept, 1)
+    path.unlink()
+    kept.rename(path)
+    outbox = await opened(tmp_path)
+    assert await payloads(outbox) == [b"theirs"], "as the newer version finds it"
     await outbox.close()
 
 
