@@ -9,6 +9,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+import zlib
 
 import numpy as np
 import pytest
@@ -142,6 +143,25 @@ def test_a_damaged_chunk_costs_itself_alone(tmp_path) -> None:
     assert file.trend(RMS, Step.SECOND, 0, BEGIN_S + HOUR_S).t_s.tolist() == list(
         range(BEGIN_S + 50, BEGIN_S + 60)
     )
+    file.close()
+
+
+def test_a_store_of_old_without_numbers_is_read_and_goes_on(tmp_path) -> None:
+    file = HistoryFile(tmp_path / NAME)
+    file.write({RMS: seconds(BEGIN_S, np.full(120, 3.0))})
+    pack(file, BEGIN_S + 2 * HOUR_S)
+    other = sqlite3.connect(tmp_path / NAME)
+    for row, data in other.execute("SELECT rowid, data FROM chunk").fetchall():
+        values = zlib.decompressobj().decompress(data[1:])
+        other.execute("UPDATE chunk SET data = ? WHERE rowid = ?", (data[:1] + zlib.compress(values), row))
+    other.commit()
+    other.close()
+    assert file.trend(RMS, Step.MINUTE, 0, 1e11).n.tolist() == [1, 1], "all the same, as none is known"
+    file.write({RMS: seconds(BEGIN_S + HOUR_S, np.full(60, 9.0))})
+    assert pack(file, BEGIN_S + 3 * HOUR_S) == 0
+    minutes = file.trend(RMS, Step.MINUTE, 0, 1e11)
+    assert minutes.mean.tolist() == [3, 3, 9]
+    assert minutes.n.tolist() == [120, 120, 120], "as many as the usual one"
     file.close()
 
 
