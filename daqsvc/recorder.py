@@ -230,11 +230,13 @@ class _Kept:
     Attributes:
         alarms: by alarm, its newest event.
         standings: by stream.
+        streams: those of which samples have been forgotten.
         since_begin: whether nothing has been forgotten yet.
     """
 
     alarms: dict[str, AlarmEvent] = field(default_factory=dict)
     standings: dict[str, StreamState] = field(default_factory=dict)
+    streams: set[str] = field(default_factory=set)
     since_begin: bool = True
 
 
@@ -488,11 +490,17 @@ class MachineRecorder:
     def _begin(self, history: Sequence[_Item], begin_ns: int) -> tuple[int, list[_Remembered]]:
         """Where a snapshot begins that reaches back to a time, and what detectors remembered there.
 
-        It begins as much earlier as the last moment at which they were asked.
+        It begins as much earlier as the last moment at which they were asked; or, where the first samples of
+        a stream are still there, with these: whoever judges them remembers nothing then.
         """
         if self._kept.since_begin:
             return 0, []
         firsts = [next((k for k, one in enumerate(history) if one.at_ns >= begin_ns), len(history))]
+        known = set(self._kept.streams)
+        for number, item in enumerate(history):
+            if isinstance(item.what, SampleBlock) and item.what.stream not in known:
+                known.add(item.what.stream)
+                firsts.append(number)
         chosen: list[_Remembered] = []
         for memories in [*self._memories.values()]:
             there = [one for one in [*memories] if one.at_ns <= begin_ns]
@@ -517,6 +525,8 @@ class MachineRecorder:
                 kept.alarms[what.alarm] = what
             elif isinstance(what, _Stands):
                 kept.standings[what.stream] = what.standing
+            elif isinstance(what, SampleBlock):
+                kept.streams.add(what.stream)
 
     async def _turn(self) -> None:
         now_ns = self._clock.monotonic_ns()
@@ -663,6 +673,8 @@ class MachineRecorder:
         """The first message of a snapshot: whose it is, and how things stood at its begin."""
         wall_ns = self._clock.wall_ns() - self._clock.monotonic_ns()
         alarms, standings = dict(self._kept.alarms), dict(self._kept.standings)
+        known = self._kept.streams | {one.what.stream for one in before if isinstance(one.what, SampleBlock)}
+        streams = dict(self._streams())
         for item in before:
             if isinstance(item.what, AlarmEvent):
                 alarms[item.what.alarm] = item.what
@@ -678,9 +690,10 @@ class MachineRecorder:
             "begin": iso_utc(begin_ns + wall_ns),
             "wall_ns_at_0": wall_ns,
             "from_start": self._kept.since_begin and not before,
+            "streams_from_start": [name for name in streams if name not in known],
             "changed_ns": self._changed_ns,
             "remembered": {one.detector: one.end_index for one in memories},
-            "streams": dict(self._streams()),
+            "streams": streams,
             "standings": {name: one._asdict() for name, one in standings.items()},
             "alarms": [alarm_document(event) for event in alarms.values()],
         }

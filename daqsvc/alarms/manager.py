@@ -91,6 +91,7 @@ class AlarmManager:
         self._alarms: dict[str, Alarm] = {}
         self._shown: Counter[AlarmState] = Counter()
         self._shelving_ends = ShelvingEnds()
+        self._restarted = True
         self._unlooked = False
         """Whether no diagnosis has come since `resume`: what was doubted before may silence any alarm."""
         self._conditions: set[str] = set()
@@ -208,6 +209,8 @@ class AlarmManager:
         events: Iterable[AlarmEvent],
         active_detectors: Mapping[str, Sequence[str]],
         conditions: Iterable[str] = (),
+        *,
+        restarted: bool = True,
     ) -> list[AlarmEvent]:
         """Go on from where the alarms stood when the service ended; before the first diagnosis.
 
@@ -220,12 +223,14 @@ class AlarmManager:
             events: the last event of each alarm, in the order in which they were published.
             active_detectors: the detectors that will make statements, with the sensors that these rest on.
             conditions: names of what the service will say of itself by `condition`.
+            restarted: whether that may have been long ago; False in a replay, where it was just now.
 
         Returns:
             The events by which alarms return to normal that nobody will judge any more: the machine file
             no longer has them, or not what a quality alarm is about.
         """
         events = list(events)
+        self._restarted = restarted
         self._expected.note(active_detectors, conditions)
         for ruled in self._ruled:
             named = {sensor for d in ruled.rule.detectors for sensor in active_detectors.get(d, ())}
@@ -450,6 +455,10 @@ class AlarmManager:
         if ours and ruled is not None:
             self._resume_ruled(ruled, event)
         elif not _stands(event):
+            if name in self._alarms and ours:
+                # In a replay, where it has stood.
+                self._doubts.settle(name)
+                self._resume_unruled(event)
             return True
         elif ours and (
             name in self._expected.quality or name.removeprefix("detector-ok/") in active_detectors
@@ -457,7 +466,7 @@ class AlarmManager:
             self._resume_unruled(event)
             doubts = [doubt for doubt in event.doubts if doubt.detector in active_detectors]
             t_ns = self._clock.monotonic_ns()
-            self._doubts.resume(doubts, t_ns, event.finding)
+            self._doubts.resume(doubts, t_ns, event.finding, restarted=self._restarted)
             self._doubts.expect(name, self._expected.quality.get(name, {}), t_ns)
         elif ours and is_condition(event) and (name != ALARM_FLOOD or self._handling.flood_alarms):
             self._resume_unruled(event)

@@ -195,13 +195,17 @@ class SensorHealth:
         )
         return Doubt(detector, diagnosis.quality, not_ok, diagnosis.reason, tuple(diagnosis.sensors))
 
-    def resume(self, doubts: Iterable[Doubt], t_ns: int, finding: str = "") -> None:
+    def resume(
+        self, doubts: Iterable[Doubt], t_ns: int, finding: str = "", *, restarted: bool = True
+    ) -> None:
         """Go on from before a restart, by ``t_ns``: what was lacking is good again when that has lasted.
 
         Args:
             doubts: what stood against the sensors.
             t_ns: monotonic time now.
             finding: what the alarm was raised by, as `finding` names it: the same is no change.
+            restarted: whether that may have been long ago. Else a silence is over with the first good
+                statement, as it is without a restart.
         """
         causes = {
             part.partition("=")[0]: match[0] for part in finding.split("|") if (match := _CAUSE.search(part))
@@ -209,11 +213,19 @@ class SensorHealth:
         for doubt in doubts:
             if doubt.quality == "missing" and doubt.detector in causes:
                 self._causes[doubt.detector] = causes[doubt.detector]
-            if doubt.quality == "missing":
+            if doubt.quality == "missing" and (restarted or doubt.detector not in causes):
                 self._lacked_at_restart[doubt.detector] = t_ns
             self._forget(doubt.detector)
             self._unheard.discard(doubt.detector)
             self._remember(quality_alarm(doubt.detector, doubt.sensors), doubt)
+
+    def settle(self, name: str) -> None:
+        """Forget all that is said against the subject of the quality alarm ``name``."""
+        for detector in [one for one, (alarm, _) in self._by_detector.items() if alarm == name]:
+            self._forget(detector)
+            self._lacked_at_restart.pop(detector, None)
+            self._causes.pop(detector, None)
+            self._unheard.discard(detector)
 
     def not_ok(self) -> list[tuple[str, Doubt]]:
         """Who has found sensors not OK, each with the quality alarm that says so."""

@@ -2,7 +2,8 @@
 
 The buses are replaced, and the hands that give samples to detectors: these give the windows that were given
 then. So every detector computes the same numbers from the same samples in the same portions. It begins with
-what it remembered then, if the snapshot has that, else anew.
+what it remembered then, if the snapshot has that, else anew. That nothing came is heard as it was said then:
+no sample tells when.
 """
 
 from __future__ import annotations
@@ -28,7 +29,12 @@ from daqsvc.diagnosis.memory import DetectorMemory, MemoryNotFittingError, put
 from daqsvc.diagnosis.pipeline import THREADS, KernelThreads, kernel_failed
 from daqsvc.diagnosis.statements import said_of_silence
 from daqsvc.machine_watch import MachineWatch
-from daqsvc.publish.payloads import alarm_document, alarm_event, statement_document
+from daqsvc.publish.payloads import (
+    alarm_document,
+    alarm_event,
+    recorded_statement,
+    statement_document,
+)
 from daqsvc.recorder import machine_values
 from daqsvc.settings.load import machine_file_of
 from daqsvc.settings.problems import AssemblyError, MachineFileError
@@ -229,7 +235,8 @@ class Replay:
                     f"other limits came into force at {iso_utc(int(changed_ns) + self._wall_ns)}: what was "
                     "before is judged by them too, and may differ from what was said then"
                 )
-            self._is_from_start = bool(about["from_start"])
+            self._from_start = set(about["streams"] if about["from_start"] else ())
+            self._from_start |= set(about.get("streams_from_start", ()))
             self._is_same = about["version"] == __version__ and machine_values(machine) == json.loads(
                 snapshot.files.get(MACHINE_JSON, b"null")
             )
@@ -268,7 +275,7 @@ class Replay:
         """
         watch, pipeline = self._watch, self._watch.pipeline
         await pipeline.warm()
-        self._alarms.resume(self._before, watch.active_detectors())
+        self._alarms.resume(self._before, watch.active_detectors(), restarted=False)
         for stream, standing in self._standings.items():
             if stream in watch.standings:
                 watch.stand(stream, standing)
@@ -331,7 +338,7 @@ class Replay:
                     return detector.name
                 self._since[detector.name] = end_index
                 self._result.anew.pop(detector.name, None)
-            elif not (self._is_from_start and self._is_same):
+            elif not (detector.stream in self._from_start and self._is_same):
                 self._result.anew[detector.name] = self._why_anew
         return ""
 
@@ -381,13 +388,31 @@ class Replay:
             if noted.topic == STANDING and document["stream"] in self._watch.standings:
                 told = {key: value for key, value in document.items() if key != "stream"}
                 self._watch.stand(document["stream"], StreamState(**told))
+            elif noted.topic == DIAGNOSES and document["detector"] in self._names:
+                self._hear(document)
             elif noted.topic == ALARMS and not document.get("by") and self._is_earlier(document):
-                event = alarm_event(json.dumps(document).encode())
-                self._alarms.resume([event], self._watch.active_detectors())
+                self._go_on_from(alarm_event(json.dumps(document).encode()))
             elif noted.topic == WINDOWS and document["detector"] in self._readers:
                 await self._give(document["detector"], document)
         except _NOT_OURS as error:
             _refuse(error)
+
+    def _hear(self, statement: Document) -> None:
+        """Have the alarms hear what was said then, if it is not said again."""
+        is_silence = _is_silence(statement)
+        if not is_silence and (self._is_replayed(statement) or not self._is_same):
+            return
+        diagnosis = recorded_statement(statement)
+        events = self._alarms.take(diagnosis)
+        if is_silence:
+            self._result.statements.append(diagnosis)
+            self._take(events)
+
+    def _go_on_from(self, event: AlarmEvent) -> None:
+        """Have an alarm stand as it did then, where what was heard is not enough for it to."""
+        stands = self._alarms.alarms.get(event.alarm)
+        if stands is None or (stands.state, stands.level) != (event.to_state, event.to_level):
+            self._alarms.resume([event], self._watch.active_detectors(), restarted=False)
 
     async def _give(self, detector: str, document: Document) -> None:
         """Have a detector process what it processed then."""
@@ -418,6 +443,8 @@ class Replay:
         await reader.asks.wait()
 
     def _report(self, diagnosis: Diagnosis) -> None:
+        if diagnosis.quality == "missing" and diagnosis.end_index == diagnosis.first_index:
+            return  # it is heard when it was said
         self._result.statements.append(diagnosis)
         self._take(self._alarms.take(diagnosis))
 
@@ -428,15 +455,21 @@ class Replay:
 
     def _compare(self) -> None:
         """Hold what was said then against what is said now."""
-        said, alarmed = [], []
+        said: list[Document] = []
+        alarmed: list[Document] = []
+        of_service: list[Document] = []
         for entry in self._snapshot.entries:
             if isinstance(entry.what, SampleBlock):
                 continue
             document = entry.what.document
-            if entry.what.topic == DIAGNOSES and self._is_replayed(document):
+            if entry.what.topic == DIAGNOSES and (self._is_replayed(document) or self._is_heard(document)):
                 said.append(document)
             elif entry.what.topic == ALARMS and not document.get("by") and not self._is_earlier(document):
-                alarmed.append(document)
+                (alarmed if self._is_judged(document) else of_service).append(document)
+        if of_service:
+            self._result.notes.append(
+                f"alarm events of the service itself are not judged again: {len(of_service)}"
+            )
         _hold(self._result.said, said, [statement_document(one) for one in self._result.statements])
         # What follows of statements that came after the end of the file came after it, too.
         ends = _ends(said)
@@ -459,16 +492,32 @@ class Replay:
         except (KeyError, TypeError):
             return False
 
+    def _is_heard(self, statement: Document) -> bool:
+        return statement.get("detector") in self._names and _is_silence(statement)
+
+    def _is_judged(self, alarm: Document) -> bool:
+        """Whether an alarm event of then follows of what a detector has said."""
+        cause = alarm.get("cause")
+        return isinstance(cause, dict) and cause.get("detector") in self._names
+
     def _is_earlier(self, alarm: Document) -> bool:
         """Whether an alarm event of then follows of samples that its detector had judged by the begin."""
-        cause = alarm.get("cause")
-        if not isinstance(cause, dict) or cause.get("detector") not in self._names:
-            return False
-        return not self._is_replayed(cause)
+        cause = alarm["cause"] if self._is_judged(alarm) else None
+        return cause is not None and not _is_silence(cause) and not self._is_replayed(cause)
 
 
 def _names(detector: Detector, t_ns: int) -> set[str]:
     return {detector.name, *(one.detector for one in said_of_silence(detector, 0.0, t_ns))}
+
+
+def _is_silence(statement: Document) -> bool:
+    """Whether a statement says that nothing came: it rests on no samples."""
+    window = statement.get("window")
+    return (
+        isinstance(window, dict)
+        and statement.get("quality") == "missing"
+        and window.get("first_index") == window.get("end_index")
+    )
 
 
 def _end_of(statement: Document) -> int:

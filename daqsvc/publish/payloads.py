@@ -5,6 +5,7 @@ A change that an old consumer would not survive gets a new version number; a new
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -271,6 +272,16 @@ def alarm_document(event: AlarmEvent) -> dict[str, Any]:
 def statement_document(diagnosis: Diagnosis) -> dict[str, Any]:
     """A diagnosis as a dictionary of what JSON knows, without a stamp."""
     return {"machine": diagnosis.machine, "monotonic_ns": diagnosis.t_ns, **_statement(diagnosis)}
+
+
+def recorded_statement(document: Mapping[str, Any]) -> Diagnosis:
+    """The diagnosis that `statement_document` has told; what JSON could not say is NaN.
+
+    Raises:
+        ValueError: it tells of none.
+    """
+    told = {key: one for key, one in document.items() if key != "machine"}
+    return _diagnosis(str(document.get("machine")), CausePayload.model_validate_json(json.dumps(told)))
 
 
 def diagnosis_payload(identity: Identity, diagnosis: Diagnosis, clock: Clock) -> DiagnosisPayload:

@@ -583,3 +583,19 @@ async def test_the_end_of_the_service_closes_what_is_open(tmp_path: Path) -> Non
         await one.passes(0.6)
     [path] = one.files
     assert held(path)[3] == Damage()
+
+
+async def test_a_snapshot_has_the_first_samples_of_a_stream_that_has_just_come(tmp_path: Path) -> None:
+    async with bench(tmp_path, before_s=0.2) as one:
+        one.recorder.stand("shaft", StreamState("nothing has come"))
+        one.clock.advance_to(one.clock.monotonic_ns() + 30 * NS_PER_S)
+        await one.passes(1.0)
+        one.alarm()
+        await one.passes(30.0)
+        one.alarm()
+        await one.passes(2.0)
+        first, second = one.files
+    assert (firsts_in(first)[0], firsts_in(second)[0] > 0) == (0, True)
+    abouts = [held(path)[0] for path in (first, second)]
+    assert [about["streams_from_start"] for about in abouts] == [["shaft"], []]
+    assert [about["from_start"] for about in abouts] == [False, False]

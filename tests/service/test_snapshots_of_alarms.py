@@ -12,6 +12,7 @@ from support.recorded_rig import RATE_HZ, let_time_pass, play, recorded_rig, rec
 from support.waiting import PATIENCE_S
 
 from daqsvc.acquisition.samples import SampleBlock
+from daqsvc.alarms.states import Level
 from daqsvc.confined.limits import ResourceLimits
 from daqsvc.offline.replay import replay
 from daqsvc.snapshots.contents import ALARMS, DIAGNOSES, MACHINE_JSON, MACHINE_TOML
@@ -20,11 +21,12 @@ from daqsvc.snapshots.reading import read_snapshot
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from daqsvc.offline.replay import Replayed
+    from daqsvc.offline.replay import Comparison, Replayed
     from daqsvc.service import Service
     from daqsvc.snapshots.contents import Document, Snapshot
 
 pytestmark = pytest.mark.integration
+RATE_ROWS = round(RATE_HZ) // 3 * 3
 
 
 def snapshots(service: Service) -> list[Path]:
@@ -37,6 +39,15 @@ def is_statement(what: object, statement: Document) -> bool:
         return False
     document = getattr(what, "document", {})
     return all(document[key] == statement[key] for key in ("detector", "decision", "monotonic_ns"))
+
+
+def in_short(comparison: Comparison) -> list[list[tuple[object, ...]]]:
+    """What differs: said then only, and now only."""
+    keys = ("alarm", "detector", "kind", "decision", "state", "monotonic_ns", "message", "quality")
+    return [
+        [tuple(one.get(key) for key in keys) for one in differs]
+        for differs in (comparison.changed, comparison.added)
+    ]
 
 
 async def again(snapshot: Snapshot, folder: Path) -> Replayed:
@@ -96,6 +107,41 @@ async def test_an_alarm_leaves_a_snapshot_that_replays_to_the_same_alarm(tmp_pat
     about = {**snapshot.about, "changed_ns": snapshot.about["begin_ns"] + 1}
     changed = await again(replace(snapshot, about=about), tmp_path / "changed")
     assert changed.notes[0].startswith("other limits came into force at 20")
+
+
+async def test_alarms_of_a_device_that_comes_and_goes_are_the_same_again(tmp_path: Path) -> None:
+    machine, samples = recorded_rig("snapshot-silence", before_s=3.0, after_s=0.5)
+    async with recording(machine, tmp_path / "store") as (service, clock):
+        await let_time_pass(service, clock, 8.0)  # nothing comes
+        await play(service, clock, samples[: round(6.5 * RATE_HZ) // 3 * 3])
+        await let_time_pass(service, clock, 6.0)
+        files = snapshots(service)
+    kinds = []
+    for number, path in enumerate(files):
+        snapshot = read_snapshot(path, ResourceLimits())
+        alarms = [e.what.document for e in snapshot.entries if getattr(e.what, "topic", "") == ALARMS]
+        kinds += [(one["alarm"], one["kind"]) for one in alarms]
+        replayed = await again(snapshot, tmp_path / f"replay {number}")
+        assert replayed.is_equal, (path.name, in_short(replayed.said), in_short(replayed.alarmed))
+        assert replayed.alarmed.equal > 0
+    assert {("sensor-ok/probe-x", "raised"), ("sensor-ok/probe-x", "returned")} <= {*kinds}
+    assert ("rotor-fault", "raised") in kinds
+
+
+async def test_what_the_service_says_of_itself_is_not_judged_again(tmp_path: Path) -> None:
+    machine, samples = recorded_rig("snapshot-condition", after_s=2.0)
+    async with recording(machine, tmp_path / "store") as (service, clock):
+        asked = asyncio.create_task(recorder_of(service).snapshot("a test"))
+        await let_time_pass(service, clock, 0.2)
+        for level in (Level.ALERT, Level.NORMAL):
+            for event in service.alarms.manager.condition("store/disk", level, "the disk is full"):
+                recorder_of(service).alarm(event)
+        await play(service, clock, samples[: RATE_ROWS * 2])
+        await let_time_pass(service, clock, 3.0)
+        path = await asked
+    replayed = await again(read_snapshot(path, ResourceLimits()), tmp_path / "replay")
+    assert replayed.is_equal, replayed.alarmed
+    assert replayed.notes == ["alarm events of the service itself are not judged again: 2"]
 
 
 @pytest.mark.long
