@@ -11,7 +11,7 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NoReturn
 
@@ -265,6 +265,7 @@ class Replay:
             for name in _names(detector, self._begin_ns)
         }
         """By detector of a statement, the one that makes it."""
+        self._earlier = self._found_earlier()
         self._ticked_ns = self._begin_ns
 
     async def run(self) -> Replayed:
@@ -388,14 +389,46 @@ class Replay:
             if noted.topic == STANDING and document["stream"] in self._watch.standings:
                 told = {key: value for key, value in document.items() if key != "stream"}
                 self._watch.stand(document["stream"], StreamState(**told))
-            elif noted.topic == DIAGNOSES and document["detector"] in self._names:
-                self._hear(document)
-            elif noted.topic == ALARMS and not document.get("by") and self._is_earlier(document):
-                self._go_on_from(alarm_event(json.dumps(document).encode()))
+            elif noted.topic in (DIAGNOSES, ALARMS):
+                self._follow(noted)
             elif noted.topic == WINDOWS and document["detector"] in self._readers:
                 await self._give(document["detector"], document)
         except _NOT_OURS as error:
             _refuse(error)
+
+    def _found_earlier(self) -> dict[str, deque[Noted]]:
+        """By detector that remembers, what was said by samples that it had judged by the begin, in order.
+
+        It may have come late, when the detector had got further samples already.
+        """
+        earlier: dict[str, deque[Noted]] = {name: deque() for name in self._since}
+        for entry in self._snapshot.entries:
+            if not isinstance(entry.what, SampleBlock) and (name := self._earlier_by(entry.what)) in earlier:
+                earlier[name].append(entry.what)
+        return earlier
+
+    def _earlier_by(self, noted: Noted) -> str:
+        """The detector that has said something by samples that it had judged by the begin; else nothing."""
+        document = noted.document
+        statement = document.get("cause") if noted.topic == ALARMS else document
+        if noted.topic not in (ALARMS, DIAGNOSES) or not isinstance(statement, dict) or document.get("by"):
+            return ""
+        name = self._names.get(str(statement.get("detector")), "")
+        return "" if _is_silence(statement) or self._is_replayed(statement) else name
+
+    def _follow(self, noted: Noted) -> None:
+        """Have the alarms follow what was said then, if it is not said again."""
+        document = noted.document
+        earlier = self._earlier.get(self._earlier_by(noted))
+        if earlier is not None:
+            if not earlier or earlier[0] is not noted:
+                return  # it has been heard before the first window of its detector
+            earlier.popleft()
+        if noted.topic == DIAGNOSES:
+            if document["detector"] in self._names:
+                self._hear(document)
+        elif not document.get("by") and self._is_earlier(document):
+            self._go_on_from(alarm_event(json.dumps(document).encode()))
 
     def _hear(self, statement: Document) -> None:
         """Have the alarms hear what was said then, if it is not said again."""
@@ -416,6 +449,9 @@ class Replay:
 
     async def _give(self, detector: str, document: Document) -> None:
         """Have a detector process what it processed then."""
+        earlier = self._earlier.get(detector, ())
+        while earlier:
+            self._follow(earlier[0])
         reader = self._readers[detector]
         first, count = int(document["first_index"]), int(document["count"])
         if first < self._since.get(detector, first):
