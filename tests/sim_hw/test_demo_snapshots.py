@@ -24,6 +24,7 @@ def told(capsys: pytest.CaptureFixture[str]) -> list[dict[str, Any]]:
 
 
 @pytest.mark.long
+@pytest.mark.timeout(900)
 def test_a_snapshot_of_the_demo_replays_to_the_alarms_that_it_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
