@@ -37,6 +37,7 @@ from daqsvc.settings.models import ProximityProbe
 from daqsvc.settings.plugins import configured, detector_tables
 from daqsvc.settings.problems import AssemblyError
 from daqsvc.settings.units import factor_between
+from daqsvc.snapshots.contents import SUFFIX as SNAPSHOT_SUFFIX
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
@@ -338,6 +339,9 @@ class Runner:
             elif sensor.channel in there:
                 columns[sensor.name] = sensor.channel
         missing = [name for name in _needs(self.detectors) if name not in columns]
+        if missing and recording.endswith(SNAPSHOT_SUFFIX):
+            # Of a snapshot the fastest streams are read, and the others where they are asked for by name.
+            return {name: channels.get(name, name) for name in _needs(self.detectors)}
         if missing or not columns:
             missing = missing or [sensor.name for sensor in self.machine.sensors]
             lacking = [sensor for sensor in self.machine.sensors if sensor.name in missing]
