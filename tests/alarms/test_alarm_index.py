@@ -79,7 +79,8 @@ class WalkingDoubts(SensorHealth):
         names = (name,) if before is None or before[0] == name else (before[0], name)
         return Touched(names, frozenset())
 
-    def resume(self, doubts, t_ns, found=""):
+    def resume(self, doubts, t_ns, found="", *, restarted=True):
+        assert restarted, "nothing is replayed here"
         for doubt in doubts:
             self.assumed.pop(doubt.detector, None)
             self.table[doubt.detector] = (quality_alarm(doubt.detector, doubt.sensors), doubt)
