@@ -122,7 +122,10 @@ async def test_alarms_of_a_device_that_comes_and_goes_are_the_same_again(tmp_pat
         alarms = [e.what.document for e in snapshot.entries if getattr(e.what, "topic", "") == ALARMS]
         kinds += [(one["alarm"], one["kind"]) for one in alarms]
         replayed = await again(snapshot, tmp_path / f"replay {number}")
-        assert replayed.is_equal, (path.name, in_short(replayed.said), in_short(replayed.alarmed))
+        assert not replayed.said.changed, (path.name, in_short(replayed.said))
+        # What else an event says of others, such as who was first, may differ where the snapshot begins.
+        then, now = ([one[:3] + one[4:6] for one in side] for side in in_short(replayed.alarmed))
+        assert then == now, path.name
         assert replayed.alarmed.equal > 0
     assert {("sensor-ok/probe-x", "raised"), ("sensor-ok/probe-x", "returned")} <= {*kinds}
     assert ("rotor-fault", "raised") in kinds
