@@ -258,7 +258,7 @@ async def _run_until_stopped(
         files: as they were named.
         store: directory of the journal.
         guard: of the process.
-        manager: that is told of the service.
+        manager: the service manager, which hears how the service stands.
         let_go: lets go of the store, which the service takes itself.
 
     Raises:
