@@ -103,6 +103,25 @@ def test_analyze_judges_it_as_its_samples(analyze, machine, recorded, tmp_path):
     assert {**found, "recording": ""} == {**expected, "recording": ""}
 
 
+def test_a_snapshot_is_judged_by_its_slower_streams_where_the_verdict_rests_on_them(
+    analyze, machine, tmp_path
+):
+    orbit = Orbit(change=UNBALANCE)
+    samples = np.column_stack([orbit.x, orbit.y, orbit.keyphasor]).astype(np.float32)
+    streams = {
+        "housing": Sampled(2 * RATE_HZ, {"casing": "m/s2"}, np.zeros((2 * len(samples), 1))),
+        "shaft": Sampled(RATE_HZ, dict(zip(SENSORS, ("um", "um", "V"), strict=True)), samples),
+    }
+    source = write_snapshot(tmp_path / "run.mcap", streams, round(EPOCH_S * 1e9))
+    table = save_table(tmp_path / "table.npz", samples)
+    code, (found, expected), err = analyze(machine, source, table, "--jobs", 1)
+    assert (code, err) == (0, "")
+    [problem] = found["data_quality"].pop("problems")
+    assert problem.startswith(f"casing left out: sampled at {2 * RATE_HZ:g} Hz, and the slower streams are")
+    assert expected["data_quality"].pop("problems") == []
+    assert {**found, "recording": ""} == {**expected, "recording": ""}
+
+
 def test_calibrate_learns_from_it_as_from_its_samples(verb, machine, ending, tmp_path):
     source, sent = write_recording(tmp_path / f"run{ending}", machine, Orbit())
     table = save_table(tmp_path / "table.npz", sent)

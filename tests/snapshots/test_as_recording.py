@@ -67,6 +67,18 @@ def test_of_several_rates_the_fastest_are_read_unless_others_are_named(several):
     slow = load_recording(several, {"y": "probe-y"})
     assert (slow.names, slow.rate_hz, slow.units) == (("y",), 500.0, {"y": "um"})
     assert np.array_equal(slow.samples, Y)
+    assert slow.notes == (
+        (
+            "probe-x left out: sampled at 1000 Hz, and the slower streams are read, at 500 Hz; "
+            "daqsvc replay judges all of them"
+        ),
+    )
+    assert load_recording(several).notes == (
+        (
+            "probe-y left out: sampled at 500 Hz, and the fastest streams are read, at 1000 Hz; "
+            "daqsvc replay judges all of them"
+        ),
+    )
 
 
 def test_a_stream_of_another_rate_is_called_so(several):
@@ -86,6 +98,7 @@ def test_streams_on_a_grid_are_read_from_there(tmp_path):
     recording = load_recording(path, {"probe-x": "probe-x", "probe-y": "probe-y"})
     assert (recording.rate_hz, recording.units) == (1000.0, {"probe-x": "um", "probe-y": "um"})
     assert (recording.samples == ord("b")).all()
+    assert [note.partition(":")[0] for note in recording.notes] == ["oil left out"]
     assert load_recording(path, {"oil": "oil"}).rate_hz == 10.0
     with pytest.raises(RecordingError, match=r"oil of .* at 10 Hz, and the grid a\+b is read, at 1000 Hz"):
         list_channels(path, ["oil"])
@@ -95,8 +108,8 @@ def test_what_is_wrong_with_it_is_told(several):
     data = several.read_bytes()
     several.write_bytes(data[: data.rindex(DATA_END)])
     cut = "the snapshot ends early: it was cut, or is still being written"
-    assert load_recording(several).notes == (cut,)
-    assert load_all(several)[1] == [cut]
+    assert load_recording(several).notes[0] == cut
+    assert load_all(several)[1][0] == cut
 
 
 def test_damaged_parts_are_counted_in_words():

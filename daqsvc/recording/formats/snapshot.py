@@ -18,7 +18,7 @@ from daqsvc.recording.contents import STATED_START, Contents, Elsewhere, check_c
 from daqsvc.recording.streams import FIRST_NS, LAST_NS, iso_ns
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Collection, Iterator, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -55,7 +55,7 @@ def read_snapshot_channels(path: Path, budget: Budget) -> Contents:
     contents = streams.read(groups[0])
     elsewhere: dict[str, Elsewhere] = {}
     for group in groups[1:]:
-        one = Elsewhere(streams.why_not(group, groups[0]), partial(streams.read, group))
+        one = Elsewhere(f"is {streams.why_not(group, groups[0])}", partial(streams.read, group))
         for name in streams.names(group):
             if name not in contents.entries:
                 elsewhere.setdefault(name, one)
@@ -142,13 +142,21 @@ class _Streams:
         """The channels of streams: their sensors, or what they are called themselves."""
         return [name for stream in group for name in self._sensors[stream]]
 
+    def _left_out(self, read: Sequence[str], names: Collection[str]) -> Iterator[str]:
+        """Which sensors are not among the names that are read, and why, in sentences."""
+        for group in self.groups():
+            sensors = [one for stream in group for one in self._facts[stream]["sensors"] if one]
+            if left_out := [one for one in sensors if one not in names]:
+                yield f"{', '.join(left_out)} left out: {self.why_not(group, read)}"
+
     def why_not(self, group: Sequence[str], read: Sequence[str]) -> str:
         """Why channels of a group are not read together with those of another."""
         own_hz, hz = (self._facts[one[0]]["rate_hz"] for one in (group, read))
-        instead = (
-            "the fastest streams are read" if read[0] not in self._grids() else f"the grid {read[0]} is read"
-        )
-        return f"is sampled at {own_hz:g} Hz, and {instead}, at {hz:g} Hz; daqsvc replay judges all of them"
+        if read[0] in self._grids():
+            instead = f"the grid {read[0]} is read"
+        else:
+            instead = f"the {'fastest' if hz > own_hz else 'slower'} streams are read"
+        return f"sampled at {own_hz:g} Hz, and {instead}, at {hz:g} Hz; daqsvc replay judges all of them"
 
     def _grids(self) -> set[str]:
         return {name for name in self._facts if not any(self._facts[name]["sensors"])}
@@ -167,7 +175,7 @@ class _Streams:
         if isinstance(self._wall_ns, int) and FIRST_NS <= self._wall_ns + begin_ns <= LAST_NS:
             cut[STATED_START] = np.array(iso_ns(self._wall_ns + begin_ns))
         units = {name: self._units[name] for name in entries if self._units.get(name)}
-        return Contents(cut, units=units, notes=self._notes)
+        return Contents(cut, units=units, notes=(*self._notes, *self._left_out(group, entries)))
 
 
 def _joined(blocks: list[SampleBlock], begin_ns: int, budget: Budget) -> NDArray[np.float32]:
