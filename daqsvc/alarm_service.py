@@ -621,7 +621,7 @@ class AlarmService:
         if len(having) > 1:
             names = ", ".join(one.identity.machine for one in having)
             raise CommandNotAllowedError(
-                f"{names} each have an alarm {command.alarm!r}: name the machine as well"
+                f"{names} each have an alarm {command.alarm!r}: name the machine as well (--machine)"
             )
         return having[0] if having else self.manager
 

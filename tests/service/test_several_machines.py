@@ -196,7 +196,10 @@ async def test_the_service_speaks_of_itself_once(tmp_path: Path, monkeypatch: py
             await asyncio.to_thread(ask_status, tmp_path / "store", "three")
         wish = partial(AlarmCommand, verb=Verb.BYPASS, by="the test")
         outcome = await service.alarms.execute(wish(alarm="rotor-fault"), "test")
-        assert outcome.reason == "one, two each have an alarm 'rotor-fault': name the machine as well"
+        assert (
+            outcome.reason
+            == "one, two each have an alarm 'rotor-fault': name the machine as well (--machine)"
+        )
         outcome = await service.alarms.execute(wish(alarm="rotor-fault", machine="two"), "test")
         assert outcome.accepted
         states = {
