@@ -19,7 +19,7 @@ import socket
 import stat
 import struct
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Protocol
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -29,6 +29,7 @@ from daqsvc.alarms.commands import (
     CommandMessage,
     CommandOutcome,
     DurationS,
+    JsonCommand,
     Line,
     Person,
     Reason,
@@ -65,6 +66,10 @@ STATUS_S = 10.0
 """How long it waits for the status, which waits for nothing but the processor."""
 RELOAD_S = 120.0
 """How long it waits for a reload, which may compile kernels."""
+LIVE_BUFFER_BYTES = 256 * 1024
+"""What is handed to the kernel for one who looks on, at most; more waits, or is left out."""
+MOST_LOOKING = 4
+"""Who may look on at a time: others have connections left for commands."""
 SNAPSHOT_S = 90_000.0
 """How long it waits for a snapshot, which is complete some time after it was asked for."""
 LONGEST_STATUS = 32 * 1024 * 1024
@@ -80,7 +85,8 @@ _RELOADS = {
 }
 """The questions, and whether nothing is to be changed."""
 _SNAPSHOT_VERB = b'{"schema": "daqsvc.control/1", "verb": "snapshot"'
-_QUESTIONS = "'status', 'reload' or 'snapshot'"
+_LIVE_VERB = b'{"schema": "daqsvc.control/1", "verb": "live"'
+_QUESTIONS = "'status', 'live', 'reload' or 'snapshot'"
 """Those that the documents tell of, as a person reads them."""
 _ANSWER: Literal["daqsvc.control-answer/1"] = "daqsvc.control-answer/1"
 
@@ -114,6 +120,17 @@ class ControlRequest(CommandMessage):
     occurrence: Annotated[Line, Field(min_length=1, max_length=100)] | None = None
     duration_s: DurationS | None = None
     reason: Reason = ""
+
+
+class LiveRequest(JsonCommand):
+    """Who asks to be told what passes of a machine; the samples of these streams and grids with it."""
+
+    model_config = ConfigDict(populate_by_name=True)
+
+    schema_: Literal["daqsvc.control/1"] = Field(alias="schema")
+    verb: Literal["live"]
+    machine: Annotated[Line, Field(max_length=200)] | None = None
+    streams: Annotated[tuple[Annotated[Line, Field(max_length=200)], ...], Field(strict=False)] = ()
 
 
 class ControlAnswer(BaseModel):
@@ -156,6 +173,26 @@ class Reload(Protocol):
         Raises:
             ReloadRefusedError: nothing was.
         """
+        ...
+
+
+class Looking(NamedTuple):
+    """One who looks on.
+
+    Attributes:
+        lines: waits for what comes next, lines of JSON; nothing at the end.
+        leave: ends it.
+    """
+
+    lines: Callable[[], Awaitable[bytes]]
+    leave: Callable[[], None]
+
+
+class Look(Protocol):
+    """See `daqsvc.service.Service.look`."""
+
+    def __call__(self, machine: str | None, streams: Collection[str]) -> Looking | tuple[str, ...]:
+        """Begin to look on; the names of all machines if there is no such one."""
         ...
 
 
@@ -249,6 +286,7 @@ class ControlServer:
             nobody may ask.
         files: what it reads then.
         snapshot: makes a snapshot. None if nobody may ask.
+        look: begins to tell what passes. None if nobody may ask.
     """
 
     def __init__(
@@ -262,6 +300,7 @@ class ControlServer:
         reload: Reload | None = None,
         files: Sequence[Path] = (),
         snapshot: TakeSnapshot | None = None,
+        look: Look | None = None,
     ) -> None:
         self.path = (runtime or store) / SOCKET
         self._link = None if runtime is None else store / SOCKET
@@ -273,6 +312,8 @@ class ControlServer:
         self._reload = reload
         self._files = tuple(f"{file.absolute()}" for file in files)
         self._snapshot = snapshot
+        self._look = look
+        self._looking = 0
         self._server: asyncio.Server | None = None
         self._inode: int | None = None
         self._refused = ""
@@ -413,15 +454,10 @@ class ControlServer:
         try:
             while (line := await _next_line(reader)) is not None:
                 client.busy = True
-                if self._status is not None and line.startswith(_STATUS_VERB):
-                    answer = await self._tell_status(self._status, line)
-                elif self._reload is not None and line.strip() in _RELOADS:
-                    told = await _reloaded(self._reload, dry_run=_RELOADS[line.strip()])
-                    answer = _json_line(told.model_copy(update={"files": self._files}))
-                elif self._snapshot is not None and line.startswith(_SNAPSHOT_VERB):
-                    answer = _json_line(await _snapshot_answer(self._snapshot, line, client.source))
-                else:
-                    answer = _json_line(await self._answer(line, client.source))
+                if self._look is not None and line.startswith(_LIVE_VERB):
+                    await self._tell_live(self._look, line, reader, writer)
+                    return
+                answer = await self._told(line, client.source)
                 client.busy = False
                 self._clients.append(self._clients.pop(self._clients.index(client)))
                 writer.write(answer)
@@ -443,6 +479,17 @@ class ControlServer:
             else:
                 writer.close()
 
+    async def _told(self, line: bytes, source: str) -> bytes:
+        """The answer to a question or a command."""
+        if self._status is not None and line.startswith(_STATUS_VERB):
+            return await self._tell_status(self._status, line)
+        if self._reload is not None and line.strip() in _RELOADS:
+            told = await _reloaded(self._reload, dry_run=_RELOADS[line.strip()])
+            return _json_line(told.model_copy(update={"files": self._files}))
+        if self._snapshot is not None and line.startswith(_SNAPSHOT_VERB):
+            return _json_line(await _snapshot_answer(self._snapshot, line, source))
+        return _json_line(await self._answer(line, source))
+
     async def _tell_status(
         self, status: Callable[[str | None], Awaitable[bytes | tuple[str, ...]]], line: bytes
     ) -> bytes:
@@ -457,6 +504,56 @@ class ControlServer:
         self.counters.malformed += asked is not None
         reason = "name a machine" if asked is None else f"this service does not watch {asked!r:.200}"
         return _json_line(WhichMachineAnswer(accepted=False, reason=reason, machines=told))
+
+    async def _tell_live(
+        self, look: Look, line: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> None:
+        """Tell one who looks on what passes, until it goes or nothing more comes."""
+        looking = self._begun_looking(look, line)
+        if isinstance(looking, ControlAnswer):
+            self.counters.malformed += 1
+            writer.write(_json_line(looking))
+            return
+        self._looking += 1
+        writer.transport.set_write_buffer_limits(high=LIVE_BUFFER_BYTES)
+        # Whatever the client still says: it is heard only that it goes.
+        gone = asyncio.create_task(reader.read(1), name="one who looks on goes")
+        try:
+            while not gone.done():
+                telling = asyncio.ensure_future(looking.lines())
+                await asyncio.wait({telling, gone}, return_when=asyncio.FIRST_COMPLETED)
+                if not telling.done():
+                    telling.cancel()
+                    await asyncio.wait({telling})
+                    return
+                if not (told := telling.result()):
+                    return
+                writer.write(told)
+                async with asyncio.timeout(PATIENCE_S):
+                    await writer.drain()
+        finally:
+            self._looking -= 1
+            looking.leave()
+            gone.cancel()
+            await asyncio.wait({gone})
+
+    def _begun_looking(self, look: Look, line: bytes) -> Looking | ControlAnswer:
+        """Begin to look at the machine that a request names, or say why not."""
+        try:
+            asked = LiveRequest.read(line)
+        except (ValueError, RecursionError) as error:
+            fault = faults_of(error, "it")[0] if isinstance(error, ValidationError) else f"{error}"
+            return ControlAnswer(accepted=False, reason=f"the request is not valid, {fault}"[:500])
+        machine = asked.machine
+        if self._looking >= MOST_LOOKING:
+            return ControlAnswer(
+                accepted=False, reason=f"{MOST_LOOKING} others look already; end one of them"
+            )
+        looking = look(machine, asked.streams)
+        if isinstance(looking, Looking):
+            return looking
+        reason = "name a machine" if machine is None else f"this service does not watch {machine!r:.200}"
+        return WhichMachineAnswer(accepted=False, reason=reason, machines=looking)
 
     async def _answer(self, line: bytes, source: str) -> ControlAnswer:
         if line.strip() == _QUESTION:

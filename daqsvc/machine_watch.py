@@ -12,6 +12,7 @@ from daqsvc.detectors.make import change_setpoints, detectors
 from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.diagnosis.snapshots import alignment, at_once, patience
 from daqsvc.diagnosis.statements import said_of_silence
+from daqsvc.live_feed import LiveFeed
 from daqsvc.recorder import MachineRecorder
 from daqsvc.settings.streams import Grid
 
@@ -50,6 +51,7 @@ class MachineWatch:
         standings: how each stream stands.
         pipeline: runs the detectors.
         recorder: records what comes and what is said; None if the machine file does not ask for it.
+        live: tells who looks on.
 
     Raises:
         AssemblyError: see `daqsvc.detectors.make.detectors`.
@@ -81,6 +83,7 @@ class MachineWatch:
             self.recorder = MachineRecorder(
                 machine, settings, store, clock, supervisor, lambda: self.pipeline.is_judging
             )
+        self.live = LiveFeed(machine, clock)
         self.rings = {grid.name: _ring(machine, grid, watching) for grid in grids}
         self.alignment = alignment(machine, clock, self.deliver)
         self.pipeline = Pipeline(
@@ -105,6 +108,7 @@ class MachineWatch:
             self.rings[block.stream].write(block)
             if self.recorder is not None:
                 self.recorder.block(block)
+            self.live.block(block)
             self.alignment.accept(block)
 
     def receiver(self, stream: str) -> Callable[[SampleBlock], None]:
@@ -120,6 +124,7 @@ class MachineWatch:
         self.standings[stream] = standing
         if self.recorder is not None:
             self.recorder.stand(stream, standing)
+        self.live.stand(stream, standing)
         for grid in self._grids:
             if stream in grid.streams:
                 standings = [self.standings[name] for name in grid.streams]
@@ -143,6 +148,8 @@ class MachineWatch:
         self.machine = machine
         if self.recorder is not None:
             self.recorder.change_machine(machine)
+        self.live.end()
+        self.live.machine = machine
         with self.supervisor.sparing_others("setpoints", "detectors judge by those of before"):
             change_setpoints(machine, self.pipeline.detectors)
 
@@ -161,6 +168,7 @@ class MachineWatch:
 
     def close(self) -> None:
         """No more samples come."""
+        self.live.end()
         for ring in self.rings.values():
             ring.close()
 

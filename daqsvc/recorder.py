@@ -22,8 +22,8 @@ from daqsvc.alarms.conditions import is_condition
 from daqsvc.alarms.events import ANNUNCIATIONS, AlarmEvent, Identity
 from daqsvc.diagnosis.memory import MemoryNotTakenError, taken_memory
 from daqsvc.diagnosis.record import Diagnosis
+from daqsvc.machine_facts import machine_values, stream_facts
 from daqsvc.publish.payloads import alarm_document, statement_document
-from daqsvc.settings.models import MachineFile
 from daqsvc.settings.registry import configured
 from daqsvc.settings.speed_signals import RPM, speed_signals
 from daqsvc.snapshots.contents import (
@@ -52,8 +52,8 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.standing import StreamState
     from daqsvc.diagnosis.detector import Detector
     from daqsvc.diagnosis.memory import DetectorMemory
+    from daqsvc.settings.models import MachineFile
     from daqsvc.settings.recorder import Recorder as RecorderTable
-    from daqsvc.settings.streams import Grid
     from daqsvc.snapshots.contents import Document
     from daqsvc.snapshots.writing import SnapshotWriter
     from daqsvc.supervision import Supervisor
@@ -674,7 +674,7 @@ class MachineRecorder:
         wall_ns = self._clock.wall_ns() - self._clock.monotonic_ns()
         alarms, standings = dict(self._kept.alarms), dict(self._kept.standings)
         known = self._kept.streams | {one.what.stream for one in before if isinstance(one.what, SampleBlock)}
-        streams = dict(self._streams())
+        streams = dict(stream_facts(self._machine))
         for item in before:
             if isinstance(item.what, AlarmEvent):
                 alarms[item.what.alarm] = item.what
@@ -697,24 +697,6 @@ class MachineRecorder:
             "standings": {name: one._asdict() for name, one in standings.items()},
             "alarms": [alarm_document(event) for event in alarms.values()],
         }
-
-    def _streams(self) -> Iterator[tuple[str, Document]]:
-        machine = self._machine
-        sensors = {(one.stream, one.channel): one for one in machine.sensors}
-        for name, stream in machine.streams.items():
-            names = stream.layout.channel_names
-            known = [sensors.get((name, channel)) for channel in names]
-            yield (
-                name,
-                {
-                    "rate_hz": stream.rate_hz,
-                    "channels": list(names),
-                    "sensors": ["" if one is None else one.name for one in known],
-                    "units": ["" if one is None else one.unit for one in known],
-                },
-            )
-        for grid in machine.grids:
-            yield grid.name, _of_grid(grid)
 
     def _write(self, snapshot: _Open, items: Iterable[_Item], *, is_over: bool) -> Path | None:
         """Write what has happened, and the end of the file if it is over; blocks.
@@ -807,28 +789,6 @@ class MachineRecorder:
                 return Entry(item.at_ns, Noted(STATES, {**about, **one.memory.document()}))
             case _Stands(stream, standing):
                 return Entry(item.at_ns, Noted(STANDING, {"stream": stream, **standing._asdict()}))
-
-
-def machine_values(machine: MachineFile) -> dict[str, Any]:
-    """What is in force of a machine file, as TOML would give it, but for outputs, store and recorder."""
-    others = {key for key in type(machine).model_fields if key not in MachineFile.model_fields}
-    values: dict[str, Any] = json.loads(
-        machine.model_dump_json(
-            serialize_as_any=True, exclude_unset=True, by_alias=True, exclude={*others, "store", "recorder"}
-        )
-    )
-    return values
-
-
-def _of_grid(grid: Grid) -> Document:
-    names = list(grid.channel_names)
-    nothing = ["" for _ in names]
-    return {
-        "rate_hz": grid.rate_hz,
-        "channels": names,
-        "sensors": nothing,
-        "units": nothing,
-    }
 
 
 def _paths(values: Any) -> Iterator[str]:

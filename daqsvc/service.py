@@ -16,7 +16,7 @@ from daqsvc.alarm_service import AlarmService
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.make import alarm_rule
 from daqsvc.alarms.manager import AlarmManager
-from daqsvc.control import ControlError, ControlServer, ReloadRefusedError, SnapshotNotMadeError
+from daqsvc.control import ControlError, ControlServer, Looking, ReloadRefusedError, SnapshotNotMadeError
 from daqsvc.diagnosis.pipeline import THREADS, KernelThreads, kernel_failed
 from daqsvc.driver_reports import DriverReports
 from daqsvc.machine_watch import MachineWatch
@@ -195,6 +195,7 @@ class Service:
             self.reload,
             files,
             self.snapshot,
+            self.look,
         )
 
     def _watch(self, box: Box, name: str) -> MachineWatch:
@@ -233,6 +234,16 @@ class Service:
             [machine] = self.reports
         report = self.reports.get(machine or "")
         return tuple(self.reports) if report is None else await report.line()
+
+    def look(self, machine: str | None, streams: Collection[str]) -> Looking | tuple[str, ...]:
+        """Begin to look at a machine, or the only one; the names of all if there is no such machine."""
+        name = next(iter(self.watches)) if machine is None and len(self.watches) == 1 else machine
+        watch = self.watches.get(name or "")
+        if watch is None or name is None:
+            return tuple(self.watches)
+        latest = self.reports[name].latest
+        looker = watch.live.look(streams, latest, self.alarms.newest(name), watch.standings)
+        return Looking(looker.lines, partial(watch.live.leave, looker))
 
     def _alarms_of(self, machine: MachineFile) -> AlarmManager:
         return AlarmManager(
@@ -547,6 +558,7 @@ class Service:
         self.reports[diagnosis.machine].remember(diagnosis)
         if (recorder := self.watches[diagnosis.machine].recorder) is not None:
             recorder.diagnosis(diagnosis)
+        self.watches[diagnosis.machine].live.diagnosis(diagnosis)
         with self.supervisor.sparing_others(
             f"alarms by {diagnosis.detector}", "one of its statements is lost"
         ):
@@ -558,8 +570,11 @@ class Service:
 
     def _record_alarm(self, event: AlarmEvent) -> None:
         watch = self.watches.get(event.identity.machine)
-        if watch is not None and watch.recorder is not None:
+        if watch is None:
+            return
+        if watch.recorder is not None:
             watch.recorder.alarm(event)
+        watch.live.alarm(event)
 
     def _bus_health(self) -> dict[str, BusHealth]:
         health: dict[str, BusHealth] = {}

@@ -108,6 +108,11 @@ class StatusReport:
         self._text = b""
         self._made_s = -math.inf
 
+    @property
+    def latest(self) -> list[Diagnosis]:
+        """What each detector has said last."""
+        return [*self._latest.values()]
+
     def remember(self, diagnosis: Diagnosis) -> None:
         """Keep a statement of a detector until its next one."""
         self._latest[diagnosis.detector] = diagnosis

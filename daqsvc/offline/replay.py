@@ -28,6 +28,7 @@ from daqsvc.alarms.manager import AlarmManager
 from daqsvc.diagnosis.memory import DetectorMemory, MemoryNotFittingError, put
 from daqsvc.diagnosis.pipeline import THREADS, KernelThreads, kernel_failed
 from daqsvc.diagnosis.statements import said_of_silence
+from daqsvc.machine_facts import machine_values
 from daqsvc.machine_watch import MachineWatch
 from daqsvc.publish.payloads import (
     alarm_document,
@@ -35,7 +36,6 @@ from daqsvc.publish.payloads import (
     recorded_statement,
     statement_document,
 )
-from daqsvc.recorder import machine_values
 from daqsvc.settings.load import machine_file_of
 from daqsvc.settings.problems import AssemblyError, MachineFileError
 from daqsvc.snapshots.contents import ALARMS, DIAGNOSES, FILES, MACHINE_JSON, STANDING, STATES, STORE, WINDOWS

@@ -137,7 +137,7 @@ async def test_the_client_and_the_server_understand_each_other(tmp_path: Path) -
         (wish(schema="daqsvc.control/2"), "schema"),
         (
             wish(verb="delete"),
-            "'unbypass'; or a question, as it is documented to the letter: 'status', 'reload'",
+            "'unbypass'; or a question, as it is documented to the letter: 'status', 'live', 'reload'",
         ),
         (wish(verb=None), "verb"),
         (wish(alarm=""), "alarm"),

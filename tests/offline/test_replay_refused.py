@@ -10,7 +10,7 @@ from support.recorded_rig import recorded_rig
 
 from daqsvc import __version__
 from daqsvc.offline.replay import ReplayError, replay
-from daqsvc.recorder import machine_values
+from daqsvc.machine_facts import machine_values
 from daqsvc.snapshots.contents import MACHINE_JSON, SCHEMA, Snapshot
 
 if TYPE_CHECKING:

@@ -1,0 +1,239 @@
+"""What passes of a machine, for who looks on: samples, statements, alarms. Nothing is made while nobody does.
+
+Who looks is told in lines of JSON. The first one is `LiveFeed.about`. Each further one has one key:
+``samples`` (of a stream, base64 of float32), ``statement``, ``alarm``, ``standing``, or ``left_out``: how
+many samples and other things were left out since the last line, as they were not taken fast enough.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+from collections import deque
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+
+import numpy as np
+from pydantic_core import to_json
+
+from daqsvc import __version__
+from daqsvc.acquisition.samples import SampleBlock
+from daqsvc.alarms.events import AlarmEvent
+from daqsvc.diagnosis.record import Diagnosis
+from daqsvc.machine_facts import machine_values, stream_facts
+from daqsvc.publish.payloads import alarm_document, statement_document
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Iterator, Mapping
+
+    from daqsvc.acquisition.clock import Clock
+    from daqsvc.acquisition.standing import StreamState
+    from daqsvc.settings.models import MachineFile
+
+SCHEMA = "daqsvc.live/1"
+GATHER_S = 0.05
+"""What comes in so short a time is told together."""
+MOST_WAITING_BYTES = 4_000_000
+"""Samples that wait for one who looks."""
+MOST_WAITING = 2000
+"""Likewise items of every kind."""
+
+
+class _Stands(NamedTuple):
+    stream: str
+    standing: StreamState
+
+
+_Happened: TypeAlias = "SampleBlock | Diagnosis | AlarmEvent | _Stands"
+
+
+class Looker:
+    """One who looks on.
+
+    Args:
+        about: the first line.
+        streams: those whose samples are wanted.
+    """
+
+    def __init__(self, about: bytes, streams: Collection[str]) -> None:
+        self.streams = frozenset(streams)
+        self._lines = [about]
+        self._waiting: deque[_Happened] = deque()
+        self._bytes = 0
+        self._left_out = 0
+        self._has_come = asyncio.Event()
+        self._is_over = False
+
+    def take(self, happened: _Happened) -> None:
+        """Have it wait until it is told."""
+        size = happened.samples.nbytes if isinstance(happened, SampleBlock) else 0
+        if len(self._waiting) >= MOST_WAITING or self._bytes + size > MOST_WAITING_BYTES:
+            self._left_out += len(happened.samples) if isinstance(happened, SampleBlock) else 1
+        else:
+            self._waiting.append(happened)
+            self._bytes += size
+        self._has_come.set()
+
+    def end(self) -> None:
+        """No more comes: the machine is watched otherwise from now on, or not at all."""
+        self._is_over = True
+        self._has_come.set()
+
+    async def lines(self) -> bytes:
+        """What has come since, as lines; waits until there is something. Nothing at the end."""
+        if not self._lines:
+            await self._has_come.wait()
+            if not self._is_over:
+                await asyncio.sleep(GATHER_S)
+        told, self._lines = self._lines, []
+        items, self._waiting, self._bytes = self._waiting, deque(), 0
+        left_out, self._left_out = self._left_out, 0
+        self._has_come.clear()
+        if self._is_over:
+            self._has_come.set()
+        told += map(_line, _told(items))
+        if left_out:
+            told.append(_line({"left_out": left_out}))
+        return b"".join(told)
+
+
+class LiveFeed:
+    """What passes of one machine, and those who look on.
+
+    Args:
+        machine: the machine file.
+        clock: the service's clock.
+    """
+
+    def __init__(self, machine: MachineFile, clock: Clock) -> None:
+        self.machine = machine
+        self._clock = clock
+        self._lookers: set[Looker] = set()
+
+    def about(
+        self,
+        statements: Iterable[Diagnosis],
+        alarms: Iterable[AlarmEvent],
+        standings: Mapping[str, StreamState],
+    ) -> dict[str, Any]:
+        """Whose machine it is, what comes of it, and how it stands.
+
+        Args:
+            statements: what each detector has said last.
+            alarms: the last event of each alarm.
+            standings: how each stream stands.
+        """
+        machine = self.machine
+        return {
+            "schema": SCHEMA,
+            "version": __version__,
+            "site": machine.site,
+            "box": machine.box,
+            "machine": machine.machine.name,
+            "monotonic_ns": self._clock.monotonic_ns(),
+            "wall_ns_at_0": self._clock.wall_ns() - self._clock.monotonic_ns(),
+            "streams": dict(stream_facts(machine)),
+            "values": machine_values(machine),
+            "statements": [statement_document(one) for one in statements],
+            "alarms": [alarm_document(one) for one in alarms],
+            "standings": {name: one._asdict() for name, one in standings.items()},
+        }
+
+    def look(
+        self,
+        streams: Collection[str],
+        statements: Iterable[Diagnosis],
+        alarms: Iterable[AlarmEvent],
+        standings: Mapping[str, StreamState],
+    ) -> Looker:
+        """Begin to look on.
+
+        Args:
+            streams: streams or grids whose samples are wanted.
+            statements: see `about`.
+            alarms: see `about`.
+            standings: see `about`.
+        """
+        looker = Looker(_line(self.about(statements, alarms, standings)), streams)
+        self._lookers.add(looker)
+        return looker
+
+    def leave(self, looker: Looker) -> None:
+        """It looks no more."""
+        self._lookers.discard(looker)
+
+    def block(self, block: SampleBlock) -> None:
+        """Samples have come, of a stream or a grid."""
+        for looker in self._lookers:
+            if block.stream in looker.streams:
+                looker.take(block)
+
+    def diagnosis(self, diagnosis: Diagnosis) -> None:
+        """A detector has said something."""
+        self._tell(diagnosis)
+
+    def alarm(self, event: AlarmEvent) -> None:
+        """An alarm has changed."""
+        self._tell(event)
+
+    def stand(self, stream: str, standing: StreamState) -> None:
+        """A stream stands otherwise."""
+        self._tell(_Stands(stream, standing))
+
+    def end(self) -> None:
+        """The machine is watched no more, or otherwise: who looks is to look anew."""
+        for looker in self._lookers:
+            looker.end()
+        self._lookers.clear()
+
+    def _tell(self, happened: _Happened) -> None:
+        for looker in self._lookers:
+            looker.take(happened)
+
+
+def _told(items: Iterable[_Happened]) -> Iterator[dict[str, Any]]:
+    """Each thing that has happened; blocks of a stream that go on from each other are one."""
+    held: dict[str, list[SampleBlock]] = {}
+    for item in items:
+        if isinstance(item, SampleBlock):
+            blocks = held.setdefault(item.stream, [])
+            if blocks and not _goes_on(blocks[-1], item):
+                yield _samples(blocks)
+                blocks.clear()
+            blocks.append(item)
+        elif isinstance(item, Diagnosis):
+            yield {"statement": statement_document(item)}
+        elif isinstance(item, AlarmEvent):
+            yield {"alarm": alarm_document(item)}
+        else:
+            yield {"standing": {"stream": item.stream, **item.standing._asdict()}}
+    for blocks in held.values():
+        if blocks:
+            yield _samples(blocks)
+
+
+def _goes_on(before: SampleBlock, block: SampleBlock) -> bool:
+    return block.first_index == before.end_index and block.quality == before.quality
+
+
+def _samples(blocks: list[SampleBlock]) -> dict[str, Any]:
+    """Blocks that go on from each other, with the time of the newest one's first sample counted back."""
+    first, last = blocks[0], blocks[-1]
+    rows = np.concatenate([block.samples for block in blocks]).astype("<f4")
+    before = len(rows) - len(last.samples)
+    return {
+        "samples": {
+            "stream": first.stream,
+            "first_index": first.first_index,
+            "t_first_ns": last.t_first_ns - round(before * last.period_ns),
+            "period_ns": last.period_ns,
+            "lost_before": first.lost_before,
+            "quality": int(last.quality),
+            "shape": list(rows.shape),
+            "values": base64.b64encode(rows.tobytes()).decode(),
+        }
+    }
+
+
+def _line(document: dict[str, Any]) -> bytes:
+    # What JSON has no number for is null, as in all that the service publishes.
+    return to_json(document, inf_nan_mode="null") + b"\n"

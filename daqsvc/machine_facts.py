@@ -1,0 +1,49 @@
+"""What others are told of a machine: its streams, and the machine file that is in force."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+from daqsvc.settings.models import MachineFile
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from daqsvc.settings.streams import Grid
+
+
+def machine_values(machine: MachineFile) -> dict[str, Any]:
+    """What is in force of a machine file, as TOML would give it, but for outputs, store and recorder."""
+    others = {key for key in type(machine).model_fields if key not in MachineFile.model_fields}
+    values: dict[str, Any] = json.loads(
+        machine.model_dump_json(
+            serialize_as_any=True, exclude_unset=True, by_alias=True, exclude={*others, "store", "recorder"}
+        )
+    )
+    return values
+
+
+def stream_facts(machine: MachineFile) -> Iterator[tuple[str, dict[str, Any]]]:
+    """By stream and grid its rate, its channels, and the sensor and unit of each channel; "" for none."""
+    sensors = {(one.stream, one.channel): one for one in machine.sensors}
+    for name, stream in machine.streams.items():
+        names = stream.layout.channel_names
+        known = [sensors.get((name, channel)) for channel in names]
+        yield (
+            name,
+            {
+                "rate_hz": stream.rate_hz,
+                "channels": list(names),
+                "sensors": ["" if one is None else one.name for one in known],
+                "units": ["" if one is None else one.unit for one in known],
+            },
+        )
+    for grid in machine.grids:
+        yield grid.name, _of_grid(grid)
+
+
+def _of_grid(grid: Grid) -> dict[str, Any]:
+    names = list(grid.channel_names)
+    nothing = ["" for _ in names]
+    return {"rate_hz": grid.rate_hz, "channels": names, "sensors": nothing, "units": nothing}
