@@ -75,7 +75,8 @@ class MetricsOutput(Output, Collector):
         self._find_stalled = port.stalls.hold_to(STALLED_S, unhealthy)
         self._stalled: list[str] = []
         self._looked_s = time.monotonic()
-        self._registry = CollectorRegistry()
+        # What it collects depends on the machine files: a filter (name[]=) must ask it by its samples.
+        self._registry = CollectorRegistry(support_collectors_without_names=True)
         self._registry.register(self)
         ProcessCollector(registry=self._registry)
 

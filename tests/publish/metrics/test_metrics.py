@@ -170,6 +170,20 @@ async def test_what_the_service_counts_is_what_prometheus_gets(tmp_path: Path) -
     assert abs(time.time() - spoke_s) < PATIENCE_S
 
 
+async def test_who_asks_for_some_metrics_gets_these(tmp_path: Path) -> None:
+    port = free_port()
+    async with serving(tmp_path, port) as output:
+        output.status(figures(tmp_path))
+        await eventually(lambda: output._link.state == "up", "it is served")
+        asked = "/metrics?name[]=daqsvc_bus_up&name[]=daqsvc_part_failures_total&name[]=process_open_fds"
+        found = samples((await asyncio.to_thread(get, port, asked))[1])
+    assert {name for name, _ in found} == {
+        "daqsvc_bus_up",
+        "daqsvc_part_failures_total",
+        "process_open_fds",
+    }
+
+
 async def test_promtool_has_nothing_against_the_metrics(tmp_path: Path) -> None:
     text = await served(tmp_path)
     command = [program("promtool"), "check", "metrics"]
