@@ -67,6 +67,7 @@ class ProcessGuard:
         self._end_process = end
         self._stop: Callable[[], None] | None = None
         self._reload: Callable[[], object] | None = None
+        self._reload_asked = False
         self._loop: asyncio.AbstractEventLoop | None = None
         self._close: Callable[[float], bool] | None = None
         self._main = threading.get_ident()
@@ -118,8 +119,12 @@ class ProcessGuard:
             stop()
 
     def reload_by(self, reload: Callable[[], object]) -> None:
-        """Say what SIGHUP has done on the event loop; called there."""
+        """Say what SIGHUP has done on the event loop; called there. One that came before is obeyed now."""
         self._reload = reload
+        # In this order, as `_hear` has the other: one that comes right now is rather obeyed twice than never.
+        if self._reload_asked:
+            self._reload_asked = False
+            reload()
 
     def protect(self, close: Callable[[float], bool]) -> None:
         """Say what must be done before the process may be ended by force.
@@ -203,11 +208,17 @@ class ProcessGuard:
         elif number == signal.SIGHUP:
             if any(_is_gone(fd) for fd in self._terminals):
                 self.lose_terminal("the terminal is gone")
-            elif self._reload is not None and self._loop is not None:
-                with contextlib.suppress(RuntimeError):  # the loop is closed already
-                    self._loop.call_soon_threadsafe(self._reload)
             else:
-                log.warning("SIGHUP is ignored: the service starts, and has just read its machine files")
+                self._hear_reload()
+
+    def _hear_reload(self) -> None:
+        is_first, self._reload_asked = not self._reload_asked, True
+        if self._reload is not None and self._loop is not None:
+            self._reload_asked = False
+            with contextlib.suppress(RuntimeError):  # the loop is closed already
+                self._loop.call_soon_threadsafe(self._reload)
+        elif is_first:
+            log.warning("SIGHUP: the service starts; it reads its machine files again when it is ready")
 
     def _ask_to_stop(self, why: str) -> None:
         if self._turns_stopping is not None:

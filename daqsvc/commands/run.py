@@ -91,13 +91,14 @@ class RunCommand:
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `daqsvc.cli.Command.run`."""
-        from daqsvc.kernel_compiler import compile_apart  # noqa: PLC0415 - each verb imports only what it needs
-
         share_heaps()
         manager = ServiceManager.of_environment()
         handler = LogThread(STDERR)
         self._start_logging(verbose=arguments.verbose, handler=handler)
         try:
+            manager.starting()
+            from daqsvc.kernel_compiler import compile_apart  # noqa: PLC0415 - each verb imports only what it needs
+
             box = load_box(arguments.files, self._load)
             if box is None:
                 return EXIT_USAGE

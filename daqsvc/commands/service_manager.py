@@ -10,6 +10,7 @@ import asyncio
 import logging
 import os
 import socket
+import threading
 import time
 from collections import Counter
 from typing import TYPE_CHECKING, Self
@@ -53,12 +54,21 @@ class ServiceManager:
     Args:
         address: ``$NOTIFY_SOCKET``: a path, or ``@`` and the name of an abstract socket; empty for nobody.
         watchdog_s: how soon the service is ended that is silent; None if nobody waits for it.
+
+    Attributes:
+        is_ready: whether it has been told that the service is ready.
+        begun_s: when `starting` was called, by the monotonic clock; None if it was not.
     """
 
     def __init__(self, address: str = "", watchdog_s: float | None = None) -> None:
         self.watchdog_s = watchdog_s if address else None
         self._address = f"\0{address[1:]}" if address.startswith("@") else address
+        self.is_ready = False
+        self.begun_s: float | None = None
         self._stopping = False
+        self._says_reloading = False
+        self._starting: threading.Thread | None = None
+        self._started = threading.Event()
         self._socket: socket.socket | None = None
         if address:
             self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
@@ -85,6 +95,7 @@ class ServiceManager:
 
     def close(self) -> None:
         """Tell nothing more."""
+        self._end_starting()
         if self._socket is not None:
             self._socket.close()
 
@@ -100,16 +111,48 @@ class ServiceManager:
             return False
         return True
 
+    def starting(self) -> None:
+        """The process begins to start: ask for time from now on, until `follow` does.
+
+        On a thread, for imports and kernels block the main one for minutes on a small box. Time is asked for
+        `START_MOST_S` at most: a start that hangs is ended by systemd soon after.
+        """
+        if self._socket is None or self.begun_s is not None:
+            return
+        self.begun_s = time.monotonic()
+        self._starting = threading.Thread(target=self._ask_for_time, name="service manager", daemon=True)
+        self._starting.start()
+
+    def _ask_for_time(self) -> None:
+        asked = 0
+        while not (self._started.is_set() or self._stopping) and asked * EXTEND_EVERY_S < START_MOST_S:
+            self.tell(STATUS=STARTING, EXTEND_TIMEOUT_USEC=round(EXTEND_BY_S * US_PER_S))
+            asked += 1
+            self._started.wait(EXTEND_EVERY_S)
+
+    def _end_starting(self) -> None:
+        self._started.set()
+        starting, self._starting = self._starting, None
+        if starting is not None:
+            starting.join(2 * SEND_S)
+
     def reloading(self, *, begins: bool) -> None:
-        """The service goes over to other machine files, or has done so."""
-        if begins:
+        """The service goes over to other machine files, or has done so.
+
+        Before it is ready only in words: ``READY=1`` at the end would tell that it is, whatever it waits for.
+        """
+        if begins and self.is_ready:
+            self._says_reloading = True
             self.tell(RELOADING=1, MONOTONIC_USEC=time.monotonic_ns() // 1000, STATUS="reloading")
-        else:
+        elif self._says_reloading:
+            self._says_reloading = False
             self.tell(READY=1, STATUS="reloaded")
+        else:
+            self.tell(STATUS="reloading" if begins else "reloaded")
 
     def stopping(self) -> None:
         """The service stops; from any thread."""
-        self._stopping = True
+        self._stopping = True  # no lock: it may be called while a signal interrupts anything
         self.tell(STOPPING=1, STATUS="stopping")
 
     async def follow(self, service: Service) -> None:
@@ -120,6 +163,7 @@ class ServiceManager:
         """
         if self._socket is None:
             return
+        self._end_starting()
         follower = _Follower(self, service)
         while not self._stopping:
             follower.look(asyncio.get_running_loop().time())
@@ -136,9 +180,8 @@ class _Follower:
         if manager.watchdog_s is not None:
             then = "the service manager is told nothing more, and starts the service again"
             self._stalled = service.stalls.hold_to(max(manager.watchdog_s, LEAST_WATCH_S), then)
-        self._begun_s: float | None = None
+        self._begun_s = manager.begun_s
         self._serving_since_s = 0.0
-        self._is_ready = False
         self._alive_s = self._extended_s = self._told_s = self._refreshed_s = float("-inf")
         self._told = ""
 
@@ -152,10 +195,11 @@ class _Follower:
             self._extend(now_s, gets_on=now_s - self._begun_s < START_MOST_S)
             return
         gets_on = self._stalled is None or not self._stalled(now_s)
-        if not self._is_ready:
+        if not self._manager.is_ready:
             awaited = service.awaited(patient=now_s - self._serving_since_s < TRIED_S)
             if not awaited:
-                self._is_ready = self._manager.tell(READY=1, STATUS="; ".join(_in_short(service)))
+                text = "; ".join(filter(None, _in_short(service)))
+                self._manager.is_ready = self._manager.tell(READY=1, STATUS=text)
             else:
                 text = f"waiting for {', '.join(f'bus {bus}: {why}' for bus, why in awaited.items())}"
                 self._status(text, text, now_s)
@@ -176,7 +220,7 @@ class _Follower:
         is_new = standing != self._told and now_s - self._told_s >= CHANGE_S
         if not is_new and now_s - self._refreshed_s < REFRESH_S:
             return
-        if self._manager.tell(STATUS=standing if figures == standing else f"{standing}; {figures}"):
+        if self._manager.tell(STATUS=standing if figures in {standing, ""} else f"{standing}; {figures}"):
             self._told, self._told_s, self._refreshed_s = standing, now_s, now_s
 
 
@@ -202,5 +246,8 @@ def _in_short(service: Service) -> tuple[str, str]:
             why = f" ({output.reason[:LONGEST_REASON]})" * bool(output.reason)
             said.append("broker connected" if figures["connected"] else f"broker not connected{why}")
     messages = outbox.depth + outbox.waiting
-    wait = "1 alarm message waits" if messages == 1 else f"{messages} alarm messages wait"
-    return "; ".join(said), f"{wait} for the broker"
+    what = "1 alarm message" if messages == 1 else f"{messages} alarm messages"
+    if "mqtt" in service.alarms.outputs:
+        return "; ".join(said), f"{what} wait{'s' * (messages == 1)} for the broker"
+    # Without one they are kept for a broker that a later machine file may name.
+    return "; ".join(said), f"{what} kept for a broker" if messages else ""

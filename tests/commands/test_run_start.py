@@ -10,9 +10,12 @@ import sys
 from types import SimpleNamespace
 
 import pytest
+from support.notify_sockets import NotifySocket
+from support.waiting import eventually
 
 import daqsvc.service
 from daqsvc.commands import early_signals, run
+from daqsvc.commands.process_guard import ProcessGuard
 from daqsvc.commands.service_manager import ServiceManager
 from daqsvc.control import ReloadRefusedError
 from daqsvc.outbox.files import is_possessed
@@ -50,7 +53,7 @@ async def test_what_the_start_has_made_is_not_looked_through_for_garbage_again(m
     finally:
         gc.unfreeze()
     assert frozen[1] > frozen[0] + 1000
-    assert len(reloads) == 1, "SIGHUP is obeyed from the start on, not before"
+    assert len(reloads) == 1, "SIGHUP is obeyed when the service is ready"
 
 
 async def test_however_often_sighup_comes_meanwhile_the_files_are_read_once_more(caplog):
@@ -74,6 +77,41 @@ async def test_however_often_sighup_comes_meanwhile_the_files_are_read_once_more
     await reloader.part.over
     assert len(reloads) == 3
     assert caplog.text.count("SIGHUP: the machine files say nothing different") == 3
+
+
+async def test_a_hang_up_while_the_service_starts_is_obeyed_once_when_it_is_ready(caplog):
+    """The machine files may have changed since they were read."""
+    reloads = []
+    guard = ProcessGuard()
+    guard._terminals = []
+    with guard:
+        guard.stop_by(asyncio.get_running_loop(), lambda: None)
+        for _ in range(3):
+            guard._hear(signal.SIGHUP)
+        assert reloads == []
+        guard.reload_by(lambda: reloads.append("at once"))
+        assert reloads == ["at once"]
+        guard._hear(signal.SIGHUP)
+        await eventually(lambda: len(reloads) == 2, "it is obeyed as ever")
+    said = "SIGHUP: the service starts; it reads its machine files again when it is ready"
+    assert [record.getMessage() for record in caplog.records] == [said]
+
+
+def test_systemd_is_asked_for_time_before_anything_that_takes_long(monkeypatch, tmp_path):
+    """Kernels compile for minutes on a small box, and its TimeoutStartSec is one minute."""
+    with NotifySocket(tmp_path) as systemd:
+        monkeypatch.setenv("NOTIFY_SOCKET", systemd.address)
+        told = []
+
+        def load_box(*_):
+            told.append(systemd.next())
+
+        monkeypatch.setattr(run, "load_box", load_box)
+        monkeypatch.setattr(run, "LogThread", lambda _: SimpleNamespace(flush_within=lambda _: None))
+        command = run.RunCommand(lambda _: None, lambda **_: None)
+        assert command.run(SimpleNamespace(files=[], store=None, verbose=False)) == 2
+    assert "EXTEND_TIMEOUT_USEC" in told[0]
+    assert told[0]["STATUS"].startswith("starting: ")
 
 
 def test_a_hang_up_that_comes_before_the_service_has_its_handlers_ends_nothing():

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from support.notify_sockets import NotifySocket
 
+from daqsvc.commands import service_manager
 from daqsvc.commands.service_manager import ServiceManager, _Follower
 from daqsvc.supervision import Progress, StallWatch
 
@@ -125,6 +126,115 @@ def test_a_watchdog_that_is_too_short_or_no_number_is_warned_of_once(
     assert warning in caplog.text
 
 
+def served(stalls: StallWatch, awaited: dict[str, str] | None = None, depth: int = 0) -> Any:
+    """A service that runs."""
+    outbox = SimpleNamespace(counters=SimpleNamespace(shut=0, unbacked=0, depth=depth, waiting=0))
+    return SimpleNamespace(
+        ready=SimpleNamespace(is_set=lambda: True),
+        awaited=lambda *, patient: awaited or {},
+        stalls=stalls,
+        driver_reports=[],
+        alarms=SimpleNamespace(managers={}, outbox=outbox, outputs={}),
+    )
+
+
+def telling(manager: ServiceManager, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, object]]:
+    """What a manager is going to tell."""
+    told: list[dict[str, object]] = []
+    monkeypatch.setattr(manager, "tell", lambda **one: told.append(one) or True)
+    return told
+
+
+def test_a_reload_before_the_service_is_ready_does_not_make_it_ready(monkeypatch: pytest.MonkeyPatch) -> None:
+    """systemd would wait for no bus any more, and then for signs of life that nobody gives."""
+    awaited = {"can0": "no samples have come yet"}
+    manager = ServiceManager("@nobody", 5.0)
+    told = telling(manager, monkeypatch)
+    follower = _Follower(manager, served(StallWatch(dict), awaited))
+    follower.look(0.0)
+    manager.reloading(begins=True)
+    manager.reloading(begins=False)
+    follower.look(20.0)
+    assert not any({"READY", "RELOADING", "WATCHDOG"} & one.keys() for one in told)
+    assert [one["STATUS"] for one in told if "STATUS" in one][1:3] == ["reloading", "reloaded"]
+    # The bus may come while machine files are gone over to: then the end of that is nobody's business.
+    manager.reloading(begins=True)
+    awaited.clear()
+    follower.look(21.0)
+    manager.reloading(begins=False)
+    assert [one.get("READY") for one in told if "READY" in one] == [1]
+    assert {"WATCHDOG": 1} in told
+    manager.close()
+
+
+def test_a_reload_of_a_service_that_is_ready_is_told_and_its_watchdog_fed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    awaited: dict[str, str] = {}
+    manager = ServiceManager("@nobody", 5.0)
+    told = telling(manager, monkeypatch)
+    follower = _Follower(manager, served(StallWatch(dict), awaited))
+    follower.look(0.0)
+    manager.reloading(begins=True)
+    assert told[-1]["RELOADING"] == 1
+    awaited["can1"] = "no samples have come yet"
+    manager.reloading(begins=False)
+    assert told[-1]["READY"] == 1
+    told.clear()
+    for second in range(1, 10):
+        follower.look(float(second))
+    assert sum("WATCHDOG" in one for one in told) >= 3, "also while a bus is awaited that the reload brought"
+    manager.close()
+
+
+def test_time_is_asked_for_from_the_beginning_until_the_service_is_followed_and_not_for_ever(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(service_manager, "EXTEND_EVERY_S", 0.01)
+    monkeypatch.setattr(service_manager, "START_MOST_S", 0.03)
+    with NotifySocket(tmp_path) as systemd:
+        manager = ServiceManager(systemd.address)
+        manager.starting()
+        assert manager._starting is not None
+        # Nothing of the service is there yet; whatever hangs then is not waited for without end.
+        manager._starting.join()
+        for _ in range(3):
+            told = systemd.next()
+            assert told is not None
+            assert told["STATUS"].startswith("starting: ")
+            assert told["EXTEND_TIMEOUT_USEC"] == "30000000"
+        assert systemd.next(0.0) is None
+        manager.close()
+
+        manager = ServiceManager(systemd.address)
+        monkeypatch.setattr(service_manager, "START_MOST_S", 1e9)
+        manager.starting()
+        systemd.until("EXTEND_TIMEOUT_USEC")
+        thread = manager._starting
+        manager._end_starting()
+        assert thread is not None
+        thread.join()
+        manager.close()
+
+
+@pytest.mark.parametrize(
+    ("outputs", "depth", "said"),
+    [
+        ((), 7, "7 alarm messages kept for a broker"),
+        ((), 1, "1 alarm message kept for a broker"),
+        ((), 0, ""),
+        (("mqtt",), 7, "7 alarm messages wait for the broker"),
+        (("mqtt",), 1, "1 alarm message waits for the broker"),
+    ],
+)
+def test_the_status_names_no_broker_that_there_is_not(
+    outputs: tuple[str, ...], depth: int, said: str
+) -> None:
+    service = served(StallWatch(dict), depth=depth)
+    service.alarms.outputs = dict.fromkeys(outputs, SimpleNamespace(figures=dict))
+    assert service_manager._in_short(service) == ("0 of 0 buses up; alarms: none", said)
+
+
 @pytest.mark.parametrize(("watchdog_s", "held_to_s"), [(0.5, 3.0), (3.0, 3.0), (5.0, 5.0)])
 def test_parts_are_held_to_the_watchdog_but_to_three_seconds_at_least(
     watchdog_s: float, held_to_s: float, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
@@ -132,15 +242,7 @@ def test_parts_are_held_to_the_watchdog_but_to_three_seconds_at_least(
     fed: list[bool] = []
     manager = ServiceManager("@nobody", watchdog_s)
     monkeypatch.setattr(manager, "tell", lambda **told: fed.append("WATCHDOG" in told) or True)
-    outbox = SimpleNamespace(counters=SimpleNamespace(shut=0, unbacked=0, depth=0, waiting=0))
-    service: Any = SimpleNamespace(
-        ready=SimpleNamespace(is_set=lambda: True),
-        awaited=lambda *, patient: {},
-        stalls=StallWatch(lambda: {"part": Progress(1)}),
-        driver_reports=[],
-        alarms=SimpleNamespace(managers={}, outbox=outbox, outputs={}),
-    )
-    follower = _Follower(manager, service)
+    follower = _Follower(manager, served(StallWatch(lambda: {"part": Progress(1)})))
     every_s, last_s = 0.25, 0.0
     for look in range(40):
         fed.clear()
