@@ -167,6 +167,17 @@ def test_uff_spectra_are_no_channels(tmp_path):
         load_recording(path)
 
 
+@pytest.mark.parametrize("binary", [0, 1])
+@pytest.mark.parametrize(("part", "cut"), [(0.3, 1), (0.8, 2), (1.0, 2)])
+def test_a_uff_that_is_cut_is_said_to_be(tmp_path, binary, part, cut):
+    path = tmp_path / "rig.uff"
+    write_uff_of(path, CHANNELS, RATE_HZ, "g", binary=binary)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(part * len(whole)) - 2])
+    with pytest.raises(RecordingError, match=f"data set {cut} of it begins and does not end; it is cut"):
+        load_recording(path)
+
+
 # HDF5.
 
 

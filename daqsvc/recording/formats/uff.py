@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 import re
 from typing import TYPE_CHECKING, Any
 
@@ -45,6 +46,9 @@ _STEP_DIGITS = 6
 EXACT = re.compile(rf"(?:{STATED_START} = (\S+), )?{STATED_RATE} = ([\d.e+-]+)")
 """What `daqsvc export` says in the fourth header line: begin and rate with all their digits."""
 
+_MARK = re.compile(rb"    -1(?=[\r\n]| {74}|\Z)")
+"""The line that begins a data set, and the one that ends it, as pyuff finds them."""
+
 _EXPANSION = 2
 """A number of four bytes becomes one of eight."""
 
@@ -53,6 +57,7 @@ def read_uff(path: Path, budget: Budget) -> Contents:
     """Time responses by the first line of their headers, or by node and direction."""
     pyuff = needed(path, "pyuff", "pyuff")
     budget.check_declared(_EXPANSION * budget.file_bytes)
+    _check_ends(path)
     file = pyuff.UFF(str(path))
     numbers = [i for i, kind in enumerate(file.get_set_types()) if int(kind) == FUNCTION]
     if not numbers:
@@ -87,6 +92,24 @@ def read_uff(path: Path, budget: Budget) -> Contents:
     if start := (exact and exact[1]) or _text(sets[0].get("id3")):
         entries.setdefault(STATED_START, np.array(start))
     return Contents(entries, rates_hz=rates_hz, times=times, units=units, starts_ns=starts_ns)
+
+
+def _check_ends(path: Path) -> None:
+    """See whether each data set ends, as pyuff leaves out the one that does not.
+
+    Raises:
+        RecordingError: one does not.
+    """
+    with path.open("rb") as file:
+        if not file.seek(0, 2):
+            return
+        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            marks = sum(1 for _ in _MARK.finditer(content))
+    if marks % 2:
+        raise RecordingError(
+            f"{path} cannot be read: data set {marks // 2 + 1} of it begins and does not end; it is cut: "
+            "copy or save it anew"
+        )
 
 
 def _without_abscissa(one: dict[str, Any]) -> dict[str, Any]:
