@@ -28,6 +28,7 @@ from daqsvc.settings.registry import configured
 from daqsvc.settings.speed_signals import RPM, speed_signals
 from daqsvc.snapshots.contents import (
     ALARMS,
+    CAUSES,
     DIAGNOSES,
     FILES,
     MACHINE_JSON,
@@ -71,6 +72,7 @@ MOST_WAITING_BYTES = 64_000_000
 """Samples that wait for a disk that is slow, at most, beside those that the history holds anyway."""
 MOST_WAITING = 50_000
 """Likewise items of every kind."""
+SCHEDULED = "scheduled"
 MOST_CAUSES = 100
 """Of one snapshot that are written down."""
 MEMORY_EVERY_NS = 5 * NS_PER_S
@@ -150,7 +152,14 @@ class _Remembered(NamedTuple):
     memory: DetectorMemory
 
 
-_Happened: TypeAlias = "SampleBlock | Diagnosis | AlarmEvent | _Read | _Stands | _Remembered"
+class _Caused(NamedTuple):
+    """There was a further cause for a file that is being written."""
+
+    kind: Kind
+    words: str
+
+
+_Happened: TypeAlias = "SampleBlock | Diagnosis | AlarmEvent | _Read | _Stands | _Remembered | _Caused"
 
 
 class _Item(NamedTuple):
@@ -169,29 +178,31 @@ class _Open:
         cause_ns: when there was cause to begin it.
         begin_ns: its begin.
         until_ns: its end, as it looks now.
-        causes: in words.
         machine: the machine file that was in force.
-        about: its first message, but for the causes.
+        about: its first message.
         waiting: what is to be written to it.
+        causes: how many there are so far.
         came_bytes: the samples among that, but for those that the history had.
         asked: who waits for it.
         writing: what a thread is writing now; its file, if that is complete then.
         writer: its file; None before that is open.
+        last: what was handed out last of what waited.
     """
 
     kind: Kind
     cause_ns: int
     begin_ns: int
     until_ns: int
-    causes: list[str]
     machine: MachineFile
     about: Document
     waiting: list[_Item]
+    causes: int = 1
     came_bytes: int = 0
     _held: int = field(init=False)
     asked: list[asyncio.Future[Path]] = field(default_factory=list)
     writing: asyncio.Future[Path | None] | None = None
     writer: SnapshotWriter | None = None
+    last: _Item | None = None
 
     def __post_init__(self) -> None:
         self._held = len(self.waiting)
@@ -209,7 +220,13 @@ class _Open:
         """What waits, as far as an end; nothing waits then."""
         taken, self.waiting = self.waiting[:end], []
         self.came_bytes = self._held = 0
+        if taken:
+            self.last = taken[-1]
         return taken
+
+    def go_on(self, missed: list[_Item], until_ns: int) -> None:
+        """Have it last longer when it was over; what it has missed meanwhile is in the history anyway."""
+        self.waiting, self.until_ns, self._held = missed, until_ns, len(missed)
 
     def answer(self, outcome: Path | SnapshotRefusedError) -> None:
         """Tell those who wait for it what has come of it."""
@@ -290,6 +307,8 @@ class MachineRecorder:
         """The snapshot that further causes make longer."""
         self._ending: list[_Open] = []
         """Snapshots that are as long as they may be, and wait for detectors."""
+        self._lingering: list[_Open] = []
+        """Snapshots that are over but not closed: what reaches back into the newest one goes on in it."""
         self._continuous: _Open | None = None
         """The file of the continuous recording."""
         self._finishing: list[_Open] = []
@@ -321,6 +340,8 @@ class MachineRecorder:
             self._open.asked, before.asked = before.asked, []
         if before is not None:
             self._ending.append(before)
+        for one in self._lingering:
+            one.last = None  # nothing goes on in it
         for one in (*self._ending, *([self._continuous] if self._continuous else [])):
             one.until_ns = min(one.until_ns, now_ns)
 
@@ -446,23 +467,63 @@ class MachineRecorder:
                 self._cause("speed", f"{detector}: speed {speed_rpm:.4g} rpm")
 
     def _cause(self, kind: Kind, words: str) -> _Open:
-        """Begin a snapshot, or let the one that is open last longer."""
+        """Begin a snapshot, or let the one that is open, or has just ended, last longer."""
         now_ns = self._clock.monotonic_ns()
         until_ns = now_ns + self._after_ns
         one = self._open
-        if one is not None and until_ns > one.cause_ns - self._before_ns + self._longest_ns:
-            # It has no room for what comes after this cause.
+        if one is not None and not self._has_room(one, until_ns):
             one.until_ns = min(one.until_ns, now_ns)
             self._ending.append(one)
-            one = None
+            one = self._open = None
         if one is None:
-            self._open = one = self._begun(kind, words, now_ns - self._before_ns, until_ns)
+            one = self._open = self._overlapped(now_ns - self._before_ns, until_ns)
+        if one is None:
+            one = self._open = self._begun(kind, words, now_ns - self._before_ns, until_ns)
             return one
         one.until_ns = max(one.until_ns, until_ns)
-        if len(one.causes) < MOST_CAUSES:
-            one.causes.append(words)
-        one.kind = min(kind, one.kind, key=get_args(Kind).index)
+        self._add_cause(one, kind, words)
         return one
+
+    def _schedule(self) -> None:
+        """Begin a snapshot; one that is open does not last longer for it, as nothing has happened."""
+        now_ns = self._clock.monotonic_ns()
+        if self._open is not None:
+            self._add_cause(self._open, "scheduled", SCHEDULED)
+        else:
+            begin_ns, until_ns = now_ns - self._before_ns, now_ns + self._after_ns
+            self._open = self._begun("scheduled", SCHEDULED, begin_ns, until_ns)
+
+    def _add_cause(self, one: _Open, kind: Kind, words: str) -> None:
+        one.kind = min(kind, one.kind, key=get_args(Kind).index)
+        if one.causes < MOST_CAUSES:
+            one.causes += 1
+            one.take_in(_Item(self._clock.monotonic_ns(), _Caused(kind, words)), 0)
+
+    def _has_room(self, one: _Open, until_ns: int) -> bool:
+        return until_ns <= one.cause_ns - self._before_ns + self._longest_ns
+
+    def _overlapped(self, begin_ns: int, until_ns: int) -> _Open | None:
+        """The snapshot that has just ended, if another one would begin with something that it has.
+
+        It goes on then, with all that has happened since.
+        """
+        if not self._lingering:
+            return None
+        one = self._lingering[-1]
+        history = list(self._history)
+        end = next((k + 1 for k in reversed(range(len(history))) if history[k] is one.last), 0)
+        first, _ = self._begin(history, begin_ns)
+        if first >= end or not self._has_room(one, until_ns) or self._is_too_large(one, SNAPSHOT_SHARE):
+            return None
+        self._lingering.remove(one)
+        one.go_on(history[end:], until_ns)
+        return one
+
+    def _is_near(self, one: _Open, now_ns: int) -> bool:
+        """Whether a further cause may still have a snapshot go on that has ended."""
+        if one.last is None or self._open is not None:
+            return False
+        return now_ns - one.last.at_ns <= self._before_ns + MEMORY_EVERY_NS + SPARE_NS
 
     def _begun(self, kind: Kind, words: str, begin_ns: int, until_ns: int) -> _Open:
         """A file that reaches back to a time, or a little further."""
@@ -483,9 +544,9 @@ class MachineRecorder:
         """A file that begins with an item of the history."""
         cause_ns, until_ns = cause_until_ns
         begin_ns = history[first].at_ns if first < len(history) else self._clock.monotonic_ns()
-        about = self._about(history[:first], begin_ns, memories)
+        about = {**self._about(history[:first], begin_ns, memories), "causes": [words]}
         waiting = [*(_Item(begin_ns, one) for one in memories), *history[first:]]
-        return _Open(kind, cause_ns, begin_ns, until_ns, [words], self._machine, about, waiting)
+        return _Open(kind, cause_ns, begin_ns, until_ns, self._machine, about, waiting)
 
     def _begin(self, history: Sequence[_Item], begin_ns: int) -> tuple[int, list[_Remembered]]:
         """Where a snapshot begins that reaches back to a time, and what detectors remembered there.
@@ -534,19 +595,27 @@ class MachineRecorder:
         every_s = self._settings.every_s
         if every_s is not None and (self._due_ns is None or now_ns >= self._due_ns):
             if self._due_ns is not None:
-                self._cause("scheduled", "scheduled")
+                self._schedule()
             self._due_ns = now_ns + round(every_s * NS_PER_S)
+        for snapshot in [one for one in self._lingering if not self._is_near(one, now_ns)]:
+            self._lingering.remove(snapshot)
+            await self._write_on(snapshot, [], is_over=True)
         for snapshot in [*self._ending, *([self._open] if self._open else [])]:
             late_ns = now_ns - snapshot.until_ns
             is_over = late_ns >= 0 and (late_ns >= PATIENCE_NS or not self._is_judging())
+            items = snapshot.hand_out()
             if is_over and snapshot is self._open:
                 # What is a cause while it is being closed begins another one.
                 self._open = None
+                if not snapshot.asked and snapshot.last is not None:
+                    # Who has asked waits for the whole file; nobody waits for this one.
+                    self._lingering.append(snapshot)
+                    is_over = False
             elif is_over:
                 self._ending.remove(snapshot)
             elif self._is_too_large(snapshot, SNAPSHOT_SHARE):
                 snapshot.until_ns = min(snapshot.until_ns, now_ns)
-            await self._write_on(snapshot, snapshot.hand_out(), is_over=is_over)
+            await self._write_on(snapshot, items, is_over=is_over)
         if self._settings.continuous:
             await self._continue(self._clock.monotonic_ns())
 
@@ -635,7 +704,7 @@ class MachineRecorder:
             self._continuous_from_ns = self._clock.monotonic_ns() + AGAIN_NS
         if snapshot is self._open:
             self._open = None
-        for those in (self._ending, self._finishing):
+        for those in (self._ending, self._lingering, self._finishing):
             if snapshot in those:
                 those.remove(snapshot)
         if self._is_well:
@@ -649,9 +718,10 @@ class MachineRecorder:
     async def _end(self) -> None:
         """No more is written: bring what is under way to its end, if the disk is quick."""
         self._is_over = True
-        ending = [*self._finishing, *self._written()]
+        ending = [*self._finishing, *self._lingering, *self._written()]
         self._open = self._continuous = None
         self._ending.clear()
+        self._lingering.clear()
         self._finishing.clear()
         await asyncio.gather(*(self._end_of(one) for one in ending))
 
@@ -718,9 +788,8 @@ class MachineRecorder:
         Raises:
             OSError: it cannot be made.
         """
-        about = {**snapshot.about, "causes": list(snapshot.causes)}
         files = self._files(snapshot.machine)
-        writer = self.folder.new(snapshot.kind, snapshot.cause_ns, about, files)
+        writer = self.folder.new(snapshot.kind, snapshot.cause_ns, snapshot.about, files)
         self._make_room({writer.path.name})
         return writer
 
@@ -769,26 +838,29 @@ class MachineRecorder:
     def _make_room(self, spared: set[str]) -> None:
         """Delete what is too old or too much, but for what is being written; blocks."""
         self._unswept_bytes = 0
-        others = [*self._written(), *self._finishing]
+        others = [*self._written(), *self._lingering, *self._finishing]
         spared |= {one.writer.path.name for one in others if one.writer is not None}
         self.folder.make_room(self._clock.wall_ns(), spared)
 
     def _entry(self, item: _Item) -> Entry:
         """An item as it is written."""
+        if isinstance(item.what, SampleBlock):
+            return Entry(item.at_ns, item.what)
         match item.what:
-            case SampleBlock() as block:
-                return Entry(item.at_ns, block)
             case Diagnosis() as diagnosis:
-                return Entry(item.at_ns, Noted(DIAGNOSES, statement_document(diagnosis)))
+                noted = Noted(DIAGNOSES, statement_document(diagnosis))
             case AlarmEvent() as event:
-                return Entry(item.at_ns, Noted(ALARMS, alarm_document(event)))
+                noted = Noted(ALARMS, alarm_document(event))
             case _Read() as read:
-                return Entry(item.at_ns, Noted(WINDOWS, read.window))
+                noted = Noted(WINDOWS, read.window)
             case _Remembered() as one:
                 about = {"detector": one.detector, "end_index": one.end_index}
-                return Entry(item.at_ns, Noted(STATES, {**about, **one.memory.document()}))
+                noted = Noted(STATES, {**about, **one.memory.document()})
             case _Stands(stream, standing):
-                return Entry(item.at_ns, Noted(STANDING, {"stream": stream, **standing._asdict()}))
+                noted = Noted(STANDING, {"stream": stream, **standing._asdict()})
+            case _Caused(kind, words):
+                noted = Noted(CAUSES, {"kind": kind, "cause": words})
+        return Entry(item.at_ns, noted)
 
 
 def _paths(values: Any) -> Iterator[str]:

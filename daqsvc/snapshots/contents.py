@@ -18,6 +18,8 @@ SUFFIX = ".mcap"
 ABOUT = "/about"
 SAMPLES = "/samples/"
 """In front of the name of a stream, or of a grid."""
+CAUSES = "/causes"
+"""Those that came while it was written; the first is in the first message."""
 STANDING = "/standing"
 WINDOWS = "/windows"
 STATES = "/states"
@@ -67,7 +69,7 @@ class Snapshot:
     """A snapshot that was read.
 
     Attributes:
-        about: its first message.
+        about: its first message, with the causes that came later among its ``causes``.
         files: by name, the files in it.
         entries: what happened, in order.
         notes: what is wrong with the file, in sentences.

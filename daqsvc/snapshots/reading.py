@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+import stat
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,7 @@ from google.protobuf.message import DecodeError
 from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.confined.process import ConfinedError, ConfinedProcess, RaisedThereError
 from daqsvc.snapshots import samples_pb2
-from daqsvc.snapshots.contents import ABOUT, SAMPLES, SCHEMA, Entry, Noted, Snapshot
+from daqsvc.snapshots.contents import ABOUT, CAUSES, SAMPLES, SCHEMA, Entry, Noted, Snapshot
 from daqsvc.snapshots.mcap import Attachment, Damage, McapError, Message, read
 
 if TYPE_CHECKING:
@@ -124,12 +125,19 @@ def load(path: str) -> tuple[Document, list[NDArray[np.float32]]]:
             f"{path} is no snapshot of daqsvc, or one of another version: its first message is not {SCHEMA}"
         )
     return {
-        "about": about,
+        "about": {**about, "causes": _causes(about, entries)} if "causes" in about else about,
         "files": files,
         "entries": entries,
         "streams": list(rows),
         "notes": notes_of(damage),
     }, arrays
+
+
+def _causes(about: Document, entries: list[list[Any]]) -> list[str]:
+    """Why a snapshot was made, in words: what it begins with, and what came while it was written."""
+    first = about["causes"]
+    later = [one[2].get("cause") for one in entries if one[1] == CAUSES and isinstance(one[2], dict)]
+    return [one for one in (*(first if isinstance(first, list) else ()), *later) if isinstance(one, str)]
 
 
 def _facts(block: SampleBlock) -> list[Any]:
@@ -169,17 +177,19 @@ def read_snapshot(path: Path, limits: ResourceLimits, process: ConfinedProcess |
         SnapshotError: it cannot be read, or is none.
     """
     try:
-        size = path.stat().st_size
+        status = path.stat()
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise SnapshotError(f"{path!s:.200} cannot be read: {reason}; correct the path") from None
+    if not stat.S_ISREG(status.st_mode):
+        raise SnapshotError(f"{path} cannot be read: it is no file but a folder, pipe or device; give a file")
     reader = process or ConfinedProcess()
     try:
         document, arrays = reader.call(
             f"{__name__}:load",
             {"path": str(path)},
             memory_bytes=limits.memory_bytes,
-            cpu_s=limits.cpu_s(size),
+            cpu_s=limits.cpu_s(status.st_size),
         )
     except RaisedThereError as error:
         if error.kind == SnapshotError.__name__:

@@ -15,6 +15,7 @@ from daqsvc.snapshots import samples_pb2
 from daqsvc.snapshots.contents import (
     ABOUT,
     ALARMS,
+    CAUSES,
     DIAGNOSES,
     SAMPLES,
     STANDING,
@@ -56,7 +57,7 @@ class SnapshotWriter:
         self._file = os.fdopen(os.open(path, FLAGS, MODE), "wb")
         try:
             self._mcap = McapWriter(self._file, f"daqsvc {__version__}")
-            for topic in (ABOUT, ALARMS, DIAGNOSES, STANDING, WINDOWS, STATES):
+            for topic in (ABOUT, CAUSES, ALARMS, DIAGNOSES, STANDING, WINDOWS, STATES):
                 self._mcap.open_channel(topic, "json", _JSON, {})
             samples = samples_schema()
             for stream, facts in about["streams"].items():

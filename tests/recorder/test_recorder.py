@@ -20,11 +20,12 @@ from daqsvc.acquisition.samples import SampleBlock, Window
 from daqsvc.acquisition.standing import StreamState
 from daqsvc.alarms.events import AlarmEvent, EventKind, Identity
 from daqsvc.alarms.states import AlarmState, Level
+from daqsvc.confined.limits import ResourceLimits
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.recorder import MOST_WAITING_BYTES, MachineRecorder, SnapshotRefusedError
-from daqsvc.snapshots.contents import MACHINE_JSON
+from daqsvc.snapshots.contents import CAUSES, MACHINE_JSON
 from daqsvc.snapshots.mcap import Attachment, Damage
-from daqsvc.snapshots.reading import entries_of
+from daqsvc.snapshots.reading import entries_of, read_snapshot
 from daqsvc.snapshots.writing import SnapshotWriter
 from daqsvc.supervision import Supervisor
 
@@ -137,7 +138,10 @@ def held(path: Path) -> tuple[Document, float, float, Damage]:
     ]
     times = [one.at_ns / NS_PER_S for one in read if isinstance(one.what, SampleBlock)]
     assert not isinstance(read[0].what, SampleBlock)
-    return read[0].what.document, min(times), max(times), damage
+    noted = [one.what for one in read if not isinstance(one.what, SampleBlock)]
+    later = [one.document["cause"] for one in noted if one.topic == CAUSES]
+    about = {**noted[0].document, "causes": [*noted[0].document["causes"], *later]}
+    return about, min(times), max(times), damage
 
 
 def values_in(path: Path) -> str:
@@ -207,7 +211,99 @@ async def test_causes_that_overlap_make_one_snapshot_up_to_a_length(tmp_path: Pa
     other, other_begin_s, other_end_s, _ = held(second)
     assert other_begin_s == pytest.approx(end_s - 1.15, abs=0.3)
     assert other_end_s == pytest.approx(begun_s + 7 * 0.8 + 1.0, abs=0.3)
-    assert other["causes"] == ["rotor-fault: raised"]
+    assert other["causes"] == 4 * ["rotor-fault: raised"]
+
+
+async def test_alarms_whose_snapshots_would_overlap_make_one(tmp_path: Path) -> None:
+    async with bench(tmp_path, before_s=4.0, after_s=4.0) as one:
+        await one.passes(37.3)
+        begun_s = one.clock.monotonic_ns() / NS_PER_S
+        one.alarm()
+        await one.passes(5.3)
+        assert not one.recorder.figures()["recording"], "it has what comes after the first one"
+        [path] = one.files
+        assert held(path)[2] == pytest.approx(begun_s + 4.0, abs=0.3)
+        assert held(path)[3].ends_early
+        one.alarm("shaft-vibration-x")
+        one.recorder.stand("shaft", StreamState("its rate is odd"))
+        await one.passes(40.0)
+        one.alarm()
+        await one.passes(15.0)
+        first, second = one.files
+    about, begin_s, end_s, damage = held(first)
+    assert damage == Damage()
+    assert about["causes"] == ["rotor-fault: raised", "shaft-vibration-x: raised"]
+    assert begin_s == pytest.approx(begun_s - 4.0, abs=0.2)
+    assert end_s == pytest.approx(begun_s + 5.3 + 4.0, abs=0.3)
+    firsts = firsts_in(first)
+    assert firsts == list(range(firsts[0], firsts[-1] + 1, ROWS)), "nothing is missing, or there twice"
+    assert held(second)[1] > end_s
+    assert one.recorder.counters.snapshots == 2
+    assert one.recorder.counters.blocks_dropped == 0
+
+
+async def test_a_snapshot_that_has_ended_goes_on_within_its_longest_time_only(tmp_path: Path) -> None:
+    async with bench(tmp_path, before_s=4.0, after_s=4.0, longest_s=15.0) as one:
+        await one.passes(30.0)
+        for _ in range(4):
+            one.alarm()
+            await one.passes(5.3)
+        await one.passes(15.0)
+        files = one.files
+    assert [len(held(path)[0]["causes"]) for path in files] == [2, 2]
+    assert all(held(path)[2] - held(path)[1] < 15.5 for path in files)
+
+
+async def test_who_asks_does_not_wait_for_causes_that_may_come(tmp_path: Path) -> None:
+    async with bench(tmp_path, before_s=4.0) as one:
+        await one.passes(30.0)
+        one.alarm()
+        asked = asyncio.create_task(one.recorder.snapshot("somebody"))
+        await one.passes(1.5)
+        assert asked.done()
+        assert held(await asked)[3] == Damage()
+        one.alarm("shaft-vibration-x")
+        await one.passes(15.0)
+        assert (await asked).exists(), "nobody takes it away or goes on in it"
+        assert held(await asked)[0]["causes"] == ["rotor-fault: raised", "somebody"]
+        _, second = one.files
+        assert held(second)[0]["causes"] == ["shaft-vibration-x: raised"]
+        # Who asks just after an alarm's snapshot has ended gets that, with what has happened since.
+        one.alarm()
+        await one.passes(2.0)
+        asked = asyncio.create_task(one.recorder.snapshot("somebody else"))
+        await one.passes(1.5)
+        assert asked.done()
+        assert held(await asked)[0]["causes"] == ["rotor-fault: raised", "somebody else"]
+        assert (await asked).name.endswith("-alarm.mcap")
+
+
+async def test_a_snapshot_by_the_clock_lengthens_no_other(tmp_path: Path) -> None:
+    async with bench(tmp_path, before_s=1.0, after_s=9.0, every_s=10.0) as one:
+        await one.passes(14.0)
+        asked = asyncio.create_task(one.recorder.snapshot("somebody"))
+        await one.passes(9.5)
+        assert asked.done(), "the clock has struck meanwhile"
+        assert held(await asked)[0]["causes"] == ["scheduled", "somebody", "scheduled"]
+        await one.passes(17.0)
+    assert [held(path)[0]["causes"] for path in one.files][1:] == [["scheduled"]]
+
+
+async def test_a_cause_that_came_later_is_there_after_a_cut(tmp_path: Path) -> None:
+    async with bench(tmp_path, after_s=5.0) as one:
+        await one.passes(10.0)
+        one.alarm()
+        await one.passes(2.0)
+        one.alarm("shaft-vibration-x", EventKind.ESCALATED)
+        await one.passes(1.0)
+        [path] = one.files
+        assert held(path)[3].ends_early
+        cut = tmp_path / "cut.mcap"
+        cut.write_bytes(path.read_bytes())
+    expected = ["rotor-fault: raised", "shaft-vibration-x: escalated"]
+    assert [held(file)[0]["causes"] for file in (cut, path)] == [expected, expected]
+    for file in (cut, path):
+        assert read_snapshot(file, ResourceLimits()).about["causes"] == expected
 
 
 async def test_what_calls_for_nobody_is_no_cause(tmp_path: Path) -> None:
@@ -397,7 +493,7 @@ async def test_a_disk_that_hangs_for_an_hour_costs_no_memory(
         await one.passes(20.0)
         before = one.recorder.counters.snapshots
         one.alarm()
-        await one.passes(5.0)
+        await one.passes(9.0)
         assert one.recorder.counters.snapshots > before
 
 
@@ -413,6 +509,8 @@ async def test_an_alarm_while_a_snapshot_is_being_closed_leaves_its_own(
     async with bench(tmp_path) as one:
         await one.passes(5.0)
         one.alarm()
+        asked_first = asyncio.create_task(one.recorder.snapshot("somebody"))
+        await asyncio.sleep(0)
         with monkeypatch.context() as patched:
             patched.setattr(SnapshotWriter, "finish", slow)
             for _ in range(12):
@@ -426,8 +524,9 @@ async def test_an_alarm_while_a_snapshot_is_being_closed_leaves_its_own(
         await one.passes(3.0)
         path = await asked
         first, second = one.files
-    assert held(first)[0]["causes"] == ["rotor-fault: raised"]
-    assert held(second)[0]["causes"] == ["shaft-vibration-x: raised"] or path == second
+        assert (await asked_first, path) == (first, second)
+    assert held(first)[0]["causes"] == ["rotor-fault: raised", "somebody"]
+    assert held(second)[0]["causes"] == ["shaft-vibration-x: raised", "somebody"]
     assert held(second)[2] > held(first)[2]
     assert second.name.endswith("-alarm.mcap")
 
@@ -520,6 +619,7 @@ async def test_a_file_holds_the_limits_that_were_in_force(tmp_path: Path) -> Non
         one.recorder.change_machine(machine.model_copy(update={"alarms": alarms}))
         await one.passes(2.0)
         changed_ns = one.recorder._changed_ns
+        assert changed_ns is not None
     before, after = (
         [path for path in one.files if ("1.75" in values_in(path)) == is_after] for is_after in (False, True)
     )
