@@ -6,6 +6,7 @@ where it asks for a value that is not (`UnusableValueError`): one mistake never 
 
 from __future__ import annotations
 
+import math
 import os
 from contextlib import suppress
 from pathlib import Path
@@ -124,6 +125,7 @@ def _checks(draft: MachineFile, facts: Mapping[str, Any]) -> Iterator[Iterator[F
     yield _check_memory(draft)
     yield _names(draft)
     yield _check_speed_steps(draft)
+    yield _check_schedule(draft)
     yield from physics_checks(draft)
     with suppress(UnusableValueError):
         for _, detector, settings in configured(draft.pipeline, valid_only=True):
@@ -379,6 +381,22 @@ def _check_speed_steps(draft: MachineFile) -> Iterator[Finding]:
         "asks for snapshots by the speed, and no detector of this machine states one",
         f'write a table {" or ".join(tables)}, a sensor of type "trend" in rpm, or remove every_rpm',
     )
+
+
+def _check_schedule(draft: MachineFile) -> Iterator[Finding]:
+    """Snapshots by the clock do not come before the one that came before is over."""
+    recorder = draft.recorder
+    if recorder is None or recorder.every_s is None:
+        return
+    lasts_s = recorder.before_s + recorder.after_s
+    if recorder.every_s < lasts_s:
+        yield Finding(
+            ("recorder", "every_s"),
+            f"asks for a snapshot every {recorder.every_s:g} s, and each holds {lasts_s:g} s "
+            "(before_s and after_s): they would overlap",
+            f"write every_s = {math.ceil(lasts_s)} or more, or have all recorded with continuous = true",
+            fatal=False,
+        )
 
 
 def _check_memory(draft: MachineFile) -> Iterator[Finding]:

@@ -33,3 +33,12 @@ def test_steps_of_a_speed_that_nobody_states_are_refused_in_a_sentence() -> None
     assert problem.key == "recorder.every_rpm"
     assert problem.message == "asks for snapshots by the speed, and no detector of this machine states one"
     assert "[pipeline.rotor_bank] or [pipeline.rotor_synchronous]" in problem.remedy
+
+
+@pytest.mark.parametrize(("every_s", "is_warned"), [("10.0", True), ("19.9", True), ("20.0", False)])
+def test_snapshots_by_the_clock_that_overlap_are_warned_of(every_s: str, *, is_warned: bool) -> None:
+    machine = parse_machine_file(f"{RIG}\n[recorder]\nevery_s = {every_s}\n", Path("rig.toml"))
+    found = [one for one in machine.warnings if one.key == "recorder.every_s"]
+    assert bool(found) == is_warned
+    assert all("each holds 20 s" in one.message for one in found)
+    assert all("continuous = true" in one.remedy for one in found)
