@@ -32,7 +32,7 @@ class ReplayCommand(VerbWithKernels):
         "goes or at a speed, print the alarms that come of it, and hold them and every statement of the "
         "detectors against what the service said then, to the last bit. With a machine file that judges "
         "instead of the one in the snapshot. Exit code: 0 if it was judged, with --check 1 if anything "
-        "differs, 3 if it cannot be read or judged, 2 for wrong usage."
+        "differs or nothing could be compared, 3 if it cannot be read or judged, 2 for wrong usage."
     )
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
@@ -90,6 +90,10 @@ def _print_alarm(event: AlarmEvent) -> None:
 
 
 def _lines(replayed: Replayed) -> Iterator[str]:
+    if replayed.causes:
+        more = len(replayed.causes) - _SHOWN
+        shown = "; ".join(map(_printable, replayed.causes[:_SHOWN]))
+        yield f"made for: {shown}" + (f"; {more} more (--json has all)" if more > 0 else "")
     yield from replayed.notes
     for detector, why in replayed.anew.items():
         yield f"{detector} is judged anew: {why}"
@@ -104,6 +108,13 @@ def _lines(replayed: Replayed) -> Iterator[str]:
             yield f"  only now: {_in_short(document)}"
         if comparison.later:
             yield f"  {comparison.later} more are of samples at the end, of which the file has none"
+    if not replayed.is_compared:
+        yield "nothing was compared: the snapshot has no statement or alarm event of what was judged again"
+
+
+def _printable(text: str) -> str:
+    """What a terminal shows and does not obey."""
+    return "".join(one if one.isprintable() else ascii(one)[1:-1] for one in text)
 
 
 def _in_short(document: dict[str, Any]) -> str:
@@ -125,7 +136,9 @@ def _document(replayed: Replayed) -> dict[str, Any]:
     document: dict[str, Any] = json.loads(
         to_json(
             {
+                "causes": replayed.causes,
                 "is_equal": replayed.is_equal,
+                "is_compared": replayed.is_compared,
                 "anew": replayed.anew,
                 "notes": replayed.notes,
                 "alarms": [alarm_document(event) for event in replayed.alarms],

@@ -22,6 +22,7 @@ from daqsvc.acquisition.clock import NS_PER_S, DrivenClock, iso_utc
 from daqsvc.acquisition.ring import RingClosed, RingError, RingReader
 from daqsvc.acquisition.samples import SampleBlock, Window
 from daqsvc.acquisition.standing import StreamState
+from daqsvc.alarms.conditions import SERVICE
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.make import alarm_rule
 from daqsvc.alarms.manager import AlarmManager
@@ -42,7 +43,7 @@ from daqsvc.snapshots.contents import ALARMS, DIAGNOSES, FILES, MACHINE_JSON, ST
 from daqsvc.supervision import Supervisor
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Sequence
+    from collections.abc import Awaitable, Callable, Iterable, Sequence
     from pathlib import Path
 
     from daqsvc.acquisition.ring import SampleRing
@@ -58,6 +59,8 @@ LONGEST_GAP_NS = 3600 * NS_PER_S
 """Between two entries of a snapshot: what is longer is damage."""
 ALARM_TICK_NS = NS_PER_S
 _LONGEST_REASON = 200
+_LISTED = 5
+"""Names that are said one by one."""
 _TURNS = 4
 """Of the event loop, after which whoever woke has done what there was to do."""
 _NOT_OURS = (KeyError, ValueError, TypeError, AttributeError, RecursionError, OverflowError)
@@ -92,6 +95,7 @@ class Replayed:
     """What came of a replay.
 
     Attributes:
+        causes: why the snapshot was made, in words.
         statements: of the detectors, in order.
         alarms: events of alarms, in order.
         anew: the detectors that began anew, and why.
@@ -100,6 +104,7 @@ class Replayed:
         alarmed: likewise the events of alarms, but for people's.
     """
 
+    causes: list[str] = field(default_factory=list)
     statements: list[Diagnosis] = field(default_factory=list)
     alarms: list[AlarmEvent] = field(default_factory=list)
     anew: dict[str, str] = field(default_factory=dict)
@@ -109,8 +114,15 @@ class Replayed:
 
     @property
     def is_equal(self) -> bool:
-        """Whether all that was said then is said now, and nothing else."""
-        return not (self.said.changed or self.said.added or self.alarmed.changed or self.alarmed.added)
+        """Whether all that was said then is said now, and nothing else; not if nothing was compared."""
+        return self.is_compared and not (
+            self.said.changed or self.said.added or self.alarmed.changed or self.alarmed.added
+        )
+
+    @property
+    def is_compared(self) -> bool:
+        """Whether there was anything to compare."""
+        return any(one.equal or one.changed or one.added for one in (self.said, self.alarmed))
 
 
 class GivenWindows(RingReader):
@@ -218,13 +230,14 @@ class Replay:
         self._snapshot = snapshot
         self._pace = pace
         self._heard = heard
-        self._machine = machine.model_copy(update={"recorder": None})
         self._directory = directory
         self._result = Replayed(notes=list(snapshot.notes))
         self._since: dict[str, int] = {}
         """By detector, the index from which on it judges."""
         about = snapshot.about
         try:
+            self._machine = named = self._under_its_name(machine.model_copy(update={"recorder": None}))
+            self._result.causes = [one for one in about.get("causes", ()) if isinstance(one, str)]
             self._begin_ns, self._wall_ns = int(about["begin_ns"]), int(about["wall_ns_at_0"])
             iso_utc(self._begin_ns + self._wall_ns)  # there is such a time
             self._standings = {n: StreamState(**one) for n, one in dict(about["standings"]).items()}
@@ -237,7 +250,7 @@ class Replay:
                 )
             self._from_start = set(about["streams"] if about["from_start"] else ())
             self._from_start |= set(about.get("streams_from_start", ()))
-            self._is_same = about["version"] == __version__ and machine_values(machine) == json.loads(
+            self._is_same = about["version"] == __version__ and machine_values(named) == json.loads(
                 snapshot.files.get(MACHINE_JSON, b"null")
             )
         except _NOT_OURS as error:
@@ -252,11 +265,12 @@ class Replay:
         self._supervisor = Supervisor()
         self._readers: dict[str, GivenWindows] = {}
         self._watch = self._made()
+        self._see_who_judges()
         self._alarms = AlarmManager(
-            Identity(machine.site, machine.box, machine.machine.name),
-            [alarm_rule(alarm) for alarm in machine.alarms],
+            Identity(named.site, named.box, named.machine.name),
+            [alarm_rule(alarm) for alarm in named.alarms],
             self._clock,
-            handling=machine.alarm_handling,
+            handling=named.alarm_handling,
         )
         self._before = before
         self._names = {
@@ -267,6 +281,51 @@ class Replay:
         """By detector of a statement, the one that makes it."""
         self._earlier = self._found_earlier()
         self._ticked_ns = self._begin_ns
+
+    def _under_its_name(self, machine: MachineFile) -> MachineFile:
+        """The machine file by the names of the snapshot: they are no physics, but what is said has them."""
+        about = self._snapshot.about
+        own = {"site": machine.site, "box": machine.box, "machine": machine.machine.name}
+        then = {key: str(about.get(key, name)) for key, name in own.items()}
+        if then == own:
+            return machine
+        self._result.notes.append(
+            f"judged as {_printable('/'.join(then.values()))}, as it was then: the machine file is of "
+            f"{'/'.join(own.values())}"
+        )
+        named = machine.machine.model_copy(update={"name": then["machine"]})
+        return machine.model_copy(update={**then, "machine": named})
+
+    def _see_who_judges(self) -> None:
+        """See that the detectors of the machine file have something to judge.
+
+        Raises:
+            ReplayError: there is nothing for any of them.
+        """
+        try:
+            given = {
+                str(entry.what.document["detector"])
+                for entry in self._snapshot.entries
+                if not isinstance(entry.what, SampleBlock) and entry.what.topic == WINDOWS
+            }
+        except _NOT_OURS as error:
+            _refuse(error)
+        streams = {detector.name: detector.stream for detector in self._watch.pipeline.detectors}
+        then = self._snapshot.about["streams"]
+        if then and not set(streams.values()) & set(then):
+            raise ReplayError(
+                f"has samples of {_listed(then)}, and the detectors of {self._machine.path} judge "
+                f"{_listed(streams.values()) or 'nothing'}: give a machine file of this machine"
+            )
+        if given and not given & streams.keys():
+            raise ReplayError(
+                f"has samples for the detectors {_listed(given)}, of which {self._machine.path} has none, "
+                f"but {_listed(streams) or 'no detector'}: give a machine file of this machine"
+            )
+        if given and (idle := streams.keys() - given):
+            self._result.notes.append(
+                f"{_listed(idle)} not judged: the snapshot does not say which samples they were given"
+            )
 
     async def run(self) -> Replayed:
         """Replay it.
@@ -489,23 +548,44 @@ class Replay:
         for event in events:
             self._heard(event)
 
-    def _compare(self) -> None:
-        """Hold what was said then against what is said now."""
+    def _said_then(self) -> tuple[list[Document], list[Document]]:
+        """The statements and alarm events of then that are to be said now."""
         said: list[Document] = []
         alarmed: list[Document] = []
-        of_service: list[Document] = []
+        others: dict[str, Counter[str]] = {DIAGNOSES: Counter(), ALARMS: Counter()}
+        """By topic and detector, what is of no detector of the machine file."""
         for entry in self._snapshot.entries:
-            if isinstance(entry.what, SampleBlock):
+            if isinstance(entry.what, SampleBlock) or entry.what.topic not in others:
                 continue
-            document = entry.what.document
-            if entry.what.topic == DIAGNOSES and (self._is_replayed(document) or self._is_heard(document)):
-                said.append(document)
-            elif entry.what.topic == ALARMS and not document.get("by") and not self._is_earlier(document):
-                (alarmed if self._is_judged(document) else of_service).append(document)
-        if of_service:
+            topic, document = entry.what.topic, entry.what.document
+            if topic == DIAGNOSES:
+                if self._is_replayed(document) or self._is_heard(document):
+                    said.append(document)
+                elif document.get("detector") not in self._names:
+                    others[topic][str(document.get("detector"))] += 1
+            elif self._is_judged(document):
+                if not (document.get("by") or self._is_earlier(document)):
+                    alarmed.append(document)
+            elif not document.get("by"):
+                others[topic][_judge(document)] += 1
+        self._tell_of_others(others)
+        return said, alarmed
+
+    def _tell_of_others(self, others: dict[str, Counter[str]]) -> None:
+        if of_service := others[ALARMS].pop(SERVICE, 0):
             self._result.notes.append(
-                f"alarm events of the service itself are not judged again: {len(of_service)}"
+                f"alarm events of the service itself are not judged again: {of_service}"
             )
+        for topic, words in ((DIAGNOSES, "statements"), (ALARMS, "alarm events")):
+            if counts := others[topic]:
+                self._result.notes.append(
+                    f"{words} of detectors that the machine file does not have are not judged again: "
+                    f"{counts.total()} ({_listed(counts)})"
+                )
+
+    def _compare(self) -> None:
+        """Hold what was said then against what is said now."""
+        said, alarmed = self._said_then()
         _hold(self._result.said, said, [statement_document(one) for one in self._result.statements])
         # What follows of statements that came after the end of the file came after it, too.
         ends = _ends(said)
@@ -540,6 +620,22 @@ class Replay:
         """Whether an alarm event of then follows of samples that its detector had judged by the begin."""
         cause = alarm["cause"] if self._is_judged(alarm) else None
         return cause is not None and not _is_silence(cause) and not self._is_replayed(cause)
+
+
+def _judge(alarm: Document) -> str:
+    """The detector of whose statement an alarm event of then follows."""
+    cause = alarm.get("cause")
+    return str(cause.get("detector", SERVICE)) if isinstance(cause, dict) else SERVICE
+
+
+def _listed(names: Iterable[str]) -> str:
+    some = sorted({*names})
+    more = ", ..." if len(some) > _LISTED else ""
+    return _printable(", ".join(f"{name:.60}" for name in some[:_LISTED])) + more
+
+
+def _printable(text: str) -> str:
+    return "".join(one if one.isprintable() else "?" for one in text)
 
 
 def _names(detector: Detector, t_ns: int) -> set[str]:

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import json
+import os
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
+from support.paths import ROOT
 from support.recorded_rig import recorded_rig
 
 from daqsvc import __version__
-from daqsvc.offline.replay import ReplayError, replay
+from daqsvc.acquisition.samples import SampleBlock
+from daqsvc.cli import main
 from daqsvc.machine_facts import machine_values
-from daqsvc.snapshots.contents import MACHINE_JSON, SCHEMA, Snapshot
+from daqsvc.offline.replay import ReplayError, replay
+from daqsvc.settings.load import load_machine_file
+from daqsvc.snapshots.contents import CAUSES, MACHINE_JSON, SCHEMA, WINDOWS, Entry, Noted, Snapshot
+from daqsvc.snapshots.writing import SnapshotWriter
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -50,3 +57,67 @@ async def test_it_is_refused(about: dict[str, Any], files: dict[str, bytes] | No
     with pytest.raises(ReplayError) as caught:
         await replay(Snapshot({**ABOUT, **about}, there), None, tmp_path)
     assert "\n" not in f"{caught.value}"
+
+
+FACTS = {"rate_hz": 640.0, "channels": ["x"], "sensors": ["probe-x"], "units": ["um"]}
+MOTOR = ROOT / "config" / "machines" / "motor-accelerometer.toml"
+
+
+@pytest.mark.parametrize(
+    ("streams", "detector", "why"),
+    [
+        (
+            {"shaft": FACTS},
+            "rotor-bank",
+            f"has samples of shaft, and the detectors of {MOTOR} judge drive-end: give a machine file",
+        ),
+        (
+            {"drive-end": FACTS},
+            "rotor-bank",
+            f"has samples for the detectors rotor-bank, of which {MOTOR} has none, but ",
+        ),
+    ],
+)
+async def test_a_machine_file_of_which_nothing_is_judged_is_refused(
+    streams: dict[str, Any], detector: str, why: str, tmp_path: Path
+) -> None:
+    given = {"detector": detector, "first_index": 0, "count": 1}
+    snapshot = Snapshot(
+        {**ABOUT, "machine": "laval-rig", "streams": streams},
+        {MACHINE_JSON: machine_json()},
+        [Entry(2 * 10**9, Noted(WINDOWS, given))],
+    )
+    with pytest.raises(ReplayError) as caught:
+        await replay(snapshot, load_machine_file(MOTOR), tmp_path)
+    assert f"{caught.value}".startswith(why)
+
+
+def test_a_check_of_nothing_is_not_passed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "a snapshot.mcap"
+    about = {**ABOUT, "streams": {"shaft": FACTS, "other": FACTS}, "causes": ["a \x1b[31mknock"]}
+    writer = SnapshotWriter(path, about, {MACHINE_JSON: machine_json()}, 10**18)
+    rows = np.zeros((64, 1), np.float32)
+    writer.write(
+        [
+            Entry(10**9, SampleBlock("other", 0, rows, 10**9, 1e9 / 640.0)),
+            Entry(10**9, Noted(CAUSES, {"kind": "alarm", "cause": "rotor-fault: raised"})),
+        ]
+    )
+    writer.finish()
+    assert main(["replay", f"{path}"]) == 0
+    first, *_, last = capsys.readouterr().out.splitlines()
+    assert first == "made for: a \\x1b[31mknock; rotor-fault: raised"
+    assert last.startswith("nothing was compared")
+    assert main(["replay", f"{path}", "--check", "--json"]) == 1
+    told = json.loads(capsys.readouterr().out)
+    assert (told["is_equal"], told["is_compared"]) == (False, False)
+    assert told["causes"] == ["a \x1b[31mknock", "rotor-fault: raised"]
+
+
+def test_what_is_no_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pipe = tmp_path / "pipe.mcap"
+    os.mkfifo(pipe)
+    for path in (pipe, tmp_path):
+        for command in (["replay", f"{path}"], ["export", f"{pipe}", "--to", f"{tmp_path / 'x.csv'}"]):
+            assert main(command) == 3
+            assert "it is no file but a folder, pipe or device; give a file" in capsys.readouterr().err

@@ -15,7 +15,7 @@ from daqsvc.acquisition.samples import SampleBlock
 from daqsvc.alarms.states import Level
 from daqsvc.confined.limits import ResourceLimits
 from daqsvc.offline.replay import replay
-from daqsvc.snapshots.contents import ALARMS, DIAGNOSES, MACHINE_JSON, MACHINE_TOML
+from daqsvc.snapshots.contents import ALARMS, DIAGNOSES, MACHINE_JSON, MACHINE_TOML, Noted
 from daqsvc.snapshots.reading import read_snapshot
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from daqsvc.offline.replay import Comparison, Replayed
     from daqsvc.service import Service
-    from daqsvc.snapshots.contents import Document, Snapshot
+    from daqsvc.snapshots.contents import Document, Entry, Snapshot
 
 pytestmark = pytest.mark.integration
 RATE_ROWS = round(RATE_HZ) // 3 * 3
@@ -61,6 +61,24 @@ def what_differs(comparison: Comparison) -> list[tuple[object, ...]]:
     return differs + list(now)
 
 
+def of_alarms(snapshot: Snapshot) -> list[Document]:
+    """The alarm events in it."""
+    noted = [entry.what for entry in snapshot.entries if isinstance(entry.what, Noted)]
+    return [one.document for one in noted if one.topic == ALARMS]
+
+
+def by_another(entry: Entry) -> Entry:
+    """The same, said by a detector of another name if the rotor bank has said it."""
+    if not isinstance(entry.what, Noted):
+        return entry
+    document = dict(entry.what.document)
+    if entry.what.topic == ALARMS and document["cause"]["detector"] == "rotor-bank":
+        document["cause"] = {**document["cause"], "detector": "gone"}
+    if entry.what.topic == DIAGNOSES and document["detector"] == "rotor-bank":
+        document["detector"] = "gone"
+    return replace(entry, what=Noted(entry.what.topic, document))
+
+
 async def again(snapshot: Snapshot, folder: Path) -> Replayed:
     folder.mkdir()  # noqa: ASYNC240 - of this test alone
     return await replay(snapshot, None, folder)
@@ -86,7 +104,7 @@ async def test_an_alarm_leaves_a_snapshot_that_replays_to_the_same_alarm(tmp_pat
     recorded = np.concatenate([e.what.samples for e in snapshot.entries if isinstance(e.what, SampleBlock)])
     scale = 0.0005 / 0.00787  # a count of the device, in um
     assert np.abs(recorded[:, :2] - samples[: len(recorded), :2]).max() < scale
-    alarms = [e.what.document for e in snapshot.entries if getattr(e.what, "topic", "") == ALARMS]
+    alarms = of_alarms(snapshot)
     assert next(one["kind"] for one in alarms if one["alarm"] == "rotor-fault") == "raised"
 
     replayed = await again(snapshot, tmp_path / "replay")
@@ -98,11 +116,7 @@ async def test_an_alarm_leaves_a_snapshot_that_replays_to_the_same_alarm(tmp_pat
     assert not replayed.notes
 
     # An alarm that is raised now and was not then shows as such, wherever it is in the file.
-    raised = next(
-        entry.what.document
-        for entry in snapshot.entries
-        if getattr(entry.what, "topic", "") == ALARMS and entry.what.document["kind"] == "raised"
-    )
+    raised = next(one for one in alarms if one["kind"] == "raised")
     statement = {key: one for key, one in raised["cause"].items() if key not in {"schema", "site", "box"}}
     hidden = [
         entry
@@ -113,6 +127,24 @@ async def test_an_alarm_leaves_a_snapshot_that_replays_to_the_same_alarm(tmp_pat
     without = await again(replace(snapshot, entries=hidden), tmp_path / "without")
     assert not without.is_equal
     assert [one["decision"] for one in without.said.added] == [statement["decision"]]
+
+    # A name is no physics: by a machine file that differs in nothing else it is the same.
+    named = machine.machine.model_copy(update={"name": "other-rig"})
+    (tmp_path / "named").mkdir()
+    other = machine.model_copy(update={"box": "other-box", "machine": named})
+    renamed = await replay(snapshot, other, tmp_path / "named")
+    assert renamed.is_equal
+    assert renamed.said.equal == replayed.said.equal
+    assert renamed.notes == [
+        "judged as demo/virtual/laval-rig, as it was then: the machine file is of demo/other-box/other-rig"
+    ]
+
+    # What detectors have said that the machine file does not have is named as such.
+    gone = await again(replace(snapshot, entries=[*map(by_another, snapshot.entries)]), tmp_path / "gone")
+    ours = [one for one in alarms if one["cause"]["detector"] == "rotor-bank"]
+    events = f"not judged again: {len(ours)} (gone)"
+    assert len([note for note in gone.notes if "the machine file does not have" in note]) == 2
+    assert any(note.startswith("alarm events of detectors") and note.endswith(events) for note in gone.notes)
 
     # Limits that came into force within it are told.
     about = {**snapshot.about, "changed_ns": snapshot.about["begin_ns"] + 1}
@@ -130,7 +162,7 @@ async def test_alarms_of_a_device_that_comes_and_goes_are_the_same_again(tmp_pat
     kinds = []
     for number, path in enumerate(files):
         snapshot = read_snapshot(path, ResourceLimits())
-        alarms = [e.what.document for e in snapshot.entries if getattr(e.what, "topic", "") == ALARMS]
+        alarms = of_alarms(snapshot)
         kinds += [(one["alarm"], one["kind"]) for one in alarms]
         replayed = await again(snapshot, tmp_path / f"replay {number}")
         assert replayed.is_equal, (path.name, in_short(replayed.said), what_differs(replayed.alarmed))

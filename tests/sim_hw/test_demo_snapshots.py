@@ -56,6 +56,8 @@ def test_a_snapshot_of_the_demo_replays_to_the_alarms_that_it_told(
     assert main(["replay", path]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert "rotor-fault raised" in lines[0]
+    [causes] = [line for line in lines if line.startswith("made for: ")]
+    assert "rotor-fault: raised; " in causes
     assert lines[-1] == f"{len(alarms)} of {len(alarms)} alarm events are as they were, to the last bit"
 
 
