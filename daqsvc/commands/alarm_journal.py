@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from daqsvc.commands.tables import ago, aligned, local_time
 from daqsvc.outbox.reading import read_journal, read_pasts
+from daqsvc.outbox.safety import as_owner_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -49,7 +50,7 @@ def current(store: Path) -> list[EventDocument]:
     Raises:
         OutboxError: there is no journal, or it cannot be read.
     """
-    view = read_journal(store, history=0)
+    view = _journal(store)
     _tell_damage(view, store)
     return list(_documents(view.latest))
 
@@ -60,7 +61,7 @@ def machines_of(store: Path) -> set[str]:
     Raises:
         OutboxError: there is no journal, or it cannot be read.
     """
-    return {event["machine"] for event in _documents(read_journal(store, history=0).latest)}
+    return {event["machine"] for event in _documents(_journal(store).latest)}
 
 
 def standing(store: Path, events: Sequence[EventDocument]) -> list[AlarmView]:
@@ -73,7 +74,7 @@ def standing(store: Path, events: Sequence[EventDocument]) -> list[AlarmView]:
     Raises:
         OutboxError: the journal cannot be read.
     """
-    topics = {entry.topic: json.loads(entry.payload) for entry in read_journal(store, history=0).latest}
+    topics = {entry.topic: json.loads(entry.payload) for entry in _journal(store).latest}
     topic_of = {event.get("id"): topic for topic, event in topics.items()}
     standing_now = {
         topic: event["occurrence"]
@@ -84,7 +85,8 @@ def standing(store: Path, events: Sequence[EventDocument]) -> list[AlarmView]:
     def is_over(entry: JournalEntry) -> bool:
         return bool(json.loads(entry.payload).get("occurrence") != standing_now[entry.topic])
 
-    pasts = read_pasts(store, standing_now, is_over, MOST_EVENTS) if standing_now else {}
+    with as_owner_of(store):
+        pasts = read_pasts(store, standing_now, is_over, MOST_EVENTS) if standing_now else {}
     views = []
     for event in events:
         past = list(_documents(pasts.get(topic_of.get(event["id"], ""), ())))
@@ -104,13 +106,18 @@ def history(store: Path, most: int, machine: str | None = None) -> list[EventDoc
     """
     asked = most
     while True:
-        view = read_journal(store, history=asked)
+        view = _journal(store, asked)
         events = [one for one in _documents(view.history) if machine in {None, one["machine"]}]
         # Messages of other kinds and machines may lie between.
         if len(events) >= most or len(view.history) + view.damaged < asked:
             _tell_damage(view, store)
             return events[-most:]
         asked *= 4
+
+
+def _journal(store: Path, history: int = 0) -> JournalView:
+    with as_owner_of(store):
+        return read_journal(store, history=history)
 
 
 def _tell_damage(view: JournalView, store: Path) -> None:

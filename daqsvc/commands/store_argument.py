@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import sys
@@ -66,13 +67,14 @@ def _default_directory(machine: MachineFile, end: str = "") -> Path:
 def store_doubts(machine: MachineFile) -> Iterator[str]:
     """Why the service could not use the store that a machine file names, if this account ran it.
 
+    Root is told what would keep the owner of the store from using it: nobody lets the service run as root.
+
     Raises:
         AssemblyError: nobody could: it is no directory, or a newer version of the program has written it.
     """
     from daqsvc.outbox.files import is_read_only  # noqa: PLC0415 - only what a verb needs
     from daqsvc.outbox.messages import NewerOutboxError, StorePathError  # noqa: PLC0415
-    from daqsvc.outbox.reading import refuse_newer  # noqa: PLC0415
-    from daqsvc.outbox.safety import account, unusable  # noqa: PLC0415
+    from daqsvc.outbox.safety import account, as_owner_of, unusable  # noqa: PLC0415
     from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415
 
     if machine.store is None:
@@ -80,15 +82,26 @@ def store_doubts(machine: MachineFile) -> Iterator[str]:
     at = f"{machine.path}: store.directory = {str(machine.store.directory)!r}"
     try:
         store = machine.resolve(machine.store.directory)
-        why = unusable(store)
-        if not why:
-            refuse_newer(store / JOURNAL)
+        with as_owner_of(store):
+            who, why = account(), unusable(store)
+            _refuse_newer(store)
+        if why:
+            _refuse_newer(store)  # only this account may be able to read it
     except (NewerOutboxError, StorePathError) as error:
         raise AssemblyError(f"{at}: {error}") from None
     if why and is_read_only(store):
         yield f"{at}: daqsvc run would keep the alarms in memory only, and lose them at its end: {why}"
     elif why:
-        yield f"{at}: daqsvc run could not start as {account()}: {why}"
+        yield f"{at}: daqsvc run could not start as {who}: {why}"
+
+
+def _refuse_newer(store: Path) -> None:
+    from daqsvc.outbox.messages import StoreRefusedError  # noqa: PLC0415 - only what a verb needs
+    from daqsvc.outbox.reading import refuse_newer  # noqa: PLC0415
+
+    # That is said more kindly: it is only this account that may not use it.
+    with contextlib.suppress(StoreRefusedError):
+        refuse_newer(store / JOURNAL)
 
 
 def add_store(parser: argparse.ArgumentParser, *, of_a_machine: bool = True) -> None:

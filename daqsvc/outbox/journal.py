@@ -41,6 +41,7 @@ from daqsvc.outbox.renewal import JournalDamage, Renewal
 from daqsvc.outbox.safety import (
     refuse_link,
     refuse_no_directory,
+    refuse_unopenable,
     refuse_unsafe,
     refuse_unwritable,
     restrict_files,
@@ -207,6 +208,7 @@ class Journal:
             make_directory(self.path.parent)
             refuse_unsafe(self.path.parent)
             refuse_unwritable(self.path.parent)
+            refuse_unopenable(self.path.parent)
             restrict_files(self.path.parent)
             self._lock = take_possession(self.path.with_name(self.path.name + ".lock"))
         except OSError as error:

@@ -20,7 +20,7 @@ from urllib.parse import quote
 
 from daqsvc.outbox.files import FileError, remedy
 from daqsvc.outbox.messages import OutboxError, is_sound
-from daqsvc.outbox.safety import refuse_link
+from daqsvc.outbox.safety import refuse_foreign, whose_to_read
 from daqsvc.outbox.tables import SCHEMA_VERSION, known_version, newer_writer, version_of
 from daqsvc.outbox.written_by import written_by
 
@@ -147,7 +147,7 @@ def _read(path: Path, query: Callable[[sqlite3.Connection], _T]) -> _T:
         ) from None
     except PermissionError as error:
         raise OutboxError(
-            f"the journal {path} may not be read: {error.strerror}; run this as the service's user or as root"
+            f"the journal {path} may not be read: {error.strerror}; {whose_to_read(path)}"
         ) from error
     except FileError as error:
         raise OutboxError(
@@ -265,9 +265,8 @@ def opened_to_read(path: Path) -> Iterator[sqlite3.Connection]:
 
 def _check_readable(path: Path) -> None:
     """Raise what SQLite would not tell apart, without a handle: closing one undoes this process's locks."""
-    refuse_link(path)
-    path.stat()
-    if not os.access(path, os.R_OK):
+    refuse_foreign(path)
+    if not os.access(path, os.R_OK, effective_ids=True):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
 

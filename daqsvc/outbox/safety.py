@@ -6,19 +6,36 @@ service's own user and root may be able to put something there.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pwd
 import stat
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from daqsvc.outbox.files import is_read_only, remedy, restrict
+from daqsvc.outbox.files import SIDE_FILES, is_read_only, remedy, restrict
 from daqsvc.outbox.messages import StorePathError, StoreRefusedError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 JOURNAL, BESIDE = "outbox", ("audit.jsonl", "control.sock")
 """How the names of the files begin that nobody else may have put there."""
 
 _OURS = (JOURNAL, "audit", "command-ids", "sparkplug.", "mqtt-", "home-assistant")
 """How the names of the files of a store begin."""
+
+_LOCK = "outbox.sqlite.lock"
+"""It is only read."""
+
+_OPENED = (
+    *(f"outbox.sqlite{end}" for end in (*SIDE_FILES, ".sequence", ".sequence.twin", ".ballast")),
+    *(f"outbox-{what}.sqlite{end}" for what in ("telemetry", "refused") for end in SIDE_FILES),
+    "audit.jsonl",
+    "command-ids",
+    _LOCK,
+)
+"""The files of a store that the service opens as they are; others it replaces, or only keeps."""
 
 _MOST_LINKS = 40
 """Symbolic links in one path, as the kernel has it."""
@@ -57,6 +74,7 @@ def unusable(store: Path) -> str:
             return ""
         refuse_unsafe(store)
         refuse_unwritable(store)
+        refuse_unopenable(store)
     except StoreRefusedError as error:
         return f"{error}"
     except OSError as error:
@@ -66,10 +84,41 @@ def unusable(store: Path) -> str:
 
 def account() -> str:
     """This process's user, as `chown` takes it."""
+    return _account(os.geteuid())
+
+
+@contextlib.contextmanager
+def as_owner_of(store: Path) -> Iterator[None]:
+    """Let root look at a store as its owner would: all that root reads there, the owner may put there.
+
+    For the verbs: it is the whole process that has other rights until the end. Others than root keep theirs.
+    """
     try:
-        return pwd.getpwuid(os.geteuid()).pw_name
+        owner = store.stat()
+    except OSError:
+        owner = None  # whoever goes on says what is wrong with it
+    if owner is None or owner.st_uid == 0 or os.geteuid() != 0:
+        yield
+        return
+    group, groups = os.getegid(), os.getgroups()
+    with contextlib.ExitStack() as back:
+        # A container may not let its root change accounts: then it looks as root.
+        with contextlib.suppress(PermissionError):
+            os.setgroups(_groups(owner))
+            back.callback(os.setgroups, groups)
+            os.setegid(owner.st_gid)
+            back.callback(os.setegid, group)
+            os.seteuid(owner.st_uid)
+            back.callback(os.seteuid, 0)
+        yield
+
+
+def _groups(owner: os.stat_result) -> list[int]:
+    try:
+        entry = pwd.getpwuid(owner.st_uid)
     except KeyError:
-        return f"{os.geteuid()}"
+        return [owner.st_gid]
+    return os.getgrouplist(entry.pw_name, entry.pw_gid)
 
 
 def refuse_unsafe(store: Path) -> None:
@@ -117,6 +166,35 @@ def refuse_unwritable(store: Path) -> None:
     raise StoreRefusedError(f"the store {store} may not be written by {us}: {helps}")
 
 
+def refuse_unopenable(store: Path) -> None:
+    """Make sure that this account may open what it keeps in a store, which may be a copy that root has made.
+
+    Without its journal the service would run all the same, as on a disk that fails, and lose what it held.
+
+    Raises:
+        StoreRefusedError: it may not; the text says what to do.
+        OSError: it cannot be looked at.
+    """
+    writable = 0 if is_read_only(store) else os.W_OK
+    for path in (store / name for name in _OPENED):
+        needed = os.R_OK | (writable if path.name != _LOCK else 0)
+        try:
+            status = path.lstat()
+        except FileNotFoundError:
+            continue
+        is_ours = not stat.S_ISREG(status.st_mode) or os.access(path, needed, effective_ids=True)
+        # The service that ends takes some away just now.
+        if is_ours or not os.path.lexists(path):
+            continue
+        us = account()
+        if status.st_uid == os.geteuid():
+            raise StoreRefusedError(f"{path} may not be opened by {us}, whose it is: chmod u+rw {path}")
+        raise StoreRefusedError(
+            f"{path} belongs to {_user(status.st_uid)}, and {us}, as whom the service runs, may not open it: "
+            f"chown -R {us} {store}"
+        )
+
+
 def restrict_files(store: Path) -> None:
     """Take from the files of a store what they allow to others than their owner and group.
 
@@ -140,6 +218,27 @@ def refuse_link(path: Path) -> None:
     except FileNotFoundError:
         return
     _refuse_file(path, status)
+
+
+def refuse_foreign(path: Path) -> None:
+    """The same for who only reads a file: it may also be of the owner of its store, which is no link either.
+
+    Raises:
+        StoreRefusedError, OSError: likewise.
+    """
+    status = path.lstat()
+    if not stat.S_ISREG(status.st_mode) or status.st_uid != path.parent.stat().st_uid:
+        _refuse_file(path, status)
+
+
+def whose_to_read(path: Path) -> str:
+    """Who may read a file of a store, or what is to be done first."""
+    with contextlib.suppress(OSError):
+        owner, store = path.lstat().st_uid, path.parent.stat()
+        if owner != store.st_uid:
+            theirs = f"chown -R {_account(store.st_uid)} {path.parent}"
+            return f"it belongs to {_user(owner)} and its store to {_user(store.st_uid)}: {theirs}"
+    return "run this as the service's user or as root"
 
 
 def _refuse_path(store: Path) -> None:
@@ -211,15 +310,23 @@ def _refuse_file(path: Path, status: os.stat_result) -> None:
 
 
 def _belongs(what: str, owner: int, path: Path) -> str:
+    # What is given to root, the service's own account could not open any more.
+    taken = f"chown {account()} {path}, " if os.geteuid() else ""
     return (
         f"{what} belongs to {_user(owner)} and the service runs as {_user(os.geteuid())}: "
-        f"chown {account()} {path}, run the service as {_user(owner)}, "
-        "or give it a directory of its own"
+        f"{taken}run the service as {_user(owner)}, or give it a directory of its own"
     )
 
 
 def _trusted() -> set[int]:
     return {0, os.geteuid()}
+
+
+def _account(number: int) -> str:
+    try:
+        return pwd.getpwuid(number).pw_name
+    except KeyError:
+        return f"{number}"
 
 
 def _user(number: int) -> str:

@@ -9,6 +9,7 @@ import re
 import sqlite3
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -28,7 +29,7 @@ from daqsvc.outbox.files import take_possession
 from daqsvc.settings import load_machine_file
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     Check = Callable[[Path], tuple[int, str, str]]
 
@@ -205,16 +206,51 @@ def test_a_store_that_may_not_be_written_is_a_warning(
     assert "could not start" not in out
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a directory away")
-def test_a_store_of_somebody_else_is_a_warning(tmp_path: Path, check: Check) -> None:
-    store = tmp_path / "alarms"
-    store.mkdir(mode=0o700)
-    os.chown(store, NOBODY, NOBODY)
-    assert run(MACHINE, store) == 2
-    code, out, _ = check(store)
-    assert code == 0
-    assert "could not start as root: the store" in out
-    assert f"alarms belongs to nobody and the service runs as root: chown root {store}" in out
+@pytest.fixture
+def owned() -> Iterator[Path]:
+    """A store of the service's own account, where that can get at it."""
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder).chmod(0o755)
+        store = Path(folder) / "alarms"
+        store.mkdir(mode=0o700)
+        os.chown(store, NOBODY, NOBODY)
+        yield store
+
+
+is_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can give files away")
+
+
+@is_root
+def test_root_is_told_how_the_service_of_another_account_stands_with_its_store(
+    owned: Path, check: Check, caplog: pytest.LogCaptureFixture
+) -> None:
+    code, out, err = check(owned)
+    assert (code, err, "Warnings" in out) == (0, "", False), "the service's account may use it"
+    assert (os.geteuid(), os.getegid()) == (0, 0)
+    # Whoever runs the service as root is not told to take the store away from its account.
+    assert run(MACHINE, owned) == 2
+    said = f"the store {owned} belongs to nobody and the service runs as root: run the service as nobody, or"
+    assert said in caplog.text
+    newer_file = owned / "outbox.sqlite"
+    with contextlib.closing(sqlite3.connect(newer_file)) as file:
+        file.execute("PRAGMA user_version = 99")
+    for owner in (NOBODY, 0):  # as it should be, and a copy that only root can read
+        os.chown(newer_file, owner, owner)
+        newer_file.chmod(0o600)
+        code, out, err = check(owned)
+        assert (code, out) == (2, "")
+        assert "has schema version 99" in err
+
+
+@is_root
+def test_a_copy_of_a_store_that_belongs_to_root_is_a_warning_with_its_remedy(
+    owned: Path, check: Check
+) -> None:
+    (owned / "outbox.sqlite").touch(0o600)
+    code, out, err = check(owned)
+    assert (code, err) == (0, "")
+    assert f"could not start as nobody: {owned}/outbox.sqlite belongs to root, and nobody, as whom the" in out
+    assert f"chown -R nobody {owned}" in out
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can be somebody else for a while")

@@ -15,11 +15,13 @@ from support.paths import ROOT
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.alarms.commands import AlarmCommand, Verb
 from daqsvc.audit import AuditError, AuditLog
+from daqsvc.commands.alarm_journal import current
 from daqsvc.outbox.files import is_read_only, remedy
 from daqsvc.outbox.journal import Journal
 from daqsvc.outbox.limits import OutboxLimits
 from daqsvc.outbox.messages import OutboxError, StoreRefusedError
 from daqsvc.outbox.reading import read_journal
+from daqsvc.outbox.safety import as_owner_of, refuse_unopenable
 from daqsvc.outbox.store import Outbox
 
 STRANGER = 61234
@@ -179,6 +181,80 @@ def test_of_a_directory_that_is_not_there_the_one_above_tells_whether_it_can_be_
     monkeypatch.setattr(os, "statvfs", statvfs)
     assert is_read_only(tmp_path / "none" / "of" / "these")
     assert "mount it writable again" in remedy(tmp_path / "none")
+
+
+@is_root
+@pytest.mark.parametrize(
+    "name",
+    [
+        "outbox.sqlite",
+        "outbox.sqlite-wal",
+        "outbox.sqlite.sequence",
+        "outbox.sqlite.lock",
+        "outbox-telemetry.sqlite",
+        "audit.jsonl",
+    ],
+)
+async def test_a_file_of_roots_in_the_store_of_the_service_is_refused_before_anything_is_lost(name, searched):
+    """So it is after `cp -r` by root. The service would go on without a journal, as on a disk that fails."""
+    store = searched / "above" / "store"
+    store.chmod(0o700)
+    (store / name).touch(0o600)
+    (store / "outbox.sqlite.bak").touch(0o600)
+    os.chown(store, STRANGER, STRANGER)
+    remedy_ = f"{name} belongs to root, and {STRANGER}, as whom the service runs, may not open it: chown -R"
+    there = sorted(path.name for path in store.iterdir())
+    for _ in range(2):
+        outbox = Outbox(store / "outbox.sqlite", SystemClock())
+        os.seteuid(STRANGER)
+        try:
+            with pytest.raises(StoreRefusedError, match=re.escape(f"{remedy_} {STRANGER} {store}")):
+                await outbox.open()
+        finally:
+            os.seteuid(0)
+            await outbox.close()
+    assert sorted(path.name for path in store.iterdir()) == there
+    os.chown(store / name, STRANGER, STRANGER)
+    os.seteuid(STRANGER)
+    try:
+        refuse_unopenable(store)  # what an administrator keeps beside it is nobody's business
+        (store / name).chmod(0)
+        with pytest.raises(StoreRefusedError, match=re.escape(f"chmod u+rw {store / name}")):
+            refuse_unopenable(store)
+    finally:
+        os.seteuid(0)
+
+
+@is_root
+def test_root_reads_the_store_of_the_service_as_its_owner_and_no_file_of_others(searched):
+    store = searched / "above" / "store"
+    opened(store).close()
+    for path in (store, *store.iterdir()):
+        os.chown(path, STRANGER, STRANGER)
+    before = os.geteuid(), os.getegid(), os.getgroups()
+    with as_owner_of(store):
+        assert (os.geteuid(), os.getegid(), os.getgroups()) == (STRANGER, STRANGER, [STRANGER])
+        assert read_journal(store).unsent == 0
+    assert (os.geteuid(), os.getegid(), os.getgroups()) == before
+    assert current(store) == []
+    os.chown(store / "outbox.sqlite", 0, 0)
+    with pytest.raises(
+        OutboxError, match=f"belongs to root and its store to user {STRANGER}: chown -R {STRANGER} "
+    ):
+        current(store)
+    os.chown(store / "outbox.sqlite", STRANGER + 1, STRANGER + 1)
+    with pytest.raises(OutboxError, match=f"belongs to user {STRANGER + 1}"):
+        read_journal(store)
+    # The owner may be who attacks: a link to what only root may read.
+    (searched / "secret").touch(0o600)
+    (store / "outbox.sqlite").unlink()
+    (store / "outbox.sqlite").symlink_to(searched / "secret")
+    os.chown(store / "outbox.sqlite", STRANGER, STRANGER, follow_symlinks=False)
+    for read in (read_journal, current):
+        with pytest.raises(OutboxError, match="symbolic link"):
+            read(store)
+    with as_owner_of(store), pytest.raises(PermissionError):
+        (store / "outbox.sqlite").read_bytes()
 
 
 @is_root
