@@ -27,6 +27,7 @@ from daqsvc.commands.example import ExampleCommand
 from daqsvc.commands.export import ExportCommand
 from daqsvc.commands.fleet import FleetCommand
 from daqsvc.commands.machine_files import load_box
+from daqsvc.commands.page import PageCommand
 from daqsvc.commands.record import RecordCommand
 from daqsvc.commands.reload import ReloadCommand
 from daqsvc.commands.replay import ReplayCommand
@@ -182,6 +183,7 @@ def commands() -> dict[str, Command]:
         "snapshot": SnapshotCommand(load),
         "replay": ReplayCommand(load, kernel_cache.prepare),
         "status": StatusCommand(load),
+        "page": PageCommand(load),
         "trend": TrendCommand(load),
         "alarms": AlarmsCommand(load),
         **alarm_verbs(load),

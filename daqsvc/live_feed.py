@@ -16,6 +16,7 @@ import numpy as np
 from pydantic_core import to_json
 
 from daqsvc import __version__
+from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import SampleBlock
 from daqsvc.alarms.events import AlarmEvent
 from daqsvc.diagnosis.record import Diagnosis
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping
 
     from daqsvc.acquisition.clock import Clock
+    from daqsvc.acquisition.ring import SampleRing
     from daqsvc.acquisition.standing import StreamState
     from daqsvc.settings.models import MachineFile
 
@@ -36,6 +38,8 @@ MOST_WAITING_BYTES = 4_000_000
 """Samples that wait for one who looks."""
 MOST_WAITING = 2000
 """Likewise items of every kind."""
+BEFORE_S = 20.0
+"""What the rings hold of so long before is told at first."""
 
 
 class _Stands(NamedTuple):
@@ -107,6 +111,7 @@ class LiveFeed:
     def __init__(self, machine: MachineFile, clock: Clock) -> None:
         self.machine = machine
         self._clock = clock
+        self._begun_ns = clock.monotonic_ns()
         self._lookers: set[Looker] = set()
 
     def about(
@@ -129,7 +134,7 @@ class LiveFeed:
             "site": machine.site,
             "box": machine.box,
             "machine": machine.machine.name,
-            "monotonic_ns": self._clock.monotonic_ns(),
+            "begun_ns": self._begun_ns,
             "wall_ns_at_0": self._clock.wall_ns() - self._clock.monotonic_ns(),
             "streams": dict(stream_facts(machine)),
             "values": machine_values(machine),
@@ -144,6 +149,7 @@ class LiveFeed:
         statements: Iterable[Diagnosis],
         alarms: Iterable[AlarmEvent],
         standings: Mapping[str, StreamState],
+        rings: Mapping[str, SampleRing],
     ) -> Looker:
         """Begin to look on.
 
@@ -152,8 +158,12 @@ class LiveFeed:
             statements: see `about`.
             alarms: see `about`.
             standings: see `about`.
+            rings: what has come lately, by stream and grid.
         """
         looker = Looker(_line(self.about(statements, alarms, standings)), streams)
+        for stream in looker.streams & rings.keys():
+            if (before := _before(rings[stream])) is not None:
+                looker.take(before)
         self._lookers.add(looker)
         return looker
 
@@ -188,6 +198,17 @@ class LiveFeed:
     def _tell(self, happened: _Happened) -> None:
         for looker in self._lookers:
             looker.take(happened)
+
+
+def _before(ring: SampleRing) -> SampleBlock | None:
+    """What a ring holds of the last `BEFORE_S`, no more than may wait together; None if that is nothing."""
+    if not ring.started:
+        return None
+    last = ring.end_index - 1
+    most = MOST_WAITING_BYTES // 2 // (4 * len(ring.channels))
+    count = min(round(BEFORE_S * NS_PER_S / ring.period_at(last)), last + 1 - ring.oldest_index, most)
+    first = last + 1 - count
+    return SampleBlock(ring.stream, first, ring.read(first, count), ring.time_of(first), ring.period_at(last))
 
 
 def _told(items: Iterable[_Happened]) -> Iterator[dict[str, Any]]:

@@ -242,7 +242,8 @@ class Service:
         if watch is None or name is None:
             return tuple(self.watches)
         latest = self.reports[name].latest
-        looker = watch.live.look(streams, latest, self.alarms.newest(name), watch.standings)
+        newest = self.alarms.newest(name)
+        looker = watch.live.look(streams, latest, newest, watch.standings, watch.rings)
         return Looking(looker.lines, partial(watch.live.leave, looker))
 
     def _alarms_of(self, machine: MachineFile) -> AlarmManager:

@@ -153,7 +153,7 @@ def block(first_index: int, rows: int, stream: str = "shaft") -> SampleBlock:
 async def test_who_is_slow_is_told_how_much_was_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live_feed, "MOST_WAITING_BYTES", 10 * 8 * 10)
     feed = LiveFeed(rig("live-slow"), DrivenClock())
-    looker = feed.look(["shaft"], [], [], {})
+    looker = feed.look(["shaft"], [], [], {}, {})
     for number in range(25):
         feed.block(block(10 * number, 10))
     feed.block(block(0, 10, "other"))
@@ -174,7 +174,7 @@ async def test_who_is_slow_is_told_how_much_was_left_out(monkeypatch: pytest.Mon
 
 async def test_blocks_behind_a_gap_are_told_apart() -> None:
     feed = LiveFeed(rig("live-gap"), DrivenClock())
-    looker = feed.look(["shaft"], [], [], {})
+    looker = feed.look(["shaft"], [], [], {}, {})
     feed.block(block(0, 10))
     feed.block(block(10, 5))
     feed.block(block(20, 5))

@@ -1,0 +1,5 @@
+"""The page: what an engineer looks at in a browser. A process of its own beside the service.
+
+`source` asks the service over its control socket, `machine_live` keeps what it tells, `views` turn that into
+figures and text, `server` hands both to browsers.
+"""

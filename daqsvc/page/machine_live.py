@@ -1,0 +1,240 @@
+"""What the page knows of one machine: what the service has told since somebody began to look.
+
+Nothing is kept over a restart, and of the waveforms no more than the last seconds.
+"""
+
+from __future__ import annotations
+
+import base64
+import itertools
+from collections import deque
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+
+from daqsvc.acquisition.ring import SampleRing
+from daqsvc.acquisition.samples import Quality, SampleBlock
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from numpy.typing import NDArray
+
+    Document = dict[str, Any]
+    Samples = NDArray[np.float32]
+
+KEEP_S = 20.0
+"""Of the waveforms."""
+MOST_VALUES = 4_000_000
+"""Of one stream that are kept, at most."""
+MOST_SAID = 3600
+"""Statements of one detector that are kept."""
+MOST_JOURNAL = 500
+"""Alarm events that are kept."""
+
+
+class Sensor(NamedTuple):
+    """A sensor, by the machine file.
+
+    Attributes:
+        name: its name.
+        kind: ``"proximity"``, ``"accelerometer"``, ``"keyphasor"`` and the like.
+        unit: of its samples.
+        angle_deg: where a probe points, from +x against the clock; None for others.
+        threshold: where a keyphasor's pulse begins; None for others.
+        edge: the edge of that pulse that marks a revolution.
+    """
+
+    name: str
+    kind: str
+    unit: str
+    angle_deg: float | None
+    threshold: float | None
+    edge: Literal["rising", "falling"]
+
+
+class Said(NamedTuple):
+    """A statement, in short.
+
+    Attributes:
+        t_ns: of its last sample, by the box's monotonic clock.
+        decision: what it decides.
+        probabilities: by mode.
+        statistics: its figures.
+    """
+
+    t_ns: int
+    decision: str
+    probabilities: dict[str, float]
+    statistics: dict[str, float]
+
+
+class Place(NamedTuple):
+    """Where a sensor's samples come: a column of a stream, or of a grid."""
+
+    stream: str
+    column: int
+
+
+class MachineLive:
+    """One machine, as it was told.
+
+    Args:
+        about: the first line of `daqsvc.live_feed`.
+    """
+
+    def __init__(self, about: Document) -> None:
+        self.about = about
+        self.values: Document = about["values"]
+        self.name: str = about["machine"]
+        self.wall_ns_at_0: int = about["wall_ns_at_0"]
+        self.sensors = {one["name"]: _sensor(one) for one in self.values.get("sensors", ())}
+        self.rings: dict[str, SampleRing] = {}
+        self.latest: dict[str, Document] = {one["detector"]: one for one in about["statements"]}
+        self.said: dict[str, deque[Said]] = {}
+        self.alarms: dict[str, Document] = {one["alarm"]: one for one in about["alarms"]}
+        self.journal: deque[Document] = deque(sorted(about["alarms"], key=_when), MOST_JOURNAL)
+        self.standings: dict[str, Document] = dict(about["standings"])
+        self.status: Document | None = None
+        """The newest answer to ``status``."""
+        self.left_out = 0
+        self._places = self._found_places()
+
+    @property
+    def speed_rpm(self) -> float:
+        """What a detector says of the speed, or the machine file."""
+        for one in self.latest.values():
+            measured = one["statistics"].get("speed")
+            if measured is not None and one["units"].get("speed") == "rpm":
+                return float(measured)
+        return float(self.values["machine"].get("speed_rpm", 0.0))
+
+    @property
+    def turns_clockwise(self) -> bool:
+        """Whether the shaft turns clockwise, seen from where the probes' angles are."""
+        return bool(self.values["machine"].get("rotation") == "clockwise")
+
+    def take(self, line: Document) -> None:
+        """Take in a line of the feed after the first one."""
+        if (samples := line.get("samples")) is not None:
+            self._write(samples)
+        elif (statement := line.get("statement")) is not None:
+            self._hear(statement)
+        elif (alarm := line.get("alarm")) is not None:
+            self.alarms[alarm["alarm"]] = alarm
+            self.journal.append(alarm)
+        elif (standing := line.get("standing")) is not None:
+            self.standings[standing["stream"]] = standing
+        self.left_out += line.get("left_out", 0)
+
+    def go_on_from(self, before: MachineLive) -> None:
+        """Keep what is known of the time before the connection was made anew."""
+        self.said, self.status = before.said, before.status
+        if self.about["begun_ns"] == before.about["begun_ns"]:  # else samples are counted anew
+            self.rings = before.rings
+        for event in before.journal:
+            if event not in self.journal:
+                self.journal.append(event)
+        self.journal = deque(sorted(self.journal, key=_when), MOST_JOURNAL)
+
+    def rate_hz(self, stream: str) -> float:
+        """Samples per second of a stream, by the machine file."""
+        return float(self.about["streams"][stream]["rate_hz"])
+
+    def place_of(self, sensors: Iterable[str]) -> list[Place] | None:
+        """Where sensors are sampled together; None if nowhere."""
+        wanted = list(sensors)
+        for there in self._places.values():
+            if all(one in there for one in wanted):
+                return [there[one] for one in wanted]
+        return None
+
+    def newest(self, stream: str, seconds: float) -> tuple[Samples, int] | None:
+        """The last samples of a stream, ``[n, channels]``, and when the very last one was taken."""
+        ring = self.rings.get(stream)
+        if ring is None or not ring.started:
+            return None
+        count = min(round(seconds * self.rate_hz(stream)), ring.end_index - ring.oldest_index)
+        return ring.read(ring.end_index - count, count), ring.time_of(ring.end_index - 1)
+
+    def probes(self) -> list[tuple[str, str]]:
+        """Pairs of proximity probes of one plane: neighbours in the machine file, 60 to 120 degrees apart."""
+        probes = [one for one in self.sensors.values() if one.kind == "proximity"]
+        pairs = []
+        for x, y in itertools.pairwise(probes):
+            apart = abs(((y.angle_deg or 0.0) - (x.angle_deg or 0.0) + 180.0) % 360.0 - 180.0)
+            if 60.0 <= apart <= 120.0 and self.place_of([x.name, y.name]):
+                pairs.append((x.name, y.name))
+        return pairs
+
+    def keyphasor(self) -> str | None:
+        """The first keyphasor."""
+        return next((one.name for one in self.sensors.values() if one.kind == "keyphasor"), None)
+
+    def edge_of(self, keyphasor: str) -> Literal["rising", "falling"]:
+        """The edge of a keyphasor's pulse that marks a revolution."""
+        return self.sensors[keyphasor].edge
+
+    def vibration_sensors(self) -> list[str]:
+        """All sensors but keyphasors, by their names."""
+        return [one.name for one in self.sensors.values() if one.kind not in {"keyphasor", "tachometer"}]
+
+    def _found_places(self) -> dict[str, dict[str, Place]]:
+        """By stream and grid, where each sensor's samples are in it."""
+        places: dict[str, dict[str, Place]] = {}
+        named: dict[str, str] = {}
+        for stream, facts in self.about["streams"].items():
+            if any(facts["sensors"]):
+                pairs = zip(facts["sensors"], facts["channels"], strict=True)
+                named |= {f"{stream}.{channel}": sensor for sensor, channel in pairs}
+                places[stream] = {
+                    sensor: Place(stream, column) for column, sensor in enumerate(facts["sensors"]) if sensor
+                }
+        for stream, facts in self.about["streams"].items():
+            if stream not in places:  # a grid
+                columns = enumerate(named.get(channel, "") for channel in facts["channels"])
+                places[stream] = {sensor: Place(stream, column) for column, sensor in columns if sensor}
+        return places
+
+    def _hear(self, statement: Document) -> None:
+        detector = statement["detector"]
+        self.latest[detector] = statement
+        said = self.said.setdefault(detector, deque(maxlen=MOST_SAID))
+        said.append(
+            Said(
+                statement["monotonic_ns"],
+                statement["decision"],
+                statement["probabilities"],
+                statement["statistics"],
+            )
+        )
+
+    def _write(self, told: Document) -> None:
+        rows = np.frombuffer(base64.b64decode(told["values"]), "<f4").reshape(told["shape"])
+        stream, first = told["stream"], told["first_index"]
+        ring = self.rings.get(stream)
+        if ring is None:
+            ring = self.rings[stream] = self._ring(stream, rows.shape[1])
+        period_ns, t_first_ns = told["period_ns"], told["t_first_ns"]
+        if ring.started and (known := ring.end_index - first) > 0:  # whoever asks anew is told it again
+            rows, first, t_first_ns = rows[known:], first + known, t_first_ns + round(known * period_ns)
+            if not len(rows):
+                return
+        lost = first - ring.end_index if ring.started else 0
+        ring.write(SampleBlock(stream, first, rows, t_first_ns, period_ns, lost, Quality(told["quality"])))
+
+    def _ring(self, stream: str, channels: int) -> SampleRing:
+        wanted = round(KEEP_S * self.rate_hz(stream))
+        return SampleRing(
+            stream, self.about["streams"][stream]["channels"], max(min(wanted, MOST_VALUES // channels), 1)
+        )
+
+
+def _when(event: Document) -> int:
+    return int(event["monotonic_ns"])
+
+
+def _sensor(told: Document) -> Sensor:
+    angle, threshold = told.get("angle_deg"), told.get("threshold_v")
+    edge: Literal["rising", "falling"] = "falling" if told.get("edge") == "falling" else "rising"
+    return Sensor(told["name"], told.get("type", ""), told.get("unit", ""), angle, threshold, edge)

@@ -1,0 +1,137 @@
+"""What is made for several browsers at once: each picture of a view is made once, however many look at it."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import contextlib
+import json
+import logging
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from daqsvc.page.text import alarm_rows, head, machine_rows
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Mapping
+
+    from daqsvc.page.machine_live import MachineLive
+    from daqsvc.page.source import BoxSource, Listening
+    from daqsvc.page.views.view import View
+
+log = logging.getLogger(__name__)
+
+HEAD_EVERY_S = 0.5
+"""How often at least something is told, so that a browser knows that it is still heard."""
+STALE_S = 3.0
+"""Of a service that has said nothing for so long it is told that it is silent."""
+
+
+class Picture:
+    """One view of one machine, made again and again while browsers look at it.
+
+    Args:
+        source: of the machines.
+        machine: its name.
+        view: what is shown beside the head; None for the machine as a whole.
+        chosen: see `daqsvc.page.views.view.Choice`.
+    """
+
+    def __init__(self, source: BoxSource, machine: str, view: View | None, chosen: Mapping[str, str]) -> None:
+        self._source = source
+        self._machine = machine
+        self._view = view
+        self._chosen = chosen
+        self._newest = b""
+        self._made = asyncio.Condition()
+        self._looking = 0
+        self._is_over = False
+        self._task: asyncio.Task[None] | None = None
+
+    async def events(self) -> AsyncIterator[bytes]:
+        """Server-sent events, until the browser goes."""
+        self._looking += 1
+        if self._task is None:
+            self._task = asyncio.create_task(self._make(), name=f"picture of {self._machine}")
+        try:
+            while not self._is_over:
+                async with self._made:
+                    await self._made.wait()
+                    newest = self._newest
+                yield newest
+        finally:
+            self._looking -= 1
+            if not self._looking:
+                self.end()
+
+    async def close(self) -> None:
+        """End it for all who look."""
+        self._is_over = True
+        self.end()
+        async with self._made:
+            self._made.notify_all()
+
+    def end(self) -> None:
+        """Make it no more."""
+        if self._task is not None:
+            self._task.cancel()
+            self._task = None
+
+    async def _make(self) -> None:
+        async with self._source.looking(self._machine) as listening:
+            with contextlib.ExitStack() as wanting:
+                wanted: set[str] = set()
+                every_s = HEAD_EVERY_S if self._view is None else self._view.every_s
+                while True:
+                    begun_s = time.monotonic()
+                    streams = self._streams(listening)
+                    if streams != wanted:
+                        wanting.enter_context(listening.wanting(streams))
+                        wanted = streams
+                    told = await asyncio.to_thread(self._told, listening)
+                    async with self._made:
+                        self._newest = b"data: " + told + b"\n\n"
+                        self._made.notify_all()
+                    await asyncio.sleep(max(every_s - (time.monotonic() - begun_s), 0.01))
+
+    def _streams(self, listening: Listening) -> set[str]:
+        live = listening.live
+        if self._view is None or live is None or self._view.why_not(live):
+            return set()
+        return self._view.streams(live, self._chosen)
+
+    def _told(self, listening: Listening) -> bytes:
+        """What browsers are told now, as JSON; on a thread."""
+        live = listening.live
+        silent_s = time.monotonic() - listening.heard_s
+        why = listening.why_not or ("the service says nothing" if silent_s > STALE_S else "")
+        told: dict[str, Any] = {"age_s": round(silent_s, 1), "why": why}
+        if live is not None:
+            told["html"] = {"head": head(live), "alarms": alarm_rows(live), "machine": machine_rows(live)}
+            if self._view is not None:
+                told |= self._view_of(self._view, live)
+        return json.dumps(told).encode()
+
+    def _view_of(self, view: View, live: MachineLive) -> dict[str, Any]:
+        if why_not := view.why_not(live):
+            return {"note": why_not}
+        try:
+            shown = view.shown(live, self._chosen)
+        except LookupError as error:
+            # What was chosen is not there any more, e.g. a sensor after a reload.
+            log.debug("view %s of %s", view.name, self._machine, exc_info=True)
+            return {"note": f"what is chosen is not there any more ({error}): choose anew"}
+        sources = {
+            name: {column: _sent(values) for column, values in columns.items()}
+            for name, columns in shown.sources.items()
+        }
+        return {"sources": sources, "rows": [list(row) for row in shown.rows], "note": shown.note}
+
+
+def _sent(values: Any) -> Any:
+    """Numbers as the base64 of little-endian float32; texts as they are."""
+    if isinstance(values, list):
+        return values
+    return {"f4": base64.b64encode(np.asarray(values, "<f4").tobytes()).decode()}

@@ -1,0 +1,237 @@
+"""Where the page gets what it shows: the service on this box, over its control socket.
+
+A machine is listened to while somebody looks at it. Samples are asked for of the streams that are looked at.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+import time
+from typing import TYPE_CHECKING, Any
+
+from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.acquisition.link import Backoff
+from daqsvc.control import SOCKET, STATUS_QUESTION
+from daqsvc.live_feed import SCHEMA
+from daqsvc.page.machine_live import MachineLive
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Iterable, Iterator
+    from pathlib import Path
+
+    Document = dict[str, Any]
+
+log = logging.getLogger(__name__)
+
+LONGEST_LINE = 64 * 1024 * 1024
+STATUS_EVERY_S = 1.0
+LINGER_S = 5.0
+"""How long a machine is still listened to when nobody looks any more."""
+
+
+class Listening:
+    """Listens to one machine of a service, and keeps what it tells.
+
+    Args:
+        store: the store of the service.
+        machine: its name.
+    """
+
+    def __init__(self, store: Path, machine: str) -> None:
+        self.machine = machine
+        self.live: MachineLive | None = None
+        """What was told; None before the service has answered for the first time."""
+        self.why_not = "the service has not answered yet"
+        """Why nothing is told by now; empty if something is."""
+        self.heard_s = time.monotonic()
+        """When the service said something last."""
+        self._path = store / SOCKET
+        self._wanted: dict[object, frozenset[str]] = {}
+        self._streams: frozenset[str] = frozenset()
+        self._anew = asyncio.Event()
+        self._has_begun = asyncio.Event()
+
+    async def first(self, timeout_s: float) -> MachineLive | None:
+        """The machine, as soon as the service has told of it; None if it does not in time."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout_s):
+                await self._has_begun.wait()
+        return self.live
+
+    @contextlib.contextmanager
+    def wanting(self, streams: Iterable[str]) -> Iterator[None]:
+        """Have the samples of streams come meanwhile."""
+        who = object()
+        self._wanted[who] = frozenset(streams)
+        self._ask_anew()
+        try:
+            yield
+        finally:
+            del self._wanted[who]
+            self._ask_anew()
+
+    def _ask_anew(self) -> None:
+        wanted = frozenset().union(*self._wanted.values())
+        # What is wanted no more goes on coming until something else is: it costs less than asking anew.
+        if wanted - self._streams or (self._streams and not wanted):
+            self._anew.set()
+
+    async def run(self) -> None:
+        """Listen until cancelled; again and again where that fails."""
+        backoff = Backoff()
+        asking = asyncio.create_task(self._ask_status(), name=f"status of {self.machine}")
+        try:
+            while True:
+                self._anew.clear()
+                self._streams = frozenset().union(*self._wanted.values())
+                try:
+                    await self._listen(backoff)
+                except (OSError, ValueError, asyncio.IncompleteReadError) as error:
+                    self.why_not = _in_words(error)
+                if not self._anew.is_set():
+                    await asyncio.sleep(backoff.next_ns() / NS_PER_S)
+        finally:
+            asking.cancel()
+            await asyncio.wait({asking})
+
+    async def _listen(self, backoff: Backoff) -> None:
+        reader, writer = await asyncio.open_unix_connection(self._path, limit=LONGEST_LINE)
+        try:
+            asked = {"machine": self.machine, "streams": sorted(self._streams)}
+            question = f'{{"schema": "daqsvc.control/1", "verb": "live", {json.dumps(asked)[1:]}\n'
+            writer.write(question.encode())
+            about = json.loads(await reader.readuntil())
+            if about.get("schema") != SCHEMA:
+                raise ValueError(str(about.get("reason", "it answers in a way that is not known here")))
+            self._begin(about)
+            backoff.reset()
+            waiting = asyncio.create_task(self._anew.wait(), name="other streams are wanted")
+            try:
+                while not waiting.done():
+                    reading = asyncio.ensure_future(reader.readuntil())
+                    try:
+                        await asyncio.wait({reading, waiting}, return_when=asyncio.FIRST_COMPLETED)
+                    finally:
+                        if not reading.done():
+                            reading.cancel()
+                        await asyncio.wait({reading})
+                    if reading.cancelled():
+                        return
+                    self._take(json.loads(reading.result()))
+            finally:
+                waiting.cancel()
+        finally:
+            writer.close()
+            with contextlib.suppress(OSError):
+                await writer.wait_closed()
+
+    def _begin(self, about: Document) -> None:
+        before = self.live
+        self.live = MachineLive(about)
+        if before is not None and before.about["streams"] == about["streams"]:
+            self.live.go_on_from(before)
+        self.why_not = ""
+        self.heard_s = time.monotonic()
+        self._has_begun.set()
+
+    def _take(self, line: Document) -> None:
+        if self.live is not None:
+            self.live.take(line)
+        self.heard_s = time.monotonic()
+
+    async def _ask_status(self) -> None:
+        """Ask how everything stands, every second."""
+        question = {"schema": "daqsvc.control/1", "verb": "status", "machine": self.machine}
+        line = json.dumps(question).encode() + b"\n"
+        while True:
+            with contextlib.suppress(OSError, ValueError, asyncio.IncompleteReadError):
+                async with _connected(self._path) as (reader, writer):
+                    while True:
+                        writer.write(line)
+                        status = json.loads(await reader.readuntil())
+                        if self.live is not None and status.get("machine") == self.machine:
+                            self.live.status = status
+                            self.heard_s = time.monotonic()
+                        await asyncio.sleep(STATUS_EVERY_S)
+            await asyncio.sleep(STATUS_EVERY_S)
+
+
+class BoxSource:
+    """The machines of the service that runs on a store.
+
+    Args:
+        store: its directory.
+    """
+
+    def __init__(self, store: Path) -> None:
+        self._store = store
+        self._listening: dict[str, tuple[Listening, asyncio.Task[None]]] = {}
+        self._looking: dict[str, int] = {}
+
+    async def machines(self) -> list[str]:
+        """The names of the machines that the service watches.
+
+        Raises:
+            OSError: it does not answer.
+            ValueError: it answers something else.
+        """
+        async with _connected(self._store / SOCKET) as (reader, writer):
+            writer.write(STATUS_QUESTION + b"\n")
+            try:
+                told = json.loads(await reader.readuntil())
+                # Of several it has to be said which one is meant: the answer names them.
+                names = told["machines"] if "machines" in told else [told["machine"]]
+            except (asyncio.IncompleteReadError, KeyError) as error:
+                raise ValueError("the service has not answered") from error
+        return [str(name) for name in names]
+
+    @contextlib.asynccontextmanager
+    async def looking(self, machine: str) -> AsyncIterator[Listening]:
+        """Listen to a machine meanwhile, together with all others who look at it."""
+        if machine not in self._listening:
+            listening = Listening(self._store, machine)
+            task = asyncio.create_task(listening.run(), name=f"listen to {machine}")
+            self._listening[machine] = listening, task
+        self._looking[machine] = self._looking.get(machine, 0) + 1
+        try:
+            yield self._listening[machine][0]
+        finally:
+            self._looking[machine] -= 1
+            asyncio.get_running_loop().call_later(LINGER_S, self._perhaps_end, machine)
+
+    def _perhaps_end(self, machine: str) -> None:
+        if not self._looking.get(machine) and machine in self._listening:
+            self._listening.pop(machine)[1].cancel()
+
+    async def close(self) -> None:
+        """Listen no more."""
+        tasks = {task for _, task in self._listening.values()}
+        self._listening.clear()
+        for task in tasks:
+            task.cancel()
+        if tasks:
+            await asyncio.wait(tasks)
+
+
+@contextlib.asynccontextmanager
+async def _connected(path: Path) -> AsyncIterator[tuple[asyncio.StreamReader, asyncio.StreamWriter]]:
+    reader, writer = await asyncio.open_unix_connection(path, limit=LONGEST_LINE)
+    try:
+        yield reader, writer
+    finally:
+        writer.close()
+        with contextlib.suppress(OSError):
+            await writer.wait_closed()
+
+
+def _in_words(error: Exception) -> str:
+    if isinstance(error, FileNotFoundError | ConnectionRefusedError):
+        return "no daqsvc runs on the store"
+    if isinstance(error, PermissionError):
+        return "the page may not ask the service: run it as the service's user"
+    if isinstance(error, asyncio.IncompleteReadError):
+        return "the service has ended the connection"
+    return f"{error}" or type(error).__name__

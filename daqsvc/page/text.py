@@ -1,0 +1,99 @@
+"""How a machine stands, in HTML that is put into the page as it is."""
+
+from __future__ import annotations
+
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+from daqsvc.acquisition.clock import NS_PER_S, iso_utc
+from daqsvc.page.views.modes import in_words
+
+if TYPE_CHECKING:
+    from daqsvc.page.machine_live import MachineLive
+
+    Document = dict[str, Any]
+
+WORST = {"danger": 2, "alert": 1}
+STATES = {
+    "active_unacknowledged": "active, not acknowledged",
+    "active_acknowledged": "active, acknowledged",
+    "returned_unacknowledged": "returned, not acknowledged",
+    "latched_unacknowledged": "latched, not acknowledged",
+    "latched_acknowledged": "latched, acknowledged",
+    "shelved": "shelved",
+    "suppressed": "suppressed",
+    "out_of_service": "out of service",
+}
+"""States of alarms (ISA-18.2) but normal."""
+
+
+def standing(live: MachineLive) -> list[Document]:
+    """The alarms that are not normal, the worst and newest first."""
+    alarms = [one for one in live.alarms.values() if one["state"] != "normal"]
+    return sorted(alarms, key=lambda one: (-WORST.get(one["level"], 0), -one["monotonic_ns"]))
+
+
+def level_of(live: MachineLive) -> str:
+    """The worst level of what stands uncovered."""
+    covered = {"shelved", "suppressed", "out_of_service"}
+    levels = [one["level"] for one in standing(live) if one["state"] not in covered]
+    return max(levels, key=lambda level: WORST.get(level, 0), default="normal")
+
+
+def head(live: MachineLive) -> str:
+    """One line: the machine, its worst level, its speed."""
+    level = level_of(live)
+    description = live.values["machine"].get("description", "")
+    return (
+        f'<span class="level {escape(level)}">{escape(level)}</span> '
+        f"<span>{live.speed_rpm:.0f} rpm</span> <span>{escape(description)}</span>"
+    )
+
+
+def alarm_rows(live: MachineLive) -> str:
+    """The standing alarms as rows of a table."""
+    rows = [
+        _row(
+            f'<span class="level {escape(one["level"])}">{escape(one["level"])}</span>',
+            escape(one["alarm"]) + (' <span class="first">first</span>' if one["first_out"] else ""),
+            escape(STATES.get(str(one["state"]), str(one["state"]))),
+            _time(one["wall_ns"]),
+            escape(one["message"]),
+        )
+        for one in standing(live)
+    ]
+    return "".join(rows) or '<tr><td colspan="5">No alarm stands.</td></tr>'
+
+
+def machine_rows(live: MachineLive) -> str:
+    """What each detector says, and what each channel measures."""
+    rows = []
+    for one in sorted(live.latest.values(), key=lambda said: str(said["detector"])):
+        figures = ", ".join(
+            f"{name} {value:.4g} {one['units'].get(name, '')}".rstrip()
+            for name, value in one["statistics"].items()
+            if value is not None and "." not in name
+        )
+        likely = sorted(one["probabilities"].items(), key=lambda mode: -(mode[1] or 0.0))[:3]
+        odds = ", ".join(f"p({mode}) {in_words(p)}" for mode, p in likely)
+        said = one["decision"] if not one["reason"] else f"{one['decision']}: {one['reason']}"
+        rows.append(
+            _row(
+                escape(str(one["detector"])),
+                f'<span class="level {escape(one["severity"])}">{escape(said)}</span>',
+                escape("; ".join(filter(None, (odds, figures)))),
+                _time(live.wall_ns_at_0 + int(one["monotonic_ns"])),
+                escape(one["quality"]),
+            )
+        )
+    return "".join(rows) or '<tr><td colspan="5">No detector has said anything yet.</td></tr>'
+
+
+def _row(*cells: str) -> str:
+    return f"<tr>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>"
+
+
+def _time(wall_ns: int) -> str:
+    """A time that the browser shows in its own zone; UTC stands beside it."""
+    utc = iso_utc(wall_ns // NS_PER_S * NS_PER_S)
+    return f'<time datetime="{utc}" title="{utc}">{utc}</time>'

@@ -1,0 +1,18 @@
+"""All views of a machine, in the order in which they stand on the page."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from daqsvc.page.views.modes import ModesView
+from daqsvc.page.views.orbit import OrbitView
+from daqsvc.page.views.spectrum import FullSpectrumView, SpectrumView
+from daqsvc.page.views.timebase import TimebaseView
+
+if TYPE_CHECKING:
+    from daqsvc.page.views.view import View
+
+VIEWS: dict[str, View] = {
+    view.name: view for view in (ModesView(), OrbitView(), TimebaseView(), SpectrumView(), FullSpectrumView())
+}
+"""By the name in the address."""

@@ -1,0 +1,103 @@
+"""The probabilities of the modes over time, and what the detectors find."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.page.charts import Axis, chart, legend, source
+from daqsvc.page.views.view import Choice, Figure, Shown
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from daqsvc.page.charts import Theme
+    from daqsvc.page.machine_live import MachineLive
+
+LENGTHS = {"60": "1 minute", "300": "5 minutes", "10": "10 s"}
+
+
+class ModesView:
+    """See `daqsvc.page.views.view.View`."""
+
+    name = "modes"
+    title = "Probabilities"
+    sentence = (
+        "How probable each condition of the machine is by what the detector has seen so far, from 0 to 1. "
+        "N is the machine as it should be; the others are its faults."
+    )
+    every_s = 0.5
+
+    def choices(self, live: MachineLive) -> list[Choice]:
+        """See `daqsvc.page.views.view.View.choices`."""
+        detectors = {name: name for name, one in live.latest.items() if one["probabilities"]}
+        return [Choice("detector", "Detector", detectors), Choice("length", "Length", LENGTHS)]
+
+    def why_not(self, live: MachineLive) -> str:
+        """See `daqsvc.page.views.view.View.why_not`."""
+        if any(one["probabilities"] for one in live.latest.values()):
+            return ""
+        return "no detector of this machine has told any probabilities yet"
+
+    def streams(self, live: MachineLive, chosen: Mapping[str, str]) -> set[str]:
+        """See `daqsvc.page.views.view.View.streams`."""
+        del live, chosen
+        return set()
+
+    def figures(self, live: MachineLive, chosen: Mapping[str, str], theme: Theme) -> list[Figure]:
+        """See `daqsvc.page.views.view.View.figures`."""
+        detector = chosen["detector"]
+        modes = list(live.latest[detector]["probabilities"])
+        made = chart(
+            Axis("time before now, s", -float(chosen["length"]), 0.0),
+            Axis("probability", -0.02, 1.02),
+            theme,
+            tips=[
+                ("time", "@t{0.0} s"),
+                *((mode, f"@m{number}{{0.000}}") for number, mode in enumerate(modes)),
+            ],
+        )
+        columns = ["t", *(f"m{number}" for number in range(len(modes)))]
+        told = source("modes", columns)
+        for number, mode in enumerate(modes):
+            colour = theme.series[number % len(theme.series)]
+            made.step(
+                "t",
+                f"m{number}",
+                source=told,
+                line_color=colour,
+                line_width=2,
+                mode="after",
+                legend_label=mode,
+            )
+        legend(made, theme)
+        return [Figure("modes", f"Probabilities of the modes of {detector} over time", made)]
+
+    def shown(self, live: MachineLive, chosen: Mapping[str, str]) -> Shown:
+        """See `daqsvc.page.views.view.View.shown`."""
+        detector = chosen["detector"]
+        said = list(live.said.get(detector, ()))
+        latest = live.latest[detector]
+        now_ns = int(latest["monotonic_ns"])
+        since_ns = now_ns - float(chosen["length"]) * NS_PER_S
+        modes = list(latest["probabilities"])
+        wanted = [one for one in said if one.t_ns >= since_ns and one.probabilities]
+        columns = {"t": np.array([(one.t_ns - now_ns) / NS_PER_S for one in wanted])}
+        for number, mode in enumerate(modes):
+            columns[f"m{number}"] = np.array([one.probabilities.get(mode, np.nan) for one in wanted])
+        rows = [(f"p({mode})", in_words(p), "") for mode, p in latest["probabilities"].items()]
+        rows.append(("decides", latest["decision"], ""))
+        if len(latest["group"]) > 1:
+            rows.append(("not told apart", ", ".join(latest["group"]), ""))
+        return Shown({"modes": columns}, rows, latest["reason"])
+
+
+def in_words(probability: float | None) -> str:
+    """A probability as a person reads it."""
+    if probability is None:
+        return "not known"
+    if probability > 0.999:
+        return "> 0.999"
+    return "< 0.001" if probability < 0.001 else f"{probability:.3f}"

@@ -1,0 +1,118 @@
+"""The orbit of the shaft's centre: as it is, and its order 1X alone."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daqsvc.page.charts import Axis, chart, legend, source
+from daqsvc.page.shaft import order_1x, whirl
+from daqsvc.page.views.view import Choice, Figure, Shown
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from daqsvc.page.charts import Theme
+    from daqsvc.page.machine_live import MachineLive
+
+REVOLUTIONS = {"4": "4 revolutions", "1": "1 revolution", "16": "16 revolutions"}
+LARGER = 1.15
+"""The figure goes so far beyond the clearance."""
+
+
+class OrbitView:
+    """See `daqsvc.page.views.view.View`."""
+
+    name = "orbit"
+    title = "Orbit"
+    sentence = (
+        "The path of the shaft's centre, seen along the shaft: as the probes have it, and its 1X alone. The "
+        "dot is where the centre is when the keyphasor's mark passes; the circle is the clearance."
+    )
+    every_s = 0.1
+
+    def choices(self, live: MachineLive) -> list[Choice]:
+        """See `daqsvc.page.views.view.View.choices`."""
+        pairs = {f"{x},{y}": f"{x} and {y}" for x, y in live.probes()}
+        return [Choice("probes", "Probes", pairs), Choice("revolutions", "Length", REVOLUTIONS)]
+
+    def why_not(self, live: MachineLive) -> str:
+        """See `daqsvc.page.views.view.View.why_not`."""
+        if live.probes():
+            return ""
+        return "an orbit needs two proximity probes of one plane, 60 to 120 degrees apart, sampled together"
+
+    def streams(self, live: MachineLive, chosen: Mapping[str, str]) -> set[str]:
+        """See `daqsvc.page.views.view.View.streams`."""
+        probes = chosen["probes"].split(",")
+        key = live.keyphasor()
+        places = (live.place_of([*probes, key]) if key else None) or live.place_of(probes) or []
+        return {one.stream for one in places}
+
+    def figures(self, live: MachineLive, chosen: Mapping[str, str], theme: Theme) -> list[Figure]:
+        """See `daqsvc.page.views.view.View.figures`."""
+        clearance_um = float(live.values["machine"].get("rotor", {}).get("clearance_um", 0.0))
+        reach = LARGER * clearance_um if clearance_um else None
+        low = None if reach is None else -reach
+        made = chart(
+            Axis("x, um", low, reach),
+            Axis("y, um", low, reach),
+            theme,
+            height=520,
+            tips=[("x", "@x{0.0} um"), ("y", "@y{0.0} um")],
+            is_round=True,
+        )
+        if clearance_um:
+            turn = np.linspace(0.0, 2.0 * math.pi, 181)
+            made.line(
+                clearance_um * np.cos(turn),
+                clearance_um * np.sin(turn),
+                line_color=theme.quiet,
+                line_dash="dashed",
+                legend_label=f"clearance {clearance_um:g} um",
+            )
+        made.line(
+            "x", "y", source=source("orbit", ["x", "y"]), line_color=theme.series[0], legend_label="orbit"
+        )
+        made.line(
+            "x",
+            "y",
+            source=source("orbit_1x", ["x", "y"]),
+            line_color=theme.series[1],
+            line_width=2,
+            legend_label="1X",
+        )
+        marks = source("orbit_marks", ["x", "y"])
+        made.scatter("x", "y", source=marks, size=9, color=theme.series[0], legend_label="keyphasor")
+        legend(made, theme)
+        probes = chosen["probes"].replace(",", " and ")
+        return [Figure("orbit", f"Orbit of the shaft's centre by {probes}, with its 1X and clearance", made)]
+
+    def shown(self, live: MachineLive, chosen: Mapping[str, str]) -> Shown:
+        """See `daqsvc.page.views.view.View.shown`."""
+        x, y = chosen["probes"].split(",")
+        seen = whirl(live, (x, y), float(chosen["revolutions"]))
+        if seen is None:
+            return Shown(note="no samples of these probes have come yet")
+        sources = {"orbit": {"x": seen.xy_um[:, 0], "y": seen.xy_um[:, 1]}}
+        index = np.arange(len(seen.xy_um))
+        sources["orbit_marks"] = {
+            axis: np.interp(seen.marks, index, seen.xy_um[:, column]) for column, axis in enumerate("xy")
+        }
+        rows = [("speed", f"{60.0 * seen.speed_hz:.1f}", "rpm")]
+        if (order := order_1x(seen)) is not None:
+            ellipse = order.ellipse_um()
+            sources["orbit_1x"] = {"x": ellipse[:, 0], "y": ellipse[:, 1]}
+            for axis, mean, vector in zip("xy", order.mean_um, order.vectors_um, strict=True):
+                rows.append((f"mean {axis}", f"{mean:.1f}", "um"))
+                rows.append((f"1X {axis}", f"{abs(vector):.1f}", "um peak"))
+                if seen.has_keyphasor:
+                    lag_deg = math.degrees(-np.angle(vector)) % 360.0
+                    rows.append((f"1X {axis} behind the mark", f"{lag_deg:.0f}", "degrees"))
+        largest = np.hypot(*(seen.xy_um - np.nanmean(seen.xy_um, axis=0)).T)
+        rows.append(("largest distance from the mean", f"{np.nanmax(largest):.1f}", "um"))
+        missing = int(np.isnan(seen.xy_um).any(axis=1).sum())
+        note = f"{missing} of {len(seen.xy_um)} samples are missing" if missing else ""
+        return Shown(sources, rows, note)

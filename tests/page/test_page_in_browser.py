@@ -1,0 +1,264 @@
+"""The page in a real browser: what it shows of a running service, and what it says when that is gone."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import re
+from typing import TYPE_CHECKING, Any
+
+import can
+import numpy as np
+import pytest
+from axe_playwright_python.async_playwright import Axe
+from support.browsers import browsing, page_served
+from support.live_service import running, watch_of
+from support.recorded_rig import RATE_HZ, recorded_rig
+from support.waiting import PATIENCE_S, eventually
+
+from daqsvc.alarms.commands import AlarmCommand, Verb
+from drivers.can.plugin import frame_layout
+from sim_hw.nodes.can_node import CanNode
+from sim_hw.nodes.pacing import RealTimePacer
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+    from playwright.async_api import Browser, Page
+
+    from daqsvc.service import Service
+
+pytestmark = [pytest.mark.integration, pytest.mark.long]
+
+VIEWS = ("modes", "orbit", "timebase", "spectrum", "full-spectrum")
+HEALTHY_S = 2.7
+"""The paper's rotor is healthy for so long; then its damping goes."""
+PATIENCE_MS = 1000.0 * PATIENCE_S
+NUMBER = re.compile(r"-?\d+(\.\d+)?(e-?\d+)?")
+
+
+@contextlib.asynccontextmanager
+async def live_rig(store: Path, channel: str, *, faulty: bool) -> AsyncIterator[Service]:
+    """A service that watches the paper's rotor, which turns for as long as the test lasts."""
+    machine, samples = recorded_rig(channel)
+    machine = machine.model_copy(update={"recorder": None})
+    whole = round(HEALTHY_S * 10) * 64
+    healthy = samples[64 : whole // 3 * 3]
+    played = np.concatenate([healthy, samples[len(healthy) :]] if faulty else [healthy] * 200)
+    async with running(machine, store) as service:
+        await eventually(lambda: service.drivers[0].link.state == "up", "the bus is up")
+        layout = frame_layout(watch_of(service).machine, "shaft")
+        with can.Bus(interface="virtual", channel=channel, protocol=can.CanProtocol.CAN_FD) as bus:
+            node = CanNode(bus, layout, played[: len(played) // 3 * 3], RATE_HZ)
+            playing = asyncio.create_task(node.play(RealTimePacer(service.clock)))
+            try:
+                yield service
+            finally:
+                playing.cancel()
+                await asyncio.wait({playing})
+
+
+@contextlib.asynccontextmanager
+async def tab(browser: Browser, **options: Any) -> AsyncIterator[Page]:
+    """A tab in which nothing may go wrong, and which may ask nobody but the page's server."""
+    context = await browser.new_context(**options)
+    page = await context.new_page()
+    wrong: list[str] = []
+    page.on("console", lambda said: wrong.append(said.text) if said.type == "error" else None)
+    page.on("pageerror", lambda error: wrong.append(f"{error}"))
+    page.on("request", lambda asked: None if "//127.0.0.1:" in asked.url else wrong.append(asked.url))
+    try:
+        yield page
+        assert wrong == []
+    finally:
+        await context.close()
+
+
+async def figures(page: Page) -> dict[str, float]:
+    """The table beside a view: what, and the number."""
+    told = await page.evaluate(
+        "[...document.querySelectorAll('#rows tr')].map(row => [...row.cells].map(one => one.textContent))"
+    )
+    return {cells[0]: float(cells[1]) for cells in told if NUMBER.fullmatch(cells[1])}
+
+
+async def until_figures(page: Page, *names: str) -> dict[str, float]:
+    async with asyncio.timeout(PATIENCE_S):
+        while not (told := await figures(page)).keys() >= {*names}:
+            await asyncio.sleep(0.1)
+    return told
+
+
+async def test_every_view_shows_the_numbers_of_the_machine(tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    async with (
+        live_rig(store, "page-views", faulty=False) as service,
+        page_served(store) as (address, _),
+        browsing() as browser,
+        tab(browser) as page,
+    ):
+        ring = watch_of(service).rings["shaft"]
+        await eventually(lambda: ring.end_index > 5 * RATE_HZ, "some seconds have come")
+        machine = f"{address}/machines/laval-rig"
+
+        # At its natural frequency a Laval rotor whirls with e / (2 zeta), 90 degrees behind the heavy spot.
+        whirl_um = 10.0 / (2.0 * 0.18)
+        await page.goto(f"{machine}/orbit?revolutions=16")
+        told = await until_figures(page, "1X x behind the mark")
+        assert told["1X x"] == pytest.approx(whirl_um, rel=0.2)
+        assert told["1X y"] == pytest.approx(whirl_um, rel=0.2)
+        assert told["1X x behind the mark"] == pytest.approx(90.0, abs=12.0)
+        assert told["1X y behind the mark"] == pytest.approx(180.0, abs=12.0)
+        assert told["mean y"] == pytest.approx(-10.0, abs=4.0), "the static sag"
+        assert told["speed"] == pytest.approx(600.0, abs=1.0)
+
+        await page.goto(f"{machine}/full-spectrum")
+        told = await until_figures(page, "1X forward", "1X backward")
+        assert told["1X forward"] == pytest.approx(whirl_um, rel=0.2)
+        assert told["1X backward"] < 0.3 * whirl_um, "it turns forward"
+
+        await page.goto(f"{machine}/spectrum?sensor=probe-y")
+        told = await until_figures(page, "1X at 10.00 Hz")
+        assert told["1X at 10.00 Hz"] == pytest.approx(whirl_um, rel=0.2)
+
+        await page.goto(f"{machine}/timebase?sensor=probe-x&length=5")
+        told = await until_figures(page, "peak to peak")
+        samples = ring.read(ring.end_index - round(5 * RATE_HZ), round(5 * RATE_HZ))[:, 0]
+        assert told["rms about the mean"] == pytest.approx(float(samples.std()), rel=0.05)
+        assert told["mean"] == pytest.approx(float(samples.mean()), abs=1.0)
+
+        await page.goto(f"{machine}/modes")
+        await page.get_by_role("row", name="p(N)").wait_for(timeout=PATIENCE_MS)
+        said = next(one for one in service.reports["laval-rig"].latest if one.detector == "rotor-bank")
+        assert said.decision == "N"
+        assert await page.get_by_role("row", name="p(N)").inner_text() == "p(N)\t> 0.999\t"
+        assert await page.get_by_role("row", name="decides").inner_text() == "decides\tN\t"
+
+        await page.goto(machine)
+        row = page.get_by_role("row", name="levels/probe-x")
+        await row.wait_for(timeout=PATIENCE_MS)
+        rms = float(re.search(r"rms ([\d.]+) um", await row.inner_text())[1])  # type: ignore[index]
+        assert rms == pytest.approx(float(samples.std()), rel=0.15)
+
+        await page.goto(address)
+        await page.get_by_role("link", name="laval-rig").click()
+        assert page.url == machine
+
+
+async def test_an_alarm_appears_and_what_is_done_about_it(tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    async with (
+        live_rig(store, "page-alarm", faulty=True) as service,
+        page_served(store) as (address, _),
+        browsing() as browser,
+        tab(browser) as page,
+    ):
+        await page.goto(f"{address}/machines/laval-rig")
+        row = page.locator("#alarms").get_by_role("row", name="rotor-fault")
+        await row.wait_for(timeout=PATIENCE_MS)
+        assert "not acknowledged" in await row.inner_text()
+        assert "rotor-bank finds" in await row.inner_text()
+        assert await page.locator("#head .level").inner_text() in {"alert", "danger"}
+        acknowledge = AlarmCommand(verb=Verb.ACKNOWLEDGE, alarm="rotor-fault", by="the test")
+        assert (await service.alarms.execute(acknowledge, "test")).accepted
+        await page.get_by_role("row", name="active, acknowledged").wait_for(timeout=PATIENCE_MS)
+        await page.goto(address)
+        await page.locator(".tile.danger, .tile.alert").wait_for(timeout=PATIENCE_MS)
+        assert "rotor-fault first" in await page.locator(".tile").inner_text()
+
+
+async def test_what_is_not_heard_any_more_is_grey_and_says_its_age(tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    silence = "#silence:not([hidden])"
+    async with browsing() as browser, page_served(store) as (address, _), tab(browser) as page:
+        await page.goto(address)
+        assert "no daqsvc answers on this box" in await page.locator("main").inner_text()
+        async with live_rig(store, "page-grey", faulty=False):
+            await page.goto(f"{address}/machines/laval-rig/orbit")
+            await until_figures(page, "1X x")
+            assert not await page.locator(silence).count()
+        await page.locator(silence).wait_for(timeout=PATIENCE_MS)
+        said = await page.locator(silence).inner_text()
+        why = "no daqsvc runs on the store|the service has ended the connection"
+        assert re.fullmatch(rf"What is shown is \d+ s old: ({why})\.", said)
+        assert "stale" in (await page.locator("body").get_attribute("class") or "")
+        async with live_rig(store, "page-grey", faulty=False):
+            await page.locator(silence).wait_for(state="hidden", timeout=PATIENCE_MS)
+            shown = await page.locator("#rows").inner_text()
+            await page.locator(f"#rows:not(:text-is({shown!r}))").wait_for(timeout=PATIENCE_MS)
+
+
+async def test_a_page_whose_server_is_gone_says_so(tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    async with live_rig(store, "page-gone", faulty=False), browsing() as browser:
+        context = await browser.new_context()
+        page = await context.new_page()
+        async with page_served(store) as (address, _):
+            await page.goto(f"{address}/machines/laval-rig/timebase")
+            await until_figures(page, "mean")
+            port = int(address.rpartition(":")[2])
+        gone = page.get_by_text("the page's server does not answer")
+        await gone.wait_for(timeout=PATIENCE_MS)
+        async with page_served(store, port):
+            await gone.wait_for(state="hidden", timeout=PATIENCE_MS)
+        await context.close()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+async def test_everybody_can_read_it(scheme: Any, tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    async with (
+        live_rig(store, f"page-read-{scheme}", faulty=True),
+        page_served(store) as (address, _),
+        browsing() as browser,
+        tab(browser, color_scheme=scheme) as page,
+    ):
+        machine = f"{address}/machines/laval-rig"
+        await page.goto(machine)
+        await page.locator("#alarms").get_by_text("rotor-bank finds").first.wait_for(timeout=PATIENCE_MS)
+        for path in (address, machine, *(f"{machine}/{view}" for view in VIEWS)):
+            await page.set_viewport_size({"width": 1280, "height": 900})
+            await page.goto(path)
+            await page.locator("footer").wait_for()
+            if path != address:
+                await page.locator("#alarms .level").first.wait_for(timeout=PATIENCE_MS)
+            found = await Axe().run(page)
+            serious = [
+                (one["id"], [node["target"] for node in one["nodes"]])
+                for one in found.response["violations"]
+                if one["impact"] in {"serious", "critical"}
+            ]
+            assert serious == [], path
+            # A phone, and a screen of 1280 pixels that is enlarged fourfold.
+            for width in (360, 320):
+                await page.set_viewport_size({"width": width, "height": 640})
+                async with asyncio.timeout(PATIENCE_S):  # figures follow a moment later
+                    while await page.evaluate("document.documentElement.scrollWidth") > width:
+                        await asyncio.sleep(0.05)
+            await page.screenshot(path=tmp_path / "shot.png", full_page=True)
+
+
+async def test_figures_stand_still_when_they_are_frozen(tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    async with (
+        live_rig(store, "page-freeze", faulty=False),
+        page_served(store) as (address, _),
+        browsing() as browser,
+        tab(browser) as page,
+    ):
+        await page.goto(f"{address}/machines/laval-rig/orbit")
+        await until_figures(page, "1X x")
+        await page.get_by_role("button", name="Freeze").click()
+        assert "Frozen" in await page.locator("#silence").inner_text()
+        shown = await page.locator("#rows").inner_text()
+        await asyncio.sleep(0.5)
+        assert await page.locator("#rows").inner_text() == shown
+        await page.get_by_role("button", name="Freeze").click()
+        await page.locator(f"#rows:not(:text-is({shown!r}))").wait_for(timeout=PATIENCE_MS)
+        # The choice is in the address, and the address can be shared.
+        await page.get_by_label("Length").select_option("16")
+        await page.wait_for_url("**/orbit?probes=probe-x%2Cprobe-y&revolutions=16")
+        assert await page.get_by_label("Length").input_value() == "16"
+        assert math.isclose((await until_figures(page, "speed"))["speed"], 600.0, abs_tol=1.0)

@@ -1,0 +1,70 @@
+"""The page's server: whom it answers, with what, and how it ends."""
+
+from __future__ import annotations
+
+import asyncio
+import http.client
+import socket
+from typing import TYPE_CHECKING
+
+import pytest
+from support.browsers import page_served
+
+from daqsvc.cli import main
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+pytestmark = pytest.mark.integration
+
+
+def ask(
+    address: str, path: str, method: str = "GET", **headers: str
+) -> tuple[int, str, http.client.HTTPMessage]:
+    connection = http.client.HTTPConnection(address.removeprefix("http://"), timeout=60)
+    try:
+        connection.request(method, path, headers=headers)
+        answer = connection.getresponse()
+        return answer.status, answer.read().decode("latin-1"), answer.headers
+    finally:
+        connection.close()
+
+
+async def test_strangers_are_not_answered(tmp_path: Path) -> None:
+    async with page_served(tmp_path) as (address, process):
+        status, text, headers = await asyncio.to_thread(ask, address, "/")
+        assert status == 200
+        assert "no daqsvc answers on this box" in text
+        assert f"{tmp_path}" not in text, "no path goes out"
+        assert "script-src 'self';" in headers["content-security-policy"]
+        assert "unsafe-eval" not in headers["content-security-policy"]
+        assert headers["x-content-type-options"] == "nosniff"
+        # A name of somebody else that leads here (DNS rebinding).
+        assert (await asyncio.to_thread(ask, address, "/", host="evil.example"))[0] == 400
+        assert (await asyncio.to_thread(ask, address, "/static/..%2f..%2fserver.py"))[0] == 404
+        assert (await asyncio.to_thread(ask, address, "/static/server.py"))[0] == 404
+        _, _, headers = await asyncio.to_thread(ask, address, "/static/bokeh.js")
+        assert headers["content-encoding"] == "gzip"
+        status, text, headers = await asyncio.to_thread(ask, address, "/machines/none%3Cb%3E/orbit")
+        assert status == 404
+        assert "<b>" not in text
+        assert "content-security-policy" in headers
+        assert (await asyncio.to_thread(ask, address, "/events/none"))[0] == 503
+        assert (await asyncio.to_thread(ask, address, "/", "POST"))[0] == 405
+        process.terminate()
+        async with asyncio.timeout(30):
+            await process.wait()
+        assert process.returncode == 0
+
+
+def test_a_port_that_is_taken_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert main(["page", "--store", f"{tmp_path}", "--port", f"{port}"]) == 1
+    assert capsys.readouterr().err == (
+        f"daqsvc page: cannot listen at 127.0.0.1:{port}: Address already in use; end what listens there, or "
+        "give another --port\n"
+    )
+    with pytest.raises(SystemExit):
+        main(["page", "--store", f"{tmp_path}", "--port", "70000"])
+    assert "'70000' is no port: give a number from 0 to 65535" in capsys.readouterr().err

@@ -1,0 +1,171 @@
+"""What the views make of samples, against arithmetic of their own."""
+
+from __future__ import annotations
+
+import base64
+from typing import Any
+
+import numpy as np
+import pytest
+
+from daqsvc.page.machine_live import MachineLive
+from daqsvc.page.shaft import order_1x, whirl
+from daqsvc.page.text import alarm_rows
+from daqsvc.page.views.all_views import VIEWS
+from daqsvc.page.views.spectrum import amplitudes
+from daqsvc.page.views.timebase import thinned
+
+RATE_HZ = 1000.0
+SPEED_HZ = 12.3
+ANGLES = (45.0, 135.0)
+
+
+def machine_values(**machine: Any) -> dict[str, Any]:
+    probes = [
+        {"name": name, "type": "proximity", "unit": "um", "angle_deg": angle}
+        for name, angle in zip(("left", "right"), ANGLES, strict=True)
+    ]
+    key = {"name": "key", "type": "keyphasor", "unit": "V", "threshold_v": -6.0}
+    return {"machine": {"name": "rig", "speed_rpm": 60.0 * SPEED_HZ, **machine}, "sensors": [*probes, key]}
+
+
+def about(**machine: Any) -> dict[str, Any]:
+    facts = {
+        "rate_hz": RATE_HZ,
+        "channels": ["a", "b", "c"],
+        "sensors": ["left", "right", "key"],
+        "units": ["um", "um", "V"],
+    }
+    return {
+        "values": machine_values(**machine),
+        "machine": "rig",
+        "wall_ns_at_0": 0,
+        "begun_ns": 0,
+        "streams": {"shaft": facts},
+        "statements": [],
+        "alarms": [],
+        "standings": {},
+    }
+
+
+def told(rows: Any, first_index: int = 0) -> dict[str, Any]:
+    rows = np.asarray(rows, "<f4")
+    return {
+        "samples": {
+            "stream": "shaft",
+            "first_index": first_index,
+            "t_first_ns": first_index * 1_000_000,
+            "period_ns": 1e6,
+            "lost_before": 0,
+            "quality": 0,
+            "shape": list(rows.shape),
+            "values": base64.b64encode(rows.tobytes()).decode(),
+        }
+    }
+
+
+def turning(seconds: float, x: complex, y: complex) -> np.ndarray[Any, Any]:
+    """Samples of the probes and the keyphasor of a shaft whose centre moves so, ``[n, 3]``."""
+    turns = np.arange(round(seconds * RATE_HZ)) / RATE_HZ * SPEED_HZ + 0.37
+    wave = np.exp(2j * np.pi * turns)
+    position = np.array([(x * wave).real + 3.0, (y * wave).real - 7.0])
+    probes = [np.cos(a) * position[0] + np.sin(a) * position[1] for a in np.radians(ANGLES)]
+    return np.column_stack([*probes, np.where(turns % 1.0 < 0.06, -2.0, -10.0)])
+
+
+def test_the_order_1x_of_a_whirl_is_found_with_its_phase_behind_the_mark() -> None:
+    live = MachineLive(about())
+    x, y = 20.0 * np.exp(-0.5j), 11.0 * np.exp(1.2j)
+    live.take(told(turning(3.0, x, y)))
+    seen = whirl(live, ("left", "right"), 20.0)
+    assert seen is not None
+    assert seen.has_keyphasor
+    order = order_1x(seen)
+    assert order is not None
+    assert order.mean_um == pytest.approx([3.0, -7.0], abs=0.1)
+    assert np.abs(order.vectors_um - [x, y]).max() < 0.6, "a sample is 4 degrees"
+    ellipse = order.ellipse_um()
+    assert ellipse[0] == pytest.approx(ellipse[-1])
+    assert np.ptp(ellipse[:, 0]) == pytest.approx(40.0, rel=0.02)
+
+
+def test_samples_that_are_told_again_are_not_there_twice_and_a_gap_is_seen() -> None:
+    live = MachineLive(about())
+    rows = turning(1.0, 20.0, -20.0j)
+    live.take(told(rows[:600]))
+    live.take(told(rows[500:900], 500))
+    live.take(told(rows[100:200], 100))
+    newest = live.newest("shaft", 0.9)
+    assert newest is not None
+    assert np.array_equal(newest[0], rows[:900].astype(np.float32))
+    assert newest[1] == 899_000_000
+    live.take(told(rows[950:], 950))
+    newest = live.newest("shaft", 0.1)
+    assert newest is not None
+    assert np.isnan(newest[0]).all(axis=1).tolist() == [True] * 50 + [False] * 50
+    again = MachineLive(about())
+    again.go_on_from(live)
+    assert again.newest("shaft", 0.1) is not None
+    anew = MachineLive({**about(), "begun_ns": 5})
+    anew.go_on_from(live)
+    assert anew.newest("shaft", 0.1) is None, "the service counts from 0 again"
+
+
+def test_lines_of_a_spectrum_have_the_amplitudes_of_their_waves() -> None:
+    t = np.arange(2000) / RATE_HZ
+    values = 5.0 + 3.0 * np.cos(2 * np.pi * 50.0 * t) + 0.5 * np.cos(2 * np.pi * 120.0 * t + 1.0)
+    lines = 2.0 * amplitudes(values)
+    assert lines[100] == pytest.approx(3.0, rel=1e-3)
+    assert lines[240] == pytest.approx(0.5, rel=1e-3)
+    assert lines[0] < 0.01, "the mean is no vibration"
+    values[300:500] = np.nan
+    assert 2.0 * amplitudes(values)[100] == pytest.approx(3.0, rel=0.02)
+
+
+def test_forward_and_backward_whirl_are_told_apart() -> None:
+    live = MachineLive(about())
+    live.take(told(turning(8.0, 20.0, -20.0j)))  # x leads y: it turns against the clock
+    shown = VIEWS["full-spectrum"].shown(live, {"probes": "left,right", "revolutions": "80"})
+    rows = {name: float(value) for name, value, _ in shown.rows}
+    assert rows["1X forward"] == pytest.approx(20.0, rel=0.05)
+    assert rows["1X backward"] < 0.5
+    # Seen from the other end the same shaft turns clockwise, and its whirl is forward all the same.
+    clockwise = MachineLive(about(rotation="clockwise"))
+    clockwise.take(told(turning(8.0, 20.0, 20.0j)))
+    shown = VIEWS["full-spectrum"].shown(clockwise, {"probes": "left,right", "revolutions": "80"})
+    assert float({r[0]: r[1] for r in shown.rows}["1X forward"]) == pytest.approx(20.0, rel=0.05)
+
+
+def test_a_thinned_line_keeps_every_extreme() -> None:
+    values = np.random.default_rng(1).normal(size=50_000)
+    values[12_345], values[40_000] = 9.0, -9.0
+    t, kept = thinned(np.arange(50_000.0), values)
+    assert len(kept) <= 2100
+    assert (np.diff(t) > 0).all() or (np.diff(t) >= 0).all()
+    assert {9.0, -9.0} <= {*kept}
+    holes = values.copy()
+    holes[1000:1400] = np.nan
+    assert np.isnan(thinned(np.arange(50_000.0), holes)[1]).any()
+
+
+def test_a_machine_without_pairs_of_probes_has_no_orbit_and_says_why() -> None:
+    live = MachineLive(about())
+    live.sensors = {name: one._replace(angle_deg=0.0) for name, one in live.sensors.items()}
+    assert "60 to 120 degrees apart" in VIEWS["orbit"].why_not(live)
+    assert VIEWS["timebase"].why_not(live) == ""
+
+
+def test_what_an_alarm_says_is_text_and_no_markup() -> None:
+    alarm = {
+        "alarm": "a<b>",
+        "state": "active_unacknowledged",
+        "level": "alert",
+        "first_out": False,
+        "wall_ns": 1_795_000_000_000_000_000,
+        "monotonic_ns": 1,
+        "message": "<script>alert(1)</script> & so on",
+    }
+    html = alarm_rows(MachineLive({**about(), "alarms": [alarm]}))
+    assert "<script" not in html
+    assert "a&lt;b&gt;" in html
+    assert "&amp; so on" in html

@@ -1,0 +1,66 @@
+"""A real browser for tests, and a page server of its own."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import shutil
+import sys
+from typing import TYPE_CHECKING
+
+import pytest
+from playwright.async_api import async_playwright
+from support.waiting import PATIENCE_S
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+    from playwright.async_api import Browser
+
+
+def chromium() -> str:
+    """The program; skips if there is none, unless that is forbidden."""
+    program = shutil.which("chromium")
+    if program is None:
+        if os.environ.get("DAQSVC_REQUIRE_CHROMIUM") == "1":
+            pytest.fail("no chromium on this machine (apt-get install chromium)")
+        pytest.skip("no chromium on this machine (apt-get install chromium)")
+    return program
+
+
+@contextlib.asynccontextmanager
+async def browsing() -> AsyncIterator[Browser]:
+    """A browser without a window."""
+    async with async_playwright() as playwright:
+        # Of root Chromium asks that it be without its sandbox.
+        browser = await playwright.chromium.launch(
+            executable_path=chromium(), args=["--no-sandbox", "--disable-dev-shm-usage"]
+        )
+        try:
+            yield browser
+        finally:
+            await browser.close()
+
+
+@contextlib.asynccontextmanager
+async def page_served(store: Path, port: int = 0) -> AsyncIterator[tuple[str, asyncio.subprocess.Process]]:
+    """``daqsvc page`` of a store; its address and process."""
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "daqsvc", "page", "--store", str(store), "--port", f"{port}"),
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.PIPE,
+    )
+    assert process.stdout is not None
+    assert process.stderr is not None
+    try:
+        async with asyncio.timeout(PATIENCE_S):
+            said = (await process.stdout.readline()).decode()
+        assert " is at http://127.0.0.1:" in said, said or (await process.stderr.read()).decode()
+        yield said.split(" is at ")[1].split(";")[0].rstrip("/"), process
+    finally:
+        if process.returncode is None:
+            process.terminate()
+        _, err = await process.communicate()
+    assert err.decode() == "", "nothing went wrong in the page's server"
