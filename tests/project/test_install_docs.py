@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from support.guide_commands import shell_blocks
+from support.paths import ROOT
 
 from daqsvc.cli import main
 
@@ -14,11 +15,23 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-@pytest.mark.parametrize("guide", ["install.md", "edge-box.md"])
-def test_the_guides_give_a_machine_a_store_of_its_own(guide: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("guide", "example", "name"), [("install.md", "bearing", "fan"), ("edge-box.md", "laval-rig", "pump")]
+)
+def test_the_guides_give_a_machine_a_store_of_its_own(
+    guide: str, example: str, name: str, tmp_path: Path
+) -> None:
     commands = [line for blocks in shell_blocks(guide).values() for block in blocks for line in block]
     [edit] = [line for line in commands if line.startswith("sed -i ")]
-    machine = tmp_path / "pump.toml"
-    assert main(["example", "laval-rig", "--out", f"{machine}"]) == 0
-    subprocess.run(["/bin/sh", "-c", edit.replace("/etc/daqsvc/pump.toml", f"{machine}")], check=True)
-    assert 'directory = "/var/lib/daqsvc/pump"' in machine.read_text()
+    assert f"daqsvc example {example} --out /etc/daqsvc/{name}.toml" in commands
+    machine = tmp_path / f"{name}.toml"
+    assert main(["example", example, "--out", f"{machine}"]) == 0
+    subprocess.run(["/bin/sh", "-c", edit.replace(f"/etc/daqsvc/{name}.toml", f"{machine}")], check=True)
+    assert f'directory = "/var/lib/daqsvc/{name}"' in machine.read_text()
+
+
+def test_a_box_has_its_first_machine_in_the_three_commands_that_both_guides_give() -> None:
+    _, install, _ = shell_blocks("install.md")["The package"]
+    assert len(install) == 3
+    readme = [block for blocks in shell_blocks("README.md", ROOT).values() for block in blocks]
+    assert ["make deb", *install] in readme
