@@ -13,10 +13,13 @@ import json
 import logging
 import os
 import queue
+import re
 import signal
+import ssl
+import sys
 import threading
 import time
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 import paho.mqtt.client as paho
 import psycopg
@@ -26,7 +29,7 @@ from paho.mqtt.properties import Properties
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
 log = logging.getLogger("ingest")
 
@@ -39,6 +42,9 @@ RETRY_S = 1.0
 MOST_KEY_BYTES = 2000
 """Of what makes up a key: an entry of an index of PostgreSQL has room for 2704."""
 LONGEST_REASON = 2000
+TIME = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d{1,9})?(Z|[+-]\d\d:\d\d)", re.ASCII)
+"""Times as daqsvc writes them. PostgreSQL takes others too: infinity, or tomorrow, whenever that is."""
+EXIT_USAGE = 2
 AWAY = {"08", "25", "28", "3D", "3F", "40", "53", "55", "57", "58"}
 """Classes of SQLSTATE that tell of the server, not of a message: connection, read-only standby, login,
 missing database or schema, serialization, resources, object in use, shutdown, system."""
@@ -51,7 +57,8 @@ ALARM = """INSERT INTO daqsvc.alarm_events
 DIAGNOSIS = """INSERT INTO daqsvc.diagnoses
     (at, site, box, machine, detector, monotonic_ns, decision, severity, quality, statistics, diagnosis)
     VALUES (%s, %s, %s, %s, %s, %s, %s, %s, %s, %s, %s) ON CONFLICT DO NOTHING"""
-REJECTED = "INSERT INTO daqsvc.rejected (topic, payload, reason) VALUES (%s, %s, %s)"
+REJECTED = """INSERT INTO daqsvc.rejected (topic, payload, reason) VALUES (%s, %s, %s)
+    ON CONFLICT DO NOTHING"""
 
 
 class Arrived(NamedTuple):
@@ -78,11 +85,11 @@ def row_of(payload: bytes | bytearray) -> tuple[str, tuple[Any, ...]]:
         _check_key(*machine, alarm)
         occurrence = None if document["occurrence"] is None else _text(document, "occurrence")
         place = (event, *machine, alarm, _whole(document, "sequence"), occurrence)
-        return ALARM, (*place, _text(document, "time"), *_texts(document, *names), text)
+        return ALARM, (*place, _time(document), *_texts(document, *names), text)
     if document["schema"] == "daqsvc.diagnosis/1":
         machine, detector = _texts(document, "site", "box", "machine"), _text(document, "detector")
         _check_key(*machine, detector)
-        place = (_text(document, "time"), *machine, detector, _whole(document, "monotonic_ns"))
+        place = (_time(document), *machine, detector, _whole(document, "monotonic_ns"))
         said = _texts(document, "decision", "severity", "quality")
         return DIAGNOSIS, (*place, *said, json.dumps(document["statistics"]), text)
     raise ValueError(f"schema {document['schema']!r:.60} is not known here")
@@ -106,6 +113,18 @@ def _text(document: Any, name: str) -> str:
 
 def _texts(document: Any, *names: str) -> tuple[str, ...]:
     return tuple(_text(document, name) for name in names)
+
+
+def _time(document: Any) -> str:
+    """When it was.
+
+    Raises:
+        KeyError, TypeError, ValueError: it does not say so as daqsvc does.
+    """
+    text = _text(document, "time")
+    if not TIME.fullmatch(text):
+        raise ValueError(f"time is none of ISO 8601: {text!r:.60}")
+    return text
 
 
 def _whole(document: Any, name: str) -> int:
@@ -155,12 +174,21 @@ class Ingester:
     Args:
         options: of the command line.
         database: how PostgreSQL is reached.
+        password: of the user at the broker, if there is one.
+
+    Raises:
+        OSError: there is no such file of certificates.
+        ValueError: there are none in it.
     """
 
-    def __init__(self, options: argparse.Namespace, database: str) -> None:
+    def __init__(self, options: argparse.Namespace, database: str, password: str = "") -> None:
         self._options, self._database = options, database
+        self._why_away: set[str] = set()
+        """Nothing while the broker is there, or has not been tried."""
+        self._is_ending = False
         self._arrived: queue.Queue[Arrived] = queue.Queue()
         self._connection = 0
+        self._topics: tuple[str, ...] = ()
         self._database_link: psycopg.Connection[Any] | None = None
         self._lock = threading.Lock()
         self._client = paho.Client(
@@ -170,13 +198,15 @@ class Ingester:
             manual_ack=True,
         )
         if options.user:
-            self._client.username_pw_set(options.user, os.environ["MQTT_PASSWORD"])
+            self._client.username_pw_set(options.user, password)
         if options.ca:
             self._client.tls_set(options.ca)
         self._client.reconnect_delay_set(1, 30)
         self._client.on_connect = self._on_connect
+        self._client.on_connect_fail = lambda *_: self._is_away(_in_words(sys.exc_info()[1]))
+        self._client.on_subscribe = self._on_subscribe
         self._client.on_pre_connect = lambda _client, _data: self._another_connection()
-        self._client.on_disconnect = lambda *_: self._another_connection()
+        self._client.on_disconnect = self._on_disconnect
         self._client.on_message = self._on_message
 
     def run(self, should_stop: Callable[[], bool]) -> None:
@@ -192,6 +222,7 @@ class Ingester:
                 if batch := self._gathered():
                     self._write(batch, should_stop)
         finally:
+            self._is_ending = True
             self._client.disconnect()
             self._client.loop_stop()
 
@@ -199,13 +230,45 @@ class Ingester:
         self, client: paho.Client, _data: Any, _flags: Any, reason: Any, _properties: Any
     ) -> None:
         if reason.is_failure:
-            log.error("the broker refuses the connection: %s", reason)
+            why = f"it refuses the connection ({reason}): see to --user, $MQTT_PASSWORD and --id"
+            self._is_away(why, is_news=True)
             return
+        log.info("connected to the broker %s", self._broker)
+        self._why_away.clear()
         # Alarm events are few: each of them writes every one, and the table keeps one. Telemetry is shared.
         every = f"{self._options.root}/+/+/+"
         shared = f"$share/{self._options.group}/{every}"
         options = SubscribeOptions(1)
-        client.subscribe([(f"{every}/alarms/#", options), (f"{shared}/diagnosis/#", options)])
+        self._topics = f"{every}/alarms/#", f"{shared}/diagnosis/#"
+        client.subscribe([(topic, options) for topic in self._topics])
+
+    def _on_subscribe(
+        self, _client: paho.Client, _data: Any, _mid: int, reasons: Sequence[Any], _properties: Any
+    ) -> None:
+        for topic, reason in zip(self._topics, reasons, strict=False):
+            if reason.is_failure:
+                log.error(
+                    "the broker %s refuses to send %s (%s), and nothing of it is written: let this user read "
+                    "it there, and start the ingester again",
+                    *(self._broker, topic, reason),
+                )
+
+    def _on_disconnect(
+        self, _client: paho.Client, _data: Any, _flags: Any, reason: Any, _properties: Any
+    ) -> None:
+        self._another_connection()
+        if not self._is_ending:
+            self._is_away(f"the connection has ended ({reason})")
+
+    @property
+    def _broker(self) -> str:
+        return f"{self._options.broker}:{self._options.port}"
+
+    def _is_away(self, why: str, *, is_news: bool = False) -> None:
+        """Say so once, however often it is tried; and once more if the reason is news."""
+        if not self._why_away or (is_news and why not in self._why_away):
+            log.warning("the broker %s is away, and is tried again: %s", self._broker, why)
+        self._why_away.add(why)
 
     def _another_connection(self) -> None:
         with self._lock:
@@ -288,24 +351,95 @@ class Ingester:
                     self._client.ack(one.message.mid, one.message.qos)
 
 
-def main() -> None:
-    """Run until SIGTERM or SIGINT."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--broker", default="127.0.0.1")
-    parser.add_argument("--port", type=int, default=1883)
+def _in_words(error: BaseException | None) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return f"{error or 'it gives no reason'}"
+
+
+def _topic_part(text: str) -> str:
+    """A part of a topic that is subscribed to."""
+    if not text or set(text) & set("+#\0") or text.startswith("/") or text.endswith("/"):
+        raise argparse.ArgumentTypeError(f"{text!r} is no part of a topic; write it without + and #")
+    return text
+
+
+def _port(text: str) -> int:
+    if not (text.isascii() and text.isdigit() and 0 < int(text) < 65536):
+        raise argparse.ArgumentTypeError(f"{text!r} is no port; write 1 to 65535")
+    return int(text)
+
+
+def _name(text: str) -> str:
+    if not text or "\0" in text:
+        raise argparse.ArgumentTypeError(f"{text!r} is no name; write one")
+    return text
+
+
+def _misused(words: str) -> NoReturn:
+    print(f"ingest.py: {words}", file=sys.stderr)  # noqa: T201 - errors of the command line go to stderr
+    raise SystemExit(EXIT_USAGE)
+
+
+class _Parser(argparse.ArgumentParser):
+    """One sentence for each mistake, without the usage in front of it."""
+
+    def error(self, message: str) -> NoReturn:
+        _misused(f"{message}; see --help")
+
+
+def _options() -> argparse.Namespace:
+    parser = _Parser(description=__doc__.splitlines()[0])
+    parser.add_argument("--broker", type=_name, default="127.0.0.1")
+    parser.add_argument("--port", type=_port, default=1883)
     parser.add_argument(
-        "--id", required=True, help="of this ingester, another for each; keep it over restarts"
+        "--id", type=_name, required=True, help="of this ingester, another for each; keep it over restarts"
     )
-    parser.add_argument("--group", default="postgresql", help="ingesters of one group share the messages")
-    parser.add_argument("--root", default="daqsvc", help="topic_root of the machine files")
+    parser.add_argument(
+        "--group", type=_topic_part, default="postgresql", help="ingesters of one group share the messages"
+    )
+    parser.add_argument("--root", type=_topic_part, default="daqsvc", help="topic_root of the machine files")
     parser.add_argument("--user", help="at the broker; the password is in $MQTT_PASSWORD")
     parser.add_argument("--ca", help="certificates that the broker's is signed by; it then speaks TLS")
-    options = parser.parse_args()
+    return parser.parse_args()
+
+
+def _database() -> str:
+    """How PostgreSQL is reached."""
+    if not (database := os.environ.get("DATABASE", "")):
+        _misused("$DATABASE is not set; write where PostgreSQL is, as DATABASE=postgresql://user@host/plant")
+    try:
+        psycopg.conninfo.conninfo_to_dict(database)
+    except psycopg.Error as error:
+        reason = " ".join(f"{error}".split())
+        _misused(f"$DATABASE does not say where PostgreSQL is ({reason}); write postgresql://user@host/plant")
+    return database
+
+
+def _ingester() -> Ingester:
+    """As the command line and the environment have it."""
+    options, database = _options(), _database()
+    password = os.environ.get("MQTT_PASSWORD")
+    if options.user and password is None:
+        _misused("--user needs the password of that user in $MQTT_PASSWORD; set it, or leave --user out")
+    try:
+        return Ingester(options, database, password or "")
+    except (OSError, ValueError) as error:
+        # A file without certificates is an SSLError, which is an OSError.
+        reason = "it holds no certificates" if isinstance(error, ssl.SSLError) else _in_words(error)
+        _misused(
+            f"--ca {options.ca} cannot be used: {reason}; name the PEM file of the broker's certificates"
+        )
+
+
+def main() -> None:
+    """Run until SIGTERM or SIGINT."""
+    ingester = _ingester()
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s")
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
-    Ingester(options, os.environ["DATABASE"]).run(stop.is_set)
+    ingester.run(stop.is_set)
 
 
 if __name__ == "__main__":

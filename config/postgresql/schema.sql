@@ -45,6 +45,11 @@ CREATE TABLE IF NOT EXISTS daqsvc.rejected (
     payload bytea NOT NULL,
     reason  text  NOT NULL
 );
+-- Each of them once, however many ingesters get it. The sums are short enough for an index.
+DELETE FROM daqsvc.rejected AS later USING daqsvc.rejected AS first
+    WHERE (later.topic, later.payload) = (first.topic, first.payload) AND later.ctid > first.ctid
+    AND to_regclass('daqsvc.rejected_once') IS NULL;
+CREATE UNIQUE INDEX IF NOT EXISTS rejected_once ON daqsvc.rejected (md5(topic), sha256(payload));
 
 -- How each alarm stands.
 CREATE OR REPLACE VIEW daqsvc.alarms_now AS

@@ -18,6 +18,8 @@ import paho.mqtt.client as paho
 import psycopg
 import pytest
 from paho.mqtt.enums import CallbackAPIVersion
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.reasoncodes import ReasonCode
 from support.brokers import Mosquitto
 from support.paths import ROOT
 from support.ports import LOOPBACK
@@ -103,10 +105,31 @@ def alarm(number):
     }
 
 
+def statement(number):
+    return {
+        "schema": "daqsvc.diagnosis/1",
+        "site": "lab",
+        "box": "edge-0",
+        "machine": "rig",
+        "time": "2026-11-21T12:28:15.5Z",
+        "monotonic_ns": number,
+        "detector": "levels/x",
+        "decision": "alert",
+        "severity": "alert",
+        "quality": "good",
+        "statistics": {"rms": 41.3},
+    }
+
+
 POISON = {
     "an object as id": (json.dumps({**alarm(1), "id": {"a": 1}}), "id is no text"),
     "a number as time": (json.dumps({**alarm(2), "time": 5}), "time is no text"),
-    "no time": (json.dumps({**alarm(3), "time": "yesterday at noon"}), "invalid input syntax"),
+    "no time": (json.dumps({**alarm(3), "time": "yesterday at noon"}), "none of ISO 8601"),
+    "a time without an end": (json.dumps({**alarm(30), "time": "infinity"}), "none of ISO 8601"),
+    "a time that is another each day": (json.dumps({**alarm(31), "time": "tomorrow"}), "none of ISO 8601"),
+    "a time of no zone": (json.dumps({**alarm(32), "time": "2026-11-21T12:28:15"}), "none of ISO 8601"),
+    "no such day": (json.dumps({**alarm(33), "time": "2026-02-30T12:28:15Z"}), "out of range"),
+    "a statement of now": (json.dumps({**statement(34), "time": "now"}), "none of ISO 8601"),
     "half a surrogate pair": (json.dumps({**alarm(4), "message": "\ud800"}), "can't encode"),
     "half of one elsewhere": (json.dumps({**alarm(5), "more": "\ud800"}), "invalid input syntax"),
     "too deep": ("[" * 100_000, "recursion"),
@@ -216,22 +239,6 @@ def test_nothing_is_acknowledged_before_it_is_committed(tmp_path, broker, postgr
         box.loop_stop()
 
 
-def statement(number):
-    return {
-        "schema": "daqsvc.diagnosis/1",
-        "site": "lab",
-        "box": "edge-0",
-        "machine": "rig",
-        "time": "2026-11-21T12:28:15.5Z",
-        "monotonic_ns": number,
-        "detector": "levels/x",
-        "decision": "alert",
-        "severity": "alert",
-        "quality": "good",
-        "statistics": {"rms": 41.3},
-    }
-
-
 def test_ingesters_share_the_telemetry_of_a_fleet(tmp_path, broker, postgres, ingesters):
     ingesters("ingest-1")
     ingesters("ingest-2")
@@ -276,6 +283,89 @@ def test_telemetry_the_present_state_and_what_is_rejected(tmp_path, broker, post
         assert reader.execute("SELECT count(*) FROM daqsvc.alarms_now").fetchone() == (1,)
         with pytest.raises(psycopg.errors.InsufficientPrivilege):
             reader.execute("DELETE FROM daqsvc.alarm_events")
+
+
+def test_each_unusable_message_stands_once_however_many_get_it(tmp_path, broker, postgres, ingesters):
+    with psycopg.connect(postgres.url, autocommit=True) as owner:
+        # Of a version in which each stood there more than once.
+        owner.execute("DROP INDEX daqsvc.rejected_once")
+        for payload in (b"old", b"old", b"older"):
+            owner.execute(
+                "INSERT INTO daqsvc.rejected (topic, payload, reason) VALUES ('t', %s, '')", [payload]
+            )
+        owner.execute((FOLDER / "schema.sql").read_text(encoding="utf-8"))
+        assert rows(postgres, "SELECT count(*) FROM daqsvc.rejected") == [(2,)]
+        owner.execute("TRUNCATE daqsvc.rejected")
+    for name in ("ingest-1", "ingest-2"):
+        ingesters(name)
+    subscribed(tmp_path / "mosquitto.log", 2)
+    box = publisher(broker)
+    try:
+        for payload in (b"no json", b"no json either", b"no json"):
+            say(box, payload)
+        say(box, b"no json", "edge-1")
+        acknowledged = re.compile(r"Received PUBACK from daqsvc-ingest-\d")
+        log = tmp_path / "mosquitto.log"
+        until(lambda: len(acknowledged.findall(log.read_text(errors="replace"))), 8)
+    finally:
+        box.disconnect()
+        box.loop_stop()
+    assert rows(postgres, "SELECT payload, count(*) FROM daqsvc.rejected GROUP BY 1 ORDER BY 1") == [
+        (b"no json", 2),  # of two topics
+        (b"no json either", 1),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "environment", "why"),
+    [
+        ((), {}, "$DATABASE is not set; write where"),
+        ((), {"DATABASE": "plant of ours"}, "$DATABASE does not say where PostgreSQL is ("),
+        (("--user", "x"), {"DATABASE": "dbname=plant"}, "--user needs the password of that user in $MQTT_P"),
+        (("--ca", "nofile"), {"DATABASE": "dbname=plant"}, "--ca nofile cannot be used: No such file or dir"),
+        (("--ca", __file__), {"DATABASE": "dbname=plant"}, "cannot be used: it holds no certificates; name"),
+        (("--port", "99999"), {}, "argument --port: '99999' is no port; write 1 to 65535"),
+        (("--broker", ""), {}, "argument --broker: '' is no name"),
+        (("--root", "a/#"), {}, "argument --root: 'a/#' is no part of a topic"),
+        (("--group", ""), {}, "argument --group: '' is no part of a topic"),
+    ],
+)
+def test_a_mistake_of_its_command_line_is_one_sentence(tmp_path, arguments, environment, why):
+    command = [sys.executable, FOLDER / "ingest.py", "--id", "one", *arguments]
+    clean = {key: one for key, one in os.environ.items() if key not in {"DATABASE", "MQTT_PASSWORD"}}
+    done = subprocess.run(
+        command,
+        env={**clean, **environment},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("ingest.py: ")
+    assert why in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_a_broker_that_goes_and_comes_is_one_line_each(broker):
+    broker.shut_down()
+    command = [sys.executable, FOLDER / "ingest.py", "--port", str(broker.port), "--id", "ingest-1"]
+    environment = {**os.environ, "DATABASE": "dbname=plant"}
+    with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as running:
+        try:
+            named = f"the broker 127.0.0.1:{broker.port}"
+            gone = f"WARNING {named} is away, and is tried again: "
+            assert running.stderr.readline() == f"{gone}Connection refused\n"
+            for _ in range(2):
+                time.sleep(1.5)  # it is tried again meanwhile, and nothing is said
+                broker.start()
+                assert running.stderr.readline() == f"INFO connected to {named}\n"
+                broker.shut_down()
+                assert running.stderr.readline().startswith(f"{gone}the connection has ended (")
+        finally:
+            running.terminate()
+        assert running.stderr.read() == ""
 
 
 @pytest.fixture(scope="module")
@@ -353,6 +443,7 @@ def test_what_a_right_is_missing_for_waits_for_it(tmp_path, broker, postgres, in
         box = publisher(broker)
         try:
             say(box, json.dumps(alarm(1)))
+            assert "INFO connected to" in running.stderr.readline()
             assert "permission denied" in running.stderr.readline()
             owner.execute("GRANT INSERT ON daqsvc.alarm_events TO daqsvc_ingest")
             until(lambda: rows(postgres, "SELECT count(*) FROM daqsvc.alarm_events"), [(1,)])
@@ -360,3 +451,34 @@ def test_what_a_right_is_missing_for_waits_for_it(tmp_path, broker, postgres, in
             box.disconnect()
             box.loop_stop()
     assert rows(postgres, "SELECT count(*) FROM daqsvc.rejected") == [(0,)]
+
+
+class _Refusing:
+    """A client that only takes note."""
+
+    def __init__(self):
+        self.asked = []
+
+    def subscribe(self, topics):
+        self.asked = [topic for topic, _ in topics]
+
+
+def test_what_the_broker_refuses_is_said(ingest, caplog):
+    options = argparse.Namespace(
+        id="x", user=None, ca=None, root="daqsvc", group="g", broker="broker.plant", port=1883
+    )
+    ingester, client = ingest.Ingester(options, "dbname=plant"), _Refusing()
+    refused = ReasonCode(PacketTypes.CONNACK, "Not authorized")
+    for _ in range(3):
+        ingester._on_connect(client, None, None, refused, None)
+    [line] = caplog.records
+    assert "it refuses the connection (Not authorized): see to --user" in line.getMessage()
+    caplog.clear()
+    ingester._on_connect(client, None, None, ReasonCode(PacketTypes.CONNACK, "Success"), None)
+    reasons = [
+        ReasonCode(PacketTypes.SUBACK, "Granted QoS 1"),
+        ReasonCode(PacketTypes.SUBACK, "Not authorized"),
+    ]
+    ingester._on_subscribe(client, None, 1, reasons, None)
+    [line] = [one.getMessage() for one in caplog.records if one.levelname == "ERROR"]
+    assert f"refuses to send {client.asked[1]} (Not authorized), and nothing of it is written: let" in line
