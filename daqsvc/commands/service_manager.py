@@ -58,6 +58,7 @@ class ServiceManager:
     Attributes:
         is_ready: whether it has been told that the service is ready.
         begun_s: when `starting` was called, by the monotonic clock; None if it was not.
+        is_overtold: whether other words stand in place of what the service waits for.
     """
 
     def __init__(self, address: str = "", watchdog_s: float | None = None) -> None:
@@ -65,6 +66,7 @@ class ServiceManager:
         self._address = f"\0{address[1:]}" if address.startswith("@") else address
         self.is_ready = False
         self.begun_s: float | None = None
+        self.is_overtold = False
         self._stopping = False
         self._says_reloading = False
         self._starting: threading.Thread | None = None
@@ -149,6 +151,7 @@ class ServiceManager:
             self.tell(READY=1, STATUS="reloaded")
         else:
             self.tell(STATUS="reloading" if begins else "reloaded")
+            self.is_overtold = True
 
     def stopping(self) -> None:
         """The service stops; from any thread."""
@@ -217,6 +220,8 @@ class _Follower:
 
     def _status(self, standing: str, figures: str, now_s: float) -> None:
         """Tell ``standing`` with ``figures`` if the former has changed, or is told for long."""
+        if self._manager.is_overtold:
+            self._told, self._manager.is_overtold = "", False
         is_new = standing != self._told and now_s - self._told_s >= CHANGE_S
         if not is_new and now_s - self._refreshed_s < REFRESH_S:
             return

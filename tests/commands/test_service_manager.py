@@ -154,6 +154,8 @@ def test_a_reload_before_the_service_is_ready_does_not_make_it_ready(monkeypatch
     follower.look(0.0)
     manager.reloading(begins=True)
     manager.reloading(begins=False)
+    follower.look(2.0)
+    assert told[-1]["STATUS"] == "waiting for bus can0: no samples have come yet", "these words stand again"
     follower.look(20.0)
     assert not any({"READY", "RELOADING", "WATCHDOG"} & one.keys() for one in told)
     assert [one["STATUS"] for one in told if "STATUS" in one][1:3] == ["reloading", "reloaded"]

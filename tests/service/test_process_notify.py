@@ -193,6 +193,13 @@ def test_it_is_ready_when_what_it_must_have_delivers_and_tells_how_it_stands(tmp
         systemd.until("STATUS", "starting: ")
         systemd.until("EXTEND_TIMEOUT_USEC")
         systemd.until("STATUS", "waiting for bus casing: no samples have come yet")
+        # A reload is no reason to be ready, nor does it end the waiting.
+        file = tmp_path / "rig.toml"
+        file.write_text(file.read_text().replace("alert = 5.0", "alert = 4.0"))
+        process.send_signal(signal.SIGHUP)
+        systemd.until("STATUS", "reloaded")
+        assert not systemd.has_told("RELOADING")
+        systemd.until("STATUS", "waiting for bus casing: no samples have come yet")
         time.sleep(1.0)
         assert not systemd.has_told("READY")
         assert not systemd.has_told("WATCHDOG")
