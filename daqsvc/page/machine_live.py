@@ -17,6 +17,7 @@ from daqsvc.acquisition.samples import Quality, SampleBlock
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -97,6 +98,8 @@ class MachineLive:
         self.standings: dict[str, Document] = dict(about["standings"])
         self.status: Document | None = None
         """The newest answer to ``status``."""
+        self.history: Path | None = None
+        """The file of the box's history, if there can be one."""
         self.left_out = 0
         self._places = self._found_places()
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daqsvc.page.text import alarm_rows, head, machine_rows
+from daqsvc.page.text import alarm_rows, head, journal_rows, machine_rows
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Mapping
@@ -109,7 +109,9 @@ class Picture:
         why = listening.why_not or ("the service says nothing" if silent_s > STALE_S else "")
         told: dict[str, Any] = {"age_s": round(silent_s, 1), "why": why}
         if live is not None:
-            told["html"] = {"head": head(live), "alarms": alarm_rows(live), "machine": machine_rows(live)}
+            told["html"] = {"head": head(live), "alarms": alarm_rows(live)}
+            if self._view is None:
+                told["html"] |= {"machine": machine_rows(live), "journal": journal_rows(live)}
             if self._view is not None:
                 told |= self._view_of(self._view, live)
         return json.dumps(told).encode()

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.link import Backoff
 from daqsvc.control import SOCKET, STATUS_QUESTION
+from daqsvc.history.file import NAME as HISTORY
 from daqsvc.live_feed import SCHEMA
 from daqsvc.page.machine_live import MachineLive
 
@@ -49,6 +50,7 @@ class Listening:
         self.heard_s = time.monotonic()
         """When the service said something last."""
         self._path = store / SOCKET
+        self._history = store / HISTORY
         self._wanted: dict[object, frozenset[str]] = {}
         self._streams: frozenset[str] = frozenset()
         self._anew = asyncio.Event()
@@ -131,6 +133,7 @@ class Listening:
     def _begin(self, about: Document) -> None:
         before = self.live
         self.live = MachineLive(about)
+        self.live.history = self._history
         if before is not None and before.about["streams"] == about["streams"]:
             self.live.go_on_from(before)
         self.why_not = ""

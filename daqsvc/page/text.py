@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
     Document = dict[str, Any]
 
+MOST_EVENTS = 50
 WORST = {"danger": 2, "alert": 1}
 STATES = {
     "active_unacknowledged": "active, not acknowledged",
@@ -63,6 +64,22 @@ def alarm_rows(live: MachineLive) -> str:
         for one in standing(live)
     ]
     return "".join(rows) or '<tr><td colspan="5">No alarm stands.</td></tr>'
+
+
+def journal_rows(live: MachineLive) -> str:
+    """What has happened to alarms since the page looks, and the last event of each before; newest first."""
+    rows = [
+        _row(
+            _time(one["wall_ns"]),
+            escape(one["alarm"]),
+            escape(one["kind"]),
+            f'<span class="level {escape(one["level"])}">{escape(one["level"])}</span>',
+            escape(one["message"])
+            + (f" ({escape(one['by'])}: {escape(one['reason'])})" if one["by"] else ""),
+        )
+        for one in reversed(live.journal)
+    ]
+    return "".join(rows[:MOST_EVENTS]) or '<tr><td colspan="5">Nothing has happened.</td></tr>'
 
 
 def machine_rows(live: MachineLive) -> str:

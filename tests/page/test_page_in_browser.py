@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 pytestmark = [pytest.mark.integration, pytest.mark.long]
 
-VIEWS = ("modes", "orbit", "timebase", "spectrum", "full-spectrum")
+VIEWS = ("modes", "orbit", "timebase", "spectrum", "full-spectrum", "envelope", "trend")
 HEALTHY_S = 2.7
 """The paper's rotor is healthy for so long; then its damping goes."""
 PATIENCE_MS = 1000.0 * PATIENCE_S
@@ -164,6 +164,9 @@ async def test_an_alarm_appears_and_what_is_done_about_it(tmp_path: Path) -> Non
         acknowledge = AlarmCommand(verb=Verb.ACKNOWLEDGE, alarm="rotor-fault", by="the test")
         assert (await service.alarms.execute(acknowledge, "test")).accepted
         await page.get_by_role("row", name="active, acknowledged").wait_for(timeout=PATIENCE_MS)
+        done = page.locator("#journal").get_by_role("row", name="acknowledged")
+        await done.wait_for(timeout=PATIENCE_MS)
+        assert "the test" in await done.inner_text()
         await page.goto(address)
         await page.locator(".tile.danger, .tile.alert").wait_for(timeout=PATIENCE_MS)
         assert "rotor-fault first" in await page.locator(".tile").inner_text()

@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import base64
-from typing import Any
+import time
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
+from daqsvc.history.file import HistoryFile, Series
+from daqsvc.history.points import RECORD
 from daqsvc.page.machine_live import MachineLive
 from daqsvc.page.shaft import order_1x, whirl
 from daqsvc.page.text import alarm_rows
 from daqsvc.page.views.all_views import VIEWS
 from daqsvc.page.views.spectrum import amplitudes
 from daqsvc.page.views.timebase import thinned
+from daqsvc.page.views.trend import MOST_POINTS
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 RATE_HZ = 1000.0
 SPEED_HZ = 12.3
@@ -169,3 +176,65 @@ def test_what_an_alarm_says_is_text_and_no_markup() -> None:
     assert "<script" not in html
     assert "a&lt;b&gt;" in html
     assert "&amp; so on" in html
+
+
+def test_a_damaged_bearing_shows_in_the_envelope_at_its_lines() -> None:
+    rate_hz, speed_hz, order = 12_000.0, 25.0, 3.585
+    t = np.arange(round(4.0 * rate_hz)) / rate_hz
+    struck = (t * order * speed_hz) % 1.0 / (order * speed_hz)
+    rng = np.random.default_rng(3)
+    values = 5.0 * np.exp(-struck * 900.0) * np.sin(2.0 * np.pi * 3000.0 * struck) + rng.normal(size=len(t))
+    facts = {"rate_hz": rate_hz, "channels": ["a"], "sensors": ["casing"], "units": ["m/s2"]}
+    bearing = {"name": "drive-end", "type": "6205-2RS"}
+    live = MachineLive(
+        {
+            **about(speed_rpm=60.0 * speed_hz),
+            "values": {
+                "machine": {"name": "rig", "speed_rpm": 60.0 * speed_hz},
+                "sensors": [{"name": "casing", "type": "accelerometer", "unit": "m/s2"}],
+                "pipeline": {"bearing": {"bearings": [bearing]}},
+            },
+            "streams": {"housing": facts},
+        }
+    )
+    samples = told(values[:, None])["samples"]
+    live.take({"samples": {**samples, "stream": "housing", "period_ns": 1e9 / rate_hz}})
+    view = VIEWS["envelope"]
+    assert view.why_not(live) == ""
+    shown = view.shown(live, {"sensor": "casing", "length": "2"})
+    rows = {name.partition(" at ")[0]: float(value) for name, value, _ in shown.rows}
+    assert rows["drive-end BPFO"] > 2.5 * rows["drive-end BPFI"]
+    assert max(rows, key=lambda name: rows[name]) in {"drive-end BPFO", "largest"}
+    lines = shown.sources["bearing_lines"]
+    assert lines["x"][lines["name"].index("drive-end BPFO")] == pytest.approx(order * speed_hz, rel=1e-3)
+    slow = MachineLive(about())
+    assert "2000 Hz or faster" in view.why_not(slow)
+
+
+def test_a_trend_is_drawn_from_the_history_and_broken_where_nothing_was_measured(tmp_path: Path) -> None:
+    live = MachineLive(about())
+    view = VIEWS["trend"]
+    assert "keeps no history" in view.why_not(live)
+    live.history = tmp_path / "history.sqlite"
+    assert "keeps no history" in view.why_not(live)
+    now_s = int(time.time())
+    series = Series("rig", "levels/left", "statistic", "rms", "um")
+    seconds = np.array(
+        [(now_s - 3000 + k, 1, 4.0, 5.0, 7.0) for k in range(2900) if not 1000 <= k < 1400], RECORD
+    )
+    file = HistoryFile(live.history)
+    file.write({series: seconds})
+    file.close()
+    assert view.why_not(live) == ""
+    assert view.choices(live)[0].options == {"levels/left.rms": "levels/left.rms"}
+    shown = view.shown(live, {"reading": "levels/left.rms", "hours": "1"})
+    drawn = shown.sources["trend"]
+    assert len(drawn["t"]) <= MOST_POINTS
+    assert drawn["t"][0] == pytest.approx(-3000 / 3600, abs=0.01)
+    assert np.nanmin(drawn["mean"]) == np.nanmax(drawn["mean"]) == 5.0
+    hole = drawn["t"][np.isnan(drawn["mean"])]
+    assert (hole.min(), hole.max()) == pytest.approx((-2000 / 3600, -1600 / 3600), abs=0.01)
+    assert {row[0]: row[1] for row in shown.rows}["mean"] == "5"
+    by_the_hour = view.shown(live, {"reading": "levels/left.rms", "hours": "8760"})
+    assert ("mean", "5", "um") in by_the_hour.rows
+    assert len(by_the_hour.sources["trend"]["t"]) <= 2

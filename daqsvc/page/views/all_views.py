@@ -4,15 +4,26 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from daqsvc.page.views.envelope import EnvelopeView
 from daqsvc.page.views.modes import ModesView
 from daqsvc.page.views.orbit import OrbitView
 from daqsvc.page.views.spectrum import FullSpectrumView, SpectrumView
 from daqsvc.page.views.timebase import TimebaseView
+from daqsvc.page.views.trend import TrendView
 
 if TYPE_CHECKING:
     from daqsvc.page.views.view import View
 
 VIEWS: dict[str, View] = {
-    view.name: view for view in (ModesView(), OrbitView(), TimebaseView(), SpectrumView(), FullSpectrumView())
+    view.name: view
+    for view in (
+        ModesView(),
+        OrbitView(),
+        TimebaseView(),
+        SpectrumView(),
+        FullSpectrumView(),
+        EnvelopeView(),
+        TrendView(),
+    )
 }
 """By the name in the address."""

@@ -1,0 +1,160 @@
+"""Figures over hours and months, from the history on the box."""
+
+from __future__ import annotations
+
+import sqlite3
+import time
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daqsvc.history.file import EmptyHistoryError, HistoryReader, NewerHistoryError
+from daqsvc.history.points import Step
+from daqsvc.page.charts import Axis, chart, legend, source
+from daqsvc.page.views.view import Choice, Figure, Shown
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from daqsvc.history.points import TrendPoints
+    from daqsvc.page.charts import Theme
+    from daqsvc.page.machine_live import MachineLive
+
+HOURS = {"1": "1 hour", "8": "8 hours", "24": "1 day", "168": "1 week", "720": "30 days", "8760": "1 year"}
+SECONDS_UP_TO_H, MINUTES_UP_TO_H = 1.0, 200.0
+DAYS_FROM_H = 48.0
+"""What is longer is shown in days."""
+MOST_POINTS = 1500
+"""Of a line: more cannot be told apart on a screen."""
+NONE = "this machine keeps no history: write [history] into its machine file"
+
+
+class TrendView:
+    """See `daqsvc.page.views.view.View`."""
+
+    name = "trend"
+    title = "Trend"
+    sentence = (
+        "A figure over hours or months: its mean, and the range from its least to its greatest value within "
+        "each point. Where nothing was measured the line is broken."
+    )
+    every_s = 5.0
+
+    def choices(self, live: MachineLive) -> list[Choice]:
+        """See `daqsvc.page.views.view.View.choices`."""
+        return [
+            Choice("reading", "Figure", {name: name for name in _names(live)}),
+            Choice("hours", "Over", HOURS),
+        ]
+
+    def why_not(self, live: MachineLive) -> str:
+        """See `daqsvc.page.views.view.View.why_not`."""
+        return "" if _names(live) else NONE
+
+    def streams(self, live: MachineLive, chosen: Mapping[str, str]) -> set[str]:
+        """See `daqsvc.page.views.view.View.streams`."""
+        del live, chosen
+        return set()
+
+    def figures(self, live: MachineLive, chosen: Mapping[str, str], theme: Theme) -> list[Figure]:
+        """See `daqsvc.page.views.view.View.figures`."""
+        reading, hours = chosen["reading"], float(chosen["hours"])
+        per_unit, unit = (24.0, "days") if hours >= DAYS_FROM_H else (1.0, "hours")
+        figure_unit = _units(live).get(reading, "")
+        made = chart(
+            Axis(f"time before now, {unit}", -hours / per_unit, 0.0),
+            Axis(f"{reading}, {figure_unit}".rstrip(", ")),
+            theme,
+            tips=[
+                ("time", f"@t{{0.000}} {unit}"),
+                ("mean", "@mean"),
+                ("least", "@low"),
+                ("greatest", "@high"),
+            ],
+        )
+        told = source("trend", ["t", "low", "mean", "high"])
+        made.varea("t", "low", "high", source=told, fill_color=theme.series[0], fill_alpha=0.25)
+        made.line("t", "mean", source=told, line_color=theme.series[0], legend_label=reading)
+        legend(made, theme)
+        return [Figure("trend", f"{reading} over {HOURS[chosen['hours']]}", made)]
+
+    def shown(self, live: MachineLive, chosen: Mapping[str, str]) -> Shown:
+        """See `daqsvc.page.views.view.View.shown`."""
+        hours = float(chosen["hours"])
+        now_s = time.time()
+        with _Opened(live) as reader:
+            if reader is None:
+                return Shown(note=NONE)
+            series = next(one for one in reader.series(live.name) if one.name == chosen["reading"])
+            step = step_of(hours)
+            points = reader.trend(series, step, now_s - 3600.0 * hours, now_s + 1.0)
+        if not len(points.t_s):
+            return Shown(note="nothing was written down in this time")
+        t_h, low, mean, high = thinned(points, now_s, step)
+        rows = [
+            ("mean", f"{np.average(points.mean, weights=points.n):.4g}", series.unit),
+            ("least", f"{points.low.min():.4g}", series.unit),
+            ("greatest", f"{points.high.max():.4g}", series.unit),
+            ("newest", f"{points.mean[-1]:.4g}", series.unit),
+        ]
+        t = t_h / (24.0 if hours >= DAYS_FROM_H else 1.0)
+        return Shown({"trend": {"t": t, "low": low, "mean": mean, "high": high}}, rows)
+
+
+def step_of(hours: float) -> Step:
+    """The step from point to point, by the time that is shown."""
+    if hours <= SECONDS_UP_TO_H:
+        return Step.SECOND
+    return Step.MINUTE if hours <= MINUTES_UP_TO_H else Step.HOUR
+
+
+def thinned(points: TrendPoints, now_s: float, step: Step) -> tuple[np.ndarray, ...]:
+    """Time in hours before now, least, mean and greatest, in no more points than can be seen.
+
+    A hole is where a whole point has nothing.
+    """
+    first_s, last_s = int(points.t_s[0]), int(points.t_s[-1])
+    width_s = max(int(step), -(-(last_s - first_s + int(step)) // MOST_POINTS))
+    place = (points.t_s - first_s) // width_s
+    count = int(place[-1]) + 1
+    weight = np.zeros(count)
+    np.add.at(weight, place, points.n)
+    mean, low, high = np.zeros(count), np.full(count, np.inf), np.full(count, -np.inf)
+    np.add.at(mean, place, points.mean.astype(np.float64) * points.n)
+    np.minimum.at(low, place, points.low)
+    np.maximum.at(high, place, points.high)
+    nothing = weight == 0
+    mean = np.divide(mean, weight, out=np.full(count, np.nan), where=~nothing)
+    low[nothing] = high[nothing] = np.nan
+    t_h = (first_s + width_s * np.arange(count) - now_s) / 3600.0
+    return t_h, low, mean, high
+
+
+class _Opened:
+    """The history of a machine's box; None if there is none, or none that can be read."""
+
+    def __init__(self, live: MachineLive) -> None:
+        self._path = live.history
+        self._reader: HistoryReader | None = None
+
+    def __enter__(self) -> HistoryReader | None:
+        if self._path is not None and self._path.is_file():
+            try:
+                self._reader = HistoryReader(self._path)
+            except (sqlite3.Error, NewerHistoryError, EmptyHistoryError):
+                return None
+        return self._reader
+
+    def __exit__(self, *_: object) -> None:
+        if self._reader is not None:
+            self._reader.close()
+
+
+def _units(live: MachineLive) -> dict[str, str]:
+    with _Opened(live) as reader:
+        return {} if reader is None else {one.name: one.unit for one in reader.series(live.name)}
+
+
+def _names(live: MachineLive) -> list[str]:
+    """The figures that there are, r.m.s. values first."""
+    return sorted(_units(live), key=lambda name: (not name.endswith("rms"), name))
