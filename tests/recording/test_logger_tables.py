@@ -9,7 +9,7 @@ import pytest
 
 from daqsvc.recording import RecordingError
 from daqsvc.recording.formats.written_times import format_of, times_of
-from daqsvc.recording.recording import load_recording
+from daqsvc.recording.recording import load_all, load_recording
 
 RATE_HZ = 1_000
 SAMPLES = np.round(np.random.default_rng(6).normal(size=300), 4)
@@ -90,9 +90,251 @@ def test_a_cell_without_a_time_is_one_that_is_not_known():
     cells = ["31.01.2026 12:00:00", "", "31.13.2026 12:00:00", "31.01.2026 12:00:01", "x"]
     form = format_of(cells[:1])
     assert form is not None
-    assert np.isnat(times_of(cells, form)).tolist() == [False, True, True, False, True]
+    assert np.isnat(times_of(cells, form).times).tolist() == [False, True, True, False, True]
 
 
 @pytest.mark.parametrize("cells", [["12:61:00"], ["1.2"], ["31.13.2026"], ["", ""], ["10:00:00", "later"]])
 def test_words_are_no_times(cells):
     assert format_of(cells) is None
+
+
+# Units.
+
+
+def units_table(
+    tmp_path, head, *, per_s=1.0, delimiter=",", comma=False, quoted=False, end="", encoding="utf-8"
+):
+    """Samples with a time whose unit is so many times as short as a second."""
+    rows = []
+    for k, x in enumerate(SAMPLES):
+        cells = [f"{k / RATE_HZ * per_s:.12f}", f"{x:.4f}"]
+        cells = [cell.replace(".", ",") for cell in cells] if comma else cells
+        rows.append(delimiter.join(f'"{cell}"' for cell in cells) if quoted else delimiter.join(cells))
+    path = tmp_path / "rig.csv"
+    path.write_bytes("\r\n".join([head, *[row + end for row in rows], ""]).encode(encoding))
+    return path
+
+
+GERMAN = {"delimiter": ";", "comma": True}
+
+
+@pytest.mark.parametrize(
+    ("head", "per_s", "unit", "how"),
+    [
+        ("time,x\ns,m/s2", 1.0, "m/s2", {}),
+        ("time,x\nms,g", 1e3, "g", {}),
+        ("time,x\n[us],[g]", 1e6, "g", {}),
+        ("Time,x\n(ms),(mV)\n", 1e3, "mV", {}),
+        ("time,x\nmin,mm/s RMS", 1 / 60, "mm/s RMS", {}),
+        ("Zeit;x\nStd.;µm", 1 / 3600, "µm", GERMAN),
+        ("Zeit;x\nSekunden;m/s²", 1.0, "m/s²", GERMAN),
+        ("Zeit;x\nms;m/s²", 1e3, "m/s²", GERMAN | {"encoding": "latin-1"}),
+        ("Zeit;x\nμs;m/s²", 1e6, "m/s²", GERMAN | {"encoding": "utf-16"}),
+        ("Zeit;x\nms;m/s²", 1e3, "m/s²", GERMAN | {"encoding": "utf-8-sig"}),
+        ("Messung;Pumpe 1\nZeit;x\nms;m/s²", 1e3, "m/s²", GERMAN),
+        ("sep=;\nZeit;x\nms;m/s²", 1e3, "m/s²", GERMAN),
+        ('"Zeit";"x"\n"ms";"m/s²"', 1e3, "m/s²", GERMAN | {"quoted": True}),
+        ("Zeit;x\n;m/s²", 1.0, "m/s²", GERMAN),
+        ("time;x\nms;g", 1e3, "g", {"delimiter": ";", "end": ";"}),
+        ("time,x\ns,gE", 1.0, "gE", {}),
+        ("ms,g\ntime,x", 1e3, "g", {}),
+        ("# unit of x = m/s2\n# unit of time = ms\ntime,x", 1e3, "m/s2", {}),
+        ("Zeit [min];x [m/s²]", 1 / 60, "m/s²", GERMAN),
+        ("time (ms),x (g)", 1e3, "g", {}),
+        ("Zeit in ms;x (mm/s)", 1e3, "mm/s", GERMAN),
+        ("t/ms,x [g]\nms,g", 1e3, "g", {}),
+        ("time_ms,x\n,", 1e3, None, {}),
+        ("time,x (radial)", 1.0, None, {}),
+        ("Zeit;x\n;", 1.0, None, GERMAN),
+    ],
+)
+def test_units_are_those_of_their_row_or_in_brackets(tmp_path, head, per_s, unit, how):
+    path = units_table(tmp_path, head, per_s=per_s, **how)
+    (name,) = load_recording(path).names
+    assert name.split(" ")[0] == "x"
+    recording = load_recording(path, {"x": "x" if unit else name})
+    assert recording.units == ({} if unit is None else {"x": unit})
+    assert np.array_equal(recording.samples[:, 0], SAMPLES)
+    assert recording.rate_hz == pytest.approx(RATE_HZ)
+    streams, _ = load_all(path)
+    assert [(one.names, one.units) for one in streams] == [((name,), (unit or "",))]
+
+
+@pytest.mark.parametrize(
+    ("head", "why"),
+    [
+        (
+            "time,x [g]\ns,m/s2",
+            r"column 2 \(x \[g\]\) of .* is in g by its name and in m/s2 by the row of units",
+        ),
+        (
+            "# unit of x = g\ntime,x\ns,mg",
+            "is in mg by the row of units and in g by a comment; correct the one",
+        ),
+        ("time_ms,x\ns,g", "is in ms by its name and in s by the row of units"),
+    ],
+)
+def test_units_that_contradict_each_other_are_refused(tmp_path, head, why):
+    with pytest.raises(RecordingError, match=why):
+        load_recording(units_table(tmp_path, head))
+
+
+def test_a_unit_that_is_written_in_two_ways_is_one(tmp_path):
+    path = units_table(tmp_path, "Zeit [sec],x [m/s²]\ns,m/s^2")
+    assert load_recording(path, {"x": "x"}).units == {"x": "m/s²"}
+
+
+def test_a_name_without_its_unit_means_a_column_only_if_it_is_the_only_one(tmp_path):
+    path = tmp_path / "rig.csv"
+    path.write_text("x [g],x [mm],y [V],y\n" + "1,2,3,4\n" * 5)
+    assert load_recording(path, {"a": "y"}, 10.0).samples[0, 0] == 4.0
+    with pytest.raises(RecordingError, match=r"has no channel 'x'; it holds x \[g\] \(5\), x \[mm\] \(5\)"):
+        load_recording(path, {"a": "x"}, 10.0)
+    assert load_recording(path, {"a": "x [mm]"}, 10.0).units == {"a": "mm"}
+
+
+# Lines about the measurement.
+
+
+@pytest.mark.parametrize(
+    ("head", "how"),
+    [
+        ("Messung;Pumpe 1\nZeit;x", GERMAN),
+        ("Logger,Pump 1\ntime,x", {}),
+        ("Measured on Pump 1\ntime,x", {}),
+        ("sep=;\nZeit;x", GERMAN),
+        ('"sep=;"\nZeit;x', GERMAN),
+        ("Datum;31.01.2026\nZeit;x", GERMAN),
+        ("Serial,4711\ntime,x", {}),
+        ("Logger,Pump 1\nt,g\n", {}),
+        ("time,x\nrelative,housing", {}),
+    ],
+)
+def test_a_line_about_the_measurement_does_not_hide_the_names(tmp_path, head, how):
+    recording = load_recording(units_table(tmp_path, head, **how))
+    assert recording.names in {("x",), ("g",)}
+    assert recording.rate_hz == pytest.approx(RATE_HZ)
+
+
+def test_a_line_for_excel_is_no_header(tmp_path):
+    path = tmp_path / "rig.csv"
+    path.write_text("sep=;\n1,5;2\n3;4\n")  # the last line does not show that commas are decimal
+    assert load_recording(path, rate_hz=10.0).names == ("0", "1")
+
+
+def test_a_rate_in_the_only_line_above_the_names_is_taken(tmp_path):
+    path = tmp_path / "rig.csv"
+    path.write_text("Sample rate: 0.5 kHz\nx,y\n" + "1,2\n" * 5)
+    recording = load_recording(path)
+    assert (recording.names, recording.rate_hz) == (("x", "y"), 500.0)
+
+
+# Dates.
+
+
+def dated(tmp_path, moments, form, **more):
+    return table(tmp_path, [moment.strftime(form) for moment in moments], comma=False, delimiter=",", **more)
+
+
+def around(*date, step=timedelta(milliseconds=1), gap=timedelta(0)):
+    """300 moments of which the second half is on the next day."""
+    midnight = datetime(*date) + timedelta(days=1)  # noqa: DTZ001
+    return [midnight + (k - 150) * step + (gap if k >= 150 else timedelta(0)) for k in range(300)]
+
+
+WAYS_OF_DATES = [
+    "%m/%d/%Y %I:%M:%S.%f %p",
+    "%m/%d/%Y %H:%M:%S.%f",
+    "%d/%m/%Y %H:%M:%S.%f",
+    "%d/%m/%Y %I:%M:%S.%f %p",
+]
+
+
+@pytest.mark.parametrize("date", [(2026, 2, 1), (2026, 1, 31), (2026, 4, 30), (2026, 12, 31), (2026, 1, 12)])
+@pytest.mark.parametrize("form", WAYS_OF_DATES)
+def test_over_midnight_the_rows_tell_the_day_from_the_month(tmp_path, form, date):
+    moments = around(*date)
+    (stream,), notes = load_all(dated(tmp_path, moments, form))
+    assert (stream.rate_hz, len(stream.samples), notes) == (pytest.approx(RATE_HZ), 300, [])
+    assert stream.start.startswith(moments[0].isoformat())
+
+
+@pytest.mark.parametrize("form", ["%m/%d/%Y,%I:%M:%S.%f %p", "%d/%m/%Y,%H:%M:%S.%f"])
+def test_over_midnight_a_date_of_its_own_too(tmp_path, form):
+    moments = around(2026, 2, 1)
+    (stream,), _ = load_all(dated(tmp_path, moments, form, head=("Date", "Time", "x")))
+    assert (stream.rate_hz, len(stream.samples)) == (pytest.approx(RATE_HZ), 300)
+    assert stream.start.startswith(moments[0].isoformat())
+
+
+def test_the_rows_are_looked_at_to_the_end(tmp_path):
+    """The lines that the layout is found by are all of one day."""
+    moments = around(2026, 2, 1)
+    moments = [moments[0] - timedelta(milliseconds=k) for k in range(70_000, 0, -1)] + moments
+    path = tmp_path / "rig.csv"
+    path.write_text("time,x\n" + "".join(f"{one:%m/%d/%Y %H:%M:%S.%f},1\n" for one in moments))
+    assert load_recording(path).samples.shape == (70_300, 1)
+
+
+def test_am_and_pm_say_that_the_month_is_first(tmp_path):
+    moments = [datetime(2026, 2, 1, 13) + timedelta(milliseconds=k) for k in range(300)]  # noqa: DTZ001
+    (stream,), _ = load_all(dated(tmp_path, moments, WAYS_OF_DATES[0]))
+    assert stream.start.startswith("2026-02-01T13:00:00.000")
+
+
+@pytest.mark.parametrize("form", [*WAYS_OF_DATES[1:3], "%H:%M:%S.%f"])
+def test_of_one_day_the_rate_is_known_and_the_date_is_not(tmp_path, form):
+    moments = [datetime(2026, 2, 1, 13) + timedelta(milliseconds=k) for k in range(300)]  # noqa: DTZ001
+    (stream,), _ = load_all(dated(tmp_path, moments, form))
+    assert (stream.rate_hz, stream.start) == (pytest.approx(RATE_HZ), "")
+
+
+def test_dates_that_leap_either_way_are_refused(tmp_path):
+    path = dated(tmp_path, around(2026, 2, 5, gap=timedelta(days=3)), WAYS_OF_DATES[1])
+    with pytest.raises(RecordingError) as refused:
+        load_recording(path)
+    assert str(refused.value) == (
+        f"the dates in column 1 (Zeit) of {path} may have the day first or the month, and the rows leap "
+        "either way; write them as 2026-01-31"
+    )
+
+
+# Zones.
+
+
+def zoned(tmp_path, before, after, ahead_h):
+    """Times in ISO 8601 over a change of the clock by an hour."""
+    begin = datetime(2026, 3, 29, 0, 59, 59, 900_000)  # noqa: DTZ001
+    cells = []
+    for k in range(300):
+        moment = begin + timedelta(milliseconds=k)
+        late = k >= 100
+        cells.append(
+            (moment + timedelta(hours=ahead_h[late])).isoformat(timespec="milliseconds")
+            + (before, after)[late]
+        )
+    return table(tmp_path, cells, comma=False, delimiter=",")
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "ahead_h"),
+    [
+        ("+01:00", "+02:00", (1, 2)),
+        ("+0100", "+0200", (1, 2)),
+        ("+02", "+01", (2, 1)),
+        ("-05:00", "-04:00", (-5, -4)),
+        ("-01:00", "+00:00", (-1, 0)),
+        ("Z", "+01:00", (0, 1)),
+        (" UTC", " UTC", (0, 0)),
+    ],
+)
+def test_zones_count_where_all_times_have_one(tmp_path, before, after, ahead_h):
+    path = zoned(tmp_path, before, after, ahead_h)
+    (stream,), notes = load_all(path)
+    assert (len(stream.samples), stream.rate_hz, notes) == (300, pytest.approx(RATE_HZ), [])
+    assert stream.start == "2026-03-29T00:59:59.900000000Z"
+
+
+def test_zones_that_some_times_lack_do_not_count(tmp_path):
+    (stream,), _ = load_all(zoned(tmp_path, "+02:00", "", (0, 0)))
+    assert (len(stream.samples), stream.start) == (300, "2026-03-29T00:59:59.900000000Z")

@@ -19,20 +19,29 @@ import numpy as np
 
 from daqsvc.confined.limits import CountedFile, TooLargeError
 from daqsvc.recording import RecordingError
-from daqsvc.recording.contents import LONGEST_NAME, LONGEST_TEXT, STATED_START, Contents
+from daqsvc.recording.contents import LONGEST_NAME, LONGEST_TEXT, STATED_START, Contents, Elsewhere
+from daqsvc.recording.formats.column_units import is_time_name, spelt_alike, time_unit, unit_in_name
 from daqsvc.recording.formats.table_layout import SNIFFED_LINES, is_number, layout_of
-from daqsvc.recording.formats.written_times import in_turn, times_of
+from daqsvc.recording.formats.written_times import (
+    EitherDateError,
+    in_turn,
+    is_same_day,
+    joined_times,
+    times_of,
+)
+from daqsvc.recording.rate import PER_SECOND
 
 if TYPE_CHECKING:
-    from collections.abc import Generator
+    from collections.abc import Generator, Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     from daqsvc.confined.limits import Budget
+    from daqsvc.recording.formats.written_times import TimeFormat, WrittenTimes
 
     Floats: TypeAlias = NDArray[np.float64]
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
     from typing import BinaryIO
 
 
@@ -47,6 +56,8 @@ LONGEST_LINE = 1_000_000
 """Characters; what is longer among the first lines is no table."""
 
 _MOST_STATEMENTS = 1000
+_SEPARATOR = re.compile(r"(?i)sep=.?\s*")
+"""The first line of tables that Excel is told the delimiter of."""
 _BLOCK_ROWS = 1 << 16
 
 
@@ -94,37 +105,122 @@ class _DelimitedTable:
             name: numbers[:, layout.numeric.index(i)] if i in layout.numeric else np.empty(1, dtype=object)
             for i, name in enumerate(layout.names)
         }
-        entries |= self._times(len(numbers))
+        dates, undated = self._times(len(numbers))
+        entries |= dates
+        units = self._take_units(layout.names)
+        entries = dict(self._scaled(entries, units))
         for name, number in {**layout.scalars, **self._stated}.items():
             entries.setdefault(name, np.array(number))
         for name, text in self._texts.items():
             entries.setdefault(name, np.array(text))
-        units = {name: unit for name, unit in self._units.items() if name in entries}
-        return Contents(entries, is_table=True, has_header=layout.has_header, units=units)
+        contents = Contents(
+            entries,
+            is_table=True,
+            has_header=layout.has_header,
+            units={name: unit for name, unit in units.items() if name in entries},
+            # A begin of the times alone: nobody knows the day, and the channels have none.
+            starts_ns=dict.fromkeys(undated, 0),
+        )
+        return replace(contents, elsewhere=_by_short_names(contents))
 
-    def _times(self, length: int) -> dict[str, NDArray[np.generic]]:
-        """The columns of times, datetime64[ns]; a date and the time of the day beside it are one."""
+    def _take_units(self, names: Sequence[str]) -> dict[str, str]:
+        """The units of the columns by their names, as the names, a row of units or comments say.
+
+        Raises:
+            RecordingError: two of these are said of a column.
+        """
+        units: dict[str, str] = {}
+        for i, name in enumerate(names):
+            said = {
+                "its name": unit_in_name(name)[1] if self._layout.has_header else "",
+                "the row of units": self._layout.units.get(i, ""),
+                "a comment": self._units.get(name, ""),
+            }
+            told = {where: unit for where, unit in said.items() if unit and i not in self._layout.times}
+            first = next(iter(told.items()), None)
+            if first is None:
+                continue
+            for where, unit in told.items():
+                if not spelt_alike(unit, first[1]):
+                    raise RecordingError(
+                        f"column {i + 1} ({name:.{LONGEST_NAME}}) of {self._path} is in "
+                        f"{first[1]:.{LONGEST_NAME}} by {first[0]} and in {unit:.{LONGEST_NAME}} by {where}; "
+                        "correct the one that is wrong"
+                    )
+            units[name] = first[1][:LONGEST_NAME]
+        return units
+
+    def _scaled(
+        self, entries: Mapping[str, NDArray[np.generic]], units: dict[str, str]
+    ) -> Iterator[tuple[str, NDArray[np.generic]]]:
+        """The columns, those of time in a unit that their names then end with; these leave the units."""
+        for name, values in entries.items():
+            bare, own = unit_in_name(name)
+            unit = time_unit(units.get(name, ""))
+            if unit is None or not is_time_name(bare) or values.dtype.kind != "f":
+                yield name, values
+                continue
+            del units[name]
+            seconds = np.asarray(values, np.float64) * unit.factor if unit.factor != 1.0 else values
+            called = f"{bare} [{unit.name}]"
+            if own and is_time_name(name):  # as in time_ms, which says it by itself
+                yield name, values
+            elif called not in entries:
+                yield called, seconds
+            else:
+                yield name, np.asarray(seconds, np.float64) / PER_SECOND.get(unit.name, 1.0)
+
+    def _times(self, length: int) -> tuple[dict[str, NDArray[np.generic]], list[str]]:
+        """The columns of times, datetime64[ns]; a date and the time of the day beside it are one.
+
+        Returns:
+            The columns; and the names of those whose day is not known.
+        """
         layout, forms = self._layout, self._layout.times
         if not forms:
-            return {}
-        pieces: dict[int, list[NDArray[np.datetime64]]] = {i: [] for i in forms}
+            return {}, []
+        pieces: dict[int, list[WrittenTimes]] = {i: [] for i in forms}
         with contextlib.closing(self._rows(fill=False)) as rows:
             while block := list(itertools.islice(rows, _BLOCK_ROWS)):
                 cells = [layout.split(line) for line in block]
                 for i, form in forms.items():
                     pieces[i].append(times_of([row[i] if len(row) > i else "" for row in cells], form))
-        columns = {i: np.concatenate(parts)[:length] for i, parts in pieces.items()}
+        columns = {i: self._column(i, parts, length) for i, parts in pieces.items()}
         entries: dict[str, NDArray[np.generic]] = {}
+        undated = []
         for i, column in columns.items():
+            date: int | None = i
+            if forms[i].holds == "date":
+                continue
+            joined = column
             if forms[i].holds == "time":
-                date = next((j for j in (i - 1, i + 1) if j in forms and forms[j].holds == "date"), None)
-                joined = in_turn(column)
-                if date is not None:
-                    joined = column + (columns[date] - np.datetime64(0, "ns"))
-                entries[layout.names[i]] = joined
-            elif forms[i].holds == "both":
-                entries[layout.names[i]] = column
-        return entries
+                date = _beside(i, forms)
+                joined = (
+                    in_turn(column) if date is None else column + (columns[date] - np.datetime64(0, "ns"))
+                )
+            entries[layout.names[i]] = joined
+            if date is None or (forms[date].either and not forms[i].halves and is_same_day(columns[date])):
+                undated.append(layout.names[i])
+        return entries, undated
+
+    def _column(self, i: int, pieces: Sequence[WrittenTimes], length: int) -> NDArray[np.datetime64]:
+        """The times of a column by its number.
+
+        Raises:
+            RecordingError: nothing tells the day from the month.
+        """
+        forms = self._layout.times
+        form = forms[i]
+        beside = _beside(i, forms)
+        if beside is not None:
+            form = replace(form, halves=form.halves or forms[beside].halves)
+        try:
+            return joined_times(pieces, form, length)
+        except EitherDateError:
+            raise RecordingError(
+                f"the dates in column {i + 1} ({self._layout.names[i]:.{LONGEST_NAME}}) of {self._path} "
+                "may have the day first or the month, and the rows leap either way; write them as 2026-01-31"
+            ) from None
 
     def _first_lines(self) -> list[str]:
         first: list[str] = []
@@ -228,9 +324,35 @@ class _DelimitedTable:
                     )
 
 
+def _beside(i: int, forms: Mapping[int, TimeFormat]) -> int | None:
+    """Of a column of dates or times of the day, by its number, the other one of a pair beside it, if any."""
+    other = {"date": "time", "time": "date"}.get(forms[i].holds)
+    return next((j for j in (i - 1, i + 1) if j in forms and forms[j].holds == other), None)
+
+
+def _by_short_names(contents: Contents) -> dict[str, Elsewhere]:
+    """The columns with a unit behind their names by these names without it, where only one is called so."""
+    short: dict[str, list[str]] = {}
+    for name in contents.vectors():
+        bare, unit = unit_in_name(name)
+        if unit and bare != name and not is_time_name(bare) and bare not in contents.entries:
+            short.setdefault(bare, []).append(name)
+    full = {bare: names[0] for bare, names in short.items() if len(names) == 1}
+
+    def read() -> Contents:
+        # Behind all others, as columns have numbers, too.
+        more = {bare: contents.entries[name] for bare, name in full.items()}
+        units = {bare: contents.units[name] for bare, name in full.items() if name in contents.units}
+        return replace(
+            contents, entries={**contents.entries, **more}, units={**contents.units, **units}, elsewhere={}
+        )
+
+    return {bare: Elsewhere(f"is called {name!r} there: name it so", read) for bare, name in full.items()}
+
+
 def _is_no_row(line: str) -> bool:
-    """Whether a line is a comment or blank."""
-    return line[0] == "#" or line.isspace()
+    """Whether a line is a comment, blank, or for Excel alone."""
+    return line[0] == "#" or line.isspace() or (line[0] in "sS" and _SEPARATOR.fullmatch(line) is not None)
 
 
 def _empty_cell(delimiter: str | None) -> re.Pattern[str] | None:

@@ -8,6 +8,13 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from daqsvc.recording.contents import check_columns, column_names
+from daqsvc.recording.formats.column_units import (
+    is_time_name,
+    is_unit,
+    time_unit,
+    unit_in_name,
+    without_brackets,
+)
 from daqsvc.recording.formats.written_times import format_of
 
 if TYPE_CHECKING:
@@ -26,13 +33,6 @@ _TABLE_LINES = 20
 
 _LEAST_TABLE_LINES = 2
 """Rows of samples that show a table behind a preamble."""
-
-UNIT = re.compile(
-    r"(?i)[\[(]?\s*(?:|-+|%|s|sec|ms|us|µs|μs|ns|h|min|date|time|V|mV|uV|µV|A|mA|g|mg|m/s2|m/s²|m/s\^2|mm/s|m/s|in/s|"
-    r"m|mm|um|µm|μm|mil|mils|Hz|kHz|rpm|1/min|U/min|°|deg|rad|°C|C|degC|K|N|kN|Nm|Pa|kPa|MPa|bar|W|kW|"
-    r"(?:[dt]{1,2}|[yj]{2,4})[./ -]?[mdytjhs.,:/ \-f0]*|hh?:mm[:s.,f0]*)\s*[\])]?"
-)
-"""What stands in a line of units."""
 
 STATED = re.compile(
     r"""["\s]*(?P<name>[A-Za-z][\w .-]*?)\s*(?:[\[(]\s*(?P<in_name>k?Hz|S/s)\s*[\])])?["\s]*[:=;,\t|]["\s]*"""
@@ -55,6 +55,7 @@ class Layout:
         numeric: numbers of those that hold numbers.
         scalars: numbers that the preamble states.
         times: for columns of times in words, how these are written, by their numbers.
+        units: that a row of units names, by the numbers of the columns.
     """
 
     delimiter: str | None
@@ -65,6 +66,7 @@ class Layout:
     numeric: Sequence[int]
     scalars: Mapping[str, float]
     times: Mapping[int, TimeFormat] = field(default_factory=dict)
+    units: Mapping[int, str] = field(default_factory=dict)
 
     @property
     def width(self) -> int:
@@ -110,15 +112,19 @@ def _from_the_first_line(lines: Sequence[str]) -> tuple[Layout, bool]:
     rows = [split(line, delimiter) for line in top]
     last = rows[-1]
     check_columns(len(last))
-    # Loggers that end each line with a delimiter have no column after it.
-    width = len(last) - (len(last) > 1 and not any(row[len(last) - 1 :] != [""] for row in rows))
+    width = _width(rows)
     numbers = [[is_number(cell, decimal_comma=decimal_comma) for cell in row[:width]] for row in rows]
     header_lines = _header_lines(numbers)
     has_samples = header_lines < len(rows)
     numeric = [i for i in range(width) if has_samples and (numbers[-1][i] or not last[i])]
-    header = rows[0] if header_lines else []
+    heading = _heading(rows, header_lines, width)
+    header = rows[heading.names or 0] if header_lines else []
     names = column_names([*header[:width], *[""] * (width - len(header))])
-    layout = Layout(delimiter, decimal_comma, header_lines, header_lines > 0, names, numeric, {})
+    stated = _stated(lines[: heading.names or 0], decimal_comma)
+    units = heading.units_of(rows, width)
+    layout = Layout(
+        delimiter, decimal_comma, header_lines, header_lines > 0, names, numeric, stated, units=units
+    )
     body = [split(line, delimiter) for line in lines[header_lines:]]
     fits = not has_samples or (bool(numeric) and all(_is_row(row, layout) for row in body))
     return layout, fits
@@ -136,11 +142,11 @@ def _behind_a_preamble(lines: Sequence[str]) -> Layout | None:
         check_columns(len(last))
         if delimiter is not None and len(last) < 2:
             continue
-        decimal_comma = _has_decimal_comma(last, delimiter)
+        decimal_comma = _has_decimal_comma(rows[-_TABLE_LINES:], delimiter)
         numeric = [i for i, cell in enumerate(last) if is_number(cell, decimal_comma=decimal_comma)]
         if not numeric:
             continue
-        width = len(last) - (len(last) > 1 and all(row[-1] == "" for row in rows if len(row) == len(last)))
+        width = _width(rows)
         table = Layout(delimiter, decimal_comma, 0, False, [""] * width, numeric, {})
         first = len(rows)
         while first and len(rows[first - 1]) == len(last) and _is_row(rows[first - 1], table):
@@ -150,11 +156,19 @@ def _behind_a_preamble(lines: Sequence[str]) -> Layout | None:
         table = replace(table, times=_times(table, lines[first:]))
         if any(_is_like(row, table) for row in rows[:first]):
             return None
-        header = _header_above(rows, first, width)
+        heading = _heading(rows, first, width)
+        header = heading.names
         names = column_names(rows[header][:width] if header is not None else [""] * width)
         about = lines[: first if header is None else header]
         return Layout(
-            delimiter, decimal_comma, first, header is not None, names, numeric, _stated(about, decimal_comma)
+            delimiter,
+            decimal_comma,
+            first,
+            header is not None,
+            names,
+            numeric,
+            _stated(about, decimal_comma),
+            units=heading.units_of(rows, width),
         )
     return None
 
@@ -169,15 +183,90 @@ def _is_like(row: Sequence[str], table: Layout) -> bool:
     return numbers[0] if table.numeric[0] == 0 else sum(numbers) * 2 >= len(numbers)
 
 
-def _header_above(rows: Sequence[Sequence[str]], first: int, width: int) -> int | None:
-    """Which line names the columns of samples that begin at a line: the one above, or above the units."""
-    if not first or len(rows[first - 1]) < width:
-        return None
-    above = first - 1
-    is_units = all(UNIT.fullmatch(cell) for cell in rows[above][:width])
-    if is_units and above and len(rows[above - 1]) >= width and all(rows[above - 1][:width]):
-        return above - 1
-    return above
+def _width(rows: Sequence[Sequence[str]]) -> int:
+    """Columns of a table: loggers that end each line with a delimiter have none after it."""
+    last = rows[-1]
+    return len(last) - (len(last) > 1 and all(row[-1] == "" for row in rows if len(row) == len(last)))
+
+
+@dataclass(frozen=True, slots=True)
+class _Heading:
+    """Which lines above a table say what its columns are.
+
+    Attributes:
+        names: number of the line that names them; None if none does.
+        units: of the one with their units.
+    """
+
+    names: int | None = None
+    units: int | None = None
+
+    def units_of(self, rows: Sequence[Sequence[str]], width: int) -> dict[int, str]:
+        """The units by the numbers of their columns."""
+        cells = rows[self.units][:width] if self.units is not None else []
+        return {i: unit for i, cell in enumerate(cells) if (unit := without_brackets(cell))}
+
+
+def _heading(rows: Sequence[Sequence[str]], first: int, width: int) -> _Heading:
+    """What the lines right above samples are: names, with units below or above, or neither.
+
+    Args:
+        rows: the lines.
+        first: number of the first one of samples.
+        width: columns of these.
+    """
+    if not first:
+        return _Heading()
+    above, lower = first - 1, rows[first - 1]
+    upper = rows[above - 1] if above else []
+    if len(upper) >= width and not any(map(_is_moment, upper[:width])):
+        if _is_units_below(lower, upper[:width]):
+            return _Heading(above - 1, above)
+        # What stands below names that tell the time is said of the columns in other words.
+        if (
+            all(upper[:width])
+            and any(map(_tells_time, upper[:width]))
+            and not any(map(_tells_time, lower[:width]))
+        ):
+            return _Heading(above - 1)
+    if len(lower) < width:
+        return _Heading()
+    is_units_above = len(upper) >= width and _is_timed(upper, lower) and all(map(is_unit, upper[:width]))
+    return _Heading(above, above - 1 if is_units_above else None)
+
+
+def _is_units_below(cells: Sequence[str], names: Sequence[str]) -> bool:
+    """Whether a line holds the units of the columns that the line above names."""
+    if len(cells) < min(2, len(names)) or (
+        any(map(_tells_time, cells[: len(names)])) and not any(map(_tells_time, names))
+    ):
+        return False
+    cells = [*cells, *[""] * (len(names) - len(cells))][: len(names)]
+    if not all(map(is_unit, cells)):
+        return _is_timed(cells, names)
+    named = [
+        bool(name) or not cell or time_unit(cell) is not None for name, cell in zip(names, cells, strict=True)
+    ]
+    return any(names) and all(named)
+
+
+def _is_timed(units: Sequence[str], names: Sequence[str]) -> bool:
+    """Whether a unit of time stands with the name of a time."""
+    return any(
+        _tells_time(name) and time_unit(without_brackets(unit)) is not None
+        for unit, name in zip(units, names, strict=False)
+    )
+
+
+def _tells_time(name: str) -> bool:
+    """Whether a column of this name is one of time, whatever its unit."""
+    bare, unit = unit_in_name(name)
+    return is_time_name(name) or (is_time_name(bare) and time_unit(unit) is not None)
+
+
+def _is_moment(cell: str) -> bool:
+    """Whether a cell is a date or a time of the day, as it stands in lines about a measurement."""
+    return format_of([cell]) is not None
 
 
 def _stated(lines: Sequence[str], decimal_comma: bool) -> dict[str, float]:  # noqa: FBT001
@@ -213,15 +302,19 @@ def _sniff(lines: Sequence[str]) -> tuple[str | None, bool]:
         # The first line may be longer: some loggers append totals to it.
         if len(rows[-1]) < 2 or len({len(row) for row in rows[1:]}) > 1:
             continue
-        decimal_comma = _has_decimal_comma(rows[-1], delimiter)
+        decimal_comma = _has_decimal_comma(rows, delimiter)
         if any(is_number(cell, decimal_comma=decimal_comma) for cell in rows[-1]):
             return delimiter, decimal_comma
     return None, False
 
 
-def _has_decimal_comma(row: Sequence[str], delimiter: str | None) -> bool:
+def _has_decimal_comma(rows: Sequence[Sequence[str]], delimiter: str | None) -> bool:
+    """Whether there is one in a line as long as the last one; whole numbers may stand in some."""
     return delimiter not in {None, ","} and any(
-        "," in cell and is_number(cell, decimal_comma=True) for cell in row
+        "," in cell and is_number(cell, decimal_comma=True)
+        for row in rows
+        if len(row) == len(rows[-1])
+        for cell in row
     )
 
 

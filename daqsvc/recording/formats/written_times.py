@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
@@ -21,7 +21,7 @@ Holds = Literal["both", "date", "time"]
 
 _CLOCK = (
     r"(?P<h>\d{1,2}):(?P<min>\d{2})(?::(?P<s>\d{2})(?:[.,](?P<f>\d{1,9})\d*)?)?"
-    r"(?:\s?(?P<half>[AaPp][Mm]))?(?:\s?(?:Z|UTC|[+-]\d{2}:?\d{2}))?"
+    r"(?:\s?(?P<half>[AaPp][Mm]))?(?:\s?(?P<zone>Z|UTC|(?P<sign>[+-])(?P<zh>\d{2})(?::?(?P<zmin>\d{2}))?))?"
 )
 _DATES = (
     r"(?P<y>\d{4})-(?P<m>\d{2})-(?P<d>\d{2})",
@@ -30,11 +30,13 @@ _DATES = (
     r"(?P<d>\d{1,2})[/-](?P<m>\d{1,2})[/-](?P<y>\d{4})",
     r"(?P<m>\d{1,2})[/-](?P<d>\d{1,2})[/-](?P<y>\d{4})",
 )
-"""A day stands before the month where both can be meant: only the distance between two times is looked at."""
+"""Of the last two, the day or the month first, the rows of a column decide where both can be meant."""
 
 _NS_PER_S = 10**9
 _DAY_NS = 86_400 * _NS_PER_S
-_LARGEST = {"m": 12, "d": 31, "h": 23, "min": 59, "s": 60}
+_SMALL = 0x20
+"""The bit that makes a letter a small one."""
+_LARGEST = {"m": 12, "d": 31, "h": 23, "min": 59, "s": 60, "zh": 15, "zmin": 59}
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,10 +46,14 @@ class TimeFormat:
     Attributes:
         pattern: of a cell.
         holds: what is in it.
+        either: the day, which the pattern has first, and the month may be the other way round.
+        halves: there is AM or PM behind the time of the day.
     """
 
     pattern: re.Pattern[str]
     holds: Holds
+    either: bool = False
+    halves: bool = False
 
     def fits(self, cell: str) -> bool:
         """Whether a cell is such a time."""
@@ -71,14 +77,33 @@ def format_of(cells: Sequence[str]) -> TimeFormat | None:
     written = [cell for cell in cells if cell]
     if not written:
         return None
-    return next((one for one in FORMATS if all(map(one.fits, written))), None)
+    fitting = [one for one in FORMATS if all(map(one.fits, written))]
+    if not fitting:
+        return None
+    found = fitting[0].pattern.fullmatch(written[0])
+    halves = found is not None and bool(found.groupdict().get("half"))
+    return replace(fitting[0], either=len(fitting) > 1, halves=halves)
 
 
-def times_of(cells: Sequence[str], form: TimeFormat) -> Times:
-    """Times datetime64[ns] ``[n]``, of a clock alone since midnight of 1970-01-01; NaT where there is none.
+@dataclass(frozen=True, slots=True)
+class WrittenTimes:
+    """Times of a column as they are written.
 
-    A zone is left out, as only the distance between two times is looked at.
+    Attributes:
+        times: datetime64[ns] ``[n]``, of a clock alone since midnight of 1970-01-01; NaT where there is none.
+        others: the same with day and month the other way round; None where that cannot be meant.
+        offsets_ns: int64 ``[n]``, what the clock is ahead of UTC, 0 where no zone is written; None if none.
+        zoned: bool ``[n]``, whether a zone is written; None likewise.
     """
+
+    times: Times
+    others: Times | None = None
+    offsets_ns: Whole | None = None
+    zoned: NDArray[np.bool_] | None = None
+
+
+def times_of(cells: Sequence[str], form: TimeFormat) -> WrittenTimes:
+    """The times of a column, or of a piece of it, that is written in a format."""
     fields = _of_one_shape(cells, form)
     if fields is None:
         matches = [form.pattern.fullmatch(cell) for cell in cells]
@@ -89,7 +114,75 @@ def times_of(cells: Sequence[str], form: TimeFormat) -> Times:
         missing = np.array([match is None for match in matches])
     else:
         missing = np.zeros(len(cells), np.bool_)
-    return _joined(fields, missing)
+    others = None
+    if form.either:
+        others = _joined({**fields, "d": fields["m"], "m": fields["d"]}, missing)
+    times = _joined(fields, missing)
+    if "zone" not in fields or not fields["zone"].any():
+        return WrittenTimes(times, others)
+    offsets_ns = fields["sign"] * (fields["zh"] * 60 + fields["zmin"]) * 60 * _NS_PER_S
+    return WrittenTimes(times, others, offsets_ns, fields["zone"] > 0)
+
+
+class EitherDateError(ValueError):
+    """Nothing tells which of two numbers is the day and which is the month."""
+
+
+def joined_times(pieces: Sequence[WrittenTimes], form: TimeFormat, length: int) -> Times:
+    """The times of a whole column in UTC where each names its zone, else as the clock on the wall had them.
+
+    Args:
+        pieces: of the column, one behind the other.
+        form: how it is written.
+        length: rows of the table.
+
+    Raises:
+        EitherDateError: day and month can be meant both ways, and the rows tell neither.
+    """
+    times = np.concatenate([piece.times for piece in pieces])[:length]
+    others = [piece.others for piece in pieces if piece.others is not None]
+    if form.either:
+        times = _of_two_ways(times, np.concatenate(others)[:length], halves=form.halves)
+    offsets_ns = [piece.offsets_ns for piece in pieces if piece.offsets_ns is not None]
+    zoned = [piece.zoned for piece in pieces if piece.zoned is not None]
+    if len(zoned) < len(pieces):
+        return times
+    # A zone that some rows name and others do not says nothing of these.
+    if (np.concatenate(zoned)[:length] | np.isnat(times)).all():
+        times = times - np.concatenate(offsets_ns)[:length].astype("timedelta64[ns]")
+    return times
+
+
+def is_same_day(times: Times) -> bool:
+    """Whether all times that are known are of one date."""
+    days = times[~np.isnat(times)].astype("datetime64[D]")
+    return not len(days) or bool((days == days[0]).all())
+
+
+def _of_two_ways(day_first: Times, month_first: Times, *, halves: bool) -> Times:
+    """The way to read dates in which every one is a date, and the rows go on by less than a day.
+
+    Raises:
+        EitherDateError: both or neither are such a way.
+    """
+    lacking = [int(np.isnat(times).sum()) for times in (day_first, month_first)]
+    if lacking[0] != lacking[1]:
+        return day_first if lacking[0] < lacking[1] else month_first
+    leaps = [_leaps(times) for times in (day_first, month_first)]
+    if leaps[0] != leaps[1]:
+        return month_first if leaps[0] else day_first
+    # Who writes AM and PM mostly writes the month first.
+    if halves:
+        return month_first
+    # On one day the distances, and so the rate, are the same either way.
+    if not leaps[0] and is_same_day(day_first):
+        return day_first
+    raise EitherDateError
+
+
+def _leaps(times: Times) -> bool:
+    known = times[~np.isnat(times)].astype(np.int64)
+    return bool((np.abs(np.diff(known)) > _DAY_NS).any())
 
 
 def in_turn(times: Times) -> Times:
@@ -108,6 +201,10 @@ def _number(match: re.Match[str] | None, name: str) -> int:
         return 0
     if name == "half":
         return 1 if text[0] in "Aa" else 2
+    if name == "zone":
+        return 1
+    if name == "sign":
+        return -1 if text == "-" else 1
     return int(text.ljust(9, "0")) if name == "f" else int(text)
 
 
@@ -115,19 +212,29 @@ def _of_one_shape(cells: Sequence[str], form: TimeFormat) -> dict[str, Whole] | 
     """The fields, where all cells have their digits in the places of the first one; else None."""
     first = form.pattern.fullmatch(cells[0])
     text = np.array(cells)
-    if first is None or first.groupdict().get("half") or len(cells[0]) * 4 != text.dtype.itemsize:
+    if first is None or len(cells[0]) * 4 != text.dtype.itemsize:
         return None
     codes = text.view(np.uint32).reshape(len(cells), -1).astype(np.int64)
     digits = np.array([letter.isdecimal() for letter in cells[0]])
+    same = ~digits
+    fields = {}
+    if first.groupdict().get("half"):
+        begin, _ = first.span("half")
+        letters = codes[:, begin] | _SMALL
+        if not np.isin(letters, [ord("a"), ord("p")]).all():
+            return None
+        fields["half"] = np.where(letters == ord("a"), 1, 2)
+        same[begin] = False
     values = codes - ord("0")
     inside = values[:, digits]
-    if (codes[:, ~digits] != codes[0, ~digits]).any() or (inside < 0).any() or (inside > 9).any():
+    if (codes[:, same] != codes[0, same]).any() or (inside < 0).any() or (inside > 9).any():
         return None
-    fields = {}
     for name in form.pattern.groupindex:
         begin, end = first.span(name)
-        if begin < 0:
-            fields[name] = np.zeros(len(cells), np.int64)
+        if name in fields:
+            continue
+        if begin < 0 or name in {"zone", "sign"}:
+            fields[name] = np.full(len(cells), _number(first, name), np.int64)
             continue
         scale = 9 if name == "f" else end - begin
         weights = 10 ** np.arange(scale - 1, scale - 1 - (end - begin), -1, dtype=np.int64)
