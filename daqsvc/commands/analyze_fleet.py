@@ -80,7 +80,10 @@ _LEFT_OUT: tuple[Any, ...] = (None, False, {}, ())
 
 def default_results(archive: str) -> str:
     """Where the results of an archive go, unless something else is said: beside it."""
-    return f"{archive.rstrip('/')}-results"
+    place = archive.rstrip("/")
+    if place.rpartition("/")[2] in {"", ".", ".."}:
+        place = os.path.abspath(archive)  # noqa: PTH100 - what a place is called, wherever links lead
+    return f"{place}-results"
 
 
 def run_fleet(arguments: argparse.Namespace) -> int:
@@ -113,6 +116,7 @@ def _judged(arguments: argparse.Namespace) -> tuple[CampaignSummary, str]:
     set_memory(arguments.max_memory)
     archive = Archive(arguments.files[0])
     results = Results(arguments.results or default_results(arguments.files[0]))
+    archive.see_apart(results.url)
     wanted = Wanted(
         recording_options(arguments), get_limits(), verify=arguments.verify, retry=arguments.retry
     )

@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.fleet import FleetError
-from daqsvc.fleet.places import place_of
+from daqsvc.fleet.places import address_of, is_within, place_of, protocols, why
 from daqsvc.recording.formats import named_as_can_log, named_as_table
 
 if TYPE_CHECKING:
@@ -110,13 +110,24 @@ class Archive:
     @cached_property
     def is_local(self) -> bool:
         """Whether its files can be read where they lie."""
-        protocol = self._fs.protocol
-        return "file" in ((protocol,) if isinstance(protocol, str) else protocol)
+        return "file" in protocols(self._fs)
 
     @cached_property
     def address(self) -> str:
         """What reaches it from any process: of a folder the whole path, wherever that process works."""
         return self.root if self.is_local else self.url
+
+    def see_apart(self, results: str) -> None:
+        """See that results are not written into the archive: they would be files of a machine there.
+
+        Raises:
+            FleetError: they would.
+        """
+        if is_within(place_of(results), (self._fs, self.root)):
+            raise FleetError(
+                f"{results} is in the archive {self.url}, of which it would become a part; name a folder "
+                "beside it with --results"
+            )
 
     def machines(self) -> list[str]:
         """The folders of the archive that may be machines.
@@ -208,9 +219,8 @@ class Archive:
         try:
             listed = _scan(folder) if self.is_local else self._list(folder)
         except OSError as error:
-            raise FleetError(
-                f"{printable(folder)} cannot be listed: {error.strerror or error}; correct the path"
-            ) from None
+            named = printable(address_of(self.url, self._fs, self.root, folder))
+            raise FleetError(f"{named} cannot be listed: {why(error)}; correct the path") from None
         return [entry for entry in listed if not entry[0].startswith(".")]
 
     def _list(self, folder: str) -> list[tuple[str, bool, dict[str, Any] | None]]:

@@ -22,7 +22,7 @@ from urllib.parse import quote
 
 from daqsvc.fleet import FleetError
 from daqsvc.fleet.archive import printable
-from daqsvc.fleet.places import place_of
+from daqsvc.fleet.places import address_of, place_of, protocols, why
 from daqsvc.fleet.table import COLUMNS, schema
 
 if TYPE_CHECKING:
@@ -182,8 +182,7 @@ class Results:
 
     @cached_property
     def _protocols(self) -> set[str]:
-        protocol = self._fs.protocol
-        return {protocol} if isinstance(protocol, str) else set(protocol)
+        return protocols(self._fs)
 
     def _tables(self, folder: str) -> list[str]:
         """The files of a machine, finished tables before what was added to them."""
@@ -196,7 +195,8 @@ class Results:
         except FileNotFoundError:
             return []
         except OSError as error:
-            raise FleetError(f"{folder} cannot be listed: {error.strerror or error}") from None
+            named = printable(address_of(self.url, self._fs, self.root, folder))
+            raise FleetError(f"{named} cannot be listed: {why(error)}") from None
 
     def _read(self, path: str, columns: Sequence[str]) -> list[Row]:
         import pyarrow as pa  # noqa: PLC0415 - of the extra

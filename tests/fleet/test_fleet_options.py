@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from support.fleet_archives import add_machine, add_recordings, ended, start_analyze
 
-from daqsvc.commands.analyze_fleet import _text
+from daqsvc.commands.analyze_fleet import _text, default_results
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -68,6 +68,44 @@ def test_an_archive_that_holds_no_machine_is_named(analyze: Callable[..., Any], 
     code, _, err = analyze(tmp_path / "empty", "--cluster", "local:1")
     assert (code, "has a machine.toml and recordings/ in it" in err) == (1, True), err
     assert [one.name for one in tmp_path.iterdir()] == ["empty"], "no folder for results is left"
+
+
+def test_a_place_of_a_store_is_named_as_it_was_given(analyze: Callable[..., Any]) -> None:
+    code, _, err = analyze("memory://plant/none", "--cluster", "local:1", "--results", "memory://r")
+    assert code == 1
+    assert "memory://plant/none cannot be listed: No such file or directory; correct the path" in err
+
+
+@pytest.mark.parametrize(
+    "place", ["arch ive", "arch ive/pump 1", "arch ive/pump 1/new/one", "link", "a/../link"]
+)
+def test_results_in_the_archive_are_refused(analyze: Callable[..., Any], tmp_path: Path, place: str) -> None:
+    archive = tmp_path / "arch ive"
+    add_machine(archive, "pump 1")
+    (tmp_path / "a").mkdir()
+    (tmp_path / "link").symlink_to(archive / "pump 1")
+    before = sorted(tmp_path.rglob("*"))
+    code, said, err = analyze(archive, "--cluster", "local:1", "--results", tmp_path / place)
+    assert (code, said) == (1, [])
+    assert err.count("\n") == 1
+    assert f"{tmp_path / place} is in the archive {archive}, of which it would become a part; name a" in err
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("archive", "results"),
+    [
+        ("fleet", "fleet-results"),
+        ("a b/fleet/", "a b/fleet-results"),
+        ("s3://plant/archive/", "s3://plant/archive-results"),
+        (".", "/here/fleet-results"),
+        ("./", "/here/fleet-results"),
+        ("pumps/..", "/here/fleet-results"),
+    ],
+)
+def test_results_are_beside_the_archive(archive: str, results: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.getcwd", lambda: "/here/fleet")
+    assert default_results(archive) == results
 
 
 @pytest.mark.integration
