@@ -179,6 +179,11 @@ def test_units_that_contradict_each_other_are_refused(tmp_path, head, why):
         load_recording(units_table(tmp_path, head))
 
 
+def test_names_that_are_units_are_both(tmp_path):
+    recording = load_recording(units_table(tmp_path, "ms,m/s2"), {"x": "1"}, RATE_HZ)
+    assert recording.units == {"x": "m/s2"}
+
+
 def test_a_unit_that_is_written_in_two_ways_is_one(tmp_path):
     path = units_table(tmp_path, "Zeit [sec],x [m/s²]\ns,m/s^2")
     assert load_recording(path, {"x": "x"}).units == {"x": "m/s²"}

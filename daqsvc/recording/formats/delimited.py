@@ -347,7 +347,10 @@ def _by_short_names(contents: Contents) -> dict[str, Elsewhere]:
             contents, entries={**contents.entries, **more}, units={**contents.units, **units}, elsewhere={}
         )
 
-    return {bare: Elsewhere(f"is called {name!r} there: name it so", read) for bare, name in full.items()}
+    return {
+        bare: Elsewhere(f"is called {name!r} there; name it so, e.g. --map '{bare}={name}'", read)
+        for bare, name in full.items()
+    }
 
 
 def _is_no_row(line: str) -> bool:

@@ -231,8 +231,10 @@ def _heading(rows: Sequence[Sequence[str]], first: int, width: int) -> _Heading:
             return _Heading(above - 1)
     if len(lower) < width:
         return _Heading()
-    is_units_above = len(upper) >= width and _is_timed(upper, lower) and all(map(is_unit, upper[:width]))
-    return _Heading(above, above - 1 if is_units_above else None)
+    if len(upper) >= width and _is_timed(upper, lower) and all(map(is_unit, upper[:width])):
+        return _Heading(above, above - 1)
+    is_both = all(map(is_unit, lower[:width])) and not any(map(_tells_time, lower[:width]))
+    return _Heading(above, above if is_both else None)
 
 
 def _is_units_below(cells: Sequence[str], names: Sequence[str]) -> bool:
