@@ -49,7 +49,7 @@ $(READY): requirements-dev.lock pyproject.toml
 	@touch $@
 
 demo: $(READY)
-	@$(BIN)/daqsvc demo --snapshots build/demo $(ARGS)
+	@$(BIN)/daqsvc demo --snapshots build/demo --page $(ARGS)
 
 test: $(READY)
 	@$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal -m "not long" $(TESTS) $(ARGS)

@@ -17,13 +17,13 @@ from sim_hw.arguments import add_random, add_recording, add_speed, first_option,
 from sim_hw.demo.machines import DemoError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
     from types import FrameType
 
     from daqsvc.recording.recording import Recording
     from daqsvc.settings import MachineFile
     from sim_hw.demo.machines import AlarmLimits
-    from sim_hw.demo.session import DemoOutcome, Received, Script
+    from sim_hw.demo.session import DemoOutcome, DemoSession, Received, Script
     from sim_hw.scenario import BearingScenario
 
 SCENARIO = "paper"
@@ -101,6 +101,12 @@ class DemoCommand:
             "(default: they go with the demo)",
         )
         how.add_argument(
+            "--page",
+            action="store_true",
+            help="show it in a browser, too, at the address that is said (daqsvc page)",
+        )
+        how.add_argument("--again", action="store_true", help="play it again and again, until Ctrl-C")
+        how.add_argument(
             "--json",
             action="store_true",
             help='print one JSON object a line: type "diagnosis", "alarm", "status", at the end "summary"',
@@ -144,8 +150,10 @@ def _run(arguments: argparse.Namespace) -> int:
     )
 
 
-async def _interruptible(playing: Coroutine[Any, Any, DemoOutcome]) -> DemoOutcome:
+async def _interruptible(session: DemoSession) -> DemoOutcome:
     """Have SIGTERM and a lost terminal cancel what is played, as Ctrl-C does: it then ends in order.
+
+    What is only played again has been played as a whole: one of them ends it with its outcome.
 
     Raises:
         KeyboardInterrupt: one of them came.
@@ -155,13 +163,14 @@ async def _interruptible(playing: Coroutine[Any, Any, DemoOutcome]) -> DemoOutco
 
     def interrupt() -> None:
         nonlocal interrupted
-        interrupted = True
-        task.cancel()
+        if not session.enough():
+            interrupted = True
+            task.cancel()
 
-    for number in _ends_on():
+    for number in (*_ends_on(), signal.SIGINT):
         loop.add_signal_handler(number, interrupt)
     try:
-        return await playing
+        return await session.run()
     except asyncio.CancelledError:
         if interrupted:
             raise KeyboardInterrupt from None
@@ -199,28 +208,34 @@ def _say(message: str) -> None:
 def _play(script: Script, arguments: argparse.Namespace) -> dict[str, Any]:
     from sim_hw.demo.session import DemoSession, summarise  # noqa: PLC0415
 
-    def play(on_message: Callable[[Received], None]) -> DemoOutcome:
+    def play(on_message: Callable[[Received], None], on_page: Callable[[str], None]) -> DemoOutcome:
         session = DemoSession(
             script,
             speed=arguments.speed,
             broker_url=arguments.broker,
             on_message=on_message,
             snapshots=arguments.snapshots,
+            on_page=on_page if arguments.page else None,
+            again=arguments.again,
         )
-        return asyncio.run(_interruptible(session.run()))
+        return asyncio.run(_interruptible(session))
 
     if arguments.json:
-        summary = summarise(script, play(_print_message), speed=arguments.speed)
+        summary = summarise(script, play(_print_message, _print_page), speed=arguments.speed)
         _print_json(summary)
         return summary
     from sim_hw.demo.view import View  # noqa: PLC0415
 
     with View(script, arguments.speed) as view:
-        outcome = play(view.on_message)
+        outcome = play(view.on_message, view.show_page)
     summary = summarise(script, outcome, speed=arguments.speed)
     view.show_summary(summary)
     view.show_snapshots(summary)
     return summary
+
+
+def _print_page(address: str) -> None:
+    _print_json({"type": "page", "address": address})
 
 
 def _print_message(message: Received) -> None:

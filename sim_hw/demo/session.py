@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import json
 import logging
+import math
 import shutil
 import tempfile
 from dataclasses import dataclass, field
@@ -29,6 +30,7 @@ from drivers.can.plugin import frame_layout
 from drivers.fields import LayoutError
 from sim_hw.demo.broker import EmbeddedBroker
 from sim_hw.demo.machines import DemoError
+from sim_hw.demo.page import page_of
 from sim_hw.node_faults import NodeFaults
 from sim_hw.nodes.can_node import CanNode
 from sim_hw.nodes.pacing import DrivenPacer, RealTimePacer
@@ -175,6 +177,17 @@ class Script:
         """How long it lasts in simulated time."""
         return len(self.samples) / self.rate_hz
 
+    def goes_on_from(self, index: int, per_frame: int) -> NDArray[np.float64]:
+        """Most of the samples again, so that they can follow sample ``index``, and themselves.
+
+        The shaft is turned as it would be then, and they are whole frames.
+        """
+        per_rev = 1 if self.samples_per_rev is None else round(self.samples_per_rev)
+        begin = index % per_rev
+        whole = math.lcm(per_rev, per_frame)
+        count = (len(self.samples) - begin) // whole * whole
+        return self.samples[begin : begin + count] if count else self.samples
+
 
 @dataclass(slots=True)
 class DemoOutcome:
@@ -218,6 +231,9 @@ class DemoSession:
         broker_url: an MQTT broker; None to start one inside the process.
         on_message: called with each message that came back from the broker.
         snapshots: where the snapshots are kept that alarms leave; None: they go with the demo.
+        on_page: told the address of the page, which is served meanwhile; None for no page.
+        again: play it again and again once it was played, until `enough`. What comes of that is not in the
+            outcome's diagnoses.
     """
 
     def __init__(
@@ -228,6 +244,8 @@ class DemoSession:
         broker_url: str | None,
         on_message: Callable[[Received], None],
         snapshots: Path | None = None,
+        on_page: Callable[[str], None] | None = None,
+        again: bool = False,
     ) -> None:
         self.script = script
         self.speed = speed
@@ -237,6 +255,17 @@ class DemoSession:
         self._broker_url = broker_url
         self._on_message = on_message
         self._snapshots = snapshots
+        self._on_page = on_page
+        self._again = again
+        self._enough = asyncio.Event()
+        self._is_repeating = False
+        self._frames_before = 0
+        """Frames that were sent when what is played now began."""
+
+    def enough(self) -> bool:
+        """End in order if it is played again by now; whether that is so."""
+        self._enough.set()
+        return self._is_repeating
 
     async def run(self) -> DemoOutcome:
         """Play it from the beginning to the end.
@@ -254,6 +283,8 @@ class DemoSession:
             store = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="daqsvc-demo-")))
             # Also of what is broken off.
             stack.push_async_callback(self._keep_snapshots, await asyncio.to_thread(self._folder), store)
+            if self._on_page is not None:
+                self._on_page(await stack.enter_async_context(page_of(store)))
             listener = Listener(url, f"daqsvc/{machine.site}/{machine.box}", self._take)
             listening = await stack.enter_async_context(_task(listener.run()))
             await _first(listener.subscribed(), listening, f"the broker {url} does not answer", LINK_UP_S)
@@ -322,13 +353,7 @@ class DemoSession:
         script = self.script
         layout = frame_layout(_watch(service).machine, script.stream)
         node = self.node = _node(bus, layout, script)
-        pacer: Pacer
-        if isinstance(clock, DrivenClock):
-            block = max((d.block for d in _watch(service).pipeline.detectors), default=0)
-            limit = 2 * block + round(0.1 * script.rate_hz)
-            pacer = DrivenPacer(clock, self.backlog, limit, speed=self.speed)
-        else:
-            pacer = RealTimePacer(clock)
+        pacer = self._pacer(service, clock)
         begun_s = asyncio.get_running_loop().time()
         await node.play(pacer)
         self.outcome.real_s = asyncio.get_running_loop().time() - begun_s
@@ -341,6 +366,36 @@ class DemoSession:
             "reordered": done.reordered,
             "corrupted": done.corrupted,
         }
+        if self._again:
+            await self._repeat(bus, service, clock)
+
+    def _pacer(self, service: Service, clock: SystemClock | DrivenClock) -> Pacer:
+        if not isinstance(clock, DrivenClock):
+            return RealTimePacer(clock)
+        block = max((d.block for d in _watch(service).pipeline.detectors), default=0)
+        limit = 2 * block + round(0.1 * self.script.rate_hz)
+        return DrivenPacer(clock, self.backlog, limit, speed=self.speed)
+
+    async def _repeat(self, bus: can.BusABC, service: Service, clock: SystemClock | DrivenClock) -> None:
+        """Play it again and again, without the faults of the link; the device goes on counting."""
+        self._is_repeating = True
+        script = self.script
+        layout = frame_layout(_watch(service).machine, script.stream)
+        first_index = len(script.samples) // layout.samples_per_frame * layout.samples_per_frame
+        samples = script.goes_on_from(first_index, layout.samples_per_frame)
+        async with _task(self._enough.wait()) as enough:
+            while not enough.done():
+                self._frames_before = self.outcome.frames_sent
+                node = self.node = CanNode(
+                    bus, layout, samples, script.rate_hz, first_index=first_index, clip=True
+                )
+                async with _task(node.play(self._pacer(service, clock))) as playing:
+                    await asyncio.wait({playing, enough}, return_when=asyncio.FIRST_COMPLETED)
+                    if playing.done():
+                        playing.result()
+                self.outcome.frames_sent += node.frames_sent
+                self.outcome.samples_sent += node.samples_sent
+                first_index += len(samples)
 
     def counters(self) -> StreamCounters | None:
         """Counters of the stream that is played, once there is a service."""
@@ -359,7 +414,7 @@ class DemoSession:
         counters = self.counters()
         if self.service is None or self.node is None or counters is None:
             return 0
-        on_the_way = self.node.frames_sent - counters.frames_received
+        on_the_way = self._frames_before + self.node.frames_sent - counters.frames_received
         return on_the_way * self.node.samples_per_frame + _watch(self.service).pipeline.behind_samples
 
     async def _last_frames(self, service: Service) -> None:
@@ -375,7 +430,7 @@ class DemoSession:
     def _take(self, message: Received) -> None:
         if message.kind == "alarm":
             self.outcome.alarms += 1
-        if message.kind == "diagnosis" and message.payload["changed"]:
+        if message.kind == "diagnosis" and message.payload["changed"] and not self._is_repeating:
             self.outcome.diagnoses.append(message.payload)
         self._on_message(message)
 

@@ -84,6 +84,10 @@ class View:
             if exc is None:
                 self._console.print(self.picture())
 
+    def show_page(self, address: str) -> None:
+        """Say where the page is."""
+        self._console.print(f"in a browser: {address}", soft_wrap=True)
+
     def on_message(self, message: Received) -> None:
         """Take a message in."""
         payload = message.payload

@@ -1,0 +1,62 @@
+"""The page of ``daqsvc page`` beside the demo, in a process of its own as in the field."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import sys
+from typing import TYPE_CHECKING
+
+from sim_hw.demo.machines import DemoError
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+PORTS = (8420, 0)
+"""Where it listens: there, or at a port that is free."""
+START_S = 60.0
+
+
+@contextlib.asynccontextmanager
+async def page_of(store: Path) -> AsyncIterator[str]:
+    """Serve the page of a store meanwhile; its address.
+
+    Raises:
+        DemoError: it does not start.
+    """
+    process, said = None, ""
+    for port in PORTS:
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", "daqsvc", "page", "--store", f"{store}", "--port", f"{port}"),
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.PIPE,
+            start_new_session=True,  # Ctrl-C is for the demo, which ends it
+        )
+        said = await _first_line(process)
+        if " is at http://" in said:
+            break
+    assert process is not None  # noqa: S101 - there are ports
+    try:
+        if " is at http://" not in said:
+            raise DemoError(f"--page: {said}")
+        yield said.partition(" is at ")[2].partition(";")[0]
+    finally:
+        if process.returncode is None:
+            process.terminate()
+        await process.communicate()
+
+
+async def _first_line(process: asyncio.subprocess.Process) -> str:
+    """Where it is; or why it is not, when it has ended."""
+    assert process.stdout is not None  # noqa: S101 - a pipe was asked for
+    try:
+        async with asyncio.timeout(START_S):
+            said = (await process.stdout.readline()).decode()
+    except TimeoutError:
+        process.kill()
+        said = ""
+    if said:
+        return said.strip()
+    _, err = await process.communicate()
+    return err.decode().strip() or "the page does not start"
