@@ -304,6 +304,18 @@ def test_dates_that_leap_either_way_are_refused(tmp_path):
     )
 
 
+def test_dates_without_a_time_of_the_day_may_be_anything(tmp_path):
+    path = tmp_path / "rig.csv"
+    path.write_text("calibrated,x\n" + "02/05/2026,1\n02/08/2026,2\n" * 5)
+    assert load_recording(path, rate_hz=10.0).names == ("x",)
+
+
+def test_dates_and_times_without_zeros_are_read(tmp_path):
+    cells = [f"{one.month}/{one.day}/{one.year} {one:%I:%M:%S.%f %p}" for one in around(2026, 2, 9)]
+    (stream,), _ = load_all(table(tmp_path, cells, comma=False, delimiter=","))
+    assert (len(stream.samples), stream.start[:10]) == (300, "2026-02-09")
+
+
 # Zones.
 
 

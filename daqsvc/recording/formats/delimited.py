@@ -185,7 +185,9 @@ class _DelimitedTable:
                 cells = [layout.split(line) for line in block]
                 for i, form in forms.items():
                     pieces[i].append(times_of([row[i] if len(row) > i else "" for row in cells], form))
-        columns = {i: self._column(i, parts, length) for i, parts in pieces.items()}
+        # A date without the time of the day is no time of a sample: it may be anything.
+        used = [i for i in forms if forms[i].holds != "date" or _beside(i, forms) is not None]
+        columns = {i: self._column(i, pieces[i], length) for i in used}
         entries: dict[str, NDArray[np.generic]] = {}
         undated = []
         for i, column in columns.items():
