@@ -32,7 +32,10 @@ if TYPE_CHECKING:
 
 pytestmark = [pytest.mark.integration, pytest.mark.long]
 
-VIEWS = ("modes", "orbit", "timebase", "spectrum", "full-spectrum", "envelope", "trend")
+VIEWS = (
+    *("modes", "orbit", "centreline", "poincare", "timebase"),
+    *("spectrum", "full-spectrum", "envelope", "trend"),
+)
 HEALTHY_S = 2.7
 """The paper's rotor is healthy for so long; then its damping goes."""
 PATIENCE_MS = 1000.0 * PATIENCE_S

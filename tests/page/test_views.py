@@ -238,3 +238,42 @@ def test_a_trend_is_drawn_from_the_history_and_broken_where_nothing_was_measured
     by_the_hour = view.shown(live, {"reading": "levels/left.rms", "hours": "8760"})
     assert ("mean", "5", "um") in by_the_hour.rows
     assert len(by_the_hour.sources["trend"]["t"]) <= 2
+
+
+def test_the_centreline_follows_the_means_of_both_probes() -> None:
+    live = MachineLive(about())
+    view = VIEWS["centreline"]
+    assert "pipeline.levels" in view.why_not(live)
+    for second in range(5):
+        for name, angle in zip(("left", "right"), np.radians(ANGLES), strict=True):
+            mean = 10.0 * second * np.cos(angle) + 4.0 * np.sin(angle)
+            said = {
+                "detector": f"levels/{name}",
+                "monotonic_ns": second * 1_000_000_000 + (name == "right") * 1000,
+                "decision": "normal",
+                "probabilities": {},
+                "statistics": {"mean": mean},
+                "units": {"mean": "um"},
+            }
+            live.take({"statement": said})
+    assert view.why_not(live) == ""
+    shown = view.shown(live, {"probes": "left,right", "minutes": "1"})
+    assert shown.sources["centreline"]["x"] == pytest.approx([0.0, 10.0, 20.0, 30.0, 40.0])
+    assert shown.sources["centreline"]["y"] == pytest.approx([4.0] * 5)
+    assert ("moved since the first", "40.0", "um") in shown.rows
+
+
+def test_a_whirl_that_repeats_is_one_point_of_the_poincare_map() -> None:
+    live = MachineLive(about())
+    live.take(told(turning(8.0, 20.0, -20.0j)))
+    shown = VIEWS["poincare"].shown(live, {"probes": "left,right", "revolutions": "20"})
+    spread = {name: float(value) for name, value, _ in shown.rows}
+    assert 19 <= spread["revolutions"] <= 20
+    assert max(spread["spread of x"], spread["spread of y"]) < 1.0
+    twice = MachineLive(about())
+    rows = turning(8.0, 20.0, -20.0j)
+    half = np.arange(len(rows)) / RATE_HZ * SPEED_HZ * np.pi
+    rows[:, 0] += 15.0 * np.cos(half)
+    twice.take(told(rows))
+    shown = VIEWS["poincare"].shown(twice, {"probes": "left,right", "revolutions": "20"})
+    assert np.ptp(shown.sources["poincare"]["x"]) > 6.0, "half the speed makes two clouds of it"

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from daqsvc.page.views.envelope import EnvelopeView
 from daqsvc.page.views.modes import ModesView
 from daqsvc.page.views.orbit import OrbitView
+from daqsvc.page.views.position import CentrelineView, PoincareView
 from daqsvc.page.views.spectrum import FullSpectrumView, SpectrumView
 from daqsvc.page.views.timebase import TimebaseView
 from daqsvc.page.views.trend import TrendView
@@ -19,6 +20,8 @@ VIEWS: dict[str, View] = {
     for view in (
         ModesView(),
         OrbitView(),
+        CentrelineView(),
+        PoincareView(),
         TimebaseView(),
         SpectrumView(),
         FullSpectrumView(),

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.page.charts import Axis, chart, legend, source
+from daqsvc.page.charts import legend, source
 from daqsvc.page.shaft import order_1x, whirl
+from daqsvc.page.views.position import NO_PAIR, pairs_of, plane
 from daqsvc.page.views.view import Choice, Figure, Shown
 
 if TYPE_CHECKING:
@@ -18,8 +19,6 @@ if TYPE_CHECKING:
     from daqsvc.page.machine_live import MachineLive
 
 REVOLUTIONS = {"4": "4 revolutions", "1": "1 revolution", "16": "16 revolutions"}
-LARGER = 1.15
-"""The figure goes so far beyond the clearance."""
 
 
 class OrbitView:
@@ -35,14 +34,11 @@ class OrbitView:
 
     def choices(self, live: MachineLive) -> list[Choice]:
         """See `daqsvc.page.views.view.View.choices`."""
-        pairs = {f"{x},{y}": f"{x} and {y}" for x, y in live.probes()}
-        return [Choice("probes", "Probes", pairs), Choice("revolutions", "Length", REVOLUTIONS)]
+        return [pairs_of(live), Choice("revolutions", "Length", REVOLUTIONS)]
 
     def why_not(self, live: MachineLive) -> str:
         """See `daqsvc.page.views.view.View.why_not`."""
-        if live.probes():
-            return ""
-        return "an orbit needs two proximity probes of one plane, 60 to 120 degrees apart, sampled together"
+        return "" if live.probes() else NO_PAIR
 
     def streams(self, live: MachineLive, chosen: Mapping[str, str]) -> set[str]:
         """See `daqsvc.page.views.view.View.streams`."""
@@ -53,26 +49,7 @@ class OrbitView:
 
     def figures(self, live: MachineLive, chosen: Mapping[str, str], theme: Theme) -> list[Figure]:
         """See `daqsvc.page.views.view.View.figures`."""
-        clearance_um = float(live.values["machine"].get("rotor", {}).get("clearance_um", 0.0))
-        reach = LARGER * clearance_um if clearance_um else None
-        low = None if reach is None else -reach
-        made = chart(
-            Axis("x, um", low, reach),
-            Axis("y, um", low, reach),
-            theme,
-            height=520,
-            tips=[("x", "@x{0.0} um"), ("y", "@y{0.0} um")],
-            is_round=True,
-        )
-        if clearance_um:
-            turn = np.linspace(0.0, 2.0 * math.pi, 181)
-            made.line(
-                clearance_um * np.cos(turn),
-                clearance_um * np.sin(turn),
-                line_color=theme.quiet,
-                line_dash="dashed",
-                legend_label=f"clearance {clearance_um:g} um",
-            )
+        made = plane(live, theme, [("x", "@x{0.0} um"), ("y", "@y{0.0} um")])
         made.line(
             "x", "y", source=source("orbit", ["x", "y"]), line_color=theme.series[0], legend_label="orbit"
         )

@@ -8,6 +8,7 @@ import numpy as np
 
 from daqsvc.page.charts import Axis, chart, legend, source
 from daqsvc.page.shaft import whirl
+from daqsvc.page.views.position import NO_PAIR, pairs_of
 from daqsvc.page.views.view import Choice, Figure, Shown
 
 if TYPE_CHECKING:
@@ -132,14 +133,11 @@ class FullSpectrumView:
 
     def choices(self, live: MachineLive) -> list[Choice]:
         """See `daqsvc.page.views.view.View.choices`."""
-        pairs = {f"{x},{y}": f"{x} and {y}" for x, y in live.probes()}
-        return [Choice("probes", "Probes", pairs), Choice("revolutions", "Length", REVOLUTIONS)]
+        return [pairs_of(live), Choice("revolutions", "Length", REVOLUTIONS)]
 
     def why_not(self, live: MachineLive) -> str:
         """See `daqsvc.page.views.view.View.why_not`."""
-        if live.probes():
-            return ""
-        return "it needs two proximity probes of one plane, 60 to 120 degrees apart, sampled together"
+        return "" if live.probes() else NO_PAIR
 
     def streams(self, live: MachineLive, chosen: Mapping[str, str]) -> set[str]:
         """See `daqsvc.page.views.view.View.streams`."""
