@@ -761,7 +761,7 @@ def _asked(store: Path, line: bytes, timeout_s: float, longest: int, then: str) 
                 client.connect(address)
             client.sendall(line)
             with client.makefile("rb") as answers:
-                return answers.readline(longest)
+                answer = answers.readline(longest)
     except (FileNotFoundError, ConnectionRefusedError, NotADirectoryError):
         raise _absence(store) from None
     except PermissionError:
@@ -772,12 +772,14 @@ def _asked(store: Path, line: bytes, timeout_s: float, longest: int, then: str) 
         raise ControlError(f"the daqsvc of {store} has not answered within {timeout_s:g} s; {then}") from None
     except OSError as error:
         raise _unanswered(store, error, then) from None
+    if not answer:
+        raise _unanswered(store, None, then)
+    return answer
 
 
-def _unanswered(store: Path, error: Exception, then: str) -> AbsentError:
-    return AbsentError(
-        f"the daqsvc of {store} has closed the connection without an answer ({_in_short(error)}); {then}"
-    )
+def _unanswered(store: Path, error: Exception | None, then: str) -> AbsentError:
+    detail = "" if error is None else f" ({_in_short(error)})"
+    return AbsentError(f"the daqsvc of {store} has closed the connection without an answer{detail}; {then}")
 
 
 def _absence(store: Path) -> AbsentError:

@@ -28,6 +28,7 @@ from daqsvc.control import (
     ControlServer,
     UnreachableError,
     ask,
+    ask_snapshot,
     ask_status,
     events_waiting,
     request_of,
@@ -535,3 +536,20 @@ async def test_a_service_without_its_socket_is_not_said_to_be_away(
             assert "the journal cannot be written, so this may not be how the alarms stand" in said
         finally:
             await outbox.close()
+
+
+async def test_a_service_that_is_killed_meanwhile_is_said_in_plain_words(tmp_path: Path) -> None:
+    async def end(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.readline()
+        writer.close()
+
+    server = await asyncio.start_unix_server(end, tmp_path / "control.sock")
+    try:
+        with pytest.raises(AbsentError) as told:
+            await asyncio.to_thread(ask_snapshot, tmp_path)
+    finally:
+        server.close()
+        await server.wait_closed()
+    assert f"{told.value}" == (
+        f"the daqsvc of {tmp_path} has closed the connection without an answer; its log says what it has done"
+    )
