@@ -24,6 +24,7 @@ from daqsvc.dsp.quality import RefusedError
 from daqsvc.dsp.quality.recorded import known_against
 from daqsvc.recording import RecordingError
 from daqsvc.recording.formats import named_as_can_log
+from daqsvc.recording.formats.column_units import unit_in_name
 from daqsvc.recording.recording import (
     get_limits,
     list_channels,
@@ -338,6 +339,11 @@ class Runner:
                 columns[sensor.name] = sensor.name
             elif sensor.channel in there:
                 columns[sensor.name] = sensor.channel
+            else:
+                # As a table's header names it, with the unit in brackets.
+                names = {sensor.name, sensor.channel}
+                named = [one for one in there if unit_in_name(one)[0] in names]
+                columns |= {sensor.name: named[0]} if len(named) == 1 else {}
         missing = [name for name in _needs(self.detectors) if name not in columns]
         if missing and recording.endswith(SNAPSHOT_SUFFIX):
             # Of a snapshot the fastest streams are read, and the others where they are asked for by name.

@@ -33,6 +33,7 @@ VERBS = (
     "snapshot",
     "replay",
     "status",
+    "page",
     "trend",
     *PEOPLE,
     "analyze",

@@ -174,3 +174,16 @@ def test_the_demo_needs_the_machine_file_of_a_log(tmp_path, capsys):
     assert main(["demo", "--recording", str(log)]) == 1
     err = capsys.readouterr().err
     assert "only the layouts of a machine file make sense of: name that with --machine" in err
+
+
+def test_a_sensor_is_found_by_its_name_with_the_unit_in_brackets(analyze, machine, tmp_path):
+    orbit = Orbit(change=UNBALANCE)
+    samples = np.column_stack([orbit.x, orbit.y, orbit.keyphasor]).astype(np.float32)
+    table = save_table(tmp_path / "table.npz", samples)
+    named = tmp_path / "named.csv"
+    header = "time [ms],probe-x [um],probe-y (um),keyphasor [V]"
+    t_ms = 1e3 * np.arange(len(samples)) / RATE_HZ
+    np.savetxt(named, np.column_stack([t_ms, samples]), "%.9g", ",", header=header, comments="")
+    code, (found, expected), err = analyze(machine, named, table, "--jobs", 1)
+    assert (code, err) == (0, "")
+    assert found["verdict"] == expected["verdict"] == "unbalance"
