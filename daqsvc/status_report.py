@@ -131,6 +131,8 @@ class StatusReport:
 
     async def _look(self) -> _Seen:
         now_ns, figures = self._clock.monotonic_ns(), self._figures()
+        # Before the alarms: none that follows of a statement is missing beside it.
+        latest, measured = dict(self._latest), dict(self._measured)
         # Before a block can come: the newest sample is then the last one that the figures count.
         newest = {name: sample async for name, sample in _by_turns(self._newest())}
         # What the service says of itself concerns each of its machines.
@@ -142,8 +144,8 @@ class StatusReport:
             await self._oldest_wall_ns(),
             {name: status async for name, status in _by_turns((n, alarms[n]) for n in list(alarms))},
             newest,
-            dict(self._latest),
-            dict(self._measured),
+            latest,
+            measured,
         )
 
     def _document(self, seen: _Seen) -> Document:

@@ -25,6 +25,7 @@ from support.paths import ROOT
 from support.ports import LOOPBACK, free_port
 from support.waiting import PATIENCE_S, eventually
 
+from daqsvc import status_report
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import SampleBlock
 from daqsvc.alarms.commands import AlarmCommand, Verb
@@ -38,7 +39,7 @@ from daqsvc.publish.service_status import ServiceStatusPayload
 from daqsvc.settings import parse_machine_file
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import AsyncIterator, Callable
     from pathlib import Path
 
     from daqsvc.settings import MachineFile
@@ -145,6 +146,26 @@ async def test_until_when_an_alarm_is_shelved_is_told(
         service.alarms.manager.condition("store/disk", Level.ALERT, "x")
         [disk] = (await told(tmp_path / "store"))["alarms"]["standing"]
         assert disk["shelved_until_wall_ns"] is None
+
+
+async def test_no_alarm_is_missing_beside_the_statement_that_raises_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with running(rig(), tmp_path / "store") as service:
+        by_turns, asked = status_report._by_turns, iter(range(9))
+
+        async def interrupted(items: Any) -> AsyncIterator[Any]:
+            async for one in by_turns(items):
+                yield one
+            if next(asked) == 1:  # when the alarms have been looked at
+                now_ns = service.clock.monotonic_ns()
+                service._report(statement(t_ns=now_ns, quality="not_ok", reason="the probe touches"))
+
+        monkeypatch.setattr(status_report, "_by_turns", interrupted)
+        status = await told(tmp_path / "store")
+        assert next(asked) == 2
+        is_not_ok = channel(status, "probe-x")["state"] == "not_ok"
+        assert is_not_ok == bool(status["alarms"]["standing"])
 
 
 @pytest.mark.long
