@@ -68,7 +68,7 @@ RELOAD_S = 120.0
 """How long it waits for a reload, which may compile kernels."""
 LIVE_BUFFER_BYTES = 256 * 1024
 """What is handed to the kernel for one who looks on, at most; more waits, or is left out."""
-MOST_LOOKING = 4
+MOST_LOOKING = 6
 """Who may look on at a time: others have connections left for commands."""
 SNAPSHOT_S = 90_000.0
 """How long it waits for a snapshot, which is complete some time after it was asked for."""

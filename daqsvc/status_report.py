@@ -307,6 +307,7 @@ def _standing(alarms: Mapping[str, AlarmStatus], now_ns: int, wall_of_ns: int) -
                 "shelved_until_wall_ns": None
                 if status.shelved_until_ns is None
                 else status.shelved_until_ns + wall_of_ns,
+                "first_out": status.first_out,
                 "message": status.message,
             }
             for name, status in standing

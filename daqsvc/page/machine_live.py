@@ -96,8 +96,6 @@ class MachineLive:
         self.alarms: dict[str, Document] = {one["alarm"]: one for one in about["alarms"]}
         self.journal: deque[Document] = deque(sorted(about["alarms"], key=_when), MOST_JOURNAL)
         self.standings: dict[str, Document] = dict(about["standings"])
-        self.status: Document | None = None
-        """The newest answer to ``status``."""
         self.history: Path | None = None
         """The file of the box's history, if there can be one."""
         self.left_out = 0
@@ -132,7 +130,7 @@ class MachineLive:
 
     def go_on_from(self, before: MachineLive) -> None:
         """Keep what is known of the time before the connection was made anew."""
-        self.said, self.status = before.said, before.status
+        self.said = before.said
         if self.about["begun_ns"] == before.about["begun_ns"]:  # else samples are counted anew
             self.rings = before.rings
         for event in before.journal:
@@ -159,6 +157,12 @@ class MachineLive:
             return None
         count = min(round(seconds * self.rate_hz(stream)), ring.end_index - ring.oldest_index)
         return ring.read(ring.end_index - count, count), ring.time_of(ring.end_index - 1)
+
+    def newest_wall_ns(self, streams: Iterable[str]) -> int | None:
+        """When the newest sample of streams was taken, ns since the Unix epoch; None if none has come."""
+        rings = [self.rings[name] for name in streams if name in self.rings]
+        newest = [ring.time_of(ring.end_index - 1) for ring in rings if ring.started]
+        return max(newest) + self.wall_ns_at_0 if newest else None
 
     def probes(self) -> list[tuple[str, str]]:
         """Pairs of proximity probes of one plane: neighbours in the machine file, 60 to 120 degrees apart."""

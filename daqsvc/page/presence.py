@@ -129,7 +129,13 @@ class Picture:
             name: {column: _sent(values) for column, values in columns.items()}
             for name, columns in shown.sources.items()
         }
-        return {"sources": sources, "rows": [list(row) for row in shown.rows], "note": shown.note}
+        taken_ns = live.newest_wall_ns(view.streams(live, self._chosen))
+        return {
+            "taken_ms": None if taken_ns is None else taken_ns / 1e6,
+            "sources": sources,
+            "rows": [list(row) for row in shown.rows],
+            "note": shown.note,
+        }
 
 
 def _sent(values: Any) -> Any:

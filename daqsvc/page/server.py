@@ -29,7 +29,8 @@ from starlette.routing import Route
 from daqsvc import __version__
 from daqsvc.page.charts import THEMES
 from daqsvc.page.presence import Picture
-from daqsvc.page.text import level_of, standing
+from daqsvc.page.source import NOT_OURS
+from daqsvc.page.text import WORST, tile
 from daqsvc.page.views.all_views import VIEWS
 
 if TYPE_CHECKING:
@@ -125,21 +126,10 @@ class _Page:
 
     async def _plant(self) -> dict[str, Any]:
         try:
-            names = await self._source.machines()
-        except (OSError, ValueError):
+            tiles = [tile(status) for status in await self._source.statuses()]
+        except (OSError, *NOT_OURS):
             return {"tiles": [], "why": "no daqsvc answers on this box: it is started with daqsvc run"}
-        tiles: list[dict[str, Any]] = []
-        for name in names:
-            async with self._source.looking(name) as listening:
-                live = await listening.first(FIRST_S)
-                if live is None:
-                    tiles.append({"name": name, "level": "unknown", "alarms": [], "text": listening.why_not})
-                    continue
-                alarms = [{"alarm": one["alarm"], "first": one["first_out"]} for one in standing(live)]
-                text = live.values["machine"].get("description", "")
-                tiles.append({"name": name, "level": level_of(live), "alarms": alarms, "text": text})
-        order = {"danger": 0, "alert": 1, "unknown": 2}
-        tiles.sort(key=lambda tile: (order.get(tile["level"], 3), tile["name"]))
+        tiles.sort(key=lambda one: (-WORST.get(one["level"], 0), one["name"]))
         return {"tiles": tiles, "why": ""}
 
     async def machine(self, request: Request) -> Response:

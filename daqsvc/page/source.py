@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 LONGEST_LINE = 64 * 1024 * 1024
-STATUS_EVERY_S = 1.0
+NOT_OURS = (ValueError, LookupError, TypeError)
+"""What comes of an answer that is not as it is known here."""
 LINGER_S = 5.0
 """How long a machine is still listened to when nobody looks any more."""
 
@@ -84,20 +85,15 @@ class Listening:
     async def run(self) -> None:
         """Listen until cancelled; again and again where that fails."""
         backoff = Backoff()
-        asking = asyncio.create_task(self._ask_status(), name=f"status of {self.machine}")
-        try:
-            while True:
-                self._anew.clear()
-                self._streams = frozenset().union(*self._wanted.values())
-                try:
-                    await self._listen(backoff)
-                except (OSError, ValueError, asyncio.IncompleteReadError) as error:
-                    self.why_not = _in_words(error)
-                if not self._anew.is_set():
-                    await asyncio.sleep(backoff.next_ns() / NS_PER_S)
-        finally:
-            asking.cancel()
-            await asyncio.wait({asking})
+        while True:
+            self._anew.clear()
+            self._streams = frozenset().union(*self._wanted.values())
+            try:
+                await self._listen(backoff)
+            except (OSError, asyncio.IncompleteReadError, *NOT_OURS) as error:
+                self.why_not = _in_words(error)
+            if not self._anew.is_set():
+                await asyncio.sleep(backoff.next_ns() / NS_PER_S)
 
     async def _listen(self, backoff: Backoff) -> None:
         reader, writer = await asyncio.open_unix_connection(self._path, limit=LONGEST_LINE)
@@ -145,22 +141,6 @@ class Listening:
             self.live.take(line)
         self.heard_s = time.monotonic()
 
-    async def _ask_status(self) -> None:
-        """Ask how everything stands, every second."""
-        question = {"schema": "daqsvc.control/1", "verb": "status", "machine": self.machine}
-        line = json.dumps(question).encode() + b"\n"
-        while True:
-            with contextlib.suppress(OSError, ValueError, asyncio.IncompleteReadError):
-                async with _connected(self._path) as (reader, writer):
-                    while True:
-                        writer.write(line)
-                        status = json.loads(await reader.readuntil())
-                        if self.live is not None and status.get("machine") == self.machine:
-                            self.live.status = status
-                            self.heard_s = time.monotonic()
-                        await asyncio.sleep(STATUS_EVERY_S)
-            await asyncio.sleep(STATUS_EVERY_S)
-
 
 class BoxSource:
     """The machines of the service that runs on a store.
@@ -174,22 +154,31 @@ class BoxSource:
         self._listening: dict[str, tuple[Listening, asyncio.Task[None]]] = {}
         self._looking: dict[str, int] = {}
 
-    async def machines(self) -> list[str]:
-        """The names of the machines that the service watches.
+    async def statuses(self) -> list[Document]:
+        """How each machine stands that the service watches: `daqsvc.publish.service_status`.
 
         Raises:
             OSError: it does not answer.
             ValueError: it answers something else.
         """
         async with _connected(self._store / SOCKET) as (reader, writer):
-            writer.write(STATUS_QUESTION + b"\n")
+
+            async def answer(question: bytes) -> Document:
+                writer.write(question + b"\n")
+                told: Document = json.loads(await reader.readuntil())
+                return told
+
             try:
-                told = json.loads(await reader.readuntil())
+                first = await answer(STATUS_QUESTION)
+                if "machines" not in first:
+                    return [first]
                 # Of several it has to be said which one is meant: the answer names them.
-                names = told["machines"] if "machines" in told else [told["machine"]]
-            except (asyncio.IncompleteReadError, KeyError) as error:
+                return [
+                    await answer(STATUS_QUESTION[:-1] + f', "machine": {json.dumps(name)}}}'.encode())
+                    for name in first["machines"]
+                ]
+            except asyncio.IncompleteReadError as error:
                 raise ValueError("the service has not answered") from error
-        return [str(name) for name in names]
 
     @contextlib.asynccontextmanager
     async def looking(self, machine: str) -> AsyncIterator[Listening]:

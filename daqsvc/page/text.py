@@ -9,10 +9,13 @@ from daqsvc.acquisition.clock import NS_PER_S, iso_utc
 from daqsvc.page.views.modes import in_words
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from daqsvc.page.machine_live import MachineLive
 
     Document = dict[str, Any]
 
+COVERED = {"shelved", "suppressed", "out_of_service"}
 MOST_EVENTS = 50
 WORST = {"danger": 2, "alert": 1}
 STATES = {
@@ -34,16 +37,24 @@ def standing(live: MachineLive) -> list[Document]:
     return sorted(alarms, key=lambda one: (-WORST.get(one["level"], 0), -one["monotonic_ns"]))
 
 
-def level_of(live: MachineLive) -> str:
-    """The worst level of what stands uncovered."""
-    covered = {"shelved", "suppressed", "out_of_service"}
-    levels = [one["level"] for one in standing(live) if one["state"] not in covered]
+def level_of(standing_alarms: Iterable[Document]) -> str:
+    """The worst level of alarms that no person and no sensor has covered."""
+    levels = [one["level"] for one in standing_alarms if one["state"] not in COVERED]
     return max(levels, key=lambda level: WORST.get(level, 0), default="normal")
+
+
+def tile(status: Document) -> Document:
+    """A machine in short, by its `daqsvc.publish.service_status`."""
+    alarms = status["alarms"]["standing"]
+    told = [
+        {"alarm": one["alarm"], "first": one.get("first_out", False), "why": one["message"]} for one in alarms
+    ]
+    return {"name": status["machine"], "level": level_of(alarms), "alarms": told}
 
 
 def head(live: MachineLive) -> str:
     """One line: the machine, its worst level, its speed."""
-    level = level_of(live)
+    level = level_of(standing(live))
     description = live.values["machine"].get("description", "")
     return (
         f'<span class="level {escape(level)}">{escape(level)}</span> '

@@ -81,6 +81,7 @@ class StandingAlarmPayload(JsonPayload):
     occurrence: str | None
     age_s: Number = Field(description="since it changed last")
     shelved_until_wall_ns: int | None = Field(None, description="when shelving ends; null if not shelved")
+    first_out: bool = Field(False, description="it was the first of its group to stand")
     message: str
 
 

@@ -5,8 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy.fft
+from scipy.signal import firwin
 
-from daqsvc.dsp.envelope import THINNED_BINS, THINNING, hann, line_power, row_medians, squared_envelope
+from daqsvc.dsp.envelope import (
+    THINNED_BINS,
+    THINNING,
+    THINNING_KAISER,
+    THINNING_TAPS,
+    _low_pass,
+    hann,
+    line_power,
+    row_medians,
+    squared_envelope,
+)
 
 SAMPLES = 48_000
 
@@ -58,3 +69,8 @@ def test_an_envelope_is_as_long_as_the_transforms_are_fast_and_can_be_thinned(bi
         while left % factor == 0:
             left //= factor
     assert left == 1
+
+
+def test_the_low_pass_is_that_of_scipy_to_the_last_bit() -> None:
+    taps = firwin(THINNING_TAPS, 0.5 / THINNING, window=("kaiser", THINNING_KAISER), fs=1.0)
+    assert np.array_equal(_low_pass(), taps)

@@ -114,7 +114,9 @@ async def test_those_who_look_on_leave_room_for_commands(tmp_path: Path) -> None
             reader, writer = await all_of_them.enter_async_context(looking(store))
             assert "schema" in await next_line(reader)
         async with looking(store) as (refused, _):
-            assert (await next_line(refused))["reason"] == "4 others look already; end one of them"
+            assert (await next_line(refused))[
+                "reason"
+            ] == f"{MOST_LOOKING} others look already; end one of them"
         async with looking(store, b', "machine": "other"}') as (refused, _):
             assert "others look" in (await next_line(refused))["reason"]
         asking, question = await asyncio.open_unix_connection(store / SOCKET)
