@@ -42,12 +42,12 @@ BEFORE_S = 20.0
 """What the rings hold of so long before is told at first."""
 
 
-class _Stands(NamedTuple):
+class _StreamStands(NamedTuple):
     stream: str
     standing: StreamState
 
 
-_Happened: TypeAlias = "SampleBlock | Diagnosis | AlarmEvent | _Stands"
+_Happened: TypeAlias = "SampleBlock | Diagnosis | AlarmEvent | _StreamStands"
 
 
 class Looker:
@@ -67,7 +67,7 @@ class Looker:
         self._has_come = asyncio.Event()
         self._is_over = False
 
-    def take(self, happened: _Happened) -> None:
+    def add(self, happened: _Happened) -> None:
         """Have it wait until it is told."""
         size = happened.samples.nbytes if isinstance(happened, SampleBlock) else 0
         if len(self._waiting) >= MOST_WAITING or self._bytes + size > MOST_WAITING_BYTES:
@@ -163,7 +163,7 @@ class LiveFeed:
         looker = Looker(_line(self.about(statements, alarms, standings)), streams)
         for stream in looker.streams & rings.keys():
             if (before := _before(rings[stream])) is not None:
-                looker.take(before)
+                looker.add(before)
         self._lookers.add(looker)
         return looker
 
@@ -175,7 +175,7 @@ class LiveFeed:
         """Samples have come, of a stream or a grid."""
         for looker in self._lookers:
             if block.stream in looker.streams:
-                looker.take(block)
+                looker.add(block)
 
     def diagnosis(self, diagnosis: Diagnosis) -> None:
         """A detector has said something."""
@@ -187,7 +187,7 @@ class LiveFeed:
 
     def stand(self, stream: str, standing: StreamState) -> None:
         """A stream stands otherwise."""
-        self._tell(_Stands(stream, standing))
+        self._tell(_StreamStands(stream, standing))
 
     def end(self) -> None:
         """The machine is watched no more, or otherwise: who looks is to look anew."""
@@ -197,7 +197,7 @@ class LiveFeed:
 
     def _tell(self, happened: _Happened) -> None:
         for looker in self._lookers:
-            looker.take(happened)
+            looker.add(happened)
 
 
 def _before(ring: SampleRing) -> SampleBlock | None:

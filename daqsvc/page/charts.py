@@ -37,7 +37,7 @@ DARK = Theme("#1b1f23", "#c8d0d6", "#30363c", "#78828a", ("#56b4e9", "#e69f00", 
 THEMES = {"light": LIGHT, "dark": DARK}
 
 
-class Axis(NamedTuple):
+class ChartAxis(NamedTuple):
     """What an axis shows.
 
     Attributes:
@@ -54,8 +54,8 @@ class Axis(NamedTuple):
 
 
 def chart(
-    x: Axis,
-    y: Axis,
+    x: ChartAxis,
+    y: ChartAxis,
     theme: Theme,
     *,
     height: int = 320,

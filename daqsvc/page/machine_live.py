@@ -70,7 +70,7 @@ class Said(NamedTuple):
     statistics: dict[str, float]
 
 
-class Place(NamedTuple):
+class SensorPlace(NamedTuple):
     """Where a sensor's samples come: a column of a stream, or of a grid."""
 
     stream: str
@@ -115,12 +115,12 @@ class MachineLive:
         """Whether the shaft turns clockwise, seen from where the probes' angles are."""
         return bool(self.values["machine"].get("rotation") == "clockwise")
 
-    def take(self, line: Document) -> None:
+    def hear(self, line: Document) -> None:
         """Take in a line of the feed after the first one."""
         if (samples := line.get("samples")) is not None:
             self._write(samples)
         elif (statement := line.get("statement")) is not None:
-            self._hear(statement)
+            self._take_statement(statement)
         elif (alarm := line.get("alarm")) is not None:
             self.alarms[alarm["alarm"]] = alarm
             self.journal.append(alarm)
@@ -142,7 +142,7 @@ class MachineLive:
         """Samples per second of a stream, by the machine file."""
         return float(self.about["streams"][stream]["rate_hz"])
 
-    def place_of(self, sensors: Iterable[str]) -> list[Place] | None:
+    def place_of(self, sensors: Iterable[str]) -> list[SensorPlace] | None:
         """Where sensors are sampled together; None if nowhere."""
         wanted = list(sensors)
         for there in self._places.values():
@@ -186,24 +186,26 @@ class MachineLive:
         """All sensors but keyphasors, by their names."""
         return [one.name for one in self.sensors.values() if one.kind not in {"keyphasor", "tachometer"}]
 
-    def _found_places(self) -> dict[str, dict[str, Place]]:
+    def _found_places(self) -> dict[str, dict[str, SensorPlace]]:
         """By stream and grid, where each sensor's samples are in it."""
-        places: dict[str, dict[str, Place]] = {}
+        places: dict[str, dict[str, SensorPlace]] = {}
         named: dict[str, str] = {}
         for stream, facts in self.about["streams"].items():
             if any(facts["sensors"]):
                 pairs = zip(facts["sensors"], facts["channels"], strict=True)
                 named |= {f"{stream}.{channel}": sensor for sensor, channel in pairs}
                 places[stream] = {
-                    sensor: Place(stream, column) for column, sensor in enumerate(facts["sensors"]) if sensor
+                    sensor: SensorPlace(stream, column)
+                    for column, sensor in enumerate(facts["sensors"])
+                    if sensor
                 }
         for stream, facts in self.about["streams"].items():
             if stream not in places:  # a grid
                 columns = enumerate(named.get(channel, "") for channel in facts["channels"])
-                places[stream] = {sensor: Place(stream, column) for column, sensor in columns if sensor}
+                places[stream] = {sensor: SensorPlace(stream, column) for column, sensor in columns if sensor}
         return places
 
-    def _hear(self, statement: Document) -> None:
+    def _take_statement(self, statement: Document) -> None:
         detector = statement["detector"]
         self.latest[detector] = statement
         said = self.said.setdefault(detector, deque(maxlen=MOST_SAID))

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from daqsvc.page.machine_live import MachineLive
     from daqsvc.page.source import BoxSource, Listening
-    from daqsvc.page.views.view import View
+    from daqsvc.page.views.view import MachineView
 
 log = logging.getLogger(__name__)
 
@@ -39,7 +39,9 @@ class Picture:
         chosen: see `daqsvc.page.views.view.Choice`.
     """
 
-    def __init__(self, source: BoxSource, machine: str, view: View | None, chosen: Mapping[str, str]) -> None:
+    def __init__(
+        self, source: BoxSource, machine: str, view: MachineView | None, chosen: Mapping[str, str]
+    ) -> None:
         self._source = source
         self._machine = machine
         self._view = view
@@ -116,7 +118,7 @@ class Picture:
                 told |= self._view_of(self._view, live)
         return json.dumps(told).encode()
 
-    def _view_of(self, view: View, live: MachineLive) -> dict[str, Any]:
+    def _view_of(self, view: MachineView, live: MachineLive) -> dict[str, Any]:
         if why_not := view.why_not(live):
             return {"note": why_not}
         try:

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from daqsvc.page.charts import Theme
     from daqsvc.page.machine_live import MachineLive
     from daqsvc.page.source import BoxSource
-    from daqsvc.page.views.view import View
+    from daqsvc.page.views.view import MachineView
 
 HEADERS = {
     # BokehJS puts styles into its figures.
@@ -189,7 +189,7 @@ class _Page:
 
 
 def _chosen(
-    view: View | None, live: MachineLive, asked: Mapping[str, str]
+    view: MachineView | None, live: MachineLive, asked: Mapping[str, str]
 ) -> tuple[Sequence[Any], dict[str, str]]:
     """What can be chosen in a view, and what is."""
     if view is None or view.why_not(live):
@@ -202,7 +202,7 @@ def _chosen(
     return choices, chosen
 
 
-def _figures(view: View, live: MachineLive, chosen: Mapping[str, str], theme: Theme) -> str:
+def _figures(view: MachineView, live: MachineLive, chosen: Mapping[str, str], theme: Theme) -> str:
     """The figures of a view with what is to be seen now, as JSON."""
     shown = view.shown(live, chosen)
     told = []

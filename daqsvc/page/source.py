@@ -138,7 +138,7 @@ class Listening:
 
     def _take(self, line: Document) -> None:
         if self.live is not None:
-            self.live.take(line)
+            self.live.hear(line)
         self.heard_s = time.monotonic()
 
 

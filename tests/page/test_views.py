@@ -83,7 +83,7 @@ def turning(seconds: float, x: complex, y: complex) -> np.ndarray[Any, Any]:
 def test_the_order_1x_of_a_whirl_is_found_with_its_phase_behind_the_mark() -> None:
     live = MachineLive(about())
     x, y = 20.0 * np.exp(-0.5j), 11.0 * np.exp(1.2j)
-    live.take(told(turning(3.0, x, y)))
+    live.hear(told(turning(3.0, x, y)))
     seen = whirl(live, ("left", "right"), 20.0)
     assert seen is not None
     assert seen.has_keyphasor
@@ -99,14 +99,14 @@ def test_the_order_1x_of_a_whirl_is_found_with_its_phase_behind_the_mark() -> No
 def test_samples_that_are_told_again_are_not_there_twice_and_a_gap_is_seen() -> None:
     live = MachineLive(about())
     rows = turning(1.0, 20.0, -20.0j)
-    live.take(told(rows[:600]))
-    live.take(told(rows[500:900], 500))
-    live.take(told(rows[100:200], 100))
+    live.hear(told(rows[:600]))
+    live.hear(told(rows[500:900], 500))
+    live.hear(told(rows[100:200], 100))
     newest = live.newest("shaft", 0.9)
     assert newest is not None
     assert np.array_equal(newest[0], rows[:900].astype(np.float32))
     assert newest[1] == 899_000_000
-    live.take(told(rows[950:], 950))
+    live.hear(told(rows[950:], 950))
     newest = live.newest("shaft", 0.1)
     assert newest is not None
     assert np.isnan(newest[0]).all(axis=1).tolist() == [True] * 50 + [False] * 50
@@ -131,14 +131,14 @@ def test_lines_of_a_spectrum_have_the_amplitudes_of_their_waves() -> None:
 
 def test_forward_and_backward_whirl_are_told_apart() -> None:
     live = MachineLive(about())
-    live.take(told(turning(8.0, 20.0, -20.0j)))  # x leads y: it turns against the clock
+    live.hear(told(turning(8.0, 20.0, -20.0j)))  # x leads y: it turns against the clock
     shown = VIEWS["full-spectrum"].shown(live, {"probes": "left,right", "revolutions": "80"})
     rows = {name: float(value) for name, value, _ in shown.rows}
     assert rows["1X forward"] == pytest.approx(20.0, rel=0.05)
     assert rows["1X backward"] < 0.5
     # Seen from the other end the same shaft turns clockwise, and its whirl is forward all the same.
     clockwise = MachineLive(about(rotation="clockwise"))
-    clockwise.take(told(turning(8.0, 20.0, 20.0j)))
+    clockwise.hear(told(turning(8.0, 20.0, 20.0j)))
     shown = VIEWS["full-spectrum"].shown(clockwise, {"probes": "left,right", "revolutions": "80"})
     assert float({r[0]: r[1] for r in shown.rows}["1X forward"]) == pytest.approx(20.0, rel=0.05)
 
@@ -198,7 +198,7 @@ def test_a_damaged_bearing_shows_in_the_envelope_at_its_lines() -> None:
         }
     )
     samples = told(values[:, None])["samples"]
-    live.take({"samples": {**samples, "stream": "housing", "period_ns": 1e9 / rate_hz}})
+    live.hear({"samples": {**samples, "stream": "housing", "period_ns": 1e9 / rate_hz}})
     view = VIEWS["envelope"]
     assert view.why_not(live) == ""
     shown = view.shown(live, {"sensor": "casing", "length": "2"})
@@ -255,7 +255,7 @@ def test_the_centreline_follows_the_means_of_both_probes() -> None:
                 "statistics": {"mean": mean},
                 "units": {"mean": "um"},
             }
-            live.take({"statement": said})
+            live.hear({"statement": said})
     assert view.why_not(live) == ""
     shown = view.shown(live, {"probes": "left,right", "minutes": "1"})
     assert shown.sources["centreline"]["x"] == pytest.approx([0.0, 10.0, 20.0, 30.0, 40.0])
@@ -265,7 +265,7 @@ def test_the_centreline_follows_the_means_of_both_probes() -> None:
 
 def test_a_whirl_that_repeats_is_one_point_of_the_poincare_map() -> None:
     live = MachineLive(about())
-    live.take(told(turning(8.0, 20.0, -20.0j)))
+    live.hear(told(turning(8.0, 20.0, -20.0j)))
     shown = VIEWS["poincare"].shown(live, {"probes": "left,right", "revolutions": "20"})
     spread = {name: float(value) for name, value, _ in shown.rows}
     assert 19 <= spread["revolutions"] <= 20
@@ -274,6 +274,6 @@ def test_a_whirl_that_repeats_is_one_point_of_the_poincare_map() -> None:
     rows = turning(8.0, 20.0, -20.0j)
     half = np.arange(len(rows)) / RATE_HZ * SPEED_HZ * np.pi
     rows[:, 0] += 15.0 * np.cos(half)
-    twice.take(told(rows))
+    twice.hear(told(rows))
     shown = VIEWS["poincare"].shown(twice, {"probes": "left,right", "revolutions": "20"})
     assert np.ptp(shown.sources["poincare"]["x"]) > 6.0, "half the speed makes two clouds of it"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from daqsvc.page.views.envelope import EnvelopeView
+from daqsvc.page.views.envelope import EnvelopeSpectrumView
 from daqsvc.page.views.modes import ModesView
 from daqsvc.page.views.orbit import OrbitView
 from daqsvc.page.views.position import CentrelineView, PoincareView
@@ -13,9 +13,9 @@ from daqsvc.page.views.timebase import TimebaseView
 from daqsvc.page.views.trend import TrendView
 
 if TYPE_CHECKING:
-    from daqsvc.page.views.view import View
+    from daqsvc.page.views.view import MachineView
 
-VIEWS: dict[str, View] = {
+VIEWS: dict[str, MachineView] = {
     view.name: view
     for view in (
         ModesView(),
@@ -25,7 +25,7 @@ VIEWS: dict[str, View] = {
         TimebaseView(),
         SpectrumView(),
         FullSpectrumView(),
-        EnvelopeView(),
+        EnvelopeSpectrumView(),
         TrendView(),
     )
 }

@@ -9,7 +9,7 @@ import scipy.fft
 
 from daqsvc.bearing.geometry import BearingOrders, bearing_orders
 from daqsvc.dsp.envelope import line_power, squared_envelope, whiten
-from daqsvc.page.charts import Axis, chart, legend, source
+from daqsvc.page.charts import ChartAxis, chart, legend, source
 from daqsvc.page.views.view import Choice, Figure, Shown
 
 if TYPE_CHECKING:
@@ -29,8 +29,8 @@ SHOWN_HZ = 500.0
 LEAST_S = 0.5
 
 
-class EnvelopeView:
-    """See `daqsvc.page.views.view.View`."""
+class EnvelopeSpectrumView:
+    """See `daqsvc.page.views.view.MachineView`."""
 
     name = "envelope"
     title = "Envelope spectrum"
@@ -41,27 +41,27 @@ class EnvelopeView:
     every_s = 1.0
 
     def choices(self, live: MachineLive) -> list[Choice]:
-        """See `daqsvc.page.views.view.View.choices`."""
+        """See `daqsvc.page.views.view.MachineView.choices`."""
         sensors = {name: name for name in _accelerometers(live)}
         return [Choice("sensor", "Sensor", sensors), Choice("length", "Length", LENGTHS)]
 
     def why_not(self, live: MachineLive) -> str:
-        """See `daqsvc.page.views.view.View.why_not`."""
+        """See `daqsvc.page.views.view.MachineView.why_not`."""
         if _accelerometers(live):
             return ""
         return f"it needs an accelerometer that is sampled at {LEAST_RATE_HZ:g} Hz or faster"
 
     def streams(self, live: MachineLive, chosen: Mapping[str, str]) -> set[str]:
-        """See `daqsvc.page.views.view.View.streams`."""
+        """See `daqsvc.page.views.view.MachineView.streams`."""
         return {one.stream for one in live.place_of([chosen["sensor"]]) or []}
 
     def figures(self, live: MachineLive, chosen: Mapping[str, str], theme: Theme) -> list[Figure]:
-        """See `daqsvc.page.views.view.View.figures`."""
+        """See `daqsvc.page.views.view.MachineView.figures`."""
         del live
         sensor = chosen["sensor"]
         made = chart(
-            Axis("frequency, Hz", 0.0, SHOWN_HZ),
-            Axis(f"swell of {sensor}, share of the mean"),
+            ChartAxis("frequency, Hz", 0.0, SHOWN_HZ),
+            ChartAxis(f"swell of {sensor}, share of the mean"),
             theme,
             tips=[("frequency", "@f{0.00} Hz"), ("swell", "@a{0.000}")],
         )
@@ -83,7 +83,7 @@ class EnvelopeView:
         return [Figure("envelope", f"Envelope spectrum of {sensor} up to {SHOWN_HZ:g} Hz", made)]
 
     def shown(self, live: MachineLive, chosen: Mapping[str, str]) -> Shown:
-        """See `daqsvc.page.views.view.View.shown`."""
+        """See `daqsvc.page.views.view.MachineView.shown`."""
         sensor = chosen["sensor"]
         places = live.place_of([sensor])
         newest = None if places is None else live.newest(places[0].stream, float(chosen["length"]))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.page.charts import Axis, chart, legend, source
+from daqsvc.page.charts import ChartAxis, chart, legend, source
 from daqsvc.page.views.view import Choice, Figure, Shown
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ LENGTHS = {"60": "1 minute", "300": "5 minutes", "10": "10 s"}
 
 
 class ModesView:
-    """See `daqsvc.page.views.view.View`."""
+    """See `daqsvc.page.views.view.MachineView`."""
 
     name = "modes"
     title = "Probabilities"
@@ -31,28 +31,28 @@ class ModesView:
     every_s = 0.5
 
     def choices(self, live: MachineLive) -> list[Choice]:
-        """See `daqsvc.page.views.view.View.choices`."""
+        """See `daqsvc.page.views.view.MachineView.choices`."""
         detectors = {name: name for name, one in live.latest.items() if one["probabilities"]}
         return [Choice("detector", "Detector", detectors), Choice("length", "Length", LENGTHS)]
 
     def why_not(self, live: MachineLive) -> str:
-        """See `daqsvc.page.views.view.View.why_not`."""
+        """See `daqsvc.page.views.view.MachineView.why_not`."""
         if any(one["probabilities"] for one in live.latest.values()):
             return ""
         return "no detector of this machine has told any probabilities yet"
 
     def streams(self, live: MachineLive, chosen: Mapping[str, str]) -> set[str]:
-        """See `daqsvc.page.views.view.View.streams`."""
+        """See `daqsvc.page.views.view.MachineView.streams`."""
         del live, chosen
         return set()
 
     def figures(self, live: MachineLive, chosen: Mapping[str, str], theme: Theme) -> list[Figure]:
-        """See `daqsvc.page.views.view.View.figures`."""
+        """See `daqsvc.page.views.view.MachineView.figures`."""
         detector = chosen["detector"]
         modes = list(live.latest[detector]["probabilities"])
         made = chart(
-            Axis("time before now, s", -float(chosen["length"]), 0.0),
-            Axis("probability", -0.02, 1.02),
+            ChartAxis("time before now, s", -float(chosen["length"]), 0.0),
+            ChartAxis("probability", -0.02, 1.02),
             theme,
             tips=[
                 ("time", "@t{0.0} s"),
@@ -76,7 +76,7 @@ class ModesView:
         return [Figure("modes", f"Probabilities of the modes of {detector} over time", made)]
 
     def shown(self, live: MachineLive, chosen: Mapping[str, str]) -> Shown:
-        """See `daqsvc.page.views.view.View.shown`."""
+        """See `daqsvc.page.views.view.MachineView.shown`."""
         detector = chosen["detector"]
         said = list(live.said.get(detector, ()))
         latest = live.latest[detector]

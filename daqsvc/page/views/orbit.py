@@ -22,7 +22,7 @@ REVOLUTIONS = {"4": "4 revolutions", "1": "1 revolution", "16": "16 revolutions"
 
 
 class OrbitView:
-    """See `daqsvc.page.views.view.View`."""
+    """See `daqsvc.page.views.view.MachineView`."""
 
     name = "orbit"
     title = "Orbit"
@@ -33,22 +33,22 @@ class OrbitView:
     every_s = 0.1
 
     def choices(self, live: MachineLive) -> list[Choice]:
-        """See `daqsvc.page.views.view.View.choices`."""
+        """See `daqsvc.page.views.view.MachineView.choices`."""
         return [pairs_of(live), Choice("revolutions", "Length", REVOLUTIONS)]
 
     def why_not(self, live: MachineLive) -> str:
-        """See `daqsvc.page.views.view.View.why_not`."""
+        """See `daqsvc.page.views.view.MachineView.why_not`."""
         return "" if live.probes() else NO_PAIR
 
     def streams(self, live: MachineLive, chosen: Mapping[str, str]) -> set[str]:
-        """See `daqsvc.page.views.view.View.streams`."""
+        """See `daqsvc.page.views.view.MachineView.streams`."""
         probes = chosen["probes"].split(",")
         key = live.keyphasor()
         places = (live.place_of([*probes, key]) if key else None) or live.place_of(probes) or []
         return {one.stream for one in places}
 
     def figures(self, live: MachineLive, chosen: Mapping[str, str], theme: Theme) -> list[Figure]:
-        """See `daqsvc.page.views.view.View.figures`."""
+        """See `daqsvc.page.views.view.MachineView.figures`."""
         made = plane(live, theme, [("x", "@x{0.0} um"), ("y", "@y{0.0} um")])
         made.line(
             "x", "y", source=source("orbit", ["x", "y"]), line_color=theme.series[0], legend_label="orbit"
@@ -68,7 +68,7 @@ class OrbitView:
         return [Figure("orbit", f"Orbit of the shaft's centre by {probes}, with its 1X and clearance", made)]
 
     def shown(self, live: MachineLive, chosen: Mapping[str, str]) -> Shown:
-        """See `daqsvc.page.views.view.View.shown`."""
+        """See `daqsvc.page.views.view.MachineView.shown`."""
         x, y = chosen["probes"].split(",")
         seen = whirl(live, (x, y), float(chosen["revolutions"]))
         if seen is None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.dsp.probes import probes_to_xy, shaft_axes_deg
-from daqsvc.page.charts import Axis, chart, legend, source
+from daqsvc.page.charts import ChartAxis, chart, legend, source
 from daqsvc.page.shaft import UM, whirl
 from daqsvc.page.views.view import Choice, Figure, Shown
 
@@ -38,7 +38,12 @@ def plane(live: MachineLive, theme: Theme, tips: list[tuple[str, str]]) -> Any:
     reach = LARGER * clearance_um if clearance_um else None
     low = None if reach is None else -reach
     made = chart(
-        Axis("x, um", low, reach), Axis("y, um", low, reach), theme, height=520, tips=tips, is_round=True
+        ChartAxis("x, um", low, reach),
+        ChartAxis("y, um", low, reach),
+        theme,
+        height=520,
+        tips=tips,
+        is_round=True,
     )
     if clearance_um:
         turn = np.linspace(0.0, 2.0 * math.pi, 181)
@@ -53,7 +58,7 @@ def plane(live: MachineLive, theme: Theme, tips: list[tuple[str, str]]) -> Any:
 
 
 class CentrelineView:
-    """See `daqsvc.page.views.view.View`."""
+    """See `daqsvc.page.views.view.MachineView`."""
 
     name = "centreline"
     title = "Shaft centreline"
@@ -64,11 +69,11 @@ class CentrelineView:
     every_s = 1.0
 
     def choices(self, live: MachineLive) -> list[Choice]:
-        """See `daqsvc.page.views.view.View.choices`."""
+        """See `daqsvc.page.views.view.MachineView.choices`."""
         return [pairs_of(live), Choice("minutes", "Over", MINUTES)]
 
     def why_not(self, live: MachineLive) -> str:
-        """See `daqsvc.page.views.view.View.why_not`."""
+        """See `daqsvc.page.views.view.MachineView.why_not`."""
         if not live.probes():
             return NO_PAIR
         if all(f"levels/{name}" in live.latest for name in live.probes()[0]):
@@ -76,12 +81,12 @@ class CentrelineView:
         return "it needs the means of the probes: write [pipeline.levels] into the machine file"
 
     def streams(self, live: MachineLive, chosen: Mapping[str, str]) -> set[str]:
-        """See `daqsvc.page.views.view.View.streams`."""
+        """See `daqsvc.page.views.view.MachineView.streams`."""
         del live, chosen
         return set()
 
     def figures(self, live: MachineLive, chosen: Mapping[str, str], theme: Theme) -> list[Figure]:
-        """See `daqsvc.page.views.view.View.figures`."""
+        """See `daqsvc.page.views.view.MachineView.figures`."""
         made = plane(live, theme, [("x", "@x{0.0} um"), ("y", "@y{0.0} um"), ("time", "@t{0.0} min")])
         path = source("centreline", ["x", "y", "t"])
         made.line("x", "y", source=path, line_color=theme.series[0], legend_label="centre")
@@ -92,7 +97,7 @@ class CentrelineView:
         return [Figure("centreline", f"Mean position of the shaft's centre by {probes}", made)]
 
     def shown(self, live: MachineLive, chosen: Mapping[str, str]) -> Shown:
-        """See `daqsvc.page.views.view.View.shown`."""
+        """See `daqsvc.page.views.view.MachineView.shown`."""
         probes = chosen["probes"].split(",")
         t_ns, along = _means(live, (probes[0], probes[1]))
         if not len(t_ns):
@@ -111,7 +116,7 @@ class CentrelineView:
 
 
 class PoincareView:
-    """See `daqsvc.page.views.view.View`."""
+    """See `daqsvc.page.views.view.MachineView`."""
 
     name = "poincare"
     title = "Poincare map"
@@ -122,11 +127,11 @@ class PoincareView:
     every_s = 0.5
 
     def choices(self, live: MachineLive) -> list[Choice]:
-        """See `daqsvc.page.views.view.View.choices`."""
+        """See `daqsvc.page.views.view.MachineView.choices`."""
         return [pairs_of(live), Choice("revolutions", "Length", REVOLUTIONS)]
 
     def why_not(self, live: MachineLive) -> str:
-        """See `daqsvc.page.views.view.View.why_not`."""
+        """See `daqsvc.page.views.view.MachineView.why_not`."""
         if not live.probes():
             return NO_PAIR
         key = live.keyphasor()
@@ -134,13 +139,13 @@ class PoincareView:
         return "" if together else "it needs a keyphasor that is sampled together with the probes"
 
     def streams(self, live: MachineLive, chosen: Mapping[str, str]) -> set[str]:
-        """See `daqsvc.page.views.view.View.streams`."""
+        """See `daqsvc.page.views.view.MachineView.streams`."""
         key = live.keyphasor()
         places = live.place_of([*chosen["probes"].split(","), *([key] if key else [])]) or []
         return {one.stream for one in places}
 
     def figures(self, live: MachineLive, chosen: Mapping[str, str], theme: Theme) -> list[Figure]:
-        """See `daqsvc.page.views.view.View.figures`."""
+        """See `daqsvc.page.views.view.MachineView.figures`."""
         made = plane(live, theme, [("x", "@x{0.0} um"), ("y", "@y{0.0} um")])
         marks = source("poincare", ["x", "y"])
         made.scatter(
@@ -151,7 +156,7 @@ class PoincareView:
         return [Figure("poincare", f"Position of the shaft's centre once a revolution by {probes}", made)]
 
     def shown(self, live: MachineLive, chosen: Mapping[str, str]) -> Shown:
-        """See `daqsvc.page.views.view.View.shown`."""
+        """See `daqsvc.page.views.view.MachineView.shown`."""
         x, y = chosen["probes"].split(",")
         seen = whirl(live, (x, y), float(chosen["revolutions"]))
         if seen is None or not seen.has_keyphasor:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daqsvc.page.charts import Axis, chart, legend, source
+from daqsvc.page.charts import ChartAxis, chart, legend, source
 from daqsvc.page.shaft import whirl
 from daqsvc.page.views.position import NO_PAIR, pairs_of
 from daqsvc.page.views.view import Choice, Figure, Shown
@@ -48,7 +48,7 @@ def amplitudes(values: Any) -> NDArray[np.float64]:
 
 
 class SpectrumView:
-    """See `daqsvc.page.views.view.View`."""
+    """See `daqsvc.page.views.view.MachineView`."""
 
     name = "spectrum"
     title = "Spectrum"
@@ -59,27 +59,27 @@ class SpectrumView:
     every_s = 0.5
 
     def choices(self, live: MachineLive) -> list[Choice]:
-        """See `daqsvc.page.views.view.View.choices`."""
+        """See `daqsvc.page.views.view.MachineView.choices`."""
         sensors = {name: name for name in live.vibration_sensors()}
         return [Choice("sensor", "Sensor", sensors), Choice("length", "Length", LENGTHS)]
 
     def why_not(self, live: MachineLive) -> str:
-        """See `daqsvc.page.views.view.View.why_not`."""
+        """See `daqsvc.page.views.view.MachineView.why_not`."""
         return "" if live.vibration_sensors() else "the machine has no sensors of vibration"
 
     def streams(self, live: MachineLive, chosen: Mapping[str, str]) -> set[str]:
-        """See `daqsvc.page.views.view.View.streams`."""
+        """See `daqsvc.page.views.view.MachineView.streams`."""
         return {one.stream for one in live.place_of([chosen["sensor"]]) or []}
 
     def figures(self, live: MachineLive, chosen: Mapping[str, str], theme: Theme) -> list[Figure]:
-        """See `daqsvc.page.views.view.View.figures`."""
+        """See `daqsvc.page.views.view.MachineView.figures`."""
         sensor = chosen["sensor"]
         unit = live.sensors[sensor].unit
         places = live.place_of([sensor])
         highest = live.rate_hz(places[0].stream) / 2.0 if places else 1.0
         made = chart(
-            Axis("frequency, Hz", 0.0, highest),
-            Axis(f"{sensor}, {unit} peak"),
+            ChartAxis("frequency, Hz", 0.0, highest),
+            ChartAxis(f"{sensor}, {unit} peak"),
             theme,
             tips=[("frequency", "@f{0.00} Hz"), (sensor, f"@a{{0.000}} {unit}")],
         )
@@ -90,7 +90,7 @@ class SpectrumView:
         return [Figure("spectrum", f"Spectrum of {sensor} up to {highest:g} Hz", made)]
 
     def shown(self, live: MachineLive, chosen: Mapping[str, str]) -> Shown:
-        """See `daqsvc.page.views.view.View.shown`."""
+        """See `daqsvc.page.views.view.MachineView.shown`."""
         sensor = chosen["sensor"]
         places = live.place_of([sensor])
         newest = None if places is None else live.newest(places[0].stream, float(chosen["length"]))
@@ -121,7 +121,7 @@ class SpectrumView:
 
 
 class FullSpectrumView:
-    """See `daqsvc.page.views.view.View`."""
+    """See `daqsvc.page.views.view.MachineView`."""
 
     name = "full-spectrum"
     title = "Full spectrum"
@@ -132,26 +132,26 @@ class FullSpectrumView:
     every_s = 0.5
 
     def choices(self, live: MachineLive) -> list[Choice]:
-        """See `daqsvc.page.views.view.View.choices`."""
+        """See `daqsvc.page.views.view.MachineView.choices`."""
         return [pairs_of(live), Choice("revolutions", "Length", REVOLUTIONS)]
 
     def why_not(self, live: MachineLive) -> str:
-        """See `daqsvc.page.views.view.View.why_not`."""
+        """See `daqsvc.page.views.view.MachineView.why_not`."""
         return "" if live.probes() else NO_PAIR
 
     def streams(self, live: MachineLive, chosen: Mapping[str, str]) -> set[str]:
-        """See `daqsvc.page.views.view.View.streams`."""
+        """See `daqsvc.page.views.view.MachineView.streams`."""
         key = live.keyphasor()
         probes = chosen["probes"].split(",")
         places = (live.place_of([*probes, key]) if key else None) or live.place_of(probes) or []
         return {one.stream for one in places}
 
     def figures(self, live: MachineLive, chosen: Mapping[str, str], theme: Theme) -> list[Figure]:
-        """See `daqsvc.page.views.view.View.figures`."""
+        """See `daqsvc.page.views.view.MachineView.figures`."""
         del live
         made = chart(
-            Axis("order, multiples of the speed", -FULL_ORDERS, FULL_ORDERS),
-            Axis("um peak"),
+            ChartAxis("order, multiples of the speed", -FULL_ORDERS, FULL_ORDERS),
+            ChartAxis("um peak"),
             theme,
             tips=[("order", "@o{0.00}X"), ("amplitude", "@a{0.00} um")],
         )
@@ -163,7 +163,7 @@ class FullSpectrumView:
         return [Figure("full-spectrum", f"Full spectrum of the shaft's centre by {probes}", made)]
 
     def shown(self, live: MachineLive, chosen: Mapping[str, str]) -> Shown:
-        """See `daqsvc.page.views.view.View.shown`."""
+        """See `daqsvc.page.views.view.MachineView.shown`."""
         x, y = chosen["probes"].split(",")
         seen = whirl(live, (x, y), float(chosen["revolutions"]))
         if seen is None or np.isfinite(seen.xy_um).all(axis=1).sum() < LEAST_SAMPLES:

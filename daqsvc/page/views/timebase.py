@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daqsvc.page.charts import Axis, chart, legend, source
+from daqsvc.page.charts import ChartAxis, chart, legend, source
 from daqsvc.page.views.view import Choice, Figure, Shown
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ MOST_POINTS = 2000
 
 
 class TimebaseView:
-    """See `daqsvc.page.views.view.View`."""
+    """See `daqsvc.page.views.view.MachineView`."""
 
     name = "timebase"
     title = "Timebase"
@@ -31,25 +31,25 @@ class TimebaseView:
     every_s = 0.1
 
     def choices(self, live: MachineLive) -> list[Choice]:
-        """See `daqsvc.page.views.view.View.choices`."""
+        """See `daqsvc.page.views.view.MachineView.choices`."""
         sensors = {name: name for name in (*live.vibration_sensors(), *filter(None, [live.keyphasor()]))}
         return [Choice("sensor", "Sensor", sensors), Choice("length", "Length", LENGTHS)]
 
     def why_not(self, live: MachineLive) -> str:
-        """See `daqsvc.page.views.view.View.why_not`."""
+        """See `daqsvc.page.views.view.MachineView.why_not`."""
         return "" if live.sensors else "the machine has no sensors"
 
     def streams(self, live: MachineLive, chosen: Mapping[str, str]) -> set[str]:
-        """See `daqsvc.page.views.view.View.streams`."""
+        """See `daqsvc.page.views.view.MachineView.streams`."""
         return {one.stream for one in live.place_of([chosen["sensor"]]) or []}
 
     def figures(self, live: MachineLive, chosen: Mapping[str, str], theme: Theme) -> list[Figure]:
-        """See `daqsvc.page.views.view.View.figures`."""
+        """See `daqsvc.page.views.view.MachineView.figures`."""
         sensor = chosen["sensor"]
         unit = live.sensors[sensor].unit
         made = chart(
-            Axis("time before now, s", -float(chosen["length"]), 0.0),
-            Axis(f"{sensor}, {unit}"),
+            ChartAxis("time before now, s", -float(chosen["length"]), 0.0),
+            ChartAxis(f"{sensor}, {unit}"),
             theme,
             tips=[("time", "@t{0.0000} s"), (sensor, f"@v{{0.000}} {unit}")],
         )
@@ -60,7 +60,7 @@ class TimebaseView:
         return [Figure("timebase", f"Waveform of {sensor} over the last {chosen['length']} s", made)]
 
     def shown(self, live: MachineLive, chosen: Mapping[str, str]) -> Shown:
-        """See `daqsvc.page.views.view.View.shown`."""
+        """See `daqsvc.page.views.view.MachineView.shown`."""
         sensor, seconds = chosen["sensor"], float(chosen["length"])
         places = live.place_of([sensor])
         newest = None if places is None else live.newest(places[0].stream, seconds)

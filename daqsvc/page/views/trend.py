@@ -10,7 +10,7 @@ import numpy as np
 
 from daqsvc.history.file import EmptyHistoryError, HistoryReader, NewerHistoryError
 from daqsvc.history.points import Step
-from daqsvc.page.charts import Axis, chart, legend, source
+from daqsvc.page.charts import ChartAxis, chart, legend, source
 from daqsvc.page.views.view import Choice, Figure, Shown
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ NONE = "this machine keeps no history: write [history] into its machine file"
 
 
 class TrendView:
-    """See `daqsvc.page.views.view.View`."""
+    """See `daqsvc.page.views.view.MachineView`."""
 
     name = "trend"
     title = "Trend"
@@ -41,29 +41,29 @@ class TrendView:
     every_s = 5.0
 
     def choices(self, live: MachineLive) -> list[Choice]:
-        """See `daqsvc.page.views.view.View.choices`."""
+        """See `daqsvc.page.views.view.MachineView.choices`."""
         return [
             Choice("reading", "Figure", {name: name for name in _names(live)}),
             Choice("hours", "Over", HOURS),
         ]
 
     def why_not(self, live: MachineLive) -> str:
-        """See `daqsvc.page.views.view.View.why_not`."""
+        """See `daqsvc.page.views.view.MachineView.why_not`."""
         return "" if _names(live) else NONE
 
     def streams(self, live: MachineLive, chosen: Mapping[str, str]) -> set[str]:
-        """See `daqsvc.page.views.view.View.streams`."""
+        """See `daqsvc.page.views.view.MachineView.streams`."""
         del live, chosen
         return set()
 
     def figures(self, live: MachineLive, chosen: Mapping[str, str], theme: Theme) -> list[Figure]:
-        """See `daqsvc.page.views.view.View.figures`."""
+        """See `daqsvc.page.views.view.MachineView.figures`."""
         reading, hours = chosen["reading"], float(chosen["hours"])
         per_unit, unit = (24.0, "days") if hours >= DAYS_FROM_H else (1.0, "hours")
         figure_unit = _units(live).get(reading, "")
         made = chart(
-            Axis(f"time before now, {unit}", -hours / per_unit, 0.0),
-            Axis(f"{reading}, {figure_unit}".rstrip(", ")),
+            ChartAxis(f"time before now, {unit}", -hours / per_unit, 0.0),
+            ChartAxis(f"{reading}, {figure_unit}".rstrip(", ")),
             theme,
             tips=[
                 ("time", f"@t{{0.000}} {unit}"),
@@ -79,7 +79,7 @@ class TrendView:
         return [Figure("trend", f"{reading} over {HOURS[chosen['hours']]}", made)]
 
     def shown(self, live: MachineLive, chosen: Mapping[str, str]) -> Shown:
-        """See `daqsvc.page.views.view.View.shown`."""
+        """See `daqsvc.page.views.view.MachineView.shown`."""
         hours = float(chosen["hours"])
         now_s = time.time()
         with _Opened(live) as reader:

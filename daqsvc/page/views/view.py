@@ -57,7 +57,7 @@ class Shown:
     note: str = ""
 
 
-class View(Protocol):
+class MachineView(Protocol):
     """One way to look at a machine.
 
     Attributes:
