@@ -11,7 +11,7 @@ const floats = (sent) =>
 
 function inOwnZone(root) {
   for (const time of root.querySelectorAll("time")) {
-    time.textContent = new Date(time.dateTime).toLocaleString();
+    time.textContent = new Date(time.dateTime).toLocaleString([], { dateStyle: "short", timeStyle: "medium" });
   }
 }
 

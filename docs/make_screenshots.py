@@ -1,0 +1,65 @@
+"""Make docs/page-orbit.png and docs/page-machine.png: the page of the demo, in Chromium.
+
+    .venv/bin/python docs/make_screenshots.py
+
+Needs Chromium (apt-get install chromium), and the extras of development.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from threading import Thread
+
+from playwright.sync_api import Playwright, sync_playwright
+
+DOCS = Path(__file__).parent
+WIDTH, HEIGHT = 1100, 780
+SHOTS = {"page-orbit.png": ("light", "/orbit"), "page-machine.png": ("dark", "")}
+"""By file, the colours and the view."""
+SETTLE_MS = 1500
+
+
+def main() -> None:
+    """Play the demo until the shaft rubs, and take the pictures then."""
+    command = [sys.executable, "-m", "daqsvc", "demo", "--page", "--again", "--json"]
+    with (
+        subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as demo,  # noqa: S603 - of this checkout
+        sync_playwright() as playwright,
+    ):
+        try:
+            take(demo, playwright)
+        finally:
+            demo.terminate()
+
+
+def take(demo: subprocess.Popen[str], playwright: Playwright) -> None:
+    """Take the pictures when the shaft rubs, by what the demo prints."""
+    assert demo.stdout is not None  # noqa: S101 - a pipe was asked for
+    address = json.loads(demo.stdout.readline())["address"].rstrip("/")
+    browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+    size = {"width": WIDTH, "height": HEIGHT}
+    pages = {
+        name: browser.new_page(color_scheme=scheme, viewport=size) for name, (scheme, _) in SHOTS.items()
+    }
+    has_begun = False
+    for line in demo.stdout:
+        told = json.loads(line)
+        if told["type"] == "diagnosis" and not has_begun:
+            has_begun = True
+            for name, (_, view) in SHOTS.items():
+                pages[name].goto(f"{address}/machines/laval-rig{view}")
+        if told["type"] == "alarm" and told["kind"] == "escalated":
+            break
+    Thread(target=demo.stdout.read, daemon=True).start()  # else it would wait for its reader
+    for name, page in pages.items():
+        page.wait_for_timeout(SETTLE_MS)
+        page.screenshot(path=DOCS / name)
+    browser.close()
+
+
+if __name__ == "__main__":
+    main()
