@@ -1,8 +1,9 @@
 """What passes of a machine, for who looks on: samples, statements, alarms. Nothing is made while nobody does.
 
 Who looks is told in lines of JSON. The first one is `LiveFeed.about`. Each further one has one key:
-``samples`` (of a stream, base64 of float32), ``statement``, ``alarm``, ``standing``, or ``left_out``: how
-many samples and other things were left out since the last line, as they were not taken fast enough.
+``samples`` (of a stream, base64 of float32), ``statement``, ``alarm``, ``standing``, ``left_out``: how many
+samples and other things were left out since the last line, as they were not taken fast enough; or ``alive``,
+where nothing else has passed for a while.
 """
 
 from __future__ import annotations
@@ -32,6 +33,9 @@ if TYPE_CHECKING:
     from daqsvc.settings.models import MachineFile
 
 SCHEMA = "daqsvc.live/1"
+ALIVE_S = 1.0
+"""After so long without anything it is told that the service is there."""
+ALIVE = b'{"alive":true}\n'
 GATHER_S = 0.05
 """What comes in so short a time is told together."""
 MOST_WAITING_BYTES = 4_000_000
@@ -83,9 +87,13 @@ class Looker:
         self._has_come.set()
 
     async def lines(self) -> bytes:
-        """What has come since, as lines; waits until there is something. Nothing at the end."""
+        """What has come since, as lines; waits for it, but not for long. Nothing at the end."""
         if not self._lines:
-            await self._has_come.wait()
+            try:
+                async with asyncio.timeout(ALIVE_S):
+                    await self._has_come.wait()
+            except TimeoutError:
+                return ALIVE
             if not self._is_over:
                 await asyncio.sleep(GATHER_S)
         told, self._lines = self._lines, []

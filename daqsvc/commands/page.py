@@ -1,16 +1,20 @@
-"""``daqsvc page``: the machines of this box, in a browser."""
+"""``daqsvc page``: the machines of this box, or snapshots of them, in a browser."""
 
 from __future__ import annotations
 
 import argparse
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_REFUSED, EXIT_USAGE
 from daqsvc.commands.store_argument import BadFileError, StoreNotFoundError, add_store, chosen_store
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from daqsvc.commands.machine_files import Load
+    from daqsvc.page.recorded import SnapshotSource
 
 PORT = 8420
 LOOPBACK = "127.0.0.1"
@@ -18,7 +22,7 @@ HIGHEST_PORT = 65_535
 
 
 class PageCommand:
-    """``daqsvc page [FILE | --store DIR]``.
+    """``daqsvc page [FILE | --store DIR]``, ``daqsvc page --snapshot FILE...``.
 
     Args:
         load: reads a machine file; None after its errors have been printed.
@@ -36,6 +40,15 @@ class PageCommand:
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `daqsvc.cli.Command.add_arguments`."""
+        self._parser = parser
+        parser.add_argument(
+            "--snapshot",
+            type=Path,
+            action="append",
+            metavar="FILE",
+            help="show a snapshot of the recorder in place of a service, played again and again; may be "
+            "repeated, e.g. for a healthy one beside it",
+        )
         parser.add_argument(
             "--port", type=_port, default=PORT, help=f"where it listens on {LOOPBACK} (default: {PORT})"
         )
@@ -43,20 +56,43 @@ class PageCommand:
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `daqsvc.cli.Command.run`."""
+        if arguments.snapshot is not None and (arguments.file or arguments.store):
+            self._parser.error("--snapshot shows no service: leave the machine file and --store out")
         try:
-            store = chosen_store(arguments, self._load).directory
-            from daqsvc.page.serving import PortError, serve  # noqa: PLC0415 - an extra
-        except BadFileError:
-            return EXIT_USAGE
-        except StoreNotFoundError as error:
-            return _failed(f"{error}")
+            from daqsvc.page.recorded import NoPictureError  # noqa: PLC0415 - an extra
+            from daqsvc.page.serving import PortError, serve  # noqa: PLC0415
+            from daqsvc.page.source import BoxSource  # noqa: PLC0415
+            from daqsvc.snapshots.reading import SnapshotError  # noqa: PLC0415
         except ModuleNotFoundError as error:
             return _failed(f"{error.name} is missing: install it with pip install 'daqsvc[page]'")
         try:
-            serve(store, LOOPBACK, arguments.port)
-        except PortError as error:
+            if arguments.snapshot is not None:
+                serve(_of_snapshots(arguments.snapshot), "snapshots", LOOPBACK, arguments.port)
+            else:
+                store = chosen_store(arguments, self._load).directory
+                serve(BoxSource(store), f"{store}", LOOPBACK, arguments.port)
+        except BadFileError:
+            return EXIT_USAGE
+        except (StoreNotFoundError, PortError) as error:
             return _failed(f"{error}")
+        except (SnapshotError, NoPictureError) as error:
+            _failed(f"{error}")
+            return EXIT_REFUSED
         return EXIT_OK
+
+
+def _of_snapshots(files: Sequence[Path]) -> SnapshotSource:
+    """Snapshots by the names of their files.
+
+    Raises:
+        SnapshotError: one cannot be read.
+        NoPictureError: one lacks what is needed.
+    """
+    from daqsvc.confined.limits import ResourceLimits  # noqa: PLC0415 - only what a verb needs
+    from daqsvc.page.recorded import SnapshotSource  # noqa: PLC0415
+    from daqsvc.snapshots.reading import read_snapshot  # noqa: PLC0415
+
+    return SnapshotSource({file.stem: read_snapshot(file, ResourceLimits()) for file in files})
 
 
 def _failed(why: str) -> int:

@@ -219,18 +219,37 @@ class MachineLive:
         )
 
     def _write(self, told: Document) -> None:
-        rows = np.frombuffer(base64.b64decode(told["values"]), "<f4").reshape(told["shape"])
-        stream, first = told["stream"], told["first_index"]
-        ring = self.rings.get(stream)
+        self.place(
+            SampleBlock(
+                told["stream"],
+                told["first_index"],
+                np.frombuffer(base64.b64decode(told["values"]), "<f4").reshape(told["shape"]),
+                told["t_first_ns"],
+                told["period_ns"],
+                quality=Quality(told["quality"]),
+            )
+        )
+
+    def place(self, block: SampleBlock) -> None:
+        """Take in samples; what is there already is left out, what is missing before them is a gap."""
+        ring = self.rings.get(block.stream)
         if ring is None:
-            ring = self.rings[stream] = self._ring(stream, rows.shape[1])
-        period_ns, t_first_ns = told["period_ns"], told["t_first_ns"]
-        if ring.started and (known := ring.end_index - first) > 0:  # whoever asks anew is told it again
-            rows, first, t_first_ns = rows[known:], first + known, t_first_ns + round(known * period_ns)
-            if not len(rows):
-                return
-        lost = first - ring.end_index if ring.started else 0
-        ring.write(SampleBlock(stream, first, rows, t_first_ns, period_ns, lost, Quality(told["quality"])))
+            ring = self.rings[block.stream] = self._ring(block.stream, block.samples.shape[1])
+        known = max(ring.end_index - block.first_index, 0) if ring.started else 0
+        if known >= len(block.samples):
+            return
+        first_index = block.first_index + known
+        ring.write(
+            SampleBlock(
+                block.stream,
+                first_index,
+                block.samples[known:],
+                block.t_first_ns + round(known * block.period_ns),
+                block.period_ns,
+                first_index - ring.end_index if ring.started else 0,
+                block.quality,
+            )
+        )
 
     def _ring(self, stream: str, channels: int) -> SampleRing:
         wanted = round(KEEP_S * self.rate_hz(stream))

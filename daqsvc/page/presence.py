@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Mapping
 
     from daqsvc.page.machine_live import MachineLive
-    from daqsvc.page.source import BoxSource, Listening
+    from daqsvc.page.sources import Heard, MachineSource
     from daqsvc.page.views.view import MachineView
 
 log = logging.getLogger(__name__)
@@ -40,7 +40,7 @@ class Picture:
     """
 
     def __init__(
-        self, source: BoxSource, machine: str, view: MachineView | None, chosen: Mapping[str, str]
+        self, source: MachineSource, machine: str, view: MachineView | None, chosen: Mapping[str, str]
     ) -> None:
         self._source = source
         self._machine = machine
@@ -98,13 +98,13 @@ class Picture:
                         self._made.notify_all()
                     await asyncio.sleep(max(every_s - (time.monotonic() - begun_s), 0.01))
 
-    def _streams(self, listening: Listening) -> set[str]:
+    def _streams(self, listening: Heard) -> set[str]:
         live = listening.live
         if self._view is None or live is None or self._view.why_not(live):
             return set()
         return self._view.streams(live, self._chosen)
 
-    def _told(self, listening: Listening) -> bytes:
+    def _told(self, listening: Heard) -> bytes:
         """What browsers are told now, as JSON; on a thread."""
         live = listening.live
         silent_s = time.monotonic() - listening.heard_s

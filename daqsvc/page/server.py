@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
     from daqsvc.page.charts import Theme
     from daqsvc.page.machine_live import MachineLive
-    from daqsvc.page.source import BoxSource
+    from daqsvc.page.sources import MachineSource
     from daqsvc.page.views.view import MachineView
 
 HEADERS = {
@@ -58,7 +58,7 @@ FIRST_S = 3.0
 """How long a page waits for what the service tells first."""
 
 
-def application(source: BoxSource) -> Starlette:
+def application(source: MachineSource) -> Starlette:
     """The page of a box; ``state.close`` ends what browsers listen to.
 
     Args:
@@ -103,7 +103,7 @@ class _Guarded:
 
 
 class _Page:
-    def __init__(self, source: BoxSource) -> None:
+    def __init__(self, source: MachineSource) -> None:
         self._source = source
         self._pictures: dict[tuple[str, ...], Picture] = {}
         self._templates = Environment(
@@ -135,11 +135,10 @@ class _Page:
     async def machine(self, request: Request) -> Response:
         """One machine, by one view or as a whole."""
         name, chosen_view = request.path_params["machine"], request.path_params.get("view")
-        async with self._source.looking(name) as listening:
-            live = await listening.first(FIRST_S)
+        live, why = await self._first(name)
         view = VIEWS.get(chosen_view or "")
         if live is None or (chosen_view and view is None):
-            why = listening.why_not or f"there is no view {chosen_view!r}"
+            why = why or f"there is no view {chosen_view!r}"
             page = self._html("absent.html", title=name, why=why)
             page.status_code = 404
             return page
@@ -161,8 +160,7 @@ class _Page:
     async def figures(self, request: Request) -> Response:
         """The figures of a view, for BokehJS."""
         view = VIEWS.get(request.path_params["view"])
-        async with self._source.looking(request.path_params["machine"]) as listening:
-            live = await listening.first(FIRST_S)
+        live, _ = await self._first(request.path_params["machine"])
         if view is None or live is None or view.why_not(live):
             return JSONResponse([])
         theme = THEMES.get(request.query_params.get("theme", ""), THEMES["light"])
@@ -174,15 +172,22 @@ class _Page:
     async def events(self, request: Request) -> Response:
         """What comes, for as long as the browser listens."""
         name, view = request.path_params["machine"], VIEWS.get(request.path_params.get("view", ""))
-        async with self._source.looking(name) as listening:
-            live = await listening.first(FIRST_S)
+        live, why = await self._first(name)
         if live is None:
-            return Response(listening.why_not, status_code=503)
+            return Response(why, status_code=503)
         _, chosen = _chosen(view, live, request.query_params)
         key = (name, view.name if view else "", *(f"{a}={b}" for a, b in sorted(chosen.items())))
         if key not in self._pictures:
             self._pictures[key] = Picture(self._source, name, view, chosen)
         return StreamingResponse(self._pictures[key].events(), media_type="text/event-stream")
+
+    async def _first(self, machine: str) -> tuple[MachineLive | None, str]:
+        """A machine; None if nothing is told of it, and why."""
+        try:
+            async with self._source.looking(machine) as heard:
+                return await heard.first(FIRST_S), heard.why_not
+        except KeyError:
+            return None, f"there is no {machine!r} here"
 
     def _html(self, template: str, **values: Any) -> HTMLResponse:
         return HTMLResponse(self._templates.get_template(template).render(version=__version__, **values))

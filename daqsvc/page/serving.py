@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING
 import uvicorn
 
 from daqsvc.page.server import application
-from daqsvc.page.source import BoxSource
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
     from starlette.applications import Starlette
+
+    from daqsvc.page.sources import MachineSource
 
 REMEDIES = {
     errno.EADDRINUSE: "end what listens there, or give another --port",
@@ -56,8 +56,14 @@ class _Server(uvicorn.Server):
         await super().shutdown(sockets)
 
 
-def serve(store: Path, host: str, port: int) -> None:
-    """Serve the page of the service on a store until SIGINT or SIGTERM; says where.
+def serve(source: MachineSource, what: str, host: str, port: int) -> None:
+    """Serve the page of a service, or of snapshots, until SIGINT or SIGTERM; says where.
+
+    Args:
+        source: of what is shown.
+        what: the same in words.
+        host: where it listens.
+        port: likewise; 0 for one that is free.
 
     Raises:
         PortError: it cannot listen there.
@@ -71,8 +77,8 @@ def serve(store: Path, host: str, port: int) -> None:
         ) from None
     with listening:
         where = f"http://{host}:{listening.getsockname()[1]}/"
-        print(f"the page of {store} is at {where}; Ctrl-C ends it", flush=True)  # noqa: T201 - for a person
-        app = application(BoxSource(store))
+        print(f"the page of {what} is at {where}; Ctrl-C ends it", flush=True)  # noqa: T201 - for a person
+        app = application(source)
         config = uvicorn.Config(
             app,
             log_level="warning",

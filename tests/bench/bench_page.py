@@ -102,7 +102,7 @@ async def readers(address: str, count: int) -> AsyncIterator[list[int]]:
 async def looked_at(plant: Watched, store: Path, targets: Targets) -> None:
     """By nobody, by ten readers, by a browser."""
     alone = await share(plant.cpu_s)
-    async with page_served(store) as (address, process):
+    async with page_served("--store", store) as (address, process):
         page = psutil.Process(process.pid)
 
         def page_s() -> float:

@@ -14,7 +14,7 @@ import pytest
 from axe_playwright_python.async_playwright import Axe
 from support.browsers import browsing, page_served
 from support.live_service import running, watch_of
-from support.recorded_rig import RATE_HZ, recorded_rig
+from support.recorded_rig import RATE_HZ, let_time_pass, play, recorded_rig, recorder_of, recording
 from support.waiting import PATIENCE_S, eventually
 
 from daqsvc.alarms.commands import AlarmCommand, Verb
@@ -98,7 +98,7 @@ async def test_every_view_shows_the_numbers_of_the_machine(tmp_path: Path) -> No
     store = tmp_path / "store"
     async with (
         live_rig(store, "page-views", faulty=False) as service,
-        page_served(store) as (address, _),
+        page_served("--store", store) as (address, _),
         browsing() as browser,
         tab(browser) as page,
     ):
@@ -154,7 +154,7 @@ async def test_an_alarm_appears_and_what_is_done_about_it(tmp_path: Path) -> Non
     store = tmp_path / "store"
     async with (
         live_rig(store, "page-alarm", faulty=True) as service,
-        page_served(store) as (address, _),
+        page_served("--store", store) as (address, _),
         browsing() as browser,
         tab(browser) as page,
     ):
@@ -178,7 +178,7 @@ async def test_an_alarm_appears_and_what_is_done_about_it(tmp_path: Path) -> Non
 async def test_what_is_not_heard_any_more_is_grey_and_says_its_age(tmp_path: Path) -> None:
     store = tmp_path / "store"
     silence = "#silence:not([hidden])"
-    async with browsing() as browser, page_served(store) as (address, _), tab(browser) as page:
+    async with browsing() as browser, page_served("--store", store) as (address, _), tab(browser) as page:
         await page.goto(address)
         assert "no daqsvc answers on this box" in await page.locator("main").inner_text()
         async with live_rig(store, "page-grey", faulty=False):
@@ -201,13 +201,13 @@ async def test_a_page_whose_server_is_gone_says_so(tmp_path: Path) -> None:
     async with live_rig(store, "page-gone", faulty=False), browsing() as browser:
         context = await browser.new_context()
         page = await context.new_page()
-        async with page_served(store) as (address, _):
+        async with page_served("--store", store) as (address, _):
             await page.goto(f"{address}/machines/laval-rig/timebase")
             await until_figures(page, "mean")
             port = int(address.rpartition(":")[2])
         gone = page.get_by_text("the page's server does not answer")
         await gone.wait_for(timeout=PATIENCE_MS)
-        async with page_served(store, port):
+        async with page_served("--store", store, "--port", port):
             await gone.wait_for(state="hidden", timeout=PATIENCE_MS)
         await context.close()
 
@@ -217,7 +217,7 @@ async def test_everybody_can_read_it(scheme: Any, tmp_path: Path) -> None:
     store = tmp_path / "store"
     async with (
         live_rig(store, f"page-read-{scheme}", faulty=True),
-        page_served(store) as (address, _),
+        page_served("--store", store) as (address, _),
         browsing() as browser,
         tab(browser, color_scheme=scheme) as page,
     ):
@@ -250,7 +250,7 @@ async def test_figures_stand_still_when_they_are_frozen(tmp_path: Path) -> None:
     store = tmp_path / "store"
     async with (
         live_rig(store, "page-freeze", faulty=False),
-        page_served(store) as (address, _),
+        page_served("--store", store) as (address, _),
         browsing() as browser,
         tab(browser) as page,
     ):
@@ -268,3 +268,42 @@ async def test_figures_stand_still_when_they_are_frozen(tmp_path: Path) -> None:
         await page.wait_for_url("**/orbit?probes=probe-x%2Cprobe-y&revolutions=16")
         assert await page.get_by_label("Length").input_value() == "16"
         assert math.isclose((await until_figures(page, "speed"))["speed"], 600.0, abs_tol=1.0)
+
+
+async def test_a_machine_of_which_nothing_comes_is_not_shown_as_a_service_that_is_gone(
+    tmp_path: Path,
+) -> None:
+    machine = recorded_rig("page-silent")[0].model_copy(update={"recorder": None})
+    async with (
+        running(machine, tmp_path / "store"),
+        page_served("--store", tmp_path / "store") as (address, _),
+        browsing() as browser,
+        tab(browser) as page,
+    ):
+        await page.goto(f"{address}/machines/laval-rig/orbit")
+        await page.get_by_text("no samples of these probes have come yet").wait_for(timeout=PATIENCE_MS)
+        for _ in range(50):
+            assert not await page.locator("#silence:not([hidden])").count(), "the service is there"
+            await asyncio.sleep(0.1)
+
+
+async def test_a_snapshot_is_played_in_the_same_views(tmp_path: Path) -> None:
+    machine, samples = recorded_rig("page-snapshot", before_s=3.0, after_s=1.0)
+    async with recording(machine, tmp_path / "store") as (service, clock):
+        await play(service, clock, samples[: round(6.5 * RATE_HZ) // 3 * 3])
+        await let_time_pass(service, clock, 12.0)
+        folder = recorder_of(service).folder.directory
+    [path, *_] = sorted(await asyncio.to_thread(lambda: list(folder.glob("*-alarm.mcap"))))
+    async with (
+        page_served("--snapshot", path) as (address, _),
+        browsing() as browser,
+        tab(browser) as page,
+    ):
+        await page.goto(address)
+        await page.get_by_role("link", name=path.stem).click()
+        row = page.locator("#alarms").get_by_role("row", name="rotor-fault")
+        await row.wait_for(timeout=PATIENCE_MS)
+        assert "rotor-bank finds" in await row.inner_text()
+        await page.get_by_role("link", name="Orbit").click()
+        told = await until_figures(page, "1X x")
+        assert 15.0 < told["1X x"] < 100.0

@@ -31,7 +31,7 @@ def ask(
 
 
 async def test_strangers_are_not_answered(tmp_path: Path) -> None:
-    async with page_served(tmp_path) as (address, process):
+    async with page_served("--store", tmp_path) as (address, process):
         status, text, headers = await asyncio.to_thread(ask, address, "/")
         assert status == 200
         assert "no daqsvc answers on this box" in text
@@ -68,3 +68,13 @@ def test_a_port_that_is_taken_is_one_sentence(tmp_path: Path, capsys: pytest.Cap
     with pytest.raises(SystemExit):
         main(["page", "--store", f"{tmp_path}", "--port", "70000"])
     assert "'70000' is no port: give a number from 0 to 65535" in capsys.readouterr().err
+
+
+def test_what_is_no_snapshot_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "odd.mcap"
+    file.write_bytes(b"nonsense" * 100)
+    assert main(["page", "--snapshot", f"{file}", "--port", "0"]) == 3
+    assert capsys.readouterr().err.startswith(f"daqsvc page: {file} cannot be read: it ")
+    with pytest.raises(SystemExit):
+        main(["page", "--snapshot", f"{file}", "--store", f"{tmp_path}"])
+    assert "leave the machine file and --store out" in capsys.readouterr().err

@@ -45,10 +45,11 @@ async def browsing() -> AsyncIterator[Browser]:
 
 
 @contextlib.asynccontextmanager
-async def page_served(store: Path, port: int = 0) -> AsyncIterator[tuple[str, asyncio.subprocess.Process]]:
-    """``daqsvc page`` of a store; its address and process."""
+async def page_served(*arguments: str | int | Path) -> AsyncIterator[tuple[str, asyncio.subprocess.Process]]:
+    """``daqsvc page`` with these arguments, at a free port unless they say one; its address and process."""
+    port = () if "--port" in arguments else ("--port", 0)
     process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "daqsvc", "page", "--store", str(store), "--port", f"{port}"),
+        *(sys.executable, "-m", "daqsvc", "page", *map(str, (*arguments, *port))),
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.PIPE,
     )

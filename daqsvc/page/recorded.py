@@ -1,0 +1,141 @@
+"""Snapshots of the recorder in place of a service: each is played in real time, again and again."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import time
+from typing import TYPE_CHECKING, Any
+
+from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.acquisition.samples import SampleBlock
+from daqsvc.page.machine_live import MachineLive
+from daqsvc.page.text import standing
+from daqsvc.snapshots.contents import ALARMS, DIAGNOSES, MACHINE_JSON, STANDING
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Iterable, Iterator, Mapping
+
+    from daqsvc.snapshots.contents import Entry, Snapshot
+
+    Document = dict[str, Any]
+
+KEYS = {DIAGNOSES: "statement", ALARMS: "alarm", STANDING: "standing"}
+"""What is told of a topic, by the key of `daqsvc.live_feed`."""
+STEP_S = 0.5
+PAUSE_S = 3.0
+"""Between the end and the next begin."""
+
+
+class NoPictureError(Exception):
+    """A snapshot that cannot be shown; the text says why."""
+
+
+class Playing:
+    """One snapshot that is played; as `daqsvc.page.source.Listening`.
+
+    Args:
+        snapshot: as read.
+        name: what it is called.
+
+    Raises:
+        NoPictureError: it lacks what is needed.
+    """
+
+    why_not = ""
+
+    def __init__(self, snapshot: Snapshot, name: str) -> None:
+        self._snapshot = snapshot
+        self._name = name
+        self._pass = 0
+        self.heard_s = time.monotonic()
+        try:
+            self._values = json.loads(snapshot.files[MACHINE_JSON])
+            self._begin_ns = int(snapshot.about["begin_ns"])
+            self.live = self._begun()
+        except (LookupError, TypeError, ValueError) as error:
+            raise NoPictureError(
+                f"the snapshot {name} has no machine file that the page can use ({type(error).__name__}); "
+                "show one that this version has made"
+            ) from None
+
+    async def first(self, _timeout_s: float) -> MachineLive:
+        """See `daqsvc.page.source.Listening.first`."""
+        return self.live
+
+    @contextlib.contextmanager
+    def wanting(self, _streams: Iterable[str]) -> Iterator[None]:
+        """All of its streams are there."""
+        yield
+
+    async def run(self) -> None:
+        """Play it until cancelled."""
+        while True:
+            begun_s = time.monotonic()
+            for entry in self._snapshot.entries:
+                await self._wait_until(begun_s + (entry.at_ns - self._begin_ns) / NS_PER_S)
+                self._hear(entry)
+            await self._wait_until(time.monotonic() + PAUSE_S)
+            self.live = self._begun()
+
+    def _begun(self) -> MachineLive:
+        self._pass += 1
+        about = {**self._snapshot.about, "machine": self._name, "values": self._values, "statements": []}
+        return MachineLive({**about, "begun_ns": self._pass})
+
+    def _hear(self, entry: Entry) -> None:
+        if isinstance(entry.what, SampleBlock):
+            self.live.place(entry.what)
+        elif entry.what.topic in KEYS:
+            self.live.hear({KEYS[entry.what.topic]: entry.what.document})
+
+    async def _wait_until(self, due_s: float) -> None:
+        while (now_s := time.monotonic()) < due_s:
+            self.heard_s = now_s
+            await asyncio.sleep(min(due_s - now_s, STEP_S))
+        self.heard_s = time.monotonic()
+
+
+class SnapshotSource:
+    """Snapshots as `daqsvc.page.source.BoxSource` has machines.
+
+    Args:
+        snapshots: by what they are called.
+
+    Raises:
+        NoPictureError: one lacks what is needed.
+    """
+
+    def __init__(self, snapshots: Mapping[str, Snapshot]) -> None:
+        self._playing = {name: Playing(one, name) for name, one in snapshots.items()}
+        self._tasks: list[asyncio.Task[None]] = []
+
+    async def statuses(self) -> list[Document]:
+        """See `daqsvc.page.source.BoxSource.statuses`."""
+        self._play()
+        return [
+            {"machine": name, "alarms": {"standing": standing(one.live)}}
+            for name, one in self._playing.items()
+        ]
+
+    @contextlib.asynccontextmanager
+    async def looking(self, machine: str) -> AsyncIterator[Playing]:
+        """See `daqsvc.page.source.BoxSource.looking`.
+
+        Raises:
+            KeyError: there is no such snapshot.
+        """
+        self._play()
+        yield self._playing[machine]
+
+    async def close(self) -> None:
+        """Play no more."""
+        for task in self._tasks:
+            task.cancel()
+        if self._tasks:
+            await asyncio.wait(self._tasks)
+
+    def _play(self) -> None:
+        if not self._tasks:
+            self._tasks = [asyncio.create_task(one.run(), name="snapshot") for one in self._playing.values()]
