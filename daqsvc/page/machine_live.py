@@ -80,6 +80,8 @@ class SensorPlace(NamedTuple):
 class MachineLive:
     """One machine, as it was told.
 
+    The event loop tells it, and threads look at it meanwhile: they copy what they go through, by ``[*...]``.
+
     Args:
         about: the first line of `daqsvc.live_feed`.
     """
@@ -104,7 +106,7 @@ class MachineLive:
     @property
     def speed_rpm(self) -> float:
         """What a detector says of the speed, or the machine file."""
-        for one in self.latest.values():
+        for one in [*self.latest.values()]:
             measured = one["statistics"].get("speed")
             if measured is not None and one["units"].get("speed") == "rpm":
                 return float(measured)

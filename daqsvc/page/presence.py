@@ -50,6 +50,7 @@ class Picture:
         self._made = asyncio.Condition()
         self._looking = 0
         self._is_over = False
+        self._has_failed = False
         self._task: asyncio.Task[None] | None = None
 
     async def events(self) -> AsyncIterator[bytes]:
@@ -92,7 +93,7 @@ class Picture:
                     if streams != wanted:
                         wanting.enter_context(listening.wanting(streams))
                         wanted = streams
-                    told = await asyncio.to_thread(self._told, listening)
+                    told = await asyncio.to_thread(self._whatever, listening)
                     async with self._made:
                         self._newest = b"data: " + told + b"\n\n"
                         self._made.notify_all()
@@ -103,6 +104,18 @@ class Picture:
         if self._view is None or live is None or self._view.why_not(live):
             return set()
         return self._view.streams(live, self._chosen)
+
+    def _whatever(self, listening: Heard) -> bytes:
+        """See `_told`; also of a mistake in this program browsers are told."""
+        try:
+            return self._told(listening)
+        except Exception:
+            if not self._has_failed:
+                self._has_failed = True
+                log.exception("the page cannot make %s of %s", self._view, self._machine)
+            return json.dumps(
+                {"age_s": 0.0, "why": "the page has failed to make it: its log says why"}
+            ).encode()
 
     def _told(self, listening: Heard) -> bytes:
         """What browsers are told now, as JSON; on a thread."""

@@ -33,7 +33,7 @@ STATES = {
 
 def standing(live: MachineLive) -> list[Document]:
     """The alarms that are not normal, the worst and newest first."""
-    alarms = [one for one in live.alarms.values() if one["state"] != "normal"]
+    alarms = [one for one in [*live.alarms.values()] if one["state"] != "normal"]
     return sorted(alarms, key=lambda one: (-WORST.get(one["level"], 0), -one["monotonic_ns"]))
 
 
@@ -88,15 +88,15 @@ def journal_rows(live: MachineLive) -> str:
             escape(one["message"])
             + (f" ({escape(one['by'])}: {escape(one['reason'])})" if one["by"] else ""),
         )
-        for one in reversed(live.journal)
+        for one in [*live.journal][: -MOST_EVENTS - 1 : -1]
     ]
-    return "".join(rows[:MOST_EVENTS]) or '<tr><td colspan="5">Nothing has happened.</td></tr>'
+    return "".join(rows) or '<tr><td colspan="5">Nothing has happened.</td></tr>'
 
 
 def machine_rows(live: MachineLive) -> str:
     """What each detector says, and what each channel measures."""
     rows = []
-    for one in sorted(live.latest.values(), key=lambda said: str(said["detector"])):
+    for one in sorted([*live.latest.values()], key=lambda said: str(said["detector"])):
         figures = ", ".join(
             f"{name} {value:.4g} {one['units'].get(name, '')}".rstrip()
             for name, value in one["statistics"].items()

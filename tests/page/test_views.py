@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import base64
+import json
 import time
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,6 +14,7 @@ import pytest
 from daqsvc.history.file import HistoryFile, Series
 from daqsvc.history.points import RECORD
 from daqsvc.page.machine_live import MachineLive
+from daqsvc.page.presence import Picture
 from daqsvc.page.shaft import order_1x, whirl
 from daqsvc.page.text import alarm_rows
 from daqsvc.page.views.all_views import VIEWS
@@ -277,3 +280,16 @@ def test_a_whirl_that_repeats_is_one_point_of_the_poincare_map() -> None:
     twice.hear(told(rows))
     shown = VIEWS["poincare"].shown(twice, {"probes": "left,right", "revolutions": "20"})
     assert np.ptp(shown.sources["poincare"]["x"]) > 6.0, "half the speed makes two clouds of it"
+
+
+async def test_a_view_that_fails_is_said_and_the_others_go_on(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    live = MachineLive(about())
+    heard = SimpleNamespace(live=live, why_not="", heard_s=time.monotonic())
+    broken, whole = (Picture(None, "rig", VIEWS[name], {}) for name in ("orbit", "timebase"))  # type: ignore[arg-type]
+    monkeypatch.setattr(type(VIEWS["orbit"]), "shown", lambda *_: 1 / 0)
+    for _ in range(2):
+        assert json.loads(broken._whatever(heard))["why"].startswith("the page has failed")  # type: ignore[arg-type]
+    assert len(caplog.records) == 1
+    assert "note" in json.loads(whole._whatever(heard))  # type: ignore[arg-type]

@@ -67,7 +67,12 @@ async function figures() {
   const theme = matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
   const query = new URLSearchParams(location.search);
   query.set("theme", theme);
-  const made = await (await fetch(`${live.dataset.figures}?${query}`)).json();
+  const answer = await fetch(`${live.dataset.figures}?${query}`);
+  if (!answer.ok) {
+    document.getElementById("note").textContent = "The figures cannot be made: load the page anew.";
+    return;
+  }
+  const made = await answer.json();
   const place = document.getElementById("figures");
   for (const one of made) {
     const figure = document.createElement("figure");

@@ -32,12 +32,12 @@ class ModesView:
 
     def choices(self, live: MachineLive) -> list[Choice]:
         """See `daqsvc.page.views.view.MachineView.choices`."""
-        detectors = {name: name for name, one in live.latest.items() if one["probabilities"]}
+        detectors = {name: name for name, one in [*live.latest.items()] if one["probabilities"]}
         return [Choice("detector", "Detector", detectors), Choice("length", "Length", LENGTHS)]
 
     def why_not(self, live: MachineLive) -> str:
         """See `daqsvc.page.views.view.MachineView.why_not`."""
-        if any(one["probabilities"] for one in live.latest.values()):
+        if any(one["probabilities"] for one in [*live.latest.values()]):
             return ""
         return "no detector of this machine has told any probabilities yet"
 
@@ -78,7 +78,7 @@ class ModesView:
     def shown(self, live: MachineLive, chosen: Mapping[str, str]) -> Shown:
         """See `daqsvc.page.views.view.MachineView.shown`."""
         detector = chosen["detector"]
-        said = list(live.said.get(detector, ()))
+        said = [*live.said.get(detector, ())]
         latest = live.latest[detector]
         now_ns = int(latest["monotonic_ns"])
         since_ns = now_ns - float(chosen["length"]) * NS_PER_S

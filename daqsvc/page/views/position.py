@@ -176,7 +176,7 @@ def _means(live: MachineLive, probes: tuple[str, str]) -> tuple[Any, Any]:
     said = [
         [
             (one.t_ns, one.statistics["mean"])
-            for one in live.said.get(f"levels/{name}", ())
+            for one in [*live.said.get(f"levels/{name}", ())]
             if "mean" in one.statistics
         ]
         for name in probes
