@@ -4,8 +4,9 @@ A request is one line of JSON, and so is its answer: see `ControlRequest` and `C
 `daqsvc.publish.service_status.ServiceStatusPayload`. The socket is ``control.sock`` in the store's directory,
 or in systemd's ``$RUNTIME_DIRECTORY`` with a link from there, mode 0600: only the service's own user and root
 may open it, and whoever may open it may command the alarms.
-Whatever a client sends or leaves unsent costs the service a counter and a few kilobytes at most. Clients that
-hang keep nobody out: each user has connections of their own, and the quietest of them makes way for the next.
+Whatever a client sends or leaves unsent costs the service a counter and a few kilobytes at most, or ten
+megabytes of one who looks on. Clients that hang keep nobody out: each user has connections of their own, and
+the quietest of them makes way for the next; so does the one who has looked on for longest.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ from daqsvc.outbox.files import is_possessed, is_read_only
 from daqsvc.outbox.reading import JOURNAL_NAME
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Collection, Iterator, Sequence
+    from collections.abc import Awaitable, Callable, Collection, Iterable, Iterator, Sequence
     from pathlib import Path
 
     from daqsvc.alarms.commands import AlarmCommand, CommandHandler
@@ -66,10 +67,10 @@ STATUS_S = 10.0
 """How long it waits for the status, which waits for nothing but the processor."""
 RELOAD_S = 120.0
 """How long it waits for a reload, which may compile kernels."""
-LIVE_BUFFER_BYTES = 256 * 1024
-"""What is handed to the kernel for one who looks on, at most; more waits, or is left out."""
+LIVE_PIECE_BYTES = 64 * 1024
+"""What is told at a time to one who looks on; the rest when that was taken."""
 MOST_LOOKING = 6
-"""Who may look on at a time: others have connections left for commands."""
+"""Who may look on at a time, beside the connections for commands."""
 SNAPSHOT_S = 90_000.0
 """How long it waits for a snapshot, which is complete some time after it was asked for."""
 LONGEST_STATUS = 32 * 1024 * 1024
@@ -261,12 +262,14 @@ class _Client:
         uid: whose.
         source: the same in words.
         busy: whether a request of it is being carried out.
+        looks: whether it looks on, for as long as it stays.
         task: serves it.
     """
 
     uid: int
     source: str
     busy: bool = False
+    looks: bool = False
     task: asyncio.Task[None] | None = None
 
 
@@ -313,7 +316,6 @@ class ControlServer:
         self._files = tuple(f"{file.absolute()}" for file in files)
         self._snapshot = snapshot
         self._look = look
-        self._looking = 0
         self._server: asyncio.Server | None = None
         self._inode: int | None = None
         self._refused = ""
@@ -438,14 +440,25 @@ class ControlServer:
 
     def _make_room(self, uid: int) -> bool:
         """Whether there is room for one more connection of a user; only that user's others make way."""
-        theirs = [client for client in self._clients if client.uid == uid and not _is_ending(client)]
+        theirs = [one for one in self._clients if one.uid == uid and not (one.looks or _is_ending(one))]
         if len(theirs) < MOST_CLIENTS:
             return True
-        quiet = next((client for client in theirs if not client.busy), None)
-        if quiet is None or quiet.task is None:
+        return self._displace(client for client in theirs if not client.busy)
+
+    def _make_room_to_look(self, uid: int) -> bool:
+        """Whether one more may look on; the one of the same user who has looked for longest makes way."""
+        looking = [one for one in self._clients if one.looks and not _is_ending(one)]
+        if len(looking) < MOST_LOOKING:
+            return True
+        return self._displace(client for client in looking if client.uid == uid)
+
+    def _displace(self, clients: Iterable[_Client]) -> bool:
+        """End the first of some connections; whether there is one."""
+        first = next(iter(clients), None)
+        if first is None or first.task is None:
             return False
         self.counters.clients_displaced += 1
-        quiet.task.cancel()
+        first.task.cancel()
         return True
 
     async def _serve(
@@ -455,7 +468,7 @@ class ControlServer:
             while (line := await _next_line(reader)) is not None:
                 client.busy = True
                 if self._look is not None and line.startswith(_LIVE_VERB):
-                    await self._tell_live(self._look, line, reader, writer)
+                    await self._tell_live(self._look, line, client, reader, writer)
                     return
                 answer = await self._told(line, client.source)
                 client.busy = False
@@ -506,38 +519,42 @@ class ControlServer:
         return _json_line(WhichMachineAnswer(accepted=False, reason=reason, machines=told))
 
     async def _tell_live(
-        self, look: Look, line: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+        self,
+        look: Look,
+        line: bytes,
+        client: _Client,
+        reader: asyncio.StreamReader,
+        writer: asyncio.StreamWriter,
     ) -> None:
         """Tell one who looks on what passes, until it goes or nothing more comes."""
-        looking = self._begun_looking(look, line)
+        looking = self._begun_looking(look, line, client)
         if isinstance(looking, ControlAnswer):
             self.counters.malformed += 1
             writer.write(_json_line(looking))
             return
-        self._looking += 1
-        writer.transport.set_write_buffer_limits(high=LIVE_BUFFER_BYTES)
+        client.looks = True
+        writer.transport.set_write_buffer_limits(high=LIVE_PIECE_BYTES)
         # Whatever the client still says: it is heard only that it goes.
-        gone = asyncio.create_task(reader.read(1), name="one who looks on goes")
+        gone = asyncio.create_task(_until_end(reader), name="one who looks on goes")
+        telling: asyncio.Future[bytes] | None = None
         try:
             while not gone.done():
                 telling = asyncio.ensure_future(looking.lines())
                 await asyncio.wait({telling, gone}, return_when=asyncio.FIRST_COMPLETED)
-                if not telling.done():
-                    telling.cancel()
-                    await asyncio.wait({telling})
+                if not telling.done() or not (told := telling.result()):
                     return
-                if not (told := telling.result()):
-                    return
-                writer.write(told)
-                async with asyncio.timeout(PATIENCE_S):
-                    await writer.drain()
+                for at in range(0, len(told), LIVE_PIECE_BYTES):
+                    writer.write(told[at : at + LIVE_PIECE_BYTES])
+                    async with asyncio.timeout(PATIENCE_S):
+                        await writer.drain()
         finally:
-            self._looking -= 1
             looking.leave()
-            gone.cancel()
-            await asyncio.wait({gone})
+            ending = {one for one in (gone, telling) if one is not None}
+            for one in ending:
+                one.cancel()
+            await asyncio.wait(ending)
 
-    def _begun_looking(self, look: Look, line: bytes) -> Looking | ControlAnswer:
+    def _begun_looking(self, look: Look, line: bytes, client: _Client) -> Looking | ControlAnswer:
         """Begin to look at the machine that a request names, or say why not."""
         try:
             asked = LiveRequest.read(line)
@@ -545,13 +562,14 @@ class ControlServer:
             fault = faults_of(error, "it")[0] if isinstance(error, ValidationError) else f"{error}"
             return ControlAnswer(accepted=False, reason=f"the request is not valid, {fault}"[:500])
         machine = asked.machine
-        if self._looking >= MOST_LOOKING:
+        looking = look(machine, asked.streams)
+        if isinstance(looking, Looking):
+            if self._make_room_to_look(client.uid):
+                return looking
+            looking.leave()
             return ControlAnswer(
                 accepted=False, reason=f"{MOST_LOOKING} others look already; end one of them"
             )
-        looking = look(machine, asked.streams)
-        if isinstance(looking, Looking):
-            return looking
         reason = "name a machine" if machine is None else f"this service does not watch {machine!r:.200}"
         return WhichMachineAnswer(accepted=False, reason=reason, machines=looking)
 
@@ -817,6 +835,13 @@ async def _next_line(reader: asyncio.StreamReader) -> bytes | None:
         if end.partial:
             raise
         return None
+
+
+async def _until_end(reader: asyncio.StreamReader) -> None:
+    """Wait until a client says no more, or has gone."""
+    with contextlib.suppress(ConnectionError):
+        while await reader.read(LONGEST_LINE):
+            pass
 
 
 def _json_line(message: ControlRequest | ControlAnswer) -> bytes:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import base64
 from collections import deque
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -25,7 +26,7 @@ from daqsvc.machine_facts import machine_values, stream_facts
 from daqsvc.publish.payloads import alarm_document, statement_document
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 
     from daqsvc.acquisition.clock import Clock
     from daqsvc.acquisition.ring import SampleRing
@@ -58,13 +59,13 @@ class Looker:
     """One who looks on.
 
     Args:
-        about: the first line.
+        about: makes the first line, on a thread.
         streams: those whose samples are wanted.
     """
 
-    def __init__(self, about: bytes, streams: Collection[str]) -> None:
+    def __init__(self, about: Callable[[], dict[str, Any]], streams: Collection[str]) -> None:
         self.streams = frozenset(streams)
-        self._lines = [about]
+        self._about: Callable[[], dict[str, Any]] | None = about
         self._waiting: deque[_Happened] = deque()
         self._bytes = 0
         self._left_out = 0
@@ -88,7 +89,7 @@ class Looker:
 
     async def lines(self) -> bytes:
         """What has come since, as lines; waits for it, but not for long. Nothing at the end."""
-        if not self._lines:
+        if self._about is None:
             try:
                 async with asyncio.timeout(ALIVE_S):
                     await self._has_come.wait()
@@ -96,16 +97,13 @@ class Looker:
                 return ALIVE
             if not self._is_over:
                 await asyncio.sleep(GATHER_S)
-        told, self._lines = self._lines, []
+        about, self._about = self._about, None
         items, self._waiting, self._bytes = self._waiting, deque(), 0
         left_out, self._left_out = self._left_out, 0
         self._has_come.clear()
         if self._is_over:
             self._has_come.set()
-        told += map(_line, _told(items))
-        if left_out:
-            told.append(_line({"left_out": left_out}))
-        return b"".join(told)
+        return await asyncio.to_thread(_encoded, about, items, left_out)
 
 
 class LiveFeed:
@@ -168,9 +166,12 @@ class LiveFeed:
             standings: see `about`.
             rings: what has come lately, by stream and grid.
         """
-        looker = Looker(_line(self.about(statements, alarms, standings)), streams)
-        for stream in looker.streams & rings.keys():
-            if (before := _before(rings[stream])) is not None:
+        # Copied here, and made into text on a thread: that takes its time of thousands of sensors.
+        about = partial(self.about, [*statements], [*alarms], dict(standings))
+        looker = Looker(about, streams)
+        wanted = sorted(looker.streams & rings.keys())
+        for stream in wanted:
+            if (before := _before(rings[stream], MOST_WAITING_BYTES // (2 * len(wanted)))) is not None:
                 looker.add(before)
         self._lookers.add(looker)
         return looker
@@ -208,15 +209,24 @@ class LiveFeed:
             looker.add(happened)
 
 
-def _before(ring: SampleRing) -> SampleBlock | None:
-    """What a ring holds of the last `BEFORE_S`, no more than may wait together; None if that is nothing."""
-    if not ring.started:
+def _before(ring: SampleRing, most_bytes: int) -> SampleBlock | None:
+    """What a ring holds of the last `BEFORE_S`, of the newest no more than so many bytes; None if nothing."""
+    most = most_bytes // (4 * len(ring.channels))
+    if not ring.started or not most:
         return None
     last = ring.end_index - 1
-    most = MOST_WAITING_BYTES // 2 // (4 * len(ring.channels))
     count = min(round(BEFORE_S * NS_PER_S / ring.period_at(last)), last + 1 - ring.oldest_index, most)
     first = last + 1 - count
     return SampleBlock(ring.stream, first, ring.read(first, count), ring.time_of(first), ring.period_at(last))
+
+
+def _encoded(about: Callable[[], dict[str, Any]] | None, items: Iterable[_Happened], left_out: int) -> bytes:
+    """Lines of JSON; on a thread."""
+    told = [] if about is None else [about()]
+    told += _told(items)
+    if left_out:
+        told.append({"left_out": left_out})
+    return b"".join(map(_line, told))
 
 
 def _told(items: Iterable[_Happened]) -> Iterator[dict[str, Any]]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import sys
-from typing import TYPE_CHECKING
+import tempfile
+from typing import IO, TYPE_CHECKING
 
 from sim_hw.demo.machines import DemoError
 
@@ -25,30 +26,31 @@ async def page_of(store: Path) -> AsyncIterator[str]:
     Raises:
         DemoError: it does not start.
     """
-    process, said = None, ""
-    for port in PORTS:
-        process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "daqsvc", "page", "--store", f"{store}", "--port", f"{port}"),
-            stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.PIPE,
-            start_new_session=True,  # Ctrl-C is for the demo, which ends it
-        )
-        said = await _first_line(process)
-        if " is at http://" in said:
-            break
-    assert process is not None  # noqa: S101 - there are ports
-    try:
-        if " is at http://" not in said:
-            raise DemoError(f"--page: {said}")
-        yield said.partition(" is at ")[2].partition(";")[0]
-    finally:
-        if process.returncode is None:
-            process.terminate()
-        await process.communicate()
+    with tempfile.TemporaryFile() as wrong:  # a pipe would have to be read meanwhile
+        process, said = None, ""
+        for port in PORTS:
+            process = await asyncio.create_subprocess_exec(
+                *(sys.executable, "-m", "daqsvc", "page", "--store", f"{store}", "--port", f"{port}"),
+                stdout=asyncio.subprocess.PIPE,
+                stderr=wrong,
+                start_new_session=True,  # Ctrl-C is for the demo, which ends it
+            )
+            said = await _first_line(process, wrong)
+            if " is at http://" in said:
+                break
+        assert process is not None  # noqa: S101 - there are ports
+        try:
+            if " is at http://" not in said:
+                raise DemoError(f"--page: {said}")
+            yield said.partition(" is at ")[2].partition(";")[0]
+        finally:
+            if process.returncode is None:
+                process.terminate()
+            await process.communicate()
 
 
-async def _first_line(process: asyncio.subprocess.Process) -> str:
-    """Where it is; or why it is not, when it has ended."""
+async def _first_line(process: asyncio.subprocess.Process, wrong: IO[bytes]) -> str:
+    """Where it is; or why it is not, by the end of what it has said, when it has ended."""
     assert process.stdout is not None  # noqa: S101 - a pipe was asked for
     try:
         async with asyncio.timeout(START_S):
@@ -58,5 +60,7 @@ async def _first_line(process: asyncio.subprocess.Process) -> str:
         said = ""
     if said:
         return said.strip()
-    _, err = await process.communicate()
-    return err.decode().strip() or "the page does not start"
+    await process.communicate()
+    wrong.seek(0)
+    lines = wrong.read().decode(errors="replace").split("\n")
+    return next((line for line in reversed(lines) if line), "the page does not start")

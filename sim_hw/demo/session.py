@@ -263,9 +263,10 @@ class DemoSession:
         """Frames that were sent when what is played now began."""
 
     def enough(self) -> bool:
-        """End in order if it is played again by now; whether that is so."""
+        """End in order if it is played again by now; whether that is so, and it was not asked before."""
+        is_first = not self._enough.is_set()
         self._enough.set()
-        return self._is_repeating
+        return self._is_repeating and is_first
 
     async def run(self) -> DemoOutcome:
         """Play it from the beginning to the end.

@@ -17,8 +17,9 @@ from support.waiting import PATIENCE_S, eventually
 
 from daqsvc import live_feed
 from daqsvc.acquisition.clock import DrivenClock
+from daqsvc.acquisition.ring import SampleRing
 from daqsvc.acquisition.samples import SampleBlock
-from daqsvc.control import MOST_LOOKING, SOCKET
+from daqsvc.control import MOST_CLIENTS, MOST_LOOKING, SOCKET
 from daqsvc.live_feed import LiveFeed
 
 if TYPE_CHECKING:
@@ -109,30 +110,47 @@ def await_more(told: list[dict[str, Any]], count: int) -> bool:
 
 
 @pytest.mark.integration
-async def test_those_who_look_on_leave_room_for_commands(tmp_path: Path) -> None:
+async def test_those_who_look_on_leave_room_for_commands_and_for_each_other(tmp_path: Path) -> None:
     store = tmp_path / "store"
     async with running(rig("live-room"), store) as service, contextlib.AsyncExitStack() as all_of_them:
+        feed = watch_of(service).live
+        first, _ = await all_of_them.enter_async_context(looking(store))
+        await next_line(first)
         for _ in range(MOST_LOOKING):
             reader, writer = await all_of_them.enter_async_context(looking(store))
             assert "schema" in await next_line(reader)
-        async with looking(store) as (refused, _):
-            assert (await next_line(refused))[
-                "reason"
-            ] == f"{MOST_LOOKING} others look already; end one of them"
-        async with looking(store, b', "machine": "other"}') as (refused, _):
-            assert "others look" in (await next_line(refused))["reason"]
-        asking, question = await asyncio.open_unix_connection(store / SOCKET)
-        question.write(b'{"schema": "daqsvc.control/1", "verb": "standing"}\n')
-        assert (await next_line(asking))["accepted"]
-        question.close()
-        writer.close()
-        feed = watch_of(service).live
-        await eventually(lambda: len(feed._lookers) == MOST_LOOKING - 1, "its place is free")
+        async with asyncio.timeout(PATIENCE_S):
+            await first.read()  # until its end: it has looked for longest, and makes way
+        await eventually(lambda: len(feed._lookers) == MOST_LOOKING, "its place was given away")
+        for _ in range(MOST_CLIENTS):  # as many as if nobody looked
+            asking, question = await asyncio.open_unix_connection(store / SOCKET)
+            all_of_them.callback(question.close)
+            question.write(b'{"schema": "daqsvc.control/1", "verb": "standing"}\n')
+            assert (await next_line(asking))["accepted"]
+        writer.write(b"whatever is said meanwhile\n")
+        assert await next_line(reader), "it is told all the same"
         async with looking(store, b', "machine": "other"}') as (refused, _):
             told = await next_line(refused)
+        assert len(feed._lookers) == MOST_LOOKING, "nobody made way for that"
         assert (told["reason"], told["machines"]) == ("this service does not watch 'other'", ["laval-rig"])
         async with looking(store, b', "streams": "shaft"}') as (refused, _):
             assert "streams" in (await next_line(refused))["reason"]
+        # The service ends while they look: nothing of them is left.
+
+
+@pytest.mark.integration
+async def test_who_looks_on_is_one_of_another_user_and_stays(tmp_path: Path) -> None:
+    """Places of others are not given away."""
+    store = tmp_path / "store"
+    async with running(rig("live-others"), store) as service, contextlib.AsyncExitStack() as all_of_them:
+        for _ in range(MOST_LOOKING):
+            reader, _ = await all_of_them.enter_async_context(looking(store))
+            await next_line(reader)
+        for client in service.control._clients:
+            client.uid += 1
+        async with looking(store) as (refused, _):
+            assert (await next_line(refused))["reason"] == "6 others look already; end one of them"
+        assert len(watch_of(service).live._lookers) == MOST_LOOKING
 
 
 @pytest.mark.integration
@@ -184,3 +202,18 @@ async def test_blocks_behind_a_gap_are_told_apart() -> None:
     _, first, second = [json.loads(line) for line in (await looker.lines()).splitlines()]
     assert (first["samples"]["shape"], first["samples"]["t_first_ns"]) == ([15, 2], 0)
     assert (second["samples"]["first_index"], second["samples"]["t_first_ns"]) == (20, 20_000)
+
+
+async def test_streams_share_what_is_told_of_the_time_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live_feed, "MOST_WAITING_BYTES", 3 * 2 * 8 * 50)
+    feed = LiveFeed(rig("live-before"), DrivenClock())
+    rings = {}
+    for name in ("a", "b", "c", "d"):
+        rings[name] = SampleRing(name, ["x", "y"], 1000)
+        rings[name].write(block(0, 400, name))
+    looker = feed.look(["a", "b", "c"], [], [], {}, rings)
+    _, *told = [json.loads(line) for line in (await looker.lines()).splitlines()]
+    assert {one["samples"]["stream"]: one["samples"]["shape"] for one in told} == {
+        name: [50, 2] for name in "abc"
+    }
+    assert {one["samples"]["first_index"] for one in told} == {350}

@@ -60,6 +60,7 @@ async def test_what_is_played_again_loses_nothing_and_ends_when_it_is_enough() -
     )
     declared = len(session.outcome.diagnoses)
     assert session.enough()
+    assert not session.enough(), "a second Ctrl-C breaks it off"
     outcome = await playing
     assert outcome.complete
     assert outcome.samples_sent > len(script.samples)
