@@ -294,6 +294,24 @@ def test_of_one_day_the_rate_is_known_and_the_date_is_not(tmp_path, form):
     assert (stream.rate_hz, stream.start) == (pytest.approx(RATE_HZ), "")
 
 
+@pytest.mark.parametrize("head", [("Time", "x"), ("Date", "Time", "x")])
+def test_of_one_day_the_date_is_not_known_where_zones_carry_it_over_midnight(tmp_path, head):
+    """The clock is one o'clock, and UTC midnight."""
+    moments = [datetime(2026, 2, 1, 0, 59, 59, 900_000) + timedelta(milliseconds=k) for k in range(300)]  # noqa: DTZ001
+    form = f"%d/%m/%Y{' ' if len(head) == 2 else ','}%H:%M:%S.%f+01:00"
+    (stream,), _ = load_all(dated(tmp_path, moments, form, head=head))
+    assert (stream.rate_hz, stream.start) == (pytest.approx(RATE_HZ), "")
+
+
+def test_a_clock_is_a_day_later_behind_midnight_though_that_is_not_known(tmp_path):
+    cells = [f"{one:%H:%M:%S.%f}" for one in around(2026, 2, 1)]
+    cells[149:152] = [""] * 3
+    path = table(tmp_path, cells, comma=False)
+    assert load_recording(path, rate_hz=RATE_HZ).notes == ()
+    with pytest.raises(RecordingError, match=r"is 1000 Hz \(time column 'Zeit'.* and 700 Hz as given"):
+        load_recording(path, rate_hz=700.0)
+
+
 def test_dates_that_leap_either_way_are_refused(tmp_path):
     path = dated(tmp_path, around(2026, 2, 5, gap=timedelta(days=3)), WAYS_OF_DATES[1])
     with pytest.raises(RecordingError) as refused:

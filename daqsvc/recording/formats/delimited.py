@@ -25,7 +25,6 @@ from daqsvc.recording.formats.table_layout import SNIFFED_LINES, is_number, layo
 from daqsvc.recording.formats.written_times import (
     EitherDateError,
     in_turn,
-    is_same_day,
     joined_times,
     times_of,
 )
@@ -38,7 +37,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.confined.limits import Budget
-    from daqsvc.recording.formats.written_times import TimeFormat, WrittenTimes
+    from daqsvc.recording.formats.written_times import ColumnTimes, TimeFormat, WrittenTimes
 
     Floats: TypeAlias = NDArray[np.float64]
     from collections.abc import Iterator, Sequence
@@ -194,18 +193,20 @@ class _DelimitedTable:
             date: int | None = i
             if forms[i].holds == "date":
                 continue
-            joined = column
+            joined = column.times
             if forms[i].holds == "time":
                 date = _beside(i, forms)
                 joined = (
-                    in_turn(column) if date is None else column + (columns[date] - np.datetime64(0, "ns"))
+                    in_turn(column.times)
+                    if date is None
+                    else column.times + (columns[date].times - np.datetime64(0, "ns"))
                 )
             entries[layout.names[i]] = joined
-            if date is None or (forms[date].either and not forms[i].halves and is_same_day(columns[date])):
+            if date is None or not columns[date].is_dated:
                 undated.append(layout.names[i])
         return entries, undated
 
-    def _column(self, i: int, pieces: Sequence[WrittenTimes], length: int) -> NDArray[np.datetime64]:
+    def _column(self, i: int, pieces: Sequence[WrittenTimes], length: int) -> ColumnTimes:
         """The times of a column by its number.
 
         Raises:

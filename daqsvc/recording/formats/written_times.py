@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -128,8 +128,21 @@ class EitherDateError(ValueError):
     """Nothing tells which of two numbers is the day and which is the month."""
 
 
-def joined_times(pieces: Sequence[WrittenTimes], form: TimeFormat, length: int) -> Times:
-    """The times of a whole column in UTC where each names its zone, else as the clock on the wall had them.
+class ColumnTimes(NamedTuple):
+    """The times of a whole column.
+
+    Attributes:
+        times: datetime64[ns] ``[n]``, in UTC where each names its zone, else as the clock on the wall had
+            them.
+        is_dated: whether their day is known, where the column has one.
+    """
+
+    times: Times
+    is_dated: bool
+
+
+def joined_times(pieces: Sequence[WrittenTimes], form: TimeFormat, length: int) -> ColumnTimes:
+    """The times of a whole column.
 
     Args:
         pieces: of the column, one behind the other.
@@ -141,25 +154,27 @@ def joined_times(pieces: Sequence[WrittenTimes], form: TimeFormat, length: int) 
     """
     times = np.concatenate([piece.times for piece in pieces])[:length]
     others = [piece.others for piece in pieces if piece.others is not None]
+    is_dated = True
     if form.either:
-        times = _of_two_ways(times, np.concatenate(others)[:length], halves=form.halves)
+        # Before the zones, which may carry the rows of one day over midnight.
+        times, is_dated = _of_two_ways(times, np.concatenate(others)[:length], halves=form.halves)
     offsets_ns = [piece.offsets_ns for piece in pieces if piece.offsets_ns is not None]
     zoned = [piece.zoned for piece in pieces if piece.zoned is not None]
     if len(zoned) < len(pieces):
-        return times
+        return ColumnTimes(times, is_dated)
     # A zone that some rows name and others do not says nothing of these.
     if (np.concatenate(zoned)[:length] | np.isnat(times)).all():
         times = times - np.concatenate(offsets_ns)[:length].astype("timedelta64[ns]")
-    return times
+    return ColumnTimes(times, is_dated)
 
 
-def is_same_day(times: Times) -> bool:
+def _is_same_day(times: Times) -> bool:
     """Whether all times that are known are of one date."""
     days = times[~np.isnat(times)].astype("datetime64[D]")
     return not len(days) or bool((days == days[0]).all())
 
 
-def _of_two_ways(day_first: Times, month_first: Times, *, halves: bool) -> Times:
+def _of_two_ways(day_first: Times, month_first: Times, *, halves: bool) -> ColumnTimes:
     """The way to read dates in which every one is a date, and the rows go on by less than a day.
 
     Raises:
@@ -167,16 +182,16 @@ def _of_two_ways(day_first: Times, month_first: Times, *, halves: bool) -> Times
     """
     lacking = [int(np.isnat(times).sum()) for times in (day_first, month_first)]
     if lacking[0] != lacking[1]:
-        return day_first if lacking[0] < lacking[1] else month_first
+        return ColumnTimes(day_first if lacking[0] < lacking[1] else month_first, is_dated=True)
     leaps = [_leaps(times) for times in (day_first, month_first)]
     if leaps[0] != leaps[1]:
-        return month_first if leaps[0] else day_first
+        return ColumnTimes(month_first if leaps[0] else day_first, is_dated=True)
     # Who writes AM and PM mostly writes the month first.
     if halves:
-        return month_first
+        return ColumnTimes(month_first, is_dated=True)
     # On one day the distances, and so the rate, are the same either way.
-    if not leaps[0] and is_same_day(day_first):
-        return day_first
+    if not leaps[0] and _is_same_day(day_first):
+        return ColumnTimes(day_first, is_dated=False)
     raise EitherDateError
 
 
@@ -187,11 +202,12 @@ def _leaps(times: Times) -> bool:
 
 def in_turn(times: Times) -> Times:
     """Times of a clock alone, a day later behind each midnight."""
-    steps = np.diff(times.astype(np.int64))
-    known = ~(np.isnat(times[1:]) | np.isnat(times[:-1]))
-    days = np.cumsum(known & (steps < -_DAY_NS // 2))
+    # From one known time to the next: midnight may pass where the time is not known.
+    known = np.flatnonzero(~np.isnat(times))
+    steps = np.diff(times[known].astype(np.int64))
+    days = np.cumsum(steps < -_DAY_NS // 2)
     later = times.copy()
-    later[1:] += (days * _DAY_NS).astype("timedelta64[ns]")
+    later[known[1:]] += (days * _DAY_NS).astype("timedelta64[ns]")
     return later
 
 
