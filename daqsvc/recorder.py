@@ -484,13 +484,19 @@ class MachineRecorder:
         self._add_cause(one, kind, words)
         return one
 
-    def _schedule(self) -> None:
-        """Begin a snapshot; one that is open does not last longer for it, as nothing has happened."""
-        now_ns = self._clock.monotonic_ns()
+    def _schedule(self, due_ns: int, now_ns: int) -> None:
+        """Begin a snapshot; one that is open does not last longer for it, as nothing has happened.
+
+        It reaches back from when it was due, not from the turn after: so it joins the one before.
+        """
+        if self._open is not None and self._open.until_ns <= now_ns:
+            # It is over, and may wait for detectors: the next one is not to fail for that.
+            self._ending.append(self._open)
+            self._open = None
         if self._open is not None:
             self._add_cause(self._open, "scheduled", SCHEDULED)
         else:
-            begin_ns, until_ns = now_ns - self._before_ns, now_ns + self._after_ns
+            begin_ns, until_ns = due_ns - self._before_ns, now_ns + self._after_ns
             self._open = self._begun("scheduled", SCHEDULED, begin_ns, until_ns)
 
     def _add_cause(self, one: _Open, kind: Kind, words: str) -> None:
@@ -595,7 +601,7 @@ class MachineRecorder:
         every_s = self._settings.every_s
         if every_s is not None and (self._due_ns is None or now_ns >= self._due_ns):
             if self._due_ns is not None:
-                self._schedule()
+                self._schedule(self._due_ns, now_ns)
             self._due_ns = now_ns + round(every_s * NS_PER_S)
         for snapshot in [one for one in self._lingering if not self._is_near(one, now_ns)]:
             self._lingering.remove(snapshot)

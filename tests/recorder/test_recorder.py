@@ -319,6 +319,20 @@ async def test_snapshots_come_by_the_clock(tmp_path: Path) -> None:
         assert [path.name.rpartition("-")[2] for path in one.files] == 3 * ["scheduled.mcap"]
 
 
+@pytest.mark.parametrize(("before_s", "judging"), [(0.0, False), (4.0, False), (1.0, True), (4.0, True)])
+async def test_snapshots_by_the_clock_join_where_they_are_as_long_as_they_are_apart(
+    tmp_path: Path, before_s: float, *, judging: bool
+) -> None:
+    async with bench(tmp_path, before_s=before_s, after_s=10.0 - before_s, every_s=10.0) as one:
+        one.is_judging = judging
+        await one.passes(42.0)
+        files = one.files
+    assert [held(path)[0]["causes"] for path in files] == 4 * [["scheduled"]]
+    assert one.recorder.counters.snapshots == 4
+    seen = {first for path in files for first in firsts_in(path)}
+    assert seen == set(range(min(seen), max(seen) + 1, ROWS)), "no sample is missing"
+
+
 async def test_a_snapshot_is_made_at_each_step_of_the_speed(tmp_path: Path) -> None:
     async with bench(tmp_path, every_rpm=100.0, before_s=0.0, after_s=0.5) as one:
         for speed_rpm in [0.0, *np.arange(10.0, 400.0, 5.0), *np.arange(400.0, 130.0, -5.0)]:
