@@ -186,7 +186,7 @@ class _Open:
         asked: who waits for it.
         writing: what a thread is writing now; its file, if that is complete then.
         writer: its file; None before that is open.
-        last: what was handed out last of what waited.
+        last: what was handed out last of what the history had.
     """
 
     kind: Kind
@@ -220,8 +220,9 @@ class _Open:
         """What waits, as far as an end; nothing waits then."""
         taken, self.waiting = self.waiting[:end], []
         self.came_bytes = self._held = 0
-        if taken:
-            self.last = taken[-1]
+        # Causes, and what detectors remembered, stand in no history: nothing would be found behind them.
+        happened = (item for item in reversed(taken) if not isinstance(item.what, _Caused | _Remembered))
+        self.last = next(happened, self.last)
         return taken
 
     def go_on(self, missed: list[_Item], until_ns: int) -> None:

@@ -92,9 +92,12 @@ class Bench:
         window = Window(self._index - 1, np.zeros((1, 3), np.float32), self.clock.monotonic_ns(), 1.5e6)
         self.recorder.processed(Remembering(detector, stream, memory), window)
 
-    async def passes(self, seconds: float) -> None:
+    async def passes(self, seconds: float, *, silent: bool = False) -> None:
         for _ in range(round(10 * seconds)):
-            self.comes()
+            if silent:
+                self.clock.advance_to(self.clock.monotonic_ns() + NS_PER_S // 10)
+            else:
+                self.comes()
             await asyncio.sleep(0)
             await asyncio.sleep(0)
             await eventually(lambda: not self.recorder.is_writing, "what has come is written")
@@ -240,6 +243,26 @@ async def test_alarms_whose_snapshots_would_overlap_make_one(tmp_path: Path) -> 
     assert held(second)[1] > end_s
     assert one.recorder.counters.snapshots == 2
     assert one.recorder.counters.blocks_dropped == 0
+
+
+async def test_alarms_make_one_snapshot_though_the_stream_stops_with_them(tmp_path: Path) -> None:
+    async with bench(tmp_path, before_s=4.0) as one:
+        await one.passes(30.0)
+        one.alarm()
+        await one.passes(0.5)
+        one.alarm("shaft-vibration-x")
+        await one.passes(1.5, silent=True)
+        assert not one.recorder.figures()["recording"], "it has what comes after them"
+        one.alarm("rotor-rub")
+        await one.passes(12.0)
+        [path] = one.files
+    assert held(path)[0]["causes"] == [
+        "rotor-fault: raised",
+        "shaft-vibration-x: raised",
+        "rotor-rub: raised",
+    ]
+    firsts = firsts_in(path)
+    assert firsts == list(range(firsts[0], firsts[-1] + 1, ROWS)), "nothing is there twice"
 
 
 async def test_a_snapshot_that_has_ended_goes_on_within_its_longest_time_only(tmp_path: Path) -> None:
