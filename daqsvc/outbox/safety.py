@@ -37,6 +37,9 @@ _OPENED = (
 )
 """The files of a store that the service opens as they are; others it replaces, or only keeps."""
 
+_NO_GROUP = 65_534
+"""The group of nobody: of an account without an entry whose directory has root's group."""
+
 _MOST_LINKS = 40
 """Symbolic links in one path, as the kernel has it."""
 
@@ -101,24 +104,30 @@ def as_owner_of(store: Path) -> Iterator[None]:
         yield
         return
     group, groups = os.getegid(), os.getgroups()
+    its_group, its_groups = _groups(owner)
     with contextlib.ExitStack() as back:
         # A container may not let its root change accounts: then it looks as root.
         with contextlib.suppress(PermissionError):
-            os.setgroups(_groups(owner))
+            os.setgroups(its_groups)
             back.callback(os.setgroups, groups)
-            os.setegid(owner.st_gid)
+            os.setegid(its_group)
             back.callback(os.setegid, group)
             os.seteuid(owner.st_uid)
             back.callback(os.seteuid, 0)
         yield
 
 
-def _groups(owner: os.stat_result) -> list[int]:
+def _groups(owner: os.stat_result) -> tuple[int, list[int]]:
+    """The group of who owns a directory, and all of his groups.
+
+    The directory's own group says nothing: after `chown USER` it is still root's.
+    """
     try:
         entry = pwd.getpwuid(owner.st_uid)
     except KeyError:
-        return [owner.st_gid]
-    return os.getgrouplist(entry.pw_name, entry.pw_gid)
+        group = owner.st_gid or _NO_GROUP
+        return group, [group]
+    return entry.pw_gid, os.getgrouplist(entry.pw_name, entry.pw_gid)
 
 
 def refuse_unsafe(store: Path) -> None:

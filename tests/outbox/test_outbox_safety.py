@@ -258,6 +258,20 @@ def test_root_reads_the_store_of_the_service_as_its_owner_and_no_file_of_others(
 
 
 @is_root
+@pytest.mark.parametrize(
+    ("owner", "group", "has"), [(STRANGER, 0, 65_534), (65_534, 0, 65_534), (65_534, 7, 65_534)]
+)
+def test_the_owner_of_a_store_has_his_own_group_and_not_that_of_the_directory(searched, owner, group, has):
+    """`chown daqsvc STORE`, as the remedies say, leaves it to root's group."""
+    store = searched / "above" / "store"
+    os.chown(store, owner, group)
+    with as_owner_of(store):
+        assert (os.geteuid(), os.getegid()) == (owner, has)
+        assert 0 not in os.getgroups()
+    assert (os.geteuid(), os.getegid()) == (0, 0)
+
+
+@is_root
 def test_a_link_of_another_user_is_not_gone_behind(tmp_path):
     opened(tmp_path / "real").close()
     link = tmp_path / "link"
