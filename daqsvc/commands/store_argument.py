@@ -72,8 +72,10 @@ def store_doubts(machine: MachineFile) -> Iterator[str]:
     Raises:
         AssemblyError: nobody could: it is no directory, or a newer version of the program has written it.
     """
-    from daqsvc.outbox.files import is_read_only  # noqa: PLC0415 - only what a verb needs
+    from daqsvc.commands.tables import harmless  # noqa: PLC0415 - only what a verb needs
+    from daqsvc.outbox.files import is_read_only  # noqa: PLC0415
     from daqsvc.outbox.messages import NewerOutboxError, StorePathError  # noqa: PLC0415
+    from daqsvc.outbox.reading import refuse_newer_header  # noqa: PLC0415
     from daqsvc.outbox.safety import account, as_owner_of, unusable  # noqa: PLC0415
     from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415
 
@@ -83,25 +85,29 @@ def store_doubts(machine: MachineFile) -> Iterator[str]:
     try:
         store = machine.resolve(machine.store.directory)
         with as_owner_of(store):
-            who, why = account(), unusable(store)
-            _refuse_newer(store)
-        if why:
-            _refuse_newer(store)  # only this account may be able to read it
+            # Names of its files, and what stands in them, the owner chooses.
+            who, why = account(), harmless(unusable(store))
+            was_read = _refuse_newer(store)
+        if why and not was_read:
+            refuse_newer_header(store / JOURNAL)  # only this account may be able to read it
     except (NewerOutboxError, StorePathError) as error:
-        raise AssemblyError(f"{at}: {error}") from None
+        raise AssemblyError(f"{at}: {harmless(f'{error}')}") from None
     if why and is_read_only(store):
         yield f"{at}: daqsvc run would keep the alarms in memory only, and lose them at its end: {why}"
     elif why:
         yield f"{at}: daqsvc run could not start as {who}: {why}"
 
 
-def _refuse_newer(store: Path) -> None:
+def _refuse_newer(store: Path) -> bool:
+    """See `refuse_newer`; whether this account may read the journal at all."""
     from daqsvc.outbox.messages import StoreRefusedError  # noqa: PLC0415 - only what a verb needs
     from daqsvc.outbox.reading import refuse_newer  # noqa: PLC0415
 
     # That is said more kindly: it is only this account that may not use it.
     with contextlib.suppress(StoreRefusedError):
         refuse_newer(store / JOURNAL)
+        return os.access(store / JOURNAL, os.R_OK, effective_ids=True)
+    return False
 
 
 def add_store(parser: argparse.ArgumentParser, *, of_a_machine: bool = True) -> None:

@@ -11,6 +11,7 @@ import errno
 import os
 import shutil
 import sqlite3
+import stat
 import tempfile
 import time
 from dataclasses import dataclass
@@ -19,8 +20,8 @@ from typing import TYPE_CHECKING, TypeVar
 from urllib.parse import quote
 
 from daqsvc.outbox.files import FileError, remedy
-from daqsvc.outbox.messages import OutboxError, is_sound
-from daqsvc.outbox.safety import refuse_foreign, whose_to_read
+from daqsvc.outbox.messages import NewerOutboxError, OutboxError, is_sound
+from daqsvc.outbox.safety import refuse_foreign, refuse_unsafe, whose_to_read
 from daqsvc.outbox.tables import SCHEMA_VERSION, known_version, newer_writer, version_of
 from daqsvc.outbox.written_by import written_by
 
@@ -33,6 +34,9 @@ JOURNAL_NAME = "outbox.sqlite"
 """What the service calls the journal in its store."""
 
 ATTEMPTS, RETRY_S = 4, 0.05
+
+_MAGIC, _HEADER_BYTES, _USER_VERSION = b"SQLite format 3\0", 100, slice(60, 64)
+"""The header of a file of SQLite, and where the version of its tables stands in it."""
 
 _COLUMNS = "sequence, topic, payload, retain, sent, wall_ns, checksum"
 
@@ -220,10 +224,47 @@ def refuse_newer(path: Path) -> None:
 
     Raises:
         NewerOutboxError: a newer version of the program has written it.
+        StoreRefusedError: it is a file of others; or root reads, and others may put files there.
     """
     # What else may be wrong with it, the service finds and mends when it opens it.
-    with contextlib.suppress(*FileError), opened_to_read(path) as connection:
-        known_version(connection, path)
+    with contextlib.suppress(*FileError):
+        if os.geteuid() == 0:
+            # SQLite opens by name what may have become a link, or a pipe, after it was looked at.
+            refuse_unsafe(path.parent)
+        with opened_to_read(path) as connection:
+            known_version(connection, path)
+
+
+def refuse_newer_header(path: Path) -> None:
+    """The same by the header of the file alone, and without SQLite: root may do so whoever owns the store.
+
+    What only stands in the write-ahead log is not seen, nor whether the number is damaged. In a process that
+    has the journal open this would undo its locks.
+
+    Raises:
+        NewerOutboxError: a newer version of the program has written it.
+    """
+    try:
+        header = _header(path)
+    except OSError:
+        return
+    if len(header) < _HEADER_BYTES or not header.startswith(_MAGIC):
+        return
+    version = int.from_bytes(header[_USER_VERSION], "big", signed=True)
+    if version > SCHEMA_VERSION:
+        raise NewerOutboxError(
+            f"outbox {path} has schema version {version}, written by {newer_writer(written_by(path))}; this "
+            f"program knows {SCHEMA_VERSION}: install that version again, or give the service another store"
+        )
+
+
+def _header(path: Path) -> bytes:
+    """The header of a regular file; never through a symbolic link, and never waiting for a pipe."""
+    handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+    try:
+        return os.read(handle, _HEADER_BYTES) if stat.S_ISREG(os.fstat(handle).st_mode) else b""
+    finally:
+        os.close(handle)
 
 
 @contextlib.contextmanager

@@ -243,6 +243,69 @@ def test_root_is_told_how_the_service_of_another_account_stands_with_its_store(
 
 
 @is_root
+@pytest.mark.parametrize("kind", ["a stranger's", "a stranger's, where root may be nobody else", "root's"])
+def test_root_opens_no_store_with_sqlite_where_others_may_put_files(
+    kind: str, owned: Path, check: Check, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """SQLite opens by name, and its owner may have put a link there by then."""
+    with contextlib.closing(sqlite3.connect(owned / "outbox.sqlite")) as file:
+        file.execute("PRAGMA user_version = 2")
+    for path in (owned / "outbox.sqlite", owned):
+        os.chown(path, *((0, 0) if kind == "root's" else (NOBODY, NOBODY)))
+    (owned / "outbox.sqlite-wal").write_bytes(b"log")
+    os.chown(owned / "outbox.sqlite-wal", *((0, 0) if kind == "root's" else (NOBODY, NOBODY)))
+    owned.chmod(0o777)
+    who = []
+    connect: Any = sqlite3.connect
+    seteuid = os.seteuid
+
+    def connected(*arguments: Any, **how: Any) -> Any:
+        who.append(os.geteuid())
+        return connect(*arguments, **how)
+
+    def refused(user: int) -> None:
+        raise PermissionError(user)
+
+    monkeypatch.setattr(sqlite3, "connect", connected)
+    monkeypatch.setattr(os, "seteuid", refused if "nobody else" in kind else seteuid)
+    code, out, err = check(owned)
+    monkeypatch.undo()
+    assert (code, err) == (0, "")
+    assert "could not start as" in out
+    assert 0 not in who
+    assert bool(who) == (kind == "a stranger's"), "its owner's rights are enough"
+    # Root sees all the same whose version it is.
+    with contextlib.closing(sqlite3.connect(owned / "outbox.sqlite")) as file:
+        file.execute("PRAGMA user_version = 99")
+    assert "has schema version 99" in check(owned)[2]
+
+
+@is_root
+def test_the_owner_of_a_store_has_not_the_group_that_chown_has_left_to_root(
+    owned: Path, check: Check
+) -> None:
+    """`check` would pass what `run` refuses: a file that root's group may write."""
+    (owned / "outbox.sqlite").touch()
+    (owned / "outbox.sqlite").chmod(0o660)
+    os.chown(owned, NOBODY, 0)
+    code, out, err = check(owned)
+    assert (code, err) == (0, "")
+    assert f"could not start as nobody: {owned}/outbox.sqlite belongs to root, and nobody, as whom the" in out
+
+
+def test_what_a_store_says_of_itself_does_nothing_to_a_terminal(tmp_path: Path, check: Check) -> None:
+    store = tmp_path / "alarms"
+    newer(store)
+    (store / "outbox.sqlite.version").write_text("\x1b]0;x\x07 9.9.0\n")
+    assert check(store)[2].isprintable()
+    (store / "outbox.sqlite").unlink()
+    (store / "outbox.sqlite").symlink_to("\x1b[2J")
+    out = check(store)[1]
+    assert "is a symbolic link of" in out
+    assert out.isprintable()
+
+
+@is_root
 def test_a_copy_of_a_store_that_belongs_to_root_is_a_warning_with_its_remedy(
     owned: Path, check: Check
 ) -> None:

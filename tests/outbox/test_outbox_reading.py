@@ -14,8 +14,8 @@ import pytest
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.outbox import reading
-from daqsvc.outbox.messages import OutboxError
-from daqsvc.outbox.reading import JOURNAL_NAME, read_journal, read_pasts
+from daqsvc.outbox.messages import NewerOutboxError, OutboxError
+from daqsvc.outbox.reading import JOURNAL_NAME, read_journal, read_pasts, refuse_newer_header
 from daqsvc.outbox.store import Outbox
 
 pytestmark = pytest.mark.integration
@@ -191,6 +191,31 @@ def test_another_version_is_named(tmp_path, version, remedy):
     other.close()
     with pytest.raises(OutboxError, match=f"has schema version {version}.*{remedy}"):
         read_journal(tmp_path)
+
+
+def test_a_newer_version_is_seen_in_the_header_of_a_regular_file_alone(tmp_path):
+    """Root looks so where others may put files: no link is followed, and no pipe waited for."""
+    path, kept = tmp_path / JOURNAL_NAME, tmp_path / "kept"
+    refuse_newer_header(path)
+    for version in (99, 2, -1):
+        with contextlib.closing(sqlite3.connect(path)) as file:
+            file.execute(f"PRAGMA user_version = {version}")
+        with (
+            pytest.raises(NewerOutboxError, match=r"version 99")
+            if version == 99
+            else contextlib.nullcontext()
+        ):
+            refuse_newer_header(path)
+        if version == 99:
+            shutil.copy(path, kept)
+    newer = kept.read_bytes()
+    for content in (b"", newer[:99], b"X" + newer[1:]):
+        path.write_bytes(content)
+        refuse_newer_header(path)
+    for make in (lambda: path.symlink_to(kept), lambda: os.mkfifo(path), path.mkdir):
+        path.unlink()
+        make()
+        refuse_newer_header(path)
 
 
 async def test_a_message_that_has_changed_on_the_disk_is_left_out_and_counted(outbox, tmp_path):
