@@ -16,12 +16,16 @@ if TYPE_CHECKING:
 EXIT_INTERRUPTED = 128 + signal.SIGINT
 """What a shell says of a program that SIGINT has ended."""
 
+_came: set[int] = set()
+"""Signals that nobody has heard yet."""
+
 
 def ignore_until_heard(arguments: Sequence[str]) -> None:
     """From here on, let a SIGHUP that asks the service for a reload not end it, nor SIGUSR1 and SIGUSR2.
 
-    Whoever starts and reloads it in one go is too quick for its own handler (`ProcessGuard`). A handler, and
-    not SIG_IGN: that says that the service is to outlive its terminal.
+    Whoever starts and reloads it in one go is too quick for its own handler (`ProcessGuard`), which takes
+    over what came (`take_hang_up`). A handler, and not SIG_IGN: that says that the service is to outlive its
+    terminal.
 
     Args:
         arguments: of the command line, without the program.
@@ -30,7 +34,14 @@ def ignore_until_heard(arguments: Sequence[str]) -> None:
         return
     for number in (signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2):
         if signal.getsignal(number) is signal.SIG_DFL:
-            signal.signal(number, lambda *_: None)
+            signal.signal(number, _note)
+
+
+def take_hang_up() -> bool:
+    """Whether a SIGHUP came since `ignore_until_heard` that nobody has taken yet."""
+    came = signal.SIGHUP in _came
+    _came.clear()
+    return came
 
 
 def begin(argv: Sequence[str]) -> None:
@@ -57,6 +68,10 @@ def imported() -> None:
 def _is_program(argv: Sequence[str]) -> bool:
     """Whether the process is ``daqsvc`` or ``python -m daqsvc``."""
     return f"/{argv[0] if argv else ''}".endswith(("/daqsvc", "/daqsvc/__main__.py"))
+
+
+def _note(number: int, _frame: object) -> None:
+    _came.add(number)
 
 
 def _end(*_: object) -> None:

@@ -15,6 +15,7 @@ import signal
 import threading
 from typing import TYPE_CHECKING, Self
 
+from daqsvc.commands import early_signals
 from daqsvc.commands.arguments import EXIT_HUNG, EXIT_STUCK
 from daqsvc.threads import where_is
 
@@ -94,6 +95,9 @@ class ProcessGuard:
         for number in USER_SIGNALS:
             self._before[number] = signal.signal(number, lambda *_: None)
         self._thread.start()
+        if early_signals.take_hang_up() and not self._outlives_terminal:
+            # The machine files may have been read before it came.
+            self._hear(signal.SIGHUP)
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -122,12 +122,36 @@ def test_a_hang_up_that_comes_before_the_service_has_its_handlers_ends_nothing()
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_DFL
         early_signals.ignore_until_heard(["run", "machine.toml"])
         signal.raise_signal(signal.SIGHUP)
+        assert early_signals.take_hang_up()
         # Whoever has asked for it (nohup) keeps a service that outlives its terminal.
         signal.signal(signal.SIGHUP, signal.SIG_IGN)
         early_signals.ignore_until_heard(["run", "machine.toml"])
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+async def test_a_hang_up_after_the_machine_files_were_read_is_obeyed_when_the_service_is_ready(caplog):
+    """The guard does not hear signals yet then, and what was read may be old."""
+    before = signal.getsignal(signal.SIGHUP)
+    early_signals.take_hang_up()
+    reloads = []
+    try:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+        early_signals.ignore_until_heard(["run", "machine.toml"])
+        signal.raise_signal(signal.SIGHUP)
+        for number in (1, 0):
+            guard = ProcessGuard()
+            guard._terminals = []
+            with guard:
+                guard.stop_by(asyncio.get_running_loop(), lambda: None)
+                guard.reload_by(lambda: reloads.append(True))
+                assert len(reloads) == number, "once"
+            reloads.clear()
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    said = "SIGHUP: the service starts; it reads its machine files again when it is ready"
+    assert [record.getMessage() for record in caplog.records] == [said]
 
 
 def test_the_store_is_held_while_the_service_is_made(monkeypatch, tmp_path):
