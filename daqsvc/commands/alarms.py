@@ -86,14 +86,20 @@ class AlarmsCommand:
                 _show(store, events, arguments)
             finally:
                 if doubt:
-                    # What goes wrong goes to stderr.
-                    print(f"daqsvc alarms: {doubt}", file=sys.stderr)  # noqa: T201
+                    _complain("alarms", doubt)
         except BadFileError:
             return EXIT_USAGE
         except (StoreNotFoundError, NoSuchMachineError, OutboxError) as error:
-            print(f"daqsvc alarms: {error}", file=sys.stderr)  # noqa: T201 - errors go to stderr
+            _complain("alarms", error)
             return EXIT_FAILED
         return EXIT_OK
+
+
+def _complain(verb: str, what: object) -> None:
+    """Say what goes wrong, to stderr. Names of a journal or a service could hold anything."""
+    from daqsvc.commands.tables import harmless  # noqa: PLC0415 - only what a verb needs
+
+    print(f"daqsvc {verb}: {harmless(f'{what}')}", file=sys.stderr)  # noqa: T201
 
 
 class NoSuchMachineError(Exception):
@@ -216,6 +222,7 @@ class AlarmVerb:
     def run(self, arguments: argparse.Namespace) -> int:
         """See `daqsvc.cli.Command.run`."""
         from daqsvc.alarms.commands import AlarmCommand, Verb  # noqa: PLC0415 - each verb imports only what it needs
+        from daqsvc.commands.tables import harmless  # noqa: PLC0415
         from daqsvc.control import ControlError, ask, request_of  # noqa: PLC0415
         from daqsvc.outbox.messages import OutboxError  # noqa: PLC0415
 
@@ -239,16 +246,16 @@ class AlarmVerb:
         except BadFileError:
             return EXIT_USAGE
         except (StoreNotFoundError, NoSuchAlarmError, OutboxError, ControlError) as error:
-            print(f"daqsvc {name}: {error}", file=sys.stderr)  # noqa: T201 - errors go to stderr
+            _complain(name, error)
             return EXIT_FAILED
         if arguments.json:
             answer = {"verb": self._verb, "alarm": alarm, "occurrence": occurrence, "by": request.by}
             came = {"accepted": outcome.accepted, "reason": outcome.reason, "events": list(outcome.events)}
             print(json.dumps(answer | came))  # noqa: T201 - this is what the verb is for
         elif outcome.accepted:
-            print(f"{alarm}: {outcome.reason or _DONE[self._verb]}")  # noqa: T201
+            print(harmless(f"{alarm}: {outcome.reason or _DONE[self._verb]}"))  # noqa: T201
         else:
-            print(f"daqsvc {name}: refused: {outcome.reason}", file=sys.stderr)  # noqa: T201
+            _complain(name, f"refused: {outcome.reason}")
         # Accepted with a reason: the disk has not got it yet.
         return EXIT_OK if outcome.accepted and not outcome.reason else EXIT_FAILED
 

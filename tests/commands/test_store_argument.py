@@ -59,10 +59,11 @@ class Service:
         self.told: list[tuple[str | None, str]] = []
         self.server = ControlServer(store, watched, self._execute, status=self._status)
         self._watched = watched
+        self.outcome = CommandOutcome(accepted=True)
 
     async def _execute(self, command: AlarmCommand, source: str) -> CommandOutcome:
         self.told.append((command.machine, command.alarm))
-        return CommandOutcome(accepted=True)
+        return self.outcome
 
     async def _status(self, machine: str | None) -> bytes | tuple[str, ...]:
         if machine not in self._watched:
@@ -75,6 +76,27 @@ class Service:
             return await asyncio.to_thread(verb, capsys, *words)
         finally:
             await self.server.close()
+
+
+async def test_names_of_a_journal_do_nothing_to_a_terminal(tmp_path: Path, capsys: Captured) -> None:
+    """It is root's, as a rule, and the journal another account's."""
+    evil = "\x1b]0;owned\x07"
+    same = {"occurrence": "0d8c1c4e"}
+    await write_journal(
+        tmp_path, *({"machine": evil, "alarm": f"{evil}{n}", "id": f"{n}"} | same for n in (1, 2))
+    )
+    for words, said in (
+        (("alarms", "--machine", "pump"), "has alarms of"),
+        (("ack", "0d8c"), "begins the ids of"),
+    ):
+        code, out, err = verb(capsys, *words, "--store", tmp_path)
+        assert (code, out) == (1, "")
+        assert said in err
+        assert err.removesuffix("\n").isprintable()
+    service = Service(tmp_path, "pump")
+    service.outcome = CommandOutcome(accepted=True, reason=f"{evil} is full")
+    code, out, _ = await service.asked(capsys, "ack", "any", "--store", tmp_path)
+    assert (code, out) == (1, "any: \N{REPLACEMENT CHARACTER}]0;owned\N{REPLACEMENT CHARACTER} is full\n")
 
 
 async def test_a_machine_that_is_none_of_the_store_is_refused(tmp_path: Path, capsys: Captured) -> None:
