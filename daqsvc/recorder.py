@@ -169,6 +169,21 @@ class _Item(NamedTuple):
     what: _Happened
 
 
+@dataclass(frozen=True, slots=True)
+class _Again:
+    """That a file goes on which was over.
+
+    Attributes:
+        kind: why it was written till then.
+        until_ns: its end till then.
+        causes: when they came for which it goes on, and what they are; the newest.
+    """
+
+    kind: Kind
+    until_ns: int
+    causes: deque[tuple[int, _Caused]] = field(default_factory=lambda: deque(maxlen=MOST_CAUSES))
+
+
 @dataclass(slots=True)
 class _Open:
     """A file that is being written.
@@ -187,6 +202,8 @@ class _Open:
         writing: what a thread is writing now; its file, if that is complete then.
         writer: its file; None before that is open.
         last: what was handed out last of what the history had.
+        written_ns: until when the disk has taken all of it.
+        again: that it was over once; None if it never was.
     """
 
     kind: Kind
@@ -203,6 +220,8 @@ class _Open:
     writing: asyncio.Future[Path | None] | None = None
     writer: SnapshotWriter | None = None
     last: _Item | None = None
+    written_ns: int = 0
+    again: _Again | None = None
 
     def __post_init__(self) -> None:
         self._held = len(self.waiting)
@@ -227,6 +246,7 @@ class _Open:
 
     def go_on(self, missed: list[_Item], until_ns: int) -> None:
         """Have it last longer when it was over; what it has missed meanwhile is in the history anyway."""
+        self.again = _Again(self.kind, self.until_ns)
         self.waiting, self.until_ns, self._held = missed, until_ns, len(missed)
 
     def answer(self, outcome: Path | SnapshotRefusedError) -> None:
@@ -501,10 +521,13 @@ class MachineRecorder:
             self._open = self._begun("scheduled", SCHEDULED, begin_ns, until_ns)
 
     def _add_cause(self, one: _Open, kind: Kind, words: str) -> None:
-        one.kind = min(kind, one.kind, key=get_args(Kind).index)
+        one.kind = _weightiest(kind, one.kind)
+        now_ns, cause = self._clock.monotonic_ns(), _Caused(kind, words)
+        if one.again is not None:
+            one.again.causes.append((now_ns, cause))
         if one.causes < MOST_CAUSES:
             one.causes += 1
-            one.take_in(_Item(self._clock.monotonic_ns(), _Caused(kind, words)), 0)
+            one.take_in(_Item(now_ns, cause), 0)
 
     def _has_room(self, one: _Open, until_ns: int) -> bool:
         return until_ns <= one.cause_ns - self._before_ns + self._longest_ns
@@ -682,6 +705,7 @@ class MachineRecorder:
     async def _write_on(self, snapshot: _Open, items: list[_Item], *, is_over: bool) -> None:
         if is_over:
             self._finishing.append(snapshot)
+        handed_ns = self._clock.monotonic_ns()
         # A thread goes on when nobody waits for it any more: the end of the service must know of it.
         snapshot.writing = asyncio.ensure_future(
             asyncio.to_thread(self._write, snapshot, items, is_over=is_over)
@@ -692,7 +716,7 @@ class MachineRecorder:
             snapshot.writing = None
             await self._give_up(snapshot, error)
             return
-        snapshot.writing = None
+        snapshot.writing, snapshot.written_ns = None, handed_ns
         if path is None:
             return
         self._finishing.remove(snapshot)
@@ -703,9 +727,11 @@ class MachineRecorder:
         snapshot.answer(path)
 
     async def _give_up(self, snapshot: _Open, error: Exception) -> None:
-        """The disk takes no more of a snapshot: what it has got stays, and the service goes on."""
+        """The disk takes no more of a snapshot: what it has got stays, and the service goes on.
+
+        What had been over before it went on is not to be lost by that, nor is the cause for which it did.
+        """
         self.counters.write_failures += 1
-        self.counters.snapshots_failed += 1
         if snapshot is self._continuous:
             self._continuous = None
             self._continuous_from_ns = self._clock.monotonic_ns() + AGAIN_NS
@@ -714,13 +740,61 @@ class MachineRecorder:
         for those in (self._ending, self._lingering, self._finishing):
             if snapshot in those:
                 those.remove(snapshot)
+        is_begun = self._begin_again(snapshot)
+        path = await self._finished_anyway(snapshot)
+        if path is None:
+            self.counters.snapshots_failed += 1
+        else:
+            self.counters.snapshots += 1
+        outcome = "lost" if path is None else "ended" + (", and another one begun" if is_begun else "")
         if self._is_well:
             self._is_well = False
-            log.error("a snapshot of %s is lost: %s", self._identity.machine, _in_words(error))
-        snapshot.answer(SnapshotRefusedError(f"the snapshot is lost: {_in_words(error)}"))
-        if snapshot.writer is not None:
+            log.error("a snapshot of %s is %s: %s", self._identity.machine, outcome, _in_words(error))
+        snapshot.answer(path or SnapshotRefusedError(f"the snapshot is lost: {_in_words(error)}"))
+        if path is None and snapshot.writer is not None:
             with contextlib.suppress(OSError):
                 await asyncio.to_thread(snapshot.writer.abandon)
+
+    def _begin_again(self, snapshot: _Open) -> bool:
+        """Begin another file for causes of which one that went on has not all; whether there are any."""
+        again = snapshot.again
+        if again is None or snapshot.machine is not self._machine:
+            # Where other limits came into force, another one has begun anyway.
+            return False
+        whole_ns = snapshot.written_ns - self._after_ns
+        missed = [one for one in again.causes if one[0] > whole_ns]
+        if not missed:
+            return False
+        whole = (cause.kind for at_ns, cause in again.causes if at_ns <= whole_ns)
+        snapshot.kind = _weightiest(again.kind, *whole)
+        (at_ns, first), *later = missed
+        # What is older may not be in the history any more; it is in the file that ends.
+        oldest_ns = self._clock.monotonic_ns() - 2 * TURN_NS
+        begin_ns = max(at_ns, oldest_ns) - self._before_ns
+        one = self._begun(first.kind, first.words, begin_ns, snapshot.until_ns)
+        one.cause_ns, one.causes = at_ns, len(missed)
+        one.kind = _weightiest(*(cause.kind for _, cause in missed))
+        one.waiting = sorted([*one.waiting, *(_Item(*cause) for cause in later)], key=lambda item: item.at_ns)
+        one.asked, snapshot.asked = snapshot.asked, []
+        if self._open is None:
+            self._open = one
+        else:
+            self._ending.append(one)
+        return True
+
+    async def _finished_anyway(self, snapshot: _Open) -> Path | None:
+        """Close a file that the disk has refused, if all is in it for which it was written at first."""
+        again = snapshot.again
+        if snapshot.writer is None or again is None or snapshot.written_ns < again.until_ns:
+            return None
+        self._finishing.append(snapshot)
+        snapshot.writing = writing = asyncio.ensure_future(asyncio.to_thread(self._finish_anyway, snapshot))
+        path = None
+        with contextlib.suppress(OSError, ValueError):
+            path = await asyncio.shield(writing)
+        snapshot.writing = None
+        self._finishing.remove(snapshot)
+        return path
 
     async def _end(self) -> None:
         """No more is written: bring what is under way to its end, if the disk is quick."""
@@ -842,6 +916,15 @@ class MachineRecorder:
         self._make_room({path.name})
         return path
 
+    def _finish_anyway(self, snapshot: _Open) -> Path | None:
+        """Close a file after an error, as far as it was written; blocks.
+
+        Raises:
+            OSError: the disk does not take the end either.
+        """
+        assert snapshot.writer is not None  # noqa: S101 - for the type checker
+        return self.folder.finish_what_was_taken(snapshot.writer, snapshot.kind)
+
     def _make_room(self, spared: set[str]) -> None:
         """Delete what is too old or too much, but for what is being written; blocks."""
         self._unswept_bytes = 0
@@ -898,6 +981,11 @@ def _first_after(history: Sequence[_Item], memory: _Remembered) -> int | None:
             if block.end_index > memory.end_index:
                 return number
     return len(history)
+
+
+def _weightiest(*kinds: Kind) -> Kind:
+    """Of several causes the one by which a file is called."""
+    return min(kinds, key=get_args(Kind).index)
 
 
 def _in_words(error: Exception) -> str:

@@ -75,6 +75,18 @@ class SnapshotFolder:
             OSError: the disk does not take it.
         """
         writer.finish()
+        return self._named(writer, kind)
+
+    def finish_what_was_taken(self, writer: SnapshotWriter, kind: str) -> Path:
+        """The same after an error, behind the last that the disk has taken whole.
+
+        Raises:
+            OSError: the disk does not take the end either.
+        """
+        writer.finish_what_was_taken()
+        return self._named(writer, kind)
+
+    def _named(self, writer: SnapshotWriter, kind: str) -> Path:
         stem = writer.path.name.rpartition("-")[0]
         writer.path = writer.path.rename(writer.path.with_name(f"{stem}-{kind}{SUFFIX}"))
         return writer.path

@@ -100,6 +100,25 @@ class _Chunk:
         self.size += sum(map(len, parts))
 
 
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """How far a file was written, see `McapWriter.mark`.
+
+    Attributes:
+        size: its bytes.
+        counts: messages of each channel.
+        indices: how many parts its index names.
+        chunks: how many there are.
+        span_ns: times of the first message and the last.
+    """
+
+    size: int
+    counts: dict[int, int]
+    indices: int
+    chunks: int
+    span_ns: tuple[int, int] | None
+
+
 class McapWriter:
     """Writes a file; see `open_channel`, `write`, `flush`, `finish`.
 
@@ -191,6 +210,22 @@ class McapWriter:
         index = _INDEX_HEAD.pack(begin_ns, end_ns, at, self.size - at)
         index += struct.pack("<IQ", 0, 0) + _text("") + struct.pack("<QQ", chunk.size, chunk.size)
         self._indices.append(_record(_CHUNK_INDEX, index))
+
+    def mark(self) -> Mark:
+        """How far the file is now, without what waits for `flush`."""
+        return Mark(self.size, dict(self._counts), len(self._indices), self._chunks, self._span_ns)
+
+    def go_back(self, mark: Mark, file: BinaryIO) -> None:
+        """Take the file to be as it was at a mark, and go on in it.
+
+        Args:
+            mark: no attachment and no channel came after it.
+            file: open for writing, at its end, which is where it was then.
+        """
+        self._file, self._chunk = file, _Chunk()
+        self.size, self._chunks, self._span_ns = mark.size, mark.chunks, mark.span_ns
+        self._counts = dict(mark.counts)
+        del self._indices[mark.indices :]
 
     def finish(self) -> None:
         """Write what lets readers find their way, and the end."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import json
 import os
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto, FileDescriptorSet
 from pydantic_core import to_json
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daqsvc.snapshots.contents import Document, Entry
+    from daqsvc.snapshots.mcap import Mark
 
 CHUNK_BYTES = 1 << 18
 """A cut takes no more than the chunk that it is in."""
@@ -54,7 +57,9 @@ class SnapshotWriter:
     def __init__(self, path: Path, about: Document, files: Mapping[str, bytes], wall_ns: int) -> None:
         self.path = path
         self._wall_ns = wall_ns
-        self._file = os.fdopen(os.open(path, FLAGS, MODE), "wb")
+        self._file: BinaryIO = os.fdopen(os.open(path, FLAGS, MODE), "wb")
+        self._taken: Mark | None = None
+        """How far the operating system has taken it whole."""
         try:
             self._mcap = McapWriter(self._file, f"daqsvc {__version__}")
             for topic in (ABOUT, CAUSES, ALARMS, DIAGNOSES, STANDING, WINDOWS, STATES):
@@ -92,6 +97,7 @@ class SnapshotWriter:
                 self._mcap.flush()
         self._mcap.flush()
         self._file.flush()
+        self._taken = self._mcap.mark()
 
     def finish(self) -> None:
         """Write the end, and have all of it on disk.
@@ -105,6 +111,26 @@ class SnapshotWriter:
             os.fsync(self._file.fileno())
         finally:
             self._file.close()
+
+    def finish_what_was_taken(self) -> None:
+        """After an error: end the file behind the last that was written whole, as if nothing had followed.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        with contextlib.suppress(OSError):
+            self._file.close()
+        if self._taken is None:
+            raise OSError(errno.EIO, "nothing of it was written", f"{self.path}")
+        self._file = self.path.open("r+b")
+        try:
+            self._file.truncate(self._taken.size)
+            self._file.seek(0, os.SEEK_END)
+            self._mcap.go_back(self._taken, self._file)
+        except BaseException:
+            self._file.close()
+            raise
+        self.finish()
 
     def abandon(self) -> None:
         """Leave the file as it is: what was written can be read."""

@@ -24,7 +24,7 @@ from daqsvc.confined.limits import ResourceLimits
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.recorder import MOST_WAITING_BYTES, MachineRecorder, SnapshotRefusedError
 from daqsvc.snapshots.contents import CAUSES, MACHINE_JSON
-from daqsvc.snapshots.mcap import Attachment, Damage
+from daqsvc.snapshots.mcap import Attachment, Damage, McapWriter
 from daqsvc.snapshots.reading import entries_of, read_snapshot
 from daqsvc.snapshots.writing import SnapshotWriter
 from daqsvc.supervision import Supervisor
@@ -485,6 +485,81 @@ async def test_a_disk_that_fails_amid_a_snapshot_leaves_what_it_has(
         broken, whole = one.files
     assert held(broken)[3].ends_early
     assert not held(whole)[3].ends_early
+
+
+def once_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The disk takes half of the next chunk, and all after that."""
+    flush = McapWriter.flush
+
+    def half(self: McapWriter) -> None:
+        monkeypatch.setattr(McapWriter, "flush", flush)
+        self._file.write(b"half of a chunk")
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(McapWriter, "flush", half)
+
+
+@pytest.mark.parametrize("later_s", [0.0, 0.5])
+async def test_an_alarm_that_the_disk_refuses_costs_no_file_that_was_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, later_s: float
+) -> None:
+    async with bench(tmp_path, before_s=4.0) as one:
+        await one.passes(30.0)
+        asked = asyncio.create_task(one.recorder.snapshot("before"))
+        await one.passes(12.0)
+        one.alarm()
+        await one.passes(2.5)
+        one.alarm("shaft-vibration-x")
+        at_s = one.clock.monotonic_ns() / NS_PER_S
+        also = asyncio.create_task(one.recorder.snapshot("somebody"))
+        await asyncio.sleep(0)
+        await one.passes(later_s)
+        once_refused(monkeypatch)
+        await one.passes(2.0)
+        assert one.recorder.counters.write_failures == 1
+        assert one.recorder.counters.snapshots_failed == 0
+        assert one.recorder.counters.snapshots == 3
+        before, first, second = one.files
+        assert (await asked, await also) == (before, second)
+    about, _, first_end_s, damage = held(first)
+    assert damage == Damage()
+    assert about["causes"][0] == "rotor-fault: raised"
+    assert first_end_s >= at_s - 1.5, "all that it had when it was over"
+    about, begin_s, end_s, damage = held(second)
+    assert damage == Damage()
+    assert about["causes"] == ["shaft-vibration-x: raised", "somebody"]
+    assert second.name.endswith("-alarm.mcap")
+    assert begin_s == pytest.approx(at_s - 4.0, abs=0.3)
+    assert end_s == pytest.approx(at_s + 1.0, abs=0.3)
+    said = [(record.levelname, "another one begun" in record.message) for record in caplog.records]
+    assert said == [("ERROR", True), ("WARNING", False)]
+
+
+async def test_a_file_that_goes_on_stays_as_it_is_on_a_disk_that_takes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    async with bench(tmp_path, before_s=4.0) as one:
+        await one.passes(30.0)
+        one.alarm()
+        await one.passes(2.5)
+        [path] = one.files
+        whole = path.read_bytes()
+        one.alarm("shaft-vibration-x")
+        asked = asyncio.create_task(one.recorder.snapshot("somebody"))
+        with monkeypatch.context() as patched:
+            patched.setattr(SnapshotWriter, "write", refuse)
+            patched.setattr(McapWriter, "finish", refuse)
+            await one.passes(2.0)
+        with pytest.raises(SnapshotRefusedError, match="Input/output error"):
+            await asked
+        assert one.recorder.counters.snapshots_failed == 2
+        assert path.read_bytes() == whole
+        one.alarm("rotor-rub")
+        await one.passes(12.0)
+        assert one.recorder.counters.snapshots == 1
 
 
 @contextlib.contextmanager

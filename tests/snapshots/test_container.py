@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 import pytest
@@ -25,6 +26,8 @@ from daqsvc.snapshots.writing import CHUNK_BYTES, SnapshotWriter
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
+
+    from typing_extensions import Buffer
 
     from daqsvc.snapshots.contents import Document
 
@@ -178,6 +181,42 @@ def test_long_streams_lie_in_chunks_of_bounded_size(tmp_path: Path) -> None:
     read = list(entries_of(memoryview(data[: len(data) - CHUNK_BYTES // 2]), damage))
     assert damage.ends_early
     assert len(read) >= 20 - 2 * CHUNK_BYTES // (5000 * 8)
+
+
+class HalfTaken(io.BytesIO):
+    """A file on a disk that takes half of what comes, and no more."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        super().__init__()
+        self.file = file
+
+    def write(self, data: Buffer) -> int:
+        self.file.write(bytes(data)[: len(bytes(data)) // 2])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_what_was_taken_is_finished_as_if_nothing_had_followed(tmp_path: Path) -> None:
+    writer = SnapshotWriter(tmp_path / "one.mcap", ABOUT_IT, FILES, wall_ns=10**18)
+    happened = entries(4)
+    writer.write(happened[:4])
+    writer._mcap._file = HalfTaken(writer._file)
+    with pytest.raises(OSError, match="No space left"):
+        writer.write(happened[4:])
+    writer.finish_what_was_taken()
+    other = SnapshotWriter(tmp_path / "other.mcap", ABOUT_IT, FILES, wall_ns=10**18)
+    other.write(happened[:4])
+    other.finish()
+    assert writer.path.read_bytes() == other.path.read_bytes()
+    assert writer.size == other.size
+
+
+def test_of_what_was_never_taken_nothing_is_finished(tmp_path: Path) -> None:
+    writer = SnapshotWriter(tmp_path / "one.mcap", ABOUT_IT, FILES, wall_ns=10**18)
+    writer._mcap._file = HalfTaken(writer._file)
+    with pytest.raises(OSError, match="No space left"):
+        writer.write(entries(4))
+    with pytest.raises(OSError, match="nothing of it was written"):
+        writer.finish_what_was_taken()
 
 
 def test_other_tools_read_it(tmp_path: Path) -> None:
