@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from daqsvc.recording import RecordingError
+from daqsvc.recording.formats.column_units import spelt_alike
 from daqsvc.recording.formats.written_times import format_of, times_of
 from daqsvc.recording.recording import load_all, load_recording
 
@@ -179,9 +180,74 @@ def test_units_that_contradict_each_other_are_refused(tmp_path, head, why):
         load_recording(units_table(tmp_path, head))
 
 
-def test_names_that_are_units_are_both(tmp_path):
-    recording = load_recording(units_table(tmp_path, "ms,m/s2"), {"x": "1"}, RATE_HZ)
-    assert recording.units == {"x": "m/s2"}
+@pytest.mark.parametrize(
+    ("head", "units"),
+    [
+        ("ms,m/s2", ("ms", "m/s2")),
+        ("m/s2,m/s2", ("m/s2", "m/s2")),
+        ("mV rms,V", ("mV rms", "V")),
+        ("[A],[V]", ("A", "V")),
+        ("%,A", ("%", "A")),
+        ("T,m/s2", ("", "m/s2")),
+        ("A,V", ("", "")),
+        ("T,D", ("", "")),
+        ("s,v", ("", "")),
+        ("V_rms,V_peak", ("", "")),
+        ("min,IN", ("", "")),
+        ("M,rpm", ("", "")),
+    ],
+)
+def test_names_that_are_units_are_both_but_for_letters_and_words(tmp_path, head, units):
+    """A and V are channels, s and v a way and a speed, T and D anything."""
+    (stream,), _ = load_all(units_table(tmp_path, head), rate_hz=RATE_HZ)
+    assert stream.units == units
+
+
+@pytest.mark.parametrize(
+    ("head", "units"),
+    [
+        ("time,flow,B\ns,t/h,T", {"f": "t/h", "b": "T"}),
+        ("time,flow,B\n,t/h,T", {"f": "t/h", "b": "T"}),
+        ("time,flow,B\ns,t/h,t", {"f": "t/h", "b": "t"}),
+        ("time,flow,B\ntt.mm.jj,t/h,V", {"f": "t/h", "b": "V"}),
+    ],
+)
+def test_units_that_look_like_the_mask_of_a_date_are_units(tmp_path, head, units):
+    path = tmp_path / "rig.csv"
+    path.write_text(head + "\n" + "".join(f"{k / RATE_HZ},1,2\n" for k in range(9)))
+    assert load_recording(path, {"f": "flow", "b": "B"}).units == units
+
+
+def test_a_unit_behind_a_name_may_look_like_the_mask_of_a_date(tmp_path):
+    path = units_table(tmp_path, "time,flow [t/h]")
+    assert load_recording(path, {"x": "flow"}).units == {"x": "t/h"}
+    (stream,), _ = load_all(units_table(tmp_path, "time,current (T)"))  # of three phases R, S, T
+    assert (stream.names, stream.units) == (("current (T)",), ("",))
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "alike"),
+    [
+        ("mN", "MN", False),
+        ("mPa", "MPa", False),
+        ("mV RMS", "MV rms", False),
+        ("mV/g", "MV/g", False),
+        ("mHz", "MHz", False),
+        ("mNm", "MN·m", False),
+        ("mΩ", "MΩ", False),
+        ("Nm", "nm", False),
+        ("N·m", "NM", True),
+        ("MPa", "MPA", True),
+        ("mV rms", "mV RMS", True),
+        ("mm/s", "MM/S", True),
+        ("m/s²", "M/S2", True),
+        ("kHz", "KHZ", True),
+        ("g", "G", True),
+    ],
+)
+def test_milli_is_not_mega(one, other, alike):
+    assert spelt_alike(one, other) is alike
+    assert spelt_alike(other, one) is alike
 
 
 def test_a_unit_that_is_written_in_two_ways_is_one(tmp_path):

@@ -8,21 +8,29 @@ from typing import NamedTuple
 from daqsvc.recording.contents import LONGEST_TEXT
 from daqsvc.recording.rate import PER_SECOND, TIME_NAME
 
-_QUANTITY = re.compile(
-    r"(?i:%|V|mV|uV|µV|kV|A|mA|kA|"
+_UNITS = (
+    r"%|V|mV|uV|µV|kV|A|mA|kA|"
     r"g|gn|mg|ug|µg|(?:|m|c)m/s2|(?:|m|c)m/s²|(?:|m|c)m/s\^2|(?:|m)m/s/s|in/s2|in/s²|in/s\^2|ft/s2|ft/s²|ft/s\^2|gal|"
     r"(?:|m|c|u|µ)m/s|in/s|ips|m|cm|mm|um|µm|nm|in|inch|mil|mils|"
     r"Hz|kHz|1/s|rpm|r/min|1/min|min-1|min\^-1|U/min|°|deg|grad|rad|°C|C|degC|°F|F|K|"
     r"N|mN|kN|Nm|N·m|N\*m|Pa|hPa|kPa|MPa|bar|mbar|psi|W|kW|VA|kVA|var|kg|kg/h|t/h|l/min|l/h|l/s|m3/h|m³/h|"
-    r"dB|dB\(A\)|Ohm|Ω|kOhm|kΩ|s|sec|ms|us|µs|ns|h|min)"
-    r"(?i:[\s_]*\(?(?:rms|eff|pk-?pk|p-?p|pp|0-?p|0-?pk|peak|pk)\)?)?"
+    r"dB|dB\(A\)|Ohm|Ω|kOhm|kΩ|s|sec|ms|us|µs|ns|h|min"
 )
+_HOW = r"(?i:[\s_]*\(?(?:rms|eff|pk-?pk|p-?p|pp|0-?p|0-?pk|peak|pk)\)?)?"
+_QUANTITY = re.compile(rf"(?i:{_UNITS}){_HOW}")
+_AS_SPELT = re.compile(rf"(?P<unit>{_UNITS}){_HOW}")
+_IN_ROWS = frozenset({"T", "t"})
+"""Units in a row of them alone: behind a name, ``(T)`` is mostly a phase."""
+_NAMES_TOO = frozenset({"in", "min", "rad", "var", "rpm", "deg"})
+"""Units that channels are called by: input, minimum, wheel (German), variance, speed, angle."""
 _NONE = re.compile(r"-*|n/?a", re.IGNORECASE)
 _MASK = re.compile(
-    r"(?i)date|time|(?:[dt]{1,2}|[yj]{2,4})[./ -]?[mdytjhs.,:/ \-f0]*|hh?:mm[:s.,f0]*|"
+    r"(?i)date|time|(?![dt]$)(?:[dt]{1,2}|[yj]{2,4})[./ -]?[mdytjhs.,:/ \-f0]*|hh?:mm[:s.,f0]*|"
     r"m{1,2}[./-]d{1,2}[./-]y{2,4}(?:[ ,t]*h{1,2}:mm[:s.,f0]*)?(?: ?(?:tt|am/pm))?"
 )
-"""How a date or a time is written, in place of a unit."""
+"""How a date or a time is written, in place of a unit; some units look so, too."""
+_OTHER_AS_CAPITAL = re.compile(rf"(?:m(?:n|nm|pa|w|wh|v|va|var|a|j|hz|ohm|ω)|nm)(?:/.*|{_HOW})")
+"""Units, in small letters, whose first letter is another one as a capital."""
 
 _OPEN, _CLOSE = "[(", "])"
 _BEHIND = re.compile(r"(?P<name>.*\S)\s*(?:\[(?P<square>[^][]+)\]|\((?P<round>[^()]+)\))")
@@ -64,14 +72,29 @@ def without_brackets(cell: str) -> str:
     text = cell.strip()
     if text[:1] and text[0] in _OPEN and text[-1] in _CLOSE:
         text = text[1:-1].strip()
-    is_mask = _MASK.fullmatch(text) is not None and time_unit(text) is None
+    is_mask = _MASK.fullmatch(text) is not None and not _means_unit(text)
     return "" if is_mask or _NONE.fullmatch(text) else text
 
 
 def is_unit(cell: str) -> bool:
     """Whether a cell may stand in a row of units: a unit, how a date is written, or nothing."""
     text = without_brackets(cell)
-    return not text or time_unit(text) is not None or _QUANTITY.fullmatch(_one_micro(text)) is not None
+    return not text or text in _IN_ROWS or _means_unit(text)
+
+
+def unit_as_name(cell: str) -> str:
+    """The unit that a column may be called by; empty if the name is not spelt like one."""
+    text = without_brackets(cell)
+    return text if _AS_SPELT.fullmatch(_one_micro(text)) is not None else ""
+
+
+def is_surely_unit(cell: str) -> bool:
+    """Whether a cell is a unit even where a name may stand: nobody knows that of a letter or a word."""
+    spelt = _AS_SPELT.fullmatch(_one_micro(without_brackets(cell)))
+    if spelt is None:
+        return False
+    unit = spelt["unit"]
+    return cell.strip()[0] in _OPEN or (unit not in _NAMES_TOO and (len(unit) > 1 or not unit.isalpha()))
 
 
 def unit_in_name(name: str) -> tuple[str, str]:
@@ -84,7 +107,7 @@ def unit_in_name(name: str) -> tuple[str, str]:
     behind = _BEHIND.fullmatch(name)
     if behind is not None:
         unit = (behind["square"] or behind["round"]).strip()
-        return (behind["name"], unit) if unit and is_unit(unit) and without_brackets(unit) else (name, "")
+        return (behind["name"], unit) if _means_unit(unit) else (name, "")
     written = _TIME_IN.fullmatch(name)
     if written is not None and is_time_name(written["name"]) and time_unit(written["unit"]) is not None:
         return written["name"], written["unit"]
@@ -98,7 +121,10 @@ def is_time_name(name: str) -> bool:
 
 
 def spelt_alike(one: str, other: str) -> bool:
-    """Whether two texts are one unit but for small and capital letters, and how an exponent is written."""
+    """Whether two texts are one unit but for small and capital letters, and how an exponent is written.
+
+    Letters that are another unit as capitals count as written: milli and mega, Nm and nm.
+    """
     first, second = time_unit(one), time_unit(other)
     if first is not None and second is not None:
         return first.factor / PER_SECOND.get(first.name, 1.0) == second.factor / PER_SECOND.get(
@@ -108,9 +134,13 @@ def spelt_alike(one: str, other: str) -> bool:
 
 
 def _plain(unit: str) -> str:
-    return re.sub(r"[\s^*·]", "", _one_micro(unit).lower().replace("µ", "u").replace("²", "2")).replace(
-        "/s/s", "/s2"
-    )
+    written = re.sub(r"[\s^*·]", "", _one_micro(unit))
+    small = written.lower().replace("µ", "u").replace("²", "2").replace("/s/s", "/s2")
+    return written[0] + small[1:] if _OTHER_AS_CAPITAL.fullmatch(small) else small
+
+
+def _means_unit(text: str) -> bool:
+    return time_unit(text) is not None or _QUANTITY.fullmatch(_one_micro(text)) is not None
 
 
 def _one_micro(text: str) -> str:

@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING
 
 from daqsvc.recording.contents import check_columns, column_names
 from daqsvc.recording.formats.column_units import (
+    is_surely_unit,
     is_time_name,
     is_unit,
     time_unit,
+    unit_as_name,
     unit_in_name,
     without_brackets,
 )
@@ -195,7 +197,7 @@ class _Heading:
 
     Attributes:
         names: number of the line that names them; None if none does.
-        units: of the one with their units.
+        units: of the one with their units; the same if the columns are called by these.
     """
 
     names: int | None = None
@@ -204,7 +206,8 @@ class _Heading:
     def units_of(self, rows: Sequence[Sequence[str]], width: int) -> dict[int, str]:
         """The units by the numbers of their columns."""
         cells = rows[self.units][:width] if self.units is not None else []
-        return {i: unit for i, cell in enumerate(cells) if (unit := without_brackets(cell))}
+        unit_of = unit_as_name if self.units == self.names else without_brackets
+        return {i: unit for i, cell in enumerate(cells) if (unit := unit_of(cell))}
 
 
 def _heading(rows: Sequence[Sequence[str]], first: int, width: int) -> _Heading:
@@ -233,7 +236,12 @@ def _heading(rows: Sequence[Sequence[str]], first: int, width: int) -> _Heading:
         return _Heading()
     if len(upper) >= width and _is_timed(upper, lower) and all(map(is_unit, upper[:width])):
         return _Heading(above, above - 1)
-    is_both = all(map(is_unit, lower[:width])) and not any(map(_tells_time, lower[:width]))
+    # Channels A and V are no units; beside one that is called m/s2 they are.
+    is_both = (
+        all(map(is_unit, lower[:width]))
+        and any(map(is_surely_unit, lower[:width]))
+        and not any(map(_tells_time, lower[:width]))
+    )
     return _Heading(above, above if is_both else None)
 
 
