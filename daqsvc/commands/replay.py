@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_REFUSED, EXIT_USAGE, positive
+from daqsvc.commands.tables import harmless
 from daqsvc.commands.with_kernels import VerbWithKernels
 
 if TYPE_CHECKING:
@@ -67,13 +68,14 @@ class ReplayCommand(VerbWithKernels):
             with tempfile.TemporaryDirectory(prefix="daqsvc-replay-") as directory:
                 replayed = asyncio.run(replay(snapshot, machine, Path(directory), pace, heard))
         except SnapshotError as error:
-            print(f"daqsvc replay: {error}", file=sys.stderr)  # noqa: T201 - errors go to stderr
+            print(harmless(f"daqsvc replay: {error}"), file=sys.stderr)  # noqa: T201 - errors go to stderr
             return EXIT_REFUSED
         except ReplayError as error:
-            print(f"daqsvc replay: {arguments.snapshot} {error}", file=sys.stderr)  # noqa: T201
+            print(harmless(f"daqsvc replay: {arguments.snapshot} {error}"), file=sys.stderr)  # noqa: T201
             return EXIT_REFUSED
-        text = json.dumps(_document(replayed)) if arguments.json else "\n".join(_lines(replayed))
-        print(text)  # noqa: T201 - this is what the verb is for
+        # A snapshot may be anybody's: what is in it is shown and not obeyed.
+        lines = [json.dumps(_document(replayed))] if arguments.json else map(harmless, _lines(replayed))
+        print("\n".join(lines))  # noqa: T201 - this is what the verb is for
         return EXIT_FAILED if arguments.check and not replayed.is_equal else EXIT_OK
 
 
@@ -84,15 +86,14 @@ def _nothing(_event: AlarmEvent) -> None:
 def _print_alarm(event: AlarmEvent) -> None:
     from daqsvc.acquisition.clock import iso_utc  # noqa: PLC0415 - only what a verb needs
 
-    print(  # noqa: T201 - this is what the verb is for
-        f"{iso_utc(event.wall_ns)} {event.alarm} {event.kind.value}: {event.message}", flush=True
-    )
+    line = f"{iso_utc(event.wall_ns)} {event.alarm} {event.kind.value}: {event.message}"
+    print(harmless(line), flush=True)  # noqa: T201 - this is what the verb is for
 
 
 def _lines(replayed: Replayed) -> Iterator[str]:
     if replayed.causes:
         more = len(replayed.causes) - _SHOWN
-        shown = "; ".join(map(_printable, replayed.causes[:_SHOWN]))
+        shown = "; ".join(replayed.causes[:_SHOWN])
         yield f"made for: {shown}" + (f"; {more} more (--json has all)" if more > 0 else "")
     yield from replayed.notes
     for detector, why in replayed.anew.items():
@@ -110,11 +111,6 @@ def _lines(replayed: Replayed) -> Iterator[str]:
             yield f"  {comparison.later} more are of samples at the end, of which the file has none"
     if not replayed.is_compared:
         yield "nothing was compared: the snapshot has no statement or alarm event of what was judged again"
-
-
-def _printable(text: str) -> str:
-    """What a terminal shows and does not obey."""
-    return "".join(one if one.isprintable() else ascii(one)[1:-1] for one in text)
 
 
 def _in_short(document: dict[str, Any]) -> str:

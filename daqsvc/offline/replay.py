@@ -290,7 +290,7 @@ class Replay:
         if then == own:
             return machine
         self._result.notes.append(
-            f"judged as {_printable('/'.join(then.values()))}, as it was then: the machine file is of "
+            f"judged as {'/'.join(then.values())}, as it was then: the machine file is of "
             f"{'/'.join(own.values())}"
         )
         named = machine.machine.model_copy(update={"name": then["machine"]})
@@ -631,11 +631,7 @@ def _judge(alarm: Document) -> str:
 def _listed(names: Iterable[str]) -> str:
     some = sorted({*names})
     more = ", ..." if len(some) > _LISTED else ""
-    return _printable(", ".join(f"{name:.60}" for name in some[:_LISTED])) + more
-
-
-def _printable(text: str) -> str:
-    return "".join(one if one.isprintable() else "?" for one in text)
+    return ", ".join(f"{name:.60}" for name in some[:_LISTED]) + more
 
 
 def _names(detector: Detector, t_ns: int) -> set[str]:

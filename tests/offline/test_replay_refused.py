@@ -17,7 +17,7 @@ from daqsvc.cli import main
 from daqsvc.machine_facts import machine_values
 from daqsvc.offline.replay import ReplayError, replay
 from daqsvc.settings.load import load_machine_file
-from daqsvc.snapshots.contents import CAUSES, MACHINE_JSON, SCHEMA, WINDOWS, Entry, Noted, Snapshot
+from daqsvc.snapshots.contents import CAUSES, DIAGNOSES, MACHINE_JSON, SCHEMA, WINDOWS, Entry, Noted, Snapshot
 from daqsvc.snapshots.writing import SnapshotWriter
 
 if TYPE_CHECKING:
@@ -101,17 +101,27 @@ def test_a_check_of_nothing_is_not_passed(tmp_path: Path, capsys: pytest.Capture
         [
             Entry(10**9, SampleBlock("other", 0, rows, 10**9, 1e9 / 640.0)),
             Entry(10**9, Noted(CAUSES, {"kind": "alarm", "cause": "rotor-fault: raised"})),
+            Entry(10**9, Noted(DIAGNOSES, {"detector": "an\x1b[31mother"})),
         ]
     )
     writer.finish()
     assert main(["replay", f"{path}"]) == 0
-    first, *_, last = capsys.readouterr().out.splitlines()
-    assert first == "made for: a \\x1b[31mknock; rotor-fault: raised"
+    first, *between, last = capsys.readouterr().out.splitlines()
+    assert any("are not judged again: 1 (an\N{REPLACEMENT CHARACTER}[31mother)" in line for line in between)
+    assert first == "made for: a \N{REPLACEMENT CHARACTER}[31mknock; rotor-fault: raised"
     assert last.startswith("nothing was compared")
     assert main(["replay", f"{path}", "--check", "--json"]) == 1
     told = json.loads(capsys.readouterr().out)
     assert (told["is_equal"], told["is_compared"]) == (False, False)
     assert told["causes"] == ["a \x1b[31mknock", "rotor-fault: raised"]
+
+
+def test_what_is_refused_is_shown_and_not_obeyed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "one.mcap"
+    about = {**ABOUT, "standings": {"shaft": {"a \x1b[31mmood": 1}}}
+    SnapshotWriter(path, about, {MACHINE_JSON: machine_json()}, 10**18).finish()
+    assert main(["replay", f"{path}"]) == 3
+    assert "a \N{REPLACEMENT CHARACTER}[31mmood" in capsys.readouterr().err
 
 
 def test_what_is_no_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
