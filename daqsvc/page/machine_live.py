@@ -6,12 +6,16 @@ Nothing is kept over a restart, and of the waveforms no more than the last secon
 from __future__ import annotations
 
 import base64
-import itertools
+import json
+import time
+import zlib
 from collections import deque
+from itertools import takewhile
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
+from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.ring import SampleRing
 from daqsvc.acquisition.samples import Quality, SampleBlock
 
@@ -32,6 +36,13 @@ MOST_SAID = 3600
 """Statements of one detector that are kept."""
 MOST_JOURNAL = 500
 """Alarm events that are kept."""
+HYSTERESIS_V = 0.5
+"""Of a keyphasor of which the machine file does not say it."""
+PAIR = 2
+SQUARE_DEG = (60.0, 120.0)
+LATE_S = 3.0
+LATE_TURNS = 3.0
+"""A stream is late after so long, and so many times as long as it took the last time."""
 
 
 class Sensor(NamedTuple):
@@ -44,6 +55,7 @@ class Sensor(NamedTuple):
         angle_deg: where a probe points, from +x against the clock; None for others.
         threshold: where a keyphasor's pulse begins; None for others.
         edge: the edge of that pulse that marks a revolution.
+        hysteresis: how far the voltage must go back before there is another one.
     """
 
     name: str
@@ -52,6 +64,7 @@ class Sensor(NamedTuple):
     angle_deg: float | None
     threshold: float | None
     edge: Literal["rising", "falling"]
+    hysteresis: float
 
 
 class Said(NamedTuple):
@@ -68,6 +81,13 @@ class Said(NamedTuple):
     decision: str
     probabilities: dict[str, float]
     statistics: dict[str, float]
+
+
+class _Came(NamedTuple):
+    """When samples of a stream came last, and how long the next ones may take, by `time.monotonic`."""
+
+    at_s: float
+    patience_s: float
 
 
 class SensorPlace(NamedTuple):
@@ -101,16 +121,31 @@ class MachineLive:
         self.history: Path | None = None
         """The file of the box's history, if there can be one."""
         self.left_out = 0
+        self.token = zlib.crc32(json.dumps([self.values, about["streams"]], sort_keys=True).encode())
+        """Another one where the machine file is another one."""
+        self._came: dict[str, _Came] = {}
         self._places = self._found_places()
 
     @property
-    def speed_rpm(self) -> float:
-        """What a detector says of the speed, or the machine file."""
+    def measured_rpm(self) -> float | None:
+        """What a detector has measured of the speed lately; None if none has."""
         for one in [*self.latest.values()]:
             measured = one["statistics"].get("speed")
             if measured is not None and one["units"].get("speed") == "rpm":
                 return float(measured)
-        return float(self.values["machine"].get("speed_rpm", 0.0))
+        return None
+
+    @property
+    def speed_rpm(self) -> float:
+        """The speed as it was measured, or as the machine file says."""
+        measured = self.measured_rpm
+        return float(self.values["machine"].get("speed_rpm", 0.0)) if measured is None else measured
+
+    @property
+    def speed_in_words(self) -> str:
+        """The speed, and whether it is only the machine file's; "" if nobody says any."""
+        measured = self.measured_rpm is not None
+        return f"{self.speed_rpm:.0f} rpm{'' if measured else ' nominal'}" if self.speed_rpm else ""
 
     @property
     def turns_clockwise(self) -> bool:
@@ -166,23 +201,46 @@ class MachineLive:
         newest = [ring.time_of(ring.end_index - 1) for ring in rings if ring.started]
         return max(newest) + self.wall_ns_at_0 if newest else None
 
+    def silence(self, streams: Iterable[str]) -> tuple[str, float]:
+        """Which of some streams has come no more, and for how long, s; "" if all come."""
+        now_s = time.monotonic()
+        for stream in streams:
+            if self.standings.get(stream, {}).get("silent"):
+                taken_ns = self.newest_wall_ns([stream])
+                return stream, 0.0 if taken_ns is None else max(time.time() - taken_ns / NS_PER_S, 0.0)
+            if (came := self._came.get(stream)) is not None and now_s - came.at_s > came.patience_s:
+                return stream, now_s - came.at_s
+        return "", 0.0
+
     def probes(self) -> list[tuple[str, str]]:
-        """Pairs of proximity probes of one plane: neighbours in the machine file, 60 to 120 degrees apart."""
-        probes = [one for one in self.sensors.values() if one.kind == "proximity"]
-        pairs = []
-        for x, y in itertools.pairwise(probes):
-            apart = abs(((y.angle_deg or 0.0) - (x.angle_deg or 0.0) + 180.0) % 360.0 - 180.0)
-            if 60.0 <= apart <= 120.0 and self.place_of([x.name, y.name]):
+        """Pairs of proximity probes of one plane that are sampled together.
+
+        Those that a detector takes as a pair; of the others each with the one of the most similar name that
+        is 60 to 120 degrees from it.
+        """
+        told = [table["probes"] for table in self._tables() if len(table.get("probes", ())) == PAIR]
+        pairs = [(str(x), str(y)) for x, y in told if self.place_of([x, y])]
+        pairs = list(dict.fromkeys(pairs))
+        left = [
+            one
+            for one in self.sensors.values()
+            if one.kind == "proximity" and not any(one.name in pair for pair in pairs)
+        ]
+        while left:
+            x = left.pop(0)
+            others = [y for y in left if _are_square(x, y) and self.place_of([x.name, y.name])]
+            if others:
+                y = max(others, key=lambda other: _alike(x.name, other.name))
+                left.remove(y)
                 pairs.append((x.name, y.name))
         return pairs
+
+    def _tables(self) -> list[Document]:
+        return [one for one in self.values.get("pipeline", {}).values() if isinstance(one, dict)]
 
     def keyphasor(self) -> str | None:
         """The first keyphasor."""
         return next((one.name for one in self.sensors.values() if one.kind == "keyphasor"), None)
-
-    def edge_of(self, keyphasor: str) -> Literal["rising", "falling"]:
-        """The edge of a keyphasor's pulse that marks a revolution."""
-        return self.sensors[keyphasor].edge
 
     def vibration_sensors(self) -> list[str]:
         """All sensors but keyphasors, by their names."""
@@ -234,6 +292,10 @@ class MachineLive:
 
     def place(self, block: SampleBlock) -> None:
         """Take in samples; what is there already is left out, what is missing before them is a gap."""
+        now_s = time.monotonic()
+        before = self._came.get(block.stream)
+        took_s = 0.0 if before is None else now_s - before.at_s
+        self._came[block.stream] = _Came(now_s, LATE_S + LATE_TURNS * took_s)
         ring = self.rings.get(block.stream)
         if ring is None:
             ring = self.rings[block.stream] = self._ring(block.stream, block.samples.shape[1])
@@ -260,6 +322,17 @@ class MachineLive:
         )
 
 
+def _alike(one: str, other: str) -> int:
+    """How many characters two names have in common at their begin."""
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(one, other, strict=False)))
+
+
+def _are_square(x: Sensor, y: Sensor) -> bool:
+    """Whether two probes look at about a right angle."""
+    apart = abs(((y.angle_deg or 0.0) - (x.angle_deg or 0.0) + 180.0) % 360.0 - 180.0)
+    return SQUARE_DEG[0] <= apart <= SQUARE_DEG[1]
+
+
 def _when(event: Document) -> int:
     return int(event["monotonic_ns"])
 
@@ -267,4 +340,7 @@ def _when(event: Document) -> int:
 def _sensor(told: Document) -> Sensor:
     angle, threshold = told.get("angle_deg"), told.get("threshold_v")
     edge: Literal["rising", "falling"] = "falling" if told.get("edge") == "falling" else "rising"
-    return Sensor(told["name"], told.get("type", ""), told.get("unit", ""), angle, threshold, edge)
+    hysteresis = float(told.get("hysteresis_v", HYSTERESIS_V))
+    return Sensor(
+        told["name"], told.get("type", ""), told.get("unit", ""), angle, threshold, edge, hysteresis
+    )

@@ -101,9 +101,16 @@ class Picture:
 
     def _streams(self, listening: Heard) -> set[str]:
         live = listening.live
-        if self._view is None or live is None or self._view.why_not(live):
+        if self._view is None or live is None or self._view.why_not(live) or self._lacks(self._view, live):
             return set()
         return self._view.streams(live, self._chosen)
+
+    def _lacks(self, view: MachineView, live: MachineLive) -> str:
+        """What was chosen and is not there (any more), e.g. a sensor after a reload; else empty."""
+        for choice in view.choices(live):
+            if (chosen := self._chosen.get(choice.name, "nothing")) not in choice.options:
+                return chosen
+        return ""
 
     def _whatever(self, listening: Heard) -> bytes:
         """See `_told`; also of a mistake in this program browsers are told."""
@@ -124,6 +131,10 @@ class Picture:
         why = listening.why_not or ("the service says nothing" if silent_s > STALE_S else "")
         told: dict[str, Any] = {"age_s": round(silent_s, 1), "why": why}
         if live is not None:
+            told["token"] = live.token
+            stream, away_s = live.silence(self._streams(listening))
+            if stream and not why:
+                told |= {"age_s": round(away_s, 1), "why": f"nothing comes of {stream} any more"}
             told["html"] = {"head": head(live), "alarms": alarm_rows(live)}
             if self._view is None:
                 told["html"] |= {"machine": machine_rows(live), "journal": journal_rows(live)}
@@ -134,12 +145,9 @@ class Picture:
     def _view_of(self, view: MachineView, live: MachineLive) -> dict[str, Any]:
         if why_not := view.why_not(live):
             return {"note": why_not}
-        try:
-            shown = view.shown(live, self._chosen)
-        except LookupError as error:
-            # What was chosen is not there any more, e.g. a sensor after a reload.
-            log.debug("view %s of %s", view.name, self._machine, exc_info=True)
-            return {"note": f"what is chosen is not there any more ({error}): choose anew"}
+        if lacking := self._lacks(view, live):
+            return {"note": f"{lacking} is not there any more: choose another one, and press Show"}
+        shown = view.shown(live, self._chosen)
         sources = {
             name: {column: _sent(values) for column, values in columns.items()}
             for name, columns in shown.sources.items()

@@ -139,10 +139,13 @@ class _Page:
         view = VIEWS.get(chosen_view or "")
         if live is None or (chosen_view and view is None):
             why = why or f"there is no view {chosen_view!r}"
-            page = self._html("absent.html", title=name, why=why)
+            page = self._html("absent.html", title=name, why=why, again=live is None)
             page.status_code = 404
             return page
         choices, chosen = _chosen(view, live, request.query_params)
+        asked = request.query_params
+        others = [(asked[name], one) for name, one in chosen.items() if asked.get(name, one) != one]
+        instead = [f"{wanted} is not there; {one} is shown" for wanted, one in others]
         return self._html(
             "machine.html",
             title=f"{view.title if view else 'Machine'}: {name}",
@@ -155,6 +158,7 @@ class _Page:
             why_not=view.why_not(live) if view else "",
             choices=choices,
             chosen=chosen,
+            instead=instead,
         )
 
     async def figures(self, request: Request) -> Response:
@@ -174,7 +178,9 @@ class _Page:
         name, view = request.path_params["machine"], VIEWS.get(request.path_params.get("view", ""))
         live, why = await self._first(name)
         if live is None:
-            return Response(why, status_code=503)
+            # A browser asks again after an answer that ends well, and never after an error.
+            told = json.dumps({"age_s": 0.0, "why": why})
+            return Response(f"retry: 2000\ndata: {told}\n\n", media_type="text/event-stream")
         _, chosen = _chosen(view, live, request.query_params)
         key = (name, view.name if view else "", *(f"{a}={b}" for a, b in sorted(chosen.items())))
         if key not in self._pictures:

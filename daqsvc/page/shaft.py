@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
-HYSTERESIS_V = 0.5
+MOST_OFF = 0.2
+"""A mark that is so far from where it should be, in revolutions, is none."""
 UM = {"um": 1.0, "mm": 1000.0, "m": 1e6, "mil": 25.4, "in": 25_400.0}
 """Micrometres in a unit of length."""
 
@@ -87,7 +88,8 @@ def whirl(live: MachineLive, probes: tuple[str, str], revolutions: float) -> Whi
     marks = np.empty(0)
     if has_keyphasor and key is not None:
         pulses = samples[:, places[2].column].astype(np.float64)
-        finder = EdgeFinder(live.sensors[key].threshold or 0.0, HYSTERESIS_V, live.edge_of(key))
+        probe = live.sensors[key]
+        finder = EdgeFinder(probe.threshold or 0.0, probe.hysteresis, probe.edge)
         marks = np.array([index + fraction for index, fraction in finder.find(pulses)])
     return Whirl(xy, marks, live.rate_hz(stream), end_ns, speed_hz, has_keyphasor and len(marks) > 0)
 
@@ -97,13 +99,9 @@ def order_1x(seen: Whirl) -> Order | None:
 
     By two marks or more the speed is theirs, over these samples; else the one that was told.
     """
-    n = len(seen.xy_um)
-    index = np.arange(n, dtype=np.float64)
-    if len(seen.marks) > 1:
-        period = (seen.marks[-1] - seen.marks[0]) / (len(seen.marks) - 1)
-        turns = (index - seen.marks[0]) / period
-    else:
-        turns = (index - (seen.marks[0] if len(seen.marks) else 0.0)) * seen.speed_hz / seen.rate_hz
+    index = np.arange(len(seen.xy_um), dtype=np.float64)
+    mark, period = _turning(seen)
+    turns = (index - mark) / period
     there = np.isfinite(seen.xy_um).all(axis=1)
     if there.sum() < 8 or np.ptp(turns[there]) < 0.9:
         return None
@@ -111,3 +109,25 @@ def order_1x(seen: Whirl) -> Order | None:
     design = np.column_stack([np.ones(there.sum()), wave.real, -wave.imag])
     (mean, real, imaginary), *_ = np.linalg.lstsq(design, seen.xy_um[there], rcond=None)
     return Order(mean, real + 1j * imaginary)
+
+
+def _turning(seen: Whirl) -> tuple[float, float]:
+    """A sample at which the mark passes, and the samples of a revolution.
+
+    Marks may be missing, and there may be some too many: each counts as many revolutions on as it comes
+    behind the last one, by the usual distance.
+    """
+    told = seen.rate_hz / seen.speed_hz
+    if len(seen.marks) < 2:
+        return (float(seen.marks[0]) if len(seen.marks) else 0.0), told
+    usual = float(np.median(np.diff(seen.marks)))
+    kept, number = [float(seen.marks[0])], [0]
+    for mark in seen.marks[1:]:
+        turns = (float(mark) - kept[-1]) / usual
+        if round(turns) >= 1 and abs(turns - round(turns)) <= MOST_OFF * round(turns):
+            kept.append(float(mark))
+            number.append(number[-1] + round(turns))
+    if len(kept) < 2:
+        return kept[0], told
+    period, first = np.polyfit(number, kept, 1)
+    return float(first), float(period)

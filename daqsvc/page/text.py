@@ -58,7 +58,7 @@ def head(live: MachineLive) -> str:
     description = live.values["machine"].get("description", "")
     return (
         f'<span class="level {escape(level)}">{escape(level)}</span> '
-        f"<span>{live.speed_rpm:.0f} rpm</span> <span>{escape(description)}</span>"
+        f"<span>{live.speed_in_words}</span> <span>{escape(description)}</span>"
     )
 
 
@@ -85,8 +85,7 @@ def journal_rows(live: MachineLive) -> str:
             escape(one["alarm"]),
             escape(one["kind"]),
             f'<span class="level {escape(one["level"])}">{escape(one["level"])}</span>',
-            escape(one["message"])
-            + (f" ({escape(one['by'])}: {escape(one['reason'])})" if one["by"] else ""),
+            escape(": ".join(filter(None, (one["message"], one["by"], one["reason"])))),
         )
         for one in [*live.journal][: -MOST_EVENTS - 1 : -1]
     ]

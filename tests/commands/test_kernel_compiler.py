@@ -148,8 +148,11 @@ def until_said(process: subprocess.Popen[str], words: str) -> str:
 
 
 def children(pid: int) -> list[int]:
-    tasks = Path(f"/proc/{pid}/task").iterdir()
-    return [int(child) for task in tasks for child in (task / "children").read_text().split()]
+    found = ""
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # a thread may end meanwhile
+            found += (task / "children").read_text()
+    return [int(child) for child in found.split()]
 
 
 def resident_kb(pid: int) -> int:

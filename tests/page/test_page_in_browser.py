@@ -257,7 +257,7 @@ async def test_figures_stand_still_when_they_are_frozen(tmp_path: Path) -> None:
         await page.goto(f"{address}/machines/laval-rig/orbit")
         await until_figures(page, "1X x")
         await page.get_by_role("button", name="Freeze").click()
-        assert "Frozen" in await page.locator("#silence").inner_text()
+        assert "frozen since" in await page.locator("#silence").inner_text()
         shown = await page.locator("#rows").inner_text()
         await asyncio.sleep(0.5)
         assert await page.locator("#rows").inner_text() == shown
@@ -265,6 +265,7 @@ async def test_figures_stand_still_when_they_are_frozen(tmp_path: Path) -> None:
         await page.locator(f"#rows:not(:text-is({shown!r}))").wait_for(timeout=PATIENCE_MS)
         # The choice is in the address, and the address can be shared.
         await page.get_by_label("Length").select_option("16")
+        await page.get_by_role("button", name="Show").click()
         await page.wait_for_url("**/orbit?probes=probe-x%2Cprobe-y&revolutions=16")
         assert await page.get_by_label("Length").input_value() == "16"
         assert math.isclose((await until_figures(page, "speed"))["speed"], 600.0, abs_tol=1.0)

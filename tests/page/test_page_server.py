@@ -49,7 +49,9 @@ async def test_strangers_are_not_answered(tmp_path: Path) -> None:
         assert status == 404
         assert "<b>" not in text
         assert "content-security-policy" in headers
-        assert (await asyncio.to_thread(ask, address, "/events/none"))[0] == 503
+        status, text, headers = await asyncio.to_thread(ask, address, "/events/none")
+        assert (status, headers["content-type"]) == (200, "text/event-stream; charset=utf-8")
+        assert text.startswith("retry: 2000\ndata: "), "a browser asks again"
         assert (await asyncio.to_thread(ask, address, "/", "POST"))[0] == 405
         process.terminate()
         async with asyncio.timeout(30):

@@ -205,9 +205,11 @@ def test_a_damaged_bearing_shows_in_the_envelope_at_its_lines() -> None:
     view = VIEWS["envelope"]
     assert view.why_not(live) == ""
     shown = view.shown(live, {"sensor": "casing", "length": "2"})
-    rows = {name.partition(" at ")[0]: float(value) for name, value, _ in shown.rows}
+    rows = {name.partition(",")[0]: float(value) for name, value, _ in shown.rows}
     assert rows["drive-end BPFO"] > 2.5 * rows["drive-end BPFI"]
-    assert max(rows, key=lambda name: rows[name]) in {"drive-end BPFO", "largest"}
+    largest = next((name, float(value)) for name, value, _ in shown.rows if name.startswith("largest"))
+    assert largest[1] == rows["drive-end BPFO"]
+    assert float(largest[0].split()[2]) == pytest.approx(order * speed_hz, abs=0.5)
     lines = shown.sources["bearing_lines"]
     assert lines["x"][lines["name"].index("drive-end BPFO")] == pytest.approx(order * speed_hz, rel=1e-3)
     slow = MachineLive(about())
@@ -217,9 +219,9 @@ def test_a_damaged_bearing_shows_in_the_envelope_at_its_lines() -> None:
 def test_a_trend_is_drawn_from_the_history_and_broken_where_nothing_was_measured(tmp_path: Path) -> None:
     live = MachineLive(about())
     view = VIEWS["trend"]
-    assert "keeps no history" in view.why_not(live)
+    assert "nothing is written down" in view.why_not(live)
     live.history = tmp_path / "history.sqlite"
-    assert "keeps no history" in view.why_not(live)
+    assert "nothing is written down" in view.why_not(live)
     now_s = int(time.time())
     series = Series("rig", "levels/left", "statistic", "rms", "um")
     seconds = np.array(
@@ -287,9 +289,89 @@ async def test_a_view_that_fails_is_said_and_the_others_go_on(
 ) -> None:
     live = MachineLive(about())
     heard = SimpleNamespace(live=live, why_not="", heard_s=time.monotonic())
-    broken, whole = (Picture(None, "rig", VIEWS[name], {}) for name in ("orbit", "timebase"))  # type: ignore[arg-type]
+    broken, whole = (
+        Picture(None, "rig", VIEWS[name], chosen)  # type: ignore[arg-type]
+        for name, chosen in (
+            ("orbit", {"probes": "left,right", "revolutions": "4"}),
+            ("timebase", {"sensor": "gone", "length": "1"}),
+        )
+    )
     monkeypatch.setattr(type(VIEWS["orbit"]), "shown", lambda *_: 1 / 0)
     for _ in range(2):
         assert json.loads(broken._whatever(heard))["why"].startswith("the page has failed")  # type: ignore[arg-type]
     assert len(caplog.records) == 1
-    assert "note" in json.loads(whole._whatever(heard))  # type: ignore[arg-type]
+    note = json.loads(whole._whatever(heard))["note"]  # type: ignore[arg-type]
+    assert note.startswith("gone is not there any more")
+
+
+@pytest.mark.parametrize("spoilt", ["a mark is missing", "a mark too many"])
+def test_a_mark_that_is_missing_or_too_many_leaves_1x_as_it_is(spoilt: str) -> None:
+    live = MachineLive(about())
+    rows = turning(3.0, 20.0, -20.0j)
+    pulses = np.flatnonzero((rows[1:, 2] > -6.0) & (rows[:-1, 2] <= -6.0)) + 1
+    at = pulses[-3]
+    if spoilt == "a mark is missing":
+        rows[at - 2 : at + 8] = np.nan
+    else:
+        rows[at + 30 : at + 33, 2] = -2.0
+    live.hear(told(rows))
+    seen = whirl(live, ("left", "right"), 8.0)
+    assert seen is not None
+    order = order_1x(seen)
+    assert order is not None
+    assert np.abs(order.vectors_um) == pytest.approx([20.0, 20.0], rel=0.03)
+
+
+def test_the_hysteresis_of_the_machine_file_counts() -> None:
+    values = machine_values()
+    values["sensors"][2]["hysteresis_v"] = 3.0
+    live = MachineLive({**about(), "values": values})
+    rows = turning(3.0, 20.0, -20.0j)
+    noise = np.random.default_rng(2).normal(scale=0.8, size=len(rows))
+    live.hear(told(np.column_stack([rows[:, :2], rows[:, 2] + noise])))
+    seen = whirl(live, ("left", "right"), 16.0)
+    assert seen is not None
+    assert 15 <= len(seen.marks) <= 16
+
+
+def probes_named(*names: str, pipeline: dict[str, Any] | None = None) -> list[tuple[str, str]]:
+    sensors = [
+        {"name": name, "type": "proximity", "unit": "um", "angle_deg": 45.0 if "x" in name else 135.0}
+        for name in names
+    ]
+    facts = {"rate_hz": 1.0, "channels": [*names], "sensors": [*names], "units": ["um"] * len(names)}
+    values = {"machine": {"name": "rig"}, "sensors": sensors, "pipeline": pipeline or {}}
+    return MachineLive({**about(), "values": values, "streams": {"s": facts}}).probes()
+
+
+def test_probes_of_two_planes_make_no_pair() -> None:
+    two = [("de-x", "de-y"), ("nde-x", "nde-y")]
+    assert probes_named("de-x", "de-y", "nde-x", "nde-y") == two
+    assert probes_named("de-x", "nde-x", "de-y", "nde-y") == two
+    bank = {"rotor_bank": {"probes": ["x2", "y1"]}, "levels": {"window_s": 1.0}}
+    assert probes_named("x1", "x2", "y1", "y2", pipeline=bank) == [("x2", "y1"), ("x1", "y2")]
+
+
+def test_a_stream_that_comes_no_more_is_told_with_its_age(monkeypatch: pytest.MonkeyPatch) -> None:
+    live = MachineLive(about())
+    chosen = {"sensor": "left", "length": "1"}
+    heard = SimpleNamespace(live=live, why_not="", heard_s=time.monotonic() + 1e6)
+    picture = Picture(None, "rig", VIEWS["timebase"], chosen)  # type: ignore[arg-type]
+    live.hear(told(turning(1.0, 20.0, -20.0j)))
+    assert json.loads(picture._whatever(heard))["why"] == ""  # type: ignore[arg-type]
+    now_s = time.monotonic()
+    with monkeypatch.context() as later:
+        later.setattr(time, "monotonic", lambda: now_s + 30.0)
+        said = json.loads(picture._whatever(heard))  # type: ignore[arg-type]
+    assert said["why"] == "nothing comes of shaft any more"
+    assert said["age_s"] == pytest.approx(30.0, abs=0.5)
+    live.hear({"standing": {"stream": "shaft", "doubt": "", "proven": True, "silent": True}})
+    assert json.loads(picture._whatever(heard))["why"], "so says the service, too"  # type: ignore[arg-type]
+
+
+def test_a_speed_that_nobody_has_measured_is_called_nominal() -> None:
+    live = MachineLive(about())
+    assert live.speed_in_words == "738 rpm nominal"
+    said = {"detector": "bank", "monotonic_ns": 1, "decision": "N", "probabilities": {}}
+    live.hear({"statement": {**said, "statistics": {"speed": 741.0}, "units": {"speed": "rpm"}}})
+    assert live.speed_in_words == "741 rpm"

@@ -2,7 +2,8 @@
 "use strict";
 const live = document.getElementById("live");
 const sources = {};
-let frozen = false;
+let frozenAt = null;
+let token = null;
 let heard = performance.now();
 let told = { age_s: 0, why: "" };
 
@@ -24,15 +25,16 @@ function show(now) {
       inOwnZone(place);
     }
   }
-  for (const [name, columns] of Object.entries(now.sources ?? {})) {
-    if (sources[name]) {
-      sources[name].data = Object.fromEntries(Object.entries(columns).map(([key, sent]) => [key, floats(sent)]));
-    }
+  if (frozenAt) return;
+  for (const [name, source] of Object.entries(sources)) {
+    // What is not told is not there: no old curve stays under a note.
+    const columns = now.sources?.[name] ?? Object.fromEntries(Object.keys(source.data).map((key) => [key, []]));
+    source.data = Object.fromEntries(Object.entries(columns).map(([key, sent]) => [key, floats(sent)]));
   }
   const rows = document.querySelector("#rows tbody");
-  if (rows && now.rows) {
+  if (rows) {
     rows.replaceChildren(
-      ...now.rows.map((cells) => {
+      ...(now.rows ?? []).map((cells) => {
         const row = document.createElement("tr");
         row.append(
           ...cells.map((text, at) => {
@@ -58,8 +60,9 @@ function sayAge() {
   const why = away_s > 3 ? "the page's server does not answer" : told.why;
   const place = document.getElementById("silence");
   document.body.classList.toggle("stale", silent);
-  place.hidden = !silent && !frozen;
-  const text = silent ? `What is shown is ${Math.round(age_s)} s old: ${why}.` : frozen ? "Frozen: press Freeze again to go on." : "";
+  place.hidden = !silent && !frozenAt;
+  const frozen = frozenAt ? `The figures are frozen since ${frozenAt}: press Freeze again to go on. ` : "";
+  const text = frozen + (silent ? `What is shown is ${Math.round(age_s)} s old: ${why}.` : "");
   if (place.textContent !== text) place.textContent = text;
 }
 
@@ -67,12 +70,15 @@ async function figures() {
   const theme = matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
   const query = new URLSearchParams(location.search);
   query.set("theme", theme);
-  const answer = await fetch(`${live.dataset.figures}?${query}`);
-  if (!answer.ok) {
-    document.getElementById("note").textContent = "The figures cannot be made: load the page anew.";
-    return;
+  let made = [];
+  while (!made.length) {
+    try {
+      made = await (await fetch(`${live.dataset.figures}?${query}`)).json();
+    } catch {
+      // The age says that nobody answers.
+    }
+    if (!made.length) await new Promise((then) => setTimeout(then, 2000));
   }
-  const made = await answer.json();
   const place = document.getElementById("figures");
   for (const one of made) {
     const figure = document.createElement("figure");
@@ -89,24 +95,33 @@ async function figures() {
   }
 }
 
+let events = null;
+
 function listen() {
-  const events = new EventSource(live.dataset.events + location.search);
+  // A browser has few connections to a server: tabs that nobody sees let go of theirs.
+  if (document.hidden) return;
+  events = new EventSource(live.dataset.events + location.search);
   events.onmessage = (event) => {
     heard = performance.now();
     told = JSON.parse(event.data);
-    if (!frozen) show(told);
+    if (token !== null && told.token !== undefined && told.token !== token) location.reload();
+    token = told.token ?? token;
+    show(told);
     sayAge();
   };
 }
+
+let good = heard;
 
 async function watchPlant(list) {
   try {
     const now = await (await fetch("/plant.json")).json();
     heard = performance.now();
-    told = { age_s: 0, why: now.why };
+    if (!now.why) good = heard;
+    told = { age_s: (heard - good) / 1000, why: now.why };
     const text = JSON.stringify(now.tiles);
-    if (list.dataset.shown !== undefined && list.dataset.shown !== text) location.reload();
-    list.dataset.shown = text;
+    if (!now.why && list.dataset.shown !== undefined && list.dataset.shown !== text) location.reload();
+    if (!now.why || list.children.length === 0) list.dataset.shown = text;
   } catch {
     // The age says it.
   }
@@ -116,15 +131,18 @@ async function watchPlant(list) {
 const plant = document.querySelector("[data-plant]");
 if (plant) watchPlant(plant);
 if (live) {
-  (live.dataset.figures ? figures() : Promise.resolve()).then(listen);
+  (live.dataset.figures ? figures() : Promise.resolve()).then(() => {
+    listen();
+    document.addEventListener("visibilitychange", () => {
+      events?.close();
+      listen();
+    });
+  });
   const freeze = document.getElementById("freeze");
   freeze?.addEventListener("click", () => {
-    frozen = !frozen;
-    freeze.setAttribute("aria-pressed", String(frozen));
+    frozenAt = frozenAt ? null : new Date().toLocaleTimeString();
+    freeze.setAttribute("aria-pressed", String(frozenAt !== null));
     sayAge();
   });
-  for (const select of document.querySelectorAll(".choices select")) {
-    select.addEventListener("change", () => select.form.submit());
-  }
 }
 setInterval(sayAge, 1000);

@@ -27,6 +27,8 @@ LEAST_RATE_HZ = 2000.0
 WHITENING_HZ = 100.0
 SHOWN_HZ = 500.0
 LEAST_S = 0.5
+SLIP = 0.01
+"""So far from where it is reckoned a line of a bearing is looked for, as its balls slip."""
 
 
 class EnvelopeSpectrumView:
@@ -68,17 +70,8 @@ class EnvelopeSpectrumView:
         made.line(
             "f", "a", source=source("envelope", ["f", "a"]), line_color=theme.series[0], legend_label=sensor
         )
-        lines = source("bearing_lines", ["x", "top", "name"])
+        lines = source("bearing_lines", ["x", "name"])
         made.vspan(x="x", source=lines, line_color=theme.series[1], line_dash="dashed")
-        made.text(
-            x="x",
-            y="top",
-            text="name",
-            source=lines,
-            text_color=theme.text,
-            text_font_size="11px",
-            angle=1.5708,
-        )
         legend(made, theme)
         return [Figure("envelope", f"Envelope spectrum of {sensor} up to {SHOWN_HZ:g} Hz", made)]
 
@@ -96,20 +89,23 @@ class EnvelopeSpectrumView:
             return Shown(note="too few samples have come for an envelope")
         frequency, swell = envelope_spectrum(np.where(there, values - values[there].mean(), 0.0), rate_hz)
         rows, lines = [], {"x": [], "name": []}  # type: tuple[list[tuple[str, str, str]], dict[str, list[Any]]]
-        for name, at_hz in bearing_lines(live):
-            near = np.abs(frequency - at_hz) <= max(0.02 * at_hz, 2.0 * frequency[1])
+        # A multiple of the speed beside a line is the shaft, and no bearing.
+        speed_hz = abs(live.speed_rpm) / 60.0
+        turns = frequency / speed_hz if speed_hz else np.full(len(frequency), 0.5)
+        own = np.abs(turns - np.rint(turns)) * speed_hz > 1.5 * frequency[1]
+        for name, at_hz in bearing_lines(live, sensor):
+            near = (np.abs(frequency - at_hz) <= max(SLIP * at_hz, 1.5 * frequency[1])) & own
             if at_hz < SHOWN_HZ and near.any():
-                rows.append((f"{name} at {at_hz:.1f} Hz", f"{swell[near].max():.3f}", "of the mean"))
+                found = np.flatnonzero(near)[swell[near].argmax()]
+                what = f"{name}, {at_hz:.1f} Hz"
+                rows.append((what, f"{swell[found]:.3f}", f"of the mean, at {frequency[found]:.1f} Hz"))
                 lines["x"].append(at_hz)
                 lines["name"].append(name)
         highest = int(swell[1:].argmax()) + 1
         rows.append((f"largest at {frequency[highest]:.1f} Hz", f"{swell[highest]:.3f}", "of the mean"))
         missing = int((~there).sum())
         note = f"{missing} of {len(values)} samples are missing" if missing else ""
-        top = [0.0] * len(lines["x"])
-        return Shown(
-            {"envelope": {"f": frequency, "a": swell}, "bearing_lines": {**lines, "top": top}}, rows, note
-        )
+        return Shown({"envelope": {"f": frequency, "a": swell}, "bearing_lines": lines}, rows, note)
 
 
 def envelope_spectrum(values: Any, rate_hz: float) -> tuple[Any, Any]:
@@ -130,10 +126,12 @@ def envelope_spectrum(values: Any, rate_hz: float) -> tuple[Any, Any]:
     return np.arange(len(swell)) * rate_hz / length, swell
 
 
-def bearing_lines(live: MachineLive) -> Iterator[tuple[str, float]]:
-    """Where the parts of the machine's bearings would be seen at its speed, Hz."""
+def bearing_lines(live: MachineLive, sensor: str) -> Iterator[tuple[str, float]]:
+    """Where the parts of the bearings that a sensor watches would be seen at the machine's speed, Hz."""
     speed_hz = abs(live.speed_rpm) / 60.0
     for one in live.values.get("pipeline", {}).get("bearing", {}).get("bearings", ()):
+        if one.get("sensor", sensor) != sensor:
+            continue
         told = one.get("orders")
         orders = (
             bearing_orders(one["type"])

@@ -78,7 +78,8 @@ class OrbitView:
         sources["orbit_marks"] = {
             axis: np.interp(seen.marks, index, seen.xy_um[:, column]) for column, axis in enumerate("xy")
         }
-        rows = [("speed", f"{60.0 * seen.speed_hz:.1f}", "rpm")]
+        measured = live.measured_rpm is not None
+        rows = [("speed", f"{60.0 * seen.speed_hz:.1f}", "rpm" if measured else "rpm nominal")]
         if (order := order_1x(seen)) is not None:
             ellipse = order.ellipse_um()
             sources["orbit_1x"] = {"x": ellipse[:, 0], "y": ellipse[:, 1]}
@@ -88,8 +89,11 @@ class OrbitView:
                 if seen.has_keyphasor:
                     lag_deg = math.degrees(-np.angle(vector)) % 360.0
                     rows.append((f"1X {axis} behind the mark", f"{lag_deg:.0f}", "degrees"))
-        largest = np.hypot(*(seen.xy_um - np.nanmean(seen.xy_um, axis=0)).T)
-        rows.append(("largest distance from the mean", f"{np.nanmax(largest):.1f}", "um"))
-        missing = int(np.isnan(seen.xy_um).any(axis=1).sum())
+        there = seen.xy_um[np.isfinite(seen.xy_um).all(axis=1)]
+        if not len(there):
+            return Shown(note="the samples of these probes are missing")
+        largest = np.hypot(*(there - there.mean(axis=0)).T).max()
+        rows.append(("largest distance from the mean", f"{largest:.1f}", "um"))
+        missing = len(seen.xy_um) - len(there)
         note = f"{missing} of {len(seen.xy_um)} samples are missing" if missing else ""
         return Shown(sources, rows, note)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from daqsvc.page.machine_live import MachineLive
 
 MINUTES = {"10": "10 minutes", "1": "1 minute", "60": "1 hour"}
-REVOLUTIONS = {"100": "100 revolutions", "20": "20 revolutions", "400": "400 revolutions"}
+REVOLUTIONS = {"100": "100 revolutions", "20": "20 revolutions", "200": "200 revolutions"}
 LARGER = 1.15
 NO_PAIR = "it needs two proximity probes of one plane, 60 to 120 degrees apart, sampled together"
 SAME_NS = NS_PER_S // 2
@@ -162,13 +162,19 @@ class PoincareView:
         if seen is None or not seen.has_keyphasor:
             return Shown(note="no mark of the keyphasor has come yet")
         index = np.arange(len(seen.xy_um))
-        at = [np.interp(seen.marks, index, seen.xy_um[:, column]) for column in (0, 1)]
+        at = np.column_stack([np.interp(seen.marks, index, seen.xy_um[:, column]) for column in (0, 1)])
+        at = at[np.isfinite(at).all(axis=1)]
+        if not len(at):
+            return Shown(note="the samples of these probes are missing")
+        x_rms, y_rms = at.std(axis=0)
         rows = [
-            ("revolutions", f"{len(seen.marks)}", ""),
-            ("spread of x", f"{np.nanstd(at[0]):.1f}", "um r.m.s."),
-            ("spread of y", f"{np.nanstd(at[1]):.1f}", "um r.m.s."),
+            ("revolutions", f"{len(at)}", ""),
+            ("spread of x", f"{x_rms:.1f}", "um r.m.s."),
+            ("spread of y", f"{y_rms:.1f}", "um r.m.s."),
         ]
-        return Shown({"poincare": {"x": at[0], "y": at[1]}}, rows)
+        wanted = round(float(chosen["revolutions"]))
+        note = f"{wanted} revolutions are asked for, and {len(at)} are there" if len(at) < wanted - 1 else ""
+        return Shown({"poincare": {"x": at[:, 0], "y": at[:, 1]}}, rows, note)
 
 
 def _means(live: MachineLive, probes: tuple[str, str]) -> tuple[Any, Any]:

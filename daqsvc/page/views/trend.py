@@ -26,7 +26,7 @@ DAYS_FROM_H = 48.0
 """What is longer is shown in days."""
 MOST_POINTS = 1500
 """Of a line: more cannot be told apart on a screen."""
-NONE = "this machine keeps no history: write [history] into its machine file"
+NONE = "nothing is written down of this machine yet; that needs [history] in its machine file"
 
 
 class TrendView:
