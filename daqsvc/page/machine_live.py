@@ -195,6 +195,14 @@ class MachineLive:
         count = min(round(seconds * self.rate_hz(stream)), ring.end_index - ring.oldest_index)
         return ring.read(ring.end_index - count, count), ring.time_of(ring.end_index - 1)
 
+    def newest_of(self, sensor: str, seconds: float) -> tuple[NDArray[np.float64], float] | None:
+        """The last samples of a sensor, ``[n]``, and its samples per second; None if none have come."""
+        places = self.place_of([sensor])
+        newest = None if places is None else self.newest(places[0].stream, seconds)
+        if places is None or newest is None:
+            return None
+        return newest[0][:, places[0].column].astype(np.float64), self.rate_hz(places[0].stream)
+
     def newest_wall_ns(self, streams: Iterable[str]) -> int | None:
         """When the newest sample of streams was taken, ns since the Unix epoch; None if none has come."""
         rings = [self.rings[name] for name in streams if name in self.rings]

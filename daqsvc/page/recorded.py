@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     Document = dict[str, Any]
 
 KEYS = {DIAGNOSES: "statement", ALARMS: "alarm", STANDING: "standing"}
-"""What is told of a topic, by the key of `daqsvc.live_feed`."""
+"""By topic of a snapshot, the key of `daqsvc.live_feed`."""
 STEP_S = 0.5
 PAUSE_S = 3.0
 """Between the end and the next begin."""

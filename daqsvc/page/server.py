@@ -188,7 +188,7 @@ class _Page:
         return StreamingResponse(self._pictures[key].events(), media_type="text/event-stream")
 
     async def _first(self, machine: str) -> tuple[MachineLive | None, str]:
-        """A machine; None if nothing is told of it, and why."""
+        """A machine; None if the source does not know it yet, and why."""
         try:
             async with self._source.looking(machine) as heard:
                 return await heard.first(FIRST_S), heard.why_not

@@ -78,12 +78,10 @@ class EnvelopeSpectrumView:
     def shown(self, live: MachineLive, chosen: Mapping[str, str]) -> Shown:
         """See `daqsvc.page.views.view.MachineView.shown`."""
         sensor = chosen["sensor"]
-        places = live.place_of([sensor])
-        newest = None if places is None else live.newest(places[0].stream, float(chosen["length"]))
-        if places is None or newest is None:
+        newest = live.newest_of(sensor, float(chosen["length"]))
+        if newest is None:
             return Shown(note="no samples of this sensor have come yet")
-        values = newest[0][:, places[0].column].astype(np.float64)
-        rate_hz = live.rate_hz(places[0].stream)
+        values, rate_hz = newest
         there = np.isfinite(values)
         if there.sum() < LEAST_S * rate_hz:
             return Shown(note="too few samples have come for an envelope")

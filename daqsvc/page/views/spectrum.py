@@ -92,15 +92,13 @@ class SpectrumView:
     def shown(self, live: MachineLive, chosen: Mapping[str, str]) -> Shown:
         """See `daqsvc.page.views.view.MachineView.shown`."""
         sensor = chosen["sensor"]
-        places = live.place_of([sensor])
-        newest = None if places is None else live.newest(places[0].stream, float(chosen["length"]))
-        if places is None or newest is None:
+        newest = live.newest_of(sensor, float(chosen["length"]))
+        if newest is None:
             return Shown(note="no samples of this sensor have come yet")
-        values = newest[0][:, places[0].column].astype(np.float64)
+        values, rate_hz = newest
         missing = int(np.isnan(values).sum())
         if len(values) - missing < LEAST_SAMPLES:
             return Shown(note="too few samples have come for a spectrum")
-        rate_hz = live.rate_hz(places[0].stream)
         lines = 2.0 * amplitudes(values)[: len(values) // 2 + 1]
         frequency = np.arange(len(lines)) * rate_hz / len(values)
         unit = live.sensors[sensor].unit

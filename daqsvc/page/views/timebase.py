@@ -62,12 +62,11 @@ class TimebaseView:
     def shown(self, live: MachineLive, chosen: Mapping[str, str]) -> Shown:
         """See `daqsvc.page.views.view.MachineView.shown`."""
         sensor, seconds = chosen["sensor"], float(chosen["length"])
-        places = live.place_of([sensor])
-        newest = None if places is None else live.newest(places[0].stream, seconds)
-        if places is None or newest is None:
+        newest = live.newest_of(sensor, seconds)
+        if newest is None:
             return Shown(note="no samples of this sensor have come yet")
-        values = newest[0][:, places[0].column].astype(np.float64)
-        t_s = (np.arange(len(values)) - len(values) + 1) / live.rate_hz(places[0].stream)
+        values, rate_hz = newest
+        t_s = (np.arange(len(values)) - len(values) + 1) / rate_hz
         there = values[np.isfinite(values)]
         unit = live.sensors[sensor].unit
         rows = []
