@@ -627,12 +627,16 @@ class AlarmService:
 
     def _refusal(self, command: AlarmCommand) -> str | None:
         """Why a command would be refused now; None if it would not."""
+        if command.denied:
+            return command.denied
         try:
             return self._manager_of(command).refusal(command)
         except CommandNotAllowedError as refusal:
             return f"{refusal}"
 
     async def _outcome(self, command: AlarmCommand) -> CommandOutcome:
+        if command.denied:
+            return self._refuse(command.denied)
         try:
             events = self._manager_of(command).execute(command)
         except CommandNotAllowedError as refusal:

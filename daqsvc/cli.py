@@ -28,6 +28,7 @@ from daqsvc.commands.export import ExportCommand
 from daqsvc.commands.fleet import FleetCommand
 from daqsvc.commands.machine_files import load_box
 from daqsvc.commands.page import PageCommand
+from daqsvc.commands.page_account import PageAccountCommand
 from daqsvc.commands.record import RecordCommand
 from daqsvc.commands.reload import ReloadCommand
 from daqsvc.commands.replay import ReplayCommand
@@ -184,6 +185,7 @@ def commands() -> dict[str, Command]:
         "replay": ReplayCommand(load, kernel_cache.prepare),
         "status": StatusCommand(load),
         "page": PageCommand(load),
+        "page-account": PageAccountCommand(),
         "trend": TrendCommand(load),
         "alarms": AlarmsCommand(load),
         **alarm_verbs(load),

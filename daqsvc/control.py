@@ -19,7 +19,7 @@ import os
 import socket
 import stat
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Protocol
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -109,7 +109,11 @@ class UnreachableError(AbsentError):
 
 
 class ControlRequest(CommandMessage):
-    """What a person asks for."""
+    """What a person asks for.
+
+    ``via`` is for the audit log: how the person has asked a program that passes it on, such as the page.
+    ``denied`` is why that program has found that the person may not: then it is written down, and refused.
+    """
 
     model_config = ConfigDict(populate_by_name=True)
 
@@ -121,6 +125,8 @@ class ControlRequest(CommandMessage):
     occurrence: Annotated[Line, Field(min_length=1, max_length=100)] | None = None
     duration_s: DurationS | None = None
     reason: Reason = ""
+    via: Annotated[Line, Field(max_length=200)] = ""
+    denied: Reason = ""
 
 
 class LiveRequest(JsonCommand):
@@ -582,7 +588,8 @@ class ControlServer:
             self.counters.malformed += 1
             return ControlAnswer(accepted=False, reason=f"{error}")
         self.counters.requests += 1
-        outcome = await self._execute(request.command(request.verb, request.machine), source)
+        command = replace(request.command(request.verb, request.machine), denied=request.denied)
+        outcome = await self._execute(command, f"{source} {request.via}".rstrip())
         return ControlAnswer(accepted=outcome.accepted, reason=outcome.reason, events=outcome.events)
 
 
@@ -627,12 +634,13 @@ def parse_request(line: bytes, machines: Collection[str]) -> ControlRequest:
     return request
 
 
-def request_of(command: AlarmCommand, machine: str | None) -> ControlRequest:
+def request_of(command: AlarmCommand, machine: str | None, via: str = "") -> ControlRequest:
     """The request for a command.
 
     Args:
         command: what is asked.
         machine: the machine that is meant; None for whichever the service watches.
+        via: over what a person has asked who passes it on; empty if nobody does.
 
     Raises:
         ControlError: it cannot be asked, e.g. because a text is too long.
@@ -647,6 +655,8 @@ def request_of(command: AlarmCommand, machine: str | None) -> ControlRequest:
             occurrence=command.occurrence,
             duration_s=command.duration_s,
             reason=command.reason,
+            via=via,
+            denied=command.denied,
         )
     except ValidationError as error:
         raise ControlError(f"that cannot be asked, {faults_of(error, 'it')[0]}") from None
@@ -845,7 +855,10 @@ async def _until_end(reader: asyncio.StreamReader) -> None:
 
 
 def _json_line(message: ControlRequest | ControlAnswer) -> bytes:
-    return json.dumps(message.model_dump(mode="json", by_alias=True)).encode("ascii") + b"\n"
+    # What a request does not say is left out: a service of an older version knows no such key.
+    is_request = isinstance(message, ControlRequest)
+    told = message.model_dump(mode="json", by_alias=True, exclude_defaults=is_request)
+    return json.dumps(told).encode("ascii") + b"\n"
 
 
 def _is_ending(client: _Client) -> bool:

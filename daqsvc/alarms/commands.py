@@ -45,6 +45,7 @@ class AlarmCommand:
             None means whichever stands.
         reason: why, in the person's words; it stands in the event and in the audit log.
         machine: whose alarm; None for the one machine that has an alarm of that name.
+        denied: why the person may not ask for it, if that is known: then it is written down, and refused.
     """
 
     verb: Verb
@@ -54,6 +55,7 @@ class AlarmCommand:
     occurrence: str | None = None
     reason: str = ""
     machine: str | None = None
+    denied: str = ""
 
 
 class MachineVerb(StrEnum):

@@ -3,22 +3,32 @@
 from __future__ import annotations
 
 import argparse
+import ipaddress
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_REFUSED, EXIT_USAGE
 from daqsvc.commands.store_argument import BadFileError, StoreNotFoundError, add_store, chosen_store
+from daqsvc.settings.addresses import is_host
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from daqsvc.commands.machine_files import Load
+    from daqsvc.page.access.choice import AccessChoice
     from daqsvc.page.recorded import SnapshotSource
 
 PORT = 8420
 LOOPBACK = "127.0.0.1"
 HIGHEST_PORT = 65_535
+
+
+class Listen(NamedTuple):
+    """Where the page listens."""
+
+    host: str
+    port: int
 
 
 class PageCommand:
@@ -32,7 +42,8 @@ class PageCommand:
     description = (
         "Show the machines that the service on this box watches in a web page: what they do, what is wrong "
         "with them and how sure that is; orbit, waveform and spectra. The page is a process of its own: the "
-        "service does not wait for it. It can be opened from this box only. Needs the extra 'page'."
+        "service does not wait for it. It is open to this box "
+        "only, unless it is asked to be open to others, too. Needs the extra 'page'."
     )
 
     def __init__(self, load: Load) -> None:
@@ -49,9 +60,15 @@ class PageCommand:
             help="show a snapshot of the recorder in place of a service, played again and again; may be "
             "repeated, e.g. for a healthy one beside it",
         )
-        parser.add_argument(
-            "--port", type=_port, default=PORT, help=f"where it listens on {LOOPBACK} (default: {PORT})"
+        where = parser.add_mutually_exclusive_group()
+        where.add_argument("--port", type=_port, help=f"where it listens on {LOOPBACK} (default: {PORT})")
+        where.add_argument(
+            "--listen",
+            type=_listen,
+            metavar="HOST:PORT",
+            help="where it listens; beyond this box it needs TLS and accounts, or a reverse proxy",
         )
+        _add_access(parser.add_argument_group("who may look, and who may act (docs/page.md)"))
         add_store(parser, of_a_machine=False)
 
     def run(self, arguments: argparse.Namespace) -> int:
@@ -59,26 +76,48 @@ class PageCommand:
         if arguments.snapshot is not None and (arguments.file or arguments.store):
             self._parser.error("--snapshot shows no service: leave the machine file and --store out")
         try:
-            from daqsvc.page.recorded import NoPictureError  # noqa: PLC0415 - an extra
+            from daqsvc.page.access.accounts import AccountsError  # noqa: PLC0415 - an extra
+            from daqsvc.page.access.choice import UnsafeError  # noqa: PLC0415
+            from daqsvc.page.recorded import NoPictureError  # noqa: PLC0415
             from daqsvc.page.serving import PortError, serve  # noqa: PLC0415
             from daqsvc.page.source import BoxSource  # noqa: PLC0415
             from daqsvc.snapshots.reading import SnapshotError  # noqa: PLC0415
         except ModuleNotFoundError as error:
             return _failed(f"{error.name} is missing: install it with pip install 'daqsvc[page]'")
+        listen = arguments.listen or Listen(LOOPBACK, PORT if arguments.port is None else arguments.port)
         try:
+            choice = _access_choice(arguments, listen.host)
             if arguments.snapshot is not None:
-                serve(_of_snapshots(arguments.snapshot), "snapshots", LOOPBACK, arguments.port)
+                serve(_of_snapshots(arguments.snapshot), "snapshots", listen.port, choice)
             else:
-                store = chosen_store(arguments, self._load).directory
-                serve(BoxSource(store), f"{store}", LOOPBACK, arguments.port)
+                store = self._store(arguments)
+                serve(BoxSource(store), f"{store}", listen.port, choice)
         except BadFileError:
             return EXIT_USAGE
-        except (StoreNotFoundError, PortError) as error:
+        except UnsafeError as error:
+            _failed(f"{error}")
+            return EXIT_USAGE
+        except (StoreNotFoundError, PortError, AccountsError) as error:
             return _failed(f"{error}")
         except (SnapshotError, NoPictureError) as error:
             _failed(f"{error}")
             return EXIT_REFUSED
         return EXIT_OK
+
+    def _store(self, arguments: argparse.Namespace) -> Path:
+        """The store of the service.
+
+        Raises:
+            BadFileError: the machine file has errors, which were printed.
+            StoreNotFoundError: there is none.
+        """
+        store = chosen_store(arguments, self._load).directory
+        if not store.is_dir():
+            raise StoreNotFoundError(
+                f"the store {store} does not exist: name that of a service by --store, or start the "
+                "service at first"
+            )
+        return store
 
 
 def _of_snapshots(files: Sequence[Path]) -> SnapshotSource:
@@ -95,9 +134,83 @@ def _of_snapshots(files: Sequence[Path]) -> SnapshotSource:
     return SnapshotSource({file.stem: read_snapshot(file, ResourceLimits()) for file in files})
 
 
+def _add_access(group: argparse._ArgumentGroup) -> None:
+    group.add_argument(
+        "--operator-link",
+        action="store_true",
+        help="print an address, made anew at each start: who opens it on this box may handle alarms",
+    )
+    group.add_argument(
+        "--accounts",
+        type=Path,
+        metavar="FILE",
+        help="accounts to sign in with, as daqsvc page-account makes them",
+    )
+    group.add_argument("--certificate", type=Path, metavar="FILE", help="certificate of TLS, in PEM")
+    group.add_argument("--private-key", type=Path, metavar="FILE", help="its private key, in PEM")
+    group.add_argument(
+        "--host-name",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="name of the page in addresses, beyond this box; may be repeated",
+    )
+    group.add_argument(
+        "--user-header", default="", metavar="NAME", help="header in which a reverse proxy says who asks"
+    )
+    group.add_argument(
+        "--proxy",
+        action="append",
+        default=[],
+        type=_address,
+        metavar="ADDRESS",
+        help="IP address of that proxy; may be repeated",
+    )
+    group.add_argument(
+        "--operator",
+        action="append",
+        default=[],
+        metavar="USER",
+        help="user of that proxy who may handle alarms; may be repeated",
+    )
+
+
+def _access_choice(arguments: argparse.Namespace, host: str) -> AccessChoice:
+    from daqsvc.page.access.choice import AccessChoice  # noqa: PLC0415 - an extra
+
+    return AccessChoice(
+        host=host,
+        names=tuple(arguments.host_name),
+        certificate=arguments.certificate,
+        private_key=arguments.private_key,
+        accounts=arguments.accounts,
+        user_header=arguments.user_header,
+        proxies=tuple(arguments.proxy),
+        operators=tuple(arguments.operator),
+        operator_link=arguments.operator_link,
+    )
+
+
 def _failed(why: str) -> int:
     print(f"daqsvc page: {why}", file=sys.stderr)  # noqa: T201 - errors go to stderr
     return EXIT_FAILED
+
+
+def _listen(text: str) -> Listen:
+    host, _, port = text.rpartition(":")
+    bare = host.removeprefix("[").removesuffix("]")
+    if (":" in bare) != (host != bare) or not is_host(bare):
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no address to listen at: give a host and a port, e.g. 127.0.0.1:8420 or [::1]:8420"
+        )
+    return Listen(bare, _port(port))
+
+
+def _address(text: str) -> str:
+    try:
+        return f"{ipaddress.ip_address(text)}"
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no IP address, such as 127.0.0.1") from None
 
 
 def _port(text: str) -> int:

@@ -152,6 +152,10 @@ class MachineLive:
         """Whether the shaft turns clockwise, seen from where the probes' angles are."""
         return bool(self.values["machine"].get("rotation") == "clockwise")
 
+    def all_alarms(self) -> dict[str, Document | None]:
+        """The last event of each alarm; None for one of the machine file that never had one."""
+        return {str(one["name"]): None for one in self.values.get("alarms", ())} | self.alarms.copy()
+
     def hear(self, line: Document) -> None:
         """Take in a line of the feed after the first one."""
         if (samples := line.get("samples")) is not None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daqsvc.page.text import alarm_rows, head, journal_rows, machine_rows
+from daqsvc.page.text import alarm_list, alarm_rows, head, journal_rows, machine_rows
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Mapping
@@ -137,7 +137,11 @@ class Picture:
                 told |= {"age_s": round(away_s, 1), "why": f"nothing comes of {stream} any more"}
             told["html"] = {"head": head(live), "alarms": alarm_rows(live)}
             if self._view is None:
-                told["html"] |= {"machine": machine_rows(live), "journal": journal_rows(live)}
+                told["html"] |= {
+                    "machine": machine_rows(live),
+                    "journal": journal_rows(live),
+                    "alarm-list": alarm_list(live.all_alarms(), self._machine),
+                }
             if self._view is not None:
                 told |= self._view_of(self._view, live)
         return json.dumps(told).encode()

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import SampleBlock
+from daqsvc.alarms.commands import CommandOutcome
 from daqsvc.page.machine_live import MachineLive
 from daqsvc.page.text import standing
 from daqsvc.snapshots.contents import ALARMS, DIAGNOSES, MACHINE_JSON, STANDING
@@ -17,6 +18,7 @@ from daqsvc.snapshots.contents import ALARMS, DIAGNOSES, MACHINE_JSON, STANDING
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterable, Iterator, Mapping
 
+    from daqsvc.alarms.commands import AlarmCommand
     from daqsvc.snapshots.contents import Entry, Snapshot
 
     Document = dict[str, Any]
@@ -128,6 +130,16 @@ class SnapshotSource:
         """
         self._play()
         yield self._playing[machine]
+
+    async def journal(self, machine: str, alarm: str, most: int) -> list[Document]:
+        """See `daqsvc.page.sources.MachineSource.journal`: what was played."""
+        events = [*self._playing[machine].live.journal][::-1]
+        return [one for one in events if alarm in {"", one["alarm"]}][:most]
+
+    async def handle(self, machine: str, command: AlarmCommand, denied: str, via: str) -> CommandOutcome:
+        """See `daqsvc.page.sources.MachineSource.handle`: nothing is done."""
+        del command, denied, via
+        return CommandOutcome(accepted=False, reason=f"{machine} is a snapshot: its alarms are of the past")
 
     async def close(self) -> None:
         """Play no more."""

@@ -23,52 +23,67 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
-from starlette.responses import HTMLResponse, JSONResponse, Response, StreamingResponse
+from starlette.responses import (
+    HTMLResponse,
+    JSONResponse,
+    PlainTextResponse,
+    RedirectResponse,
+    Response,
+    StreamingResponse,
+)
 from starlette.routing import Route
 
 from daqsvc import __version__
+from daqsvc.page.access.person import peer_of
+from daqsvc.page.access.ways import COOKIE, ByAccounts, OpenHere, SignInError
 from daqsvc.page.charts import THEMES
+from daqsvc.page.guard import Admitted, FormError, Forms, Guarded
+from daqsvc.page.handling import Said, alarms_page, handle
 from daqsvc.page.presence import Picture
 from daqsvc.page.source import NOT_OURS
 from daqsvc.page.text import WORST, tile
 from daqsvc.page.views.all_views import VIEWS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Collection, Mapping, Sequence
 
     from starlette.requests import Request
-    from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+    from daqsvc.page.access.person import Access, Person
     from daqsvc.page.charts import Theme
     from daqsvc.page.machine_live import MachineLive
     from daqsvc.page.sources import MachineSource
     from daqsvc.page.views.view import MachineView
 
-HEADERS = {
-    # BokehJS puts styles into its figures.
-    "content-security-policy": (
-        "default-src 'none'; script-src 'self'; connect-src 'self'; img-src 'self' data: blob:; "
-        "style-src 'self' 'unsafe-inline'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
-    ),
-    "x-content-type-options": "nosniff",
-    "referrer-policy": "no-referrer",
-    "cache-control": "no-store",
-}
 FIRST_S = 3.0
 """How long a page waits for what the service tells first."""
 
 
-def application(source: MachineSource) -> Starlette:
+LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
+
+
+def application(
+    source: MachineSource, access: Access | None = None, *, hosts: Collection[str] = (), tls: bool = False
+) -> Starlette:
     """The page of a box; ``state.close`` ends what browsers listen to.
 
     Args:
         source: of the machines.
+        access: who may look, and who may act; None for anybody, and nobody.
+        hosts: names that it goes by, beside those of this box for itself.
+        tls: whether browsers reach it over TLS.
     """
-    page = _Page(source)
+    access = access or OpenHere()
+    page = _Page(source, access, tls=tls)
     routes = [
         Route("/", page.plant),
         Route("/plant.json", page.plant_rows),
+        Route("/sign-in", page.sign_in, methods=["GET", "POST"]),
+        Route("/sign-out", page.sign_out, methods=["POST"]),
+        Route("/operator", page.operator),
         Route("/machines/{machine}", page.machine),
+        Route("/machines/{machine}/alarms", page.alarms, name="alarms"),
+        Route("/machines/{machine}/alarms", page.handle, methods=["POST"]),
         Route("/machines/{machine}/{view}", page.machine),
         Route("/events/{machine}", page.events),
         Route("/events/{machine}/{view}", page.events),
@@ -77,34 +92,22 @@ def application(source: MachineSource) -> Starlette:
     ]
 
     middleware = [
-        Middleware(TrustedHostMiddleware, allowed_hosts=["localhost", "127.0.0.1", "[::1]"]),
-        Middleware(_Guarded),
+        Middleware(Guarded),
+        Middleware(TrustedHostMiddleware, allowed_hosts=[*LOOPBACK, *hosts]),
+        Middleware(Admitted, access=access),
     ]
     made = Starlette(routes=routes, middleware=middleware)
     made.state.close = page.close
     return made
 
 
-class _Guarded:
-    """Adds `HEADERS` to whatever is answered."""
-
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        async def guarded(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                own = {name.lower() for name, _ in message["headers"]}
-                added = [(name.encode(), value.encode()) for name, value in HEADERS.items()]
-                message["headers"] = [*message["headers"], *(one for one in added if one[0] not in own)]
-            await send(message)
-
-        await self._app(scope, receive, guarded)
-
-
 class _Page:
-    def __init__(self, source: MachineSource) -> None:
+    def __init__(self, source: MachineSource, access: Access, *, tls: bool) -> None:
         self._source = source
+        self._access = access
+        self._tls = tls
+        self._forms = Forms()
+        self._said = Said()
         self._pictures: dict[tuple[str, ...], Picture] = {}
         self._templates = Environment(
             loader=PackageLoader("daqsvc.page"), autoescape=True, undefined=StrictUndefined
@@ -116,9 +119,72 @@ class _Page:
             await picture.close()
         await self._source.close()
 
-    async def plant(self, _: Request) -> Response:
+    async def sign_in(self, request: Request) -> Response:
+        """The form to sign in by, and what comes of it."""
+        access = self._access
+        if not isinstance(access, ByAccounts):
+            return RedirectResponse("/", 303)
+        then, why = _local(request.query_params.get("then", "/")), ""
+        if request.method == "POST":
+            try:
+                fields = await self._forms.read(request)
+                name, password = fields.get("name", ""), fields.get("password", "")
+                secret = await access.sign_in(name, password, peer_of(request))
+            except (FormError, SignInError) as error:
+                why = f"{error}"
+            else:
+                return self._signed_in(secret, _local(fields.get("then", "/")))
+        page = self._html(request, "sign_in.html", title="Sign in", then=then, why=why)
+        page.status_code = 401 if why else 200
+        return page
+
+    async def operator(self, request: Request) -> Response:
+        """Let who has the key of this start handle alarms."""
+        if not isinstance(self._access, OpenHere):
+            return RedirectResponse("/", 303)
+        try:
+            secret = self._access.begin(request.query_params.get("key", ""))
+        except SignInError as error:
+            page = self._html(request, "absent.html", title="Operator", why=f"{error}", again=False)
+            page.status_code = 403
+            return page
+        return self._signed_in(secret, "/")
+
+    async def sign_out(self, request: Request) -> Response:
+        """End a session."""
+        try:
+            await self._forms.read(request)
+        except FormError as error:
+            return PlainTextResponse(f"Nothing was done: {error}.", 403)
+        if isinstance(self._access, ByAccounts | OpenHere):
+            self._access.end(request.cookies.get(COOKIE, ""))
+        gone = RedirectResponse("/", 303)
+        gone.delete_cookie(COOKIE, httponly=True, samesite="strict", secure=self._tls)
+        return gone
+
+    def _signed_in(self, secret: str, then: str) -> Response:
+        come = RedirectResponse(then, 303)
+        come.set_cookie(COOKIE, secret, httponly=True, samesite="strict", secure=self._tls)
+        return come
+
+    async def alarms(self, request: Request) -> Response:
+        """All alarms of a machine, what has happened, and what can be done."""
+        name = request.path_params["machine"]
+        live, why = await self._first(name)
+        if live is None:
+            return self._absent(request, name, why)
+        told = await alarms_page(self._source, live, name, request, self._forms, self._said)
+        return self._html(
+            request, "alarms.html", **self._of_machine(live, name), title=f"Alarms: {name}", view=None, **told
+        )
+
+    async def handle(self, request: Request) -> Response:
+        """Do with an alarm what a form asks for."""
+        return await handle(self._source, request.path_params["machine"], request, self._forms, self._said)
+
+    async def plant(self, request: Request) -> Response:
         """All machines of the box."""
-        return self._html("plant.html", title="Plant", **await self._plant())
+        return self._html(request, "plant.html", title="Plant", **await self._plant())
 
     async def plant_rows(self, _: Request) -> Response:
         """The same as JSON, for who looks again."""
@@ -138,22 +204,16 @@ class _Page:
         live, why = await self._first(name)
         view = VIEWS.get(chosen_view or "")
         if live is None or (chosen_view and view is None):
-            why = why or f"there is no view {chosen_view!r}"
-            page = self._html("absent.html", title=name, why=why, again=live is None)
-            page.status_code = 404
-            return page
+            return self._absent(request, name, why or f"there is no view {chosen_view!r}", again=live is None)
         choices, chosen = _chosen(view, live, request.query_params)
         asked = request.query_params
         others = [(asked[name], one) for name, one in chosen.items() if asked.get(name, one) != one]
         instead = [f"{wanted} is not there; {one} is shown" for wanted, one in others]
         return self._html(
+            request,
             "machine.html",
+            **self._of_machine(live, name),
             title=f"{view.title if view else 'Machine'}: {name}",
-            machine=name,
-            description=live.values["machine"].get("description", ""),
-            views=[
-                {"name": one.name, "title": one.title, "absent": one.why_not(live)} for one in VIEWS.values()
-            ],
             view=view,
             why_not=view.why_not(live) if view else "",
             choices=choices,
@@ -195,8 +255,23 @@ class _Page:
         except KeyError:
             return None, f"there is no {machine!r} here"
 
-    def _html(self, template: str, **values: Any) -> HTMLResponse:
-        return HTMLResponse(self._templates.get_template(template).render(version=__version__, **values))
+    def _of_machine(self, live: MachineLive, name: str) -> dict[str, Any]:
+        """What every page of a machine shows."""
+        views = VIEWS.values()
+        return {
+            "machine": name,
+            "views": [{"name": one.name, "title": one.title, "absent": one.why_not(live)} for one in views],
+        }
+
+    def _absent(self, request: Request, name: str, why: str, *, again: bool = True) -> Response:
+        page = self._html(request, "absent.html", title=name, why=why, again=again)
+        page.status_code = 404
+        return page
+
+    def _html(self, request: Request, template: str, **values: Any) -> HTMLResponse:
+        person: Person | None = request.state.person
+        about = {"version": __version__, "person": person, "token": self._forms.token(person)}
+        return HTMLResponse(self._templates.get_template(template).render(**about | values))
 
 
 def _chosen(
@@ -225,6 +300,13 @@ def _figures(view: MachineView, live: MachineLive, chosen: Mapping[str, str], th
         item = json_item(one.made, ID(f"figure-{one.name}"))
         told.append({"name": one.name, "label": one.label, "item": item})
     return json.dumps(told)
+
+
+def _local(there: str) -> str:
+    """A path of this server, for a browser to go on to."""
+    # Browsers take two slashes, and a backslash, for the begin of another server's name.
+    is_here = there.startswith("/") and there[1:2] not in {"/", "\\"} and there.isprintable()
+    return there if is_here else "/"
 
 
 async def _static(request: Request) -> Response:

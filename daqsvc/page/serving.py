@@ -18,11 +18,13 @@ if TYPE_CHECKING:
 
     from starlette.applications import Starlette
 
+    from daqsvc.page.access.choice import AccessChoice
     from daqsvc.page.sources import MachineSource
 
 REMEDIES = {
     errno.EADDRINUSE: "end what listens there, or give another --port",
     errno.EACCES: "give a --port from 1024 on",
+    errno.EADDRNOTAVAIL: "give an address of this machine as --listen",
 }
 END_S = 1
 """How long browsers that listen are waited for at the end."""
@@ -56,34 +58,69 @@ class _Server(uvicorn.Server):
         await super().shutdown(sockets)
 
 
-def serve(source: MachineSource, what: str, host: str, port: int) -> None:
+def serve(
+    source: MachineSource,
+    what: str,
+    port: int,
+    choice: AccessChoice,
+) -> None:
     """Serve the page of a service, or of snapshots, until SIGINT or SIGTERM; says where.
 
     Args:
         source: of what is shown.
         what: the same in words.
-        host: where it listens.
-        port: likewise; 0 for one that is free.
+        port: where it listens; 0 for one that is free.
+        choice: who may look, who may act, and the host where it listens.
 
     Raises:
         PortError: it cannot listen there.
+        UnsafeError, AccountsError: it may not, as it was asked for.
     """
+    choice.refuse_unsafe()
+    choice.check_tls()
+    access, key = choice.access()
     try:
-        listening = socket.create_server((host, port), backlog=64)
+        listening = _listening(choice.host, port)
     except OSError as error:
-        remedy = REMEDIES.get(error.errno or 0, "give another --port")
-        raise PortError(
-            f"cannot listen at {host}:{port}: {os.strerror(error.errno or 0)}; {remedy}"
-        ) from None
+        remedy = REMEDIES.get(error.errno or 0, "give another --listen")
+        why = os.strerror(error.errno) if error.errno and error.errno > 0 else error.strerror or f"{error}"
+        raise PortError(f"cannot listen at {_bracketed(choice.host)}:{port}: {why}; {remedy}") from None
     with listening:
-        where = f"http://{host}:{listening.getsockname()[1]}/"
+        tls = choice.certificate is not None
+        port = listening.getsockname()[1]
+        where = f"http{'s' if tls else ''}://{_bracketed(_name(choice))}:{port}/"
         print(f"the page of {what} is at {where}; Ctrl-C ends it", flush=True)  # noqa: T201 - for a person
-        app = application(source)
+        if key:
+            print(f"who opens {where}operator?key={key} may handle alarms", flush=True)  # noqa: T201
+        hosts = (*choice.names, *(() if choice.is_local else (_bracketed(choice.host),)))
+        app = application(source, access, hosts=hosts, tls=tls)
         config = uvicorn.Config(
             app,
             log_level="warning",
             access_log=False,
             server_header=False,
+            proxy_headers=False,  # who is connected is what counts
             timeout_graceful_shutdown=END_S,
+            ssl_certfile=choice.certificate,
+            ssl_keyfile=choice.private_key,
         )
         _Server(config, app).run(sockets=[listening])
+
+
+def _listening(host: str, port: int) -> socket.socket:
+    """A socket that listens.
+
+    Raises:
+        OSError: it cannot.
+    """
+    [(family, *_, address), *_] = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+    return socket.create_server((address[0], port), family=family, backlog=64)
+
+
+def _name(choice: AccessChoice) -> str:
+    """What a person calls the host."""
+    return choice.names[0] if choice.names and not choice.is_local else choice.host
+
+
+def _bracketed(host: str) -> str:
+    return f"[{host}]" if ":" in host else host

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import json
 import logging
 import time
@@ -14,14 +15,27 @@ from typing import TYPE_CHECKING, Any
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.link import Backoff
-from daqsvc.control import SOCKET, STATUS_QUESTION
+from daqsvc.alarms.commands import CommandOutcome
+from daqsvc.control import (
+    SOCKET,
+    STATUS_QUESTION,
+    AbsentError,
+    ControlError,
+    NotRunningError,
+    ask,
+    request_of,
+)
 from daqsvc.history.file import NAME as HISTORY
 from daqsvc.live_feed import SCHEMA
+from daqsvc.outbox.messages import OutboxError
+from daqsvc.outbox.reading import read_journal
 from daqsvc.page.machine_live import MachineLive
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterable, Iterator
     from pathlib import Path
+
+    from daqsvc.alarms.commands import AlarmCommand
 
     Document = dict[str, Any]
 
@@ -30,6 +44,9 @@ log = logging.getLogger(__name__)
 LONGEST_LINE = 64 * 1024 * 1024
 NOT_OURS = (ValueError, LookupError, TypeError)
 """What comes of an answer that is not as it is known here."""
+ALARM_SCHEMA = "daqsvc.alarm/"
+MOST_LOOKED_AT = 20_000
+"""Messages of the journal that are looked through for the events of one alarm."""
 LINGER_S = 5.0
 """How long a machine is still listened to when nobody looks any more."""
 
@@ -198,6 +215,23 @@ class BoxSource:
         if not self._looking.get(machine) and machine in self._listening:
             self._listening.pop(machine)[1].cancel()
 
+    async def journal(self, machine: str, alarm: str, most: int) -> list[Document]:
+        """See `daqsvc.page.sources.MachineSource.journal`."""
+        return await asyncio.to_thread(_journal, self._store, machine, alarm, most)
+
+    async def handle(self, machine: str, command: AlarmCommand, denied: str, via: str) -> CommandOutcome:
+        """See `daqsvc.page.sources.MachineSource.handle`."""
+        try:
+            request = request_of(dataclasses.replace(command, denied=denied), machine, via)
+            return await asyncio.to_thread(ask, self._store, request)
+        except NotRunningError:
+            reason = "no daqsvc runs on this box: start it with daqsvc run"
+        except AbsentError:
+            reason = "the service does not answer now: look at its log, and try again"
+        except ControlError as error:
+            reason = f"{error}"
+        return CommandOutcome(accepted=False, reason=reason)
+
     async def close(self) -> None:
         """Listen no more."""
         tasks = {task for _, task in self._listening.values()}
@@ -206,6 +240,32 @@ class BoxSource:
             task.cancel()
         if tasks:
             await asyncio.wait(tasks)
+
+
+def _journal(store: Path, machine: str, alarm: str, most: int) -> list[Document]:
+    """See `BoxSource.journal`; blocks.
+
+    Raises:
+        OSError: the journal cannot be read.
+    """
+    asked = 4 * most
+    while True:
+        try:
+            view = read_journal(store, history=asked)
+        except OutboxError as error:
+            raise OSError(f"{error}") from error
+        events = [json.loads(entry.payload) for entry in reversed(view.history)]
+        chosen = [
+            event
+            for event in events
+            if str(event.get("schema", "")).startswith(ALARM_SCHEMA)
+            and event["machine"] == machine
+            and alarm in {"", event["alarm"]}
+        ]
+        # Messages of other kinds, machines and alarms may lie between.
+        if len(chosen) >= most or len(events) + view.damaged < asked or asked >= MOST_LOOKED_AT:
+            return chosen[:most]
+        asked *= 4
 
 
 @contextlib.asynccontextmanager

@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
     from contextlib import AbstractAsyncContextManager, AbstractContextManager
 
+    from daqsvc.alarms.commands import AlarmCommand, CommandOutcome
     from daqsvc.page.machine_live import MachineLive
 
 
@@ -54,6 +55,30 @@ class MachineSource(Protocol):
 
         Raises:
             KeyError: there is none of that name, where that is known.
+        """
+        ...
+
+    async def journal(self, machine: str, alarm: str, most: int) -> list[dict[str, Any]]:
+        """What has happened to the alarms of a machine, or to one of them: alarm events, newest first.
+
+        Args:
+            machine: its name.
+            alarm: its name; empty for all.
+            most: no more than so many.
+
+        Raises:
+            OSError: that cannot be read here.
+        """
+        ...
+
+    async def handle(self, machine: str, command: AlarmCommand, denied: str, via: str) -> CommandOutcome:
+        """Have a person's command carried out, and written down in the audit log of who does that.
+
+        Args:
+            machine: its name.
+            command: what is asked.
+            denied: why the page has found that the person may not: it is written down, and refused.
+            via: over what the person has asked, for the audit log.
         """
         ...
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from html import escape
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 from daqsvc.acquisition.clock import NS_PER_S, iso_utc
 from daqsvc.page.views.modes import in_words
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
     from daqsvc.page.machine_live import MachineLive
 
@@ -66,7 +67,7 @@ def alarm_rows(live: MachineLive) -> str:
     """The standing alarms as rows of a table."""
     rows = [
         _row(
-            f'<span class="level {escape(one["level"])}">{escape(one["level"])}</span>',
+            _level(one["level"]),
             escape(one["alarm"]) + (' <span class="first">first</span>' if one["first_out"] else ""),
             escape(STATES.get(str(one["state"]), str(one["state"]))),
             _time(one["wall_ns"]),
@@ -77,17 +78,83 @@ def alarm_rows(live: MachineLive) -> str:
     return "".join(rows) or '<tr><td colspan="5">No alarm stands.</td></tr>'
 
 
+def alarm_list(known: Mapping[str, Document | None], machine: str) -> str:
+    """Alarms as rows of a table: those that want a person first, then by level.
+
+    Args:
+        known: by its name the last event of each; None if it never had one.
+        machine: the machine's name in addresses.
+    """
+    there = f"/machines/{quote(machine, safe='')}/alarms?alarm="
+    return "".join(
+        _row(
+            _level("normal" if one is None else one["level"]),
+            f'<a href="{there}{quote(name, safe="")}">{escape(name)}</a>' + _first(one),
+            escape(_state(one)),
+            "" if one is None else _time(one["wall_ns"]),
+            "" if one is None else _what(one),
+        )
+        for name, one in sorted(known.items(), key=lambda item: _urgency(item[1]))
+    )
+
+
+def _urgency(alarm: Document | None) -> tuple[int, int, int]:
+    """Where an alarm stands in the list: the smaller, the sooner."""
+    if alarm is None:
+        return 4, 0, 0
+    state = str(alarm["state"])
+    if state in COVERED:
+        group = 2
+    elif state == "normal":
+        group = 3
+    else:
+        group = 0 if state.endswith("_unacknowledged") else 1
+    return group, -WORST.get(alarm["level"], 0), -int(alarm["monotonic_ns"])
+
+
+def _first(alarm: Document | None) -> str:
+    return ' <span class="first">first</span>' if alarm is not None and alarm["first_out"] else ""
+
+
+def _what(event: Document) -> str:
+    """What was found, or who did it and why."""
+    return escape(": ".join(filter(None, (event["message"], event["by"], event["reason"]))))
+
+
+def _state(alarm: Document | None) -> str:
+    """How an alarm stands, with what covers it."""
+    if alarm is None or alarm["state"] == "normal":
+        return "normal"
+    words = [STATES.get(str(alarm["state"]), str(alarm["state"]))]
+    if alarm.get("covered"):
+        words.append(f"below: {STATES.get(str(alarm['covered']), str(alarm['covered']))}")
+    if (until_ns := alarm.get("shelved_until_wall_ns")) is not None:
+        words.append(f"until {iso_utc(until_ns // NS_PER_S * NS_PER_S)}")
+    if alarm.get("chattering"):
+        words.append("comes and goes")
+    return "; ".join(words)
+
+
+def _level(level: str) -> str:
+    return f'<span class="level {escape(level)}">{escape(level)}</span>'
+
+
 def journal_rows(live: MachineLive) -> str:
     """What has happened to alarms since the page looks, and the last event of each before; newest first."""
+    return event_rows([*live.journal][: -MOST_EVENTS - 1 : -1])
+
+
+def event_rows(events: Iterable[Document]) -> str:
+    """Alarm events as rows of a table."""
     rows = [
         _row(
             _time(one["wall_ns"]),
             escape(one["alarm"]),
             escape(one["kind"]),
-            f'<span class="level {escape(one["level"])}">{escape(one["level"])}</span>',
-            escape(": ".join(filter(None, (one["message"], one["by"], one["reason"])))),
+            _level(one["level"]),
+            _what(one),
         )
-        for one in [*live.journal][: -MOST_EVENTS - 1 : -1]
+        for one in events
     ]
     return "".join(rows) or '<tr><td colspan="5">Nothing has happened.</td></tr>'
 

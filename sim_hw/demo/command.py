@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from daqsvc.recording.recording import Recording
     from daqsvc.settings import MachineFile
     from sim_hw.demo.machines import AlarmLimits
+    from sim_hw.demo.page import PageAddress
     from sim_hw.demo.session import DemoOutcome, DemoSession, Received, Script
     from sim_hw.scenario import BearingScenario
 
@@ -208,7 +209,7 @@ def _say(message: str) -> None:
 def _play(script: Script, arguments: argparse.Namespace) -> dict[str, Any]:
     from sim_hw.demo.session import DemoSession, summarise  # noqa: PLC0415
 
-    def play(on_message: Callable[[Received], None], on_page: Callable[[str], None]) -> DemoOutcome:
+    def play(on_message: Callable[[Received], None], on_page: Callable[[PageAddress], None]) -> DemoOutcome:
         session = DemoSession(
             script,
             speed=arguments.speed,
@@ -234,8 +235,8 @@ def _play(script: Script, arguments: argparse.Namespace) -> dict[str, Any]:
     return summary
 
 
-def _print_page(address: str) -> None:
-    _print_json({"type": "page", "address": address})
+def _print_page(address: PageAddress) -> None:
+    _print_json({"type": "page", "address": address.look, "operator": address.act})
 
 
 def _print_message(message: Received) -> None:

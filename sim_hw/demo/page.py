@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import sys
 import tempfile
-from typing import IO, TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, NamedTuple
 
 from sim_hw.demo.machines import DemoError
 
@@ -19,9 +19,21 @@ PORTS = (8420, 0)
 START_S = 60.0
 
 
+class PageAddress(NamedTuple):
+    """Where the page is.
+
+    Attributes:
+        look: for who looks.
+        act: for who handles alarms.
+    """
+
+    look: str
+    act: str
+
+
 @contextlib.asynccontextmanager
-async def page_of(store: Path) -> AsyncIterator[str]:
-    """Serve the page of a store meanwhile; its address.
+async def page_of(store: Path) -> AsyncIterator[PageAddress]:
+    """Serve the page of a store meanwhile; where it is.
 
     Raises:
         DemoError: it does not start.
@@ -31,6 +43,7 @@ async def page_of(store: Path) -> AsyncIterator[str]:
         for port in PORTS:
             process = await asyncio.create_subprocess_exec(
                 *(sys.executable, "-m", "daqsvc", "page", "--store", f"{store}", "--port", f"{port}"),
+                "--operator-link",
                 stdout=asyncio.subprocess.PIPE,
                 stderr=wrong,
                 start_new_session=True,  # Ctrl-C is for the demo, which ends it
@@ -42,7 +55,10 @@ async def page_of(store: Path) -> AsyncIterator[str]:
         try:
             if " is at http://" not in said:
                 raise DemoError(f"--page: {said}")
-            yield said.partition(" is at ")[2].partition(";")[0]
+            assert process.stdout is not None  # noqa: S101 - a pipe was asked for
+            acting = (await process.stdout.readline()).decode()
+            look = said.partition(" is at ")[2].partition(";")[0]
+            yield PageAddress(look, acting.removeprefix("who opens ").partition(" ")[0])
         finally:
             if process.returncode is None:
                 process.terminate()

@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from daqsvc.machine_watch import MachineWatch
     from daqsvc.settings import MachineFile
     from drivers.frames import FrameLayout
+    from sim_hw.demo.page import PageAddress
     from sim_hw.nodes.pacing import Pacer
     from sim_hw.scenario import Onset
 
@@ -231,7 +232,7 @@ class DemoSession:
         broker_url: an MQTT broker; None to start one inside the process.
         on_message: called with each message that came back from the broker.
         snapshots: where the snapshots are kept that alarms leave; None: they go with the demo.
-        on_page: told the address of the page, which is served meanwhile; None for no page.
+        on_page: called with where the page is, which is served meanwhile; None for no page.
         again: play it again and again once it was played, until `enough`. What comes of that is not in the
             outcome's diagnoses.
     """
@@ -244,7 +245,7 @@ class DemoSession:
         broker_url: str | None,
         on_message: Callable[[Received], None],
         snapshots: Path | None = None,
-        on_page: Callable[[str], None] | None = None,
+        on_page: Callable[[PageAddress], None] | None = None,
         again: bool = False,
     ) -> None:
         self.script = script

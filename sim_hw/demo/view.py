@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from types import TracebackType
     from typing import Self
 
+    from sim_hw.demo.page import PageAddress
     from sim_hw.demo.session import Received, Script
 
 LAST_ALARMS = 8
@@ -84,9 +85,10 @@ class View:
             if exc is None:
                 self._console.print(self.picture())
 
-    def show_page(self, address: str) -> None:
+    def show_page(self, address: PageAddress) -> None:
         """Say where the page is."""
-        self._console.print(f"in a browser: {address}", soft_wrap=True)
+        self._console.print(f"in a browser: {address.look}", soft_wrap=True)
+        self._console.print(f"  to handle its alarms, too: {address.act}", soft_wrap=True)
 
     def on_message(self, message: Received) -> None:
         """Take a message in."""

@@ -34,6 +34,7 @@ VERBS = (
     "replay",
     "status",
     "page",
+    "page-account",
     "trend",
     *PEOPLE,
     "analyze",

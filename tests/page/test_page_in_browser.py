@@ -3,32 +3,25 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import math
 import re
 from typing import TYPE_CHECKING, Any
 
-import can
-import numpy as np
 import pytest
 from axe_playwright_python.async_playwright import Axe
-from support.browsers import browsing, page_served
+from support.browsers import browsing, page_served, tab
 from support.live_service import running, watch_of
+from support.page_rig import live_rig
 from support.recorded_rig import RATE_HZ, let_time_pass, play, recorded_rig, recorder_of, recording
 from support.waiting import PATIENCE_S, eventually
 
 from daqsvc.alarms.commands import AlarmCommand, Verb
-from drivers.can.plugin import frame_layout
-from sim_hw.nodes.can_node import CanNode
-from sim_hw.nodes.pacing import RealTimePacer
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
     from pathlib import Path
 
-    from playwright.async_api import Browser, Page
+    from playwright.async_api import Page
 
-    from daqsvc.service import Service
 
 pytestmark = [pytest.mark.integration, pytest.mark.long]
 
@@ -36,47 +29,8 @@ VIEWS = (
     *("modes", "orbit", "centreline", "poincare", "timebase"),
     *("spectrum", "full-spectrum", "envelope", "trend"),
 )
-HEALTHY_S = 2.7
-"""The paper's rotor is healthy for so long; then its damping goes."""
 PATIENCE_MS = 1000.0 * PATIENCE_S
 NUMBER = re.compile(r"-?\d+(\.\d+)?(e-?\d+)?")
-
-
-@contextlib.asynccontextmanager
-async def live_rig(store: Path, channel: str, *, faulty: bool) -> AsyncIterator[Service]:
-    """A service that watches the paper's rotor, which turns for as long as the test lasts."""
-    machine, samples = recorded_rig(channel)
-    machine = machine.model_copy(update={"recorder": None})
-    whole = round(HEALTHY_S * 10) * 64
-    healthy = samples[64 : whole // 3 * 3]
-    played = np.concatenate([healthy, samples[len(healthy) :]] if faulty else [healthy] * 200)
-    async with running(machine, store) as service:
-        await eventually(lambda: service.drivers[0].link.state == "up", "the bus is up")
-        layout = frame_layout(watch_of(service).machine, "shaft")
-        with can.Bus(interface="virtual", channel=channel, protocol=can.CanProtocol.CAN_FD) as bus:
-            node = CanNode(bus, layout, played[: len(played) // 3 * 3], RATE_HZ)
-            playing = asyncio.create_task(node.play(RealTimePacer(service.clock)))
-            try:
-                yield service
-            finally:
-                playing.cancel()
-                await asyncio.wait({playing})
-
-
-@contextlib.asynccontextmanager
-async def tab(browser: Browser, **options: Any) -> AsyncIterator[Page]:
-    """A tab in which nothing may go wrong, and which may ask nobody but the page's server."""
-    context = await browser.new_context(**options)
-    page = await context.new_page()
-    wrong: list[str] = []
-    page.on("console", lambda said: wrong.append(said.text) if said.type == "error" else None)
-    page.on("pageerror", lambda error: wrong.append(f"{error}"))
-    page.on("request", lambda asked: None if "//127.0.0.1:" in asked.url else wrong.append(asked.url))
-    try:
-        yield page
-        assert wrong == []
-    finally:
-        await context.close()
 
 
 async def figures(page: Page) -> dict[str, float]:
@@ -177,6 +131,7 @@ async def test_an_alarm_appears_and_what_is_done_about_it(tmp_path: Path) -> Non
 
 async def test_what_is_not_heard_any_more_is_grey_and_says_its_age(tmp_path: Path) -> None:
     store = tmp_path / "store"
+    store.mkdir(mode=0o700)
     silence = "#silence:not([hidden])"
     async with browsing() as browser, page_served("--store", store) as (address, _), tab(browser) as page:
         await page.goto(address)

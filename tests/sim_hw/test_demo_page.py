@@ -40,6 +40,7 @@ async def test_the_demo_says_where_its_page_is_and_takes_it_along() -> None:
         while json.loads(await demo.stdout.readline())["type"] != "diagnosis":
             pass
         assert "laval-rig" in await asyncio.to_thread(get, told["address"])
+        assert told["operator"].startswith(f"{told['address']}operator?key=")
         await demo.stdout.read()
         await demo.wait()
     assert demo.returncode == 0

@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import re
 import shutil
 import sys
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from playwright.async_api import async_playwright
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
-    from playwright.async_api import Browser
+    from playwright.async_api import Browser, Page
 
 
 def chromium() -> str:
@@ -47,7 +48,7 @@ async def browsing() -> AsyncIterator[Browser]:
 @contextlib.asynccontextmanager
 async def page_served(*arguments: str | int | Path) -> AsyncIterator[tuple[str, asyncio.subprocess.Process]]:
     """``daqsvc page`` with these arguments, at a free port unless they say one; its address and process."""
-    port = () if "--port" in arguments else ("--port", 0)
+    port = () if {"--port", "--listen"} & {*arguments} else ("--port", 0)
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "daqsvc", "page", *map(str, (*arguments, *port))),
         stdout=asyncio.subprocess.PIPE,
@@ -58,10 +59,28 @@ async def page_served(*arguments: str | int | Path) -> AsyncIterator[tuple[str, 
     try:
         async with asyncio.timeout(PATIENCE_S):
             said = (await process.stdout.readline()).decode()
-        assert " is at http://127.0.0.1:" in said, said or (await process.stderr.read()).decode()
+        assert re.search(r" is at https?://127\.0\.0\.1:", said), (
+            said or (await process.stderr.read()).decode()
+        )
         yield said.split(" is at ")[1].split(";")[0].rstrip("/"), process
     finally:
         if process.returncode is None:
             process.terminate()
         _, err = await process.communicate()
     assert err.decode() == "", "nothing went wrong in the page's server"
+
+
+@contextlib.asynccontextmanager
+async def tab(browser: Browser, **options: Any) -> AsyncIterator[Page]:
+    """A tab in which nothing may go wrong, and which may ask nobody but the page's server."""
+    context = await browser.new_context(**options)
+    page = await context.new_page()
+    wrong: list[str] = []
+    page.on("console", lambda said: wrong.append(said.text) if said.type == "error" else None)
+    page.on("pageerror", lambda error: wrong.append(f"{error}"))
+    page.on("request", lambda asked: None if "//127.0.0.1:" in asked.url else wrong.append(asked.url))
+    try:
+        yield page
+        assert wrong == []
+    finally:
+        await context.close()
