@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import daqsvc
 from daqsvc import kernel_cache
+from daqsvc.commands.account import AccountCommand
 from daqsvc.commands.alarms import AlarmsCommand, alarm_verbs
 from daqsvc.commands.analyze import AnalyzeCommand
 from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, ArgumentParser
@@ -28,7 +29,6 @@ from daqsvc.commands.export import ExportCommand
 from daqsvc.commands.fleet import FleetCommand
 from daqsvc.commands.machine_files import load_box
 from daqsvc.commands.page import PageCommand
-from daqsvc.commands.page_account import PageAccountCommand
 from daqsvc.commands.record import RecordCommand
 from daqsvc.commands.reload import ReloadCommand
 from daqsvc.commands.replay import ReplayCommand
@@ -185,7 +185,7 @@ def commands() -> dict[str, Command]:
         "replay": ReplayCommand(load, kernel_cache.prepare),
         "status": StatusCommand(load),
         "page": PageCommand(load),
-        "page-account": PageAccountCommand(),
+        "account": AccountCommand(),
         "trend": TrendCommand(load),
         "alarms": AlarmsCommand(load),
         **alarm_verbs(load),

@@ -144,7 +144,7 @@ def _add_access(group: argparse._ArgumentGroup) -> None:
         "--accounts",
         type=Path,
         metavar="FILE",
-        help="accounts to sign in with, as daqsvc page-account makes them",
+        help="accounts to sign in with, as daqsvc account makes them",
     )
     group.add_argument("--certificate", type=Path, metavar="FILE", help="certificate of TLS, in PEM")
     group.add_argument("--private-key", type=Path, metavar="FILE", help="its private key, in PEM")

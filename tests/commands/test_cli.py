@@ -34,7 +34,7 @@ VERBS = (
     "replay",
     "status",
     "page",
-    "page-account",
+    "account",
     "trend",
     *PEOPLE,
     "analyze",

@@ -96,7 +96,7 @@ def test_a_file_that_others_may_read_is_refused(file: Path) -> None:
 
 
 def test_a_file_without_accounts_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(AccountsError, match="make the first account with daqsvc page-account"):
+    with pytest.raises(AccountsError, match="make the first account with daqsvc account"):
         AccountsFile(tmp_path / "none")
 
 
@@ -230,14 +230,14 @@ def test_the_verb_makes_accounts(
 ) -> None:
     file = f"{tmp_path / 'accounts'}"
     monkeypatch.setattr("sys.stdin", io.StringIO("long enough\n"))
-    assert main(["page-account", file, "ann", "--role", "operator"]) == 0
+    assert main(["account", file, "ann", "--role", "operator"]) == 0
     assert capsys.readouterr().out == "ann may sign in as operator\n"
     assert read_accounts(tmp_path / "accounts")["ann"].has_password("long enough")
     monkeypatch.setattr("sys.stdin", io.StringIO("short\n"))
-    assert main(["page-account", file, "bob"]) == 1
+    assert main(["account", file, "bob"]) == 1
     assert "a password has 10 to 1024 characters" in capsys.readouterr().err
     with pytest.raises(SystemExit):
-        main(["page-account", file, "a:b"])
-    assert main(["page-account", file, "ann", "--remove"]) == 0
-    assert main(["page-account", file, "ann", "--remove"]) == 1
+        main(["account", file, "a:b"])
+    assert main(["account", file, "ann", "--remove"]) == 0
+    assert main(["account", file, "ann", "--remove"]) == 1
     assert "has no account ann" in capsys.readouterr().err

@@ -1,7 +1,7 @@
 """Accounts of the page: a file of names, roles and passwords, of which only hashes are kept.
 
 Each line is ``NAME:ROLE:$scrypt$ln=15,r=8,p=1$SALT$HASH``, salt and hash in base64 (the modular crypt format,
-with scrypt of RFC 7914). `daqsvc page-account` writes it. The file is read again when it has changed.
+with scrypt of RFC 7914). `daqsvc account` writes it. The file is read again when it has changed.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class AccountsFile:
         self._why = ""
         self._read()
         if not self._accounts:
-            raise AccountsError(f"{path} holds no account: make one with daqsvc page-account {path} NAME")
+            raise AccountsError(f"{path} holds no account: make one with daqsvc account {path} NAME")
 
     def named(self, name: str) -> Account | None:
         """The account of that name; None if there is none by now, or the file cannot be used any more."""
@@ -133,7 +133,7 @@ def read_accounts(path: Path) -> dict[str, Account]:
             what = "is no account" if account is None else f"names {account.name} again"
             raise AccountsError(
                 f"{path}, line {number} {what}: remove the line, and make the account with "
-                f"daqsvc page-account {path} NAME"
+                f"daqsvc account {path} NAME"
             )
         accounts[account.name] = account
     return accounts
@@ -213,5 +213,5 @@ def _hashed(password: str, salt: bytes, log2_n: int, r: int, p: int) -> bytes:
 
 def _unreadable(path: Path, error: OSError) -> str:
     if isinstance(error, FileNotFoundError):
-        return f"{path} does not exist: make the first account with daqsvc page-account {path} NAME"
+        return f"{path} does not exist: make the first account with daqsvc account {path} NAME"
     return f"{path} cannot be read: {error.strerror or error}; it belongs to who runs the page"

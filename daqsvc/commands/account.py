@@ -1,4 +1,4 @@
-"""``daqsvc page-account``: who may sign in to the page."""
+"""``daqsvc account``: who may sign in to the page."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK
 LEAST_PASSWORD = 10
 
 
-class PageAccountCommand:
-    """``daqsvc page-account FILE NAME [--role ROLE | --remove]``."""
+class AccountCommand:
+    """``daqsvc account FILE NAME [--role ROLE | --remove]``."""
 
     help = "make an account for the page, or remove one"
     description = (
@@ -84,5 +84,5 @@ def _name(text: str) -> str:
 
 
 def _failed(why: str) -> int:
-    print(f"daqsvc page-account: {why}", file=sys.stderr)  # noqa: T201 - errors go to stderr
+    print(f"daqsvc account: {why}", file=sys.stderr)  # noqa: T201 - errors go to stderr
     return EXIT_FAILED
