@@ -135,7 +135,7 @@ proto: $(READY)
 lock:
 	uv pip compile pyproject.toml --all-extras --group dev --universal --generate-hashes --no-emit-index-url --python-version 3.11 --no-header --quiet -o requirements-dev.lock
 	uv pip compile pyproject.toml --all-extras --universal --generate-hashes --no-emit-index-url --python-version 3.11 --no-header --quiet -c requirements-dev.lock -o requirements.lock
-	uv pip compile pyproject.toml --extra dbc --universal --generate-hashes --no-emit-index-url --python-version 3.11 --no-header --quiet -c requirements-dev.lock -o requirements-service.lock
+	uv pip compile pyproject.toml --extra dbc --extra page --universal --generate-hashes --no-emit-index-url --python-version 3.11 --no-header --quiet -c requirements-dev.lock -o requirements-service.lock
 	echo 'setuptools>=77' | uv pip compile - --universal --generate-hashes --no-emit-index-url --python-version 3.11 --no-header --quiet -c requirements-dev.lock -o requirements-build.lock
 
 clean:

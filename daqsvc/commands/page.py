@@ -68,6 +68,8 @@ class PageCommand:
             metavar="HOST:PORT",
             help="where it listens; beyond this box it needs TLS and accounts, or a reverse proxy",
         )
+        # For a program that starts the page: it ends with that program, however that ends.
+        parser.add_argument("--with-parent", action="store_true", help=argparse.SUPPRESS)
         _add_access(parser.add_argument_group("who may look, and who may act (docs/page.md)"))
         add_store(parser, of_a_machine=False)
 
@@ -86,12 +88,18 @@ class PageCommand:
             return _failed(f"{error.name} is missing: install it with pip install 'daqsvc[page]'")
         listen = arguments.listen or Listen(LOOPBACK, PORT if arguments.port is None else arguments.port)
         try:
-            choice = _access_choice(arguments, listen.host)
+            choice, with_parent = _access_choice(arguments, listen.host), arguments.with_parent
             if arguments.snapshot is not None:
-                serve(_of_snapshots(arguments.snapshot), "snapshots", listen.port, choice)
+                serve(
+                    _of_snapshots(arguments.snapshot),
+                    "snapshots",
+                    listen.port,
+                    choice,
+                    with_parent=arguments.with_parent,
+                )
             else:
                 store = self._store(arguments)
-                serve(BoxSource(store), f"{store}", listen.port, choice)
+                serve(BoxSource(store), f"{store}", listen.port, choice, with_parent=with_parent)
         except BadFileError:
             return EXIT_USAGE
         except UnsafeError as error:

@@ -7,6 +7,7 @@ import errno
 import os
 import signal
 import socket
+from threading import Thread
 from typing import TYPE_CHECKING
 
 import uvicorn
@@ -63,6 +64,8 @@ def serve(
     what: str,
     port: int,
     choice: AccessChoice,
+    *,
+    with_parent: bool = False,
 ) -> None:
     """Serve the page of a service, or of snapshots, until SIGINT or SIGTERM; says where.
 
@@ -71,6 +74,7 @@ def serve(
         what: the same in words.
         port: where it listens; 0 for one that is free.
         choice: who may look, who may act, and the host where it listens.
+        with_parent: whether it ends, too, when its standard input does.
 
     Raises:
         PortError: it cannot listen there.
@@ -104,7 +108,16 @@ def serve(
             ssl_certfile=choice.certificate,
             ssl_keyfile=choice.private_key,
         )
+        if with_parent:
+            Thread(target=_end_with_input, name="end with the parent", daemon=True).start()
         _Server(config, app).run(sockets=[listening])
+
+
+def _end_with_input() -> None:
+    """End this process in order when its standard input ends: whoever holds the other end is gone."""
+    while os.read(0, 4096):
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
 
 
 def _listening(host: str, port: int) -> socket.socket:

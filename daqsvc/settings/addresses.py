@@ -5,7 +5,7 @@ from __future__ import annotations
 import ipaddress
 import re
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import Annotated, NamedTuple, TypeAlias
 
 from pydantic import AfterValidator
 from pydantic_core import PydanticCustomError
@@ -84,3 +84,48 @@ def serial_port(key: str, path: str) -> Device:
     """
     remedy = "give each bus its own port, or put all streams of the port on one bus"
     return Device(key, ("serial port", Path(path).resolve()), remedy)
+
+
+MOST_PORT = 65_535
+
+
+class Address(NamedTuple):
+    """A host and a TCP port of it."""
+
+    host: str
+    port: int
+
+    @property
+    def is_local(self) -> bool:
+        """Whether only this machine reaches it, as far as its name says."""
+        return is_loopback(self.host)
+
+
+def address_of(text: str) -> Address | None:
+    """The address that ``HOST:PORT`` names; None if it is none. A host of colons stands in brackets."""
+    host, _, port = text.rpartition(":")
+    bare = host.removeprefix("[").removesuffix("]")
+    if (":" in bare) != (host != bare) or not is_host(bare):
+        return None
+    if not (port.isascii() and port.isdecimal() and len(port) <= 5 and 1 <= int(port) <= MOST_PORT):
+        return None
+    return Address(bare, int(port))
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a host is this machine for itself."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _listening(text: str) -> str:
+    if address_of(text) is None:
+        remedy = 'write an address of this machine and a port, e.g. listen = "127.0.0.1:9000" or "[::1]:9000"'
+        raise PydanticCustomError("listen", "is no address to listen at", {"remedy": remedy})
+    return text
+
+
+ListenAddress: TypeAlias = Annotated[Text, AfterValidator(_listening)]
+"""``HOST:PORT`` where this machine listens."""

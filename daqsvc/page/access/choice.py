@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import ipaddress
 import ssl
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from daqsvc.page.access.accounts import AccountsFile
 from daqsvc.page.access.ways import ByAccounts, ByProxy, OpenHere, new_key
+from daqsvc.settings.addresses import is_loopback
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -49,10 +49,7 @@ class AccessChoice:
     @property
     def is_local(self) -> bool:
         """Whether only this box reaches it."""
-        try:
-            return ipaddress.ip_address(self.host).is_loopback
-        except ValueError:
-            return self.host == "localhost"
+        return is_loopback(self.host)
 
     def refuse_unsafe(self) -> None:
         """Make sure that nobody gets to see or do what nobody has let them.

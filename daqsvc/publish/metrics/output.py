@@ -23,8 +23,8 @@ from daqsvc.publish.metrics.families import (
     service_metrics,
 )
 from daqsvc.publish.metrics.server import MetricsServer
-from daqsvc.publish.metrics.settings import address_of
 from daqsvc.publish.output import Output
+from daqsvc.settings.addresses import address_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

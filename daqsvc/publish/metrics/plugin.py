@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import ipaddress
 from typing import TYPE_CHECKING
 
-from daqsvc.publish.metrics.settings import DEFAULT, Metrics, address_of
+from daqsvc.publish.metrics.settings import DEFAULT, Metrics
 from daqsvc.publish.plugin import OutputPlugin
+from daqsvc.settings.addresses import address_of
 from daqsvc.settings.problems import Finding
 
 if TYPE_CHECKING:
@@ -44,13 +44,7 @@ class MetricsPlugin(OutputPlugin[Metrics]):
 
 def _open_to_the_network(settings: Metrics) -> Iterator[Finding]:
     address = address_of(settings.listen)
-    if address is None:
-        return
-    try:
-        is_local = ipaddress.ip_address(address.host).is_loopback
-    except ValueError:
-        is_local = address.host == "localhost"
-    if not is_local:
+    if address is not None and not address.is_local:
         yield Finding(
             ("metrics", "listen"),
             "lets everybody in that network read the metrics: there is no password and no encryption",

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from prometheus_client.registry import Collector
 
-    from daqsvc.publish.metrics.settings import Address
+    from daqsvc.settings.addresses import Address
 
 log = logging.getLogger(__name__)
 

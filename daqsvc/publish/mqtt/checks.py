@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import ipaddress
 import stat
 from typing import TYPE_CHECKING
 
 from daqsvc.publish.mqtt.settings import FILES, LONGEST_PASSWORD, first_line
+from daqsvc.settings.addresses import is_loopback
 from daqsvc.settings.problems import Finding
 
 if TYPE_CHECKING:
@@ -117,7 +117,7 @@ def _credentials(mqtt: Mqtt) -> Iterator[Finding]:
         yield Finding(
             ("mqtt", keys[0]), "is a password without a user", "add username to [mqtt], or remove it"
         )
-    if not mqtt.tls and not _is_this_host(host):
+    if not mqtt.tls and not is_loopback(host):
         yield Finding(
             ("mqtt", keys[0]),
             f"the password would go to {host} unencrypted",
@@ -134,17 +134,10 @@ def _one_source(mqtt: Mqtt, file: str, credential: str) -> Iterator[Finding]:
 
 
 def _open_to_commands(mqtt: Mqtt) -> Iterator[Finding]:
-    if mqtt.commands.enabled and not mqtt.tls and not _is_this_host(mqtt.host):
+    if mqtt.commands.enabled and not mqtt.tls and not is_loopback(mqtt.host):
         yield Finding(
             ("mqtt", "commands", "enabled"),
             f"commands would come from {mqtt.host} unencrypted, and from whoever answers there",
             "write mqtts:// in the url, or enabled = false",
             fatal=False,
         )
-
-
-def _is_this_host(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"

@@ -37,9 +37,10 @@ from daqsvc.publish.faults import fault_counts
 from daqsvc.publish.metrics import output as output_module
 from daqsvc.publish.metrics import server as server_module
 from daqsvc.publish.metrics.output import MetricsOutput
-from daqsvc.publish.metrics.settings import Metrics, address_of
+from daqsvc.publish.metrics.settings import Metrics
 from daqsvc.publish.output import Watched
 from daqsvc.service import Service
+from daqsvc.settings.addresses import address_of
 from daqsvc.supervision import Progress, StallWatch
 
 if TYPE_CHECKING:

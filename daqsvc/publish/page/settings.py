@@ -1,0 +1,54 @@
+"""Where the page listens, and who may look and act."""
+
+from __future__ import annotations
+
+import ipaddress
+from typing import Annotated
+
+from pydantic import AfterValidator, Field
+from pydantic_core import PydanticCustomError
+
+from daqsvc.settings.addresses import ListenAddress  # noqa: TC001 - pydantic reads the annotations
+from daqsvc.settings.files import FilePath  # noqa: TC001
+from daqsvc.settings.section import Section, Text
+
+DEFAULT = "127.0.0.1:8420"
+MOST_NAMES = 32
+
+
+def _ip_address(text: str) -> str:
+    try:
+        return f"{ipaddress.ip_address(text)}"
+    except ValueError:
+        remedy = 'write e.g. "127.0.0.1"'
+        raise PydanticCustomError("ip_address", "is no IP address", {"remedy": remedy}) from None
+
+
+def _header(text: str) -> str:
+    if not (text.isascii() and text.replace("-", "").isalnum()):
+        remedy = 'write a name of letters, digits and -, e.g. "X-Remote-User"'
+        raise PydanticCustomError("header", "is no name of a header", {"remedy": remedy})
+    return text
+
+
+class Page(Section):
+    """The page in a browser, which the service starts as a process of its own."""
+
+    listen: ListenAddress = Field(default=DEFAULT, description="host and TCP port where the page listens")
+    host_names: Annotated[tuple[Text, ...], Field(strict=False, max_length=MOST_NAMES)] = Field(
+        default=(), description="names of the page in addresses, beyond this box"
+    )
+    certificate_file: FilePath | None = Field(default=None, description="certificate of TLS, in PEM")
+    private_key_file: FilePath | None = Field(default=None, description="its private key, in PEM")
+    accounts_file: FilePath | None = Field(
+        default=None, description="accounts to sign in with, made by daqsvc account"
+    )
+    user_header: Annotated[Text, AfterValidator(_header)] | None = Field(
+        default=None, description="header in which a reverse proxy says who asks"
+    )
+    proxies: Annotated[
+        tuple[Annotated[Text, AfterValidator(_ip_address)], ...], Field(strict=False, max_length=MOST_NAMES)
+    ] = Field(default=(), description="IP addresses of that proxy")
+    operators: Annotated[tuple[Text, ...], Field(strict=False, max_length=1000)] = Field(
+        default=(), description="users of that proxy who may handle alarms"
+    )
