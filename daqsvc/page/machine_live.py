@@ -18,12 +18,16 @@ import numpy as np
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.ring import SampleRing
 from daqsvc.acquisition.samples import Quality, SampleBlock
+from daqsvc.dsp.speed.keyphasor import EdgeFinder
+from daqsvc.page.runs import Column, Runs
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
 
     from numpy.typing import NDArray
+
+    from daqsvc.page.runs import SpectrumThen, Vectors
 
     Document = dict[str, Any]
     Samples = NDArray[np.float32]
@@ -121,6 +125,7 @@ class MachineLive:
         self.history: Path | None = None
         """The file of the box's history, if there can be one."""
         self.left_out = 0
+        self._runs = Runs()
         self.token = zlib.crc32(json.dumps([self.values, about["streams"]], sort_keys=True).encode())
         """Another one where the machine file is another one."""
         self._came: dict[str, _Came] = {}
@@ -174,6 +179,7 @@ class MachineLive:
         self.said = before.said
         if self.about["begun_ns"] == before.about["begun_ns"]:  # else samples are counted anew
             self.rings = before.rings
+            self._runs = before._runs
         for event in before.journal:
             if event not in self.journal:
                 self.journal.append(event)
@@ -206,6 +212,28 @@ class MachineLive:
         if places is None or newest is None:
             return None
         return newest[0][:, places[0].column].astype(np.float64), self.rate_hz(places[0].stream)
+
+    def vectors_of(self, sensor: str) -> Vectors:
+        """1X of a sensor since somebody looks at it."""
+        key = self.keyphasor()
+        places = self.place_of([sensor, key]) if key else None
+        if key is None or places is None:
+            return self._runs.vectors(sensor, None, 0, EdgeFinder(0.0, 0.0, "rising"))
+        told = self.sensors[key]
+        finder = EdgeFinder(told.threshold or 0.0, told.hysteresis, told.edge)
+        return self._runs.vectors(sensor, self._column(places[0]), places[1].column, finder)
+
+    def spectra_of(self, sensor: str, window_s: float) -> list[SpectrumThen]:
+        """Spectra of a sensor since somebody looks at it, the oldest first."""
+        places = self.place_of([sensor])
+        column = None if places is None else self._column(places[0])
+        return self._runs.spectra(sensor, column, window_s, self.speed_rpm)
+
+    def _column(self, place: SensorPlace) -> Column | None:
+        ring = self.rings.get(place.stream)
+        if ring is None or not ring.started:
+            return None
+        return Column(ring, place.column, self.rate_hz(place.stream))
 
     def newest_wall_ns(self, streams: Iterable[str]) -> int | None:
         """When the newest sample of streams was taken, ns since the Unix epoch; None if none has come."""

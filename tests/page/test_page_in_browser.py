@@ -28,6 +28,7 @@ pytestmark = [pytest.mark.integration, pytest.mark.long]
 VIEWS = (
     *("modes", "orbit", "centreline", "poincare", "timebase"),
     *("spectrum", "full-spectrum", "envelope", "trend"),
+    *("waterfall", "bode", "polar"),
 )
 PATIENCE_MS = 1000.0 * PATIENCE_S
 NUMBER = re.compile(r"-?\d+(\.\d+)?(e-?\d+)?")

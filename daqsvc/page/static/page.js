@@ -145,4 +145,5 @@ if (live) {
     sayAge();
   });
 }
+inOwnZone(document);
 setInterval(sayAge, 1000);

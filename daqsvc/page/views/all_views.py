@@ -8,9 +8,11 @@ from daqsvc.page.views.envelope import EnvelopeSpectrumView
 from daqsvc.page.views.modes import ModesView
 from daqsvc.page.views.orbit import OrbitView
 from daqsvc.page.views.position import CentrelineView, PoincareView
+from daqsvc.page.views.run_up import BodeView, PolarView
 from daqsvc.page.views.spectrum import FullSpectrumView, SpectrumView
 from daqsvc.page.views.timebase import TimebaseView
 from daqsvc.page.views.trend import TrendView
+from daqsvc.page.views.waterfall import WaterfallView
 
 if TYPE_CHECKING:
     from daqsvc.page.views.view import MachineView
@@ -26,6 +28,9 @@ VIEWS: dict[str, MachineView] = {
         SpectrumView(),
         FullSpectrumView(),
         EnvelopeSpectrumView(),
+        WaterfallView(),
+        BodeView(),
+        PolarView(),
         TrendView(),
     )
 }
