@@ -20,12 +20,15 @@ if TYPE_CHECKING:
 
     from daqsvc.page.access.person import Access, Person
 
-HEADERS = {
+_POLICY = (
     # BokehJS puts styles into its figures.
-    "content-security-policy": (
-        "default-src 'none'; script-src 'self'; connect-src 'self'; img-src 'self' data: blob:; "
-        "style-src 'self' 'unsafe-inline'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
-    ),
+    "default-src 'none'; script-src 'self'; connect-src 'self'; img-src 'self' data: blob:; "
+    "style-src 'self' 'unsafe-inline'; base-uri 'none'; form-action 'self'; frame-ancestors 'self'"
+)
+FRAMING = f"{_POLICY}; frame-src 'self'"
+"""Of the page that shows two others beside each other."""
+HEADERS = {
+    "content-security-policy": _POLICY,
     "x-content-type-options": "nosniff",
     "referrer-policy": "same-origin",
     "cache-control": "no-store",

@@ -81,6 +81,11 @@ class Playing:
             await self._wait_until(time.monotonic() + PAUSE_S)
             self.live = self._begun()
 
+    def journal(self, alarm: str, most: int) -> list[Document]:
+        """What was played of the events of an alarm, or of all (""), the newest first."""
+        events = [*self.live.journal][::-1]
+        return [one for one in events if alarm in {"", one["alarm"]}][:most]
+
     def _begun(self) -> MachineLive:
         self._pass += 1
         about = {**self._snapshot.about, "machine": self._name, "values": self._values, "statements": []}
@@ -97,6 +102,11 @@ class Playing:
             self.heard_s = now_s
             await asyncio.sleep(min(due_s - now_s, STEP_S))
         self.heard_s = time.monotonic()
+
+
+def refused_of_the_past(machine: str) -> CommandOutcome:
+    """What comes of a command to an alarm of a snapshot."""
+    return CommandOutcome(accepted=False, reason=f"{machine} is a snapshot: its alarms are of the past")
 
 
 class SnapshotSource:
@@ -133,13 +143,17 @@ class SnapshotSource:
 
     async def journal(self, machine: str, alarm: str, most: int) -> list[Document]:
         """See `daqsvc.page.sources.MachineSource.journal`: what was played."""
-        events = [*self._playing[machine].live.journal][::-1]
-        return [one for one in events if alarm in {"", one["alarm"]}][:most]
+        return self._playing[machine].journal(alarm, most)
+
+    async def snapshots(self, machine: str) -> list[Any]:
+        """See `daqsvc.page.sources.MachineSource.snapshots`: it is one."""
+        del machine
+        return []
 
     async def handle(self, machine: str, command: AlarmCommand, denied: str, via: str) -> CommandOutcome:
         """See `daqsvc.page.sources.MachineSource.handle`: nothing is done."""
         del command, denied, via
-        return CommandOutcome(accepted=False, reason=f"{machine} is a snapshot: its alarms are of the past")
+        return refused_of_the_past(machine)
 
     async def close(self) -> None:
         """Play no more."""

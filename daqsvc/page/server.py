@@ -37,9 +37,10 @@ from daqsvc import __version__
 from daqsvc.page.access.person import peer_of
 from daqsvc.page.access.ways import COOKIE, ByAccounts, OpenHere, SignInError
 from daqsvc.page.charts import THEMES
-from daqsvc.page.guard import Admitted, FormError, Forms, Guarded
+from daqsvc.page.guard import FRAMING, Admitted, FormError, Forms, Guarded
 from daqsvc.page.handling import Said, alarms_page, handle
 from daqsvc.page.presence import Picture
+from daqsvc.page.recorded import NoPictureError
 from daqsvc.page.source import NOT_OURS
 from daqsvc.page.text import WORST, tile
 from daqsvc.page.views.all_views import VIEWS
@@ -55,6 +56,8 @@ if TYPE_CHECKING:
     from daqsvc.page.sources import MachineSource
     from daqsvc.page.views.view import MachineView
 
+ALARM_KINDS = {"alarm"}
+"""Why snapshots are made that show no healthy machine."""
 FIRST_S = 3.0
 """How long a page waits for what the service tells first."""
 
@@ -84,6 +87,8 @@ def application(
         Route("/machines/{machine}", page.machine),
         Route("/machines/{machine}/alarms", page.alarms, name="alarms"),
         Route("/machines/{machine}/alarms", page.handle, methods=["POST"]),
+        Route("/machines/{machine}/snapshots", page.snapshots),
+        Route("/beside", page.beside),
         Route("/machines/{machine}/{view}", page.machine),
         Route("/events/{machine}", page.events),
         Route("/events/{machine}/{view}", page.events),
@@ -182,6 +187,32 @@ class _Page:
         """Do with an alarm what a form asks for."""
         return await handle(self._source, request.path_params["machine"], request, self._forms, self._said)
 
+    async def snapshots(self, request: Request) -> Response:
+        """The recorder's snapshots of a machine, and two of them beside each other."""
+        name = request.path_params["machine"]
+        live, why = await self._first(name)
+        if live is None:
+            return self._absent(request, name, why)
+        try:
+            kept, why = await self._source.snapshots(name), ""
+        except OSError:
+            kept, why = [], "the snapshots cannot be read by who runs the page"
+        # The newest one that no alarm has caused is taken for a healthy one.
+        calm = next((one.name for one in kept if one.kind not in ALARM_KINDS), "")
+        about = self._of_machine(live, name) | {"kept": kept, "why": why, "calm": calm}
+        return self._html(request, "snapshots.html", title=f"Snapshots: {name}", view=None, **about)
+
+    async def beside(self, request: Request) -> Response:
+        """Two machines or snapshots by one view, beside each other."""
+        asked = request.query_params
+        names = [name for name in (asked.get("left", ""), asked.get("right", "")) if name]
+        view = VIEWS.get(asked.get("view", ""))
+        page = self._html(
+            request, "beside.html", title=" beside ".join(names) or "Beside", names=names, view=view
+        )
+        page.headers["content-security-policy"] = FRAMING
+        return page
+
     async def plant(self, request: Request) -> Response:
         """All machines of the box."""
         return self._html(request, "plant.html", title="Plant", **await self._plant())
@@ -254,6 +285,8 @@ class _Page:
                 return await heard.first(FIRST_S), heard.why_not
         except KeyError:
             return None, f"there is no {machine!r} here"
+        except NoPictureError as error:
+            return None, f"{error}"
 
     def _of_machine(self, live: MachineLive, name: str) -> dict[str, Any]:
         """What every page of a machine shows."""

@@ -29,13 +29,17 @@ from daqsvc.history.file import NAME as HISTORY
 from daqsvc.live_feed import SCHEMA
 from daqsvc.outbox.messages import OutboxError
 from daqsvc.outbox.reading import read_journal
+from daqsvc.page.box_snapshots import AT, BoxSnapshots
 from daqsvc.page.machine_live import MachineLive
+from daqsvc.page.recorded import refused_of_the_past
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterable, Iterator
     from pathlib import Path
 
     from daqsvc.alarms.commands import AlarmCommand
+    from daqsvc.page.box_snapshots import KeptSnapshot
+    from daqsvc.page.recorded import Playing
 
     Document = dict[str, Any]
 
@@ -109,6 +113,8 @@ class Listening:
                 await self._listen(backoff)
             except (OSError, asyncio.IncompleteReadError, *NOT_OURS) as error:
                 self.why_not = _in_words(error)
+                if isinstance(error, NOT_OURS):
+                    self._has_begun.set()  # it has answered: nobody need wait for what it refuses
             if not self._anew.is_set():
                 await asyncio.sleep(backoff.next_ns() / NS_PER_S)
 
@@ -168,6 +174,7 @@ class BoxSource:
 
     def __init__(self, store: Path) -> None:
         self._store = store
+        self._snapshots = BoxSnapshots(store)
         self._listening: dict[str, tuple[Listening, asyncio.Task[None]]] = {}
         self._looking: dict[str, int] = {}
 
@@ -198,8 +205,17 @@ class BoxSource:
                 raise ValueError("the service has not answered") from error
 
     @contextlib.asynccontextmanager
-    async def looking(self, machine: str) -> AsyncIterator[Listening]:
-        """Listen to a machine meanwhile, together with all others who look at it."""
+    async def looking(self, machine: str) -> AsyncIterator[Listening | Playing]:
+        """Listen to a machine meanwhile, together with all others who look at it; or play a snapshot of it.
+
+        Raises:
+            KeyError: there is no such snapshot.
+            NoPictureError: it cannot be shown.
+        """
+        if AT in machine:
+            async with self._snapshots.looking(machine) as playing:
+                yield playing
+            return
         if machine not in self._listening:
             listening = Listening(self._store, machine)
             task = asyncio.create_task(listening.run(), name=f"listen to {machine}")
@@ -215,12 +231,21 @@ class BoxSource:
         if not self._looking.get(machine) and machine in self._listening:
             self._listening.pop(machine)[1].cancel()
 
+    async def snapshots(self, machine: str) -> list[KeptSnapshot]:
+        """See `daqsvc.page.sources.MachineSource.snapshots`."""
+        return await asyncio.to_thread(self._snapshots.kept, machine.partition(AT)[0])
+
     async def journal(self, machine: str, alarm: str, most: int) -> list[Document]:
-        """See `daqsvc.page.sources.MachineSource.journal`."""
+        """See `daqsvc.page.sources.MachineSource.journal`; of a snapshot what was played."""
+        if AT in machine:
+            async with self._snapshots.looking(machine) as playing:
+                return playing.journal(alarm, most)
         return await asyncio.to_thread(_journal, self._store, machine, alarm, most)
 
     async def handle(self, machine: str, command: AlarmCommand, denied: str, via: str) -> CommandOutcome:
         """See `daqsvc.page.sources.MachineSource.handle`."""
+        if AT in machine:
+            return refused_of_the_past(machine)
         try:
             request = request_of(dataclasses.replace(command, denied=denied), machine, via)
             return await asyncio.to_thread(ask, self._store, request)
@@ -234,6 +259,7 @@ class BoxSource:
 
     async def close(self) -> None:
         """Listen no more."""
+        await self._snapshots.close()
         tasks = {task for _, task in self._listening.values()}
         self._listening.clear()
         for task in tasks:

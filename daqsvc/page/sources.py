@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from contextlib import AbstractAsyncContextManager, AbstractContextManager
 
     from daqsvc.alarms.commands import AlarmCommand, CommandOutcome
+    from daqsvc.page.box_snapshots import KeptSnapshot
     from daqsvc.page.machine_live import MachineLive
 
 
@@ -68,6 +69,14 @@ class MachineSource(Protocol):
 
         Raises:
             OSError: that cannot be read here.
+        """
+        ...
+
+    async def snapshots(self, machine: str) -> list[KeptSnapshot]:
+        """The recorder's snapshots of a machine that can be looked at by their names, the newest first.
+
+        Raises:
+            OSError: they cannot be read here.
         """
         ...
 
