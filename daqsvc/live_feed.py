@@ -22,7 +22,7 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import SampleBlock
 from daqsvc.alarms.events import AlarmEvent
 from daqsvc.diagnosis.record import Diagnosis
-from daqsvc.machine_facts import machine_values, stream_facts
+from daqsvc.machine_facts import fault_names, machine_values, stream_facts
 from daqsvc.publish.payloads import alarm_document, statement_document
 
 if TYPE_CHECKING:
@@ -144,6 +144,7 @@ class LiveFeed:
             "wall_ns_at_0": self._clock.wall_ns() - self._clock.monotonic_ns(),
             "streams": dict(stream_facts(machine)),
             "values": machine_values(machine),
+            "faults": fault_names(machine),
             "statements": [statement_document(one) for one in statements],
             "alarms": [alarm_document(one) for one in alarms],
             "standings": {name: one._asdict() for name, one in standings.items()},

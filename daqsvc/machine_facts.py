@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import json
+import logging
 from typing import TYPE_CHECKING, Any
 
+from daqsvc.detectors.make import plugins
+from daqsvc.settings.hooks import PluginFailedError
 from daqsvc.settings.models import MachineFile
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from daqsvc.settings.streams import Grid
+
+
+log = logging.getLogger(__name__)
 
 
 def machine_values(machine: MachineFile) -> dict[str, Any]:
@@ -22,6 +28,18 @@ def machine_values(machine: MachineFile) -> dict[str, Any]:
         )
     )
     return values
+
+
+def fault_names(machine: MachineFile) -> dict[str, dict[str, str]]:
+    """By detector and decision the fault that it means, of those whose decisions have names of their own."""
+    named: dict[str, dict[str, str]] = {}
+    for plugin, settings in plugins(machine):
+        try:
+            told = plugin.faults(machine, settings)
+            named |= {str(detector): {**faults} for detector, faults in told.items()}
+        except PluginFailedError as failed:
+            log.error("%s; its decisions are shown as they are", failed)  # noqa: TRY400
+    return named
 
 
 def stream_facts(machine: MachineFile) -> Iterator[tuple[str, dict[str, Any]]]:

@@ -22,7 +22,7 @@ from daqsvc.alarms.conditions import is_condition
 from daqsvc.alarms.events import ANNUNCIATIONS, AlarmEvent, Identity
 from daqsvc.diagnosis.memory import MemoryNotTakenError, taken_memory
 from daqsvc.diagnosis.record import Diagnosis
-from daqsvc.machine_facts import machine_values, stream_facts
+from daqsvc.machine_facts import fault_names, machine_values, stream_facts
 from daqsvc.publish.payloads import alarm_document, statement_document
 from daqsvc.settings.registry import configured
 from daqsvc.settings.speed_signals import RPM, speed_signals
@@ -845,6 +845,7 @@ class MachineRecorder:
             "changed_ns": self._changed_ns,
             "remembered": {one.detector: one.end_index for one in memories},
             "streams": streams,
+            "faults": fault_names(self._machine),
             "standings": {name: one._asdict() for name, one in standings.items()},
             "alarms": [alarm_document(event) for event in alarms.values()],
         }

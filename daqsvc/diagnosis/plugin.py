@@ -10,7 +10,7 @@ from daqsvc.settings.problems import AssemblyError
 from daqsvc.settings.section import Section
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
     from pathlib import Path
 
     from daqsvc.diagnosis.detector import Detector
@@ -78,6 +78,18 @@ class DetectorPlugin(PipelineTable[SettingsT]):
             AssemblyError: a file that the table names cannot be used, or its figures cannot go together.
         """
         raise NotImplementedError
+
+    def faults(self, machine: MachineFile, settings: SettingsT) -> Mapping[str, Mapping[str, str]]:
+        """By detector and decision the fault that it means, e.g. ``"damping_loss"``, for who shows it.
+
+        Unless overridden nothing: a decision that is not named here is the fault's own name.
+
+        Args:
+            machine: the machine file.
+            settings: the table.
+        """
+        del machine, settings
+        return {}
 
     def change_setpoints(
         self, machine: MachineFile, settings: SettingsT, running: Iterable[Detector]

@@ -94,6 +94,20 @@ class _Came(NamedTuple):
     patience_s: float
 
 
+class Decided(NamedTuple):
+    """What a detector decides.
+
+    Attributes:
+        decision: the same.
+        since_ns: when it has said so first, by the box's monotonic clock.
+        is_seen: whether it came while somebody looked; else it may be older.
+    """
+
+    decision: str
+    since_ns: int
+    is_seen: bool
+
+
 class SensorPlace(NamedTuple):
     """Where a sensor's samples come: a column of a stream, or of a grid."""
 
@@ -130,6 +144,11 @@ class MachineLive:
         """Another one where the machine file is another one."""
         self._came: dict[str, _Came] = {}
         self._places = self._found_places()
+        self.decided: dict[str, Decided] = {
+            name: Decided(str(one["decision"]), int(one["monotonic_ns"]), is_seen=False)
+            for name, one in self.latest.items()
+        }
+        """By detector what it decides, and since when."""
 
     @property
     def measured_rpm(self) -> float | None:
@@ -157,6 +176,10 @@ class MachineLive:
         """Whether the shaft turns clockwise, seen from where the probes' angles are."""
         return bool(self.values["machine"].get("rotation") == "clockwise")
 
+    def fault_of(self, detector: str, decision: str) -> str:
+        """The fault that a decision of a detector means."""
+        return str(self.about.get("faults", {}).get(detector, {}).get(decision, decision))
+
     def all_alarms(self) -> dict[str, Document | None]:
         """The last event of each alarm; None for one of the machine file that never had one."""
         return {str(one["name"]): None for one in self.values.get("alarms", ())} | self.alarms.copy()
@@ -177,6 +200,9 @@ class MachineLive:
     def go_on_from(self, before: MachineLive) -> None:
         """Keep what is known of the time before the connection was made anew."""
         self.said = before.said
+        for detector, now in self.decided.items():
+            if (known := before.decided.get(detector)) is not None and known.decision == now.decision:
+                self.decided[detector] = known
         if self.about["begun_ns"] == before.about["begun_ns"]:  # else samples are counted anew
             self.rings = before.rings
             self._runs = before._runs
@@ -306,7 +332,10 @@ class MachineLive:
         return places
 
     def _take_statement(self, statement: Document) -> None:
-        detector = statement["detector"]
+        detector, decision = statement["detector"], str(statement["decision"])
+        if detector not in self.decided or self.decided[detector].decision != decision:
+            is_seen = detector in self.latest
+            self.decided[detector] = Decided(decision, int(statement["monotonic_ns"]), is_seen=is_seen)
         self.latest[detector] = statement
         said = self.said.setdefault(detector, deque(maxlen=MOST_SAID))
         said.append(

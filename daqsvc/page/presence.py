@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from daqsvc.page.findings import finding_rows
 from daqsvc.page.text import alarm_list, alarm_rows, head, journal_rows, machine_rows
 
 if TYPE_CHECKING:
@@ -138,6 +139,7 @@ class Picture:
             told["html"] = {"head": head(live), "alarms": alarm_rows(live)}
             if self._view is None:
                 told["html"] |= {
+                    "findings": finding_rows(live),
                     "machine": machine_rows(live),
                     "journal": journal_rows(live),
                     "alarm-list": alarm_list(live.all_alarms(), self._machine),

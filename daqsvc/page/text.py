@@ -66,11 +66,11 @@ def head(live: MachineLive) -> str:
 def alarm_rows(live: MachineLive) -> str:
     """The standing alarms as rows of a table."""
     rows = [
-        _row(
-            _level(one["level"]),
+        row(
+            level_mark(one["level"]),
             escape(one["alarm"]) + (' <span class="first">first</span>' if one["first_out"] else ""),
             escape(STATES.get(str(one["state"]), str(one["state"]))),
-            _time(one["wall_ns"]),
+            time_mark(one["wall_ns"]),
             escape(one["message"]),
         )
         for one in standing(live)
@@ -87,11 +87,11 @@ def alarm_list(known: Mapping[str, Document | None], machine: str) -> str:
     """
     there = f"/machines/{quote(machine, safe='')}/alarms?alarm="
     return "".join(
-        _row(
-            _level("normal" if one is None else one["level"]),
+        row(
+            level_mark("normal" if one is None else one["level"]),
             f'<a href="{there}{quote(name, safe="")}">{escape(name)}</a>' + _first(one),
             escape(_state(one)),
-            "" if one is None else _time(one["wall_ns"]),
+            "" if one is None else time_mark(one["wall_ns"]),
             "" if one is None else _what(one),
         )
         for name, one in sorted(known.items(), key=lambda item: _urgency(item[1]))
@@ -135,7 +135,8 @@ def _state(alarm: Document | None) -> str:
     return "; ".join(words)
 
 
-def _level(level: str) -> str:
+def level_mark(level: str) -> str:
+    """A level with its colour."""
     return f'<span class="level {escape(level)}">{escape(level)}</span>'
 
 
@@ -147,11 +148,11 @@ def journal_rows(live: MachineLive) -> str:
 def event_rows(events: Iterable[Document]) -> str:
     """Alarm events as rows of a table."""
     rows = [
-        _row(
-            _time(one["wall_ns"]),
+        row(
+            time_mark(one["wall_ns"]),
             escape(one["alarm"]),
             escape(one["kind"]),
-            _level(one["level"]),
+            level_mark(one["level"]),
             _what(one),
         )
         for one in events
@@ -172,22 +173,23 @@ def machine_rows(live: MachineLive) -> str:
         odds = ", ".join(f"p({mode}) {in_words(p)}" for mode, p in likely)
         said = one["decision"] if not one["reason"] else f"{one['decision']}: {one['reason']}"
         rows.append(
-            _row(
+            row(
                 escape(str(one["detector"])),
                 f'<span class="level {escape(one["severity"])}">{escape(said)}</span>',
                 escape("; ".join(filter(None, (odds, figures)))),
-                _time(live.wall_ns_at_0 + int(one["monotonic_ns"])),
+                time_mark(live.wall_ns_at_0 + int(one["monotonic_ns"])),
                 escape(one["quality"]),
             )
         )
     return "".join(rows) or '<tr><td colspan="5">No detector has said anything yet.</td></tr>'
 
 
-def _row(*cells: str) -> str:
+def row(*cells: str) -> str:
+    """Cells of HTML as a row of a table."""
     return f"<tr>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>"
 
 
-def _time(wall_ns: int) -> str:
+def time_mark(wall_ns: int) -> str:
     """A time that the browser shows in its own zone; UTC stands beside it."""
     utc = iso_utc(wall_ns // NS_PER_S * NS_PER_S)
     return f'<time datetime="{utc}" title="{utc}">{utc}</time>'

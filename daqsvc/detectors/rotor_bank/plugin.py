@@ -50,6 +50,12 @@ class RotorBankPlugin(DetectorPlugin[RotorBank]):
         del draft, settings
         return {ROTOR_BANK: ("speed",)}
 
+    def faults(self, machine: MachineFile, settings: RotorBank) -> Mapping[str, Mapping[str, str]]:
+        """See `DetectorPlugin.faults`."""
+        from daqsvc.detectors.rotor_bank.build import faults  # noqa: PLC0415 - the kernels bring a compiler
+
+        return {ROTOR_BANK: faults(machine, settings)}
+
     def describe(self, machine: MachineFile, settings: RotorBank) -> str:
         """See `PipelineTable.describe`."""
         del machine
