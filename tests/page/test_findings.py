@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from support.machine_files import LAVAL, parsed
 from test_views import about
@@ -10,6 +10,9 @@ from test_views import about
 from daqsvc.machine_facts import fault_names
 from daqsvc.page.findings import FAULTS, SOUND, finding_rows, sentence
 from daqsvc.page.machine_live import MachineLive
+
+if TYPE_CHECKING:
+    import pytest
 
 NAMES = {"rotor-bank": {"N": "normal", "F1": "damping_loss", "F1L2": "damping_loss", "F1L3": "rub"}}
 
@@ -102,3 +105,14 @@ def test_every_mode_of_the_bank_means_a_fault_that_the_page_knows() -> None:
     named = fault_names(parsed(LAVAL))["rotor-bank"]
     assert named == {"N": "normal", "F1": "damping_loss", "F1L2": "damping_loss", "F1L3": "rub"}
     assert {*named.values()} <= FAULTS.keys() | SOUND
+
+
+def test_a_plugin_that_fails_costs_its_names_and_nothing_else(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def failing(*_: Any) -> Any:
+        raise KeyError("no such thing")
+
+    monkeypatch.setattr("daqsvc.detectors.rotor_bank.build.faults", failing)
+    assert fault_names(parsed(LAVAL)) == {}
+    assert "its decisions are shown as they are" in caplog.text

@@ -74,6 +74,7 @@ BROUGHT = {
 """For every contract of plugins something that keeps it, and the distribution that brings this."""
 NOT_ASKED = {
     ("crest.CrestPlugin", "change_setpoints"): "at a reload",
+    ("crest.CrestPlugin", "faults"): "where somebody looks on",
     ("daqsvc.settings.packing.PackedLayout", "polled"): "where a trend is taken of it",
     ("daqsvc.diagnosis.recorded.RecordedLive", "sensors"): "where it gives a verdict",
     ("daqsvc.diagnosis.recorded.RecordedLive", "not_judged"): "likewise",
