@@ -69,8 +69,8 @@ def test_what_is_said_of_every_recording_is_as_before():
     if " avx512f" in CPUINFO.read_text():
         guard("--only", *GROUPS)
         return
-    # The golden digests were taken on a processor with AVX-512. Without it the last digits are others (seen on
-    # an AMD EPYC, with the very code that they were taken of); what is said of each recording is not.
+    # The golden digests were taken on a processor with AVX-512. Without it the last digits are others (seen
+    # on an AMD EPYC, with the very code that they were taken of); what is said of each recording is not.
     done = guard_run("--only", *GROUPS)
     before, now = (verdicts(done.stdout, mark) for mark in "-+")
     assert before == now, done.stdout
