@@ -6,11 +6,11 @@ import argparse
 import ipaddress
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_REFUSED, EXIT_USAGE
 from daqsvc.commands.store_argument import BadFileError, StoreNotFoundError, add_store, chosen_store
-from daqsvc.settings.addresses import is_host
+from daqsvc.settings.addresses import MOST_PORT, Address, address_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,14 +21,6 @@ if TYPE_CHECKING:
 
 PORT = 8420
 LOOPBACK = "127.0.0.1"
-HIGHEST_PORT = 65_535
-
-
-class Listen(NamedTuple):
-    """Where the page listens."""
-
-    host: str
-    port: int
 
 
 class PageCommand:
@@ -86,7 +78,7 @@ class PageCommand:
             from daqsvc.snapshots.reading import SnapshotError  # noqa: PLC0415
         except ModuleNotFoundError as error:
             return _failed(f"{error.name} is missing: install it with pip install 'daqsvc[page]'")
-        listen = arguments.listen or Listen(LOOPBACK, PORT if arguments.port is None else arguments.port)
+        listen = arguments.listen or Address(LOOPBACK, PORT if arguments.port is None else arguments.port)
         try:
             choice, with_parent = _access_choice(arguments, listen.host), arguments.with_parent
             if arguments.snapshot is not None:
@@ -204,14 +196,13 @@ def _failed(why: str) -> int:
     return EXIT_FAILED
 
 
-def _listen(text: str) -> Listen:
-    host, _, port = text.rpartition(":")
-    bare = host.removeprefix("[").removesuffix("]")
-    if (":" in bare) != (host != bare) or not is_host(bare):
+def _listen(text: str) -> Address:
+    address = address_of(text)
+    if address is None:
         raise argparse.ArgumentTypeError(
             f"{text!r} is no address to listen at: give a host and a port, e.g. 127.0.0.1:8420 or [::1]:8420"
         )
-    return Listen(bare, _port(port))
+    return address
 
 
 def _address(text: str) -> str:
@@ -222,6 +213,6 @@ def _address(text: str) -> str:
 
 
 def _port(text: str) -> int:
-    if text.isascii() and text.isdecimal() and int(text) <= HIGHEST_PORT:
+    if text.isascii() and text.isdecimal() and int(text) <= MOST_PORT:
         return int(text)
-    raise argparse.ArgumentTypeError(f"{text!r} is no port: give a number from 0 to {HIGHEST_PORT}")
+    raise argparse.ArgumentTypeError(f"{text!r} is no port: give a number from 0 to {MOST_PORT}")

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 AT = "@"
 MOST_OPEN = 4
 """Snapshots that are held in memory at a time."""
+LINGER_S = 5.0
+"""How long one is still played when nobody looks any more."""
 MOST_LISTED = 500
 _NAME = re.compile(r"(?P<date>\d{8})T(?P<time>\d{6})\.\d{6}Z-(?P<kind>[a-z-]+)")
 
@@ -98,14 +100,26 @@ class BoxSnapshots:
             yield playing
         finally:
             self._looking[name] -= 1
+            asyncio.get_running_loop().call_later(LINGER_S, self._perhaps_end, name)
+
+    def _perhaps_end(self, name: str) -> None:
+        if not self._looking.get(name):
+            self._looking.pop(name, None)
+            if name in self._open:
+                self._open.pop(name)[1].cancel()
 
     async def _opened(self, name: str) -> Playing:
         async with self._opening:
             if name not in self._open:
-                playing = await asyncio.to_thread(self._read, name)
                 for other in [one for one in self._open if not self._looking.get(one)]:
                     if len(self._open) >= MOST_OPEN:
-                        self._open.pop(other)[1].cancel()
+                        self._perhaps_end(other)
+                if len(self._open) >= MOST_OPEN:
+                    raise NoPictureError(
+                        f"{MOST_OPEN} snapshots are looked at already, and more would take too much memory: "
+                        "close one"
+                    )
+                playing = await asyncio.to_thread(self._read, name)
                 task = asyncio.create_task(playing.run(), name=f"snapshot {name}")
                 self._open[name] = playing, task
             return self._open[name][0]

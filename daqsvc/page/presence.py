@@ -16,7 +16,7 @@ from daqsvc.page.findings import finding_rows
 from daqsvc.page.text import alarm_list, alarm_rows, head, journal_rows, machine_rows
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Mapping
+    from collections.abc import AsyncGenerator, Mapping
 
     from daqsvc.page.machine_live import MachineLive
     from daqsvc.page.sources import Heard, MachineSource
@@ -54,7 +54,7 @@ class Picture:
         self._has_failed = False
         self._task: asyncio.Task[None] | None = None
 
-    async def events(self) -> AsyncIterator[bytes]:
+    async def events(self) -> AsyncGenerator[bytes]:
         """Server-sent events, until the browser goes."""
         self._looking += 1
         if self._task is None:
@@ -69,6 +69,11 @@ class Picture:
             self._looking -= 1
             if not self._looking:
                 self.end()
+
+    @property
+    def is_looked_at(self) -> bool:
+        """Whether a browser looks at it."""
+        return self._looking > 0
 
     async def close(self) -> None:
         """End it for all who look."""

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from daqsvc.page.lines import largest, one_sided
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -191,24 +193,8 @@ class _Cascade:
             first = -(-ring.oldest_index // size) * size
         while first + size <= ring.end_index:
             values = ring.read(first, size)[:, sampled.column].astype(np.float64)
-            there = np.isfinite(values)
-            if there.sum() >= LEAST_THERE * size:
-                t_ns = ring.time_of(first + size - 1)
-                self.kept.append(_spectrum(values, there, rate_hz, t_ns, speed_rpm))
+            if np.isfinite(values).sum() >= LEAST_THERE * size:
+                lines = largest(*one_sided(values, rate_hz), MOST_LINES)
+                self.kept.append(SpectrumThen(ring.time_of(first + size - 1), speed_rpm, *lines))
             first += size
         self._next_index = first
-
-
-def _spectrum(
-    values: Floats, there: NDArray[np.bool_], rate_hz: float, t_ns: int, speed_rpm: float
-) -> SpectrumThen:
-    """Peak amplitudes by a Hann window, without mean and missing samples."""
-    window = np.hanning(len(values) + 1)[:-1]
-    centred = np.where(there, values - values[there].mean(), 0.0)
-    peak = 2.0 * np.abs(np.fft.rfft(centred * window)) / (window * there).sum()
-    frequency = np.arange(len(peak)) * rate_hz / len(values)
-    group = -(-len(peak) // MOST_LINES)
-    whole = len(peak) // group * group
-    parts = peak[:whole].reshape(-1, group)
-    at = parts.argmax(axis=1) + group * np.arange(len(parts))
-    return SpectrumThen(t_ns, speed_rpm, frequency[at], peak[at])

@@ -7,8 +7,11 @@ from here.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import gzip
 import json
+import time
+from datetime import datetime
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -34,11 +37,12 @@ from starlette.responses import (
 from starlette.routing import Route
 
 from daqsvc import __version__
+from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.page.access.person import peer_of
 from daqsvc.page.access.ways import COOKIE, ByAccounts, OpenHere, SignInError
 from daqsvc.page.charts import THEMES
 from daqsvc.page.guard import FRAMING, Admitted, FormError, Forms, Guarded
-from daqsvc.page.handling import Said, alarms_page, handle
+from daqsvc.page.handling import MOST_EVENTS, Said, alarms_page, handle
 from daqsvc.page.presence import Picture
 from daqsvc.page.recorded import NoPictureError
 from daqsvc.page.source import NOT_OURS
@@ -46,18 +50,19 @@ from daqsvc.page.text import WORST, tile
 from daqsvc.page.views.all_views import VIEWS
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping, Sequence
+    from collections.abc import AsyncIterator, Collection, Mapping, Sequence
 
     from starlette.requests import Request
 
     from daqsvc.page.access.person import Access, Person
+    from daqsvc.page.box_snapshots import KeptSnapshot
     from daqsvc.page.charts import Theme
     from daqsvc.page.machine_live import MachineLive
     from daqsvc.page.sources import MachineSource
     from daqsvc.page.views.view import MachineView
 
-ALARM_KINDS = {"alarm"}
-"""Why snapshots are made that show no healthy machine."""
+LOOK_AGAIN_S = 2.0
+"""How often it is seen whether who listens is still signed in."""
 FIRST_S = 3.0
 """How long a page waits for what the service tells first."""
 
@@ -120,7 +125,7 @@ class _Page:
 
     async def close(self) -> None:
         """End what browsers listen to."""
-        for picture in self._pictures.values():
+        for picture in [*self._pictures.values()]:
             await picture.close()
         await self._source.close()
 
@@ -197,10 +202,17 @@ class _Page:
             kept, why = await self._source.snapshots(name), ""
         except OSError:
             kept, why = [], "the snapshots cannot be read by who runs the page"
-        # The newest one that no alarm has caused is taken for a healthy one.
-        calm = next((one.name for one in kept if one.kind not in ALARM_KINDS), "")
+        calm = await self._healthy(name, kept)
         about = self._of_machine(live, name) | {"kept": kept, "why": why, "calm": calm}
         return self._html(request, "snapshots.html", title=f"Snapshots: {name}", view=None, **about)
+
+    async def _healthy(self, machine: str, kept: Sequence[KeptSnapshot]) -> str:
+        """The newest snapshot during which no alarm stood, by the journal; "" if there is none."""
+        try:
+            events = await self._source.journal(machine, "", MOST_EVENTS)
+        except OSError:
+            events = []
+        return next((one.name for one in kept if one.kind != "alarm" and not _stood(events, one)), "")
 
     async def beside(self, request: Request) -> Response:
         """Two machines or snapshots by one view, beside each other."""
@@ -274,9 +286,32 @@ class _Page:
             return Response(f"retry: 2000\ndata: {told}\n\n", media_type="text/event-stream")
         _, chosen = _chosen(view, live, request.query_params)
         key = (name, view.name if view else "", *(f"{a}={b}" for a, b in sorted(chosen.items())))
-        if key not in self._pictures:
-            self._pictures[key] = Picture(self._source, name, view, chosen)
-        return StreamingResponse(self._pictures[key].events(), media_type="text/event-stream")
+        return StreamingResponse(
+            self._listened(key, name, view, chosen, request), media_type="text/event-stream"
+        )
+
+    async def _listened(
+        self,
+        key: tuple[str, ...],
+        name: str,
+        view: MachineView | None,
+        chosen: Mapping[str, str],
+        request: Request,
+    ) -> AsyncIterator[bytes]:
+        """The events of a picture, for as long as this person may look."""
+        picture = self._pictures.setdefault(key, Picture(self._source, name, view, chosen))
+        looked_s = time.monotonic()
+        try:
+            async with contextlib.aclosing(picture.events()) as events:
+                async for event in events:
+                    yield event
+                    if time.monotonic() - looked_s > LOOK_AGAIN_S:
+                        looked_s = time.monotonic()
+                        if self._access.person(request) is None:
+                            return
+        finally:
+            if not picture.is_looked_at:
+                self._pictures.pop(key, None)
 
     async def _first(self, machine: str) -> tuple[MachineLive | None, str]:
         """A machine; None if the source does not know it yet, and why."""
@@ -333,6 +368,16 @@ def _figures(view: MachineView, live: MachineLive, chosen: Mapping[str, str], th
         item = json_item(one.made, ID(f"figure-{one.name}"))
         told.append({"name": one.name, "label": one.label, "item": item})
     return json.dumps(told)
+
+
+def _stood(events: Sequence[Mapping[str, Any]], snapshot: KeptSnapshot) -> bool:
+    """Whether an alarm stood when a snapshot was made, by its last event before; the newest event first."""
+    at_ns = datetime.fromisoformat(snapshot.time_utc).timestamp() * NS_PER_S
+    last: dict[str, str] = {}
+    for event in events:
+        if event["wall_ns"] <= at_ns:
+            last.setdefault(event["alarm"], event["level"])
+    return any(level != "normal" for level in last.values())
 
 
 def _local(there: str) -> str:

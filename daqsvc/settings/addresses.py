@@ -120,6 +120,14 @@ def is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
+def is_everywhere(host: str) -> bool:
+    """Whether who listens there does so at every address of the machine."""
+    try:
+        return ipaddress.ip_address(host).is_unspecified
+    except ValueError:
+        return False
+
+
 def _listening(text: str) -> str:
     if address_of(text) is None:
         remedy = 'write an address of this machine and a port, e.g. listen = "127.0.0.1:9000" or "[::1]:9000"'

@@ -196,9 +196,13 @@ def test_the_operators_key_is_of_one_start() -> None:
 @pytest.mark.parametrize(
     ("asked", "words"),
     [
-        ({"host": "0.0.0.0"}, "others than this box reach the page"),  # noqa: S104 - refused
+        ({"host": "0.0.0.0"}, "give --host-name for each"),  # noqa: S104 - refused
+        ({"host": "0.0.0.0", "names": ("box",)}, "others than this box reach the page"),  # noqa: S104
         ({"host": "192.0.2.7", "accounts": "a"}, "others than this box reach the page"),
-        ({"host": "::", "certificate": "c", "private_key": "k"}, "others than this box reach the page"),
+        (
+            {"host": "192.0.2.7", "certificate": "c", "private_key": "k"},
+            "others than this box reach the page",
+        ),
         ({"host": "127.0.0.1", "certificate": "c"}, "belong together"),
         ({"host": "127.0.0.1", "accounts": "a", "user_header": "X"}, "choose one"),
         ({"host": "192.0.2.7", "user_header": "X"}, "name them by --proxy"),
@@ -217,7 +221,8 @@ def test_what_is_unsafe_does_not_start(asked: dict[str, Any], words: str) -> Non
         {"host": "127.0.0.1"},
         {"host": "::1"},
         {"host": "localhost", "operator_link": True},
-        {"host": "0.0.0.0", "certificate": "c", "private_key": "k", "accounts": "a"},  # noqa: S104
+        {"host": "192.0.2.7", "certificate": "c", "private_key": "k", "accounts": "a"},
+        {"host": "::", "certificate": "c", "private_key": "k", "accounts": "a", "names": ("box",)},
         {"host": "192.0.2.7", "user_header": "X", "proxies": ("192.0.2.8",)},
     ],
 )

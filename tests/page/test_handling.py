@@ -241,6 +241,26 @@ async def test_the_operators_address_lets_who_has_it_act(tmp_path: Path) -> None
         assert "operator" in (await client.get("/")).text
 
 
+async def test_who_is_removed_hears_no_more(tmp_path: Path) -> None:
+    async with handled_rig(tmp_path, "page-removed") as (_, client, _):
+        await client.sign_in("bob")
+        there = urlsplit(client.address)
+        reader, writer = await asyncio.open_connection(there.hostname, there.port)
+        asked = f"GET /events/laval-rig HTTP/1.1\r\nhost: {there.netloc}\r\ncookie: {client.cookie}\r\n\r\n"
+        writer.write(asked.encode())
+        async with asyncio.timeout(PATIENCE_S):
+            while b"data: " not in await reader.readline():
+                pass
+            await asyncio.to_thread(write_account, tmp_path / "accounts", "bob", None)
+            told = b""
+            while not told.endswith(b"0\r\n\r\n"):
+                piece = await reader.read(100_000)
+                assert piece, "the stream has an end of its own"
+                told += piece
+        writer.close()
+        await writer.wait_closed()
+
+
 @pytest.mark.parametrize(
     ("alarm", "verbs"),
     [

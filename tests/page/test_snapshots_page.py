@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import re
 import time
 from typing import TYPE_CHECKING
@@ -10,10 +11,12 @@ from typing import TYPE_CHECKING
 import pytest
 from support.browsers import browsing, page_served, tab
 from support.recorded_rig import RATE_HZ, let_time_pass, play, recorded_rig, recorder_of, recording
-from support.waiting import PATIENCE_S
+from support.waiting import PATIENCE_S, eventually
 from test_handling import Client
 
-from daqsvc.page.box_snapshots import MOST_OPEN, BoxSnapshots
+from daqsvc.page.box_snapshots import MOST_OPEN, BoxSnapshots, KeptSnapshot
+from daqsvc.page.recorded import NoPictureError
+from daqsvc.page.server import _stood
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -92,8 +95,25 @@ async def test_few_snapshots_are_held_at_a_time_and_what_is_looked_at_stays(tmp_
                     pass
             async with kept.looking(names[0]) as again:
                 assert again is first
-        assert len(kept._open) == MOST_OPEN
+        assert len(kept._open) <= MOST_OPEN
+        async with contextlib.AsyncExitStack() as all_of_them:
+            for name in names[:MOST_OPEN]:
+                await all_of_them.enter_async_context(kept.looking(name))
+            with pytest.raises(NoPictureError, match="close one"):
+                await all_of_them.enter_async_context(kept.looking(names[MOST_OPEN]))
+        await eventually(lambda: not kept._open, "none is played when nobody looks")
         with pytest.raises(KeyError):
             async with kept.looking("laval-rig@20260101T000000.000000Z-alarm"):
                 pass
         await kept.close()
+
+
+def test_a_snapshot_in_which_an_alarm_stood_is_no_healthy_one() -> None:
+    at = KeptSnapshot("rig@x", "2026-11-26T12:00:00Z", "scheduled", 1.0)
+    noon_ns = 1_795_694_400_000_000_000
+    raised = {"alarm": "a", "level": "alert", "wall_ns": noon_ns - 2_000_000_000}
+    returned = {"alarm": "a", "level": "normal", "wall_ns": noon_ns - 1_000_000_000}
+    later = {"alarm": "a", "level": "danger", "wall_ns": noon_ns + 1_000_000_000}
+    assert _stood([raised], at)
+    assert not _stood([later, returned, raised], at)
+    assert not _stood([], at)

@@ -13,12 +13,12 @@ import pytest
 
 from daqsvc.history.file import HistoryFile, Series
 from daqsvc.history.points import RECORD
+from daqsvc.page.lines import amplitudes
 from daqsvc.page.machine_live import MachineLive
 from daqsvc.page.presence import Picture
 from daqsvc.page.shaft import order_1x, whirl
 from daqsvc.page.text import alarm_rows
 from daqsvc.page.views.all_views import VIEWS
-from daqsvc.page.views.spectrum import amplitudes
 from daqsvc.page.views.timebase import thinned
 from daqsvc.page.views.trend import MOST_POINTS
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from daqsvc.page.access.accounts import AccountsFile
 from daqsvc.page.access.ways import ByAccounts, ByProxy, OpenHere, new_key
-from daqsvc.settings.addresses import is_loopback
+from daqsvc.settings.addresses import is_everywhere, is_loopback
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -67,6 +67,11 @@ class AccessChoice:
             raise UnsafeError("--operator and --proxy are about the users of --user-header: give it, too")
         if self.user_header and not self.proxies:
             raise UnsafeError("--user-header is believed of known proxies only: name them by --proxy ADDRESS")
+        if is_everywhere(self.host) and not self.names:
+            raise UnsafeError(
+                f"the page listens at {self.host}, and nobody knows by which names it is opened: give "
+                "--host-name for each, be it an address of this machine"
+            )
         if self.is_local or self.user_header:
             return
         if self.accounts is None or self.certificate is None:

@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from daqsvc.page.charts import ChartAxis, chart, legend, source
+from daqsvc.page.lines import amplitudes, largest, one_sided
 from daqsvc.page.shaft import whirl
 from daqsvc.page.views.position import NO_PAIR, pairs_of
 from daqsvc.page.views.view import Choice, Figure, Shown
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-
-    from numpy.typing import NDArray
 
     from daqsvc.page.charts import Theme
     from daqsvc.page.machine_live import MachineLive
@@ -28,23 +27,6 @@ LEAST_SAMPLES = 32
 REVOLUTIONS = {"20": "20 revolutions", "5": "5 revolutions", "80": "80 revolutions"}
 FULL_ORDERS = 6.0
 """How far the full spectrum is shown, in multiples of the speed."""
-
-
-def amplitudes(values: Any) -> NDArray[np.float64]:
-    """Peak amplitudes of the lines of a complex spectrum, without mean and missing samples.
-
-    Args:
-        values: ``[n]``, real or complex; NaN where missing.
-
-    Returns:
-        ``[n]``, at the frequencies of `numpy.fft.fftfreq`; of a real signal half of each line is at minus its
-        frequency.
-    """
-    there = np.isfinite(values)
-    centred = np.where(there, values - values[there].mean(), 0.0)
-    window = np.hanning(len(values) + 1)[:-1]
-    lines: NDArray[np.float64] = np.abs(np.fft.fft(centred * window)) / (window * there).sum()
-    return lines
 
 
 class SpectrumView:
@@ -99,8 +81,7 @@ class SpectrumView:
         missing = int(np.isnan(values).sum())
         if len(values) - missing < LEAST_SAMPLES:
             return Shown(note="too few samples have come for a spectrum")
-        lines = 2.0 * amplitudes(values)[: len(values) // 2 + 1]
-        frequency = np.arange(len(lines)) * rate_hz / len(values)
+        frequency, lines = one_sided(values, rate_hz)
         unit = live.sensors[sensor].unit
         rows = []
         speed_hz = abs(live.speed_rpm) / 60.0
@@ -113,7 +94,7 @@ class SpectrumView:
         highest = int(lines[1:].argmax()) + 1
         rows.append((f"largest at {frequency[highest]:.2f} Hz", f"{lines[highest]:.4g}", f"{unit} peak"))
         note = f"{missing} of {len(values)} samples are missing, and left out" if missing else ""
-        frequency, lines = _largest(frequency, lines)
+        frequency, lines = largest(frequency, lines, MOST_LINES)
         orders = {"x": [order * speed_hz for order in ORDERS if speed_hz]}
         return Shown({"spectrum": {"f": frequency, "a": lines}, "orders": orders}, rows, note)
 
@@ -179,21 +160,10 @@ class FullSpectrumView:
         missing = int((~np.isfinite(values)).sum())
         note = f"{missing} of {len(values)} samples are missing, and left out" if missing else ""
         wanted = np.abs(order) <= FULL_ORDERS
-        order, lines = _largest(order[wanted], lines[wanted])
+        order, lines = largest(order[wanted], lines[wanted], MOST_LINES)
         return Shown({"full_spectrum": {"o": order, "a": lines}, "orders": {"x": [-1.0, 1.0]}}, rows, note)
 
 
 def _cursors(made: Any, theme: Theme) -> None:
     """Where the orders are; the browser is told, for the speed changes."""
     made.vspan(x="x", source=source("orders", ["x"]), line_color=theme.series[1], line_dash="dashed")
-
-
-def _largest(frequency: Any, lines: Any) -> tuple[Any, Any]:
-    """The largest line of each group of neighbours, so that there are no more than can be sent."""
-    group = -(-len(lines) // MOST_LINES)
-    if group == 1:
-        return frequency, lines
-    whole = len(lines) // group * group
-    parts = lines[:whole].reshape(-1, group)
-    kept = parts.argmax(axis=1) + group * np.arange(len(parts))
-    return frequency[kept], lines[kept]

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from daqsvc.publish.page.settings import DEFAULT, Page
 from daqsvc.publish.plugin import OutputPlugin
-from daqsvc.settings.addresses import address_of
+from daqsvc.settings.addresses import address_of, is_everywhere
 from daqsvc.settings.problems import Finding
 
 if TYPE_CHECKING:
@@ -89,6 +89,12 @@ def _pairs(settings: Page) -> Iterator[Finding]:
 
 def _open_to_the_network(settings: Page) -> Iterator[Finding]:
     address = address_of(settings.listen)
+    if address is not None and is_everywhere(address.host) and not settings.host_names:
+        yield Finding(
+            ("page", "listen"),
+            "is every address of the box, and nobody knows by which names the page is opened",
+            'write host_names = ["..."] with each, be it an address of the box',
+        )
     if address is None or address.is_local or settings.user_header is not None:
         return
     if settings.accounts_file is None or settings.certificate_file is None:

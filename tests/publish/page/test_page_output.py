@@ -131,8 +131,8 @@ def found(**settings: Any) -> list[Finding]:
 @pytest.mark.parametrize(
     ("settings", "key"),
     [
-        ({"listen": "0.0.0.0:8420"}, "listen"),
-        ({"listen": "[::]:8420", "accounts_file": "a"}, "listen"),
+        ({"listen": "0.0.0.0:8420", "user_header": "X", "proxies": ["::1"]}, "listen"),
+        ({"listen": "192.0.2.7:8420", "accounts_file": "a"}, "listen"),
         ({"certificate_file": "c"}, "certificate_file"),
         ({"private_key_file": "c"}, "private_key_file"),
         ({"user_header": "X-User"}, "user_header"),
@@ -150,5 +150,7 @@ def test_what_is_unsafe_is_an_error_of_the_machine_file(settings: dict[str, Any]
 
 def test_what_is_safe_is_none() -> None:
     assert found() == []
-    assert found(listen="0.0.0.0:1", certificate_file="c", private_key_file="k", accounts_file="a") == []
+    tls = {"certificate_file": "c", "private_key_file": "k", "accounts_file": "a"}
+    assert found(listen="192.0.2.7:1", **tls) == []
+    assert found(listen="[::]:1", host_names=["box"], **tls) == []
     assert found(listen="192.0.2.7:1", user_header="X-User", proxies=["192.0.2.8"], operators=["ann"]) == []
