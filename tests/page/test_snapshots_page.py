@@ -51,6 +51,10 @@ async def test_a_snapshot_opens_beside_a_healthy_one(tmp_path: Path) -> None:
                 assert (answer.status, time.monotonic() - begun_s < 2.5) == (404, True), name
                 assert f"{tmp_path}" not in answer.text
             assert (await client.get("/machines/nobody")).status == 404
+            framed = (await client.get("/beside?left=../..&right=%22%3E%3Cb%3E")).text
+            assert 'src="/machines/..%2F.."' in framed
+            assert "<b>" not in framed
+            assert "Nothing is named to be shown" in (await client.get("/beside")).text
 
             await page.goto(f"{address}/machines/laval-rig/snapshots")
             assert await page.locator("#snapshots tbody tr").count() == len(paths)
