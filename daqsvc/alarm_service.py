@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from daqsvc.control import TakeSnapshot
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.outbox.messages import OutboxMessage
+    from daqsvc.publish.looking import Look
     from daqsvc.publish.output import Output
     from daqsvc.self_check import BusHealth
 
@@ -117,6 +118,7 @@ class AlarmService:
         stalls: finds the parts of the service that have stalled, for outputs that tell it.
         heard: told, on the event loop, of each event that comes about.
         snapshot: makes snapshots of machines. None if nobody may ask for one.
+        look: begins to tell what passes of a machine. None if nobody may look on.
     """
 
     def __init__(
@@ -134,6 +136,7 @@ class AlarmService:
         stalls: StallWatch | None = None,
         heard: Callable[[AlarmEvent], None] = lambda _event: None,
         snapshot: TakeSnapshot | None = None,
+        look: Look | None = None,
     ) -> None:
         limits = limits or OutboxLimits()
         stalls = stalls or StallWatch(dict)
@@ -160,6 +163,7 @@ class AlarmService:
             topics=self.topics,
             commands=self.execute,
             snapshots=self.take_snapshot,
+            look=look,
             earlier=EarlierState(self._witness, self._take_witness),
             progress=stalls.progress,
             stalls=stalls,

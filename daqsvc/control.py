@@ -20,7 +20,7 @@ import socket
 import stat
 import struct
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -39,12 +39,14 @@ from daqsvc.alarms.commands import (
 )
 from daqsvc.outbox.files import is_possessed, is_read_only
 from daqsvc.outbox.reading import JOURNAL_NAME
+from daqsvc.publish.looking import Looking
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Collection, Iterable, Iterator, Sequence
     from pathlib import Path
 
     from daqsvc.alarms.commands import AlarmCommand, CommandHandler
+    from daqsvc.publish.looking import Look
 
 log = logging.getLogger(__name__)
 
@@ -180,26 +182,6 @@ class Reload(Protocol):
         Raises:
             ReloadRefusedError: nothing was.
         """
-        ...
-
-
-class Looking(NamedTuple):
-    """One who looks on.
-
-    Attributes:
-        lines: waits for what comes next, lines of JSON; nothing at the end.
-        leave: ends it.
-    """
-
-    lines: Callable[[], Awaitable[bytes]]
-    leave: Callable[[], None]
-
-
-class Look(Protocol):
-    """See `daqsvc.service.Service.look`."""
-
-    def __call__(self, machine: str | None, streams: Collection[str]) -> Looking | tuple[str, ...]:
-        """Begin to look on; the names of all machines if there is no such one."""
         ...
 
 

@@ -45,6 +45,8 @@ MOST_WAITING = 2000
 """Likewise items of every kind."""
 BEFORE_S = 20.0
 """What the rings hold of so long before is told at first."""
+BEFORE_BYTES = MOST_WAITING_BYTES // 2
+"""No more than so much of it."""
 
 
 class _StreamStands(NamedTuple):
@@ -157,6 +159,7 @@ class LiveFeed:
         alarms: Iterable[AlarmEvent],
         standings: Mapping[str, StreamState],
         rings: Mapping[str, SampleRing],
+        before_bytes: int = BEFORE_BYTES,
     ) -> Looker:
         """Begin to look on.
 
@@ -166,13 +169,14 @@ class LiveFeed:
             alarms: see `about`.
             standings: see `about`.
             rings: what has come lately, by stream and grid.
+            before_bytes: samples of these that are told at first, at most.
         """
         # Copied here, and made into text on a thread: that takes its time of thousands of sensors.
         about = partial(self.about, [*statements], [*alarms], dict(standings))
         looker = Looker(about, streams)
         wanted = sorted(looker.streams & rings.keys())
         for stream in wanted:
-            if (before := _before(rings[stream], MOST_WAITING_BYTES // (2 * len(wanted)))) is not None:
+            if (before := _before(rings[stream], before_bytes // len(wanted))) is not None:
                 looker.add(before)
         self._lookers.add(looker)
         return looker

@@ -16,12 +16,14 @@ from daqsvc.alarm_service import AlarmService
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.make import alarm_rule
 from daqsvc.alarms.manager import AlarmManager
-from daqsvc.control import ControlError, ControlServer, Looking, ReloadRefusedError, SnapshotNotMadeError
+from daqsvc.control import ControlError, ControlServer, ReloadRefusedError, SnapshotNotMadeError
 from daqsvc.diagnosis.pipeline import THREADS, KernelThreads, kernel_failed
 from daqsvc.driver_reports import DriverReports
+from daqsvc.live_feed import BEFORE_BYTES
 from daqsvc.machine_watch import MachineWatch
 from daqsvc.outbox.files import make_directory
 from daqsvc.outbox.limits import OutboxLimits
+from daqsvc.publish.looking import Looking
 from daqsvc.publish.machine_figures import MACHINES, of_machine
 from daqsvc.publish.make import output_plugins, output_set
 from daqsvc.publish.output import output_name
@@ -183,6 +185,7 @@ class Service:
             stalls=self.stalls,
             heard=self._record_alarm,
             snapshot=self.snapshot,
+            look=self.look,
         )
         self.reports = {name: self._status_report(name) for name in self.watches}
         self.control = ControlServer(
@@ -235,15 +238,19 @@ class Service:
         report = self.reports.get(machine or "")
         return tuple(self.reports) if report is None else await report.line()
 
-    def look(self, machine: str | None, streams: Collection[str]) -> Looking | tuple[str, ...]:
-        """Begin to look at a machine, or the only one; the names of all if there is no such machine."""
+    def look(
+        self, machine: str | None, streams: Collection[str], *, before_bytes: int | None = None
+    ) -> Looking | tuple[str, ...]:
+        """Begin to look at a machine, or the only one; see `daqsvc.publish.looking.Look`."""
         name = next(iter(self.watches)) if machine is None and len(self.watches) == 1 else machine
         watch = self.watches.get(name or "")
         if watch is None or name is None:
             return tuple(self.watches)
         latest = self.reports[name].latest
         newest = self.alarms.newest(name)
-        looker = watch.live.look(streams, latest, newest, watch.standings, watch.rings)
+        looker = watch.live.look(
+            streams, latest, newest, watch.standings, watch.rings, before_bytes or BEFORE_BYTES
+        )
         return Looking(looker.lines, partial(watch.live.leave, looker))
 
     def _alarms_of(self, machine: MachineFile) -> AlarmManager:

@@ -1,4 +1,4 @@
-"""``daqsvc page``: the machines of this box, or snapshots of them, in a browser."""
+"""``daqsvc page``: the machines of this box, those of a plant, or snapshots, in a browser."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LOOPBACK = "127.0.0.1"
 
 
 class PageCommand:
-    """``daqsvc page [FILE | --store DIR]``, ``daqsvc page --snapshot FILE...``.
+    """``daqsvc page [FILE | --store DIR | --plant FILE | --snapshot FILE...]``.
 
     Args:
         load: reads a machine file; None after its errors have been printed.
@@ -52,6 +52,13 @@ class PageCommand:
             help="show a snapshot of the recorder in place of a service, played again and again; may be "
             "repeated, e.g. for a healthy one beside it",
         )
+        parser.add_argument(
+            "--plant",
+            type=Path,
+            metavar="FILE",
+            help="show all boxes that publish to a broker in place of the service on this box; the file has a "
+            "table [mqtt], as a machine file has it",
+        )
         where = parser.add_mutually_exclusive_group()
         where.add_argument("--port", type=_port, help=f"where it listens on {LOOPBACK} (default: {PORT})")
         where.add_argument(
@@ -69,9 +76,13 @@ class PageCommand:
         """See `daqsvc.cli.Command.run`."""
         if arguments.snapshot is not None and (arguments.file or arguments.store):
             self._parser.error("--snapshot shows no service: leave the machine file and --store out")
+        if arguments.plant is not None and (arguments.file or arguments.store or arguments.snapshot):
+            self._parser.error("--plant shows what a broker tells: leave out what names a box or a snapshot")
         try:
             from daqsvc.page.access.accounts import AccountsError  # noqa: PLC0415 - an extra
             from daqsvc.page.access.choice import UnsafeError  # noqa: PLC0415
+            from daqsvc.page.plant.plant_file import PlantFileError, read_plant_file  # noqa: PLC0415
+            from daqsvc.page.plant.source import PlantSource  # noqa: PLC0415
             from daqsvc.page.recorded import NoPictureError  # noqa: PLC0415
             from daqsvc.page.serving import PortError, serve  # noqa: PLC0415
             from daqsvc.page.source import BoxSource  # noqa: PLC0415
@@ -89,12 +100,15 @@ class PageCommand:
                     choice,
                     with_parent=arguments.with_parent,
                 )
+            elif arguments.plant is not None:
+                mqtt = read_plant_file(arguments.plant)
+                serve(PlantSource(mqtt), "the plant", listen.port, choice, with_parent=with_parent)
             else:
                 store = self._store(arguments)
                 serve(BoxSource(store), f"{store}", listen.port, choice, with_parent=with_parent)
         except BadFileError:
             return EXIT_USAGE
-        except UnsafeError as error:
+        except (UnsafeError, PlantFileError) as error:
             _failed(f"{error}")
             return EXIT_USAGE
         except (StoreNotFoundError, PortError, AccountsError) as error:

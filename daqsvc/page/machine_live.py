@@ -139,6 +139,8 @@ class MachineLive:
         self.history: Path | None = None
         """The file of the box's history, if there can be one."""
         self.left_out = 0
+        self.lacking = ""
+        """Why there is less of it than its box knows, for a person; empty if there is not."""
         self._runs = Runs()
         self.token = zlib.crc32(json.dumps([self.values, about["streams"]], sort_keys=True).encode())
         """Another one where the machine file is another one."""

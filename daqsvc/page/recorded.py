@@ -35,7 +35,7 @@ class NoPictureError(Exception):
 
 
 class Playing:
-    """One snapshot that is played; as `daqsvc.page.source.Listening`.
+    """One snapshot that is played; as `daqsvc.page.listening.Listening`.
 
     Args:
         snapshot: as read.
@@ -63,7 +63,7 @@ class Playing:
             ) from None
 
     async def first(self, _timeout_s: float) -> MachineLive:
-        """See `daqsvc.page.source.Listening.first`."""
+        """See `daqsvc.page.listening.Listening.first`."""
         return self.live
 
     @contextlib.contextmanager

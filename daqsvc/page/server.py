@@ -43,9 +43,10 @@ from daqsvc.page.access.ways import COOKIE, ByAccounts, OpenHere, SignInError
 from daqsvc.page.charts import THEMES
 from daqsvc.page.guard import FRAMING, Admitted, FormError, Forms, Guarded
 from daqsvc.page.handling import MOST_EVENTS, Said, alarms_page, handle
+from daqsvc.page.listening import NOT_OURS
 from daqsvc.page.presence import Picture
 from daqsvc.page.recorded import NoPictureError
-from daqsvc.page.source import NOT_OURS
+from daqsvc.page.sources import NotToldError
 from daqsvc.page.text import WORST, tile
 from daqsvc.page.views.all_views import VIEWS
 
@@ -200,6 +201,8 @@ class _Page:
             return self._absent(request, name, why)
         try:
             kept, why = await self._source.snapshots(name), ""
+        except NotToldError as error:
+            kept, why = [], f"{error}"
         except OSError:
             kept, why = [], "the snapshots cannot be read by who runs the page"
         calm = await self._healthy(name, kept)
@@ -226,20 +229,33 @@ class _Page:
         return page
 
     async def plant(self, request: Request) -> Response:
-        """All machines of the box."""
-        return self._html(request, "plant.html", title="Plant", **await self._plant())
+        """All machines, or those that are looked for."""
+        asked = request.query_params
+        chosen = {"find": asked.get("find", ""), "show": asked.get("show", "")}
+        return self._html(request, "plant.html", title="Plant", **chosen, **await self._plant(asked))
 
-    async def plant_rows(self, _: Request) -> Response:
+    async def plant_rows(self, request: Request) -> Response:
         """The same as JSON, for who looks again."""
-        return JSONResponse(await self._plant())
+        return JSONResponse(await self._plant(request.query_params))
 
-    async def _plant(self) -> dict[str, Any]:
+    async def _plant(self, asked: Mapping[str, str]) -> dict[str, Any]:
         try:
             tiles = [tile(status) for status in await self._source.statuses()]
+        except NotToldError as error:
+            return {"tiles": [], "why": f"{error}", "hidden": 0}
         except (OSError, *NOT_OURS):
-            return {"tiles": [], "why": "no daqsvc answers on this box: it is started with daqsvc run"}
-        tiles.sort(key=lambda one: (-WORST.get(one["level"], 0), one["name"]))
-        return {"tiles": tiles, "why": ""}
+            why = "no daqsvc answers on this box: it is started with daqsvc run"
+            return {"tiles": [], "why": why, "hidden": 0}
+        tiles.sort(key=lambda one: (-WORST.get(one["level"], 0), one["level"] == "normal", one["name"]))
+        find = asked.get("find", "").casefold()
+        only_wrong = asked.get("show") == "wrong"
+        shown = [
+            one
+            for one in tiles
+            if find in f"{one['title']} {one['place']}".casefold()
+            and not (only_wrong and one["level"] == "normal" and not one["alarms"])
+        ]
+        return {"tiles": shown, "why": "", "hidden": len(tiles) - len(shown)}
 
     async def machine(self, request: Request) -> Response:
         """One machine, by one view or as a whole."""

@@ -9,12 +9,8 @@ import asyncio
 import contextlib
 import dataclasses
 import json
-import logging
-import time
 from typing import TYPE_CHECKING, Any
 
-from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.acquisition.link import Backoff
 from daqsvc.alarms.commands import CommandOutcome
 from daqsvc.control import (
     SOCKET,
@@ -26,28 +22,24 @@ from daqsvc.control import (
     request_of,
 )
 from daqsvc.history.file import NAME as HISTORY
-from daqsvc.live_feed import SCHEMA
 from daqsvc.outbox.messages import OutboxError
 from daqsvc.outbox.reading import read_journal
 from daqsvc.page.box_snapshots import AT, BoxSnapshots
-from daqsvc.page.machine_live import MachineLive
+from daqsvc.page.listening import Listening
 from daqsvc.page.recorded import refused_of_the_past
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterable, Iterator
+    from collections.abc import AsyncIterator
     from pathlib import Path
 
+    from daqsvc.acquisition.link import Backoff
     from daqsvc.alarms.commands import AlarmCommand
     from daqsvc.page.box_snapshots import KeptSnapshot
-    from daqsvc.page.recorded import Playing
+    from daqsvc.page.sources import Heard
 
     Document = dict[str, Any]
 
-log = logging.getLogger(__name__)
-
 LONGEST_LINE = 64 * 1024 * 1024
-NOT_OURS = (ValueError, LookupError, TypeError)
-"""What comes of an answer that is not as it is known here."""
 ALARM_SCHEMA = "daqsvc.alarm/"
 MOST_LOOKED_AT = 20_000
 """Messages of the journal that are looked through for the events of one alarm."""
@@ -55,8 +47,8 @@ LINGER_S = 5.0
 """How long a machine is still listened to when nobody looks any more."""
 
 
-class Listening:
-    """Listens to one machine of a service, and keeps what it tells.
+class BoxListening(Listening):
+    """Listens to one machine of a service.
 
     Args:
         store: the store of the service.
@@ -64,72 +56,29 @@ class Listening:
     """
 
     def __init__(self, store: Path, machine: str) -> None:
-        self.machine = machine
-        self.live: MachineLive | None = None
-        """What was told; None before the service has answered for the first time."""
-        self.why_not = "the service has not answered yet"
-        """Why nothing is told by now; empty if something is."""
-        self.heard_s = time.monotonic()
-        """When the service said something last."""
+        super().__init__(machine, store / HISTORY)
         self._path = store / SOCKET
-        self._history = store / HISTORY
-        self._wanted: dict[object, frozenset[str]] = {}
-        self._streams: frozenset[str] = frozenset()
-        self._anew = asyncio.Event()
-        self._has_begun = asyncio.Event()
 
-    async def first(self, timeout_s: float) -> MachineLive | None:
-        """The machine, as soon as the service has told of it; None if it does not in time."""
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(timeout_s):
-                await self._has_begun.wait()
-        return self.live
+    def in_words(self, error: Exception) -> str:
+        """See `Listening.in_words`."""
+        if isinstance(error, FileNotFoundError | ConnectionRefusedError):
+            return "no daqsvc runs on the store"
+        if isinstance(error, PermissionError):
+            return "the page may not ask the service: run it as the service's user"
+        if isinstance(error, asyncio.IncompleteReadError):
+            return "the service has ended the connection"
+        return super().in_words(error)
 
-    @contextlib.contextmanager
-    def wanting(self, streams: Iterable[str]) -> Iterator[None]:
-        """Have the samples of streams come meanwhile."""
-        who = object()
-        self._wanted[who] = frozenset(streams)
-        self._ask_anew()
-        try:
-            yield
-        finally:
-            del self._wanted[who]
-            self._ask_anew()
-
-    def _ask_anew(self) -> None:
-        wanted = frozenset().union(*self._wanted.values())
-        # What is wanted no more goes on coming until something else is: it costs less than asking anew.
-        if wanted - self._streams or (self._streams and not wanted):
-            self._anew.set()
-
-    async def run(self) -> None:
-        """Listen until cancelled; again and again where that fails."""
-        backoff = Backoff()
-        while True:
-            self._anew.clear()
-            self._streams = frozenset().union(*self._wanted.values())
-            try:
-                await self._listen(backoff)
-            except (OSError, asyncio.IncompleteReadError, *NOT_OURS) as error:
-                self.why_not = _in_words(error)
-                if isinstance(error, NOT_OURS):
-                    self._has_begun.set()  # it has answered: nobody need wait for what it refuses
-            if not self._anew.is_set():
-                await asyncio.sleep(backoff.next_ns() / NS_PER_S)
-
-    async def _listen(self, backoff: Backoff) -> None:
+    async def listen(self, backoff: Backoff) -> None:
+        """See `Listening.listen`."""
         reader, writer = await asyncio.open_unix_connection(self._path, limit=LONGEST_LINE)
         try:
-            asked = {"machine": self.machine, "streams": sorted(self._streams)}
+            asked = {"machine": self.machine, "streams": sorted(self.streams)}
             question = f'{{"schema": "daqsvc.control/1", "verb": "live", {json.dumps(asked)[1:]}\n'
             writer.write(question.encode())
-            about = json.loads(await reader.readuntil())
-            if about.get("schema") != SCHEMA:
-                raise ValueError(str(about.get("reason", "it answers in a way that is not known here")))
-            self._begin(about)
+            self.begin(json.loads(await reader.readuntil()))
             backoff.reset()
-            waiting = asyncio.create_task(self._anew.wait(), name="other streams are wanted")
+            waiting = asyncio.create_task(self.anew.wait(), name="other streams are wanted")
             try:
                 while not waiting.done():
                     reading = asyncio.ensure_future(reader.readuntil())
@@ -141,28 +90,13 @@ class Listening:
                         await asyncio.wait({reading})
                     if reading.cancelled():
                         return
-                    self._take(json.loads(reading.result()))
+                    self.take(json.loads(reading.result()))
             finally:
                 waiting.cancel()
         finally:
             writer.close()
             with contextlib.suppress(OSError):
                 await writer.wait_closed()
-
-    def _begin(self, about: Document) -> None:
-        before = self.live
-        self.live = MachineLive(about)
-        self.live.history = self._history
-        if before is not None and before.about["streams"] == about["streams"]:
-            self.live.go_on_from(before)
-        self.why_not = ""
-        self.heard_s = time.monotonic()
-        self._has_begun.set()
-
-    def _take(self, line: Document) -> None:
-        if self.live is not None:
-            self.live.hear(line)
-        self.heard_s = time.monotonic()
 
 
 class BoxSource:
@@ -175,7 +109,7 @@ class BoxSource:
     def __init__(self, store: Path) -> None:
         self._store = store
         self._snapshots = BoxSnapshots(store)
-        self._listening: dict[str, tuple[Listening, asyncio.Task[None]]] = {}
+        self._listening: dict[str, tuple[BoxListening, asyncio.Task[None]]] = {}
         self._looking: dict[str, int] = {}
 
     async def statuses(self) -> list[Document]:
@@ -205,7 +139,7 @@ class BoxSource:
                 raise ValueError("the service has not answered") from error
 
     @contextlib.asynccontextmanager
-    async def looking(self, machine: str) -> AsyncIterator[Listening | Playing]:
+    async def looking(self, machine: str) -> AsyncIterator[Heard]:
         """Listen to a machine meanwhile, together with all others who look at it; or play a snapshot of it.
 
         Raises:
@@ -217,7 +151,7 @@ class BoxSource:
                 yield playing
             return
         if machine not in self._listening:
-            listening = Listening(self._store, machine)
+            listening = BoxListening(self._store, machine)
             task = asyncio.create_task(listening.run(), name=f"listen to {machine}")
             self._listening[machine] = listening, task
         self._looking[machine] = self._looking.get(machine, 0) + 1
@@ -303,13 +237,3 @@ async def _connected(path: Path) -> AsyncIterator[tuple[asyncio.StreamReader, as
         writer.close()
         with contextlib.suppress(OSError):
             await writer.wait_closed()
-
-
-def _in_words(error: Exception) -> str:
-    if isinstance(error, FileNotFoundError | ConnectionRefusedError):
-        return "no daqsvc runs on the store"
-    if isinstance(error, PermissionError):
-        return "the page may not ask the service: run it as the service's user"
-    if isinstance(error, asyncio.IncompleteReadError):
-        return "the service has ended the connection"
-    return f"{error}" or type(error).__name__

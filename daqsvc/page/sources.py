@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from daqsvc.page.machine_live import MachineLive
 
 
+class NotToldError(OSError):
+    """What is asked for is not to be had here; the text, for a person, says why."""
+
+
 class Heard(Protocol):
     """One machine that is listened to."""
 

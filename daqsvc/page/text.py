@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
     Document = dict[str, Any]
 
+BETWEEN = ":"
+"""Between site, box and machine in the name that a machine of a plant has."""
 COVERED = {"shelved", "suppressed", "out_of_service"}
 MOST_EVENTS = 50
 WORST = {"danger": 2, "alert": 1}
@@ -50,7 +52,13 @@ def tile(status: Document) -> Document:
     told = [
         {"alarm": one["alarm"], "first": one.get("first_out", False), "why": one["message"]} for one in alarms
     ]
-    return {"name": status["machine"], "level": level_of(alarms), "alarms": told}
+    level, away = level_of(alarms), status.get("away", "")
+    # What may have changed since nobody tells is not normal.
+    level = "unknown" if away and level == "normal" else level
+    name = str(status["machine"])
+    title = name.rpartition(BETWEEN)[2] or status.get("place", "")
+    place = status.get("place", "") if name else ""
+    return {"name": name, "title": title, "place": place, "level": level, "alarms": told, "away": away}
 
 
 def head(live: MachineLive) -> str:
@@ -60,6 +68,7 @@ def head(live: MachineLive) -> str:
     return (
         f'<span class="level {escape(level)}">{escape(level)}</span> '
         f"<span>{live.speed_in_words}</span> <span>{escape(description)}</span>"
+        f"<span>{escape(live.lacking)}</span>"
     )
 
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from daqsvc.diagnosis.reading import Reading
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.outbox.store import Outbox
+    from daqsvc.publish.looking import Look
     from daqsvc.publish.topics import Topics
     from daqsvc.supervision import Progress
 
@@ -83,6 +84,7 @@ class OutputPort:
         topics: of the box, whose site and name they have; by them events are known in the outbox.
         commands: carries out what people ask of alarms; an output has to see that they may.
         snapshots: has snapshots of machines made for people; likewise.
+        look: begins to tell what passes of a machine; None if nobody may look on.
         earlier: what a broker is asked for before it is told anything; None for nothing.
         progress: says how far each part of the service has come that can stall.
         stalls: finds those that have.
@@ -95,6 +97,7 @@ class OutputPort:
     topics: Topics
     commands: CommandHandler | None = None
     snapshots: SnapshotHandler | None = None
+    look: Look | None = None
     earlier: EarlierState | None = None
     progress: Callable[[], Mapping[str, Progress]] = dict
     stalls: StallWatch = field(default_factory=lambda: StallWatch(dict))

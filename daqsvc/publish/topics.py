@@ -10,6 +10,10 @@ ANSWER = "response"
 
 COMMANDS = "commands"
 
+LIVE = "live"
+REQUEST = "request"
+FEED = "feed"
+
 _NAME = re.compile(r"[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*")
 
 
@@ -26,6 +30,19 @@ class CommandTopic:
     machine: str
     verb: str
     is_answer: bool
+
+
+@dataclass(frozen=True, slots=True)
+class LiveTopic:
+    """What the topic of a request to look on says.
+
+    Attributes:
+        machine: at which machine, in one part.
+        looker: who looks, by a name of their own.
+    """
+
+    machine: str
+    looker: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,9 +119,58 @@ class Topics:
         is_answer = any(part.startswith(ANSWER) for part in verb[1:])
         return CommandTopic(machine, "/".join(verb), is_answer=is_answer)
 
+    @property
+    def live_requests(self) -> str:
+        """Filter for the requests to look on at any machine of the box."""
+        return f"{self.base}/+/{LIVE}/+/{REQUEST}"
+
+    def live_request_of(self, topic: str) -> LiveTopic | None:
+        """What a topic says that `live_requests` matches; None for every other one."""
+        below = f"{self.base}/"
+        parts = topic.removeprefix(below).split("/")
+        if not topic.startswith(below) or len(parts) != 4 or (parts[1], parts[3]) != (LIVE, REQUEST):
+            return None
+        machine, looker = parts[0], parts[2]
+        return LiveTopic(machine, looker) if _NAME.fullmatch(f"{machine}/{looker}") else None
+
+    def live_request(self, machine: str, looker: str) -> str:
+        """Where a request to look on is expected."""
+        return f"{self.base}/{_safe(machine)}/{LIVE}/{_safe(looker)}/{REQUEST}"
+
+    def live_feed(self, machine: str, looker: str) -> str:
+        """Where one who looks on is told."""
+        return f"{self.base}/{_safe(machine)}/{LIVE}/{_safe(looker)}/{FEED}"
+
     def command(self, machine: str, verb: str) -> str:
         """Where a command to a machine is expected."""
         return f"{self.base}/{_safe(machine)}/{COMMANDS}/{_safe(verb)}"
+
+
+@dataclass(frozen=True, slots=True)
+class BoxTopic:
+    """What the topic of a box says to who listens to many.
+
+    Attributes:
+        site: of the box.
+        box: its name.
+        rest: what stands below it, e.g. ``("laval-rig", "alarms", "rotor-fault")``; an alarm's or a
+            detector's name in one part, whatever it holds.
+    """
+
+    site: str
+    box: str
+    rest: tuple[str, ...]
+
+
+def box_topic(root: str, topic: str) -> BoxTopic | None:
+    """What a topic below a root says; None if it is none of a box."""
+    if not topic.startswith(f"{root}/"):
+        return None
+    site, box, *rest = [*topic.removeprefix(f"{root}/").split("/", 4), "", ""][:5]
+    parts = tuple(part for part in rest if part)
+    if not parts or not _NAME.fullmatch(f"{site}/{box}"):
+        return None
+    return BoxTopic(site, box, parts)
 
 
 def _safe(name: str) -> str:

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import http.client
-import json
-import re
 import ssl
-from typing import TYPE_CHECKING, Any, NamedTuple
-from urllib.parse import parse_qs, quote, urlencode, urlsplit
+from typing import TYPE_CHECKING, Any
+from urllib.parse import parse_qs, quote, urlsplit
 
 import pytest
 from support.browsers import browsing, page_served, tab
+from support.page_client import PASSWORD, Client, audited
 from support.page_rig import live_rig
 from support.tls_files import self_signed
 from support.waiting import PATIENCE_S, eventually
@@ -28,69 +26,9 @@ if TYPE_CHECKING:
     from daqsvc.service import Service
 
 pytestmark = pytest.mark.integration
-PASSWORD = "correct horse"  # noqa: S105 - of a test
 ALARM = "rotor-fault"
 MACHINE = "/machines/laval-rig/alarms"
 PATIENCE_MS = 1000.0 * PATIENCE_S
-
-
-class Answer(NamedTuple):
-    """What the page's server has answered."""
-
-    status: int
-    text: str
-    headers: http.client.HTTPMessage
-
-
-class Client:
-    """A browser without a window, which keeps one cookie."""
-
-    def __init__(self, address: str, trusted: ssl.SSLContext | None = None) -> None:
-        self.address = address
-        self.cookie = ""
-        self._trusted = trusted
-
-    async def get(self, path: str, **headers: str) -> Answer:
-        return await asyncio.to_thread(self._ask, "GET", path, None, headers)
-
-    async def post(self, path: str, fields: dict[str, str], **headers: str) -> Answer:
-        return await self.send(path, urlencode(fields).encode(), **headers)
-
-    async def send(self, path: str, body: bytes, **headers: str) -> Answer:
-        told = {"origin": self.address, "content-type": "application/x-www-form-urlencoded"} | headers
-        return await asyncio.to_thread(self._ask, "POST", path, body, told)
-
-    async def token(self, path: str) -> str:
-        found = re.search(r'name="token" value="(\w+)"', (await self.get(path)).text)
-        assert found is not None
-        return found[1]
-
-    async def sign_in(self, name: str, password: str = PASSWORD) -> Answer:
-        fields = {"token": await self.token("/sign-in"), "name": name, "password": password, "then": MACHINE}
-        return await self.post("/sign-in", fields)
-
-    def _ask(self, method: str, path: str, body: bytes | None, headers: dict[str, str]) -> Answer:
-        there = urlsplit(self.address)
-        if self._trusted is None:
-            connection = http.client.HTTPConnection(there.netloc, timeout=PATIENCE_S)
-        else:
-            connection = http.client.HTTPSConnection(there.netloc, timeout=PATIENCE_S, context=self._trusted)
-        try:
-            own = {"cookie": self.cookie} if self.cookie else {}
-            connection.request(method, path, body, {"accept": "text/html"} | own | headers)
-            answer = connection.getresponse()
-            if (cookie := answer.headers.get("set-cookie")) is not None:
-                self.cookie = cookie.partition(";")[0]
-            return Answer(answer.status, answer.read().decode(errors="replace"), answer.headers)
-        finally:
-            connection.close()
-
-
-def audited(store: Path) -> list[dict[str, Any]]:
-    """The lines of the audit log."""
-    with contextlib.suppress(FileNotFoundError):
-        return [json.loads(line) for line in (store / "audit.jsonl").read_text().splitlines()]
-    return []
 
 
 @contextlib.asynccontextmanager

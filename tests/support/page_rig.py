@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import can
 import numpy as np
+from pydantic import TypeAdapter
 from support.live_service import running, watch_of
 from support.recorded_rig import RATE_HZ, recorded_rig
 from support.waiting import eventually
 
+from daqsvc.settings.models import machine_file_model
 from drivers.can.plugin import frame_layout
 from sim_hw.nodes.can_node import CanNode
 from sim_hw.nodes.pacing import RealTimePacer
@@ -27,10 +29,21 @@ HEALTHY_S = 2.7
 
 
 @contextlib.asynccontextmanager
-async def live_rig(store: Path, channel: str, *, faulty: bool) -> AsyncIterator[Service]:
-    """A service that watches the paper's rotor, which turns for as long as the test lasts."""
+async def live_rig(
+    store: Path, channel: str, *, faulty: bool, mqtt: dict[str, Any] | None = None
+) -> AsyncIterator[Service]:
+    """A service that watches the paper's rotor, which turns for as long as the test lasts.
+
+    Args:
+        store: its store.
+        channel: name of the virtual bus.
+        faulty: whether the rotor's faults come on; else it stays healthy.
+        mqtt: its table ``[mqtt]``; None for no broker.
+    """
     machine, samples = recorded_rig(channel)
-    machine = machine.model_copy(update={"recorder": None})
+    table = mqtt and machine_file_model().model_fields["mqtt"].annotation
+    broker = table and TypeAdapter(table).validate_python(mqtt)
+    machine = machine.model_copy(update={"recorder": None, "mqtt": broker})
     whole = round(HEALTHY_S * 10) * 64
     healthy = samples[64 : whole // 3 * 3]
     played = np.concatenate([healthy, samples[len(healthy) :]] if faulty else [healthy] * 200)

@@ -115,7 +115,7 @@ let good = heard;
 
 async function watchPlant(list) {
   try {
-    const now = await (await fetch("/plant.json")).json();
+    const now = await (await fetch(`/plant.json${location.search}`)).json();
     heard = performance.now();
     if (!now.why) good = heard;
     told = { age_s: (heard - good) / 1000, why: now.why };

@@ -11,7 +11,7 @@ import errno
 import json
 import logging
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias, get_args
 
@@ -87,6 +87,10 @@ class CommandPayload(CommandMessage):
         default=None, description="refuse the command if another activation stands by now"
     )
     reason: Reason = Field(default="", description="why")
+    denied: Reason = Field(
+        default="",
+        description="why the sender has found that this person may not: it is written down, and refused",
+    )
 
 
 class SnapshotCommandPayload(JsonCommand):
@@ -282,7 +286,7 @@ class CommandIntake:
         await self._check_new(machine, request)
         if isinstance(request, SnapshotCommandPayload):
             return SnapshotRequest(machine=machine, by=request.by, reason=request.reason)
-        return request.command(Verb(verb), machine)
+        return replace(request.command(Verb(verb), machine), denied=request.denied)
 
     def _read(self, asked: bytes, verb: str) -> CommandPayload | SnapshotCommandPayload:
         wanted = SnapshotCommandPayload if verb == MachineVerb.SNAPSHOT else CommandPayload

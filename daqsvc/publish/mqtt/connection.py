@@ -144,6 +144,7 @@ class Connection:
         on_taken: called with the topic of each message for which a good PUBACK came.
         on_overlooked: called for each message from the broker that is dropped because too many wait.
         on_ignored: called for each message from the broker that came before its consent, or has no topic.
+        most_waiting: messages from the broker that may wait to be looked at.
     """
 
     def __init__(
@@ -163,6 +164,7 @@ class Connection:
         on_taken: Callable[[str], None] = lambda _topic: None,
         on_overlooked: Callable[[], None] = lambda: None,
         on_ignored: Callable[[], None] = lambda: None,
+        most_waiting: int = INCOMING,
     ) -> None:
         self.is_mqtt5 = mqtt5
         self.unacknowledged: tuple[str, ...] = ()
@@ -184,7 +186,7 @@ class Connection:
         """By packet id, in the order in which they were handed over."""
         self._overdue: asyncio.TimerHandle | None = None
         self._grants: dict[int, asyncio.Future[list[ReasonCode]]] = {}
-        self._queue: asyncio.Queue[Incoming] = asyncio.Queue(INCOMING)
+        self._queue: asyncio.Queue[Incoming] = asyncio.Queue(most_waiting)
         # Futures hold what went wrong as a result: one that nobody asks for is no complaint of asyncio's.
         self._consent: asyncio.Future[Exception | None] = self._loop.create_future()
         self._ended: asyncio.Future[Exception | None] = self._loop.create_future()

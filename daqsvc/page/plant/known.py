@@ -1,0 +1,197 @@
+"""What is known of the boxes of a plant by what they have published: availability, alarms, diagnoses."""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+from collections import deque
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from daqsvc.live_feed import SCHEMA
+from daqsvc.page.text import BETWEEN
+from daqsvc.publish.payloads import AlarmPayload, AvailabilityPayload, DiagnosisPayload
+from daqsvc.publish.topics import box_topic
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from daqsvc.publish.mqtt.connection import Incoming
+
+    Document = dict[str, Any]
+
+log = logging.getLogger(__name__)
+
+SAYS_NOTHING_S = 15.0
+"""A box that is there tells its status each second."""
+MOST_BOXES = 2000
+MOST_MACHINES = 200
+"""Of a box."""
+MOST_NAMES = 10_000
+"""Alarms, and detectors, of a machine."""
+MOST_EVENTS = 500
+
+
+@dataclass(slots=True)
+class KnownMachine:
+    """What a machine's box has published of it.
+
+    Attributes:
+        site: of the box.
+        box: its name.
+        machine: its own.
+        alarms: the last event of each alarm.
+        events: those heard, oldest first.
+        statements: the last one of each detector, as it came.
+        hearing: who is told each line as it comes, by `daqsvc.live_feed`.
+    """
+
+    site: str
+    box: str
+    machine: str
+    alarms: dict[str, Document] = field(default_factory=dict)
+    events: deque[Document] = field(default_factory=lambda: deque(maxlen=MOST_EVENTS))
+    statements: dict[str, bytes] = field(default_factory=dict)
+    hearing: list[Callable[[Document], None]] = field(default_factory=list)
+
+    @property
+    def name(self) -> str:
+        """What it is called here."""
+        return BETWEEN.join((self.site, self.box, self.machine))
+
+    def about(self) -> Document:
+        """The first line of a `daqsvc.live_feed` of it: no samples, for want of the machine file."""
+        statements = [one for one in map(_statement, [*self.statements.values()]) if one is not None]
+        stamped = next(iter([*self.alarms.values(), *statements]), {"wall_ns": 0, "monotonic_ns": 0})
+        return {
+            "schema": SCHEMA,
+            "machine": self.machine,
+            "begun_ns": 0,
+            "wall_ns_at_0": stamped["wall_ns"] - stamped["monotonic_ns"],
+            "streams": {},
+            "values": {"machine": {"name": self.machine}},
+            "statements": statements,
+            "alarms": [*self.alarms.values()],
+            "standings": {},
+        }
+
+
+@dataclass(slots=True)
+class KnownBox:
+    """A box that has published something.
+
+    Attributes:
+        site: its site.
+        box: its name.
+        state: ``"online"``, ``"offline"``, or ``""`` while that is not known.
+        why: the reason that it gives.
+        since: when that was so, ISO 8601.
+        heard_s: when it said something that was not kept at the broker, by `time.monotonic`.
+        machines: by their names.
+    """
+
+    site: str
+    box: str
+    state: str = ""
+    why: str = ""
+    since: str = ""
+    heard_s: float | None = None
+    machines: dict[str, KnownMachine] = field(default_factory=dict)
+
+    @property
+    def away(self) -> str:
+        """Why nothing comes of it at present; empty if something does."""
+        if self.state == "offline":
+            return f"the box is offline since {self.since[:19]}Z ({self.why})"
+        if self.heard_s is not None and (silent_s := time.monotonic() - self.heard_s) > SAYS_NOTHING_S:
+            return f"the box has said nothing for {silent_s:.0f} s"
+        return ""
+
+
+class KnownPlant:
+    """The boxes below one root of topics.
+
+    Args:
+        root: first part of their topics.
+    """
+
+    def __init__(self, root: str) -> None:
+        self.boxes: dict[tuple[str, str], KnownBox] = {}
+        self._root = root
+        self._has_warned = False
+
+    def machine(self, name: str) -> tuple[KnownBox, KnownMachine] | None:
+        """A machine by what it is called here; None if nothing was heard of it."""
+        site, _, rest = name.partition(BETWEEN)
+        box, _, machine = rest.partition(BETWEEN)
+        known = self.boxes.get((site, box))
+        found = None if known is None else known.machines.get(machine)
+        return None if known is None or found is None else (known, found)
+
+    def take(self, message: Incoming) -> None:
+        """Take in a message; what is none of a box, or not as it should be, is left out."""
+        topic = box_topic(self._root, message.topic)
+        if topic is None:
+            return
+        box = self.boxes.get((topic.site, topic.box))
+        if box is None:
+            if len(self.boxes) >= MOST_BOXES:
+                return
+            box = self.boxes[topic.site, topic.box] = KnownBox(topic.site, topic.box)
+        if not message.retain:
+            box.heard_s = time.monotonic()
+        try:
+            if topic.rest == ("availability",):
+                _note_availability(box, message.payload)
+            elif len(topic.rest) == 3:
+                _note_of_machine(box, topic.rest, message.payload)
+        except ValueError as error:
+            level = logging.DEBUG if self._has_warned else logging.WARNING
+            self._has_warned = True
+            log.log(level, "what came on %.200r cannot be read and is left out: %.200s", message.topic, error)
+
+
+def _note_availability(box: KnownBox, payload: bytes) -> None:
+    told = AvailabilityPayload.model_validate_json(payload)
+    box.state, box.why, box.since = told.state, told.reason, told.time
+
+
+def _note_of_machine(box: KnownBox, rest: tuple[str, ...], payload: bytes) -> None:
+    name, kind, what = rest
+    if kind not in {"alarms", "diagnosis"}:
+        return
+    machine = box.machines.get(name)
+    if machine is None:
+        if len(box.machines) >= MOST_MACHINES:
+            return
+        machine = box.machines[name] = KnownMachine(box.site, box.box, name)
+    if kind == "diagnosis":
+        if what in machine.statements or len(machine.statements) < MOST_NAMES:
+            machine.statements[what] = payload
+        if machine.hearing and (statement := _statement(payload)) is not None:
+            _tell(machine, {"statement": statement})
+    elif what in machine.alarms or len(machine.alarms) < MOST_NAMES:
+        AlarmPayload.model_validate_json(payload)
+        event = json.loads(payload)
+        before = machine.alarms.get(what)
+        if before is not None and event["sequence"] <= before["sequence"]:
+            return  # it has come again
+        machine.alarms[what] = event
+        machine.events.append(event)
+        _tell(machine, {"alarm": event})
+
+
+def _tell(machine: KnownMachine, line: Document) -> None:
+    for hear in machine.hearing:
+        hear(line)
+
+
+def _statement(payload: bytes) -> Document | None:
+    """A diagnosis; None if it is none."""
+    try:
+        DiagnosisPayload.model_validate_json(payload)
+    except ValueError:
+        return None
+    told: Document = json.loads(payload)
+    return told

@@ -1,0 +1,174 @@
+"""Listening to a machine over the broker: its box is asked again and again while somebody looks."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import time
+from typing import TYPE_CHECKING, Any
+
+from daqsvc.page.listening import Listening
+from daqsvc.page.plant.link import BrokerAwayError
+from daqsvc.publish.live.pieces import Unpacker
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from daqsvc.acquisition.link import Backoff
+    from daqsvc.page.plant.known import KnownBox, KnownMachine
+    from daqsvc.page.plant.link import BrokerLink
+
+    Document = dict[str, Any]
+
+LEASE_S = 15.0
+ASK_EVERY_S = 5.0
+"""Three requests may be lost before a feed ends that is wanted."""
+LOOK_S = 1.0
+PATIENCE_S = 2.0
+"""After so long without an answer it is shown what the box publishes for all, until there is one."""
+SILENT_S = 10.0
+"""A feed that has said nothing for so long is asked for anew; it says each second that it is alive."""
+NO_WAVEFORMS = (
+    "Alarms and diagnoses come of this box, and no waveforms: write [mqtt.live] into its machine file, and "
+    "let this page publish below live/ at the broker."
+)
+
+
+class LeasedListening(Listening):
+    """Listens to one machine of a plant.
+
+    Args:
+        link: to the broker.
+        box: the machine's.
+        machine: what is known of it.
+    """
+
+    def __init__(self, link: BrokerLink, box: KnownBox, machine: KnownMachine) -> None:
+        super().__init__(machine.name, None)
+        self._link = link
+        self._box = box
+        self._known = machine
+        self._topics = link.topics_of(machine)
+
+    async def listen(self, backoff: Backoff) -> None:
+        """See `Listening.listen`."""
+        while away := self._link.why_not or self._box.away:
+            self._show_known()
+            self.why_not = away
+            await asyncio.sleep(LOOK_S)
+        feed = time.time_ns() // 1_000_000
+        name = self._known.machine
+        request = self._topics.live_request(name, self._link.looker)
+        with self._link.feed(self._topics.live_feed(name, self._link.looker)) as pieces, self._telling():
+            asking = asyncio.create_task(self._ask(request, feed), name=f"ask {self.machine}")
+            waiting = asyncio.create_task(self.anew.wait(), name="other streams are wanted")
+            try:
+                await self._hear(Unpacker(feed), pieces, {asking, waiting}, backoff)
+            finally:
+                for task in (asking, waiting):
+                    task.cancel()
+                await asyncio.wait({asking, waiting})
+                if not self.anew.is_set():
+                    self._link.tell(request, self._request(feed, 0.0))
+
+    async def _hear(
+        self,
+        unpacker: Unpacker,
+        pieces: asyncio.Queue[bytes],
+        ends: set[asyncio.Task[Any]],
+        backoff: Backoff,
+    ) -> None:
+        """Take the pieces of a feed until it ends; where there is none, what the broker tells all."""
+        rest, heard_s = b"", time.monotonic()
+        while not any(task.done() for task in ends):
+            piece = await _next(pieces, ends)
+            if piece is None:
+                self._bear_silence(time.monotonic() - heard_s)
+                continue
+            heard_s = time.monotonic()
+            *lines, rest = (rest + unpacker.take(piece)).split(b"\n")
+            for line in lines:
+                self._take_line(json.loads(line))
+                backoff.reset()
+        for task in ends:
+            if task.done() and not task.cancelled():
+                task.result()
+
+    def _bear_silence(self, silent_s: float) -> None:
+        """Show what there is while nothing comes of the feed.
+
+        Raises:
+            ConnectionError: it has to be asked for anew.
+        """
+        if away := self._link.why_not or self._box.away:
+            raise ConnectionError(away)
+        if silent_s > SILENT_S and not self._is_poor:
+            raise ConnectionError("nothing comes of the box any more")
+        if silent_s > PATIENCE_S:
+            self._show_known()
+        if self._is_poor and self._box.heard_s is not None:
+            self.heard_s = self._box.heard_s
+
+    @property
+    def _is_poor(self) -> bool:
+        """Whether what is shown is only what the box publishes for all."""
+        return self.live is not None and bool(self.live.lacking)
+
+    def _take_line(self, line: Document) -> None:
+        if "schema" in line or "accepted" in line:
+            self.begin(line)
+        elif line.get("over"):
+            raise ConnectionError("the service begins anew")
+        else:
+            self.take(line)
+
+    def _show_known(self) -> None:
+        """Begin with what the box publishes for all, unless that or more is shown already."""
+        if self.live is None:
+            self.begin(self._known.about())
+            if self.live is not None:
+                self.live.lacking = NO_WAVEFORMS
+
+    @contextlib.contextmanager
+    def _telling(self) -> Iterator[None]:
+        """Take meanwhile what the box publishes for all."""
+        self._known.hearing.append(self._hear_known)
+        try:
+            yield
+        finally:
+            self._known.hearing.remove(self._hear_known)
+
+    def _hear_known(self, line: Document) -> None:
+        if self._is_poor:
+            self.take(line)
+
+    async def _ask(self, request: str, feed: int) -> None:
+        while True:
+            try:
+                await self._link.say(request, self._request(feed, LEASE_S))
+            except BrokerAwayError:
+                if self._link.why_not:
+                    raise
+                # The broker lets this page not ask: what it lets it hear is shown all the same.
+            await asyncio.sleep(ASK_EVERY_S)
+
+    def _request(self, feed: int, lease_s: float) -> bytes:
+        asked = {
+            "schema": "daqsvc.live-request/1",
+            "feed": feed,
+            "streams": sorted(self.streams),
+            "lease_s": lease_s,
+        }
+        return json.dumps(asked).encode()
+
+
+async def _next(pieces: asyncio.Queue[bytes], ends: set[asyncio.Task[Any]]) -> bytes | None:
+    """The next piece; None if none comes for a while, or something else ends."""
+    coming = asyncio.ensure_future(pieces.get())
+    try:
+        await asyncio.wait({coming, *ends}, timeout=LOOK_S, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        if not coming.done():
+            coming.cancel()
+    return coming.result() if coming.done() and not coming.cancelled() else None

@@ -1,0 +1,168 @@
+"""Where the page gets what it shows of a plant: from the broker that its boxes publish to."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from typing import TYPE_CHECKING, Any
+
+from daqsvc.alarms.commands import CommandOutcome
+from daqsvc.page.plant.known import KnownPlant
+from daqsvc.page.plant.leased import LeasedListening
+from daqsvc.page.plant.link import BrokerAwayError, BrokerLink
+from daqsvc.page.sources import NotToldError
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from daqsvc.alarms.commands import AlarmCommand
+    from daqsvc.page.box_snapshots import KeptSnapshot
+    from daqsvc.page.sources import Heard
+    from daqsvc.publish.mqtt.settings import Mqtt
+
+    Document = dict[str, Any]
+
+log = logging.getLogger(__name__)
+
+LINGER_S = 5.0
+"""How long a machine is still listened to when nobody looks any more."""
+BEGIN_S = 3.0
+"""How long the broker is waited for at first."""
+LOOK_S = 0.05
+
+
+class PlantSource:
+    """The machines of all boxes that publish to a broker; see `daqsvc.page.sources.MachineSource`.
+
+    Args:
+        mqtt: the broker.
+    """
+
+    def __init__(self, mqtt: Mqtt) -> None:
+        self._known = KnownPlant(mqtt.topic_root)
+        self._link = BrokerLink(mqtt, self._known)
+        self._begun_s = 0.0
+        self._running: asyncio.Task[None] | None = None
+        self._listening: dict[str, tuple[LeasedListening, asyncio.Task[None]]] = {}
+        self._looking: dict[str, int] = {}
+
+    def begin(self) -> None:
+        """Begin to listen to the broker, if that has not been done."""
+        if self._running is None:
+            self._begun_s = asyncio.get_running_loop().time()
+            self._running = asyncio.create_task(self._link.run(), name="listen to the broker")
+
+    async def statuses(self) -> list[Document]:
+        """See `daqsvc.page.sources.MachineSource.statuses`.
+
+        Raises:
+            NotToldError: the broker is away.
+        """
+        await self._begun("")
+        if self._link.why_not:
+            raise NotToldError(self._link.why_not)
+        told = []
+        for box in [*self._known.boxes.values()]:
+            about = {"place": f"{box.site}, {box.box}", "away": box.away}
+            for machine in [*box.machines.values()]:
+                standing = [one for one in machine.alarms.values() if one["state"] != "normal"]
+                told.append({"machine": machine.name, "alarms": {"standing": standing}, **about})
+            if not box.machines:
+                away = box.away or "no machine of this box has said anything yet"
+                told.append({"machine": "", "alarms": {"standing": []}, **about, "away": away})
+        return told
+
+    async def _begun(self, machine: str) -> None:
+        """Wait, soon after the begin, until the broker has told of a machine, or of any."""
+        self.begin()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout_at(self._begun_s + BEGIN_S):
+                while self._link.why_not or not self._has_heard(machine):  # noqa: ASYNC110 - at the begin only
+                    await asyncio.sleep(LOOK_S)
+
+    def _has_heard(self, machine: str) -> bool:
+        if machine:
+            return self._known.machine(machine) is not None
+        return any(box.machines for box in self._known.boxes.values())
+
+    @contextlib.asynccontextmanager
+    async def looking(self, machine: str) -> AsyncIterator[Heard]:
+        """See `daqsvc.page.sources.MachineSource.looking`.
+
+        Raises:
+            KeyError: nothing was heard of such a machine.
+        """
+        if machine not in self._listening:
+            await self._begun(machine)
+            found = self._known.machine(machine)
+            if found is None:
+                raise KeyError(machine)
+            if machine not in self._listening:
+                listening = LeasedListening(self._link, *found)
+                task = asyncio.create_task(listening.run(), name=f"listen to {machine}")
+                self._listening[machine] = listening, task
+        self._looking[machine] = self._looking.get(machine, 0) + 1
+        try:
+            yield self._listening[machine][0]
+        finally:
+            self._looking[machine] -= 1
+            asyncio.get_running_loop().call_later(LINGER_S, self._perhaps_end, machine)
+
+    def _perhaps_end(self, machine: str) -> None:
+        if not self._looking.get(machine) and machine in self._listening:
+            self._listening.pop(machine)[1].cancel()
+
+    async def journal(self, machine: str, alarm: str, most: int) -> list[Document]:
+        """See `daqsvc.page.sources.MachineSource.journal`; what the broker keeps, and what came since."""
+        found = self._known.machine(machine)
+        events = [] if found is None else [*found[1].events][::-1]
+        events.sort(key=lambda one: -int(one["wall_ns"]))
+        return [one for one in events if alarm in {"", one["alarm"]}][:most]
+
+    async def snapshots(self, machine: str) -> list[KeptSnapshot]:
+        """See `daqsvc.page.sources.MachineSource.snapshots`.
+
+        Raises:
+            NotToldError: they are on the box.
+        """
+        del machine
+        raise NotToldError("the snapshots are on the box: its own page shows them")
+
+    async def handle(self, machine: str, command: AlarmCommand, denied: str, via: str) -> CommandOutcome:
+        """See `daqsvc.page.sources.MachineSource.handle`: as a command over the broker."""
+        found = self._known.machine(machine)
+        if found is None:
+            return CommandOutcome(accepted=False, reason=f"there is no {machine!r} here")
+        box, known = found
+        asked: Document = {"alarm": command.alarm, "by": command.by, "reason": command.reason}
+        if command.duration_s is not None:
+            asked["duration_s"] = command.duration_s
+        if command.occurrence is not None:
+            asked["occurrence"] = command.occurrence
+        if denied:
+            asked["denied"] = denied
+        log.info(
+            "%s asks: %s %s of %s, %s", via, command.verb, command.alarm, machine, denied or "as operator"
+        )
+        topic = self._link.topics_of(known).command(known.machine, command.verb)
+        try:
+            answer = await self._link.command(topic, asked)
+        except BrokerAwayError as error:
+            return CommandOutcome(accepted=False, reason=f"{error}")
+        if answer is None:
+            why = box.away or "it takes commands only if its machine file says so in [mqtt.commands]"
+            return CommandOutcome(accepted=False, reason=f"the box has not answered: {why}")
+        return CommandOutcome(accepted=bool(answer.get("accepted")), reason=f"{answer.get('reason', '')}")
+
+    async def close(self) -> None:
+        """Listen no more."""
+        tasks = {task for _, task in self._listening.values()}
+        self._listening.clear()
+        for task in tasks:
+            task.cancel()
+        if tasks:
+            await asyncio.wait(tasks)
+        if self._running is not None:
+            self._running.cancel()
+            await asyncio.wait({self._running})
