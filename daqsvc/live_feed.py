@@ -127,6 +127,8 @@ class LiveFeed:
         statements: Iterable[Diagnosis],
         alarms: Iterable[AlarmEvent],
         standings: Mapping[str, StreamState],
+        *,
+        of_this_box: bool = True,
     ) -> dict[str, Any]:
         """Whose machine it is, what comes of it, and how it stands.
 
@@ -134,9 +136,11 @@ class LiveFeed:
             statements: what each detector has said last.
             alarms: the last event of each alarm.
             standings: how each stream stands.
+            of_this_box: whether who looks is, and can use the files that the machine file names.
         """
         machine = self.machine
-        return {
+        folder = {"folder": f"{machine.path.parent.absolute()}"} if of_this_box else {}
+        return folder | {
             "schema": SCHEMA,
             "version": __version__,
             "site": machine.site,
@@ -159,7 +163,7 @@ class LiveFeed:
         alarms: Iterable[AlarmEvent],
         standings: Mapping[str, StreamState],
         rings: Mapping[str, SampleRing],
-        before_bytes: int = BEFORE_BYTES,
+        before_bytes: int | None = None,
     ) -> Looker:
         """Begin to look on.
 
@@ -169,10 +173,14 @@ class LiveFeed:
             alarms: see `about`.
             standings: see `about`.
             rings: what has come lately, by stream and grid.
-            before_bytes: samples of these that are told at first, at most.
+            before_bytes: samples of these that are told at first, at most, to who is elsewhere; None for
+                a process of this box, which is told as well where the machine file lies.
         """
         # Copied here, and made into text on a thread: that takes its time of thousands of sensors.
-        about = partial(self.about, [*statements], [*alarms], dict(standings))
+        about = partial(
+            self.about, [*statements], [*alarms], dict(standings), of_this_box=before_bytes is None
+        )
+        before_bytes = BEFORE_BYTES if before_bytes is None else before_bytes
         looker = Looker(about, streams)
         wanted = sorted(looker.streams & rings.keys())
         for stream in wanted:

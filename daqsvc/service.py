@@ -19,7 +19,6 @@ from daqsvc.alarms.manager import AlarmManager
 from daqsvc.control import ControlError, ControlServer, ReloadRefusedError, SnapshotNotMadeError
 from daqsvc.diagnosis.pipeline import THREADS, KernelThreads, kernel_failed
 from daqsvc.driver_reports import DriverReports
-from daqsvc.live_feed import BEFORE_BYTES
 from daqsvc.machine_watch import MachineWatch
 from daqsvc.outbox.files import make_directory
 from daqsvc.outbox.limits import OutboxLimits
@@ -248,9 +247,7 @@ class Service:
             return tuple(self.watches)
         latest = self.reports[name].latest
         newest = self.alarms.newest(name)
-        looker = watch.live.look(
-            streams, latest, newest, watch.standings, watch.rings, before_bytes or BEFORE_BYTES
-        )
+        looker = watch.live.look(streams, latest, newest, watch.standings, watch.rings, before_bytes)
         return Looking(looker.lines, partial(watch.live.leave, looker))
 
     def _alarms_of(self, machine: MachineFile) -> AlarmManager:

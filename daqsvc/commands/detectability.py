@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import math
 import sys
@@ -12,8 +13,6 @@ from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, positive
 from daqsvc.commands.with_kernels import VerbWithKernels
 
 if TYPE_CHECKING:
-    import argparse
-
     from daqsvc.diagnosis.plugin import DetectorPlugin
     from daqsvc.settings import MachineFile
 
@@ -67,11 +66,14 @@ class DetectabilityCommand(VerbWithKernels):
             metavar="E",
             help="without a rotor bank: mass eccentricity, where neither calibration nor file tells it",
         )
+        # For the page, which knows what is in force, and where the files that it names are.
+        parser.add_argument("--values-in", type=Path, metavar="FOLDER", help=argparse.SUPPRESS)
         parser.add_argument("--json", action="store_true", help="print one JSON object")
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `Command.run`."""
-        machine = self._load(arguments.file)
+        folder = arguments.values_in
+        machine = self._load(arguments.file) if folder is None else _of_values(arguments.file, folder)
         if machine is None:
             return EXIT_USAGE
         from daqsvc.diagnosis.plugin import DetectabilityOptions, UnfitOptionError  # noqa: PLC0415 - pydantic
@@ -98,6 +100,18 @@ class DetectabilityCommand(VerbWithKernels):
             return _complain(arguments, f"{error}", EXIT_FAILED)
         print(json.dumps(prediction.json) if arguments.json else prediction.text)  # noqa: T201 - this is what the verb is for
         return EXIT_OK
+
+
+def _of_values(file: Path, folder: Path) -> MachineFile | None:
+    """The machine file of values in JSON, as if it lay in a folder; None after its errors were said."""
+    from daqsvc.settings.load import machine_file_of  # noqa: PLC0415 - brings pydantic
+    from daqsvc.settings.problems import MachineFileError  # noqa: PLC0415 - likewise
+
+    try:
+        return machine_file_of(json.loads(file.read_text()), folder / "machine.toml")
+    except MachineFileError as error:
+        print(f"{error.problems[0].message}", file=sys.stderr)  # noqa: T201 - as `_complain`
+        return None
 
 
 def _is_predictable(table: object) -> bool:

@@ -56,8 +56,8 @@ class PageCommand:
             "--plant",
             type=Path,
             metavar="FILE",
-            help="show all boxes that publish to a broker in place of the service on this box; the file has a "
-            "table [mqtt], as a machine file has it",
+            help="show all boxes that publish to a broker in place of the service on this box; the file has "
+            "a table [mqtt], as a machine file has it",
         )
         where = parser.add_mutually_exclusive_group()
         where.add_argument("--port", type=_port, help=f"where it listens on {LOOPBACK} (default: {PORT})")

@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import re
 from typing import TYPE_CHECKING, NamedTuple
 
 from daqsvc.confined.limits import ResourceLimits
-from daqsvc.page.recorded import NoPictureError, Playing
+from daqsvc.page.recorded import NAME, NoPictureError, Playing
 from daqsvc.snapshots.contents import SUFFIX
 from daqsvc.snapshots.folder import FOLDER
 from daqsvc.snapshots.reading import SnapshotError, read_snapshot
@@ -26,7 +25,6 @@ MOST_OPEN = 4
 LINGER_S = 5.0
 """How long one is still played when nobody looks any more."""
 MOST_LISTED = 500
-_NAME = re.compile(r"(?P<date>\d{8})T(?P<time>\d{6})\.\d{6}Z-(?P<kind>[a-z-]+)")
 
 
 class KeptSnapshot(NamedTuple):
@@ -66,7 +64,7 @@ class BoxSnapshots:
         """
         found = []
         for path in self._paths(machine):
-            named = _NAME.fullmatch(path.stem)
+            named = NAME.fullmatch(path.stem)
             if named is None:
                 continue
             with contextlib.suppress(FileNotFoundError):  # it has made room for newer ones just now
@@ -127,7 +125,7 @@ class BoxSnapshots:
     def _read(self, name: str) -> Playing:
         machine, _, stem = name.partition(AT)
         path = next((one for one in self._paths(machine) if one.stem == stem), None)
-        if path is None or _NAME.fullmatch(stem) is None:
+        if path is None or NAME.fullmatch(stem) is None:
             raise KeyError(name)
         try:
             return Playing(read_snapshot(path, ResourceLimits()), name)

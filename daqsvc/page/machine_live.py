@@ -40,6 +40,8 @@ MOST_SAID = 3600
 """Statements of one detector that are kept."""
 MOST_JOURNAL = 500
 """Alarm events that are kept."""
+LEAST_WAVEFORM_HZ = 20.0
+"""What is sampled more slowly is a trend value, and has no spectrum to look at."""
 HYSTERESIS_V = 0.5
 """Of a keyphasor of which the machine file does not say it."""
 PAIR = 2
@@ -79,12 +81,14 @@ class Said(NamedTuple):
         decision: what it decides.
         probabilities: by mode.
         statistics: its figures.
+        evidence: what it rests on, nats.
     """
 
     t_ns: int
     decision: str
     probabilities: dict[str, float]
     statistics: dict[str, float]
+    evidence: dict[str, float]
 
 
 class _Came(NamedTuple):
@@ -139,8 +143,8 @@ class MachineLive:
         self.history: Path | None = None
         """The file of the box's history, if there can be one."""
         self.left_out = 0
-        self.lacking = ""
-        """Why there is less of it than its box knows, for a person; empty if there is not."""
+        self.note = ""
+        """What a person has to know of all that is shown, e.g. that it is of the past; empty for nothing."""
         self._runs = Runs()
         self.token = zlib.crc32(json.dumps([self.values, about["streams"]], sort_keys=True).encode())
         """Another one where the machine file is another one."""
@@ -314,6 +318,15 @@ class MachineLive:
         """All sensors but keyphasors, by their names."""
         return [one.name for one in self.sensors.values() if one.kind not in {"keyphasor", "tachometer"}]
 
+    def waveform_sensors(self) -> list[str]:
+        """Those sensors of vibration that are sampled fast enough for a spectrum, by their names."""
+        found = []
+        for name in self.vibration_sensors():
+            places = self.place_of([name])
+            if places and self.rate_hz(places[0].stream) >= LEAST_WAVEFORM_HZ:
+                found.append(name)
+        return found
+
     def _found_places(self) -> dict[str, dict[str, SensorPlace]]:
         """By stream and grid, where each sensor's samples are in it."""
         places: dict[str, dict[str, SensorPlace]] = {}
@@ -346,6 +359,7 @@ class MachineLive:
                 statement["decision"],
                 statement["probabilities"],
                 statement["statistics"],
+                statement.get("evidence", {}),
             )
         )
 

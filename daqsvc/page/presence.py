@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from daqsvc.page.findings import finding_rows
+from daqsvc.page.present import value_rows
 from daqsvc.page.text import alarm_list, alarm_rows, head, journal_rows, machine_rows
 
 if TYPE_CHECKING:
@@ -36,17 +37,25 @@ class Picture:
     Args:
         source: of the machines.
         machine: its name.
-        view: what is shown beside the head; None for the machine as a whole.
+        view: what is shown beside the head; None for nothing.
         chosen: see `daqsvc.page.views.view.Choice`.
+        as_a_whole: whether the tables of the machine as a whole are made, too.
     """
 
     def __init__(
-        self, source: MachineSource, machine: str, view: MachineView | None, chosen: Mapping[str, str]
+        self,
+        source: MachineSource,
+        machine: str,
+        view: MachineView | None,
+        chosen: Mapping[str, str],
+        *,
+        as_a_whole: bool = False,
     ) -> None:
         self._source = source
         self._machine = machine
         self._view = view
         self._chosen = chosen
+        self._as_a_whole = as_a_whole
         self._newest = b""
         self._made = asyncio.Condition()
         self._looking = 0
@@ -142,9 +151,10 @@ class Picture:
             if stream and not why:
                 told |= {"age_s": round(away_s, 1), "why": f"nothing comes of {stream} any more"}
             told["html"] = {"head": head(live), "alarms": alarm_rows(live)}
-            if self._view is None:
+            if self._as_a_whole:
                 told["html"] |= {
                     "findings": finding_rows(live),
+                    "values": value_rows(live),
                     "machine": machine_rows(live),
                     "journal": journal_rows(live),
                     "alarm-list": alarm_list(live.all_alarms(), self._machine),

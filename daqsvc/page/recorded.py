@@ -5,7 +5,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import math
+import re
 import time
+from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.acquisition.clock import NS_PER_S
@@ -26,6 +29,8 @@ if TYPE_CHECKING:
 KEYS = {DIAGNOSES: "statement", ALARMS: "alarm", STANDING: "standing"}
 """By topic of a snapshot, the key of `daqsvc.live_feed`."""
 STEP_S = 0.5
+NAME = re.compile(r"(?P<date>\d{8})T(?P<time>\d{6})\.(?P<us>\d{6})Z-(?P<kind>[a-z-]+)")
+"""Of the file of a snapshot: when its cause came, and why it was made."""
 PAUSE_S = 3.0
 """Between the end and the next begin."""
 
@@ -55,12 +60,25 @@ class Playing:
         try:
             self._values = json.loads(snapshot.files[MACHINE_JSON])
             self._begin_ns = int(snapshot.about["begin_ns"])
+            self._cause = "; ".join(map(str, snapshot.about.get("causes", ())))
+            self._cause_s = self._found_cause_s()
             self.live = self._begun()
         except (LookupError, TypeError, ValueError) as error:
             raise NoPictureError(
                 f"the snapshot {name} has no machine file that the page can use ({type(error).__name__}); "
                 "show one that this version has made"
             ) from None
+
+    def _found_cause_s(self) -> float | None:
+        """How long after its begin the cause came, by the name of the file; None if that does not say it."""
+        about = self._snapshot.about
+        if (named := NAME.search(self._name)) is None:
+            return None
+        date, clock = named["date"], named["time"]
+        cause = datetime.strptime(f"{date}{clock}{named['us']}+0000", "%Y%m%d%H%M%S%f%z")
+        begin_wall_ns = self._begin_ns + int(about["wall_ns_at_0"])
+        cause_s = cause.timestamp() - begin_wall_ns / NS_PER_S
+        return cause_s if cause_s >= 0.0 else None
 
     async def first(self, _timeout_s: float) -> MachineLive:
         """See `daqsvc.page.listening.Listening.first`."""
@@ -76,9 +94,10 @@ class Playing:
         while True:
             begun_s = time.monotonic()
             for entry in self._snapshot.entries:
-                await self._wait_until(begun_s + (entry.at_ns - self._begin_ns) / NS_PER_S)
+                await self._wait_until(begun_s + (entry.at_ns - self._begin_ns) / NS_PER_S, begun_s)
                 self._hear(entry)
-            await self._wait_until(time.monotonic() + PAUSE_S)
+            ended_s = time.monotonic()
+            await self._wait_until(ended_s + PAUSE_S, begun_s, ended_s)
             self.live = self._begun()
 
     def journal(self, alarm: str, most: int) -> list[Document]:
@@ -97,11 +116,19 @@ class Playing:
         elif entry.what.topic in KEYS:
             self.live.hear({KEYS[entry.what.topic]: entry.what.document})
 
-    async def _wait_until(self, due_s: float) -> None:
+    async def _wait_until(self, due_s: float, begun_s: float, ended_s: float = math.inf) -> None:
         while (now_s := time.monotonic()) < due_s:
             self.heard_s = now_s
+            self.live.note = self._moment(min(now_s, ended_s) - begun_s)
             await asyncio.sleep(min(due_s - now_s, STEP_S))
         self.heard_s = time.monotonic()
+
+    def _moment(self, played_s: float) -> str:
+        """Which moment is shown: how long before its cause, or after it."""
+        if self._cause_s is None:
+            return f"snapshot, {played_s:.0f} s after its begin"
+        away_s = played_s - self._cause_s
+        return f"snapshot, {abs(away_s):.0f} s {'before' if away_s < 0 else 'after'} its cause: {self._cause}"
 
 
 def refused_of_the_past(machine: str) -> CommandOutcome:

@@ -41,6 +41,7 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.page.access.person import peer_of
 from daqsvc.page.access.ways import COOKIE, ByAccounts, OpenHere, SignInError
 from daqsvc.page.charts import THEMES
+from daqsvc.page.detectable import Detectabilities
 from daqsvc.page.guard import FRAMING, Admitted, FormError, Forms, Guarded
 from daqsvc.page.handling import MOST_EVENTS, Said, alarms_page, handle
 from daqsvc.page.listening import NOT_OURS
@@ -49,6 +50,7 @@ from daqsvc.page.recorded import NoPictureError
 from daqsvc.page.sources import NotToldError
 from daqsvc.page.text import WORST, tile
 from daqsvc.page.views.all_views import VIEWS
+from daqsvc.page.views.modes import ModesView
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Collection, Mapping, Sequence
@@ -68,6 +70,8 @@ FIRST_S = 3.0
 """How long a page waits for what the service tells first."""
 
 
+PANEL = ModesView.name
+"""The view that the page of a machine as a whole has in it."""
 LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
 
 
@@ -94,6 +98,7 @@ def application(
         Route("/machines/{machine}/alarms", page.alarms, name="alarms"),
         Route("/machines/{machine}/alarms", page.handle, methods=["POST"]),
         Route("/machines/{machine}/snapshots", page.snapshots),
+        Route("/machines/{machine}/detectability", page.detectability),
         Route("/beside", page.beside),
         Route("/machines/{machine}/{view}", page.machine),
         Route("/events/{machine}", page.events),
@@ -119,6 +124,7 @@ class _Page:
         self._tls = tls
         self._forms = Forms()
         self._said = Said()
+        self._detectabilities = Detectabilities()
         self._pictures: dict[tuple[str, ...], Picture] = {}
         self._templates = Environment(
             loader=PackageLoader("daqsvc.page"), autoescape=True, undefined=StrictUndefined
@@ -128,6 +134,7 @@ class _Page:
         """End what browsers listen to."""
         for picture in [*self._pictures.values()]:
             await picture.close()
+        await self._detectabilities.close()
         await self._source.close()
 
     async def sign_in(self, request: Request) -> Response:
@@ -217,6 +224,20 @@ class _Page:
             events = []
         return next((one.name for one in kept if one.kind != "alarm" and not _stood(events, one)), "")
 
+    async def detectability(self, request: Request) -> Response:
+        """What can be told apart on a machine."""
+        name = request.path_params["machine"]
+        live, why = await self._first(name)
+        if live is None:
+            return self._absent(request, name, why)
+        told = self._detectabilities.of(live)
+        about = self._of_machine(live, name) | {
+            "waits": told is None,
+            "text": told.text if told else "",
+            "why_not": told.why_not.rstrip(".") if told else "",
+        }
+        return self._html(request, "detectability.html", title=f"Detectability: {name}", view=None, **about)
+
     async def beside(self, request: Request) -> Response:
         """Two machines or snapshots by one view, beside each other."""
         asked = request.query_params
@@ -265,6 +286,7 @@ class _Page:
         if live is None or (chosen_view and view is None):
             return self._absent(request, name, why or f"there is no view {chosen_view!r}", again=live is None)
         choices, chosen = _chosen(view, live, request.query_params)
+        panel = "" if view or VIEWS[PANEL].why_not(live) else PANEL
         asked = request.query_params
         others = [(asked[name], one) for name, one in chosen.items() if asked.get(name, one) != one]
         instead = [f"{wanted} is not there; {one} is shown" for wanted, one in others]
@@ -274,6 +296,7 @@ class _Page:
             **self._of_machine(live, name),
             title=f"{view.title if view else 'Machine'}: {name}",
             view=view,
+            panel=panel,
             why_not=view.why_not(live) if view else "",
             choices=choices,
             chosen=chosen,
@@ -294,28 +317,26 @@ class _Page:
 
     async def events(self, request: Request) -> Response:
         """What comes, for as long as the browser listens."""
-        name, view = request.path_params["machine"], VIEWS.get(request.path_params.get("view", ""))
+        name, asked = request.path_params["machine"], request.path_params.get("view")
+        view = VIEWS.get(asked or PANEL)
         live, why = await self._first(name)
         if live is None:
             # A browser asks again after an answer that ends well, and never after an error.
             told = json.dumps({"age_s": 0.0, "why": why})
             return Response(f"retry: 2000\ndata: {told}\n\n", media_type="text/event-stream")
         _, chosen = _chosen(view, live, request.query_params)
-        key = (name, view.name if view else "", *(f"{a}={b}" for a, b in sorted(chosen.items())))
-        return StreamingResponse(
-            self._listened(key, name, view, chosen, request), media_type="text/event-stream"
-        )
+        key = (name, asked or "", *(f"{a}={b}" for a, b in sorted(chosen.items())))
+        picture = Picture(self._source, name, view, chosen, as_a_whole=asked is None)
+        return StreamingResponse(self._listened(key, picture, request), media_type="text/event-stream")
 
     async def _listened(
         self,
         key: tuple[str, ...],
-        name: str,
-        view: MachineView | None,
-        chosen: Mapping[str, str],
+        picture: Picture,
         request: Request,
     ) -> AsyncIterator[bytes]:
-        """The events of a picture, for as long as this person may look."""
-        picture = self._pictures.setdefault(key, Picture(self._source, name, view, chosen))
+        """The events of a picture, or of one that is the same, for as long as this person may look."""
+        picture = self._pictures.setdefault(key, picture)
         looked_s = time.monotonic()
         try:
             async with contextlib.aclosing(picture.events()) as events:

@@ -68,7 +68,7 @@ def head(live: MachineLive) -> str:
     return (
         f'<span class="level {escape(level)}">{escape(level)}</span> '
         f"<span>{live.speed_in_words}</span> <span>{escape(description)}</span>"
-        f"<span>{escape(live.lacking)}</span>"
+        f"<span>{escape(live.note)}</span>"
     )
 
 

@@ -113,7 +113,7 @@ class LeasedListening(Listening):
     @property
     def _is_poor(self) -> bool:
         """Whether what is shown is only what the box publishes for all."""
-        return self.live is not None and bool(self.live.lacking)
+        return self.live is not None and bool(self.live.note)
 
     def _take_line(self, line: Document) -> None:
         if "schema" in line or "accepted" in line:
@@ -128,7 +128,7 @@ class LeasedListening(Listening):
         if self.live is None:
             self.begin(self._known.about())
             if self.live is not None:
-                self.live.lacking = NO_WAVEFORMS
+                self.live.note = NO_WAVEFORMS
 
     @contextlib.contextmanager
     def _telling(self) -> Iterator[None]:

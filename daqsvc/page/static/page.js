@@ -16,6 +16,16 @@ function inOwnZone(root) {
   }
 }
 
+// On a phone the rows of a table are cards, in which each cell says what it is.
+function labelled(rows) {
+  for (const row of rows) {
+    const heads = row.closest("table").tHead?.rows[0]?.cells ?? [];
+    if (row.cells.length === heads.length) {
+      [...row.cells].forEach((cell, at) => (cell.dataset.label = heads[at].textContent));
+    }
+  }
+}
+
 function show(now) {
   for (const [id, html] of Object.entries(now.html ?? {})) {
     const place = document.querySelector(id === "head" ? "#head" : `#${id} tbody`);
@@ -23,6 +33,7 @@ function show(now) {
       place.dataset.shown = html;
       place.innerHTML = html;
       inOwnZone(place);
+      if (place.rows) labelled(place.rows);
     }
   }
   if (frozenAt) return;
@@ -146,4 +157,5 @@ if (live) {
   });
 }
 inOwnZone(document);
+for (const table of document.querySelectorAll(".wide table")) labelled(table.tBodies[0].rows);
 setInterval(sayAge, 1000);

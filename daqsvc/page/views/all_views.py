@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from daqsvc.page.views.envelope import EnvelopeSpectrumView
+from daqsvc.page.views.evidence import EvidenceView
 from daqsvc.page.views.modes import ModesView
 from daqsvc.page.views.orbit import OrbitView
 from daqsvc.page.views.position import CentrelineView, PoincareView
@@ -21,6 +22,7 @@ VIEWS: dict[str, MachineView] = {
     view.name: view
     for view in (
         ModesView(),
+        EvidenceView(),
         OrbitView(),
         CentrelineView(),
         PoincareView(),

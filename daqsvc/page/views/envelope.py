@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.fft
 
-from daqsvc.bearing.geometry import BearingOrders, bearing_orders
 from daqsvc.dsp.envelope import line_power, squared_envelope, whiten
+from daqsvc.page.bearing_lines import bearing_lines
 from daqsvc.page.charts import ChartAxis, chart, legend, source
 from daqsvc.page.views.view import Choice, Figure, Shown
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Mapping
 
     from daqsvc.page.charts import Theme
     from daqsvc.page.machine_live import MachineLive
@@ -91,7 +91,8 @@ class EnvelopeSpectrumView:
         speed_hz = abs(live.speed_rpm) / 60.0
         turns = frequency / speed_hz if speed_hz else np.full(len(frequency), 0.5)
         own = np.abs(turns - np.rint(turns)) * speed_hz > 1.5 * frequency[1]
-        for name, at_hz in bearing_lines(live, sensor):
+        for name, order in bearing_lines(live, sensor):
+            at_hz = order * speed_hz
             near = (np.abs(frequency - at_hz) <= max(SLIP * at_hz, 1.5 * frequency[1])) & own
             if at_hz < SHOWN_HZ and near.any():
                 found = np.flatnonzero(near)[swell[near].argmax()]
@@ -122,23 +123,6 @@ def envelope_spectrum(values: Any, rate_hz: float) -> tuple[Any, Any]:
     bins = min(int(SHOWN_HZ * length / rate_hz) + 1, len(band.clipped) // 2)
     swell = np.sqrt(line_power(squared_envelope(band.clipped, bins), bins))
     return np.arange(len(swell)) * rate_hz / length, swell
-
-
-def bearing_lines(live: MachineLive, sensor: str) -> Iterator[tuple[str, float]]:
-    """Where the parts of the bearings that a sensor watches would be seen at the machine's speed, Hz."""
-    speed_hz = abs(live.speed_rpm) / 60.0
-    for one in live.values.get("pipeline", {}).get("bearing", {}).get("bearings", ()):
-        if one.get("sensor", sensor) != sensor:
-            continue
-        told = one.get("orders")
-        orders = (
-            bearing_orders(one["type"])
-            if told is None
-            else BearingOrders(inner=told["bpfi"], outer=told["bpfo"], ball=told["bsf"], cage=told["ftf"])
-        )
-        parts = {"BPFO": orders.outer, "BPFI": orders.inner, "2 BSF": 2.0 * orders.ball, "FTF": orders.cage}
-        for part, order in parts.items():
-            yield f"{one.get('name', '')} {part}".strip(), order * speed_hz
 
 
 def _accelerometers(live: MachineLive) -> list[str]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.page.charts import ChartAxis, chart, legend, source
+from daqsvc.page.charts import ChartAxis, chart, legend, source, stroke
 from daqsvc.page.views.view import Choice, Figure, Shown
 
 if TYPE_CHECKING:
@@ -62,12 +62,11 @@ class ModesView:
         columns = ["t", *(f"m{number}" for number in range(len(modes)))]
         told = source("modes", columns)
         for number, mode in enumerate(modes):
-            colour = theme.series[number % len(theme.series)]
             made.step(
                 "t",
                 f"m{number}",
                 source=told,
-                line_color=colour,
+                **stroke(theme, number),
                 line_width=2,
                 mode="after",
                 legend_label=mode,

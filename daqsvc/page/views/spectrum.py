@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from daqsvc.page.bearing_lines import bearing_lines
 from daqsvc.page.charts import ChartAxis, chart, legend, source
 from daqsvc.page.lines import amplitudes, largest, one_sided
 from daqsvc.page.shaft import whirl
 from daqsvc.page.views.position import NO_PAIR, pairs_of
-from daqsvc.page.views.view import Choice, Figure, Shown
+from daqsvc.page.views.view import NO_WAVEFORM, Choice, Figure, Shown
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -19,8 +20,24 @@ if TYPE_CHECKING:
     from daqsvc.page.machine_live import MachineLive
 
 LENGTHS = {"2": "2 s", "0.5": "0.5 s", "10": "10 s"}
-ORDERS = (1, 2, 3)
-"""Multiples of the speed that are marked."""
+CURSORS: dict[str, tuple[float, ...]] = {
+    "1X to 3X": (1.0, 2.0, 3.0),
+    "1X to 10X": tuple(map(float, range(1, 11))),
+    "fractions of 1X": (0.25, 1.0 / 3.0, 0.5, 2.0 / 3.0, 0.75, 1.0),
+}
+"""Multiples of the speed that are marked, by what a person reads."""
+HARMONICS = (1, 2, 3)
+"""Of a line of a bearing that are marked."""
+AXES = {"hz": "frequency, Hz", "order": "orders of the speed"}
+SCALES = {"linear": "linear", "log": "logarithmic"}
+AMPLITUDES = {"peak": ("peak", 1.0), "pp": ("peak to peak", 2.0), "rms": ("r.m.s.", 1.0 / np.sqrt(2.0))}
+"""What a person reads, and how large it is of a wave with the peak 1."""
+OWN = "own"
+QUANTITIES = {OWN: "as measured", "velocity": "velocity, mm/s"}
+MM_S2 = {"g": 9806.65, "m/s2": 1000.0, "m/s^2": 1000.0, "mm/s2": 1.0, "mm/s^2": 1.0}
+"""Millimetres per second squared in a unit of acceleration."""
+INTEGRATED_FROM_HZ = 2.0
+"""Below, a velocity is drift of the sensor (ISO 20816-1 begins at 2 Hz)."""
 MOST_LINES = 4096
 """Of a spectrum that are sent; of more the largest of each group."""
 LEAST_SAMPLES = 32
@@ -35,19 +52,30 @@ class SpectrumView:
     name = "spectrum"
     title = "Spectrum"
     sentence = (
-        "How strong each frequency is in what a sensor measures: peak amplitudes, by a Hann window. Dashed "
-        "lines are 1X, 2X and 3X of the speed."
+        "How strong each frequency is in what a sensor measures, by a Hann window. Dashed lines are "
+        "multiples of the speed, or of a line of a bearing, as chosen; the cursor says which order a line is."
     )
     every_s = 0.5
 
     def choices(self, live: MachineLive) -> list[Choice]:
         """See `daqsvc.page.views.view.MachineView.choices`."""
-        sensors = {name: name for name in live.vibration_sensors()}
-        return [Choice("sensor", "Sensor", sensors), Choice("length", "Length", LENGTHS)]
+        sensors = {name: name for name in live.waveform_sensors()}
+        cursors = {name: name for name in (*CURSORS, *(name for name, _ in bearing_lines(live, "")))}
+        choices = [
+            Choice("sensor", "Sensor", sensors),
+            Choice("length", "Length", LENGTHS),
+            Choice("cursors", "Cursors", cursors),
+            Choice("axis", "Axis", AXES),
+            Choice("amplitude", "Amplitude", {key: words for key, (words, _) in AMPLITUDES.items()}),
+            Choice("scale", "Scale", SCALES),
+        ]
+        if any(live.sensors[name].unit in MM_S2 for name in sensors):
+            choices.append(Choice("quantity", "Quantity", QUANTITIES))
+        return choices
 
     def why_not(self, live: MachineLive) -> str:
         """See `daqsvc.page.views.view.MachineView.why_not`."""
-        return "" if live.vibration_sensors() else "the machine has no sensors of vibration"
+        return "" if live.waveform_sensors() else NO_WAVEFORM
 
     def streams(self, live: MachineLive, chosen: Mapping[str, str]) -> set[str]:
         """See `daqsvc.page.views.view.MachineView.streams`."""
@@ -56,17 +84,23 @@ class SpectrumView:
     def figures(self, live: MachineLive, chosen: Mapping[str, str], theme: Theme) -> list[Figure]:
         """See `daqsvc.page.views.view.MachineView.figures`."""
         sensor = chosen["sensor"]
-        unit = live.sensors[sensor].unit
+        _, unit = _factor_and_unit(live, chosen)
         places = live.place_of([sensor])
         highest = live.rate_hz(places[0].stream) / 2.0 if places else 1.0
-        made = chart(
-            ChartAxis("frequency, Hz", 0.0, highest),
-            ChartAxis(f"{sensor}, {unit} peak"),
-            theme,
-            tips=[("frequency", "@f{0.00} Hz"), (sensor, f"@a{{0.000}} {unit}")],
+        by_order = chosen["axis"] == "order" and live.speed_rpm != 0.0
+        across = (
+            ChartAxis("order, multiples of the speed", 0.0, highest * 60.0 / abs(live.speed_rpm))
+            if by_order
+            else ChartAxis("frequency, Hz", 0.0, highest)
         )
-        lines = source("spectrum", ["f", "a"])
-        made.line("f", "a", source=lines, line_color=theme.series[0], legend_label=sensor)
+        made = chart(
+            across,
+            ChartAxis(f"{sensor}, {unit}", log=chosen["scale"] == "log"),
+            theme,
+            tips=[("frequency", "@f{0.00} Hz"), ("order", "@o{0.00}X"), (sensor, f"@a{{0.0000}} {unit}")],
+        )
+        lines = source("spectrum", ["x", "f", "o", "a"])
+        made.line("x", "a", source=lines, line_color=theme.series[0], legend_label=sensor)
         _cursors(made, theme)
         legend(made, theme)
         return [Figure("spectrum", f"Spectrum of {sensor} up to {highest:g} Hz", made)]
@@ -82,21 +116,55 @@ class SpectrumView:
         if len(values) - missing < LEAST_SAMPLES:
             return Shown(note="too few samples have come for a spectrum")
         frequency, lines = one_sided(values, rate_hz)
-        unit = live.sensors[sensor].unit
-        rows = []
+        factor, unit = _factor_and_unit(live, chosen)
+        lines = lines * factor
+        if _is_velocity(live, chosen):
+            per_s = 2.0 * np.pi * np.maximum(frequency, INTEGRATED_FROM_HZ)
+            lines = np.where(frequency < INTEGRATED_FROM_HZ, 0.0, lines / per_s)
         speed_hz = abs(live.speed_rpm) / 60.0
-        for order in ORDERS:
+        cursors = _cursor_orders(live, chosen["cursors"]) if speed_hz else {}
+        rows = []
+        for name, order in cursors.items():
             near = np.abs(frequency - order * speed_hz) <= 2.0 * rate_hz / len(values)
-            if speed_hz and near.any():
-                rows.append(
-                    (f"{order}X at {order * speed_hz:.2f} Hz", f"{lines[near].max():.4g}", f"{unit} peak")
-                )
+            if near.any():
+                rows.append((f"{name} at {order * speed_hz:.2f} Hz", f"{lines[near].max():.4g}", unit))
         highest = int(lines[1:].argmax()) + 1
-        rows.append((f"largest at {frequency[highest]:.2f} Hz", f"{lines[highest]:.4g}", f"{unit} peak"))
+        rows.append((f"largest at {frequency[highest]:.2f} Hz", f"{lines[highest]:.4g}", unit))
+        if speed_hz:
+            rows.append(("that is order", f"{frequency[highest] / speed_hz:.2f}", "X"))
+        overall = np.sqrt(np.sum(np.square(lines[1:] / AMPLITUDES[chosen["amplitude"]][1])) / 3.0)
+        rows.append(("overall", f"{overall:.4g}", f"{_unit(live, chosen)} r.m.s."))
         note = f"{missing} of {len(values)} samples are missing, and left out" if missing else ""
         frequency, lines = largest(frequency, lines, MOST_LINES)
-        orders = {"x": [order * speed_hz for order in ORDERS if speed_hz]}
-        return Shown({"spectrum": {"f": frequency, "a": lines}, "orders": orders}, rows, note)
+        orders = frequency / speed_hz if speed_hz else np.full(len(frequency), np.nan)
+        by_order = chosen["axis"] == "order" and speed_hz
+        columns = {"x": orders if by_order else frequency, "f": frequency, "o": orders, "a": lines}
+        marks = {"x": [one if by_order else one * speed_hz for one in cursors.values()]}
+        return Shown({"spectrum": columns, "orders": marks}, rows, note)
+
+
+def _is_velocity(live: MachineLive, chosen: Mapping[str, str]) -> bool:
+    return chosen.get("quantity", OWN) != OWN and live.sensors[chosen["sensor"]].unit in MM_S2
+
+
+def _factor_and_unit(live: MachineLive, chosen: Mapping[str, str]) -> tuple[float, str]:
+    """By what a peak amplitude of the sensor is to be multiplied, and the unit of what comes of it."""
+    words, factor = AMPLITUDES[chosen["amplitude"]]
+    if _is_velocity(live, chosen):
+        factor *= MM_S2[live.sensors[chosen["sensor"]].unit]
+    return factor, f"{_unit(live, chosen)} {words}"
+
+
+def _unit(live: MachineLive, chosen: Mapping[str, str]) -> str:
+    return "mm/s" if _is_velocity(live, chosen) else live.sensors[chosen["sensor"]].unit
+
+
+def _cursor_orders(live: MachineLive, chosen: str) -> dict[str, float]:
+    """The multiples of the speed that are marked, by what they are called."""
+    if chosen in CURSORS:
+        return {f"{order:.3g}X": order for order in CURSORS[chosen]}
+    order = dict(bearing_lines(live, "")).get(chosen, 1.0)
+    return {f"{number if number > 1 else ''} {chosen}".strip(): number * order for number in HARMONICS}
 
 
 class FullSpectrumView:

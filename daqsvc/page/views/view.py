@@ -12,6 +12,9 @@ if TYPE_CHECKING:
     from daqsvc.page.machine_live import MachineLive
 
 
+NO_WAVEFORM = "no sensor of vibration is sampled fast enough for a spectrum"
+
+
 @dataclass(frozen=True, slots=True)
 class Choice:
     """One thing that can be chosen in a view.

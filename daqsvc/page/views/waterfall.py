@@ -9,7 +9,7 @@ import numpy as np
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.page.charts import ChartAxis, chart, source
 from daqsvc.page.runs import MOST_SPECTRA
-from daqsvc.page.views.view import Choice, Figure, Shown
+from daqsvc.page.views.view import NO_WAVEFORM, Choice, Figure, Shown
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -37,7 +37,7 @@ class WaterfallView:
 
     def choices(self, live: MachineLive) -> list[Choice]:
         """See `daqsvc.page.views.view.MachineView.choices`."""
-        sensors = {name: name for name in live.vibration_sensors()}
+        sensors = {name: name for name in live.waveform_sensors()}
         return [
             Choice("sensor", "Sensor", sensors),
             Choice("over", "Over", OVER),
@@ -46,7 +46,7 @@ class WaterfallView:
 
     def why_not(self, live: MachineLive) -> str:
         """See `daqsvc.page.views.view.MachineView.why_not`."""
-        return "" if live.vibration_sensors() else "the machine has no sensors of vibration"
+        return "" if live.waveform_sensors() else NO_WAVEFORM
 
     def streams(self, live: MachineLive, chosen: Mapping[str, str]) -> set[str]:
         """See `daqsvc.page.views.view.MachineView.streams`."""

@@ -1,0 +1,92 @@
+"""What can be told apart on a machine, computed by a process of its own: that takes seconds, and memory."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import sys
+import tempfile
+from collections import OrderedDict
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from daqsvc.page.machine_live import MachineLive
+
+MOST_KEPT = 50
+LIMIT_S = 300.0
+"""The first time kernels are compiled."""
+NOT_HERE = "it needs files of the box: open the box's own page"
+
+
+class Detectable(NamedTuple):
+    """What can be told apart.
+
+    Attributes:
+        text: as `daqsvc detectability` prints it; empty if it cannot be computed.
+        why_not: why it cannot be.
+    """
+
+    text: str
+    why_not: str
+
+
+class Detectabilities:
+    """What can be told apart on each machine that was asked for, computed once for each machine file."""
+
+    def __init__(self) -> None:
+        self._made: OrderedDict[tuple[str, int], asyncio.Task[Detectable]] = OrderedDict()
+        self._one_at_a_time = asyncio.Lock()
+
+    def of(self, live: MachineLive) -> Detectable | None:
+        """That of a machine; None while it is being computed."""
+        key = (live.name, live.token)
+        if key not in self._made:
+            self._made[key] = asyncio.create_task(self._compute(live), name=f"detectability of {live.name}")
+            while len(self._made) > MOST_KEPT:
+                self._made.popitem(last=False)[1].cancel()
+        task = self._made[key]
+        return task.result() if task.done() and not task.cancelled() else None
+
+    async def close(self) -> None:
+        """Compute no more."""
+        tasks = {*self._made.values()}
+        for task in tasks:
+            task.cancel()
+        if tasks:
+            await asyncio.wait(tasks)
+
+    async def _compute(self, live: MachineLive) -> Detectable:
+        folder = live.about.get("folder", "")
+        async with self._one_at_a_time:
+            with tempfile.TemporaryDirectory(prefix="daqsvc-page-") as scratch:
+                values = Path(scratch) / "machine.json"
+                await asyncio.to_thread(values.write_text, json.dumps(live.values))
+                return await _asked(values, folder or scratch, is_here=bool(folder))
+
+
+async def _asked(values: Path, folder: str, *, is_here: bool) -> Detectable:
+    """What the verb says."""
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "daqsvc", "detectability", f"{values}", "--values-in", folder),
+        stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.PIPE,
+    )
+    try:
+        async with asyncio.timeout(LIMIT_S):
+            out, err = await process.communicate()
+    except TimeoutError:
+        return Detectable("", f"it has taken longer than {LIMIT_S:g} s")
+    finally:
+        if process.returncode is None:
+            with contextlib.suppress(ProcessLookupError):
+                process.kill()
+            await process.wait()
+    if process.returncode == 0:
+        return Detectable(out.decode(), "")
+    said = err.decode(errors="replace").strip().splitlines() or ["it has failed without a word"]
+    # No path goes out.
+    why = said[-1].replace(f"{values}: ", "").replace(f"{values.parent}/", "").replace(f"{folder}/", "")
+    return Detectable("", why if is_here else f"{why}; {NOT_HERE}")

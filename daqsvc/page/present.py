@@ -1,0 +1,63 @@
+"""The present values of a machine: what each sensor measures, its limits, and whether it is OK."""
+
+from __future__ import annotations
+
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+from daqsvc.page.text import level_mark, row, time_mark
+
+if TYPE_CHECKING:
+    from daqsvc.page.machine_live import MachineLive
+
+    Document = dict[str, Any]
+
+MOST_ROWS = 500
+LIMITS = ("alert", "danger")
+OK = {"good": "OK", "not_ok": "not OK", "missing": "missing"}
+"""By the quality of a statement, what a person reads of the sensors behind it."""
+WORST_FIRST = ("not_ok", "missing", "good")
+
+
+def value_rows(live: MachineLive) -> str:
+    """What each sensor measures, with its limits and its OK state, as rows of a table."""
+    said = [*live.latest.values()]
+    sensors = [*live.sensors] or sorted({name for one in said for name in one["sensors"]})
+    rows = [_row_of(live, sensor, [one for one in said if sensor in one["sensors"]]) for sensor in sensors]
+    more = len(rows) - MOST_ROWS
+    rows = rows[:MOST_ROWS]
+    if more > 0:
+        rows.append(f'<tr><td colspan="5">{more} more sensors are not listed.</td></tr>')
+    return "".join(rows) or '<tr><td colspan="5">Nothing is told of any sensor yet.</td></tr>'
+
+
+def _row_of(live: MachineLive, sensor: str, statements: list[Document]) -> str:
+    if not statements:
+        return row(escape(sensor), "no detector measures it", "", "unknown", "")
+    own = [one for one in statements if one["statistics"] and len(one["sensors"]) == 1] or statements
+    values = [part for one in own for part in _values(one)] if len(own[0]["sensors"]) == 1 else []
+    worst = min(statements, key=lambda one: WORST_FIRST.index(one["quality"]))
+    state = OK[worst["quality"]] + (f": {worst['reason']}" if worst["reason"] else "")
+    levels = [str(one["severity"]) for one in own if len(one["sensors"]) == 1]
+    level = next((one for one in ("danger", "alert") if one in levels), "normal" if levels else "unknown")
+    newest_ns = max(int(one["monotonic_ns"]) for one in statements)
+    return row(
+        escape(sensor),
+        "<br>".join(map(escape, values)) or "see the detectors below",
+        level_mark(level) if levels else "",
+        escape(state),
+        time_mark(live.wall_ns_at_0 + newest_ns),
+    )
+
+
+def _values(statement: Document) -> list[str]:
+    """Each figure of a statement with its unit and its limits."""
+    told = []
+    for name, value in statement["statistics"].items():
+        if value is None or "." in name:
+            continue
+        unit = statement["units"].get(name, "")
+        limits = {which: statement["thresholds"].get(f"{name}.{which}") for which in LIMITS}
+        known = [f"{which} {limit:.4g}" for which, limit in limits.items() if limit is not None]
+        told.append(f"{name} {value:.4g} {unit}".rstrip() + (f" ({', '.join(known)})" if known else ""))
+    return told
