@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from bokeh.models import ColumnDataSource, CrosshairTool, HoverTool
+from bokeh.models import ColumnDataSource, CrosshairTool, DataRange1d, HoverTool
 from bokeh.plotting import figure
 
 if TYPE_CHECKING:
@@ -33,7 +33,13 @@ class Theme(NamedTuple):
 
 
 LIGHT = Theme("#ffffff", "#333a40", "#e3e6e8", "#8a939b", SERIES)
-DARK = Theme("#1b1f23", "#c8d0d6", "#30363c", "#78828a", ("#56b4e9", "#e69f00", "#35c490", *SERIES[3:]))
+DARK = Theme(
+    "#1b1f23",
+    "#c8d0d6",
+    "#30363c",
+    "#78828a",
+    ("#56b4e9", "#e69f00", "#35c490", "#cc79a7", "#f0e442", "#ff7f4d"),
+)
 THEMES = {"light": LIGHT, "dark": DARK}
 
 
@@ -85,6 +91,8 @@ def chart(
     for name, axis in (("x", x), ("y", y)):
         if axis.lowest is not None and axis.highest is not None:
             options[f"{name}_range"] = (axis.lowest, axis.highest)
+        elif axis.lowest is not None:
+            options[f"{name}_range"] = DataRange1d(start=axis.lowest)
         if axis.log:
             options[f"{name}_axis_type"] = "log"
     # As long along x as along y, it is as wide as it is high.

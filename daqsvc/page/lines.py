@@ -12,6 +12,10 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 
+HANN_POWER = 1.5
+"""The power of all lines of a wave over that of its highest one, by a Hann window."""
+
+
 def amplitudes(values: Any) -> Floats:
     """Peak amplitudes of the lines of a complex spectrum, without mean and missing samples; by a Hann window.
 
@@ -38,6 +42,15 @@ def one_sided(values: Floats, rate_hz: float) -> tuple[Floats, Floats]:
     """
     lines = 2.0 * amplitudes(values)[: len(values) // 2 + 1]
     return np.arange(len(lines)) * rate_hz / len(values), lines
+
+
+def size_of(lines: Floats) -> float:
+    """The amplitude of one wave whose line these five are, wherever it lies between them.
+
+    A Hann window spreads a wave over its neighbours: its highest line is up to 15 % too low, the power of all
+    of them is not.
+    """
+    return float(np.sqrt(np.sum(np.square(lines)) / HANN_POWER))
 
 
 def largest(frequency: Floats, lines: Floats, most: int) -> tuple[Floats, Floats]:

@@ -43,8 +43,9 @@ LONGEST_LINE = 64 * 1024 * 1024
 ALARM_SCHEMA = "daqsvc.alarm/"
 MOST_LOOKED_AT = 20_000
 """Messages of the journal that are looked through for the events of one alarm."""
-LINGER_S = 5.0
-"""How long a machine is still listened to when nobody looks any more."""
+LINGER_S = 60.0
+"""How long a machine is still listened to when nobody looks any more, without samples: a view that is opened
+next does not begin with nothing."""
 
 
 class BoxListening(Listening):

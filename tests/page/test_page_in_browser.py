@@ -99,6 +99,20 @@ async def test_every_view_shows_the_numbers_of_the_machine(tmp_path: Path) -> No
         await row.wait_for(timeout=PATIENCE_MS)
         rms = float(re.search(r"rms ([\d.]+) um", await row.inner_text())[1])  # type: ignore[index]
         assert rms == pytest.approx(float(samples.std()), rel=0.15)
+        value = await page.locator("#values").get_by_role("row", name="probe-x").inner_text()
+        assert re.search(r"rms [\d.]+ um", value)
+        assert "(alert 50, danger 70)" in value
+        assert value.split("\t")[2:4] == ["normal", "OK"]
+        await page.locator("#figures canvas, #figures .bk-Figure").first.wait_for(timeout=PATIENCE_MS)
+
+        await page.goto(f"{machine}/evidence")
+        await page.get_by_role("row", name="declared").wait_for(timeout=PATIENCE_MS)
+        assert await page.get_by_role("row", name="declared").inner_text() == "declared\tN\t"
+
+        await page.goto(f"{machine}/detectability")
+        table = page.locator("#detectability")
+        await table.wait_for(timeout=PATIENCE_MS)
+        assert "All modes can be told apart at 600 rpm" in await table.inner_text()
 
         await page.goto(address)
         await page.get_by_role("link", name="laval-rig").click()

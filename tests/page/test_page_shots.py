@@ -26,9 +26,12 @@ LOOKED_FOR = "#figures canvas, #figures .bk-Figure, #figures div[id]"
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 async def test_every_page_has_its_picture(scheme: Any, tmp_path: Path) -> None:
     await asyncio.to_thread(SHOTS.mkdir, parents=True, exist_ok=True)
-    paths = {"machine": "", "alarms": "/alarms", "snapshots": "/snapshots", "detectability": "/detectability"} | {
-        name: f"/{name}" for name in VIEWS
-    }
+    paths = {
+        "machine": "",
+        "alarms": "/alarms",
+        "snapshots": "/snapshots",
+        "detectability": "/detectability",
+    } | {name: f"/{name}" for name in VIEWS}
     async with (
         live_rig(tmp_path / "store", f"page-shots-{scheme}", faulty=True),
         page_served("--store", tmp_path / "store") as (address, _),

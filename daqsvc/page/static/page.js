@@ -142,12 +142,11 @@ async function watchPlant(list) {
 const plant = document.querySelector("[data-plant]");
 if (plant) watchPlant(plant);
 if (live) {
-  (live.dataset.figures ? figures() : Promise.resolve()).then(() => {
+  if (live.dataset.figures) figures();
+  listen();
+  document.addEventListener("visibilitychange", () => {
+    events?.close();
     listen();
-    document.addEventListener("visibilitychange", () => {
-      events?.close();
-      listen();
-    });
   });
   const freeze = document.getElementById("freeze");
   freeze?.addEventListener("click", () => {

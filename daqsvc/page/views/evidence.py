@@ -58,7 +58,7 @@ class EvidenceView:
         modes = _modes(live.latest[detector])
         made = chart(
             ChartAxis("time before now, s", -float(chosen["length"]), 0.0),
-            ChartAxis("evidence against the declared mode, nats"),
+            ChartAxis("evidence against the declared mode, nats", 0.0),
             theme,
             tips=[
                 ("time", "@t{0.0} s"),
@@ -110,7 +110,5 @@ class EvidenceView:
 
 def _modes(statement: Document) -> list[str]:
     """The modes of a bank of observers that has told its evidence."""
-    evidence = statement["evidence"]
-    return [
-        mode for mode in statement["probabilities"] if {f"{AGAINST}{mode}", f"{LEAD}{mode}"} & {*evidence}
-    ]
+    is_bank = any(name.startswith((AGAINST, LEAD)) for name in statement["evidence"])
+    return [*statement["probabilities"]] if is_bank else []

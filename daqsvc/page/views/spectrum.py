@@ -8,7 +8,7 @@ import numpy as np
 
 from daqsvc.page.bearing_lines import bearing_lines
 from daqsvc.page.charts import ChartAxis, chart, legend, source
-from daqsvc.page.lines import amplitudes, largest, one_sided
+from daqsvc.page.lines import amplitudes, largest, one_sided, size_of
 from daqsvc.page.shaft import whirl
 from daqsvc.page.views.position import NO_PAIR, pairs_of
 from daqsvc.page.views.view import NO_WAVEFORM, Choice, Figure, Shown
@@ -127,9 +127,10 @@ class SpectrumView:
         for name, order in cursors.items():
             near = np.abs(frequency - order * speed_hz) <= 2.0 * rate_hz / len(values)
             if near.any():
-                rows.append((f"{name} at {order * speed_hz:.2f} Hz", f"{lines[near].max():.4g}", unit))
+                rows.append((f"{name} at {order * speed_hz:.2f} Hz", f"{size_of(lines[near]):.4g}", unit))
         highest = int(lines[1:].argmax()) + 1
-        rows.append((f"largest at {frequency[highest]:.2f} Hz", f"{lines[highest]:.4g}", unit))
+        around = lines[max(highest - 2, 1) : highest + 3]
+        rows.append((f"largest at {frequency[highest]:.2f} Hz", f"{size_of(around):.4g}", unit))
         if speed_hz:
             rows.append(("that is order", f"{frequency[highest] / speed_hz:.2f}", "X"))
         overall = np.sqrt(np.sum(np.square(lines[1:] / AMPLITUDES[chosen["amplitude"]][1])) / 3.0)
@@ -224,7 +225,7 @@ class FullSpectrumView:
             near = np.abs(order - one) <= 2.0 * width
             if near.any():
                 which = "forward" if one > 0 else "backward"
-                rows.append((f"{abs(one):g}X {which}", f"{lines[near].max():.2f}", "um peak"))
+                rows.append((f"{abs(one):g}X {which}", f"{size_of(lines[near]):.2f}", "um peak"))
         missing = int((~np.isfinite(values)).sum())
         note = f"{missing} of {len(values)} samples are missing, and left out" if missing else ""
         wanted = np.abs(order) <= FULL_ORDERS

@@ -1,0 +1,76 @@
+"""What the innovations say for and against each mode, as the bank has told it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_findings import looking, said
+
+from daqsvc.page.charts import LIGHT
+from daqsvc.page.present import value_rows
+from daqsvc.page.views.all_views import VIEWS
+
+VIEW = VIEWS["evidence"]
+CHOSEN = {"detector": "rotor-bank", "length": "60"}
+LIMITS = {"cusum": 16.0, "cusum.back": 25.0}
+
+
+def test_evidence_against_the_declared_mode_is_drawn_over_time_with_what_it_takes() -> None:
+    statements = [
+        said(
+            "N",
+            t_ns=second * 10**9,
+            evidence={"cusum.F1": 2.0 * second, "lead.F1": 24.0 - second},
+            thresholds=LIMITS,
+        )
+        for second in range(8)
+    ]
+    live = looking(*statements)
+    shown = VIEW.shown(live, CHOSEN)
+    drawn = shown.sources["evidence"]
+    assert drawn["t"] == pytest.approx(np.arange(-7.0, 1.0))
+    assert drawn["m1"] == pytest.approx(2.0 * np.arange(8)), "F1 is the second mode"
+    assert drawn["m0"] == pytest.approx(np.zeros(8)), "nothing speaks against what is declared"
+    assert shown.sources["limits"]["y"] == [16.0, 25.0]
+    rows = {name: value for name, value, _ in shown.rows}
+    assert rows["declared"] == "N"
+    assert (rows["for F1 against it"], rows["it leads F1 by"]) == ("14.0", "17.0")
+    [figure] = VIEW.figures(live, CHOSEN, LIGHT)
+    assert "rotor-bank" in figure.label
+
+
+def test_without_a_bank_it_says_so() -> None:
+    live = looking(said("alert", evidence={}, probabilities={}))
+    assert "no bank of observers" in VIEW.why_not(live)
+    assert next(choice.options for choice in VIEW.choices(live)) == {}
+
+
+def levels(quality: str = "good", **others: object) -> dict[str, object]:
+    plain = said(
+        "alert",
+        detector="levels/left",
+        sensors=["left"],
+        probabilities={},
+        statistics={"rms": 41.3, "mean": 3.2},
+        units={"rms": "um", "mean": "um"},
+        thresholds={"rms.alert": 40.0, "rms.danger": 60.0},
+        quality=quality,
+    )
+    return plain | others
+
+
+def test_present_values_stand_with_their_limits_and_the_state_of_the_sensor() -> None:
+    rows = value_rows(looking(levels(), said("N", sensors=["left", "right", "key"], severity="normal")))
+    left, right, key = rows.split("</tr>")[:3]
+    assert "rms 41.3 um (alert 40, danger 60)<br>mean 3.2 um" in left
+    assert ">alert</span>" in left
+    assert "<td>OK</td>" in left
+    assert "see the detectors below" in right
+    assert "key" in key
+
+
+def test_a_sensor_that_is_not_ok_says_why_whoever_has_found_it() -> None:
+    doubt = said("N", sensors=["left", "right"], quality="not_ok", reason="the gap voltage is -1 V")
+    rows = value_rows(looking(levels(), doubt))
+    assert "not OK: the gap voltage is -1 V" in rows.split("</tr>")[0]
+    assert "no detector measures it" in rows.split("</tr>")[2]
