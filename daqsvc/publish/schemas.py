@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from daqsvc.publish.home_assistant.readings import ReadingsPayload
 from daqsvc.publish.home_assistant.summary import SummaryPayload
+from daqsvc.publish.live.request import LiveRequestPayload
 from daqsvc.publish.mqtt.commands import CommandPayload, ResponsePayload, SnapshotCommandPayload
 from daqsvc.publish.payloads import AlarmPayload, AvailabilityPayload, DiagnosisPayload, StatusPayload
 from daqsvc.publish.service_status import ServiceStatusPayload
@@ -26,6 +27,7 @@ PAYLOADS: Mapping[str, type[BaseModel]] = {
     "daqsvc.availability/1": AvailabilityPayload,
     "daqsvc.command/1": CommandPayload,
     "daqsvc.diagnosis/1": DiagnosisPayload,
+    "daqsvc.live-request/1": LiveRequestPayload,
     "daqsvc.readings/1": ReadingsPayload,
     "daqsvc.response/1": ResponsePayload,
     "daqsvc.service-status/1": ServiceStatusPayload,
@@ -41,7 +43,7 @@ def json_schemas() -> dict[str, dict[str, Any]]:
     schemas = {}
     for name, model in PAYLOADS.items():
         # What is published has all its keys; what is taken in may leave out those with a default.
-        taken_in = model in {CommandPayload, SnapshotCommandPayload}
+        taken_in = model in {CommandPayload, LiveRequestPayload, SnapshotCommandPayload}
         schema = model.model_json_schema(by_alias=True, mode="validation" if taken_in else "serialization")
         schemas[name] = {"$schema": "https://json-schema.org/draft/2020-12/schema", "$id": name, **schema}
     return schemas
