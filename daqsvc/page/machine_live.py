@@ -136,6 +136,8 @@ class MachineLive:
         self.sensors = {one["name"]: _sensor(one) for one in self.values.get("sensors", ())}
         self.rings: dict[str, SampleRing] = {}
         self.latest: dict[str, Document] = {one["detector"]: one for one in about["statements"]}
+        self.probable = {name: one for name, one in self.latest.items() if one["probabilities"]}
+        """By detector the last statement with probabilities: while data are missing there are none."""
         self.said: dict[str, deque[Said]] = {}
         self.alarms: dict[str, Document] = {one["alarm"]: one for one in about["alarms"]}
         self.journal: deque[Document] = deque(sorted(about["alarms"], key=_when), MOST_JOURNAL)
@@ -206,6 +208,7 @@ class MachineLive:
     def go_on_from(self, before: MachineLive) -> None:
         """Keep what is known of the time before the connection was made anew."""
         self.said = before.said
+        self.probable = before.probable | self.probable
         for detector, now in self.decided.items():
             if (known := before.decided.get(detector)) is not None and known.decision == now.decision:
                 self.decided[detector] = known
@@ -352,6 +355,8 @@ class MachineLive:
             is_seen = detector in self.latest
             self.decided[detector] = Decided(decision, int(statement["monotonic_ns"]), is_seen=is_seen)
         self.latest[detector] = statement
+        if statement["probabilities"]:
+            self.probable[detector] = statement
         said = self.said.setdefault(detector, deque(maxlen=MOST_SAID))
         said.append(
             Said(

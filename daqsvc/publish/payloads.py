@@ -167,6 +167,7 @@ class StatusPayload(Stamped):
     """Figures of the service itself, nested by what they belong to."""
 
     schema_: Literal["daqsvc.status/1"] = Field("daqsvc.status/1", alias="schema")
+    machines: tuple[str, ...] = Field((), description="what the box tells of, by the names in topics")
     figures: Figures
 
 
@@ -294,7 +295,9 @@ def diagnosis_payload(identity: Identity, diagnosis: Diagnosis, clock: Clock) ->
     )
 
 
-def status_payload(site: str, box: str, figures: Mapping[str, Any], clock: Clock) -> StatusPayload:
+def status_payload(
+    site: str, box: str, figures: Mapping[str, Any], clock: Clock, machines: Iterable[str] = ()
+) -> StatusPayload:
     """The payload of the service's figures as they are now.
 
     Args:
@@ -302,11 +305,14 @@ def status_payload(site: str, box: str, figures: Mapping[str, Any], clock: Clock
         box: name of the box.
         figures: numbers, or mappings of numbers, by name.
         clock: for the stamp.
+        machines: names of those that the service watches.
 
     Raises:
         pydantic.ValidationError: a figure is neither a number nor a mapping of numbers.
     """
-    return StatusPayload(**stamp_now(site, box, clock), figures=Figures.model_validate(figures))
+    return StatusPayload(
+        **stamp_now(site, box, clock), machines=tuple(machines), figures=Figures.model_validate(figures)
+    )
 
 
 def availability_payload(

@@ -74,3 +74,17 @@ def test_a_sensor_that_is_not_ok_says_why_whoever_has_found_it() -> None:
     rows = value_rows(looking(levels(), doubt))
     assert "not OK: the gap voltage is -1 V" in rows.split("</tr>")[0]
     assert "no detector measures it" in rows.split("</tr>")[2]
+
+
+def test_views_of_a_detector_stay_while_its_data_are_missing() -> None:
+    missing = said(
+        "N", t_ns=10**9, probabilities={}, evidence={}, quality="missing", reason="no samples for 2 s"
+    )
+    live = looking(said("N"), missing)
+    for name in ("modes", "evidence"):
+        view = VIEWS[name]
+        assert view.why_not(live) == ""
+        assert view.choices(live)[0].options == {"rotor-bank": "rotor-bank"}
+        shown = view.shown(live, CHOSEN)
+        assert shown.note == "no samples for 2 s"
+        assert len(shown.sources[name]["t"]) == 1, "what was told before"

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+import base64
+import contextlib
+import json
 import math
 import re
+import time
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
 from axe_playwright_python.async_playwright import Axe
+from support.bearing_signals import BALL, CAGE, INNER, OUTER, SPEED_RPM, healthy, knocks
 from support.browsers import browsing, page_served, tab
 from support.live_service import running, watch_of
 from support.page_rig import live_rig
@@ -16,6 +22,10 @@ from support.recorded_rig import RATE_HZ, let_time_pass, play, recorded_rig, rec
 from support.waiting import PATIENCE_S, eventually
 
 from daqsvc.alarms.commands import AlarmCommand, Verb
+from daqsvc.control import SOCKET
+from daqsvc.history.file import NAME as HISTORY
+from daqsvc.history.file import HistoryFile, Series
+from daqsvc.history.points import RECORD
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -26,7 +36,7 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.integration, pytest.mark.long]
 
 VIEWS = (
-    *("modes", "orbit", "centreline", "poincare", "timebase"),
+    *("modes", "evidence", "orbit", "centreline", "poincare", "timebase"),
     *("spectrum", "full-spectrum", "envelope", "trend"),
     *("waterfall", "bode", "polar"),
 )
@@ -51,6 +61,12 @@ async def until_figures(page: Page, *names: str) -> dict[str, float]:
 
 async def test_every_view_shows_the_numbers_of_the_machine(tmp_path: Path) -> None:
     store = tmp_path / "store"
+    store.mkdir()
+    now_s = int(time.time())
+    points = np.array([(now_s - 600 + k, 1, 40.0, 41.0, 43.0) for k in range(600)], RECORD)
+    history = HistoryFile(store / HISTORY)
+    history.write({Series("laval-rig", "levels/probe-x", "level", "rms", "um"): points})
+    history.close()
     async with (
         live_rig(store, "page-views", faulty=False) as service,
         page_served("--store", store) as (address, _),
@@ -86,6 +102,32 @@ async def test_every_view_shows_the_numbers_of_the_machine(tmp_path: Path) -> No
         samples = ring.read(ring.end_index - round(5 * RATE_HZ), round(5 * RATE_HZ))[:, 0]
         assert told["rms about the mean"] == pytest.approx(float(samples.std()), rel=0.05)
         assert told["mean"] == pytest.approx(float(samples.mean()), abs=1.0)
+
+        await page.goto(f"{machine}/centreline")
+        told = await until_figures(page, "x now", "y now")
+        mean = ring.read(ring.end_index - round(2 * RATE_HZ), round(2 * RATE_HZ)).mean(axis=0)
+        assert [told["x now"], told["y now"]] == pytest.approx([mean[0], mean[1]], abs=5.0)
+
+        await page.goto(f"{machine}/poincare?revolutions=20")
+        told = await until_figures(page, "spread of x")
+        assert told["revolutions"] == pytest.approx(20.0, abs=1.0)
+        noise_um = watch_of(service).machine.pipeline.rotor_bank.noise_um  # type: ignore[attr-defined]
+        assert told["spread of x"] == pytest.approx(noise_um, rel=0.6), "the same each revolution, but for noise"
+
+        await page.goto(f"{machine}/waterfall?sensor=probe-y")
+        told = await until_figures(page, "largest of all", "speed of the newest")
+        assert told["largest of all"] == pytest.approx(whirl_um, rel=0.25)
+        assert told["speed of the newest"] == pytest.approx(600.0, abs=1.0)
+
+        for view in ("bode", "polar"):
+            await page.goto(f"{machine}/{view}?sensor=probe-x")
+            told = await until_figures(page, "1X now", "lag now")
+            assert told["1X now"] == pytest.approx(whirl_um, rel=0.2)
+            assert told["lag now"] == pytest.approx(90.0, abs=12.0)
+
+        await page.goto(f"{machine}/trend?hours=1")
+        told = await until_figures(page, "mean", "greatest")
+        assert (told["mean"], told["least"], told["greatest"]) == (41.0, 40.0, 43.0)
 
         await page.goto(f"{machine}/modes")
         await page.get_by_role("row", name="p(N)").wait_for(timeout=PATIENCE_MS)
@@ -194,11 +236,12 @@ async def test_everybody_can_read_it(scheme: Any, tmp_path: Path) -> None:
         machine = f"{address}/machines/laval-rig"
         await page.goto(machine)
         await page.locator("#alarms").get_by_text("rotor-bank finds").first.wait_for(timeout=PATIENCE_MS)
-        for path in (address, machine, *(f"{machine}/{view}" for view in VIEWS)):
+        pages = ("alarms", "alarms?alarm=rotor-fault", "snapshots", "detectability")
+        for path in (address, machine, *(f"{machine}/{view}" for view in (*pages, *VIEWS))):
             await page.set_viewport_size({"width": 1280, "height": 900})
             await page.goto(path)
             await page.locator("footer").wait_for()
-            if path != address:
+            if path.rpartition("/")[2] in {"laval-rig", *VIEWS}:
                 await page.locator("#alarms .level").first.wait_for(timeout=PATIENCE_MS)
             found = await Axe().run(page)
             serious = [
@@ -278,3 +321,84 @@ async def test_a_snapshot_is_played_in_the_same_views(tmp_path: Path) -> None:
         await page.get_by_role("link", name="Orbit").click()
         told = await until_figures(page, "1X x")
         assert 15.0 < told["1X x"] < 100.0
+
+
+async def test_the_envelope_of_a_damaged_bearing_shows_its_outer_race(tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    store.mkdir()
+    samples = healthy(4.0, seed=5) + knocks(4.0, OUTER, seed=6)
+    orders = {"bpfi": INNER, "bpfo": OUTER, "bsf": BALL / 2.0, "ftf": CAGE}
+    about = {
+        "schema": "daqsvc.live/1",
+        "machine": "fan",
+        "begun_ns": 0,
+        "wall_ns_at_0": time.time_ns(),
+        "streams": {"de": {"rate_hz": 12_000.0, "channels": ["a"], "sensors": ["de"], "units": ["g"]}},
+        "values": {
+            "machine": {"name": "fan", "speed_rpm": SPEED_RPM},
+            "sensors": [{"name": "de", "type": "accelerometer", "unit": "g"}],
+            "pipeline": {"bearing": {"bearings": [{"name": "", "sensor": "de", "orders": orders}]}},
+        },
+        "statements": [],
+        "alarms": [],
+        "standings": {},
+    }
+    values = base64.b64encode(samples.astype("<f4").tobytes()).decode()
+    facts = {"stream": "de", "first_index": 0, "t_first_ns": 0, "period_ns": 1e9 / 12_000.0, "lost_before": 0}
+    told = {"samples": facts | {"quality": 0, "shape": [len(samples), 1], "values": values}}
+
+    async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        wanted = json.loads(await reader.readline())["streams"]
+        writer.write(json.dumps(about).encode() + b"\n")
+        if "de" in wanted:
+            writer.write(json.dumps(told).encode() + b"\n")
+        with contextlib.suppress(ConnectionError):
+            while not reader.at_eof():
+                writer.write(b'{"alive":true}\n')
+                await writer.drain()
+                await asyncio.sleep(0.3)
+        writer.close()
+
+    async with (
+        await asyncio.start_unix_server(answer, store / SOCKET),
+        page_served("--store", store) as (address, _),
+        browsing() as browser,
+        tab(browser) as page,
+    ):
+        await page.goto(f"{address}/machines/fan/envelope?length=2")
+        outer_hz, inner_hz = OUTER * SPEED_RPM / 60.0, INNER * SPEED_RPM / 60.0
+        names = f"BPFO, {outer_hz:.1f} Hz", f"BPFI, {inner_hz:.1f} Hz"
+        shown = await until_figures(page, *names)
+        assert shown[names[0]] > 3.0 * shown[names[1]]
+        assert await page.locator("#rows tr", has_text="largest at").count() == 1
+        await page.goto("about:blank")
+
+
+async def test_everything_is_reached_by_the_keyboard(tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    async with (
+        live_rig(store, "page-keys", faulty=False),
+        page_served("--store", store) as (address, _),
+        browsing() as browser,
+        tab(browser) as page,
+    ):
+        await page.goto(f"{address}/machines/laval-rig/spectrum")
+        await until_figures(page, "1X at 10.00 Hz")
+        await page.keyboard.press("Tab")
+        focused = page.locator(":focus")
+        assert await focused.inner_text() == "Skip to the content"
+        assert await focused.is_visible()
+        reached = []
+        for _ in range(60):
+            await page.keyboard.press("Tab")
+            reached.append(await focused.evaluate("one => one.name || one.textContent.trim()"))
+            if reached[-1] == "axis":
+                await page.keyboard.press("ArrowDown")
+            if reached[-1] == "Freeze":
+                break
+        assert {"Plant", "Alarms", "Orbit", "sensor", "cursors", "axis", "Show"} <= {*reached}
+        await page.keyboard.press("Enter")
+        assert "frozen" in await page.locator("#silence").inner_text()
+        await page.keyboard.press("Shift+Tab")
+        await page.keyboard.press("Enter")
+        await page.wait_for_url("**axis=order**", timeout=PATIENCE_MS)

@@ -46,6 +46,9 @@ async def test_every_page_has_its_picture(scheme: Any, tmp_path: Path) -> None:
             for name, path in {"plant": None, **paths}.items():
                 await page.goto(address if path is None else f"{machine}{path}")
                 absent = await page.get_by_text("There is no such view of this machine").count()
+                if name == "machine":
+                    await page.locator("#values tbody tr").first.wait_for(timeout=1000.0 * PATIENCE_S)
+                    await page.wait_for_timeout(1200)  # for its figure
                 if name in VIEWS and not absent:
                     await page.locator(LOOKED_FOR).first.wait_for(timeout=1000.0 * PATIENCE_S)
                     await page.wait_for_timeout(1200)  # for its data

@@ -73,7 +73,7 @@ async def page_served(
             process.terminate()
         _, err = await process.communicate()
     wrong = [line for line in err.decode().splitlines() if not may_say or may_say not in line]
-    assert wrong == [], "nothing went wrong in the page's server"
+    assert not wrong, "\n".join(["the page's server has said:", *wrong])
 
 
 @contextlib.asynccontextmanager

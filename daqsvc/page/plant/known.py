@@ -9,6 +9,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from daqsvc.acquisition.clock import iso_utc
 from daqsvc.live_feed import SCHEMA
 from daqsvc.page.text import BETWEEN
 from daqsvc.publish.payloads import AlarmPayload, AvailabilityPayload, DiagnosisPayload
@@ -88,6 +89,7 @@ class KnownBox:
         why: the reason that it gives.
         since: when that was so, ISO 8601.
         heard_s: when it said something that was not kept at the broker, by `time.monotonic`.
+        heard_utc: the same, ISO 8601.
         machines: by their names.
     """
 
@@ -97,6 +99,7 @@ class KnownBox:
     why: str = ""
     since: str = ""
     heard_s: float | None = None
+    heard_utc: str = ""
     machines: dict[str, KnownMachine] = field(default_factory=dict)
 
     @property
@@ -104,8 +107,8 @@ class KnownBox:
         """Why nothing comes of it at present; empty if something does."""
         if self.state == "offline":
             return f"the box is offline since {self.since[:19]}Z ({self.why})"
-        if self.heard_s is not None and (silent_s := time.monotonic() - self.heard_s) > SAYS_NOTHING_S:
-            return f"the box has said nothing for {silent_s:.0f} s"
+        if self.heard_s is not None and time.monotonic() - self.heard_s > SAYS_NOTHING_S:
+            return f"the box has said nothing since {self.heard_utc}"
         return ""
 
 
@@ -141,9 +144,12 @@ class KnownPlant:
             box = self.boxes[topic.site, topic.box] = KnownBox(topic.site, topic.box)
         if not message.retain:
             box.heard_s = time.monotonic()
+            box.heard_utc = f"{iso_utc(time.time_ns())[:19]}Z"
         try:
             if topic.rest == ("availability",):
                 _note_availability(box, message.payload)
+            elif topic.rest == ("status",):
+                _note_machines(box, message.payload)
             elif len(topic.rest) == 3:
                 _note_of_machine(box, topic.rest, message.payload)
         except ValueError as error:
@@ -157,15 +163,28 @@ def _note_availability(box: KnownBox, payload: bytes) -> None:
     box.state, box.why, box.since = told.state, told.reason, told.time
 
 
+def _note_machines(box: KnownBox, payload: bytes) -> None:
+    told = json.loads(payload)
+    names = told.get("machines", ()) if isinstance(told, dict) else ()
+    for name in names if isinstance(names, list) else ():
+        if isinstance(name, str) and "/" not in name:
+            _machine_of(box, name)
+
+
+def _machine_of(box: KnownBox, name: str) -> KnownMachine | None:
+    """A machine of a box; None if there is no room for it."""
+    if name not in box.machines and len(box.machines) < MOST_MACHINES:
+        box.machines[name] = KnownMachine(box.site, box.box, name)
+    return box.machines.get(name)
+
+
 def _note_of_machine(box: KnownBox, rest: tuple[str, ...], payload: bytes) -> None:
     name, kind, what = rest
     if kind not in {"alarms", "diagnosis"}:
         return
-    machine = box.machines.get(name)
+    machine = _machine_of(box, name)
     if machine is None:
-        if len(box.machines) >= MOST_MACHINES:
-            return
-        machine = box.machines[name] = KnownMachine(box.site, box.box, name)
+        return
     if kind == "diagnosis":
         if what in machine.statements or len(machine.statements) < MOST_NAMES:
             machine.statements[what] = payload

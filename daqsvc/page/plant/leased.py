@@ -50,6 +50,8 @@ class LeasedListening(Listening):
         self._box = box
         self._known = machine
         self._topics = link.topics_of(machine)
+        self._hears_over: int | None = None
+        """Over which connection diagnoses come that the box publishes for all; None if none do."""
 
     async def listen(self, backoff: Backoff) -> None:
         """See `Listening.listen`."""
@@ -69,6 +71,7 @@ class LeasedListening(Listening):
                 for task in (asking, waiting):
                     task.cancel()
                 await asyncio.wait({asking, waiting})
+                await self._leave_diagnoses()
                 if not self.anew.is_set():
                     self._link.tell(request, self._request(feed, 0.0))
 
@@ -85,15 +88,32 @@ class LeasedListening(Listening):
             piece = await _next(pieces, ends)
             if piece is None:
                 self._bear_silence(time.monotonic() - heard_s)
-                continue
-            heard_s = time.monotonic()
-            *lines, rest = (rest + unpacker.take(piece)).split(b"\n")
-            for line in lines:
-                self._take_line(json.loads(line))
-                backoff.reset()
+            else:
+                heard_s = time.monotonic()
+                *lines, rest = (rest + unpacker.take(piece)).split(b"\n")
+                for line in lines:
+                    self._take_line(json.loads(line))
+                    backoff.reset()
+            await self._follow_diagnoses()
         for task in ends:
             if task.done() and not task.cancelled():
                 task.result()
+
+    async def _follow_diagnoses(self) -> None:
+        """Have the diagnoses come that the box publishes for all, where they are all there is; else not."""
+        if not self._is_poor:
+            await self._leave_diagnoses()
+            return
+        if self._hears_over != self._link.connections:
+            self._hears_over = self._link.connections
+            await self._link.hear_diagnoses(self._known)
+        if self._box.heard_s is not None:
+            self.heard_s = self._box.heard_s
+
+    async def _leave_diagnoses(self) -> None:
+        if self._hears_over == self._link.connections:
+            await self._link.leave_diagnoses(self._known)
+        self._hears_over = None
 
     def _bear_silence(self, silent_s: float) -> None:
         """Show what there is while nothing comes of the feed.
@@ -107,8 +127,6 @@ class LeasedListening(Listening):
             raise ConnectionError("nothing comes of the box any more")
         if silent_s > PATIENCE_S:
             self._show_known()
-        if self._is_poor and self._box.heard_s is not None:
-            self.heard_s = self._box.heard_s
 
     @property
     def _is_poor(self) -> bool:
@@ -116,19 +134,29 @@ class LeasedListening(Listening):
         return self.live is not None and bool(self.live.note)
 
     def _take_line(self, line: Document) -> None:
-        if "schema" in line or "accepted" in line:
+        if line.get("accepted") is False:
+            self._refused(str(line.get("reason", "it does not say why")))
+        elif "schema" in line:
             self.begin(line)
         elif line.get("over"):
             raise ConnectionError("the service begins anew")
         else:
             self.take(line)
 
-    def _show_known(self) -> None:
+    def _refused(self, why: str) -> None:
+        """Show what the box publishes for all, as it lets this page not look on."""
+        if self.live is None or self._is_poor:
+            self.live = None
+            self._show_known(f"No waveforms come of this box: {why}.")
+        else:
+            raise ConnectionError(why)
+
+    def _show_known(self, why: str = NO_WAVEFORMS) -> None:
         """Begin with what the box publishes for all, unless that or more is shown already."""
         if self.live is None:
             self.begin(self._known.about())
             if self.live is not None:
-                self.live.note = NO_WAVEFORMS
+                self.live.note = why
 
     @contextlib.contextmanager
     def _telling(self) -> Iterator[None]:

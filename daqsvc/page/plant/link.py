@@ -51,6 +51,8 @@ class BrokerLink:
     def __init__(self, mqtt: Mqtt, known: KnownPlant) -> None:
         self.looker = f"page-{uuid.uuid4().hex[:16]}"
         """By which boxes know this page among those that look on."""
+        self.connections = 0
+        """How many there have been."""
         self.why_not = "the broker has not answered yet"
         """Why nothing comes by now; empty if something does."""
         self._mqtt = mqtt
@@ -122,6 +124,7 @@ class BrokerLink:
         for topic in refused:
             log.warning("MQTT broker %s does not let the page listen to %s", self.name, topic)
         self._connection = connection
+        self.connections += 1
         self._heard_boxes.clear()
         self._new_boxes.set()
         self.why_not = ""
@@ -151,7 +154,7 @@ class BrokerLink:
                     continue
                 self._heard_boxes.add((site, box))
                 base = Topics(self._mqtt.topic_root, site, box).base
-                await connection.watch(f"{base}/status", f"{base}/+/alarms/#", f"{base}/+/diagnosis/#")
+                await connection.watch(f"{base}/status", f"{base}/+/alarms/#")
 
     async def _take_all(self, connection: Connection) -> None:
         async for message in connection.incoming():
@@ -180,6 +183,20 @@ class BrokerLink:
             return
         if waiting is not None and not waiting.done():
             waiting.set_result(told)
+
+    async def hear_diagnoses(self, machine: KnownMachine) -> None:
+        """Have the diagnoses of a machine come: they are many, and of few machines somebody looks at them."""
+        if self._connection is not None:
+            base = self.topics_of(machine).base
+            with contextlib.suppress(MqttError):
+                await self._connection.watch(f"{base}/{machine.machine}/diagnosis/#")
+
+    async def leave_diagnoses(self, machine: KnownMachine) -> None:
+        """Have them come no more."""
+        if self._connection is not None:
+            base = self.topics_of(machine).base
+            with contextlib.suppress(MqttError):
+                await self._connection.unsubscribe(f"{base}/{machine.machine}/diagnosis/#")
 
     @contextlib.contextmanager
     def feed(self, topic: str) -> Iterator[asyncio.Queue[bytes]]:

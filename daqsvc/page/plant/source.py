@@ -159,10 +159,9 @@ class PlantSource:
         """Listen no more."""
         tasks = {task for _, task in self._listening.values()}
         self._listening.clear()
+        if self._running is not None:  # the first: nobody waits for a broker that does not answer
+            tasks.add(self._running)
         for task in tasks:
             task.cancel()
         if tasks:
             await asyncio.wait(tasks)
-        if self._running is not None:
-            self._running.cancel()
-            await asyncio.wait({self._running})

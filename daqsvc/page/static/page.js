@@ -124,6 +124,14 @@ function listen() {
 
 let good = heard;
 
+// The tiles anew, without the page jumping, or the keyboard losing its place.
+async function renew(list) {
+  const page = new DOMParser().parseFromString(await (await fetch(location.href)).text(), "text/html");
+  const held = list.contains(document.activeElement) ? document.activeElement.getAttribute("href") : null;
+  list.innerHTML = page.querySelector("[data-plant]").innerHTML;
+  if (held) [...list.querySelectorAll("a")].find((link) => link.getAttribute("href") === held)?.focus();
+}
+
 async function watchPlant(list) {
   try {
     const now = await (await fetch(`/plant.json${location.search}`)).json();
@@ -131,7 +139,7 @@ async function watchPlant(list) {
     if (!now.why) good = heard;
     told = { age_s: (heard - good) / 1000, why: now.why };
     const text = JSON.stringify(now.tiles);
-    if (!now.why && list.dataset.shown !== undefined && list.dataset.shown !== text) location.reload();
+    if (!now.why && list.dataset.shown !== undefined && list.dataset.shown !== text) await renew(list);
     if (!now.why || list.children.length === 0) list.dataset.shown = text;
   } catch {
     // The age says it.
@@ -139,6 +147,8 @@ async function watchPlant(list) {
   setTimeout(() => watchPlant(list), 2000);
 }
 
+const again = document.querySelector("[data-again-s]");
+if (again) setTimeout(() => location.reload(), 1000 * again.dataset.againS);
 const plant = document.querySelector("[data-plant]");
 if (plant) watchPlant(plant);
 if (live) {

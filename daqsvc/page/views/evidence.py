@@ -38,12 +38,12 @@ class EvidenceView:
 
     def choices(self, live: MachineLive) -> list[Choice]:
         """See `daqsvc.page.views.view.MachineView.choices`."""
-        detectors = {name: name for name, one in [*live.latest.items()] if _modes(one)}
+        detectors = {name: name for name, one in [*live.probable.items()] if _modes(one)}
         return [Choice("detector", "Detector", detectors), Choice("length", "Length", LENGTHS)]
 
     def why_not(self, live: MachineLive) -> str:
         """See `daqsvc.page.views.view.MachineView.why_not`."""
-        if any(_modes(one) for one in [*live.latest.values()]):
+        if any(_modes(one) for one in [*live.probable.values()]):
             return ""
         return "no bank of observers has told its evidence yet"
 
@@ -55,7 +55,7 @@ class EvidenceView:
     def figures(self, live: MachineLive, chosen: Mapping[str, str], theme: Theme) -> list[Figure]:
         """See `daqsvc.page.views.view.MachineView.figures`."""
         detector = chosen["detector"]
-        modes = _modes(live.latest[detector])
+        modes = _modes(live.probable[detector])
         made = chart(
             ChartAxis("time before now, s", -float(chosen["length"]), 0.0),
             ChartAxis("evidence against the declared mode, nats", 0.0),
@@ -92,7 +92,7 @@ class EvidenceView:
             "t": np.array([(one.t_ns - now_ns) / NS_PER_S for one in wanted]),
             "decision": [one.decision for one in wanted],
         }
-        modes = _modes(latest)
+        modes = _modes(live.probable[detector])
         for number, mode in enumerate(modes):
             against = [one.evidence.get(f"{AGAINST}{mode}") for one in wanted]
             columns[f"m{number}"] = np.array([0.0 if one is None else one for one in against])

@@ -32,14 +32,12 @@ class ModesView:
 
     def choices(self, live: MachineLive) -> list[Choice]:
         """See `daqsvc.page.views.view.MachineView.choices`."""
-        detectors = {name: name for name, one in [*live.latest.items()] if one["probabilities"]}
+        detectors = {name: name for name in [*live.probable]}
         return [Choice("detector", "Detector", detectors), Choice("length", "Length", LENGTHS)]
 
     def why_not(self, live: MachineLive) -> str:
         """See `daqsvc.page.views.view.MachineView.why_not`."""
-        if any(one["probabilities"] for one in [*live.latest.values()]):
-            return ""
-        return "no detector of this machine has told any probabilities yet"
+        return "" if live.probable else "no detector of this machine has told any probabilities yet"
 
     def streams(self, live: MachineLive, chosen: Mapping[str, str]) -> set[str]:
         """See `daqsvc.page.views.view.MachineView.streams`."""
@@ -49,7 +47,7 @@ class ModesView:
     def figures(self, live: MachineLive, chosen: Mapping[str, str], theme: Theme) -> list[Figure]:
         """See `daqsvc.page.views.view.MachineView.figures`."""
         detector = chosen["detector"]
-        modes = list(live.latest[detector]["probabilities"])
+        modes = list(live.probable[detector]["probabilities"])
         made = chart(
             ChartAxis("time before now, s", -float(chosen["length"]), 0.0),
             ChartAxis("probability", -0.02, 1.02),
@@ -81,7 +79,7 @@ class ModesView:
         latest = live.latest[detector]
         now_ns = int(latest["monotonic_ns"])
         since_ns = now_ns - float(chosen["length"]) * NS_PER_S
-        modes = list(latest["probabilities"])
+        modes = list(live.probable[detector]["probabilities"])
         wanted = [one for one in said if one.t_ns >= since_ns and one.probabilities]
         columns = {"t": np.array([(one.t_ns - now_ns) / NS_PER_S for one in wanted])}
         for number, mode in enumerate(modes):

@@ -168,7 +168,7 @@ class MqttPublisher(Output):
 
     def status(self, figures: Mapping[str, Any]) -> None:
         """Publish the figures of the service."""
-        payload = status_payload(self.topics.site, self.topics.box, figures, self._clock)
+        payload = status_payload(self.topics.site, self.topics.box, figures, self._clock, self._port.machines)
         self.telemetry("status", payload.to_json())
 
     def conditions(self, raised: frozenset[str]) -> Iterator[Condition]:
