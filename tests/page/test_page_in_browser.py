@@ -112,7 +112,9 @@ async def test_every_view_shows_the_numbers_of_the_machine(tmp_path: Path) -> No
         told = await until_figures(page, "spread of x")
         assert told["revolutions"] == pytest.approx(20.0, abs=1.0)
         noise_um = watch_of(service).machine.pipeline.rotor_bank.noise_um  # type: ignore[attr-defined]
-        assert told["spread of x"] == pytest.approx(noise_um, rel=0.6), "the same each revolution, but for noise"
+        assert told["spread of x"] == pytest.approx(noise_um, rel=0.6), (
+            "the same each revolution, but for noise"
+        )
 
         await page.goto(f"{machine}/waterfall?sensor=probe-y")
         told = await until_figures(page, "largest of all", "speed of the newest")

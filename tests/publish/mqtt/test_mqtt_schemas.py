@@ -90,7 +90,8 @@ async def test_all_that_a_service_says_and_hears_is_as_the_schemas_promise(tmp_p
     assert not answers["bad"]["accepted"]
     said = [m.payload for m in live.messages if not m.topic.endswith("/commands/acknowledge")]
     # What goes to the box, and what it says over its control socket.
-    others = {"daqsvc.command/1", "daqsvc.snapshot-command/1", "daqsvc.service-status/1"}
+    asked = {"daqsvc.command/1", "daqsvc.live-request/1", "daqsvc.snapshot-command/1"}
+    others = asked | {"daqsvc.service-status/1"}
     assert {payload["schema"] for payload in said} == set(PAYLOADS) - others
     for payload in [*said, good]:
         validator(payload["schema"]).validate(payload)
@@ -104,6 +105,8 @@ async def test_all_that_a_service_says_and_hears_is_as_the_schemas_promise(tmp_p
         ("daqsvc.command/1", acknowledge("c") | {"force": True}),
         ("daqsvc.command/1", acknowledge("a b")),
         ("daqsvc.command/1", acknowledge("c", duration_s=0)),
+        ("daqsvc.live-request/1", {"schema": "daqsvc.live-request/1", "feed": -1, "lease_s": 1.0}),
+        ("daqsvc.live-request/1", {"schema": "daqsvc.live-request/1", "feed": 1, "lease_s": 1e6}),
         ("daqsvc.availability/1", {"schema": "daqsvc.availability/1", "state": "gone"}),
     ],
 )
