@@ -17,9 +17,9 @@ from threading import Thread
 from playwright.sync_api import Playwright, sync_playwright
 
 DOCS = Path(__file__).parent
-WIDTH, HEIGHT = 1100, 780
-SHOTS = {"page-orbit.png": ("light", "/orbit"), "page-machine.png": ("dark", "")}
-"""By file, the colours and the view."""
+WIDTH = 1100
+SHOTS = {"page-orbit.png": ("light", "/orbit", 780), "page-machine.png": ("dark", "", 1290)}
+"""By file, the colours, the view and the height."""
 SETTLE_MS = 1500
 
 
@@ -41,16 +41,16 @@ def take(demo: subprocess.Popen[str], playwright: Playwright) -> None:
     assert demo.stdout is not None  # noqa: S101 - a pipe was asked for
     address = json.loads(demo.stdout.readline())["address"].rstrip("/")
     browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
-    size = {"width": WIDTH, "height": HEIGHT}
     pages = {
-        name: browser.new_page(color_scheme=scheme, viewport=size) for name, (scheme, _) in SHOTS.items()
+        name: browser.new_page(color_scheme=scheme, viewport={"width": WIDTH, "height": height})
+        for name, (scheme, _, height) in SHOTS.items()
     }
     has_begun = False
     for line in demo.stdout:
         told = json.loads(line)
         if told["type"] == "diagnosis" and not has_begun:
             has_begun = True
-            for name, (_, view) in SHOTS.items():
+            for name, (_, view, _) in SHOTS.items():
                 pages[name].goto(f"{address}/machines/laval-rig{view}")
         if told["type"] == "alarm" and told["kind"] == "escalated":
             break

@@ -167,7 +167,7 @@ class StatusPayload(Stamped):
     """Figures of the service itself, nested by what they belong to."""
 
     schema_: Literal["daqsvc.status/1"] = Field("daqsvc.status/1", alias="schema")
-    machines: tuple[str, ...] = Field((), description="what the box tells of, by the names in topics")
+    machines: tuple[str, ...] = Field((), description="those that the box watches, by their names in topics")
     figures: Figures
 
 

@@ -177,7 +177,9 @@ class LiveLink(MqttLink):
         before_bytes = round(self._settings.max_kb_per_s * 1000 / 2)
         looking = self._look(topic.machine, request.streams, before_bytes=before_bytes)
         if not isinstance(looking, Looking):
-            why = f"this box does not watch {topic.machine!r:.200}"
+            why = (
+                f"there is no machine {topic.machine!r:.200} here; alarms under that name are of the service"
+            )
             await self._refuse(connection, topic, request.feed, why)
             return
         packer = Packer(request.feed)

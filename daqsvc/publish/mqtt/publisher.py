@@ -86,6 +86,9 @@ class MqttPublisher(Output):
         self._port = port
         self._outbox = port.outbox
         self._clock = port.clock
+        names = [*port.machines]
+        # Of several the last one stands for the service alone.
+        self._machines = names[:-1] if len(names) > 1 else names
         self._links = links
         self._check = BrokerCheck()
         self._intake: CommandIntake | None = None
@@ -168,7 +171,7 @@ class MqttPublisher(Output):
 
     def status(self, figures: Mapping[str, Any]) -> None:
         """Publish the figures of the service."""
-        payload = status_payload(self.topics.site, self.topics.box, figures, self._clock, self._port.machines)
+        payload = status_payload(self.topics.site, self.topics.box, figures, self._clock, self._machines)
         self.telemetry("status", payload.to_json())
 
     def conditions(self, raised: frozenset[str]) -> Iterator[Condition]:

@@ -133,7 +133,7 @@ async def test_too_many_and_unknown_machines_are_refused_in_the_feed() -> None:
         await eventually(lambda: machine.left == 1, "there is room")
         ask(link, 6, 60.0, topic=TOPICS.live_request("other", "page-2"))
         await eventually(lambda: "other/live" in broker.sent[-1][0], "it is refused")
-        assert b"does not watch 'other'" in Unpacker(6).take(broker.sent[-1][1])
+        assert b"no machine 'other' here" in Unpacker(6).take(broker.sent[-1][1])
 
 
 async def test_a_machine_that_is_watched_no_more_says_that_it_is_over() -> None:
