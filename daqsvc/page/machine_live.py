@@ -112,6 +112,18 @@ class Decided(NamedTuple):
     is_seen: bool
 
 
+class Earlier(NamedTuple):
+    """Figures of a detector over time.
+
+    Attributes:
+        t_ns: ``[n]``, by the box's monotonic clock.
+        values: ``[n, keys]``; NaN where a figure was not told.
+    """
+
+    t_ns: NDArray[np.int64]
+    values: NDArray[np.float64]
+
+
 class SensorPlace(NamedTuple):
     """Where a sensor's samples come: a column of a stream, or of a grid."""
 
@@ -144,6 +156,8 @@ class MachineLive:
         self.standings: dict[str, Document] = dict(about["standings"])
         self.history: Path | None = None
         """The file of the box's history, if there can be one."""
+        self.earlier: dict[str, Earlier] = {}
+        """By detector, probabilities of the time before anybody looked, once they were asked for."""
         self.left_out = 0
         self.note = ""
         """What a person has to know of all that is shown, e.g. that it is of the past; empty for nothing."""

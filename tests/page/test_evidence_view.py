@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pytest
 from test_findings import looking, said
 
+from daqsvc.history.file import HistoryFile, Series
+from daqsvc.history.points import RECORD
 from daqsvc.page.charts import LIGHT
 from daqsvc.page.present import value_rows
 from daqsvc.page.views.all_views import VIEWS
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 VIEW = VIEWS["evidence"]
 CHOSEN = {"detector": "rotor-bank", "length": "60"}
@@ -88,3 +95,21 @@ def test_views_of_a_detector_stay_while_its_data_are_missing() -> None:
         shown = view.shown(live, CHOSEN)
         assert shown.note == "no samples for 2 s"
         assert len(shown.sources[name]["t"]) == 1, "what was told before"
+
+
+def test_probabilities_begin_with_what_the_history_knows(tmp_path: Path) -> None:
+    now_s = 1_800_000_000
+    live = looking(*(said("N", t_ns=(100 + second) * 10**9) for second in range(3)))
+    live.wall_ns_at_0 = (now_s - 100) * 10**9
+    live.history = tmp_path / "history.sqlite"
+    points = np.array([(now_s - 20 + k, 1, 0.25, 0.25, 0.25) for k in range(25)], RECORD)
+    file = HistoryFile(live.history)
+    file.write({Series("rig", "rotor-bank", "probabilities", "F1", ""): points})
+    file.close()
+    shown = VIEWS["modes"].shown(live, CHOSEN).sources["modes"]
+    assert shown["t"] == pytest.approx(np.arange(-22.0, 1.0)), "each moment once, the history first"
+    assert shown["m1"][:20] == pytest.approx(np.full(20, 0.25))
+    assert shown["m1"][20:] == pytest.approx(np.full(3, 0.02)), "what was told since"
+    assert np.isnan(shown["m0"][:20]).all(), "nobody has written that one down"
+    short = VIEWS["modes"].shown(live, CHOSEN | {"length": "10"}).sources["modes"]
+    assert short["t"].min() >= -10.0

@@ -8,6 +8,7 @@ import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.page.charts import ChartAxis, chart, legend, source, stroke
+from daqsvc.page.earlier import probabilities_before
 from daqsvc.page.views.view import Choice, Figure, Shown
 
 if TYPE_CHECKING:
@@ -80,10 +81,19 @@ class ModesView:
         now_ns = int(latest["monotonic_ns"])
         since_ns = now_ns - float(chosen["length"]) * NS_PER_S
         modes = list(live.probable[detector]["probabilities"])
-        wanted = [one for one in said if one.t_ns >= since_ns and one.probabilities]
-        columns = {"t": np.array([(one.t_ns - now_ns) / NS_PER_S for one in wanted])}
-        for number, mode in enumerate(modes):
-            columns[f"m{number}"] = np.array([one.probabilities.get(mode, np.nan) for one in wanted])
+        wanted = [one for one in said if one.probabilities]
+        first_ns = min((one.t_ns for one in wanted), default=now_ns)
+        if detector not in live.earlier:
+            live.earlier[detector] = probabilities_before(live, detector, modes, first_ns)
+        earlier = live.earlier[detector]
+        t_ns = np.append(earlier.t_ns, np.array([one.t_ns for one in wanted], np.int64))
+        lately = np.array(
+            [[one.probabilities.get(mode, np.nan) for mode in modes] for one in wanted], np.float64
+        )
+        values = np.concatenate([earlier.values, lately.reshape(-1, len(modes))])
+        shown = t_ns >= since_ns
+        columns = {"t": (t_ns[shown] - now_ns) / NS_PER_S}
+        columns |= {f"m{number}": values[shown, number] for number in range(len(modes))}
         rows = [(f"p({mode})", in_words(p), "") for mode, p in latest["probabilities"].items()]
         rows.append(("decides", latest["decision"], ""))
         if len(latest["group"]) > 1:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import sqlite3
 import time
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.history.file import EmptyHistoryError, HistoryReader, NewerHistoryError
 from daqsvc.history.points import Step
 from daqsvc.page.charts import ChartAxis, chart, legend, source
+from daqsvc.page.earlier import opened_history
 from daqsvc.page.views.view import Choice, Figure, Shown
 
 if TYPE_CHECKING:
@@ -82,7 +81,7 @@ class TrendView:
         """See `daqsvc.page.views.view.MachineView.shown`."""
         hours = float(chosen["hours"])
         now_s = time.time()
-        with _Opened(live) as reader:
+        with opened_history(live) as reader:
             if reader is None:
                 return Shown(note=NONE)
             series = next(one for one in reader.series(live.name) if one.name == chosen["reading"])
@@ -130,28 +129,8 @@ def thinned(points: TrendPoints, now_s: float, step: Step) -> tuple[np.ndarray, 
     return t_h, low, mean, high
 
 
-class _Opened:
-    """The history of a machine's box; None if there is none, or none that can be read."""
-
-    def __init__(self, live: MachineLive) -> None:
-        self._path = live.history
-        self._reader: HistoryReader | None = None
-
-    def __enter__(self) -> HistoryReader | None:
-        if self._path is not None and self._path.is_file():
-            try:
-                self._reader = HistoryReader(self._path)
-            except (sqlite3.Error, NewerHistoryError, EmptyHistoryError):
-                return None
-        return self._reader
-
-    def __exit__(self, *_: object) -> None:
-        if self._reader is not None:
-            self._reader.close()
-
-
 def _units(live: MachineLive) -> dict[str, str]:
-    with _Opened(live) as reader:
+    with opened_history(live) as reader:
         return {} if reader is None else {one.name: one.unit for one in reader.series(live.name)}
 
 
