@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import re
 import sys
 import tempfile
 from collections import OrderedDict
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 if TYPE_CHECKING:
     from daqsvc.page.machine_live import MachineLive
 
+_PATH = re.compile(r"/(?:[\w.@-]+/)+")
 MOST_KEPT = 50
 LIMIT_S = 300.0
 """The first time kernels are compiled."""
@@ -88,5 +90,5 @@ async def _asked(values: Path, folder: str, *, is_here: bool) -> Detectable:
         return Detectable(out.decode(), "")
     said = err.decode(errors="replace").strip().splitlines() or ["it has failed without a word"]
     # No path goes out.
-    why = said[-1].replace(f"{values}: ", "").replace(f"{values.parent}/", "").replace(f"{folder}/", "")
+    why = _PATH.sub("", said[-1].replace(f"{values}: ", ""))
     return Detectable("", why if is_here else f"{why}; {NOT_HERE}")

@@ -168,9 +168,14 @@ def box_topic(root: str, topic: str) -> BoxTopic | None:
         return None
     site, box, *rest = [*topic.removeprefix(f"{root}/").split("/", 4), "", ""][:5]
     parts = tuple(part for part in rest if part)
-    if not parts or not _NAME.fullmatch(f"{site}/{box}"):
+    if not parts or not _NAME.fullmatch(f"{site}/{box}/{parts[0]}"):
         return None
     return BoxTopic(site, box, parts)
+
+
+def is_one_part(name: str) -> bool:
+    """Whether a name can stand in a topic, as one part of it."""
+    return "/" not in name and _NAME.fullmatch(name) is not None
 
 
 def _safe(name: str) -> str:

@@ -86,7 +86,7 @@ def test_the_latest_event_of_an_alarm_is_its_state_and_a_repeat_changes_nothing(
     found = plant.machine("lab:edge:rig")
     assert found is not None
     assert found[1].alarms["hot"]["state"] == "active_acknowledged"
-    assert [event["sequence"] for event in found[1].events] == [3, 5]
+    assert [json.loads(event)["sequence"] for event in found[1].events] == [3, 5]
 
 
 def test_names_of_machines_come_with_the_status_and_lines_go_to_who_listens() -> None:
@@ -163,6 +163,7 @@ def test_a_flood_of_names_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(known_module, "MOST_BOXES", 3)
     monkeypatch.setattr(known_module, "MOST_MACHINES", 4)
     monkeypatch.setattr(known_module, "MOST_NAMES", 5)
+    monkeypatch.setattr(known_module, "LARGEST", 5000)
     plant = KnownPlant("daqsvc")
     for number in range(20):
         plant.take(Incoming(f"daqsvc/lab/box{number}/status", b"{}"))
@@ -173,6 +174,13 @@ def test_a_flood_of_names_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     assert all(len(box.machines) <= 4 for box in plant.boxes.values())
     machine = plant.boxes["lab", "edge"].machines["rig0"]
     assert (len(machine.alarms), len(machine.statements)) == (5, 5)
+    heard(plant, "rig1/diagnosis/long", bytes(6000))
+    monkeypatch.setattr(known_module, "MOST_BYTES", 0)
+    heard(plant, "rig1/diagnosis/one-more", b"x")
+    assert plant.boxes["lab", "edge"].machines["rig1"].statements == {}
+    plant.take(Incoming("daqsvc/lab/edge/a rig/alarms/a", alarm(1)))
+    plant.take(Incoming("daqsvc/lab/edge/status", b'{"machines": ["a rig", "a/b", "+"]}'))
+    assert {*plant.boxes["lab", "edge"].machines} == {f"rig{number}" for number in range(4)}
 
 
 @given(st.lists(st.text(max_size=4), max_size=8).map("/".join))

@@ -17,6 +17,7 @@ from support.waiting import PATIENCE_S, eventually
 from daqsvc.page.access.accounts import account_line, write_account
 from daqsvc.page.access.role import Role
 from daqsvc.page.plant.plant_file import PlantFileError, read_plant_file
+from daqsvc.publish.looking import Looking
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -73,6 +74,12 @@ async def test_a_plant_shows_a_box_and_its_waveforms_while_somebody_looks(
         assert await page.locator(".tile a").inner_text() == "laval-rig"
         assert "demo, virtual" in await page.locator(".tile").inner_text()
         assert live_pieces(mosquitto) == 0, "nothing is sent for nobody"
+        for elsewhere in ({}, {"before_bytes": 1000}):
+            looking = service.look(None, (), **elsewhere)
+            assert isinstance(looking, Looking)
+            first = json.loads((await looking.lines()).splitlines()[0])
+            assert ("folder" in first) == (elsewhere == {}), "no path goes to the broker"
+            looking.leave()
 
         await page.goto(f"{address}{MACHINE}/orbit")
         await page.locator("#rows tr:nth-child(4)").first.wait_for(timeout=PATIENCE_MS)

@@ -13,10 +13,10 @@ from daqsvc.acquisition.clock import iso_utc
 from daqsvc.live_feed import SCHEMA
 from daqsvc.page.text import BETWEEN
 from daqsvc.publish.payloads import AlarmPayload, AvailabilityPayload, DiagnosisPayload
-from daqsvc.publish.topics import box_topic
+from daqsvc.publish.topics import box_topic, is_one_part
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from daqsvc.publish.mqtt.connection import Incoming
 
@@ -31,7 +31,11 @@ MOST_MACHINES = 200
 """Of a box."""
 MOST_NAMES = 10_000
 """Alarms, and detectors, of a machine."""
-MOST_EVENTS = 500
+MOST_EVENTS = 200
+LARGEST = 256 * 1024
+"""Bytes of a message that is kept."""
+MOST_BYTES = 300_000_000
+"""Of the messages that are kept, of all boxes."""
 
 
 @dataclass(slots=True)
@@ -43,7 +47,7 @@ class KnownMachine:
         box: its name.
         machine: its own.
         alarms: the last event of each alarm.
-        events: those heard, oldest first.
+        events: those heard, as they came, oldest first.
         statements: the last one of each detector, as it came.
         hearing: who is told each line as it comes, by `daqsvc.live_feed`.
     """
@@ -52,7 +56,7 @@ class KnownMachine:
     box: str
     machine: str
     alarms: dict[str, Document] = field(default_factory=dict)
-    events: deque[Document] = field(default_factory=lambda: deque(maxlen=MOST_EVENTS))
+    events: deque[bytes] = field(default_factory=lambda: deque(maxlen=MOST_EVENTS))
     statements: dict[str, bytes] = field(default_factory=dict)
     hearing: list[Callable[[Document], None]] = field(default_factory=list)
 
@@ -123,6 +127,7 @@ class KnownPlant:
         self.boxes: dict[tuple[str, str], KnownBox] = {}
         self._root = root
         self._has_warned = False
+        self._bytes = 0
 
     def machine(self, name: str) -> tuple[KnownBox, KnownMachine] | None:
         """A machine by what it is called here; None if nothing was heard of it."""
@@ -151,11 +156,43 @@ class KnownPlant:
             elif topic.rest == ("status",):
                 _note_machines(box, message.payload)
             elif len(topic.rest) == 3:
-                _note_of_machine(box, topic.rest, message.payload)
+                self._note_of_machine(box, topic.rest, message.payload)
         except ValueError as error:
             level = logging.DEBUG if self._has_warned else logging.WARNING
             self._has_warned = True
             log.log(level, "what came on %.200r cannot be read and is left out: %.200s", message.topic, error)
+
+    def _note_of_machine(self, box: KnownBox, rest: tuple[str, ...], payload: bytes) -> None:
+        name, kind, what = rest
+        if kind not in {"alarms", "diagnosis"} or len(payload) > LARGEST:
+            return
+        machine = _machine_of(box, name)
+        if machine is None:
+            return
+        if kind == "diagnosis":
+            if self._has_room(machine.statements, what, payload):
+                machine.statements[what] = payload
+            if machine.hearing and (statement := _statement(payload)) is not None:
+                _tell(machine, {"statement": statement})
+            return
+        AlarmPayload.model_validate_json(payload)
+        event = json.loads(payload)
+        before = machine.alarms.get(what)
+        if before is not None and event["sequence"] <= before["sequence"]:
+            return  # it has come again
+        if self._has_room(machine.alarms, what, payload):
+            machine.alarms[what] = event
+            machine.events.append(payload)
+            _tell(machine, {"alarm": event})
+
+    def _has_room(self, known: Mapping[str, object], what: str, payload: bytes) -> bool:
+        """Whether a message may be kept: of one that is known there is the last one only."""
+        if what in known:
+            return True
+        if len(known) >= MOST_NAMES or self._bytes + len(payload) > MOST_BYTES:
+            return False
+        self._bytes += len(payload)
+        return True
 
 
 def _note_availability(box: KnownBox, payload: bytes) -> None:
@@ -167,7 +204,7 @@ def _note_machines(box: KnownBox, payload: bytes) -> None:
     told = json.loads(payload)
     names = told.get("machines", ()) if isinstance(told, dict) else ()
     for name in names if isinstance(names, list) else ():
-        if isinstance(name, str) and "/" not in name:
+        if isinstance(name, str) and is_one_part(name):
             _machine_of(box, name)
 
 
@@ -176,29 +213,6 @@ def _machine_of(box: KnownBox, name: str) -> KnownMachine | None:
     if name not in box.machines and len(box.machines) < MOST_MACHINES:
         box.machines[name] = KnownMachine(box.site, box.box, name)
     return box.machines.get(name)
-
-
-def _note_of_machine(box: KnownBox, rest: tuple[str, ...], payload: bytes) -> None:
-    name, kind, what = rest
-    if kind not in {"alarms", "diagnosis"}:
-        return
-    machine = _machine_of(box, name)
-    if machine is None:
-        return
-    if kind == "diagnosis":
-        if what in machine.statements or len(machine.statements) < MOST_NAMES:
-            machine.statements[what] = payload
-        if machine.hearing and (statement := _statement(payload)) is not None:
-            _tell(machine, {"statement": statement})
-    elif what in machine.alarms or len(machine.alarms) < MOST_NAMES:
-        AlarmPayload.model_validate_json(payload)
-        event = json.loads(payload)
-        before = machine.alarms.get(what)
-        if before is not None and event["sequence"] <= before["sequence"]:
-            return  # it has come again
-        machine.alarms[what] = event
-        machine.events.append(event)
-        _tell(machine, {"alarm": event})
 
 
 def _tell(machine: KnownMachine, line: Document) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import logging
 from typing import TYPE_CHECKING, Any
 
@@ -116,7 +117,7 @@ class PlantSource:
     async def journal(self, machine: str, alarm: str, most: int) -> list[Document]:
         """See `daqsvc.page.sources.MachineSource.journal`; what the broker keeps, and what came since."""
         found = self._known.machine(machine)
-        events = [] if found is None else [*found[1].events][::-1]
+        events: list[Document] = [] if found is None else [*map(json.loads, reversed(found[1].events))]
         events.sort(key=lambda one: -int(one["wall_ns"]))
         return [one for one in events if alarm in {"", one["alarm"]}][:most]
 

@@ -156,18 +156,28 @@ class LiveLink(MqttLink):
             await self._end([topic])
         if request.lease_s == 0.0:
             return
+        refused = ""
         if len(self._lookers) >= self._settings.most_lookers:
-            telling = self._refuse(
-                connection,
-                topic,
-                request.feed,
+            refused = (
                 f"{len(self._lookers)} others look on already: close one of their pages, or raise "
-                "most_lookers in [mqtt.live]",
+                "most_lookers in [mqtt.live]"
             )
-        else:
-            telling = self._tell(connection, topic, request)
-        task = asyncio.create_task(telling, name=f"looks on: {topic.looker}")
+        task = asyncio.create_task(
+            self._serve(connection, topic, request, refused), name=f"looks on: {topic.looker}"
+        )
         self._lookers[topic] = _Looker(request.feed, until_s, task)
+
+    async def _serve(
+        self, connection: Connection, topic: LiveTopic, request: LiveRequestPayload, refused: str
+    ) -> None:
+        """Tell one, or why not, until the broker will not take it: then the connection stands all the same."""
+        try:
+            if refused:
+                await self._refuse(connection, topic, request.feed, refused)
+            else:
+                await self._tell(connection, topic, request)
+        except PublishRefusedError as error:
+            log.warning("who looks on at %s is told nothing more: %s", topic.machine, error)
 
     async def _refuse(self, connection: Connection, topic: LiveTopic, feed: int, why: str) -> None:
         line = json.dumps({"accepted": False, "reason": why}).encode() + b"\n"
@@ -187,8 +197,6 @@ class LiveLink(MqttLink):
             while lines := await looking.lines():
                 await self._send(connection, topic, await asyncio.to_thread(packer.pack, lines))
             await self._send(connection, topic, packer.pack(OVER))
-        except PublishRefusedError as error:
-            log.warning("who looks on at %s is told nothing more: %s", topic.machine, error)
         finally:
             looking.leave()
 

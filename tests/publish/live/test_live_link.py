@@ -15,7 +15,7 @@ from daqsvc.publish.live.pieces import Unpacker
 from daqsvc.publish.live.settings import Live
 from daqsvc.publish.looking import Looking
 from daqsvc.publish.mqtt.connection import Incoming
-from daqsvc.publish.mqtt.errors import MqttError
+from daqsvc.publish.mqtt.errors import MqttError, PublishRefusedError
 from daqsvc.publish.topics import Topics
 
 if TYPE_CHECKING:
@@ -168,6 +168,24 @@ async def test_a_lost_connection_ends_it_and_everybody_who_looks() -> None:
         with pytest.raises(MqttError, match="lost"):
             running.result()
         assert machine.left == 1
+
+
+@pytest.mark.parametrize("machine_name", ["rig", "other"])
+async def test_a_broker_that_takes_no_feed_ends_that_and_nothing_else(
+    machine_name: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    machine = Machine()
+    async with linked(machine) as (link, broker, running):
+        broker.error = PublishRefusedError("not authorised")
+        machine.lines.put_nowait(b"one\n")
+        ask(link, 1, 60.0, topic=TOPICS.live_request(machine_name, "page-1"))
+        await eventually(lambda: "not authorised" in caplog.text, "it is said")
+        await asyncio.sleep(0.05)
+        assert not running.done()
+        broker.error = None
+        machine.lines.put_nowait(b"two\n")
+        ask(link, 2, 60.0)
+        await eventually(lambda: broker.told(2).endswith(b"two\n"), "others are told")
 
 
 @pytest.mark.parametrize(
