@@ -170,7 +170,7 @@ class LiveLink(MqttLink):
     async def _serve(
         self, connection: Connection, topic: LiveTopic, request: LiveRequestPayload, refused: str
     ) -> None:
-        """Tell one, or why not, until the broker will not take it: then the connection stands all the same."""
+        """Tell one, or why not, until the broker will not take it; the connection stands all the same."""
         try:
             if refused:
                 await self._refuse(connection, topic, request.feed, refused)
