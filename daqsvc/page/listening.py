@@ -13,7 +13,7 @@ from daqsvc.live_feed import SCHEMA
 from daqsvc.page.machine_live import MachineLive
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
     from pathlib import Path
 
     Document = dict[str, Any]
@@ -120,3 +120,54 @@ class Listening:
         if self.live is not None:
             self.live.hear(line)
         self.heard_s = time.monotonic()
+
+
+class Listenings:
+    """Machines that are listened to while somebody looks at them, and a while longer.
+
+    Args:
+        linger_s: how much longer.
+    """
+
+    def __init__(self, linger_s: float) -> None:
+        self._linger_s = linger_s
+        self._listening: dict[str, tuple[Listening, asyncio.Task[None]]] = {}
+        self._looking: dict[str, int] = {}
+
+    def __contains__(self, machine: str) -> bool:
+        """Whether a machine is listened to."""
+        return machine in self._listening
+
+    @contextlib.contextmanager
+    def looking(self, machine: str, make: Callable[[], Listening]) -> Iterator[Listening]:
+        """Listen to a machine meanwhile, together with all others who look at it.
+
+        Args:
+            machine: its name.
+            make: what listens to it, if nothing does yet.
+        """
+        if machine not in self._listening:
+            listening = make()
+            task = asyncio.create_task(listening.run(), name=f"listen to {machine}")
+            self._listening[machine] = listening, task
+        self._looking[machine] = self._looking.get(machine, 0) + 1
+        try:
+            yield self._listening[machine][0]
+        finally:
+            self._looking[machine] -= 1
+            asyncio.get_running_loop().call_later(self._linger_s, self._perhaps_end, machine)
+
+    def _perhaps_end(self, machine: str) -> None:
+        if not self._looking.get(machine):
+            self._looking.pop(machine, None)
+            if machine in self._listening:
+                self._listening.pop(machine)[1].cancel()
+
+    async def close(self) -> None:
+        """Listen to none any more."""
+        tasks = {task for _, task in self._listening.values()}
+        self._listening.clear()
+        for task in tasks:
+            task.cancel()
+        if tasks:
+            await asyncio.wait(tasks)

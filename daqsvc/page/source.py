@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import dataclasses
 import json
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.alarms.commands import CommandOutcome
@@ -25,7 +26,7 @@ from daqsvc.history.file import NAME as HISTORY
 from daqsvc.outbox.messages import OutboxError
 from daqsvc.outbox.reading import read_journal
 from daqsvc.page.box_snapshots import AT, BoxSnapshots
-from daqsvc.page.listening import Listening
+from daqsvc.page.listening import Listening, Listenings
 from daqsvc.page.recorded import refused_of_the_past
 
 if TYPE_CHECKING:
@@ -110,8 +111,7 @@ class BoxSource:
     def __init__(self, store: Path) -> None:
         self._store = store
         self._snapshots = BoxSnapshots(store)
-        self._listening: dict[str, tuple[BoxListening, asyncio.Task[None]]] = {}
-        self._looking: dict[str, int] = {}
+        self._listenings = Listenings(LINGER_S)
 
     async def statuses(self) -> list[Document]:
         """How each machine stands that the service watches: `daqsvc.publish.service_status`.
@@ -151,20 +151,8 @@ class BoxSource:
             async with self._snapshots.looking(machine) as playing:
                 yield playing
             return
-        if machine not in self._listening:
-            listening = BoxListening(self._store, machine)
-            task = asyncio.create_task(listening.run(), name=f"listen to {machine}")
-            self._listening[machine] = listening, task
-        self._looking[machine] = self._looking.get(machine, 0) + 1
-        try:
-            yield self._listening[machine][0]
-        finally:
-            self._looking[machine] -= 1
-            asyncio.get_running_loop().call_later(LINGER_S, self._perhaps_end, machine)
-
-    def _perhaps_end(self, machine: str) -> None:
-        if not self._looking.get(machine) and machine in self._listening:
-            self._listening.pop(machine)[1].cancel()
+        with self._listenings.looking(machine, partial(BoxListening, self._store, machine)) as listening:
+            yield listening
 
     async def snapshots(self, machine: str) -> list[KeptSnapshot]:
         """See `daqsvc.page.sources.MachineSource.snapshots`."""
@@ -195,12 +183,7 @@ class BoxSource:
     async def close(self) -> None:
         """Listen no more."""
         await self._snapshots.close()
-        tasks = {task for _, task in self._listening.values()}
-        self._listening.clear()
-        for task in tasks:
-            task.cancel()
-        if tasks:
-            await asyncio.wait(tasks)
+        await self._listenings.close()
 
 
 def _journal(store: Path, machine: str, alarm: str, most: int) -> list[Document]:

@@ -6,9 +6,11 @@ import asyncio
 import contextlib
 import json
 import logging
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.alarms.commands import CommandOutcome
+from daqsvc.page.listening import Listenings
 from daqsvc.page.plant.known import KnownPlant
 from daqsvc.page.plant.leased import LeasedListening
 from daqsvc.page.plant.link import BrokerAwayError, BrokerLink
@@ -45,8 +47,7 @@ class PlantSource:
         self._link = BrokerLink(mqtt, self._known)
         self._begun_s = 0.0
         self._running: asyncio.Task[None] | None = None
-        self._listening: dict[str, tuple[LeasedListening, asyncio.Task[None]]] = {}
-        self._looking: dict[str, int] = {}
+        self._listenings = Listenings(LINGER_S)
 
     def begin(self) -> None:
         """Begin to listen to the broker, if that has not been done."""
@@ -94,25 +95,13 @@ class PlantSource:
         Raises:
             KeyError: nothing was heard of such a machine.
         """
-        if machine not in self._listening:
+        if machine not in self._listenings:
             await self._begun(machine)
-            found = self._known.machine(machine)
-            if found is None:
-                raise KeyError(machine)
-            if machine not in self._listening:
-                listening = LeasedListening(self._link, *found)
-                task = asyncio.create_task(listening.run(), name=f"listen to {machine}")
-                self._listening[machine] = listening, task
-        self._looking[machine] = self._looking.get(machine, 0) + 1
-        try:
-            yield self._listening[machine][0]
-        finally:
-            self._looking[machine] -= 1
-            asyncio.get_running_loop().call_later(LINGER_S, self._perhaps_end, machine)
-
-    def _perhaps_end(self, machine: str) -> None:
-        if not self._looking.get(machine) and machine in self._listening:
-            self._listening.pop(machine)[1].cancel()
+        found = self._known.machine(machine)
+        if found is None:
+            raise KeyError(machine)
+        with self._listenings.looking(machine, partial(LeasedListening, self._link, *found)) as listening:
+            yield listening
 
     async def journal(self, machine: str, alarm: str, most: int) -> list[Document]:
         """See `daqsvc.page.sources.MachineSource.journal`; what the broker keeps, and what came since."""
@@ -158,11 +147,8 @@ class PlantSource:
 
     async def close(self) -> None:
         """Listen no more."""
-        tasks = {task for _, task in self._listening.values()}
-        self._listening.clear()
-        if self._running is not None:  # the first: nobody waits for a broker that does not answer
-            tasks.add(self._running)
-        for task in tasks:
-            task.cancel()
-        if tasks:
-            await asyncio.wait(tasks)
+        if self._running is not None:
+            self._running.cancel()  # at first: nobody waits for a broker that does not answer
+        await self._listenings.close()
+        if self._running is not None:
+            await asyncio.wait({self._running})

@@ -19,7 +19,15 @@ if TYPE_CHECKING:
     from daqsvc.page.charts import Theme
     from daqsvc.page.machine_live import MachineLive
 
-HOURS = {"1": "1 hour", "0.25": "15 minutes", "8": "8 hours", "24": "1 day", "168": "1 week", "720": "30 days", "8760": "1 year"}
+HOURS = {
+    "1": "1 hour",
+    "0.25": "15 minutes",
+    "8": "8 hours",
+    "24": "1 day",
+    "168": "1 week",
+    "720": "30 days",
+    "8760": "1 year",
+}
 SECONDS_UP_TO_H, MINUTES_UP_TO_H = 1.0, 200.0
 DAYS_FROM_H = 48.0
 """What is longer is shown in days."""
