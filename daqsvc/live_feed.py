@@ -45,8 +45,6 @@ MOST_WAITING = 2000
 """Likewise items of every kind."""
 BEFORE_S = 20.0
 """What the rings hold of so long before is told at first."""
-BEFORE_BYTES = MOST_WAITING_BYTES // 2
-"""No more than so much of it."""
 
 
 class _StreamStands(NamedTuple):
@@ -180,7 +178,7 @@ class LiveFeed:
         about = partial(
             self.about, [*statements], [*alarms], dict(standings), of_this_box=before_bytes is None
         )
-        before_bytes = BEFORE_BYTES if before_bytes is None else before_bytes
+        before_bytes = MOST_WAITING_BYTES // 2 if before_bytes is None else before_bytes
         looker = Looker(about, streams)
         wanted = sorted(looker.streams & rings.keys())
         for stream in wanted:

@@ -56,6 +56,7 @@ _PROBES_ONLY = (
 )
 """Options of `analyze` that accelerometers have not."""
 _SAID_TWICE = "--bearing and --orders both say what the bearing is; leave out one of them"
+_DIMENSIONS = ("--balls", "--ball-diameter-mm", "--pitch-diameter-mm")
 _ORDER_KEYS = ("BPFI", "BPFO", "BSF", "FTF")
 
 
@@ -129,11 +130,34 @@ def by_orders(arguments: argparse.Namespace) -> bool:
 
 def analyze_misuse(arguments: argparse.Namespace, machine: Path | None, recordings: Sequence[str]) -> str:
     """What is wrong with options of `analyze` that are sound one by one; empty if nothing is."""
+    if wrong := _take_dimensions(arguments):
+        return wrong
     if by_bearing(arguments):
         return next(_bearing_misuse(arguments, machine), "")
     if by_orders(arguments):
         return _order_misuse(arguments, machine)
     return _probe_misuse(arguments, machine, recordings)
+
+
+def _take_dimensions(arguments: argparse.Namespace) -> str:
+    """Make orders of the dimensions of a bearing, if those are given; what is wrong with them, or empty."""
+    given = _given(arguments, (*_DIMENSIONS, "--contact-deg"))
+    if not given:
+        return ""
+    if missing := _missing(arguments, _DIMENSIONS):
+        return f"{given[0]} tells of a bearing's dimensions: {', '.join(missing)} must be given too"
+    if arguments.bearing is not None or arguments.orders is not None:
+        return "--balls, --bearing and --orders all say what the bearing is; leave out all but one of them"
+    from daqsvc.bearing.geometry import BearingGeometry  # noqa: PLC0415 - each verb imports only what it needs
+
+    sizes = arguments.balls, arguments.ball_diameter_mm, arguments.pitch_diameter_mm
+    try:
+        orders = BearingGeometry(*sizes, arguments.contact_deg or 0.0).orders()
+    except ValueError as error:
+        return f"--balls: {error}"
+    told = (orders.inner, orders.outer, orders.ball, orders.cage)
+    arguments.orders = dict(zip(_ORDER_KEYS, told, strict=True))
+    return ""
 
 
 def _probe_misuse(arguments: argparse.Namespace, machine: Path | None, recordings: Sequence[str]) -> str:
@@ -156,6 +180,10 @@ def _probe_misuse(arguments: argparse.Namespace, machine: Path | None, recording
 
 def calibrate_misuse(arguments: argparse.Namespace, machine: Path | None, recordings: Sequence[str]) -> str:
     """What is wrong with options of `calibrate` that are sound one by one; empty if nothing is."""
+    return _take_dimensions(arguments) or _calibrate_misuse(arguments, machine, recordings)
+
+
+def _calibrate_misuse(arguments: argparse.Namespace, machine: Path | None, recordings: Sequence[str]) -> str:
     if calibrates_bearing(arguments):
         return _healthy_bearing_misuse(arguments, machine, recordings)
     if arguments.out is None and not arguments.json:
@@ -407,6 +435,18 @@ def _add_bearing(add: Callable[..., argparse.Action]) -> None:
         metavar="BPFI=F,BPFO=F,BSF=F,FTF=F",
         help="fault orders per revolution of the shaft, in place of --bearing",
     )
+    add(
+        "--balls",
+        type=count,
+        metavar="N",
+        help="its dimensions in place of --bearing: balls or rollers of a row",
+    )
+    for name, about in (
+        ("ball-diameter-mm", "of a ball, or of a roller at its middle"),
+        ("pitch-diameter-mm", "of the circle through their centres"),
+    ):
+        add(f"--{name}", type=positive, metavar="D", help=f"with --balls: diameter {about}")
+    add("--contact-deg", type=not_negative, metavar="A", help="with --balls: contact angle (default: 0)")
 
 
 def _add_rotor(add: Callable[..., argparse.Action], *, speed_help: str, help_more: str = "") -> None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from daqsvc.bearing.geometry import BearingOrders, bearing_orders
+from daqsvc.bearing.geometry import BearingGeometry, BearingOrders, bearing_orders
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -22,12 +22,16 @@ def bearing_lines(live: MachineLive, sensor: str) -> Iterator[tuple[str, float]]
     for one in live.values.get("pipeline", {}).get("bearing", {}).get("bearings", ()):
         if sensor and one.get("sensor", sensor) != sensor:
             continue
-        told = one.get("orders")
-        orders = (
-            bearing_orders(one["type"])
-            if told is None
-            else BearingOrders(inner=told["bpfi"], outer=told["bpfo"], ball=told["bsf"], cage=told["ftf"])
-        )
+        orders = _orders(one)
         parts = {"BPFO": orders.outer, "BPFI": orders.inner, "2 BSF": 2.0 * orders.ball, "FTF": orders.cage}
         for part, order in parts.items():
             yield f"{one.get('name', '')} {part}".strip(), order
+
+
+def _orders(bearing: dict[str, Any]) -> BearingOrders:
+    if (told := bearing.get("orders")) is not None:
+        return BearingOrders(inner=told["bpfi"], outer=told["bpfo"], ball=told["bsf"], cage=told["ftf"])
+    if (size := bearing.get("geometry")) is not None:
+        diameters = size["ball_diameter_mm"], size["pitch_diameter_mm"]
+        return BearingGeometry(size["balls"], *diameters, size.get("contact_deg", 0.0)).orders()
+    return bearing_orders(bearing["type"])

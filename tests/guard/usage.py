@@ -90,6 +90,9 @@ analyze absent.npz --bearing 6205-2RS --channels a,b,c --speed-rpm 600
 analyze absent.npz --bearing 6205-2RS --channels a --speed-rpm orbit:600
 analyze absent.npz --bearing 6205-2RS --orders BPFI=5,BPFO=3,BSF=2,FTF=0.4 --channels a --speed-rpm 600
 analyze absent.npz --orders BPFI=5,BPFO=3,BSF=2 --channels a --speed-rpm 600
+analyze absent.npz --balls 9 --channels a --speed-rpm 600
+analyze absent.npz --balls 9 --ball-diameter-mm 8 --pitch-diameter-mm 39 --bearing 6205 --channels a
+analyze absent.npz --balls 30 --ball-diameter-mm 7.94 --pitch-diameter-mm 39.04 --channels a --speed-rpm 600
 analyze absent.npz --orders BPFI=3,BPFO=5,BSF=2,FTF=0.4 --channels a --speed-rpm 600
 analyze absent.npz --bearing 6205-2RS --channels a --speed-rpm 600 --baseline-fs 1000
 analyze absent.npz --bearing 6205-2RS --channels a --speed-rpm 600 --baseline absent.npz

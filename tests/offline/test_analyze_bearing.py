@@ -27,6 +27,8 @@ pytestmark = pytest.mark.integration
 EXAMPLE = ROOT / "config" / "machines" / "bearing.toml"
 WORDS = {"normal", "changed", "inner", "outer", "ball", "inner_or_outer"}
 
+SIZE = ("--balls", "9", "--ball-diameter-mm", "7.94", "--pitch-diameter-mm", "39.04")
+
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
@@ -182,6 +184,14 @@ def test_orders_stand_in_for_the_catalogue(verb: Run, files: dict[str, Path]) ->
     }  # fmt: skip
 
 
+def test_dimensions_stand_in_for_the_catalogue(verb: Run, files: dict[str, Path]) -> None:
+    code, (found,), _ = verb("analyze", files["outer"], *OPTIONS[:-2], *SIZE)
+    assert (code, found["verdict"]) == (0, "outer")
+    bearing = found["channels"]["de"]["bearing"]
+    assert bearing.pop("name") is None
+    assert bearing == pytest.approx({"bpfi": 5.4152, "bpfo": 3.5848, "bsf": 2.3567, "ftf": 0.3983}, rel=1e-3)
+
+
 def test_variables_are_found_by_the_end_of_their_names(verb: Run, tmp_path: Path) -> None:
     """Sets of recordings number their variables, and one set of options must do for all."""
     first, second = Housing(order=OUTER, seed=12).samples, Housing(seed=13).samples
@@ -273,6 +283,11 @@ def test_another_unit_or_a_machine_at_rest_is_no_change_of_the_machine(
     [
         (("--bearing", "6205", "--orders", "BPFI=5,BPFO=3,BSF=2,FTF=0.4"), "leave out one of them"),
         (("--bearing", "6205"), "--channels, --speed-rpm must be given too"),
+        (("--balls", "9"), "--ball-diameter-mm, --pitch-diameter-mm must be given too"),
+        (("--contact-deg", "15"), "--balls, --ball-diameter-mm"),
+        ((*SIZE, "--bearing", "6205"), "leave out all but one of them"),
+        ((*SIZE, "--contact-deg", "90", *OPTIONS[:6]), "contact angle is 90 deg"),
+        (("--balls", "30", *SIZE[2:], *OPTIONS[:6]), "30 balls of diameter 7.94 do not fit"),
         (("--bearing", "6205-XX", "--channels", "de", "--speed-rpm", "1797"), "near names: 6205"),
         (("--orders", "BPFI=5,BPFO=3,BSF=2"), "FTF missing"),
         (("--orders", "BPFI=5,BPFI=3,BSF=2,FTF=.4"), "'BPFI=3' is no fault order"),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from test_views import RATE_HZ, SPEED_HZ, about, told
 
+from daqsvc.page.bearing_lines import bearing_lines
 from daqsvc.page.charts import DARK, LIGHT, stroke
 from daqsvc.page.machine_live import MachineLive
 from daqsvc.page.views.all_views import VIEWS
@@ -98,6 +99,19 @@ def test_the_velocity_of_an_accelerometer_is_its_integral() -> None:
     assert row(made, "1X at") == (pytest.approx(mm_s, rel=0.01), "mm/s r.m.s.")
     assert row(made, "overall")[1] == "mm/s r.m.s."
     assert made.sources["spectrum"]["a"][made.sources["spectrum"]["f"] < 2.0].max() == 0.0
+
+
+def test_lines_of_a_bearing_come_of_its_orders_its_dimensions_or_the_catalogue() -> None:
+    live = looking()
+    told = [dict(bearing_lines(live, ""))]
+    size = {"balls": 9, "ball_diameter_mm": 7.94, "pitch_diameter_mm": 39.04}
+    for key, one in (("geometry", size), ("type", "6205-2RS")):
+        live.values["pipeline"]["bearing"]["bearings"] = [{"name": "drive end", "sensor": "casing", key: one}]
+        told.append(dict(bearing_lines(live, "casing")))
+    assert told[0]["drive end BPFO"] == BPFO
+    assert told[1] == pytest.approx(told[2], rel=1e-3)
+    assert told[1]["drive end BPFO"] == pytest.approx(3.585, abs=1e-3)
+    assert dict(bearing_lines(live, "another")) == {}
 
 
 def test_figures_are_made_of_every_choice() -> None:

@@ -217,3 +217,7 @@ async def test_streams_share_what_is_told_of_the_time_before(monkeypatch: pytest
         name: [50, 2] for name in "abc"
     }
     assert {one["samples"]["first_index"] for one in told} == {350}
+    elsewhere = feed.look(["a"], [], [], {}, rings, before_bytes=2 * 4 * 20)
+    about, only = [json.loads(line) for line in (await elsewhere.lines()).splitlines()]
+    assert only["samples"]["shape"] == [20, 2]
+    assert "folder" not in about, "the path is of this box"

@@ -8,7 +8,6 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from daqsvc.bearing.baseline import BaselineFileError, load_bearing_baseline, save_bearing_baseline
-from daqsvc.bearing.geometry import BearingOrders, bearing_orders
 from daqsvc.bearing.identify import ChangeRules
 from daqsvc.bearing.isolation import least_rate_hz
 from daqsvc.bearing.model import BearingParameters
@@ -16,6 +15,7 @@ from daqsvc.bearing.two_sensors import PairModel, TwoSensorMonitor
 from daqsvc.detectors.bearing.detector import SAME_SPEED, BearingDetector
 from daqsvc.detectors.bearing.direction import TwoSensors
 from daqsvc.detectors.bearing.housed import HousedBearing
+from daqsvc.detectors.bearing.kinematics import orders_of
 from daqsvc.detectors.bearing.settings import BEARING
 from daqsvc.dsp.quality.unit import M_S2_PER_UNIT
 from daqsvc.dsp.speed.keyphasor import KeyphasorProbe
@@ -172,30 +172,6 @@ def _two_sensors(machine: MachineFile, settings: WatchedBearing, index: int) -> 
             f"bearing look alike; sample at {least_hz:.0f} Hz or faster, or remove model and rotor_sensor"
         )
     return TwoSensors(rotor.name, column, PairModel(parameters, m_s2_per_unit, model.mismatch))
-
-
-def orders_of(settings: WatchedBearing, index: int) -> BearingOrders:
-    """Fault orders of a bearing of a machine file.
-
-    Args:
-        settings: the bearing.
-        index: its place in ``pipeline.bearing.bearings``.
-
-    Raises:
-        ValueError: the catalogue does not know it, or its orders contradict each other.
-    """
-    at = f"pipeline.bearing.bearings[{index}]"
-    if settings.orders is None:
-        assert settings.type is not None  # noqa: S101 - detectors/bearing/checks.py: one of the two
-        try:
-            return bearing_orders(settings.type)
-        except KeyError as error:
-            raise ValueError(f"{at}.type: {error.args[0]}") from None
-    orders = settings.orders
-    try:
-        return BearingOrders(inner=orders.bpfi, outer=orders.bpfo, ball=orders.bsf, cage=orders.ftf)
-    except ValueError as error:
-        raise ValueError(f"{at}.orders: {error}") from None
 
 
 def _fitting(

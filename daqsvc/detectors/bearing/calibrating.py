@@ -9,7 +9,8 @@ import numpy as np
 
 from daqsvc.bearing.baseline import learn_baseline, resampled
 from daqsvc.bearing.race.judge import race_test
-from daqsvc.detectors.bearing.build import SAME_RATE, orders_of, pair_models
+from daqsvc.detectors.bearing.build import SAME_RATE, pair_models
+from daqsvc.detectors.bearing.kinematics import orders_of
 from daqsvc.detectors.bearing.recorded_checks import against_healthy_run
 from daqsvc.dsp.quality import RefusedError, UnfitError
 from daqsvc.dsp.quality.clipped import refuse_clipped

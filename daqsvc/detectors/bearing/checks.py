@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
+from daqsvc.detectors.bearing.kinematics import orders_by
 from daqsvc.detectors.bearing.settings import WINDOW_S
 from daqsvc.detectors.shaft.checks import LEAST_FOR_PULSES, named
 from daqsvc.settings.problems import Finding, choice, unique
@@ -52,12 +54,19 @@ def bearing_checks(draft: MachineFile, settings: Bearing) -> Iterator[Iterator[F
 
 def _kinematics(bearing: WatchedBearing, at: KeyPath) -> Iterator[Finding]:
     """The orders come from one place, and are in an order that a bearing can have."""
-    if (bearing.type is None) == (bearing.orders is None):
+    told = [key for key in ("type", "orders", "geometry") if getattr(bearing, key) is not None]
+    if len(told) != 1:
         yield Finding(
             at,
-            "has neither type nor orders" if bearing.type is None else "has both type and orders",
-            'write type = "6205-2RS", or orders = { bpfi = .., bpfo = .., bsf = .., ftf = .. }',
+            f"has both {' and '.join(told)}" if told else "has neither type nor orders",
+            'write type = "6205-2RS", or orders = { bpfi = .., bpfo = .., bsf = .., ftf = .. }, or '
+            "geometry = { balls = .., ball_diameter_mm = .., pitch_diameter_mm = .. }",
         )
+    if bearing.geometry is not None:
+        try:
+            orders_by(bearing.geometry)
+        except ValueError as error:
+            yield Finding((*at, "geometry"), f"is of no bearing: {error}", "measure again, or look it up")
     orders = bearing.orders
     if orders is not None and not orders.ftf < 0.5 < orders.bpfo < orders.bpfi:
         yield Finding(
@@ -221,13 +230,23 @@ def _pulses(draft: MachineFile, settings: Bearing) -> Iterator[Finding]:
         )
 
 
+def _inner_order(bearing: WatchedBearing) -> float | None:
+    """BPFI of a bearing that is not of the catalogue; None if it is not known."""
+    if bearing.geometry is None:
+        return None if bearing.orders is None else bearing.orders.bpfi
+    with suppress(ValueError):
+        return orders_by(bearing.geometry).inner
+    return None
+
+
 def _lines(draft: MachineFile, bearing: WatchedBearing, at: KeyPath) -> Iterator[Finding]:
     """The lines of a bearing lie below half the rate, where samples tell them."""
     sensor = named(draft).get(bearing.sensor)
-    if bearing.orders is None or sensor is None or sensor.stream not in draft.streams:
+    inner = _inner_order(bearing)
+    if inner is None or sensor is None or sensor.stream not in draft.streams:
         return
     rate_hz = draft.streams[sensor.stream].rate_hz
-    line_hz = bearing.orders.bpfi * abs(draft.machine.speed_rpm) / 60.0
+    line_hz = inner * abs(draft.machine.speed_rpm) / 60.0
     if line_hz >= rate_hz / 2.0:
         yield Finding(
             (*at, "sensor"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from daqsvc.detectors.bearing.checks import bearing_checks
+from daqsvc.detectors.bearing.kinematics import orders_by
 from daqsvc.detectors.bearing.settings import BEARING, Bearing
 from daqsvc.diagnosis.plugin import DetectorPlugin
 from daqsvc.diagnosis.reading import Reading
@@ -87,12 +88,16 @@ def _described(settings: Bearing) -> str:
 
 
 def _watched(bearing: WatchedBearing) -> str:
-    orders = bearing.orders
-    kinematics = (
-        f"{bearing.type}"
-        if orders is None
-        else f"BPFI {orders.bpfi:g}, BPFO {orders.bpfo:g}, BSF {orders.bsf:g}, FTF {orders.ftf:g}"
-    )
+    orders, geometry = bearing.orders, bearing.geometry
+    kinematics = f"{bearing.type}"
+    if orders is not None:
+        kinematics = f"BPFI {orders.bpfi:g}, BPFO {orders.bpfo:g}, BSF {orders.bsf:g}, FTF {orders.ftf:g}"
+    elif geometry is not None:
+        made = orders_by(geometry)
+        kinematics = (
+            f"{geometry.balls} of {geometry.ball_diameter_mm:g} mm on {geometry.pitch_diameter_mm:g} mm: "
+            f"BPFI {made.inner:.4g}, BPFO {made.outer:.4g}, BSF {made.ball:.4g}, FTF {made.cage:.4g}"
+        )
     by = bearing.sensor
     if bearing.rotor_sensor is not None:
         by += f", races also by direction with {bearing.rotor_sensor}"

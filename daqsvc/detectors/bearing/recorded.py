@@ -17,9 +17,10 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.bearing.baseline import load_bearing_baseline
 from daqsvc.bearing.identify import ChangeRules, NotIdentifiableError, compare_residual
 from daqsvc.bearing.race.judge import race_test
-from daqsvc.detectors.bearing.build import bearing_detector, healthy_machine, orders_of
+from daqsvc.detectors.bearing.build import bearing_detector, healthy_machine
 from daqsvc.detectors.bearing.calibrating import HealthyRun
 from daqsvc.detectors.bearing.finding import UNDETERMINED, BearingFinding, find
+from daqsvc.detectors.bearing.kinematics import orders_of
 from daqsvc.detectors.bearing.recorded_checks import (
     ball_order_problem,
     meant_in_hz,

@@ -30,6 +30,23 @@ class FaultOrders(Section):
     ftf: Annotated[Order, Field(description="the cage turns", examples=[0.398])]
 
 
+class RollingGeometry(Section):
+    """The dimensions of a rolling bearing, of one row; from its data sheet or measured."""
+
+    balls: Annotated[int, Field(ge=3, le=500, description="balls or rollers of one row", examples=[9])]
+    ball_diameter_mm: Annotated[
+        float,
+        Field(ge=0.01, le=10_000, description="of a ball, or of a roller at its middle", examples=[7.94]),
+    ]
+    pitch_diameter_mm: Annotated[
+        float,
+        Field(ge=0.01, le=100_000, description="of the circle through their centres", examples=[39.04]),
+    ]
+    contact_deg: Annotated[float, Field(ge=0, lt=90)] = Field(
+        default=0.0, description="contact angle; 0 for deep-groove and cylindrical roller bearings"
+    )
+
+
 class ThreeMasses(Section):
     """The bearing as a chain of rotor, rolling elements and housing, to ground."""
 
@@ -56,9 +73,12 @@ class WatchedBearing(Section):
     name: Annotated[Name, Field(description="name of the bearing", examples=["drive-end"])]
     sensor: Annotated[Name, Field(description="the accelerometer on its housing", examples=["accel-de"])]
     type: Text | None = Field(
-        default=None, description='designation in the catalogue, e.g. "6205-2RS"; or orders'
+        default=None, description='designation in the catalogue, e.g. "6205-2RS"; or orders, or geometry'
     )
     orders: FaultOrders | None = Field(default=None, description="its fault orders, in place of type")
+    geometry: RollingGeometry | None = Field(
+        default=None, description="its dimensions, in place of type: ball and roller bearings of any kind"
+    )
     rotor_sensor: Name | None = Field(
         default=None, description="accelerometer that moves with the rotor, to tell the races by direction"
     )

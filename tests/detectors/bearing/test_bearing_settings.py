@@ -26,6 +26,7 @@ ROTOR = MACHINES / "rotor-synchronous.toml"
 DRIVE_END = 'sensor = "accel-de"'
 TYPE = 'type = "6205-2RS"'
 ORDERS = "orders = { bpfi = 4.9469, bpfo = 3.0530, bsf = 1.9940, ftf = 0.3817 }"
+GEOMETRY = "geometry = { balls = 9, ball_diameter_mm = 7.94, pitch_diameter_mm = 39.04 }"
 MODEL = (
     "model = { masses_kg = [4.0, 0.0185, 2.0], stiffness_n_per_m = [2e7, 1e8, 5e7], "
     "damping_n_s_per_m = [200.0, 300.0, 2000.0] }"
@@ -55,6 +56,16 @@ def test_the_detector_is_what_the_machine_file_says() -> None:
     assert made.baseline is None
 
 
+def test_dimensions_make_the_orders_of_the_catalogue() -> None:
+    first, _ = detector(machine((TYPE, GEOMETRY))).bearings
+    assert first.orders.same_as(bearing_orders("6205-2RS"))
+    tilted = GEOMETRY.replace(" }", ", contact_deg = 15.0 }")
+    first, _ = detector(machine((TYPE, tilted))).bearings
+    assert first.orders.outer == pytest.approx(4.5 * (1.0 - 7.94 / 39.04 * np.cos(np.radians(15.0))))
+    text = " ".join(describe(machine((TYPE, GEOMETRY))).split())
+    assert "drive-end (9 of 7.94 mm on 39.04 mm: BPFI 5.415, BPFO 3.585, BSF 2.357, FTF 0.3983)" in text
+
+
 def test_what_was_understood_is_told() -> None:
     text = " ".join(describe(machine()).split())
     assert "drive-end (6205-2RS) by accel-de" in text
@@ -70,6 +81,9 @@ def test_what_was_understood_is_told() -> None:
         (((DRIVE_END, 'sensor = "accel-d"'),), "bearings[0].sensor", "no such sensor", 'mean "accel-de"'),
         (((TYPE, ""),), "bearings[0]", "neither type nor orders", "6205-2RS"),
         (((TYPE, f"{TYPE}\n{ORDERS}"),), "bearings[0]", "both type and orders", "bpfo"),
+        (((TYPE, f"{TYPE}\n{GEOMETRY}"),), "bearings[0]", "both type and geometry", "balls"),
+        (((TYPE, GEOMETRY.replace("9", "30", 1)),), "bearings[0].geometry", "30 balls", "measure"),
+        (((TYPE, GEOMETRY.replace("balls = 9, ", "")),), "geometry.balls", "is missing", "balls = 9"),
         (
             (("bpfi = 4.9469", "bpfi = 148.4"), ("ftf = 0.3817", "ftf = 11.5")),
             "bearings[1].orders",
