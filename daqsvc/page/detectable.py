@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 if TYPE_CHECKING:
     from daqsvc.page.machine_live import MachineLive
 
-_PATH = re.compile(r"/(?:[\w.@-]+/)+")
+_PATH = re.compile(r"/[^:'\"]*/")
 MOST_KEPT = 50
 LIMIT_S = 300.0
 """The first time kernels are compiled."""
@@ -49,7 +49,12 @@ class Detectabilities:
             while len(self._made) > MOST_KEPT:
                 self._made.popitem(last=False)[1].cancel()
         task = self._made[key]
-        return task.result() if task.done() and not task.cancelled() else None
+        if not task.done() or task.cancelled():
+            return None
+        told = Detectable("", "it has failed: try again later") if task.exception() else task.result()
+        if told.why_not:
+            del self._made[key]  # whoever looks again has it computed again
+        return told
 
     async def close(self) -> None:
         """Compute no more."""
@@ -61,11 +66,23 @@ class Detectabilities:
 
     async def _compute(self, live: MachineLive) -> Detectable:
         folder = live.about.get("folder", "")
+        if not folder and _names_files(live.values):
+            return Detectable("", NOT_HERE)
         async with self._one_at_a_time:
             with tempfile.TemporaryDirectory(prefix="daqsvc-page-") as scratch:
                 values = Path(scratch) / "machine.json"
                 await asyncio.to_thread(values.write_text, json.dumps(live.values))
                 return await _asked(values, folder or scratch, is_here=bool(folder))
+
+
+def _names_files(values: object) -> bool:
+    """Whether a machine file of elsewhere names files, which are not to be opened here."""
+    if isinstance(values, dict):
+        return any(_names_files(one) for one in values.values())
+    if isinstance(values, list):
+        return any(_names_files(one) for one in values)
+    is_file = isinstance(values, str) and (values.startswith("/") or ".." in values)
+    return is_file and not str(values).startswith("/dev/")
 
 
 async def _asked(values: Path, folder: str, *, is_here: bool) -> Detectable:

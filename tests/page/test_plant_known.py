@@ -130,6 +130,29 @@ async def test_a_box_that_is_offline_or_silent_is_not_normal(monkeypatch: pytest
     assert tile((await source.statuses())[0])["level"] == "danger"
 
 
+def test_a_retained_online_alone_is_not_there_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    plant = KnownPlant("daqsvc")
+    heard(plant, "availability", availability("online", "connected"))
+    box = plant.boxes["lab", "edge"]
+    assert box.away == ""
+    now_s = known_module.time.monotonic()
+    monkeypatch.setattr(known_module.time, "monotonic", lambda: now_s + 60.0)
+    assert "since this page listens" in box.away
+
+
+def test_a_box_that_counts_anew_is_believed_and_what_is_taken_away_goes() -> None:
+    plant = KnownPlant("daqsvc")
+    heard(plant, "rig/alarms/hot", alarm(2**60, "active_unacknowledged"))
+    later = json.loads(alarm(1, "active_acknowledged")) | {"wall_ns": 200}
+    heard(plant, "rig/alarms/hot", json.dumps(later).encode())
+    alarms = plant.boxes["lab", "edge"].machines["rig"].alarms
+    assert alarms["hot"]["state"] == "active_acknowledged"
+    heard(plant, "rig/alarms/hot", b"")
+    assert alarms == {}
+    heard(plant, "status", b"[" * 100_000)
+    heard(plant, "status", bytes(known_module.LARGEST + 1))
+
+
 PARTS = st.sampled_from(
     ["daqsvc", "lab", "edge", "rig", "alarms", "diagnosis", "status", "availability", "", "+", "é"]
 )

@@ -68,7 +68,11 @@ class KnownMachine:
     def about(self) -> Document:
         """The first line of a `daqsvc.live_feed` of it: no samples, for want of the machine file."""
         statements = [one for one in map(_statement, [*self.statements.values()]) if one is not None]
-        stamped = next(iter([*self.alarms.values(), *statements]), {"wall_ns": 0, "monotonic_ns": 0})
+        nothing = {"wall_ns": 0, "monotonic_ns": 0}
+        # The newest: an older one may be of before the box was booted.
+        stamped = max(
+            [*self.alarms.values(), *statements], key=lambda one: int(one["wall_ns"]), default=nothing
+        )
         return {
             "schema": SCHEMA,
             "machine": self.machine,
@@ -92,6 +96,7 @@ class KnownBox:
         state: ``"online"``, ``"offline"``, or ``""`` while that is not known.
         why: the reason that it gives.
         since: when that was so, ISO 8601.
+        known_s: when something of it was heard first, which may be old, by `time.monotonic`.
         heard_s: when it said something that was not kept at the broker, by `time.monotonic`.
         heard_utc: the same, ISO 8601.
         machines: by their names.
@@ -102,6 +107,7 @@ class KnownBox:
     state: str = ""
     why: str = ""
     since: str = ""
+    known_s: float = field(default_factory=time.monotonic)
     heard_s: float | None = None
     heard_utc: str = ""
     machines: dict[str, KnownMachine] = field(default_factory=dict)
@@ -111,8 +117,9 @@ class KnownBox:
         """Why nothing comes of it at present; empty if something does."""
         if self.state == "offline":
             return f"the box is offline since {self.since[:19]}Z ({self.why})"
-        if self.heard_s is not None and time.monotonic() - self.heard_s > SAYS_NOTHING_S:
-            return f"the box has said nothing since {self.heard_utc}"
+        last_s = self.known_s if self.heard_s is None else self.heard_s
+        if time.monotonic() - last_s > SAYS_NOTHING_S:
+            return f"the box has said nothing since {self.heard_utc or 'this page listens'}"
         return ""
 
 
@@ -140,7 +147,7 @@ class KnownPlant:
     def take(self, message: Incoming) -> None:
         """Take in a message; what is none of a box, or not as it should be, is left out."""
         topic = box_topic(self._root, message.topic)
-        if topic is None:
+        if topic is None or len(message.payload) > LARGEST:
             return
         box = self.boxes.get((topic.site, topic.box))
         if box is None:
@@ -157,14 +164,14 @@ class KnownPlant:
                 _note_machines(box, message.payload)
             elif len(topic.rest) == 3:
                 self._note_of_machine(box, topic.rest, message.payload)
-        except ValueError as error:
+        except (ValueError, TypeError, LookupError, RecursionError) as error:
             level = logging.DEBUG if self._has_warned else logging.WARNING
             self._has_warned = True
             log.log(level, "what came on %.200r cannot be read and is left out: %.200s", message.topic, error)
 
     def _note_of_machine(self, box: KnownBox, rest: tuple[str, ...], payload: bytes) -> None:
         name, kind, what = rest
-        if kind not in {"alarms", "diagnosis"} or len(payload) > LARGEST:
+        if kind not in {"alarms", "diagnosis"}:
             return
         machine = _machine_of(box, name)
         if machine is None:
@@ -175,10 +182,16 @@ class KnownPlant:
             if machine.hearing and (statement := _statement(payload)) is not None:
                 _tell(machine, {"statement": statement})
             return
-        AlarmPayload.model_validate_json(payload)
-        event = json.loads(payload)
+        if not payload:
+            machine.alarms.pop(what, None)  # taken away at the broker
+            return
+        known = AlarmPayload.model_validate_json(payload)
+        numbers = {"sequence": known.sequence, "wall_ns": known.wall_ns, "monotonic_ns": known.monotonic_ns}
+        event = json.loads(payload) | numbers
         before = machine.alarms.get(what)
-        if before is not None and event["sequence"] <= before["sequence"]:
+        if before is not None and (
+            event["sequence"] <= before["sequence"] and event["wall_ns"] <= before["wall_ns"]
+        ):
             return  # it has come again
         if self._has_room(machine.alarms, what, payload):
             machine.alarms[what] = event

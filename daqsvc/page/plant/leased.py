@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from daqsvc.page.listening import Listening
 from daqsvc.page.plant.link import BrokerAwayError
-from daqsvc.publish.live.pieces import Unpacker
+from daqsvc.publish.live.pieces import BrokenFeedError, Unpacker
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 LEASE_S = 15.0
 ASK_EVERY_S = 5.0
 """Three requests may be lost before a feed ends that is wanted."""
+LONGEST_LINE = 64 * 1024 * 1024
 LOOK_S = 1.0
 PATIENCE_S = 2.0
 """After so long without an answer it is shown what the box publishes for all, until there is one."""
@@ -68,12 +69,12 @@ class LeasedListening(Listening):
             try:
                 await self._hear(Unpacker(feed), pieces, {asking, waiting}, backoff)
             finally:
+                if not self.anew.is_set():
+                    self._link.tell(request, self._request(feed, 0.0))
                 for task in (asking, waiting):
                     task.cancel()
                 await asyncio.wait({asking, waiting})
                 await self._leave_diagnoses()
-                if not self.anew.is_set():
-                    self._link.tell(request, self._request(feed, 0.0))
 
     async def _hear(
         self,
@@ -89,8 +90,11 @@ class LeasedListening(Listening):
             if piece is None:
                 self._bear_silence(time.monotonic() - heard_s)
             else:
-                heard_s = time.monotonic()
-                *lines, rest = (rest + unpacker.take(piece)).split(b"\n")
+                took = unpacker.take(piece)
+                heard_s = time.monotonic() if took else heard_s
+                *lines, rest = (rest + took).split(b"\n")
+                if len(rest) > LONGEST_LINE:
+                    raise BrokenFeedError("a line of the feed has no end")
                 for line in lines:
                     self._take_line(json.loads(line))
                     backoff.reset()
@@ -137,6 +141,7 @@ class LeasedListening(Listening):
         if line.get("accepted") is False:
             self._refused(str(line.get("reason", "it does not say why")))
         elif "schema" in line:
+            line.pop("folder", None)  # no box says which files are opened here
             self.begin(line)
         elif line.get("over"):
             raise ConnectionError("the service begins anew")

@@ -68,6 +68,7 @@ class LiveLink(MqttLink):
         self._topics = topics
         self._asked: asyncio.Queue[tuple[LiveTopic, LiveRequestPayload]] = asyncio.Queue(MOST_REQUESTS)
         self._lookers: dict[LiveTopic, _Looker] = {}
+        self._sending = asyncio.Lock()
         self._free_s = 0.0
         self._has_warned = False
 
@@ -208,4 +209,5 @@ class LiveLink(MqttLink):
             begun_s = max(loop.time(), self._free_s)
             self._free_s = begun_s + len(piece) / (self._settings.max_kb_per_s * 1000)
             await asyncio.sleep(begun_s - loop.time())
-            await connection.deliver(there, piece, retain=False, expiry_s=PIECE_EXPIRY_S)
+            async with self._sending:  # an alarm waits for one piece, however many look
+                await connection.deliver(there, piece, retain=False, expiry_s=PIECE_EXPIRY_S)

@@ -11,7 +11,7 @@ import zlib
 PIECE_BYTES = 32 * 1024
 """An alarm waits behind one piece at most: on a line of 64 kbit/s for four seconds."""
 LONGEST_HEAD = 48
-MOST_BYTES = 64 * 1024 * 1024
+MOST_BYTES = 8 * 1024 * 1024
 """Of lines that come out of one piece."""
 FASTEST = 1
 """Samples hardly get smaller by more effort."""
@@ -66,6 +66,8 @@ class Unpacker:
         if len(numbers) != 2 or not all(one.isdigit() for one in numbers):
             raise BrokenFeedError("what came is no piece of a live feed")
         feed, number = map(int, numbers)
+        if feed == self._feed and number == 0 and self._number > 1:
+            raise BrokenFeedError("the feed has begun anew")  # whoever sends it has lost the connection
         if feed != self._feed or number < self._number:
             return b""
         if number > self._number:
@@ -76,6 +78,8 @@ class Unpacker:
             lines = self._stream.decompress(packed, MOST_BYTES)
         except zlib.error as error:
             raise BrokenFeedError(f"a piece cannot be unpacked ({error})") from None
+        if self._stream.eof:
+            raise BrokenFeedError("the feed has ended by itself")
         if self._stream.unconsumed_tail:
             raise BrokenFeedError(f"a piece has more than {MOST_BYTES} bytes in it")
         return lines

@@ -31,6 +31,14 @@ def test_a_lost_piece_is_seen_and_others_are_left_out() -> None:
     assert unpacker.take(second) == b"two\n"
 
 
+def test_a_feed_that_begins_anew_under_its_number_is_seen() -> None:
+    packer, unpacker = Packer(7), Unpacker(7)
+    for text in (b"one\n", b"two\n"):
+        unpacker.take(packer.pack(text)[0])
+    with pytest.raises(BrokenFeedError, match="begun anew"):
+        unpacker.take(Packer(7).pack(b"one\n")[0])
+
+
 @pytest.mark.parametrize("piece", [b"", b"7\n", b"7 0", b"7 x\n", b"-7 0\nx", b"7 0\nno zlib", b"\xff" * 100])
 def test_what_is_no_piece_is_refused(piece: bytes) -> None:
     unpacker = Unpacker(7)
