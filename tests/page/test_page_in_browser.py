@@ -204,6 +204,11 @@ async def test_what_is_not_heard_any_more_is_grey_and_says_its_age(tmp_path: Pat
         why = "no daqsvc runs on the store|the service has ended the connection"
         assert re.fullmatch(rf"What is shown is \d+ s old: ({why})\.", said)
         assert "stale" in (await page.locator("body").get_attribute("class") or "")
+        found = await Axe().run(page)
+        wrong = [
+            one["id"] for one in found.response["violations"] if one["impact"] in {"serious", "critical"}
+        ]
+        assert wrong == [], "what is grey is still to be read"
         async with live_rig(store, "page-grey", faulty=False):
             await page.locator(silence).wait_for(state="hidden", timeout=PATIENCE_MS)
             shown = await page.locator("#rows").inner_text()
