@@ -133,6 +133,20 @@ def source(name: str, columns: Sequence[str]) -> Any:
     return ColumnDataSource({column: [] for column in columns}, name=name)
 
 
+def step_lines(made: Any, data: Any, names: Sequence[str], theme: Theme) -> None:
+    """A line for each of some names that keeps its value until the next time.
+
+    Args:
+        made: the figure.
+        data: its source, with the times in column ``t`` and the values in ``m0``, ``m1`` and so on.
+        names: in the legend.
+        theme: its colours.
+    """
+    for number, name in enumerate(names):
+        look = stroke(theme, number)
+        made.step("t", f"m{number}", source=data, line_width=2, mode="after", legend_label=name, **look)
+
+
 def legend(made: Any, theme: Theme) -> None:
     """Make the legend of a figure quiet; a click on an entry hides its line."""
     for one in made.legend:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 if TYPE_CHECKING:
     from daqsvc.page.machine_live import MachineLive
 
-_PATH = re.compile(r"/[^:'\"]*/")
+_PATH = re.compile(r"(?<!\w)/(?:[^/\s:'\"]+/)+")
 MOST_KEPT = 50
 LIMIT_S = 300.0
 """The first time kernels are compiled."""
@@ -106,6 +106,6 @@ async def _asked(values: Path, folder: str, *, is_here: bool) -> Detectable:
     if process.returncode == 0:
         return Detectable(out.decode(), "")
     said = err.decode(errors="replace").strip().splitlines() or ["it has failed without a word"]
-    # No path goes out.
-    why = _PATH.sub("", said[-1].replace(f"{values}: ", ""))
+    # No path goes out, but units such as mm/s do.
+    why = _PATH.sub("", said[-1].replace(f"{values}: ", "").replace(f"{folder}/", ""))
     return Detectable("", why if is_here else f"{why}; {NOT_HERE}")

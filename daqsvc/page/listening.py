@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
+from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.acquisition.clock import NS_PER_S
@@ -22,8 +23,8 @@ NOT_OURS = (ValueError, LookupError, TypeError)
 """What comes of an answer that is not as it is known here."""
 
 
-class Listening:
-    """Listens to one machine, and keeps what it tells; how, a subclass says.
+class Listening(ABC):
+    """Listens to one machine and keeps what it reports; a subclass knows the way.
 
     Args:
         machine: its name.
@@ -46,13 +47,13 @@ class Listening:
         self._wanted: dict[object, frozenset[str]] = {}
         self._has_begun = asyncio.Event()
 
+    @abstractmethod
     async def listen(self, backoff: Backoff) -> None:
         """Ask for the `streams`, and take what is told, until that ends or `anew` is set.
 
         Args:
-            backoff: to be reset as soon as something is told.
+            backoff: to be reset as soon as something comes.
         """
-        raise NotImplementedError
 
     def in_words(self, error: Exception) -> str:
         """Why nothing is told, for a person."""

@@ -21,30 +21,30 @@ WORST_FIRST = ("not_ok", "missing", "good")
 
 def value_rows(live: MachineLive) -> str:
     """What each sensor measures, with its limits and its OK state, as rows of a table."""
-    said = [*live.latest.values()]
-    sensors = [*live.sensors] or sorted({name for one in said for name in one["sensors"]})
-    rows = [_row_of(live, sensor, [one for one in said if sensor in one["sensors"]]) for sensor in sensors]
-    more = len(rows) - MOST_ROWS
-    rows = rows[:MOST_ROWS]
-    if more > 0:
+    statements: dict[str, list[Document]] = {name: [] for name in live.sensors}
+    for one in [*live.latest.values()]:
+        for name in one["sensors"]:
+            statements.setdefault(name, []).append(one)
+    rows = [_row_of(live, name, about) for name, about in [*statements.items()][:MOST_ROWS]]
+    if (more := len(statements) - MOST_ROWS) > 0:
         rows.append(f'<tr><td colspan="5">{more} more sensors are not listed.</td></tr>')
-    return "".join(rows) or '<tr><td colspan="5">Nothing is told of any sensor yet.</td></tr>'
+    return "".join(rows) or '<tr><td colspan="5">No sensor has reported yet.</td></tr>'
 
 
 def _row_of(live: MachineLive, sensor: str, statements: list[Document]) -> str:
     if not statements:
         return row(escape(sensor), "no detector measures it", "", "unknown", "")
-    own = [one for one in statements if one["statistics"] and len(one["sensors"]) == 1] or statements
-    values = [part for one in own for part in _values(one)] if len(own[0]["sensors"]) == 1 else []
+    own = [one for one in statements if len(one["sensors"]) == 1]
+    values = "<br>".join(escape(value) for one in own for value in _values(one))
+    levels = [str(one["severity"]) for one in own]
+    level = next((one for one in ("danger", "alert") if one in levels), "normal")
     worst = min(statements, key=lambda one: WORST_FIRST.index(one["quality"]))
     state = OK[worst["quality"]] + (f": {worst['reason']}" if worst["reason"] else "")
-    levels = [str(one["severity"]) for one in own if len(one["sensors"]) == 1]
-    level = next((one for one in ("danger", "alert") if one in levels), "normal" if levels else "unknown")
     newest_ns = max(int(one["monotonic_ns"]) for one in statements)
     return row(
         escape(sensor),
-        "<br>".join(map(escape, values)) or "see the detectors below",
-        level_mark(level) if levels else "",
+        values or ("no value" if own else "see the detectors below"),
+        level_mark(level) if own else "",
         escape(state),
         time_mark(live.wall_ns_at_0 + newest_ns),
     )
@@ -52,12 +52,12 @@ def _row_of(live: MachineLive, sensor: str, statements: list[Document]) -> str:
 
 def _values(statement: Document) -> list[str]:
     """Each figure of a statement with its unit and its limits."""
-    told = []
+    texts = []
     for name, value in statement["statistics"].items():
         if value is None or "." in name:
             continue
         unit = statement["units"].get(name, "")
         limits = {which: statement["thresholds"].get(f"{name}.{which}") for which in LIMITS}
         known = [f"{which} {limit:.4g}" for which, limit in limits.items() if limit is not None]
-        told.append(f"{name} {value:.4g} {unit}".rstrip() + (f" ({', '.join(known)})" if known else ""))
-    return told
+        texts.append(f"{name} {value:.4g} {unit}".rstrip() + (f" ({', '.join(known)})" if known else ""))
+    return texts

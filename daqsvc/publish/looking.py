@@ -1,4 +1,4 @@
-"""Looking on: what passes of a machine, told to one who looks for as long as they do."""
+"""What the service gives to a viewer of live data."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ if TYPE_CHECKING:
 
 
 class Looking(NamedTuple):
-    """One who looks on.
+    """One viewer.
 
     Attributes:
-        lines: waits for what comes next, lines of JSON; nothing at the end.
-        leave: ends it.
+        lines: waits for the next lines of JSON; empty at the end.
+        leave: ends the feed.
     """
 
     lines: Callable[[], Awaitable[bytes]]
@@ -26,12 +26,12 @@ class Look(Protocol):
     def __call__(
         self, machine: str | None, streams: Collection[str], *, before_bytes: int | None = None
     ) -> Looking | tuple[str, ...]:
-        """Begin to look on; the names of all machines if there is no such one.
+        """Begin a feed; the names of all machines if there is no such machine.
 
         Args:
             machine: its name; None for the only one.
             streams: streams and grids whose samples are wanted.
-            before_bytes: samples of before that are told at first, at most; None for what a process of this
-                box takes.
+            before_bytes: the most that is sent at first of earlier samples, to a viewer elsewhere; None for a
+                process on this box.
         """
         ...

@@ -84,7 +84,7 @@ class OutputPort:
         topics: of the box, whose site and name they have; by them events are known in the outbox.
         commands: carries out what people ask of alarms; an output has to see that they may.
         snapshots: has snapshots of machines made for people; likewise.
-        look: begins to tell what passes of a machine; None if nobody may look on.
+        look: begins a feed of live data of a machine; None if there is none.
         earlier: what a broker is asked for before it is told anything; None for nothing.
         progress: says how far each part of the service has come that can stall.
         stalls: finds those that have.

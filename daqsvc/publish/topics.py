@@ -34,11 +34,11 @@ class CommandTopic:
 
 @dataclass(frozen=True, slots=True)
 class LiveTopic:
-    """What the topic of a request to look on says.
+    """What the topic of a request for live data names.
 
     Attributes:
-        machine: at which machine, in one part.
-        looker: who looks, by a name of their own.
+        machine: the machine, in one part.
+        looker: the viewer, by a name that it has chosen.
     """
 
     machine: str
@@ -121,7 +121,7 @@ class Topics:
 
     @property
     def live_requests(self) -> str:
-        """Filter for the requests to look on at any machine of the box."""
+        """Filter for the requests for live data of any machine of the box."""
         return f"{self.base}/+/{LIVE}/+/{REQUEST}"
 
     def live_request_of(self, topic: str) -> LiveTopic | None:
@@ -134,11 +134,11 @@ class Topics:
         return LiveTopic(machine, looker) if _NAME.fullmatch(f"{machine}/{looker}") else None
 
     def live_request(self, machine: str, looker: str) -> str:
-        """Where a request to look on is expected."""
+        """Where a request for live data is expected."""
         return f"{self.base}/{_safe(machine)}/{LIVE}/{_safe(looker)}/{REQUEST}"
 
     def live_feed(self, machine: str, looker: str) -> str:
-        """Where one who looks on is told."""
+        """Where the feed of a viewer goes."""
         return f"{self.base}/{_safe(machine)}/{LIVE}/{_safe(looker)}/{FEED}"
 
     def command(self, machine: str, verb: str) -> str:

@@ -116,6 +116,31 @@ async def test_without_a_table_for_it_alarms_and_diagnoses_are_shown_and_it_says
         assert live_pieces(mosquitto) == 0
 
 
+async def test_a_viewer_too_many_is_told_so_and_has_its_turn_later(
+    tmp_path: Path, mosquitto: Mosquitto
+) -> None:
+    table = box_table(mosquitto.port, live={"max_viewers": 1})
+    file = plant_file(tmp_path, mosquitto.port)
+    async with (
+        live_rig(tmp_path / "store", "plant-turn", faulty=False, mqtt=table) as service,
+        page_served("--plant", file) as (second, _),
+        browsing() as browser,
+        tab(browser) as page,
+    ):
+        viewers = service.watches["laval-rig"].live._lookers
+        async with page_served("--plant", file) as (first, _), tab(browser) as other:
+            await shows(Client(first), MACHINE, "laval-rig")
+            await other.goto(f"{first}{MACHINE}/orbit")
+            await eventually(lambda: len(viewers) == 1, "one looks")
+            await shows(Client(second), MACHINE, "laval-rig")
+            await page.goto(f"{second}{MACHINE}")
+            refused = page.locator("#head", has_text="max_viewers")
+            await refused.wait_for(timeout=PATIENCE_MS)
+            await other.goto("about:blank")
+        await page.locator("#values", has_text="probe-x").wait_for(timeout=PATIENCE_MS)
+        await refused.wait_for(state="detached", timeout=PATIENCE_MS)
+
+
 async def test_a_box_and_a_broker_that_go_are_plain_to_see_and_come_back(
     tmp_path: Path, mosquitto: Mosquitto
 ) -> None:

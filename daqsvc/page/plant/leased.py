@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import math
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -31,8 +32,8 @@ PATIENCE_S = 2.0
 SILENT_S = 10.0
 """A feed that has said nothing for so long is asked for anew; it says each second that it is alive."""
 NO_WAVEFORMS = (
-    "Alarms and diagnoses come of this box, and no waveforms: write [mqtt.live] into its machine file, and "
-    "let this page publish below live/ at the broker."
+    "This box sends alarms and diagnoses but no waveforms: add [mqtt.live] to its machine file, and allow "
+    "this page to publish below live/ at the broker."
 )
 
 
@@ -51,6 +52,8 @@ class LeasedListening(Listening):
         self._box = box
         self._known = machine
         self._topics = link.topics_of(machine)
+        self._refused_s = math.inf
+        """When the box has refused to send waveforms: it is asked again after a while."""
         self._hears_over: int | None = None
         """Over which connection diagnoses come that the box publishes for all; None if none do."""
 
@@ -85,7 +88,8 @@ class LeasedListening(Listening):
     ) -> None:
         """Take the pieces of a feed until it ends; where there is none, what the broker tells all."""
         rest, heard_s = b"", time.monotonic()
-        while not any(task.done() for task in ends):
+        self._refused_s = math.inf
+        while not any(task.done() for task in ends) and time.monotonic() < self._refused_s + LEASE_S:
             piece = await _next(pieces, ends)
             if piece is None:
                 self._bear_silence(time.monotonic() - heard_s)
@@ -149,19 +153,20 @@ class LeasedListening(Listening):
             self.take(line)
 
     def _refused(self, why: str) -> None:
-        """Show what the box publishes for all, as it lets this page not look on."""
-        if self.live is None or self._is_poor:
-            self.live = None
-            self._show_known(f"No waveforms come of this box: {why}.")
-        else:
+        """Show what the box publishes for everybody, as it refuses to send more to this page."""
+        if self.live is not None and not self._is_poor:
             raise ConnectionError(why)
+        self._refused_s = time.monotonic()
+        self._show_known()
+        if self.live is not None:
+            self.live.note = f"This box sends no waveforms: {why}."
 
-    def _show_known(self, why: str = NO_WAVEFORMS) -> None:
+    def _show_known(self) -> None:
         """Begin with what the box publishes for all, unless that or more is shown already."""
         if self.live is None:
             self.begin(self._known.about())
             if self.live is not None:
-                self.live.note = why
+                self.live.note = NO_WAVEFORMS
 
     @contextlib.contextmanager
     def _telling(self) -> Iterator[None]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.page.charts import ChartAxis, chart, legend, source, stroke
+from daqsvc.page.charts import ChartAxis, chart, legend, source, step_lines
 from daqsvc.page.views.view import Choice, Figure, Shown
 
 if TYPE_CHECKING:
@@ -67,16 +67,7 @@ class EvidenceView:
             ],
         )
         told = source("evidence", ["t", "decision", *(f"m{number}" for number in range(len(modes)))])
-        for number, mode in enumerate(modes):
-            made.step(
-                "t",
-                f"m{number}",
-                source=told,
-                line_width=2,
-                mode="after",
-                legend_label=mode,
-                **stroke(theme, number),
-            )
+        step_lines(made, told, modes, theme)
         made.hspan(y="y", source=source("limits", ["y"]), line_color=theme.quiet, line_dash="dashed")
         legend(made, theme)
         return [Figure("evidence", f"Evidence of each mode of {detector} against the declared one", made)]

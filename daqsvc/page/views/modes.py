@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.page.charts import ChartAxis, chart, legend, source, stroke
+from daqsvc.page.charts import ChartAxis, chart, legend, source, step_lines
 from daqsvc.page.earlier import probabilities_before
 from daqsvc.page.views.view import Choice, Figure, Shown
 
@@ -60,16 +60,7 @@ class ModesView:
         )
         columns = ["t", *(f"m{number}" for number in range(len(modes)))]
         told = source("modes", columns)
-        for number, mode in enumerate(modes):
-            made.step(
-                "t",
-                f"m{number}",
-                source=told,
-                **stroke(theme, number),
-                line_width=2,
-                mode="after",
-                legend_label=mode,
-            )
+        step_lines(made, told, modes, theme)
         legend(made, theme)
         return [Figure("modes", f"Probabilities of the modes of {detector} over time", made)]
 

@@ -1,1 +1,1 @@
-"""Machines told to who looks on from elsewhere, over the broker, for as long as they look."""
+"""Live data of machines, over the broker, to viewers that ask for it."""

@@ -1,4 +1,4 @@
-"""Tells who looks on over the broker, while their leases last."""
+"""Sends live data over the broker to viewers, while their leases last."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ OVER = b'{"over":true}\n'
 
 @dataclass(slots=True)
 class _Looker:
-    """One who looks on.
+    """One viewer.
 
     Attributes:
-        feed: the number of what is told.
+        feed: the number of its feed.
         until_s: when the lease is over, by the loop's clock.
-        task: tells.
+        task: sends the feed.
     """
 
     feed: int
@@ -49,18 +49,18 @@ class _Looker:
 
 
 class LiveLink(MqttLink):
-    """Sends what passes of a machine, in pieces, one at a time, to those who have asked for it.
+    """Sends the live data of machines in pieces, one at a time, to the viewers that have asked for it.
 
-    Each piece waits for its PUBACK: on a slow way samples are left out, which the feed says, and alarms wait
-    for one piece at most.
+    Each piece waits for its PUBACK: on a slow link samples are left out, which the feed reports, and an alarm
+    waits for one piece at most.
 
     Args:
-        settings: how many may look, and how much that may send.
-        look: begins to tell.
+        settings: how many viewers, and how much they are sent.
+        look: begins a feed.
         topics: the box.
     """
 
-    name = "who looks on"
+    name = "live viewers"
 
     def __init__(self, settings: Live, look: Look, topics: Topics) -> None:
         self._settings = settings
@@ -93,14 +93,14 @@ class LiveLink(MqttLink):
         return True
 
     async def run(self, connection: Connection) -> None:
-        """Tell over one connection; see `MqttLink.run`.
+        """Serve viewers over one connection; see `MqttLink.run`.
 
         Raises:
             MqttError: the connection is lost.
         """
         if await connection.watch(self._topics.live_requests, fresh_only=True):
             log.warning(
-                "the MQTT broker does not let this client listen to %s: nobody can look on over it",
+                "the MQTT broker does not let this client subscribe to %s: no live data is sent over it",
                 self._topics.live_requests,
             )
         asking = asyncio.ensure_future(self._asked.get())
@@ -158,27 +158,27 @@ class LiveLink(MqttLink):
         if request.lease_s == 0.0:
             return
         refused = ""
-        if len(self._lookers) >= self._settings.most_lookers:
+        if len(self._lookers) >= self._settings.max_viewers:
             refused = (
-                f"{len(self._lookers)} others look on already: close one of their pages, or raise "
-                "most_lookers in [mqtt.live]"
+                f"it has {len(self._lookers)} viewers already: close one of their pages, or raise "
+                "max_viewers in [mqtt.live]"
             )
         task = asyncio.create_task(
-            self._serve(connection, topic, request, refused), name=f"looks on: {topic.looker}"
+            self._serve(connection, topic, request, refused), name=f"viewer {topic.looker}"
         )
         self._lookers[topic] = _Looker(request.feed, until_s, task)
 
     async def _serve(
         self, connection: Connection, topic: LiveTopic, request: LiveRequestPayload, refused: str
     ) -> None:
-        """Tell one, or why not, until the broker will not take it; the connection stands all the same."""
+        """Serve one viewer, or refuse it; if the broker refuses the feed, only that feed ends."""
         try:
             if refused:
                 await self._refuse(connection, topic, request.feed, refused)
             else:
                 await self._tell(connection, topic, request)
         except PublishRefusedError as error:
-            log.warning("who looks on at %s is told nothing more: %s", topic.machine, error)
+            log.warning("live data of %s is no longer sent to a viewer: %s", topic.machine, error)
 
     async def _refuse(self, connection: Connection, topic: LiveTopic, feed: int, why: str) -> None:
         line = json.dumps({"accepted": False, "reason": why}).encode() + b"\n"
@@ -202,12 +202,12 @@ class LiveLink(MqttLink):
             looking.leave()
 
     async def _send(self, connection: Connection, topic: LiveTopic, pieces: list[bytes]) -> None:
-        """Send pieces, no faster than all who look on may take together."""
+        """Send pieces, no faster than the limit for all viewers together."""
         there = self._topics.live_feed(topic.machine, topic.looker)
         loop = asyncio.get_running_loop()
         for piece in pieces:
             begun_s = max(loop.time(), self._free_s)
             self._free_s = begun_s + len(piece) / (self._settings.max_kb_per_s * 1000)
             await asyncio.sleep(begun_s - loop.time())
-            async with self._sending:  # an alarm waits for one piece, however many look
+            async with self._sending:  # an alarm waits for one piece, however many viewers there are
                 await connection.deliver(there, piece, retain=False, expiry_s=PIECE_EXPIRY_S)

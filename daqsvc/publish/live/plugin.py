@@ -1,4 +1,4 @@
-"""Looking on over the broker as a plugin."""
+"""Live data over the broker as a plugin."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ if TYPE_CHECKING:
 
 
 class LivePlugin(MqttLinkPlugin[Live]):
-    """Waveforms, statements and alarms to who asks for them over the broker, while they look."""
+    """Live waveforms, statements and alarms to viewers over the broker, while they ask for them."""
 
     settings = Live
-    about = "waveforms to who looks on over the broker"
+    about = "live waveforms to viewers over the broker"
     place = 4
 
     def describe(self, machine: MachineFile, settings: Live) -> str:
         """See `OutputTable.describe`."""
         del machine
-        most, rate = settings.most_lookers, settings.max_kb_per_s
-        return f"waveforms to {most} who look on at most, {rate:g} kB/s" if settings.enabled else ""
+        most, rate = settings.max_viewers, settings.max_kb_per_s
+        return f"waveforms to at most {most} viewers, {rate:g} kB/s" if settings.enabled else ""
 
     def link(self, settings: Live | None, mqtt: Mqtt, port: OutputPort) -> MqttLink | None:
         """See `MqttLinkPlugin.link`."""

@@ -1,4 +1,4 @@
-"""Who may look on over the broker, and how much that may send."""
+"""How many may view live data over the broker, and how much is sent."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from daqsvc.settings.section import Section
 
 
 class Live(Section):
-    """Waveforms over the broker, to who asks for them by a request with a lease; nothing else is sent."""
+    """Live waveforms over the broker, to viewers that ask for them by a request with a lease."""
 
-    enabled: bool = Field(default=True, description="false sends to nobody, whoever asks")
-    most_lookers: Annotated[int, Field(ge=1, le=64)] = Field(
-        default=8, description="how many machines and pages may be looked at a time; further ones are refused"
+    enabled: bool = Field(default=True, description="false sends nothing, whoever asks")
+    max_viewers: Annotated[int, Field(ge=1, le=64)] = Field(
+        default=8, description="viewers at a time, each of one machine; further ones are refused"
     )
     max_kb_per_s: Annotated[float, Field(ge=1, le=100_000)] = Field(
-        default=500.0, description="what all of them together may take of the way to the broker, kB/s"
+        default=500.0, description="the most that all of them together are sent, kB/s"
     )

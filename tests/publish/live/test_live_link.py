@@ -1,4 +1,4 @@
-"""Looking on over the broker: only while a lease lasts, no more than may, no faster than allowed."""
+"""Live data over the broker: only while a lease lasts, to so many viewers, no faster than allowed."""
 
 from __future__ import annotations
 
@@ -124,11 +124,11 @@ async def test_another_feed_begins_anew_and_a_lease_of_nothing_ends() -> None:
 
 async def test_too_many_and_unknown_machines_are_refused_in_the_feed() -> None:
     machine = Machine()
-    async with linked(machine, most_lookers=1) as (link, broker, _):
+    async with linked(machine, max_viewers=1) as (link, broker, _):
         ask(link, 1, 60.0)
         await eventually(lambda: len(machine.looking) == 1, "it looks")
         ask(link, 5, 60.0, topic=TOPICS.live_request("rig", "page-2"))
-        await eventually(lambda: b"most_lookers" in broker.told(5, "page-2"), "it is refused")
+        await eventually(lambda: b"max_viewers" in broker.told(5, "page-2"), "it is refused")
         ask(link, 1, 0.0)
         await eventually(lambda: machine.left == 1, "there is room")
         ask(link, 6, 60.0, topic=TOPICS.live_request("other", "page-2"))
