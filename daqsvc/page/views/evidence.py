@@ -45,7 +45,7 @@ class EvidenceView:
         """See `daqsvc.page.views.view.MachineView.why_not`."""
         if any(_modes(one) for one in [*live.probable.values()]):
             return ""
-        return "no bank of observers has told its evidence yet"
+        return "no bank of observers has reported evidence yet"
 
     def streams(self, live: MachineLive, chosen: Mapping[str, str]) -> set[str]:
         """See `daqsvc.page.views.view.MachineView.streams`."""
@@ -100,6 +100,6 @@ class EvidenceView:
 
 
 def _modes(statement: Document) -> list[str]:
-    """The modes of a bank of observers that has told its evidence."""
+    """The modes of a bank of observers that has reported evidence."""
     is_bank = any(name.startswith((AGAINST, LEAD)) for name in statement["evidence"])
     return [*statement["probabilities"]] if is_bank else []

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from daqsvc.dsp.quality.unit import M_S2_PER_UNIT
 from daqsvc.page.bearing_lines import bearing_lines
 from daqsvc.page.charts import ChartAxis, chart, legend, source
 from daqsvc.page.lines import amplitudes, largest, one_sided, size_of
@@ -34,8 +35,6 @@ AMPLITUDES = {"peak": ("peak", 1.0), "pp": ("peak to peak", 2.0), "rms": ("r.m.s
 """What a person reads, and how large it is of a wave with the peak 1."""
 OWN = "own"
 QUANTITIES = {OWN: "as measured", "velocity": "velocity, mm/s"}
-MM_S2 = {"g": 9806.65, "m/s2": 1000.0, "m/s^2": 1000.0, "mm/s2": 1.0, "mm/s^2": 1.0}
-"""Millimetres per second squared in a unit of acceleration."""
 INTEGRATED_FROM_HZ = 2.0
 """Below, a velocity is drift of the sensor (ISO 20816-1 begins at 2 Hz)."""
 MOST_LINES = 4096
@@ -69,7 +68,7 @@ class SpectrumView:
             Choice("amplitude", "Amplitude", {key: words for key, (words, _) in AMPLITUDES.items()}),
             Choice("scale", "Scale", SCALES),
         ]
-        if any(live.sensors[name].unit in MM_S2 for name in sensors):
+        if any(live.sensors[name].unit in M_S2_PER_UNIT for name in sensors):
             choices.append(Choice("quantity", "Quantity", QUANTITIES))
         return choices
 
@@ -145,14 +144,14 @@ class SpectrumView:
 
 
 def _is_velocity(live: MachineLive, chosen: Mapping[str, str]) -> bool:
-    return chosen.get("quantity", OWN) != OWN and live.sensors[chosen["sensor"]].unit in MM_S2
+    return chosen.get("quantity", OWN) != OWN and live.sensors[chosen["sensor"]].unit in M_S2_PER_UNIT
 
 
 def _factor_and_unit(live: MachineLive, chosen: Mapping[str, str]) -> tuple[float, str]:
     """By what a peak amplitude of the sensor is to be multiplied, and the unit of what comes of it."""
     words, factor = AMPLITUDES[chosen["amplitude"]]
     if _is_velocity(live, chosen):
-        factor *= MM_S2[live.sensors[chosen["sensor"]].unit]
+        factor *= 1000.0 * M_S2_PER_UNIT[live.sensors[chosen["sensor"]].unit]
     return factor, f"{_unit(live, chosen)} {words}"
 
 
