@@ -295,7 +295,9 @@ def _innovations(subject: _Subject) -> Figure:
     figure = _figure(subject, "Innovations and departure test", (9.6, 7.0))
     upper, lower = figure.subplots(2, 1, sharex=True)
     calibration = subject.calibration
-    moved, _ = compensated(subject.trace.vectors, calibration.rotor, calibration.speed_rad_s, subject.rate_hz)
+    moved, _ = compensated(
+        subject.trace.vectors, calibration.rotor, calibration.speed_rad_s, subject.rate_hz, calibration.law
+    )
     deviation = np.sqrt(calibration.spread.of_means(1.0, float(calibration.revolutions), 0.0))
     innovation = np.abs(moved - calibration.baseline) / deviation
     for k, name in enumerate(_COMPONENTS):

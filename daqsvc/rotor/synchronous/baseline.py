@@ -18,6 +18,7 @@ from daqsvc.rotor.synchronous.departure import (
     oddest_stretch,
     turn_per_revolution,
 )
+from daqsvc.rotor.synchronous.speed_law import SpeedLaw, learn
 from daqsvc.rotor.synchronous.vectors import HARMONICS, Healthy
 
 if TYPE_CHECKING:
@@ -69,6 +70,7 @@ class Calibration:
         noise_variance: relative variance of that from revolution to revolution.
         samples_per_rev: usable samples in a revolution.
         fit_error: what a Laval rotor leaves unexplained of a run-up, relative; None if there was none.
+        law: how the vector follows the speed beyond what the rotor predicts; None where the speed was steady.
     """
 
     rotor: LavalRotor
@@ -80,6 +82,7 @@ class Calibration:
     noise_variance: float
     samples_per_rev: float
     fit_error: float | None = None
+    law: SpeedLaw | None = None
 
     @property
     def speed_rad_s(self) -> float:
@@ -143,6 +146,7 @@ class Calibration:
             (_FLOOR * self.amplitude_um) ** 2,
             speed_slope=slope,
             amplitude_um=self.amplitude_um,
+            law=self.law,
         )
 
     @property
@@ -184,11 +188,16 @@ class Calibration:
 
 
 def compensated(
-    vectors: SynchronousVectors, rotor: LavalRotor, speed_rad_s: float, rate_hz: float
+    vectors: SynchronousVectors,
+    rotor: LavalRotor,
+    speed_rad_s: float,
+    rate_hz: float,
+    law: SpeedLaw | None = None,
 ) -> tuple[Complexes, Floats]:
     """Vectors with 1X brought to one speed, and each revolution's relative deviation from it.
 
-    1X itself moves with the speed; the slope d ln H / d ln Omega of the rotor takes that out to first order.
+    1X itself moves with the speed; the slope d ln H / d ln Omega of the rotor takes that out to first order,
+    and what was learnt of this machine (``law``) the rest.
 
     Returns:
         complex128 ``[R, 5]`` and float64 ``[R]``.
@@ -199,6 +208,8 @@ def compensated(
     moved = vectors.vectors.copy()
     moved[:, 1] /= 1.0 + slope * deviation
     moved[:, 2] /= 1.0 + slope.conjugate() * deviation
+    if law is not None:
+        moved -= np.outer(deviation, law.slopes_um)
     return moved, deviation
 
 
@@ -225,8 +236,13 @@ def calibrate(
         )
     speed_rad_s = float(2.0 * math.pi * rate_hz / vectors.period_samples.mean())
     moved, deviation = compensated(vectors, rotor, speed_rad_s, rate_hz)
-    baseline = moved.mean(axis=0)
     samples = float(vectors.samples.mean())
+    law = learn(
+        moved, deviation, np.full(5, float(vectors.noise.mean()) / samples), *rotor.speed_slope(speed_rad_s)
+    )
+    if law is not None:
+        moved, deviation = compensated(vectors, rotor, speed_rad_s, rate_hz, law)
+    baseline = moved.mean(axis=0)
     amplitude = float(np.sqrt(np.sum(np.abs(baseline[1:]) ** 2)))
     noise = max(float(vectors.noise.mean()), (_NOISE_FLOOR * amplitude) ** 2)
     white = noise / samples
@@ -235,7 +251,7 @@ def calibrate(
     nonstationary = nonstationarity(
         moved, np.maximum(vectors.noise, (_NOISE_FLOOR * amplitude) ** 2), vectors.samples, baseline
     )
-    _refuse_unsteady(moved, white, rotor, speed_rad_s, deviation, samples, assumed=angle_assumed)
+    _refuse_unsteady(moved, white, rotor, speed_rad_s, deviation, samples, law, assumed=angle_assumed)
     _refuse_nonstationary(nonstationary, samples, 0.0 if angle_assumed else amplitude * math.pi / samples)
     relative = nonstationary / nonstationary.mean()
     freedom = 1.0 / max(samples - 5.0, 1.0)
@@ -248,6 +264,7 @@ def calibrate(
         noise=float(nonstationary.mean()),
         noise_variance=max(freedom, float(relative.var(ddof=1))),
         samples_per_rev=samples,
+        law=law,
     )
 
 
@@ -304,6 +321,7 @@ def _refuse_unsteady(
     speed_rad_s: float,
     deviation: Floats,
     samples: float,
+    law: SpeedLaw | None,
     *,
     assumed: bool,
 ) -> None:
@@ -316,12 +334,15 @@ def _refuse_unsteady(
         speed_rad_s: mean speed.
         deviation: float64 ``[R]``, relative deviation of every revolution's speed.
         samples: samples in a revolution.
+        law: how the vector follows the speed, where that was learnt.
         assumed: whether the angle rests on a stated speed.
     """
     amplitude = float(np.median(np.abs(moved[:, 1])))
     memory, floor = _memory(rotor, speed_rad_s), (_FLOOR * amplitude) ** 2
     _, slope = rotor.speed_slope(speed_rad_s)
     guard = amplitude * slope * deviation
+    if law is not None:
+        guard, floor = float(law.spread_um.max()) * deviation, floor + float(law.bend_um.max()) ** 2
     jitter_rad = 0.0 if assumed else _EDGE_SAMPLES * 2.0 * math.pi / samples
     odd = oddest_stretch(moved, white, memory, floor, guard, jitter_rad)
     if odd.nats <= VECTOR_NATS:

@@ -28,6 +28,8 @@ from daqsvc.rotor.synchronous.vectors import HARMONICS
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from daqsvc.rotor.synchronous.speed_law import SpeedLaw
+
     Complexes = NDArray[np.complex128]
     Floats = NDArray[np.float64]
 
@@ -74,6 +76,7 @@ class Spread:
         drift: um^2, variance of the mean position that is the probes', not the shaft's.
         turn_rad: standard deviation of what the angle turns against the shaft in a revolution, where a
             stated speed replaces a keyphasor.
+        law: how the vector follows the speed, where that was learnt; takes the place of ``speed_slope``.
     """
 
     variance: Floats
@@ -84,6 +87,7 @@ class Spread:
     amplitude_um: float = 0.0
     drift: float = 0.0
     turn_rad: float = 0.0
+    law: SpeedLaw | None = None
 
     def of_means(
         self,
@@ -102,7 +106,11 @@ class Spread:
         """
         share = np.asarray(1.0 / np.asarray(revolutions) + 1.0 / np.asarray(reference))[..., np.newaxis]
         variance = self.variance * share + self.floor
-        guard = (self.amplitude_um * self.speed_slope * np.asarray(speed)) ** 2
+        slope = 0.0 if self.law is not None else self.speed_slope
+        if self.law is not None:
+            variance = variance + (self.law.spread_um * np.asarray(speed)[..., np.newaxis]) ** 2
+            variance = variance + self.law.bend_um**2
+        guard = (self.amplitude_um * slope * np.asarray(speed)) ** 2
         guard = guard + (self.amplitude_um * self.turn_rad * np.asarray(apart)) ** 2
         variance[..., 1] += guard
         variance[..., 2] += guard

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 
 from daqsvc.rotor.laval import compliance, unbalance_response
+from daqsvc.rotor.synchronous.contact import fills_clearance, has_marks, marks_would_show
 from daqsvc.rotor.synchronous.vectors import (
     BACKWARD,
     DC,
@@ -60,6 +61,10 @@ RotorFault: TypeAlias = Literal[
 ]
 """Verdicts about a rotor."""
 
+_ORDER: tuple[RotorFault, ...] = (
+    "normal", "unbalance", "damping_loss", "static_load", "stiffness_loss", "rub", "unmodelled",
+)  # fmt: skip
+
 UNMODELLED_NATS = 6.0
 
 _LEAK = 0.01
@@ -68,13 +73,24 @@ _LEAK = 0.01
 _STIFFNESS_LOSSES = np.geomspace(0.02, 1.2, 24)
 """1 / k - 1 of the stiffness losses looked for."""
 _STIFFNESS_TOLERANCE = 0.3
+_FOLLOWS = np.array([0.1, 0.3])
+"""Parts of a shift by which 1X may follow it where supports are stiffer the more they carry."""
+_FOLLOWING_NATS = 1.0
 _GENERIC_STIFFNESS_NATS = 2.0
 """What stiffness loss pays where no model ties mean position and 1X together."""
+_SINKS = np.geomspace(0.02, 1.5, 12)
+"""Parts of the sag that a shaft sinks by where no model tells how much of it is due to the softer part ..."""
+_SINKS_ASIDE = np.radians([-50.0, -25.0, 0.0, 25.0, 50.0])
+"""... and angles off the vertical: an oil film gives way aside, too."""
+_SINKS_WITHIN = 0.25
 _STIFFNESS_DAMPING = np.array([0.0, 1.8])
 """A softer support also damps more: relative increase per 1 / k - 1, up to `_MOST_DAMPING`."""
 _MOST_DAMPING = 1.6
 
-_RUB_FULL_CLEARANCE = 0.9
+_NO_CONTACT_NATS = 12.0
+"""What a rub stays behind all others where its harmonics would be seen and are not."""
+_HIDDEN_CONTACT_NATS = 1.0
+"""The same where noise may hide them: a rub stays in the group, but is not the first of it."""
 
 _DAMPING_LEFT = np.geomspace(0.03, 0.97, 40)
 _DAMPING_FREQUENCY = np.array([0.92, 0.96, 1.0, 1.015])
@@ -84,7 +100,7 @@ _DAMPING_TOLERANCE = 0.05
 
 
 def likelihoods(
-    change: Complexes, variance: Floats, healthy: Healthy, position: Complexes
+    change: Complexes, variance: Floats, healthy: Healthy, position: Complexes, *, shaken: bool = False
 ) -> dict[RotorFault, float]:
     """Log marginal likelihood ratio of every hypothesis against "normal", in nats.
 
@@ -93,6 +109,7 @@ def likelihoods(
         variance: float64 ``[5]``, complex variance of each component of it, um^2.
         healthy: the machine before.
         position: complex128 ``[5]``, the present synchronous vector in um, for the clearance.
+        shaken: whether motion came with the change that does not repeat with the shaft.
     """
     normal = float(log_density(change, variance).sum())
     scores: dict[RotorFault, float] = {"normal": normal}
@@ -101,13 +118,15 @@ def likelihoods(
     scores["damping_loss"] = _damping_loss(change, variance, healthy) + half
     scores["static_load"] = _static_load(change, variance, healthy)
     scores["stiffness_loss"] = _stiffness_loss(change, variance, healthy)
-    scores["rub"] = _rub(change, variance, healthy, position)
     scores["unmodelled"] = float(
         np.logaddexp(
             _unmodelled(change, variance, healthy) - UNMODELLED_NATS, crack(change, variance, healthy) - 1.0
         )
     )
-    return {name: score - normal for name, score in scores.items()}
+    scores["rub"], behind = _rub(change, variance, healthy, position, shaken=shaken)
+    if behind:
+        scores["rub"] = min(scores["rub"], max(scores[name] for name in scores.keys() - {"rub"}) - behind)
+    return {name: scores[name] - normal for name in _ORDER}
 
 
 def damping_misfit(change: Complexes, variance: Floats, healthy: Healthy) -> float:
@@ -192,7 +211,21 @@ def _damped(healthy: Healthy) -> tuple[Complexes, Complexes]:
 def _static_load(change: Complexes, variance: Floats, healthy: Healthy) -> float:
     score = _still(change, variance, abs(change[DC]))
     score[DC] = _free(change[DC], variance[DC], healthy.amplitude_um)
+    if not healthy.laval:
+        # An oil film that carries more is stiffer: the orbit follows, by a part of the way that the shaft went.
+        way = min(abs(change[DC]), healthy.amplitude_um)
+        for k in (FORWARD, BACKWARD):
+            follows = log_density(np.full(2, change[k]), variance[k] + (_FOLLOWS * way) ** 2)
+            score[k] = np.logaddexp(score[k], log_mean(follows) - _FOLLOWING_NATS)
     return float(score.sum())
+
+
+def _sunk(change: complex, variance: float, healthy: Healthy) -> float:
+    """Log density of the mean position where some support, nobody knows which, gives way under the weight."""
+    sag_um = max(healthy.rotor.sag_um, 1e-6)
+    depth, aside = np.meshgrid(_SINKS, _SINKS_ASIDE, indexing="ij")
+    moved = (-1j * sag_um * depth * np.exp(1j * aside)).ravel()
+    return log_mean(log_density(change - moved, variance + (_SINKS_WITHIN * np.abs(moved)) ** 2))
 
 
 def _stiffness_loss(change: Complexes, variance: Floats, healthy: Healthy) -> float:
@@ -204,8 +237,12 @@ def _stiffness_loss(change: Complexes, variance: Floats, healthy: Healthy) -> fl
         backward = np.logaddexp(
             score[BACKWARD], _free(change[BACKWARD], variance[BACKWARD], healthy.amplitude_um)
         ) - math.log(2.0)
-        both = [_free(change[k], variance[k], healthy.amplitude_um) for k in (DC, FORWARD)]
-        return rest - float(score[BACKWARD]) + float(backward) + sum(both) - _GENERIC_STIFFNESS_NATS
+        sunk = _sunk(change[DC], variance[DC], healthy)
+        # Far above the critical speed 1X hardly knows of the supports.
+        turned = np.logaddexp(
+            score[FORWARD], _free(change[FORWARD], variance[FORWARD], healthy.amplitude_um)
+        ) - math.log(2.0)
+        return rest - float(score[BACKWARD]) + float(backward) + sunk + float(turned) - _GENERIC_STIFFNESS_NATS
     omega, zeta = healthy.rotor.box
     loss, point, more = (
         axis.ravel()
@@ -226,21 +263,17 @@ def _stiffness_loss(change: Complexes, variance: Floats, healthy: Healthy) -> fl
     return rest + log_mean(total)
 
 
-def _rub(change: Complexes, variance: Floats, healthy: Healthy, position: Complexes) -> float:
+def _rub(
+    change: Complexes, variance: Floats, healthy: Healthy, position: Complexes, *, shaken: bool
+) -> tuple[float, float]:
+    """Likelihood of a rub, and nats by which it must stay behind all others where no mark of contact shows."""
     pulse = rub_pulse(change, variance, healthy)
-    clearance_um = healthy.rotor.clearance_um
-    if clearance_um is None:
-        return pulse
-    theta = 2.0 * math.pi * np.arange(64) / 64.0
-    orbit = np.exp(1j * np.outer(theta, HARMONICS)) @ position
-    others = [i for i in range(5) if i != FORWARD]
-    beyond_1x = (
-        np.abs(change[others]) ** 2 > 9.0 * variance[others] + (2.0 * _LEAK * healthy.amplitude_um) ** 2
-    )
-    if np.abs(orbit).max() > _RUB_FULL_CLEARANCE * clearance_um and beyond_1x.any():
+    if fills_clearance(position, change, variance, healthy):
         # An orbit that fills the clearance touches, whatever shape it has by then.
-        return max(pulse, _unmodelled(change, variance, healthy) + UNMODELLED_NATS)
-    return pulse
+        return max(pulse, _unmodelled(change, variance, healthy) + UNMODELLED_NATS), 0.0
+    if shaken or has_marks(change, variance):
+        return pulse, 0.0
+    return pulse, _NO_CONTACT_NATS if marks_would_show(change, variance) else _HIDDEN_CONTACT_NATS
 
 
 def _unmodelled(change: Complexes, variance: Floats, healthy: Healthy) -> float:
@@ -385,6 +418,9 @@ def _facing(force: Complexes, place: Complexes) -> Floats:
 _GENERIC_RUB_MARGIN_NATS = 12.0
 _ENERGY_NATS = 12.0
 _MOST_ENERGY_NATS = 100.0
+_MISFIT = 0.005
+"""Part of the evidence of a change that the shape of a rub's pulse may be off by: where no rotor model fits to the
+last digit, a few nats of thousands say nothing."""
 _RIVALS = frozenset(("rub", "unmodelled"))
 
 
@@ -467,18 +503,16 @@ def identify(
         energy: of the present segment; motion that does not repeat with the shaft (whirl, repeated
             impacts) is what no linear fault makes.
     """
-    scores = likelihoods(change, variance, healthy.healthy, healthy.baseline + change)
+    amplitude = healthy.healthy.amplitude_um
+    least = (rules.least_severity * amplitude) ** 2
+    shaken = energy is not None and energy.nats > _ENERGY_NATS and energy.excess > least
+    scores = likelihoods(change, variance, healthy.healthy, healthy.baseline + change, shaken=shaken)
     model_holds = comparison is not None and comparison.holds(complex(change[1]))
     if comparison is not None and model_holds:
         scores["damping_loss"] += min(0.0, comparison.damping_nats)
         scores["unbalance"] += min(0.0, -comparison.damping_nats)
-    amplitude = healthy.healthy.amplitude_um
     square = float(np.sum(np.abs(change) ** 2))
-    if (
-        energy is not None
-        and energy.nats > _ENERGY_NATS
-        and energy.excess > (rules.least_severity * amplitude) ** 2
-    ):
+    if energy is not None and shaken:
         square += energy.excess
         unexplained = min(energy.nats, _MOST_ENERGY_NATS)
         # A rub shakes the rotor besides; but what leaves no mark of a rub on the vector is noise or whirl.
@@ -535,6 +569,9 @@ def _group(
         return rules.margin_nats
 
     close = [name for name in scores if scores[best] - scores[name] < margin(name)]
+    doubt = max(margin("rub"), _MISFIT * scores[best])
+    if best == "unmodelled" and "rub" not in close and scores[best] - scores["rub"] < doubt:
+        close.append("rub")
     if "normal" in close and best != "normal":
         close.remove("normal")
     return tuple(sorted(close, key=lambda name: -scores[name]))

@@ -147,6 +147,7 @@ def _power(powers: Sequence[Complexes], k: int) -> Complexes:
 
 
 DC, FORWARD, BACKWARD = (HARMONICS.index(k) for k in (0, 1, -1))
+TWICE = [HARMONICS.index(k) for k in (2, -2)]
 
 SPREADS = np.array([0.1, 0.3, 1.0, 3.0])
 """Sizes that a change may have, in parts of the healthy orbit."""

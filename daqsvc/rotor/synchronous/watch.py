@@ -243,7 +243,9 @@ class RotorWatch:
     def _take(self, one: SynchronousVectors) -> WatchReport:
         if self.calibration is None:
             return self._calibrate(one)
-        moved, speed = compensated(one, self.rotor, self.calibration.speed_rad_s, self.rate_hz)
+        moved, speed = compensated(
+            one, self.rotor, self.calibration.speed_rad_s, self.rate_hz, self.calibration.law
+        )
         nonstationary = float(
             nonstationarity(moved, one.noise, one.samples, self.calibration.baseline, self._previous)[0]
         )

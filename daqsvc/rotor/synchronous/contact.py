@@ -1,0 +1,74 @@
+"""Marks of contact: what a rub leaves on an orbit and no linear change of the rotor can.
+
+A support that gives way, a load, more unbalance, less damping: all of them leave the rotor linear, and a linear
+rotor that turns steadily moves at 0 and 1 times its speed only. Backward 1X is no mark: a support that is softer
+in one direction makes it. Contact pushes for a part of each revolution, so it leaves harmonics. Where they do not
+stand out, a change that the pulse of a rub happens to fit is no rub.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daqsvc.rotor.synchronous.vectors import BACKWARD, DC, FORWARD, HARMONICS, TWICE, Healthy
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Complexes = NDArray[np.complex128]
+    Floats = NDArray[np.float64]
+
+_LEAST_NATS = 6.0
+"""Both senses of 2X together pass this by chance once in 60 looks."""
+_LINEAR_2X = 0.003
+"""Part of a change that a linear rotor leaves at 2X, by runout that is resampled."""
+_FILLED = 0.9
+"""Part of the clearance beyond which an orbit touches, whatever shape it has by then."""
+_BEYOND_1X = 0.02
+"""Part of the healthy whirl that must move besides forward 1X where the clearance is filled."""
+_ORBIT_POINTS = 64
+_VISIBLE = 3.0
+
+
+def has_marks(change: Complexes, variance: Floats) -> bool:
+    """Whether harmonics came with a change.
+
+    Args:
+        change: complex128 ``[5]``, in the order of `HARMONICS`, um.
+        variance: float64 ``[5]``, um^2.
+    """
+    moved = float(np.abs(change).max())
+    twice = np.abs(change[TWICE]) ** 2 / (variance[TWICE] + (_LINEAR_2X * moved) ** 2)
+    return float(twice.sum()) > _LEAST_NATS
+
+
+def marks_would_show(change: Complexes, variance: Floats) -> bool:
+    """Whether noise is low enough that the harmonics of a rub of this size would stand out.
+
+    Args:
+        change: complex128 ``[5]``, um.
+        variance: float64 ``[5]``, um^2.
+    """
+    moved = float(np.abs(change[[FORWARD, BACKWARD]]).max())
+    return bool(_VISIBLE * np.sqrt(float(variance[TWICE].max())) < _LINEAR_2X * moved)
+
+
+def fills_clearance(position: Complexes, change: Complexes, variance: Floats, healthy: Healthy) -> bool:
+    """Whether the orbit reaches the wall, and more than forward 1X has moved.
+
+    Args:
+        position: complex128 ``[5]``, the present synchronous vector, um.
+        change: complex128 ``[5]``, um.
+        variance: float64 ``[5]``, um^2.
+        healthy: the machine before.
+    """
+    clearance_um = healthy.rotor.clearance_um
+    if clearance_um is None:
+        return False
+    others = [DC, BACKWARD, *TWICE]
+    least = 9.0 * variance[others] + (_BEYOND_1X * healthy.amplitude_um) ** 2
+    theta = 2.0 * np.pi * np.arange(_ORBIT_POINTS) / _ORBIT_POINTS
+    orbit = np.exp(1j * np.outer(theta, HARMONICS)) @ position
+    return bool(np.abs(orbit).max() > _FILLED * clearance_um and (np.abs(change[others]) ** 2 > least).any())

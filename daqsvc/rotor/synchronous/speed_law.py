@@ -1,0 +1,77 @@
+"""How the synchronous vector of one machine follows its speed, learnt while the speed hunts.
+
+Near a critical speed 1 % of speed moves 1X by a tenth of itself. What the stated rotor predicts of that is taken out
+beforehand (`daqsvc.rotor.synchronous.baseline.compensated`); what it does not, because frequency and damping
+are known roughly, or because the machine is no Laval rotor, is a line through the revolutions of the calibration:
+
+    Z_k(Omega) = b_k + s_k (Omega / Omega_0 - 1)
+
+The slopes have a prior: nothing beyond what the rotor's tolerances allow. A speed that does not move teaches nothing,
+and the prior stays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daqsvc.rotor.synchronous.vectors import BACKWARD, FORWARD
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Complexes = NDArray[np.complex128]
+    Floats = NDArray[np.float64]
+
+_LEAST_HUNTING = 1e-3
+"""Standard deviation of the relative speed below which nothing is learnt."""
+_MODEL_DOUBT = 2.0
+"""Standard deviation of a slope that no rotor's figures tell, in parts of the one that they do."""
+
+
+@dataclass(frozen=True, slots=True)
+class SpeedLaw:
+    """What was learnt.
+
+    Attributes:
+        slopes_um: complex128 ``[5]``, s_k: um for a relative change of speed of 1.
+        spread_um: float64 ``[5]``, standard deviation of each.
+        bend_um: float64 ``[5]``, what the line is off by at most within the speeds that it was learnt from.
+    """
+
+    slopes_um: Complexes
+    spread_um: Floats
+    bend_um: Floats
+
+
+def learn(
+    moved: Complexes, deviation: Floats, variance: Floats, slope: complex, slope_spread: float
+) -> SpeedLaw | None:
+    """Fit the line; None where the speed does not hunt.
+
+    Args:
+        moved: complex128 ``[R, 5]``, vectors with what the stated rotor predicts taken out, um.
+        deviation: float64 ``[R]``, relative speed of each revolution.
+        variance: float64 ``[5]``, variance of one revolution's vector, um^2.
+        slope: d ln Z_1 / d ln Omega of the stated rotor.
+        slope_spread: standard deviation of it over the rotor's tolerances.
+    """
+    away = deviation - deviation.mean()
+    if float(np.sqrt((away**2).mean())) < _LEAST_HUNTING:
+        return None
+    mean = moved.mean(axis=0)
+    whirl = float(np.hypot(abs(mean[FORWARD]), abs(mean[BACKWARD])))
+    prior = np.zeros(len(mean))
+    prior[[FORWARD, BACKWARD]] = whirl * np.hypot(slope_spread, _MODEL_DOUBT * abs(slope))
+    weight = np.divide(variance, prior**2, out=np.full(len(mean), np.inf), where=prior > 0.0)
+    slopes = (away @ (moved - mean)) / ((away**2).sum() + weight)
+    spread = np.sqrt(variance / ((away**2).sum() + weight))
+    turned = np.zeros(len(mean), dtype=np.complex128)
+    turned[[FORWARD, BACKWARD]] = (slope * mean[FORWARD], np.conj(slope) * mean[BACKWARD])
+    steep = np.abs(turned + slopes)
+    furthest = float(np.abs(away).max())
+    # The next term of the series of a resonance is as much smaller as this one is than the whole.
+    bend = (steep * furthest) ** 2 / max(whirl, 1e-12)
+    return SpeedLaw(slopes, spread, bend)
