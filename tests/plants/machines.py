@@ -280,7 +280,9 @@ class Machine:
     disc_masses_kg: tuple[float, ...] = field(default=())
 
 
-def _film(support: Support, condition: Condition, speed_rad_s: float, load_n: float) -> ross.CylindricalBearing:
+def _film(
+    support: Support, condition: Condition, speed_rad_s: float, load_n: float
+) -> ross.CylindricalBearing:
     assert support.journal is not None
     film = support.journal
     return ross.CylindricalBearing(
@@ -304,7 +306,9 @@ class Model:
 
     def _rotor(self, condition: Condition, speed_rad_s: float, loads: Sequence[float]) -> ross.Rotor:
         g = self.geometry
-        shaft = [ross.ShaftElement(length, 0.0, diameter, material=self._steel) for length, diameter in g.shaft]
+        shaft = [
+            ross.ShaftElement(length, 0.0, diameter, material=self._steel) for length, diameter in g.shaft
+        ]
         discs = [
             ross.DiskElement.from_geometry(n=n, material=self._steel, width=w, i_d=g.shaft[0][1], o_d=d)
             for n, w, d in g.discs
@@ -364,7 +368,10 @@ class Model:
             [6 * node + i for node in range(nodes) for i in _KEPT]
             + [d for d in range(6 * nodes, rotor.ndof) if (d - 6 * nodes) % 3 < 2]
         )
-        full = [np.asarray(m)[np.ix_(kept, kept)] for m in (rotor.M(), rotor.K(speed_rad_s), rotor.C(speed_rad_s), rotor.G())]
+        full = [
+            np.asarray(m)[np.ix_(kept, kept)]
+            for m in (rotor.M(), rotor.K(speed_rad_s), rotor.C(speed_rad_s), rotor.G())
+        ]
         mass, stiffness, damping, gyroscopic = full
         where = {int(d): i for i, d in enumerate(kept)}
 
@@ -404,8 +411,12 @@ class Model:
             if support.journal is None:
                 continue
             film = _film(support, condition, speed_rad_s, loads[i])
-            eccentricity = float(np.ravel(film.eccentricity)[0]) * support.journal.clearance_m * condition.clearance
-            stands = eccentricity * np.exp(1j * (float(np.ravel(film.attitude_angle)[0]) - np.pi / 2.0 + angles[i]))
+            eccentricity = (
+                float(np.ravel(film.eccentricity)[0]) * support.journal.clearance_m * condition.clearance
+            )
+            stands = eccentricity * np.exp(
+                1j * (float(np.ravel(film.attitude_angle)[0]) - np.pi / 2.0 + angles[i])
+            )
             x, y = places[f"support {i} x"], places[f"support {i} y"]
             k = np.array([[film.kxx[0], film.kxy[0]], [film.kyx[0], film.kyy[0]]])
             carries = loads[i] * np.exp(1j * (angles[i] + np.pi / 2.0))
@@ -424,7 +435,9 @@ class Model:
             places={name: row @ basis for name, row in places.items()},
             bending_n_m=211e9 * np.pi / 64.0 * diameter_m**4 / element_m,
             weight_n=rotor_weight,
-            disc_masses_kg=tuple(7810.0 * np.pi / 4.0 * (d**2 - g.shaft[0][1] ** 2) * w for _, w, d in g.discs),
+            disc_masses_kg=tuple(
+                7810.0 * np.pi / 4.0 * (d**2 - g.shaft[0][1] ** 2) * w for _, w, d in g.discs
+            ),
         )
 
     def _shapes(self, mass: Floats, stiffness: Floats, places: dict[str, Floats]) -> Floats:
@@ -434,7 +447,9 @@ class Model:
             _, modes = scipy.linalg.eigh(even, mass)
             bent = np.linalg.solve(even, np.stack(list(places.values()), axis=1))
             candidates = np.hstack((modes[:, :_MODES], bent / np.linalg.norm(bent, axis=0)))
-            left, size, _ = np.linalg.svd(candidates / np.linalg.norm(candidates, axis=0), full_matrices=False)
+            left, size, _ = np.linalg.svd(
+                candidates / np.linalg.norm(candidates, axis=0), full_matrices=False
+            )
             basis = left[:, size > 1e-6 * size[0]]
             # Without a scale of their own the shapes make badly conditioned matrices.
             small = basis.T @ mass @ basis
@@ -443,6 +458,7 @@ class Model:
 
     def first_critical(self) -> tuple[float, float]:
         """Speed of the largest forward 1X by unbalance, rad/s, and damping ratio by the width of that peak."""
+
         def size(speed_rad_s: float) -> float:
             machine = self.machine(Condition(), speed_rad_s)
             return abs(forward(machine, self.geometry, speed_rad_s)) / speed_rad_s**2
@@ -483,7 +499,10 @@ def stable(machine: Machine) -> bool:
     state = np.block(
         [
             [np.zeros((n, n)), np.eye(n)],
-            [-np.linalg.solve(machine.mass, machine.stiffness), -np.linalg.solve(machine.mass, machine.damping)],
+            [
+                -np.linalg.solve(machine.mass, machine.stiffness),
+                -np.linalg.solve(machine.mass, machine.damping),
+            ],
         ]
     )
     return bool(np.linalg.eigvals(state).real.max() < 0.0)

@@ -96,7 +96,8 @@ class Bench:
         )
         self.whirl_m = self.seen(self.unbalance, 1)
         rest = complex(
-            self.healthy.rest @ self.healthy.places["probe x"], self.healthy.rest @ self.healthy.places["probe y"]
+            self.healthy.rest @ self.healthy.places["probe x"],
+            self.healthy.rest @ self.healthy.places["probe y"],
         )
         self.clearance_um = 1e6 * (2.0 * abs(rest) + 5.0 * self.whirl_m)
 
@@ -159,7 +160,8 @@ def _bow(b: Bench, rng: np.random.Generator) -> Fault:
     row = b.healthy.places["rub x"] - 1j * b.healthy.places["rub y"]
     force = size * b.whirl_m / b.seen(row, 1) * np.exp(2j * np.pi * rng.random()) * row
     return size, [
-        b.stage(ONSET_REV + 20.0 * part, turning=b.turning(part * force)) for part in np.linspace(0.1, 1.0, 10)
+        b.stage(ONSET_REV + 20.0 * part, turning=b.turning(part * force))
+        for part in np.linspace(0.1, 1.0, 10)
     ]
 
 
@@ -247,7 +249,9 @@ def _misaligned(b: Bench, rng: np.random.Generator, place: str) -> Fault:
     size = rng.uniform(0.2, 0.6)
     row = b.healthy.places[f"{place} x"] - 1j * b.healthy.places[f"{place} y"]
     turned = row * np.exp(2j * np.pi * rng.random())
-    twice, once = (part * size * b.whirl_m / b.seen(row, order) * turned for part, order in ((1.0, 2), (0.4, 1)))
+    twice, once = (
+        part * size * b.whirl_m / b.seen(row, order) * turned for part, order in ((1.0, 2), (0.4, 1))
+    )
     forces = b.turning(once, twice)
     forces[0] = 0.5 * float(np.abs(twice).max() / np.abs(row).max()) * b.healthy.places[f"{place} y"]
     return size, [b.stage(ONSET_REV, turning=forces)]
@@ -306,7 +310,9 @@ FAULTS: dict[str, Callable[[Bench, np.random.Generator], Fault]] = {
     "coupled 2X": _coupled_2x,
 }
 _NEEDS_OIL = frozenset({"bearing wear", "thin oil"})
-TWICE = frozenset({"unbalance", "damping loss", "both supports softer", "static load", "light rub", "heavy rub"})
+TWICE = frozenset(
+    {"unbalance", "damping loss", "both supports softer", "static load", "light rub", "heavy rub"}
+)
 """Faults of the paper: two records of each, with other figures."""
 
 

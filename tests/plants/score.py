@@ -122,7 +122,7 @@ class Said:
     def told(self) -> bool:
         """Whether the truth is the name or in the group."""
         truth = TRUTH[self.fault]
-        return bool(self.names & (ONLY_1X if truth <= ONLY_1X else truth))
+        return bool(self.names & (max(ONLY_1X, truth)))
 
     @property
     def wrong(self) -> bool:
@@ -142,7 +142,9 @@ def samples_of(record: Path, snr_db: int, onset_rev: float, seed: int) -> NDArra
         columns.append(probe + noise * rng.standard_normal(len(z)))
     # The angle begins anywhere; a notch that passes pulls the voltage down, and its end marks angle zero.
     past = np.mod(angle + _KEYPHASOR_WIDTH_RAD, 2.0 * np.pi)
-    edge = np.interp(past, [0.0, 0.1, _KEYPHASOR_WIDTH_RAD - 0.1, _KEYPHASOR_WIDTH_RAD + 0.1, 6.2], [-2, -10, -10, -2, -2])
+    edge = np.interp(
+        past, [0.0, 0.1, _KEYPHASOR_WIDTH_RAD - 0.1, _KEYPHASOR_WIDTH_RAD + 0.1, 6.2], [-2, -10, -10, -2, -2]
+    )
     columns.append(edge + 0.02 * rng.standard_normal(len(z)))
     return np.stack(columns, axis=1).astype(np.float32)
 
@@ -186,14 +188,23 @@ def _window(samples: NDArray[np.float32], first_index: int, rate_hz: float) -> W
 
 
 def _summed(
-    case: dict[str, object], snr_db: int, said: Sequence[Diagnosis], refused: str, onset: float, *, healthy: bool
+    case: dict[str, object],
+    snr_db: int,
+    said: Sequence[Diagnosis],
+    refused: str,
+    onset: float,
+    *,
+    healthy: bool,
 ) -> Said:
     until = np.inf if healthy else onset
     before, alarms, delay = "", 0, None
     for diagnosis in said:
         at = diagnosis.end_index / PER_REV
         # A machine that has already been called changed does not depart once more when it gets a name.
-        left = before in {"", "undetermined", "normal"} and diagnosis.decision not in {"undetermined", "normal"}
+        left = before in {"", "undetermined", "normal"} and diagnosis.decision not in {
+            "undetermined",
+            "normal",
+        }
         if left and at <= until:
             alarms += 1
         elif at > until and delay is None and diagnosis.decision not in {"undetermined", "normal"}:

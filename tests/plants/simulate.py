@@ -161,7 +161,9 @@ def move(stages: Sequence[Stage], speed_rad_s: float, revolutions: int, hunting:
         state,
     )
     kept = slice(_SETTLING_REV * PER_REV, None)
-    turned = 2.0 * math.pi * (at_rev + depth * period / (2.0 * math.pi) * np.sin(2.0 * math.pi * at_rev / period))
+    turned = (
+        2.0 * math.pi * (at_rev + depth * period / (2.0 * math.pi) * np.sin(2.0 * math.pi * at_rev / period))
+    )
     return Motion(
         seen[kept, 0] + 1j * seen[kept, 1], seen[kept, 2] + 1j * seen[kept, 3], turned[kept], rate_hz
     )
@@ -183,7 +185,7 @@ def _parameters(stage: Stage) -> Floats:
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _run(propagators, forced, statics, turning, parameters, which, angle, rows, state):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202, PLR0913
+def _run(propagators, forced, statics, turning, parameters, which, angle, rows, state):  # type: ignore[no-untyped-def]
     samples = len(which)
     n = statics.shape[1]
     seen = np.empty((samples, 4))

@@ -151,6 +151,69 @@ def test_an_elliptic_orbit_grows_in_both_senses_with_the_unbalance():
     assert scores["unbalance"] - scores["unmodelled"] > 5.0
 
 
+def test_a_change_without_harmonics_is_never_a_rub_first():
+    """Mean position, forward and backward 1X fit the pulse of a rub within its tolerance: that is no contact."""
+    machine = healthy(laval=False, ellipticity=0.4)
+    angle = math.radians(140.0)
+    machine.baseline[0] = 0.3 * machine.baseline[1] * np.exp(1j * angle)
+    pushed = pulse(angle, wall_at(angle, machine, 6.0))
+    assert judged(pushed, machine)[0] == "rub"
+    linear = pushed.copy()
+    linear[3:] = 0.0
+    assert judged(linear, machine)[0] != "rub"
+    seen = np.full(5, (0.0005 * abs(pushed[1])) ** 2)
+    _, scores = judged(linear, machine, seen)
+    assert max(scores.values()) - scores["rub"] > 10.0
+    # Where noise may hide the harmonics the rub stays in the group.
+    hidden = np.full(5, (0.1 * abs(pushed[1])) ** 2)
+    best, scores = judged(linear, machine, hidden)
+    assert best != "rub"
+    assert max(scores.values()) - scores["rub"] < 5.0
+
+
+def test_motion_that_does_not_repeat_is_a_mark_of_contact():
+    machine = healthy(0.6)
+    angle = math.radians(140.0)
+    machine.baseline[0] = 0.3 * machine.baseline[1] * np.exp(1j * angle)
+    linear = pulse(angle, wall_at(angle, machine, 6.0), 0.6, width=1.0)
+    linear[3:] = 0.0
+    hidden = np.full(5, (0.1 * np.abs(linear).max()) ** 2)
+    quiet, loud = (
+        likelihoods(linear, hidden, machine, machine.baseline + linear, shaken=shaken) for shaken in (0, 1)
+    )
+    assert max(quiet, key=quiet.get) != "rub"
+    assert max(loud, key=loud.get) == "rub"
+
+
+@pytest.mark.parametrize("down_deg", [-40.0, 0.0, 40.0])
+def test_without_a_laval_rotor_a_shaft_that_sinks_may_be_softer_or_loaded(down_deg):
+    machine = healthy(laval=False, ellipticity=0.2)
+    sinks = only(0, -5.0j * np.exp(1j * math.radians(down_deg)))
+    _, scores = judged(sinks, machine)
+    assert abs(scores["static_load"] - scores["stiffness_loss"]) < 5.0
+    rises, _ = judged(-sinks, machine)
+    assert rises == "static_load"
+    # A softer support lets 1X go; a load takes it along by a part of the way only.
+    best, scores = judged(sinks + only(1, 9.0j), machine)
+    assert best == "stiffness_loss"
+    assert scores["stiffness_loss"] - scores["static_load"] > 5.0
+
+
+def test_without_a_laval_rotor_a_load_may_stiffen_the_oil_film():
+    machine = healthy(laval=False, ellipticity=0.5)
+    best, scores = judged(only(0, 8.0 + 7.0j) + only(1, 1.6) + only(-1, 1.0j), machine)
+    assert best == "static_load"
+    assert scores["static_load"] - scores["stiffness_loss"] > 5.0
+
+
+def test_1x_that_moves_alone_is_no_stiffness_loss_where_the_mean_position_is_known():
+    machine = healthy(0.7, laval=False, ellipticity=0.2)
+    still = VARIANCE.copy()
+    still[0] = (0.002 * machine.rotor.sag_um) ** 2
+    _, scores = judged(only(1, 0.6j * machine.baseline[1]), machine, still)
+    assert scores["unbalance"] - scores["stiffness_loss"] > 5.0
+
+
 def test_without_a_laval_rotor_position_and_1x_together_are_still_stiffness():
     machine = healthy(laval=False, ellipticity=0.2)
     change = only(0, 6.0 - 3.0j) + only(1, 9.0j) + only(-1, 3.0)

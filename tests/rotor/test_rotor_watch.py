@@ -140,10 +140,32 @@ def test_1x_that_follows_the_speed_is_no_fault():
         reports = watch.evaluate(synchronous_vectors(orbits(moved, NOISE_UM, 5, deviation=deviation)))
         assert watch.calibration is not None
         assert not any(report.departed for report in reports)
-    blind = replace(ROTOR, natural_frequency_tolerance=0.0, natural_frequency_hz=200.0)
+
+
+def test_a_hunting_speed_teaches_what_the_stated_rotor_does_not_know():
+    """The stated rotor is another one, and the machine's own backward whirl follows the speed, too."""
+    deviation = 0.01 * np.sin(2.0 * math.pi * np.arange(400) / 60.0)
+    moved = np.tile(with_change(backward=3.0), (400, 1))
+    follows = unbalance_response(1.0 + deviation, 0.18) / unbalance_response(1.0, 0.18)
+    moved[:, 1] *= follows
+    moved[:, 2] *= 1.0 + 6.0j * deviation
+    blind = replace(
+        ROTOR, natural_frequency_tolerance=0.05, natural_frequency_hz=1.3 * ROTOR.natural_frequency_hz
+    )
     watch = RotorWatch(blind, RATE_HZ, rules=WatchRules(retry=False))
     reports = watch.evaluate(synchronous_vectors(orbits(moved, NOISE_UM, 5, deviation=deviation)))
-    assert watch.refused or any(report.departed for report in reports)
+    assert not any(report.departed for report in reports)
+    law = watch.calibration.law
+    assert law.slopes_um[2] + np.conj(law.slopes_um[1]) * 0.0 == pytest.approx(
+        18.0j, abs=3.0 * law.spread_um[2] + 1.5
+    )
+    # At a steady speed nothing is learnt; what was learnt is no licence to move without the speed.
+    steady, _ = life((60, HEALTHY))
+    assert steady.calibration.law is None
+    moved[200:, 1] *= 1.4
+    watch = RotorWatch(blind, RATE_HZ)
+    reports = watch.evaluate(synchronous_vectors(orbits(moved, NOISE_UM, 5, deviation=deviation)))
+    assert [report.revolution for report in reports if report.departed][0] in range(201, 204)
 
 
 def test_drift_of_the_probes_is_no_static_load():

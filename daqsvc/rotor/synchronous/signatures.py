@@ -76,7 +76,7 @@ _STIFFNESS_TOLERANCE = 0.3
 _FOLLOWS = np.array([0.1, 0.3])
 """Parts of a shift by which 1X may follow it where supports are stiffer the more they carry."""
 _FOLLOWING_NATS = 1.0
-_GENERIC_STIFFNESS_NATS = 2.0
+_GENERIC_STIFFNESS_NATS = 0.5
 """What stiffness loss pays where no model ties mean position and 1X together."""
 _SINKS = np.geomspace(0.02, 1.5, 12)
 """Parts of the sag that a shaft sinks by where no model tells how much of it is due to the softer part ..."""
@@ -224,7 +224,7 @@ def _sunk(change: complex, variance: float, healthy: Healthy) -> float:
     """Log density of the mean position where some support, nobody knows which, gives way under the weight."""
     sag_um = max(healthy.rotor.sag_um, 1e-6)
     depth, aside = np.meshgrid(_SINKS, _SINKS_ASIDE, indexing="ij")
-    moved = (-1j * sag_um * depth * np.exp(1j * aside)).ravel()
+    moved: Complexes = np.asarray(-1j * sag_um * depth * np.exp(1j * aside), dtype=np.complex128).ravel()
     return log_mean(log_density(change - moved, variance + (_SINKS_WITHIN * np.abs(moved)) ** 2))
 
 
@@ -242,7 +242,9 @@ def _stiffness_loss(change: Complexes, variance: Floats, healthy: Healthy) -> fl
         turned = np.logaddexp(
             score[FORWARD], _free(change[FORWARD], variance[FORWARD], healthy.amplitude_um)
         ) - math.log(2.0)
-        return rest - float(score[BACKWARD]) + float(backward) + sunk + float(turned) - _GENERIC_STIFFNESS_NATS
+        return (
+            rest - float(score[BACKWARD]) + float(backward) + sunk + float(turned) - _GENERIC_STIFFNESS_NATS
+        )
     omega, zeta = healthy.rotor.box
     loss, point, more = (
         axis.ravel()
