@@ -81,7 +81,7 @@ def main() -> int:
     """Compare, or take; 0 if nothing differs or all was taken."""
     from guard.golden import FOLDER, TAKE, compare, take, unwanted
     from guard.parts import FAST, run
-    from guard.recordings import DATA, GROUPS, differences, keep_taken
+    from guard.recordings import DATA, GROUPS, TAKEN_ON, differences, keep_taken, processor
 
     parts = (*GROUPS, *FAST)
     parser = argparse.ArgumentParser(prog="make guard ARGS=...", description=(__doc__ or "").split("\n\n")[0])
@@ -115,6 +115,8 @@ def main() -> int:
         take(found, arguments.golden)
         for name in found:
             keep_taken(_group(name))
+        if set(chosen) >= GROUPS.keys():
+            TAKEN_ON.write_text(processor() + "\n", encoding="utf-8")
         if set(chosen) == set(parts):
             for path in unwanted(set(found), arguments.golden):
                 path.unlink()

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 DATA = Path(os.environ.get("DAQSVC_DATA", ROOT / ".." / "shared" / "data")).resolve()
 RECORDED = Path(__file__).parent / "recorded"
 CACHE = ROOT / ".cache" / "guard"
+TAKEN_ON = RECORDED / "processor"
+"""The kind of processor that the golden digests of all recordings were taken on; see `processor`."""
 NO_RECORDINGS = frozenset({".md", ".txt", ".dbc", ".png", ".yaml", ".json", ".fuck", ".pcap", ".log", ""})
 """Endings of files that are not meant for `analyze`: packet captures, logs of Zeek, descriptions."""
 _WRITTEN = re.compile(r'("written": ")[^"]*')
@@ -66,6 +68,11 @@ class Call:
         first = [] if self.machine is None else [f"machines/{self.machine}"]
         jobs = ["--jobs", "1"] if self.verb == "analyze" else []
         return [self.verb, *first, *self.recordings, *self.options, *jobs, "--json"]
+
+
+def processor() -> str:
+    """What the last digits of a digest depend on: whether there is AVX-512."""
+    return "avx512f" if " avx512f" in Path("/proc/cpuinfo").read_text(encoding="utf-8") else "no avx512f"
 
 
 def _cwru() -> Iterator[Call]:

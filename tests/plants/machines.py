@@ -1,9 +1,9 @@
 """Rotors by finite elements that share no arithmetic with the product's model (`ross-rotordynamics`).
 
-Each is reduced to the few shapes that matter: its lowest modes, and how it bends under a force where anything acts
-on it. What is left is `M q" + (C + Omega G) q' + K q = B f`, with the forces and places of `Machine`.
+Each is reduced to the few shapes that matter: its lowest modes, and how it bends under a force where
+anything acts on it. What is left is `M q" + (C + Omega G) q' + K q = f`.
 
-Runs in an environment of its own (``make plants``); nothing here imports the product.
+Runs in an environment of its own (`requirements-plants.txt`); nothing here imports the product.
 """
 
 from __future__ import annotations
@@ -336,7 +336,7 @@ class Model:
         return ross.Rotor(shaft, discs, elements, masses)
 
     def _loads(self, condition: Condition) -> tuple[list[float], list[float]]:
-        """Force on each of two supports downwards, and the angle it makes with down, by the law of the lever."""
+        """Force on each of two supports, and the angle it makes with down, by the law of the lever."""
         g = self.geometry
         places = np.concatenate(([0.0], np.cumsum([length for length, _ in g.shaft])))
         masses = np.zeros(len(places))
@@ -457,7 +457,7 @@ class Model:
         return self._basis
 
     def first_critical(self) -> tuple[float, float]:
-        """Speed of the largest forward 1X by unbalance, rad/s, and damping ratio by the width of that peak."""
+        """Speed of the largest forward 1X by unbalance, rad/s, and damping ratio by that peak's width."""
 
         def size(speed_rad_s: float) -> float:
             machine = self.machine(Condition(), speed_rad_s)

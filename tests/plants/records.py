@@ -2,8 +2,8 @@
 
     python -m plants.records FOLDER      writes one ``.npz`` a record, and ``cases.json``
 
-What is recorded is what ideal probes see; noise is for who reads it. Runout, thermal drift of the probes and hunting
-of the speed are in the records, the first in all of them.
+What is recorded is what ideal probes see; noise is for who reads it. Runout, thermal drift of the probes and
+hunting of the speed are in the records, the first in all of them.
 """
 
 from __future__ import annotations
@@ -323,7 +323,7 @@ def _vector(motion: Motion, first_rev: int, last_rev: int) -> Complexes:
 
 
 def _recorded(folder: Path, b: Bench, fault: str, copy: int) -> Case | None:
-    """Make a record; None if the machine with this fault runs away: a protection system would have stopped it."""
+    """Make a record; None if the machine with this fault runs away: its protection would have stopped it."""
     name = f"{b.geometry.name} {b.of_critical} {fault} {copy}".replace(" ", "-")
     rng = np.random.default_rng(zlib.crc32(name.encode()))
     healthy = fault == "healthy"
@@ -370,8 +370,9 @@ def _of_geometry(folder: Path, geometry: Geometry) -> list[Case]:
             if fault in _NEEDS_OIL and not oil:
                 continue
             for copy in range(2 if fault in TWICE or fault == "healthy" else 1):
-                cases.append(_recorded(folder, b, fault, copy))
-    return [case for case in cases if case is not None]
+                if case := _recorded(folder, b, fault, copy):
+                    cases.append(case)  # noqa: PERF401 - three loops in one line are not read
+    return cases
 
 
 def main(arguments: list[str]) -> int:

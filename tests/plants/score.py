@@ -1,10 +1,10 @@
-"""What the product says of the plants' records: the calibrated rotor as a detector, from raw channels to names.
+"""What the product says of the plants' records: the calibrated rotor, from raw channels to names.
 
     python -m plants.score FOLDER [--aside] [--seed N]
 
-Each record is read at three signal-to-noise ratios (power of the healthy orbit over that of the noise, per sample and
-probe). What an engineer would state is stated: the first critical speed and the damping ratio off a Bode plot, within
-20 %, the clearance by the drawing, and how far the probes may drift.
+Each record is read at three signal-to-noise ratios (power of the healthy orbit over that of the noise, per
+sample and probe). What an engineer would state is stated: the first critical speed and the damping ratio off
+a Bode plot, within 20 %, the clearance by the drawing, and how far the probes may drift.
 """
 
 from __future__ import annotations
@@ -201,13 +201,11 @@ def _summed(
     for diagnosis in said:
         at = diagnosis.end_index / PER_REV
         # A machine that has already been called changed does not depart once more when it gets a name.
-        left = before in {"", "undetermined", "normal"} and diagnosis.decision not in {
-            "undetermined",
-            "normal",
-        }
+        changed = diagnosis.decision not in {"undetermined", "normal"}
+        left = before in {"", "undetermined", "normal"} and changed
         if left and at <= until:
             alarms += 1
-        elif at > until and delay is None and diagnosis.decision not in {"undetermined", "normal"}:
+        elif at > until and delay is None and changed:
             delay = max(0.0, at - onset)
         before = diagnosis.decision
     end = said[-1]

@@ -1,8 +1,8 @@
 """A machine in time: exact steps of what is linear, a force in each step for what is not.
 
-The linear part (elements, oil films, gyroscopic moments) is propagated by its matrix exponential. Contact, a crack
-that breathes and a loose support are forces of the position at the begin of a step; a step is 1/1024 of a
-revolution.
+The linear part (elements, oil films, gyroscopic moments) is propagated by its matrix exponential. Contact, a
+crack that breathes and a loose support are forces of the position at the begin of a step; a step is 1/1024 of
+a revolution.
 """
 
 from __future__ import annotations
@@ -175,8 +175,12 @@ def _parameters(stage: Stage) -> Floats:
     figures = np.zeros(10)
     if contact is not None:
         figures[:5] = (
-            contact.centre.real, contact.centre.imag, contact.clearance_m, contact.stiffness_n_m, contact.friction,
-        )  # fmt: skip
+            contact.centre.real,
+            contact.centre.imag,
+            contact.clearance_m,
+            contact.stiffness_n_m,
+            contact.friction,
+        )
     if crack is not None:
         figures[5:8] = (crack.loss * stage.machine.bending_n_m, crack.angle_rad, float(crack.breathes))
     if loose is not None:

@@ -152,7 +152,7 @@ def test_an_elliptic_orbit_grows_in_both_senses_with_the_unbalance():
 
 
 def test_a_change_without_harmonics_is_never_a_rub_first():
-    """Mean position, forward and backward 1X fit the pulse of a rub within its tolerance: that is no contact."""
+    """Mean position and both senses of 1X fit the pulse of a rub within its tolerance: no contact."""
     machine = healthy(laval=False, ellipticity=0.4)
     angle = math.radians(140.0)
     machine.baseline[0] = 0.3 * machine.baseline[1] * np.exp(1j * angle)

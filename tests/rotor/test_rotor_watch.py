@@ -165,7 +165,7 @@ def test_a_hunting_speed_teaches_what_the_stated_rotor_does_not_know():
     moved[200:, 1] *= 1.4
     watch = RotorWatch(blind, RATE_HZ)
     reports = watch.evaluate(synchronous_vectors(orbits(moved, NOISE_UM, 5, deviation=deviation)))
-    assert [report.revolution for report in reports if report.departed][0] in range(201, 204)
+    assert next(report.revolution for report in reports if report.departed) in range(201, 204)
 
 
 def test_drift_of_the_probes_is_no_static_load():

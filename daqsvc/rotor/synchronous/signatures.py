@@ -212,7 +212,7 @@ def _static_load(change: Complexes, variance: Floats, healthy: Healthy) -> float
     score = _still(change, variance, abs(change[DC]))
     score[DC] = _free(change[DC], variance[DC], healthy.amplitude_um)
     if not healthy.laval:
-        # An oil film that carries more is stiffer: the orbit follows, by a part of the way that the shaft went.
+        # An oil film that carries more is stiffer: the orbit follows, by a part of the shaft's way.
         way = min(abs(change[DC]), healthy.amplitude_um)
         for k in (FORWARD, BACKWARD):
             follows = log_density(np.full(2, change[k]), variance[k] + (_FOLLOWS * way) ** 2)
@@ -268,7 +268,7 @@ def _stiffness_loss(change: Complexes, variance: Floats, healthy: Healthy) -> fl
 def _rub(
     change: Complexes, variance: Floats, healthy: Healthy, position: Complexes, *, shaken: bool
 ) -> tuple[float, float]:
-    """Likelihood of a rub, and nats by which it must stay behind all others where no mark of contact shows."""
+    """Likelihood of a rub, and nats that it stays behind all others where no mark of contact shows."""
     pulse = rub_pulse(change, variance, healthy)
     if fills_clearance(position, change, variance, healthy):
         # An orbit that fills the clearance touches, whatever shape it has by then.
@@ -421,8 +421,8 @@ _GENERIC_RUB_MARGIN_NATS = 12.0
 _ENERGY_NATS = 12.0
 _MOST_ENERGY_NATS = 100.0
 _MISFIT = 0.005
-"""Part of the evidence of a change that the shape of a rub's pulse may be off by: where no rotor model fits to the
-last digit, a few nats of thousands say nothing."""
+"""Part of the evidence of a change that the shape of a rub's pulse may be off by: where no rotor model fits
+to the last digit, a few nats of thousands say nothing."""
 _RIVALS = frozenset(("rub", "unmodelled"))
 
 

@@ -1,13 +1,13 @@
 """How the synchronous vector of one machine follows its speed, learnt while the speed hunts.
 
-Near a critical speed 1 % of speed moves 1X by a tenth of itself. What the stated rotor predicts of that is taken out
-beforehand (`daqsvc.rotor.synchronous.baseline.compensated`); what it does not, because frequency and damping
-are known roughly, or because the machine is no Laval rotor, is a line through the revolutions of the calibration:
+Near a critical speed 1 % of speed moves 1X by a tenth of itself. What the stated rotor predicts of that is
+taken out beforehand (`daqsvc.rotor.synchronous.baseline.compensated`). What it does not, because frequency
+and damping are known roughly, or because the machine is no Laval rotor, is a line through the calibration:
 
     Z_k(Omega) = b_k + s_k (Omega / Omega_0 - 1)
 
-The slopes have a prior: nothing beyond what the rotor's tolerances allow. A speed that does not move teaches nothing,
-and the prior stays.
+The slopes have a prior: nothing beyond what the rotor's tolerances allow. A speed that does not move teaches
+nothing, and the prior stays.
 """
 
 from __future__ import annotations
