@@ -9,6 +9,7 @@
 # make measure  figures of the source: lines, circles of imports, names that occur twice
 # make nothing-lost  200 randomised runs with kills, outages and full disks: does every alarm arrive?
 # make soak  ten minutes of all that can happen to several machines; make soak SECONDS=86400 a day of it
+# make bench-diagnosis  names given to machines that nobody modelled (finite elements), into docs/plants.md
 # make bench-data  the tables of the documentation, anew from the measured recordings
 # make deb    a Debian package of the service, in dist/; apt install ./dist/daqsvc_*.deb
 # make test-wheel  the everyday tests against the wheel in dist/, installed in a venv of its own
@@ -34,7 +35,7 @@ export OMP_NUM_THREADS ?= 1
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.cache/kernels
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-long hil check guard measure bench bench-data dist deb nothing-lost soak test-wheel hooks proto lock clean
+.PHONY: help demo test test-long hil check guard measure bench bench-data bench-diagnosis dist deb nothing-lost soak test-wheel hooks proto lock clean
 
 help:
 	@sed -n 's/^# \(make.*\)/\1/p' Makefile
@@ -127,6 +128,20 @@ soak: $(READY)
 bench-data: $(READY)
 	@for table in tests/bench/data_*.py; do $(BIN)/python $$table || exit 1; done
 
+# Rotors by finite elements, in an environment of their own: what makes them is no part of the service.
+PLANTS := build/plants
+PLANTS_VENV := .venv-plants
+$(PLANTS_VENV)/.ready: requirements-plants.lock
+	@$(PYTHON) -m venv $(PLANTS_VENV)
+	@$(PLANTS_VENV)/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements-plants.lock
+	@touch $@
+
+$(PLANTS)/cases.json: $(PLANTS_VENV)/.ready tests/plants/machines.py tests/plants/simulate.py tests/plants/records.py
+	@PYTHONPATH=tests $(PLANTS_VENV)/bin/python -m plants.records $(PLANTS)
+
+bench-diagnosis: $(READY) $(PLANTS)/cases.json
+	@PYTHONPATH=tests $(BIN)/python -m plants.table $(PLANTS) $(ARGS)
+
 # What is compiled needs a protobuf of this major version, no older than the compiler: pyproject.toml says which.
 proto: $(READY)
 	@$(BIN)/python -m grpc_tools.protoc -I. --python_out=. --pyi_out=. daqsvc/publish/sparkplug/sparkplug_b.proto daqsvc/snapshots/samples.proto
@@ -136,7 +151,8 @@ lock:
 	uv pip compile pyproject.toml --all-extras --group dev --universal --generate-hashes --no-emit-index-url --python-version 3.11 --no-header --quiet -o requirements-dev.lock
 	uv pip compile pyproject.toml --all-extras --universal --generate-hashes --no-emit-index-url --python-version 3.11 --no-header --quiet -c requirements-dev.lock -o requirements.lock
 	uv pip compile pyproject.toml --extra dbc --extra page --universal --generate-hashes --no-emit-index-url --python-version 3.11 --no-header --quiet -c requirements-dev.lock -o requirements-service.lock
+	uv pip compile requirements-plants.in --universal --generate-hashes --no-emit-index-url --python-version 3.11 --no-header --quiet -o requirements-plants.lock
 	echo 'setuptools>=77' | uv pip compile - --universal --generate-hashes --no-emit-index-url --python-version 3.11 --no-header --quiet -c requirements-dev.lock -o requirements-build.lock
 
 clean:
-	rm -rf $(VENV) .cache build *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) $(PLANTS_VENV) .cache build *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis

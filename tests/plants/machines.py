@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import io
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 GRAVITY_M_S2 = 9.80665
+_STEEL_KG_M3, _STEEL_PA, _STEEL_SHEAR_PA = 7810.0, 211e9, 81.2e9
 _MODES = 10
 _KEPT = (0, 1, 3, 4)
 """Of the six degrees of freedom of a node those that bend the shaft; it neither stretches nor twists here."""
@@ -88,7 +89,7 @@ class Geometry:
         rub: node that has the least clearance.
         coupling: node at the driven end.
         cracked: element that a crack would be in.
-        unbalance_g_mm_kg: residual unbalance per mass of a disc, and the angle of each in turn, rad.
+        unbalance_um: residual eccentricity of each disc, um, and its angle, rad.
         of_speeds: speeds, in parts of the first critical speed.
     """
 
@@ -103,6 +104,12 @@ class Geometry:
     cracked: int
     unbalance_um: tuple[tuple[float, float], ...]
     of_speeds: tuple[float, ...] = (0.7, 1.0, 1.35)
+
+    @property
+    def disc_masses_kg(self) -> tuple[float, ...]:
+        """Of the discs, less the hole for the shaft."""
+        area = ((width, np.pi / 4.0 * (d**2 - self.shaft[0][1] ** 2)) for _, width, d in self.discs)
+        return tuple(_STEEL_KG_M3 * width * square for width, square in area)
 
 
 def _even(length_m: float, count: int, diameter_m: float) -> tuple[tuple[float, float], ...]:
@@ -262,7 +269,8 @@ class Machine:
         mass: float64 ``[n, n]``.
         damping: float64 ``[n, n]``, C + Omega G.
         stiffness: float64 ``[n, n]``.
-        rest: float64 ``[n]``, where it stands under its weight and load, oil films included.
+        rest: float64 ``[n]``, where it stands under its weight and load, oil films included, as nearly as the
+            shapes reach.
         places: float64 ``[n]`` rows by name: ``x`` and ``y`` of probes, rub and coupling, and of the bend
             of the cracked element; ``x`` and ``y`` of each disc and each support.
         bending_n_m: bending stiffness of the cracked element, E I / L.
@@ -277,7 +285,7 @@ class Machine:
     places: dict[str, Floats]
     bending_n_m: float
     weight_n: float
-    disc_masses_kg: tuple[float, ...] = field(default=())
+    disc_masses_kg: tuple[float, ...]
 
 
 def _film(
@@ -301,7 +309,7 @@ class Model:
 
     def __init__(self, geometry: Geometry) -> None:
         self.geometry = geometry
-        self._steel = ross.Material("steel", rho=7810.0, E=211e9, G_s=81.2e9)
+        self._steel = ross.Material("steel", rho=_STEEL_KG_M3, E=_STEEL_PA, G_s=_STEEL_SHEAR_PA)
         self._basis: Floats | None = None
 
     def _rotor(self, condition: Condition, speed_rad_s: float, loads: Sequence[float]) -> ross.Rotor:
@@ -341,9 +349,9 @@ class Model:
         places = np.concatenate(([0.0], np.cumsum([length for length, _ in g.shaft])))
         masses = np.zeros(len(places))
         for i, (length, diameter) in enumerate(g.shaft):
-            masses[i : i + 2] += 7810.0 * np.pi / 8.0 * diameter**2 * length
-        for n, width, diameter in g.discs:
-            masses[n] += 7810.0 * np.pi / 4.0 * (diameter**2 - g.shaft[0][1] ** 2) * width
+            masses[i : i + 2] += _STEEL_KG_M3 * np.pi / 8.0 * diameter**2 * length
+        for (n, _, _), mass in zip(g.discs, g.disc_masses_kg, strict=True):
+            masses[n] += mass
         force = -1j * GRAVITY_M_S2 * masses
         weight = GRAVITY_M_S2 * float(masses.sum())
         force[g.rub] += condition.load_weight * weight * np.exp(1j * condition.load_angle_rad)
@@ -425,7 +433,6 @@ class Model:
         rest = np.linalg.solve(stiffness, force)
 
         basis = self._shapes(mass, stiffness, places)
-        # Rest is kept as it is: the shapes reach any position only nearly.
         shape = np.linalg.lstsq(basis, rest, rcond=None)[0]
         reduced = [basis.T @ m @ basis for m in (mass, damping + speed_rad_s * gyroscopic, stiffness)]
         element_m, diameter_m = g.shaft[e]
@@ -433,11 +440,9 @@ class Model:
             *reduced,
             rest=shape,
             places={name: row @ basis for name, row in places.items()},
-            bending_n_m=211e9 * np.pi / 64.0 * diameter_m**4 / element_m,
+            bending_n_m=_STEEL_PA * np.pi / 64.0 * diameter_m**4 / element_m,
             weight_n=rotor_weight,
-            disc_masses_kg=tuple(
-                7810.0 * np.pi / 4.0 * (d**2 - g.shaft[0][1] ** 2) * w for _, w, d in g.discs
-            ),
+            disc_masses_kg=g.disc_masses_kg,
         )
 
     def _shapes(self, mass: Floats, stiffness: Floats, places: dict[str, Floats]) -> Floats:

@@ -13,13 +13,21 @@ import math
 import sys
 import zlib
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-
-from plants.machines import GEOMETRIES, Condition, Geometry, Machine, Model, stable, unbalance_force
+from plants.machines import (
+    GEOMETRIES,
+    GRAVITY_M_S2,
+    Condition,
+    Geometry,
+    Machine,
+    Model,
+    stable,
+    unbalance_force,
+)
 from plants.simulate import PER_REV, Contact, Crack, Loose, Motion, Stage, move
 
 if TYPE_CHECKING:
@@ -91,15 +99,12 @@ class Bench:
         q = self._response(self.unbalance)
         self.orbit_rub = q @ self.healthy.places["rub x"], q @ self.healthy.places["rub y"]
         self.whirl_rub_m = float(max(abs(part) for part in self.orbit_rub))
-        self.rest_rub = complex(
-            self.healthy.rest @ self.healthy.places["rub x"], self.healthy.rest @ self.healthy.places["rub y"]
-        )
+        self.rest_rub = self._rest("rub")
         self.whirl_m = self.seen(self.unbalance, 1)
-        rest = complex(
-            self.healthy.rest @ self.healthy.places["probe x"],
-            self.healthy.rest @ self.healthy.places["probe y"],
-        )
-        self.clearance_um = 1e6 * (2.0 * abs(rest) + 5.0 * self.whirl_m)
+        self.clearance_um = 1e6 * (2.0 * abs(self._rest("probe")) + 5.0 * self.whirl_m)
+
+    def _rest(self, place: str) -> complex:
+        return complex(*(self.healthy.rest @ self.healthy.places[f"{place} {axis}"] for axis in "xy"))
 
     def _response(self, force: Complexes, order: int = 1) -> Complexes:
         m, w = self.healthy, order * self.speed_rad_s
@@ -114,7 +119,7 @@ class Bench:
 
     def machine(self, **changes: object) -> Machine:
         """The machine in another condition."""
-        return self.model.machine(Condition(**changes), self.speed_rad_s)  # type: ignore[arg-type]
+        return self.model.machine(Condition(**changes), self.speed_rad_s)
 
     def turning(self, once: Complexes | None = None, twice: Complexes | None = None) -> Complexes:
         """Forces at 0, 1 and 2 times the shaft speed: the residual unbalance, and what is added."""
@@ -130,8 +135,8 @@ class Bench:
         return Stage(
             begin_rev=begin_rev,
             machine=machine or self.healthy,
-            turning=self.turning() if turning is None else turning,  # type: ignore[arg-type]
-            **parts,  # type: ignore[arg-type]
+            turning=self.turning() if turning is None else turning,
+            **parts,
         )
 
     def ramp(self, machine: Callable[[float], Machine], revolutions: float) -> list[Stage]:
@@ -168,18 +173,11 @@ def _bow(b: Bench, rng: np.random.Generator) -> Fault:
 def _damping_loss(b: Bench, rng: np.random.Generator) -> Fault:
     size = rng.uniform(0.35, 0.7)
     if b.geometry.supports[0].journal is not None:
-        # Of an oil film none can be taken away alone; that of the pedestals and the discs' drag can.
-        damping = b.healthy.damping.copy()
-        even = (damping + damping.T) / 2.0
-        return size, [b.stage(ONSET_REV, _with_damping(b.healthy, damping - (1.0 - size) * 0.5 * even))]
+        # No figure of an oil film is its damping alone: a part of all that is not gyroscopic goes.
+        damping = b.healthy.damping
+        lost = (1.0 - size) * (damping + damping.T) / 4.0
+        return size, [b.stage(ONSET_REV, replace(b.healthy, damping=damping - lost))]
     return size, [b.stage(ONSET_REV, b.machine(damping=size))]
-
-
-def _with_damping(machine: Machine, damping: NDArray[np.float64]) -> Machine:
-    return Machine(
-        machine.mass, damping, machine.stiffness, machine.rest, machine.places, machine.bending_n_m,
-        machine.weight_n, machine.disc_masses_kg,
-    )  # fmt: skip
 
 
 def _softer_support(b: Bench, rng: np.random.Generator) -> Fault:
@@ -216,7 +214,7 @@ def _rub(b: Bench, rng: np.random.Generator, offset: float, depth: float) -> Fau
     theta = np.linspace(0.0, 2.0 * math.pi, 256)
     x, y = ((part * np.exp(1j * theta)).real for part in b.orbit_rub)
     reach = float(np.abs(b.rest_rub + x + 1j * y - centre).max())
-    modal = (sum(b.healthy.disc_masses_kg) + 0.3 * b.healthy.weight_n / 9.81) * b.critical[0] ** 2
+    modal = (sum(b.healthy.disc_masses_kg) + 0.3 * b.healthy.weight_n / GRAVITY_M_S2) * b.critical[0] ** 2
     contact = Contact(
         centre=centre,
         clearance_m=reach - depth * b.whirl_rub_m,

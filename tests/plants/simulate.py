@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
-
     from plants.machines import Machine
 
     Floats = NDArray[np.float64]
@@ -188,8 +187,8 @@ def _parameters(stage: Stage) -> Floats:
     return figures
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _run(propagators, forced, statics, turning, parameters, which, angle, rows, state):  # type: ignore[no-untyped-def]
+@numba.njit(cache=True)
+def _run(propagators, forced, statics, turning, parameters, which, angle, rows, state):
     samples = len(which)
     n = statics.shape[1]
     seen = np.empty((samples, 4))

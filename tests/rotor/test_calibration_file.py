@@ -25,6 +25,7 @@ from daqsvc.rotor.calibration.file import (
 from daqsvc.rotor.calibration.run_up import RunUpFit
 from daqsvc.rotor.laval import LavalRotor
 from daqsvc.rotor.synchronous.baseline import Calibration
+from daqsvc.rotor.synchronous.speed_law import SpeedLaw
 
 HERE = Path("rotor.toml")
 positive = st.floats(min_value=1e-12, max_value=1e9)
@@ -43,6 +44,15 @@ rotors = st.builds(
 )
 
 
+sizes = st.lists(positive, min_size=5, max_size=5).map(np.array)
+laws = st.builds(
+    SpeedLaw,
+    slopes_um=st.lists(complexes, min_size=5, max_size=5).map(lambda s: np.array(s, np.complex128)),
+    spread_um=sizes,
+    bend_um=sizes,
+)
+
+
 def calibrations(rotor: LavalRotor) -> st.SearchStrategy[Calibration]:
     return st.builds(
         Calibration,
@@ -55,6 +65,7 @@ def calibrations(rotor: LavalRotor) -> st.SearchStrategy[Calibration]:
         noise_variance=positive,
         samples_per_rev=positive,
         fit_error=st.none() | part,
+        law=st.none() | laws,
     )
 
 
@@ -93,7 +104,11 @@ def same(one: object, other: object) -> bool:
     """Equal to the last bit, arrays included."""
     for place in fields(one):  # type: ignore[arg-type]
         a, b = getattr(one, place.name), getattr(other, place.name)
-        if not (np.array_equal(a, b) if isinstance(a, np.ndarray) else a == b):
+        if isinstance(a, SpeedLaw) and isinstance(b, SpeedLaw):
+            equal = same(a, b)
+        else:
+            equal = np.array_equal(a, b) if isinstance(a, np.ndarray) else a == b
+        if not equal:
             return False
     return True
 

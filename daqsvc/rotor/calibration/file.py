@@ -20,6 +20,7 @@ from daqsvc.confined.small_toml import TomlFileError, parse_toml, read_toml
 from daqsvc.rotor.calibration.run_up import RunUpFit
 from daqsvc.rotor.laval import LavalRotor
 from daqsvc.rotor.synchronous.baseline import SPEED_TOLERANCE, Calibration
+from daqsvc.rotor.synchronous.speed_law import SpeedLaw
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -259,6 +260,24 @@ class _ComponentTable(_ComplexTable):
     revolution_variance: Positive
 
 
+_Five = Annotated[list[float], _list("5 numbers", 5)]
+_FiveSizes = Annotated[list[NotNegative], _list("5 numbers", 5)]
+
+
+class _SpeedLawTable(_CalibrationTable):
+    slope_re_um: _Five
+    slope_im_um: _Five
+    slope_uncertainty_um: _FiveSizes
+    bend_um: _FiveSizes
+
+    def made(self) -> SpeedLaw:
+        return SpeedLaw(
+            slopes_um=np.array(self.slope_re_um) + 1j * np.array(self.slope_im_um),
+            spread_um=np.array(self.slope_uncertainty_um),
+            bend_um=np.array(self.bend_um),
+        )
+
+
 class _SteadyTable(_CalibrationTable):
     verdict: str = ""
     source: str = ""
@@ -273,6 +292,7 @@ class _SteadyTable(_CalibrationTable):
     noise_relative_variance: Positive
     samples_per_rev: Positive
     fit_error: NotNegative | None = None
+    speed_law: _SpeedLawTable | None = None
 
     def made(self, rotor: LavalRotor) -> Calibration:
         components: list[_ComponentTable] = [getattr(self, key) for key in _COMPONENTS]
@@ -286,6 +306,7 @@ class _SteadyTable(_CalibrationTable):
             noise_variance=self.noise_relative_variance,
             samples_per_rev=self.samples_per_rev,
             fit_error=self.fit_error,
+            law=None if self.speed_law is None else self.speed_law.made(),
         )
 
 
@@ -464,6 +485,16 @@ def _steady_lines(calibration: Calibration, source: str) -> Iterator[str]:
     yield f"noise_relative_variance = {calibration.noise_variance!r}  # from revolution to revolution"
     if calibration.fit_error is not None:
         yield f"fit_error = {calibration.fit_error!r}  # of the run-up"
+    if calibration.law is not None:
+        law = calibration.law
+        figures = {
+            "slope_re_um": law.slopes_um.real,
+            "slope_im_um": law.slopes_um.imag,
+            "slope_uncertainty_um": law.spread_um,
+            "bend_um": law.bend_um,
+        }
+        yield "# how the components below follow the speed, um for a relative change of 1; the speed hunted"
+        yield f"speed_law = {{ {', '.join(f'{key} = {row.tolist()!r}' for key, row in figures.items())} }}"
     eccentricity = calibration.eccentricity_um
     yield f"# unbalance, if this is a Laval rotor: eccentricity {_polar(eccentricity)}"
     for key, value, variance in zip(

@@ -5,10 +5,11 @@ components, every hypothesis has a marginal likelihood: its unknown amplitude, d
 rotor's parameters are averaged over, so that a flexible hypothesis pays for its flexibility. All in nats.
 
 * unbalance: only 1X moves, anyhow; damping loss: only 1X moves, and along what less damping does to it.
-* static load: only the mean position moves.
-* stiffness loss: mean position and 1X move together, by one parameter.
+* static load: only the mean position moves; on a machine that is no Laval rotor, 1X may follow it a little.
+* stiffness loss: mean position and 1X move together, by one parameter; on a machine that is no Laval rotor
+  the shaft sinks, and 1X moves by any amount.
 * rub: a pulse once a revolution, directed inwards where the orbit comes nearest to the wall, passed through
-  the rotor; or an orbit that fills the clearance.
+  the rotor, with marks of contact (`daqsvc.rotor.synchronous.contact`); or an orbit that fills the clearance.
 * unmodelled: any components, each by itself. It pays `UNMODELLED_NATS` for explaining everything.
 
 The pulses of rub and crack, and the name or group of names that the likelihoods come to (`identify`), follow.
@@ -18,7 +19,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 
 import numpy as np
 
@@ -60,10 +61,7 @@ RotorFault: TypeAlias = Literal[
     "small_change",
 ]
 """Verdicts about a rotor."""
-
-_ORDER: tuple[RotorFault, ...] = (
-    "normal", "unbalance", "damping_loss", "static_load", "stiffness_loss", "rub", "unmodelled",
-)  # fmt: skip
+FAULTS: tuple[RotorFault, ...] = get_args(RotorFault)
 
 UNMODELLED_NATS = 6.0
 
@@ -126,7 +124,8 @@ def likelihoods(
     scores["rub"], behind = _rub(change, variance, healthy, position, shaken=shaken)
     if behind:
         scores["rub"] = min(scores["rub"], max(scores[name] for name in scores.keys() - {"rub"}) - behind)
-    return {name: scores[name] - normal for name in _ORDER}
+    # In the order of the names: ties go to the first.
+    return {name: scores[name] - normal for name in FAULTS if name in scores}
 
 
 def damping_misfit(change: Complexes, variance: Floats, healthy: Healthy) -> float:
@@ -531,7 +530,8 @@ def identify(
         candidates = ("small_change",)
         probabilities = {"normal": probabilities["normal"], "small_change": 1.0 - probabilities["normal"]}
     else:
-        candidates = _group(scores, best, healthy, rules)
+        marked = shaken or has_marks(change, variance)
+        candidates = _group(scores, best, healthy, rules, marked=marked)
     agreed = previous is not None and (
         set(previous.candidates) == set(candidates)
         or (model_holds and set(candidates) < set(previous.candidates))
@@ -557,9 +557,14 @@ def identify(
 
 
 def _group(
-    scores: Mapping[RotorFault, float], best: RotorFault, healthy: Calibration, rules: NamingRules
+    scores: Mapping[RotorFault, float],
+    best: RotorFault,
+    healthy: Calibration,
+    rules: NamingRules,
+    *,
+    marked: bool,
 ) -> tuple[RotorFault, ...]:
-    """All hypotheses within the margin of the best one, the best first."""
+    """All hypotheses within the margin of the best one, the best first; `marked`: by marks of contact."""
     # Without a Laval rotor any change of both senses of 1X would be a loss of damping.
     alone = best == "damping_loss" and scores[best] - scores["unbalance"] > rules.margin_nats
 
@@ -572,7 +577,7 @@ def _group(
 
     close = [name for name in scores if scores[best] - scores[name] < margin(name)]
     doubt = max(margin("rub"), _MISFIT * scores[best])
-    if best == "unmodelled" and "rub" not in close and scores[best] - scores["rub"] < doubt:
+    if marked and best == "unmodelled" and "rub" not in close and scores[best] - scores["rub"] < doubt:
         close.append("rub")
     if "normal" in close and best != "normal":
         close.remove("normal")

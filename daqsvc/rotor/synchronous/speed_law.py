@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 _LEAST_HUNTING = 1e-3
 """Standard deviation of the relative speed below which nothing is learnt."""
+_MOST_JITTER = 0.5
+"""Part of its square that may change from one revolution to the next: a shaft hunts slowly, marks jitter."""
 _MODEL_DOUBT = 2.0
 """Standard deviation of a slope that no rotor's figures tell, in parts of the one that they do."""
 
@@ -49,7 +51,7 @@ class SpeedLaw:
 def learn(
     moved: Complexes, deviation: Floats, variance: Floats, slope: complex, slope_spread: float
 ) -> SpeedLaw | None:
-    """Fit the line; None where the speed does not hunt.
+    """Fit the line; None where the speed does not hunt, or only the marks of the keyphasor jitter.
 
     Args:
         moved: complex128 ``[R, 5]``, vectors with what the stated rotor predicts taken out, um.
@@ -59,7 +61,8 @@ def learn(
         slope_spread: standard deviation of it over the rotor's tolerances.
     """
     away = deviation - deviation.mean()
-    if float(np.sqrt((away**2).mean())) < _LEAST_HUNTING:
+    hunting, jitter = float((away**2).mean()), float((np.diff(deviation) ** 2).mean()) / 2.0
+    if hunting < _LEAST_HUNTING**2 or jitter > _MOST_JITTER * hunting:
         return None
     mean = moved.mean(axis=0)
     whirl = float(np.hypot(abs(mean[FORWARD]), abs(mean[BACKWARD])))

@@ -162,7 +162,7 @@ class Healthy:
         speed_rad_s: shaft speed.
         rotor: what is known about the rotor.
         laval: whether the machine behaves like a Laval rotor; if not, stiffness loss is any change of mean
-            position and 1X together, and damping loss any change of 1X.
+            position and 1X together in which the shaft sinks, and damping loss any change of 1X.
     """
 
     baseline: Complexes

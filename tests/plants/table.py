@@ -1,0 +1,115 @@
+"""Write the tables of docs/plants.md anew: what the product says of machines that nobody modelled.
+
+    python -m plants.table FOLDER [--aside] [--seed N]
+
+Without ``--aside`` of the half of the geometries that thresholds were chosen with, the other at the end.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import Counter
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from plants.score import CLEAR, ONLY_1X, SNR_DB, TRUTH, Said, scored
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+
+PAGE = Path(__file__).parents[2] / "docs" / "plants.md"
+BEGIN, END = "<!-- table: make bench-diagnosis ({}) -->", "<!-- end of table ({}) -->"
+_BINS = (0.0, 0.5, 0.7, 0.9, 0.99, 1.01)
+
+
+def share(said: Sequence[Said], of: Callable[[Said], bool]) -> str:
+    """Part of the runs in percent."""
+    return f"{100.0 * sum(map(of, said)) / len(said):.1f}" if said else "-"
+
+
+def named(said: Iterable[Said]) -> list[Said]:
+    """Runs in which a modelled fault, large enough to be named, befell a machine whose baseline was there."""
+    return [s for s in said if s.fault in TRUTH and s.moved >= CLEAR and not s.refused]
+
+
+def summary(said: Sequence[Said]) -> list[str]:
+    """One row for every ratio."""
+    lines = [
+        "| SNR | modelled: right | told | wrong | unmodelled: misnamed | false alarms / 1000 rev | refused |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for snr in SNR_DB:
+        at = [s for s in said if s.snr_db == snr]
+        modelled = named(at)
+        others = [s for s in at if s.fault not in {*TRUTH, "healthy"} and not s.refused]
+        healthy = sum(s.revolutions_before for s in at)
+        alarms = sum(s.alarms_before for s in at if not s.refused)
+        lines.append(
+            f"| {snr} dB | {share(modelled, lambda s: s.right)} % | {share(modelled, lambda s: s.told)} % | "
+            f"{share(modelled, lambda s: s.wrong)} % of {len(modelled)} | "
+            f"{share(others, lambda s: s.misnamed)} % of {len(others)} | "
+            f"{1000.0 * alarms / max(healthy, 1.0):.2f} of {healthy:.0f} | "
+            f"{sum(bool(s.refused) for s in at)} of {len(at)} |"
+        )
+    return lines
+
+
+def answers(said: Sequence[Said], snr_db: int) -> list[str]:
+    """What each fault is called at one ratio, the commonest answer first."""
+    lines = [f"| fault, {snr_db} dB | runs | answers |", "|---|---|---|"]
+    for fault in dict.fromkeys(s.fault for s in said):
+        runs = [s for s in said if s.fault == fault and s.snr_db == snr_db and not s.refused]
+        if fault in TRUTH:
+            runs = [s for s in runs if s.moved >= CLEAR]
+        found = Counter(" or ".join(sorted(s.names)) or s.decision for s in runs)
+        told = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in found.most_common())
+        lines.append(f"| {fault} | {len(runs)} | {told} |")
+    return lines
+
+
+def certain(said: Said) -> float:
+    """Probability of what was said; that of the pair where 1X alone cannot tell."""
+    pair = said.decision in ONLY_1X
+    return sum(said.probabilities.get(n, 0.0) for n in ONLY_1X) if pair else said.probability
+
+
+def reliability(said: Sequence[Said]) -> list[str]:
+    """How often a first name is right, by the probability that it was given with."""
+    lines = ["| probability of the first name | names | right |", "|---|---|---|"]
+    modelled = [s for s in named(said) if s.named and s.decision != "small_change"]
+    for low, high in pairwise(_BINS):
+        at = [s for s in modelled if low <= certain(s) < high]
+        lines.append(f"| {low:g} to {min(high, 1.0):g} | {len(at)} | {share(at, first_is_true)} % |")
+    return lines
+
+
+def first_is_true(said: Said) -> bool:
+    """Whether the first name is the truth, or of its pair."""
+    return said.decision in said.true_names
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Judge, print and write."""
+    parser = argparse.ArgumentParser(prog="make bench-diagnosis", description="Write docs/plants.md anew.")
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--aside", action="store_true", help="the half that is looked at once, at the end")
+    parser.add_argument("--seed", type=int, default=0, help="of the noise, and of what is stated wrongly")
+    options = parser.parse_args(arguments)
+    said = scored(options.folder, aside=options.aside, seed=options.seed)
+    parts = [summary(said), reliability(said), *(answers(said, snr) for snr in SNR_DB)]
+    table = "\n\n".join("\n".join(lines) for lines in parts)
+    print(table)  # noqa: T201
+    if options.seed:
+        return 0
+    half = "set aside" if options.aside else "tuned"
+    begin, end = BEGIN.format(half), END.format(half)
+    page = PAGE.read_text(encoding="utf-8")
+    before, rest = page.split(begin)
+    PAGE.write_text(f"{before}{begin}\n{table}\n{end}{rest.split(end)[1]}", encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
