@@ -128,12 +128,13 @@ soak: $(READY)
 bench-data: $(READY)
 	@for table in tests/bench/data_*.py; do $(BIN)/python $$table || exit 1; done
 
-# Rotors by finite elements, in an environment of their own: what makes them is no part of the service.
+# Rotors by finite elements, in an environment of their own: what makes them is no part of the service. The lock is
+# complete; left to itself pip looks for extras that it does not have.
 PLANTS := build/plants
 PLANTS_VENV := .venv-plants
 $(PLANTS_VENV)/.ready: requirements-plants.lock
 	@$(PYTHON) -m venv $(PLANTS_VENV)
-	@$(PLANTS_VENV)/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements-plants.lock
+	@$(PLANTS_VENV)/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes --no-deps -r requirements-plants.lock
 	@touch $@
 
 $(PLANTS)/cases.json: $(PLANTS_VENV)/.ready tests/plants/machines.py tests/plants/simulate.py tests/plants/records.py

@@ -112,8 +112,8 @@ class Said:
 
     @property
     def true_names(self) -> frozenset[str]:
-        """Names that are true of a modelled fault; at one speed the pair is one."""
-        truth = TRUTH[self.fault]
+        """Names that are true of the fault; at one speed the pair is one."""
+        truth = TRUTH.get(self.fault) or ALLOWED.get(self.fault, frozenset())
         return truth | ONLY_1X if truth & ONLY_1X else truth
 
     @property

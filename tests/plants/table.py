@@ -14,7 +14,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from plants.score import CLEAR, ONLY_1X, SNR_DB, TRUTH, Said, scored
+from plants.score import CLEAR, MODELLED, ONLY_1X, SNR_DB, TRUTH, Said, scored
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -71,23 +71,20 @@ def answers(said: Sequence[Said], snr_db: int) -> list[str]:
 
 def certain(said: Said) -> float:
     """Probability of what was said; that of the pair where 1X alone cannot tell."""
-    pair = said.decision in ONLY_1X
-    return sum(said.probabilities.get(n, 0.0) for n in ONLY_1X) if pair else said.probability
+    return sum(
+        said.probabilities.get(n, 0.0) for n in (ONLY_1X if said.decision in ONLY_1X else {said.decision})
+    )
 
 
 def reliability(said: Sequence[Said]) -> list[str]:
-    """How often a first name is right, by the probability that it was given with."""
-    lines = ["| probability of the first name | names | right |", "|---|---|---|"]
-    modelled = [s for s in named(said) if s.named and s.decision != "small_change"]
+    """How often a first name is true, of all faults, by the probability that it was given with."""
+    lines = ["| probability of the first name | names | true |", "|---|---|---|"]
+    names = [s for s in said if s.named and not s.refused and s.fault != "healthy" and s.decision in MODELLED]
     for low, high in pairwise(_BINS):
-        at = [s for s in modelled if low <= certain(s) < high]
-        lines.append(f"| {low:g} to {min(high, 1.0):g} | {len(at)} | {share(at, first_is_true)} % |")
+        at = [s for s in names if low <= certain(s) < high]
+        true = share(at, lambda s: s.decision in s.true_names)
+        lines.append(f"| {low:g} to {min(high, 1.0):g} | {len(at)} | {true} % |")
     return lines
-
-
-def first_is_true(said: Said) -> bool:
-    """Whether the first name is the truth, or of its pair."""
-    return said.decision in said.true_names
 
 
 def main(arguments: Sequence[str]) -> int:

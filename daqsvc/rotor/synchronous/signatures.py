@@ -73,7 +73,7 @@ _STIFFNESS_LOSSES = np.geomspace(0.02, 1.2, 24)
 _STIFFNESS_TOLERANCE = 0.3
 _FOLLOWS = np.array([0.1, 0.3])
 """Parts of a shift by which 1X may follow it where supports are stiffer the more they carry."""
-_FOLLOWING_NATS = 1.0
+_FOLLOWING_NATS = 3.0
 _GENERIC_STIFFNESS_NATS = 0.5
 """What stiffness loss pays where no model ties mean position and 1X together."""
 _SINKS = np.geomspace(0.02, 1.5, 12)
