@@ -274,7 +274,10 @@ def _rub(
         return max(pulse, _unmodelled(change, variance, healthy) + UNMODELLED_NATS), 0.0
     if shaken or has_marks(change, variance):
         return pulse, 0.0
-    return pulse, _NO_CONTACT_NATS if marks_would_show(change, variance) else _HIDDEN_CONTACT_NATS
+    if marks_would_show(change, variance):
+        return pulse, _NO_CONTACT_NATS
+    # Where the rotor's model holds, it says itself how a pulse moves the mean position and both senses of 1X.
+    return pulse, 0.0 if healthy.laval else _HIDDEN_CONTACT_NATS
 
 
 def _unmodelled(change: Complexes, variance: Floats, healthy: Healthy) -> float:
