@@ -15,6 +15,7 @@ from support.page_rig import live_rig
 from support.tls_files import self_signed
 from support.waiting import PATIENCE_S, eventually
 
+from daqsvc.alarms.states import Level
 from daqsvc.page.access.accounts import account_line, write_account
 from daqsvc.page.access.role import Role
 from daqsvc.page.handling import offered
@@ -33,7 +34,7 @@ PATIENCE_MS = 1000.0 * PATIENCE_S
 
 @contextlib.asynccontextmanager
 async def handled_rig(tmp_path: Path, channel: str) -> AsyncIterator[tuple[Service, Client, Path]]:
-    """A service whose alarm stands, and its page with two accounts."""
+    """A service whose alarm stands, as bad as it gets, and its page with two accounts."""
     store, accounts = tmp_path / "store", tmp_path / "accounts"
     for name, role in (("ann", Role.OPERATOR), ("bob", Role.VIEWER)):
         write_account(accounts, name, account_line(name, role, PASSWORD))
@@ -42,7 +43,8 @@ async def handled_rig(tmp_path: Path, channel: str) -> AsyncIterator[tuple[Servi
         page_served("--store", store, "--accounts", accounts) as (address, _),
     ):
         alarms = service.alarms.managers["laval-rig"].alarms
-        await eventually(lambda: ALARM in alarms and alarms[ALARM].state.is_active, "the alarm stands")
+        # An alarm that gets worse calls for a person again, whoever acknowledged it before.
+        await eventually(lambda: ALARM in alarms and alarms[ALARM].level is Level.DANGER, "the alarm stands")
         yield service, Client(address), store
 
 

@@ -172,7 +172,7 @@ def test_a_change_without_harmonics_is_never_a_rub_first():
 
 
 def test_motion_that_does_not_repeat_is_a_mark_of_contact():
-    machine = healthy(0.6)
+    machine = healthy(0.6, laval=False)
     angle = math.radians(140.0)
     machine.baseline[0] = 0.3 * machine.baseline[1] * np.exp(1j * angle)
     linear = pulse(angle, wall_at(angle, machine, 6.0), 0.6, width=1.0)
@@ -183,6 +183,11 @@ def test_motion_that_does_not_repeat_is_a_mark_of_contact():
     )
     assert max(quiet, key=quiet.get) != "rub"
     assert max(loud, key=loud.get) == "rub"
+    # The model of a Laval rotor tells by itself how a pulse moves it, where noise hides the harmonics.
+    known = healthy(0.6)
+    known.baseline[0] = machine.baseline[0]
+    quiet = likelihoods(linear, hidden, known, known.baseline + linear)
+    assert max(quiet, key=quiet.get) == "rub"
 
 
 @pytest.mark.parametrize("down_deg", [-40.0, 0.0, 40.0])

@@ -49,6 +49,7 @@ async def test_four_minutes_of_all_that_can_happen_lose_nothing(tmp_path: Path) 
     assert {turn.machine for turn in report.evidence.turns} == {"pump", "fan", "gear", "mill", "saw"}
 
 
+@pytest.mark.marathon
 async def test_an_hour_of_the_machine_s_time_leaves_all_figures_flat() -> None:
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([f"{ROOT}", f"{ROOT / 'tests'}"])}
     done = await asyncio.to_thread(
