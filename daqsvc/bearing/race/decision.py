@@ -244,7 +244,7 @@ RACES: tuple[Part, ...] = ("inner", "outer")
 class Decision:
     """The word, what it cannot be told from, the shares of belief, and how thin it is.
 
-    ``both``: both races are in the group because each has lines of its own, though they can be told apart.
+    ``both``: the parts of the group have lines of their own each, and can be told apart: all may be damaged.
     """
 
     verdict: RaceWord
@@ -289,16 +289,28 @@ def decide(
         belief = {rest: 1.0 - fault} | _shares(open_to, fault)
         return Decision(rest, (rest,), belief, 1.0 / max(sure, LEAST_FACTOR))
     weight = {part: weight_of(part, evidence[part], rules) for part in candidates}
-    belief = {rest: 1.0 - fault} | _shares(weight, fault)
     best = max(candidates, key=weight.__getitem__)
     rivals = [weight[best] / weight[part] for part in candidates if part != best]
     margin = min([passed[best], *rivals])
-    if best != "ball" and all(passed[race] >= rules.both_factor for race in RACES):
-        other: Part = "outer" if best == "inner" else "inner"
-        return Decision(best, (best, other), belief, margin, both=True)
+    besides = [part for part in PARTS if part != best and _damaged_besides(part, evidence, passed, rules)]
+    weight |= {part: weight_of(part, evidence[part], rules) for part in besides}
+    belief = {rest: 1.0 - fault} | _shares(weight, fault)
+    if besides and passed[best] >= rules.both_factor:
+        besides.sort(key=weight.__getitem__, reverse=True)
+        return Decision(best, (best, *besides), belief, margin, both=True)
     group = tuple(part for part in candidates if weight[part] * rules.group_factor >= weight[best])
     open_race = all(race in group for race in RACES)
     return Decision("inner_or_outer" if open_race else best, group, belief, margin)
+
+
+def _damaged_besides(
+    part: Part, evidence: Mapping[Part, PartEvidence], passed: Mapping[Part, float], rules: RaceRules
+) -> bool:
+    """Whether a part that is not the foremost has lines that the foremost one does not explain."""
+    if part != "ball":
+        return passed[part] >= rules.both_factor
+    # A race's strikes make those of the ball small against the rest of the envelope, and no less regular.
+    return passed[part] >= rules.beside_ball_factor and evidence[part].z >= rules.beside_ball_z
 
 
 def _belief_strength(

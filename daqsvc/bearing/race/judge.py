@@ -17,7 +17,6 @@ import scipy.fft
 from daqsvc.bearing.race.decision import (
     MOST_MARGIN,
     MOST_UNCERTAINTY,
-    RACES,
     EnvelopeView,
     Scales,
     decide,
@@ -48,8 +47,9 @@ from daqsvc.bearing.race.verdict import (
     band_levels,
 )
 from daqsvc.dsp.envelope import levelled, line_power, squared_envelope, whiten
+from daqsvc.dsp.quality import UnfitError
 from daqsvc.dsp.quality.accelerometers import checked
-from daqsvc.dsp.speed.harmonics import shaft_rate, slow_series
+from daqsvc.dsp.speed.harmonics import REMEDY, shaft_rate, slow_series
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -76,6 +76,7 @@ class RaceFeatures:
         speed_rpm: of the shaft, as its harmonics show it.
         speed_unconfirmed: why they do not confirm it; empty if they do.
         other_speed: whether they speak for another one instead.
+        rival_rpm: the other one, where far more of them stand out there; None if not.
         revolutions: of the shaft in the record.
         notes: what is odd about the samples.
         repairs: what was wrong with them and put right.
@@ -89,6 +90,7 @@ class RaceFeatures:
     speed_rpm: float
     speed_unconfirmed: str
     other_speed: bool
+    rival_rpm: float | None
     revolutions: float
     notes: tuple[str, ...]
     repairs: tuple[str, ...]
@@ -149,8 +151,10 @@ def verdict_of(features: RaceFeatures, rules: RaceRules, baseline: RaceBaseline 
             if e.testable and e.z >= rules.regular_z and e.severity < e.limit
         ]
     if decision.both:
-        z = " and ".join(f"{evidence[part].z:.1f}" for part in RACES)
-        notes.append(f"inner and outer race both stand out (z {z}): both may be damaged")
+        damaged = [part for part in PARTS if part in decision.group]
+        places = " and ".join(PLACES[part] for part in damaged)
+        z = " and ".join(f"{evidence[part].z:.1f}" for part in damaged)
+        notes.append(f"{places} stand out, each by itself (z {z}): both may be damaged")
     if features.speed_unconfirmed:
         notes.append(f"the speed is not confirmed: {features.speed_unconfirmed}")
     repairs = len(features.repairs)
@@ -182,7 +186,32 @@ def verdict_of(features: RaceFeatures, rules: RaceRules, baseline: RaceBaseline 
 def race_features(
     samples: NDArray[np.floating], rate_hz: float, speed_rpm: float, bearing: BearingOrders, rules: RaceRules
 ) -> RaceFeatures:
-    """Measure what the decision rests on; arguments and errors as of `race_test`."""
+    """Measure what the decision rests on; arguments and errors as of `race_test`.
+
+    Harmonics of another speed may be of a machine nearby. Where the bearing's own lines stand out at that
+    speed, too, it is this machine that turns at it.
+    """
+    features = _measured(samples, rate_hz, speed_rpm, bearing, rules)
+    if features.rival_rpm is None:
+        return features
+    here = max(e.severity for e in features.evidence.values())
+    # Half and double a speed have many of its harmonics.
+    for rpm in (features.rival_rpm * factor for factor in (1.0, 0.5, 2.0)):
+        there = _measured(samples, rate_hz, rpm, bearing, rules)
+        part = max(PARTS, key=lambda part: there.evidence[part].severity)
+        if decide(there.evidence, rules).verdict != "normal" and there.evidence[part].severity > here:
+            raise UnfitError(
+                "shaft speed or sample rate",
+                f"is wrong: harmonics of a shaft and lines of the {PLACES[part]} stand out at about "
+                f"{rpm:.0f} rpm, not at {speed_rpm:g} rpm",
+                REMEDY,
+            )
+    return features
+
+
+def _measured(
+    samples: NDArray[np.floating], rate_hz: float, speed_rpm: float, bearing: BearingOrders, rules: RaceRules
+) -> RaceFeatures:
     sound = checked(np.asarray(samples, dtype=np.float64), rate_hz, speed_rpm, (rules.low_hz, rules.high_hz))
     length = scipy.fft.prev_fast_len(len(sound.values), real=True)
     spectrum = scipy.fft.rfft(sound.values[:length])
@@ -224,6 +253,7 @@ def race_features(
         speed_rpm=60.0 * shaft.rate_hz,
         speed_unconfirmed=shaft.doubt,
         other_speed=shaft.elsewhere,
+        rival_rpm=None if shaft.rival_hz is None else 60.0 * shaft.rival_hz,
         revolutions=revolutions,
         notes=notes if track is None else (*notes, _wander_note(track)),
         repairs=repairs,
