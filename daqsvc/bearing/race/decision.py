@@ -110,7 +110,7 @@ class Scales:
         # A speed that is not known sharply shifts every line: the search grows by that, and is paid for.
         self._slip = rules.slip if shaft.sharp else rules.slip + rules.speed_tolerance
         self._seen = shaft.seen
-        self._elsewhere = shaft.elsewhere
+        self._elsewhere = shaft.rival_hz is not None
         self._caution = 1.0 if shaft.seen else rules.unseen_caution
 
     def weigh(self) -> dict[Part, PartEvidence]:

@@ -48,7 +48,8 @@ from daqsvc.bearing.race.verdict import (
 )
 from daqsvc.dsp.envelope import levelled, line_power, squared_envelope, whiten
 from daqsvc.dsp.quality import UnfitError
-from daqsvc.dsp.quality.accelerometers import checked
+from daqsvc.dsp.quality.accelerometers import LEAST_BAND, checked
+from daqsvc.dsp.quality.occupied import occupied_top_hz
 from daqsvc.dsp.speed.harmonics import REMEDY, shaft_rate, slow_series
 
 if TYPE_CHECKING:
@@ -75,8 +76,7 @@ class RaceFeatures:
         levels: mean square in octave bands.
         speed_rpm: of the shaft, as its harmonics show it.
         speed_unconfirmed: why they do not confirm it; empty if they do.
-        other_speed: whether they speak for another one instead.
-        rival_rpm: the other one, where far more of them stand out there; None if not.
+        rival_rpm: the speed that they speak for instead; None if they do not.
         revolutions: of the shaft in the record.
         notes: what is odd about the samples.
         repairs: what was wrong with them and put right.
@@ -89,7 +89,6 @@ class RaceFeatures:
     levels: BandLevels
     speed_rpm: float
     speed_unconfirmed: str
-    other_speed: bool
     rival_rpm: float | None
     revolutions: float
     notes: tuple[str, ...]
@@ -167,7 +166,7 @@ def verdict_of(features: RaceFeatures, rules: RaceRules, baseline: RaceBaseline 
             len(notes) - repairs,
             repairs,
             # At another speed the lines of all parts are elsewhere: nothing was looked for in their places.
-            lost=MOST_UNCERTAINTY if features.other_speed else features.lost,
+            lost=features.lost if features.rival_rpm is None else MOST_UNCERTAINTY,
         ),
         lines=features.lines,
         margin=min(decision.margin, MOST_MARGIN),
@@ -197,9 +196,12 @@ def race_features(
     here = max(e.severity for e in features.evidence.values())
     # Half and double a speed have many of its harmonics.
     for rpm in (features.rival_rpm * factor for factor in (1.0, 0.5, 2.0)):
-        there = _measured(samples, rate_hz, rpm, bearing, rules)
-        part = max(PARTS, key=lambda part: there.evidence[part].severity)
-        if decide(there.evidence, rules).verdict != "normal" and there.evidence[part].severity > here:
+        try:
+            there = _measured(samples, rate_hz, rpm, bearing, rules).evidence
+        except UnfitError:
+            continue  # too few revolutions at that speed, or in doubt itself: it contradicts nothing
+        part = max(PARTS, key=lambda part: there[part].severity)
+        if decide(there, rules).verdict != "normal" and there[part].severity > here:
             raise UnfitError(
                 "shaft speed or sample rate",
                 f"is wrong: harmonics of a shaft and lines of the {PLACES[part]} stand out at about "
@@ -218,9 +220,13 @@ def _measured(
     notes, repairs = sound.notes, sound.repairs
     holes = np.array(sound.stretches, dtype=np.float64).reshape(-1, 2) / length
     # Of a long record each of these is as large as the record: what has been used is let go.
+    occupied_hz = occupied_top_hz(sound.values, rate_hz)
     del sound
     levels = band_levels(spectrum, length, rate_hz)
     top_hz = min(TOP_SHARE * rate_hz, rules.high_hz)
+    if occupied_hz is not None and occupied_hz < top_hz:
+        top_hz = occupied_hz
+        notes = (*notes, _empty_above(top_hz, rate_hz, rules.low_hz))
     band = whiten(spectrum, length, rate_hz, rules.low_hz, top_hz, rules.whitening_hz)
     top_order = max(highest_order(bearing), NOTCHED_HARMONICS + 1.0)
     stated_hz, step_hz = speed_rpm / 60.0, rate_hz / length
@@ -252,7 +258,6 @@ def _measured(
         levels=levels,
         speed_rpm=60.0 * shaft.rate_hz,
         speed_unconfirmed=shaft.doubt,
-        other_speed=shaft.elsewhere,
         rival_rpm=None if shaft.rival_hz is None else 60.0 * shaft.rival_hz,
         revolutions=revolutions,
         notes=notes if track is None else (*notes, _wander_note(track)),
@@ -264,6 +269,23 @@ def _measured(
             floor=np.sqrt(square.depth.floor),
         ),
     )
+
+
+def _empty_above(top_hz: float, rate_hz: float, low_hz: float) -> str:
+    """What to say of a record that holds nothing above some frequency.
+
+    Raises:
+        UnfitError: what it holds is too little to judge a bearing by.
+    """
+    found = f"nothing above {top_hz:.0f} Hz at a sample rate of {rate_hz:g} Hz"
+    why = f"low-passed, or sampled at about {2e-3 * top_hz:.2g} kHz and upsampled"
+    if top_hz < LEAST_BAND * low_hz:
+        raise UnfitError(
+            "channel",
+            f"has {found} ({why}), which leaves the band {low_hz:g} to {top_hz:.0f} Hz",
+            f"record up to {LEAST_BAND * low_hz:.0f} Hz or more",
+        )
+    return f"{found}: {why}; judged by {low_hz:g} to {top_hz:.0f} Hz"
 
 
 def _wander_note(track: SpeedTrack) -> str:

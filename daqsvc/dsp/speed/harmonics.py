@@ -183,8 +183,7 @@ class ShaftRate:
         seen: whether harmonics of the shaft stand out at that rate, and more so than at any other.
         sharp: whether it is known to a fraction of the search.
         doubt: why they do not confirm it; empty if they do.
-        elsewhere: whether they speak for another one instead.
-        rival_hz: the other one, where far more of them stand out there than here; None if not.
+        rival_hz: the rate that they speak for instead; None if they do not.
         scan: votes for all speeds about the stated one.
     """
 
@@ -192,7 +191,6 @@ class ShaftRate:
     seen: bool
     sharp: bool = False
     doubt: str = ""
-    elsewhere: bool = False
     rival_hz: float | None = None
     scan: SpeedScan | None = None
 
@@ -250,19 +248,19 @@ def shaft_rate(
     beside = scan.best(np.abs(scan.share - 1.0) <= NEAR)
     if scan.votes_about(beside) > scan.votes_about(rate_hz) + NEAR_NATS:
         rate_hz, sharp = beside, True
-    doubt, elsewhere = scan.doubt(rate_hz)
-    rival_hz = scan.rival_of(rate_hz)
+    doubt, rival_hz = scan.doubt(rate_hz)
+    far_hz = scan.far_ahead(rate_hz)
     # A damaged ball makes lines at 1X less the cage's rate that can outweigh the shaft's own.
     if wrong_hz is not None and doubt and not _cage_line(enough, series_hz, (1.0 - cage) * stated_hz):
-        rival_hz = wrong_hz
-    if rival_hz is not None:
-        elsewhere = True
+        far_hz = wrong_hz
+    if far_hz is not None:
+        rival_hz = far_hz
         doubt = (
-            f"far more harmonics of a shaft stand out at about {60.0 * rival_hz:.0f} rpm than at "
+            f"far more harmonics of a shaft stand out at about {60.0 * far_hz:.0f} rpm than at "
             f"{60.0 * stated_hz:g} rpm: those of a machine nearby, unless the speed or the sample rate is "
             f"wrong; {REMEDY}"
         )
-    return ShaftRate(rate_hz, not doubt, sharp, doubt, elsewhere, rival_hz, scan)
+    return ShaftRate(rate_hz, not doubt, sharp, doubt, rival_hz, scan)
 
 
 @dataclass(frozen=True, slots=True)
@@ -312,28 +310,34 @@ class SpeedScan:
         about = np.abs(self.rates_hz / rate_hz - 1.0) <= reach
         return float(self.votes[about].max(initial=-np.inf))
 
-    def doubt(self, rate_hz: float) -> tuple[str, bool]:
-        """Why the harmonics do not confirm a rate, empty if they do, and whether they speak for another."""
+    def doubt(self, rate_hz: float) -> tuple[str, float | None]:
+        """Why the harmonics do not confirm a rate, empty if they do, and which one they speak for instead."""
         own = self.votes_about(rate_hz)
         if own < SEEN_NATS:
-            return "no harmonics of the shaft stand out", False
+            return "no harmonics of the shaft stand out", None
         if own - self.harmonics.mains_votes(rate_hz) < NOT_MAINS_NATS:
-            return "only harmonics at multiples of the mains' frequency stand out", False
+            return "only harmonics at multiples of the mains' frequency stand out", None
         other = self.best(self.others)
         if self.votes_about(other) > own + LEAD_NATS:
-            return f"more harmonics stand out at {60.0 * other:.0f} rpm", True
+            return f"more harmonics stand out at {60.0 * other:.0f} rpm", other
         odd, even, half = (
             float(self.harmonics.voices(np.array([rate_hz]), orders).mean())
             for orders in (np.arange(1.0, 9.0, 2.0), np.arange(2.0, 9.0, 2.0), np.arange(0.5, 8.0))
         )
         if half > WHOLE_SHARE * max(odd, even):
-            return f"half orders stand out as well, as if the shaft turned at {30.0 * rate_hz:.0f} rpm", True
+            return (
+                f"half orders stand out as well, as if the shaft turned at {30.0 * rate_hz:.0f} rpm",
+                0.5 * rate_hz,
+            )
         if odd < WHOLE_SHARE * even:
-            return f"only even harmonics stand out, as if the shaft turned at {120.0 * rate_hz:.0f} rpm", True
-        return "", False
+            return (
+                f"only even harmonics stand out, as if the shaft turned at {120.0 * rate_hz:.0f} rpm",
+                2.0 * rate_hz,
+            )
+        return "", None
 
-    def rival_of(self, rate_hz: float) -> float | None:
-        """Another rate that far more harmonics speak for; None if there is none."""
+    def far_ahead(self, rate_hz: float) -> float | None:
+        """Another rate with far more votes; None if there is none."""
         other = self.best(self.others)
         votes = self.votes_about(other)
         far = votes >= OTHER_LEAST_NATS and votes - self.votes_about(rate_hz) > OTHER_NATS
