@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.bearing.race.lines import (
+    HALF_WIDTH,
+    NOTCH_BINS,
     REVOLUTIONS,
     LineEvidence,
     ModulationDepth,
@@ -37,6 +39,7 @@ if TYPE_CHECKING:
 
     from daqsvc.bearing.geometry import BearingOrders
     from daqsvc.bearing.race.verdict import RaceBaseline, RaceRules, RaceWord
+    from daqsvc.dsp.drive_lines import DriveLines
     from daqsvc.dsp.speed.harmonics import ShaftRate
 
     Real = NDArray[np.float64]
@@ -68,15 +71,16 @@ class EnvelopeView:
         return EnvelopeView(self.lines.without(explained), self.depth.without(explained), self.power)
 
 
-def view_of(phases: Real, sizes: Real, revolutions: float) -> EnvelopeView:
+def view_of(phases: Real, sizes: Real, revolutions: float, others: Sequence[float] = ()) -> EnvelopeView:
     """Look at an envelope's spectrum.
 
     Args:
         phases: line power of the band with unit amplitudes, ``[bins]``.
         sizes: that of the band with clipped amplitudes, ``[bins]``.
         revolutions: of the shaft in the record: bins per order.
+        others: orders of lines, besides the harmonics of the shaft, that are no bearing's.
     """
-    lines = line_evidence(phases, revolutions)
+    lines = line_evidence(phases, revolutions, others)
     return EnvelopeView(lines, ModulationDepth(sizes, lines.notched, revolutions), sizes)
 
 
@@ -91,6 +95,7 @@ class Scales:
         shaft: rate of the shaft.
         revolutions: of the shaft in the record.
         rules: settings of the test.
+        drives: gears and motors whose lines stand out; both views are without theirs.
     """
 
     def __init__(
@@ -101,12 +106,14 @@ class Scales:
         shaft: ShaftRate,
         revolutions: float,
         rules: RaceRules,
+        drives: Sequence[DriveLines] = (),
     ) -> None:
         self._square = square
         self._log = log
         self._bearing = bearing
         self._revolutions = revolutions
         self._rules = rules
+        self._drives = drives
         # A speed that is not known sharply shifts every line: the search grows by that, and is paid for.
         self._slip = rules.slip if shaft.sharp else rules.slip + rules.speed_tolerance
         self._seen = shaft.seen
@@ -168,6 +175,8 @@ class Scales:
             mirrored = min(depth.mirrored(order) for depth in depths)
             if mirrored >= rules.smear_mirrored and z >= rules.z_limit:
                 e = replace(e, testable=False, reason=_smeared(part, order))
+        if e.z < e.z_limit and (drive := self._drive_at(stated)) is not None:
+            e = replace(e, testable=False, reason=_covered(stated, drive))
         if part == "ball":
             # A ball's marks come and go with its own tumbling: its lines are too weak for the logarithm.
             e = replace(e, depth=by_square, severity=max(z, 0.0) * by_square)
@@ -178,6 +187,19 @@ class Scales:
             if away < rules.ball_testable_bins:
                 e = replace(e, testable=False, reason=_why_not(stated, gap, rules))
         return e
+
+    def _drive_at(self, order: float) -> DriveLines | None:
+        """The gear or motor that has a line where a part's is looked for."""
+        reach = max(NOTCH_BINS / self._revolutions, HALF_WIDTH * order)
+        for drive in self._drives:
+            if any(abs(other - order) < reach for other in drive.explained(order + 1.0)):
+                return drive
+        return None
+
+
+def _covered(order: float, drive: DriveLines) -> str:
+    """Why a part is not testable where something else has a line."""
+    return f"its line at order {order:.3f} is where the {drive.kind} has one; test it at another speed"
 
 
 def _smeared(part: Part, order: float) -> str:

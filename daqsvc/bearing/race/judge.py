@@ -28,6 +28,7 @@ from daqsvc.bearing.race.lines import (
     NOTCHED_HARMONICS,
     TEETH,
     false_alarm_probability,
+    fundamental,
     highest_order,
     part_lines,
 )
@@ -46,6 +47,7 @@ from daqsvc.bearing.race.verdict import (
     RaceVerdict,
     band_levels,
 )
+from daqsvc.dsp.drive_lines import TOP_ORDER, LineLevels, drive_lines
 from daqsvc.dsp.envelope import levelled, line_power, squared_envelope, whiten
 from daqsvc.dsp.quality import UnfitError
 from daqsvc.dsp.quality.accelerometers import LEAST_BAND, checked
@@ -59,6 +61,7 @@ if TYPE_CHECKING:
 
     from daqsvc.bearing.geometry import BearingOrders
     from daqsvc.bearing.race.track import SpeedTrack
+    from daqsvc.dsp.drive_lines import DriveLines
 
 
 LOG_OFFSET = np.float32(1e-3)
@@ -81,6 +84,7 @@ class RaceFeatures:
         notes: what is odd about the samples.
         repairs: what was wrong with them and put right.
         lost: share of the record that the repairs left nothing of.
+        drives: gears and motors whose lines stand out, and are taken for no part's.
         spectrum: envelope spectrum, for figures.
     """
 
@@ -94,6 +98,7 @@ class RaceFeatures:
     notes: tuple[str, ...]
     repairs: tuple[str, ...]
     lost: float
+    drives: tuple[DriveLines, ...]
     spectrum: EnvelopeSpectrum
 
 
@@ -178,6 +183,7 @@ def verdict_of(features: RaceFeatures, rules: RaceRules, baseline: RaceBaseline 
         notes=tuple(notes),
         both=decision.both,
         repairs=features.repairs,
+        drives=features.drives,
         spectrum=features.spectrum,
     )
 
@@ -232,6 +238,7 @@ def _measured(
     stated_hz, step_hz = speed_rpm / 60.0, rate_hz / length
     bins = min(int(top_order * stated_hz / step_hz) + 10, len(band.phase) // 2)
     series, series_hz = slow_series(spectrum, step_hz, stated_hz)
+    line_levels = LineLevels(spectrum, step_hz, TOP_ORDER * stated_hz)
     del spectrum
     phases, sizes = squared_envelope(band.phase, bins), squared_envelope(band.clipped, bins)
     del band
@@ -245,12 +252,16 @@ def _measured(
         series, series_hz, power, 1.0 / step_hz, stated_hz, rules.speed_tolerance, bearing.cage
     )
     revolutions = shaft.rate_hz / step_hz
-    square = view_of(power, line_power(levelled(sizes, holes), bins), revolutions)
+    # On an even angle of the shaft the lines of a motor are none, and in even time those of a gear.
+    drives = drive_lines(line_levels, shaft.rate_hz, sharp=shaft.sharp) if track is None else ()
+    drives = tuple(drive for drive in drives if not _is_bearings(drive, bearing, rules.slip))
+    others = [order for drive in drives for order in drive.explained(top_order)]
+    square = view_of(power, line_power(levelled(sizes, holes), bins), revolutions, others)
     log_phases, log_sizes = (
         line_power(levelled(np.log(envelope + LOG_OFFSET), holes), bins) for envelope in (phases, sizes)
     )
-    log = view_of(log_phases, log_sizes, revolutions)
-    evidence = Scales(square, log, bearing, shaft, revolutions, rules).weigh()
+    log = view_of(log_phases, log_sizes, revolutions, others)
+    evidence = Scales(square, log, bearing, shaft, revolutions, rules, drives).weigh()
     refuse_rivals(evidence, bearing, shaft, rules.slip)
     return RaceFeatures(
         evidence=evidence,
@@ -263,11 +274,19 @@ def _measured(
         notes=notes if track is None else (*notes, _wander_note(track)),
         repairs=repairs,
         lost=float(np.diff(holes, axis=1).sum()),
+        drives=drives,
         spectrum=EnvelopeSpectrum(
             order=np.arange(bins) / revolutions,
             amplitude=np.sqrt(square.power),
             floor=np.sqrt(square.depth.floor),
         ),
+    )
+
+
+def _is_bearings(drive: DriveLines, bearing: BearingOrders, slip: float) -> bool:
+    """Whether a gear's mate would turn as often as a part is struck: more likely it is the bearing."""
+    return drive.kind == "gear" and any(
+        abs((drive.spacing or 0.0) / fundamental(bearing, part) - 1.0) <= slip for part in PARTS
     )
 
 

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.bearing.geometry import BearingOrders
+    from daqsvc.dsp.drive_lines import DriveLines
 
     Complex = NDArray[np.complex128]
 
@@ -121,6 +122,7 @@ class RaceVerdict:
         notes: what a reader should know, e.g. ``"ball not testable here: ..."``.
         repairs: those of the notes that say what was wrong with the samples and put right; while there are
             any, ``"normal"`` clears nothing.
+        drives: gears and motors whose lines stand out, and are taken for no part's.
         spectrum: for figures.
     """
 
@@ -138,6 +140,7 @@ class RaceVerdict:
     notes: tuple[str, ...] = ()
     both: bool = False
     repairs: tuple[str, ...] = ()
+    drives: tuple[DriveLines, ...] = ()
     spectrum: EnvelopeSpectrum | None = field(default=None, repr=False, compare=False)
 
 
