@@ -12,7 +12,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
+import scipy.fft
 
+from daqsvc.dsp.drive_lines import LineLevels, motor_lines
 from daqsvc.dsp.speed.lines import ORDERS, find_speed
 
 if TYPE_CHECKING:
@@ -22,6 +24,8 @@ if TYPE_CHECKING:
 
     Floats: TypeAlias = NDArray[np.float64]
     Flags: TypeAlias = NDArray[np.bool_]
+    from daqsvc.dsp.speed.lines import LineSpeed
+
     Complexes: TypeAlias = NDArray[np.complex128]
 
 LEAST_REVOLUTIONS = 8
@@ -33,6 +37,12 @@ _LEAST_PRESENT = 0.75
 _CLIPPED_SHARE = 1.0 / 64.0
 _DEAD = 1e-9
 """Deviation of a channel, as a part of its largest value, below which nothing moves."""
+_DEVIATIONS = 4.0
+"""Of the speed, within which a line may be an order."""
+_BLOCK_WIDTHS = 2.0
+"""Widths of a block's lines within which another one leaks into an order."""
+_MOTOR_TOP_HZ = 130.0
+"""What has to be looked at to find twice the mains."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +60,7 @@ class OrderVectors:
             search and the uncertainty says so.
         nominal_rpm: the speed that was stated.
         revolutions_per_block: shaft revolutions in a block.
+        motor_hz: of a motor's line so near to an order that it was taken out of it; None if there is none.
     """
 
     amplitudes: Complexes
@@ -59,6 +70,7 @@ class OrderVectors:
     speed_seen: bool
     nominal_rpm: float
     revolutions_per_block: int
+    motor_hz: float | None = None
 
     def __len__(self) -> int:
         return len(self.amplitudes)
@@ -106,6 +118,9 @@ def order_vectors(
     present: Flags = np.asarray(there.all(axis=1))
     centred = np.where(present[:, np.newaxis], values - np.nanmean(values, axis=0), 0.0)
     speed = find_speed(centred, rate_hz, nominal_hz)
+    motor_hz = _motor_beside(centred, rate_hz, speed)
+    if motor_hz is not None:
+        _take_out(motor_hz, centred, present, rate_hz, speed.hz)
     amplitudes, residual, revolutions = _blocks(centred, present, rate_hz, speed.hz)
     if len(amplitudes) < _LEAST_BLOCKS:
         raise ValueError(
@@ -120,7 +135,35 @@ def order_vectors(
         speed_seen=speed.seen,
         nominal_rpm=abs(speed_rpm),
         revolutions_per_block=revolutions,
+        motor_hz=motor_hz,
     )
+
+
+def _motor_beside(centred: Floats, rate_hz: float, speed: LineSpeed) -> float | None:
+    """Frequency of a motor's line that a block cannot tell from an order; None if there is none."""
+    count = len(centred)
+    block_hz = speed.hz / max(1, int(count * speed.hz / rate_hz) // _BLOCKS)
+    known = speed.deviation_hz / speed.hz * _DEVIATIONS
+    for channel in range(centred.shape[1]):
+        spectrum = scipy.fft.rfft(centred[:, channel])
+        levels = LineLevels(spectrum, rate_hz / count, ORDERS[-1] * speed.hz + _MOTOR_TOP_HZ)
+        motor = motor_lines(levels, speed.hz, known)
+        if motor is not None:
+            away = min(abs(motor.frequency_hz - order * speed.hz) for order in ORDERS)
+            if away < _BLOCK_WIDTHS * block_hz:
+                return motor.frequency_hz
+    return None
+
+
+def _take_out(line_hz: float, centred: Floats, present: Flags, rate_hz: float, speed_hz: float) -> None:
+    """Subtract a line from all channels in place, as the whole recording has it beside the orders."""
+    there = np.flatnonzero(present)
+    hz = np.array([*(order * speed_hz for order in ORDERS), line_hz])
+    phases = np.exp(2j * np.pi / rate_hz * np.outer(there, hz))
+    basis = np.concatenate((phases.real, phases.imag), axis=1)
+    fit, *_ = np.linalg.lstsq(basis, centred[there], rcond=None)
+    line = [len(ORDERS), len(hz) + len(ORDERS)]
+    centred[there] -= basis[:, line] @ fit[line]
 
 
 def _check_length(count: int, rate_hz: float, nominal_hz: float) -> None:

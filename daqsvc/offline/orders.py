@@ -273,6 +273,12 @@ def analyse_orders(
         )
     if orders.speed_seen and (problem := off_stated_speed(orders.speed_rpm, setup.speed_rpm)):
         quality = quality.with_problem(problem)
+    if orders.motor_hz is not None:
+        order = round(60.0 * orders.motor_hz / orders.speed_rpm)
+        quality = quality.with_problem(
+            f"a line of an induction motor stands out at {orders.motor_hz:.2f} Hz, twice the mains: it was "
+            f"taken out of {order}X, {order * orders.speed_rpm / 60.0:.2f} Hz, as it is no fault of the rotor"
+        )
     if not baseline.speed_seen:
         quality = quality.with_problem(
             f"no order of {setup.speed_rpm:g} rpm stands out of the healthy run {baseline_name}: if it "

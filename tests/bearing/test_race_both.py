@@ -38,6 +38,25 @@ def test_one_damaged_race_is_one(part: str, seed: int) -> None:
     assert (v.verdict, v.group, v.both) == (part, (part,), False)
 
 
+@pytest.mark.parametrize("race", ["inner", "outer"])
+@pytest.mark.parametrize(("ball", "strength"), [(1.5, 1.5), (1.5, 3.0), (3.0, 2.0)])
+def test_a_damaged_ball_and_a_damaged_race_are_told_as_two(race: str, ball: float, strength: float) -> None:
+    samples = strikes("ball", 10.0, strength=ball, seed=1) + strikes(race, 10.0, strength=strength, seed=2)
+    v = race_test(samples, RATE_HZ, SPEED_RPM, BEARING)
+    assert v.both
+    assert v.group[0] == v.verdict
+    assert set(v.group) == {"ball", race}
+    places = {"inner": "inner race", "outer": "outer race"}
+    assert any(note.startswith(f"{places[race]} and ball stand out, each by itself") for note in v.notes)
+
+
+@pytest.mark.parametrize("strength", [1.5, 3.0, 6.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_damaged_ball_is_one(strength: float, seed: int) -> None:
+    v = race_test(strikes("ball", 10.0, strength=strength, seed=seed), RATE_HZ, SPEED_RPM, BEARING)
+    assert (v.verdict, v.group, v.both) == ("ball", ("ball",), False)
+
+
 @pytest.mark.parametrize(
     ("inner_z", "outer_z", "verdict", "group"),
     [
@@ -70,6 +89,19 @@ def test_the_sum_of_two_measured_machines_shows_both(data, one: str, other: str)
     for name in (one, other):
         alone = race_test(records[name].samples, RATE_HZ, records[name].speed_rpm, BEARING)
         assert not alone.both
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(("ball", "race"), [("222", "169"), ("222", "234"), ("3005", "156"), ("3006", "234")])
+def test_the_sum_of_two_measured_machines_shows_ball_and_race(data, ball: str, race: str) -> None:
+    records = {r.name: r for r in race_records.cwru(data)}
+    first, second = records[ball].samples, records[race].samples
+    n = min(len(first), len(second))
+    v = race_test(
+        first[:n] / first.std() + second[:n] / second.std(), RATE_HZ, records[ball].speed_rpm, BEARING
+    )
+    assert v.both
+    assert set(v.group) == {"ball", "inner" if race == "169" else "outer"}
 
 
 RULES = RaceRules()

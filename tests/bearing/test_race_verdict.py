@@ -102,7 +102,11 @@ GAPPED[100:2000] = np.nan
         (strikes(None), {"rate_hz": 2000.0}, r"leaves the band 400 to 960 Hz"),
         (strikes(None), {"speed_rpm": 0.0}, r"shaft speed is 0.0 rpm; give the speed"),
         (strikes(None), {"speed_rpm": float("nan")}, r"shaft speed is nan rpm"),
-        (strikes(None), {"speed_rpm": 1450.0}, r"at about 179\d rpm"),
+        (
+            strikes("inner", strength=1.5),
+            {"speed_rpm": 1450.0},
+            r"lines of the inner race .* at about 179\d rpm",
+        ),
     ],
 )
 def test_bad_input_is_named_with_a_remedy(

@@ -30,16 +30,20 @@ def outcomes(data: Path, factors_of: Callable[[int], Sequence[tuple[float, float
     """
     found: Counter[str] = Counter()
     for number, r in enumerate(race_records.all_records(data)):
+        named = race_test(r.samples, r.rate_hz, r.speed_rpm, r.bearing).verdict == r.truth != "normal"
         for speed, rate in factors_of(number):
             found["judged"] += 1
+            found["of named parts"] += named
             try:
                 v = race_test(r.samples, rate * r.rate_hz, speed * r.speed_rpm, r.bearing)
             except UnfitError:
                 found["refused"] += 1
+                found["refused of named parts"] += named
                 continue
             found["confirmed"] += v.speed_seen
             found["wrong part"] += v.verdict not in {"normal", r.truth}
             found["right"] += v.verdict == r.truth
+            found["sure of normal"] += v.probability["normal"] > 0.5
     return found
 
 
@@ -51,7 +55,9 @@ def test_wrong_speeds_are_refused_or_not_confirmed(data: Path) -> None:
 
     counts = outcomes(data, some)
     assert counts["confirmed"] <= 0.03 * counts["judged"]
-    assert counts["refused"] >= 0.8 * counts["judged"]
+    # A healthy machine beside a louder one, and one whose speed is wrong, look alike: neither is sure.
+    assert counts["refused of named parts"] >= 0.8 * counts["of named parts"]
+    assert counts["sure of normal"] <= 0.06 * counts["judged"]
     assert counts["wrong part"] <= 0.01 * counts["judged"]
 
 

@@ -160,6 +160,32 @@ def test_1x_that_wanders_by_itself_is_no_change() -> None:
     assert change.verdict == "normal"
 
 
+def driven(seed: int, motor: float) -> np.ndarray:
+    """A motor of two poles at 2979 rpm: the line at twice the mains is 0.7 Hz beside 2X."""
+    samples = record(seed, rpm=2979.0, n=20_000)
+    t = np.arange(len(samples)) / RATE_HZ
+    return samples + motor * np.outer(np.cos(2.0 * np.pi * 100.0 * t + seed), [1.0, 0.8, 0.3])
+
+
+def test_a_motors_line_beside_2x_is_no_fault_of_the_rotor() -> None:
+    before, after = (
+        order_vectors(driven(seed, motor), RATE_HZ, 2979.0) for seed, motor in ((1, 0.2), (2, 2.0))
+    )
+    assert before.motor_hz == pytest.approx(100.0, abs=0.05)
+    assert after.motor_hz == pytest.approx(100.0, abs=0.05)
+    change = compare_orders(before, after, OrderRules())
+    assert change.verdict == "normal"
+    np.testing.assert_allclose(
+        np.abs(after.amplitudes.mean(axis=0))[1], 0.4 * np.abs(AXES), rtol=0.1, atol=0.02
+    )
+    # A shaft's 2X that grows is still one.
+    grown = order_vectors(
+        driven(3, 0.2) + 0.5 * (record(4, rpm=2979.0, n=20_000, noise=0.0) - 0.9), RATE_HZ, 2979.0
+    )
+    assert compare_orders(before, grown, OrderRules()).verdict != "normal"
+    assert orders(1).motor_hz is None
+
+
 def test_probabilities_sum_to_one() -> None:
     for scale in ((1.0, 1.0, 1.0), (1.3, 1.0, 1.0), (3.0, 2.0, 1.0), (1.0, 5.0, 1.0)):
         change = compared(scale)

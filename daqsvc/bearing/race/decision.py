@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.bearing.race.lines import (
+    HALF_WIDTH,
+    NOTCH_BINS,
     REVOLUTIONS,
     LineEvidence,
     ModulationDepth,
@@ -37,6 +39,7 @@ if TYPE_CHECKING:
 
     from daqsvc.bearing.geometry import BearingOrders
     from daqsvc.bearing.race.verdict import RaceBaseline, RaceRules, RaceWord
+    from daqsvc.dsp.drive_lines import DriveLines
     from daqsvc.dsp.speed.harmonics import ShaftRate
 
     Real = NDArray[np.float64]
@@ -68,15 +71,16 @@ class EnvelopeView:
         return EnvelopeView(self.lines.without(explained), self.depth.without(explained), self.power)
 
 
-def view_of(phases: Real, sizes: Real, revolutions: float) -> EnvelopeView:
+def view_of(phases: Real, sizes: Real, revolutions: float, others: Sequence[float] = ()) -> EnvelopeView:
     """Look at an envelope's spectrum.
 
     Args:
         phases: line power of the band with unit amplitudes, ``[bins]``.
         sizes: that of the band with clipped amplitudes, ``[bins]``.
         revolutions: of the shaft in the record: bins per order.
+        others: orders of lines, besides the harmonics of the shaft, that are no bearing's.
     """
-    lines = line_evidence(phases, revolutions)
+    lines = line_evidence(phases, revolutions, others)
     return EnvelopeView(lines, ModulationDepth(sizes, lines.notched, revolutions), sizes)
 
 
@@ -91,6 +95,7 @@ class Scales:
         shaft: rate of the shaft.
         revolutions: of the shaft in the record.
         rules: settings of the test.
+        drives: gears and motors whose lines stand out; both views are without theirs.
     """
 
     def __init__(
@@ -101,16 +106,18 @@ class Scales:
         shaft: ShaftRate,
         revolutions: float,
         rules: RaceRules,
+        drives: Sequence[DriveLines] = (),
     ) -> None:
         self._square = square
         self._log = log
         self._bearing = bearing
         self._revolutions = revolutions
         self._rules = rules
+        self._drives = drives
         # A speed that is not known sharply shifts every line: the search grows by that, and is paid for.
         self._slip = rules.slip if shaft.sharp else rules.slip + rules.speed_tolerance
         self._seen = shaft.seen
-        self._elsewhere = shaft.elsewhere
+        self._elsewhere = shaft.rival_hz is not None
         self._caution = 1.0 if shaft.seen else rules.unseen_caution
 
     def weigh(self) -> dict[Part, PartEvidence]:
@@ -168,6 +175,8 @@ class Scales:
             mirrored = min(depth.mirrored(order) for depth in depths)
             if mirrored >= rules.smear_mirrored and z >= rules.z_limit:
                 e = replace(e, testable=False, reason=_smeared(part, order))
+        if e.z < e.z_limit and (drive := self._drive_at(stated)) is not None:
+            e = replace(e, testable=False, reason=_covered(stated, drive))
         if part == "ball":
             # A ball's marks come and go with its own tumbling: its lines are too weak for the logarithm.
             e = replace(e, depth=by_square, severity=max(z, 0.0) * by_square)
@@ -178,6 +187,19 @@ class Scales:
             if away < rules.ball_testable_bins:
                 e = replace(e, testable=False, reason=_why_not(stated, gap, rules))
         return e
+
+    def _drive_at(self, order: float) -> DriveLines | None:
+        """The gear or motor that has a line where a part's is looked for."""
+        reach = max(NOTCH_BINS / self._revolutions, HALF_WIDTH * order)
+        for drive in self._drives:
+            if any(abs(other - order) < reach for other in drive.explained(order + 1.0)):
+                return drive
+        return None
+
+
+def _covered(order: float, drive: DriveLines) -> str:
+    """Why a part is not testable where something else has a line."""
+    return f"its line at order {order:.3f} is where the {drive.kind} has one; test it at another speed"
 
 
 def _smeared(part: Part, order: float) -> str:
@@ -244,7 +266,7 @@ RACES: tuple[Part, ...] = ("inner", "outer")
 class Decision:
     """The word, what it cannot be told from, the shares of belief, and how thin it is.
 
-    ``both``: both races are in the group because each has lines of its own, though they can be told apart.
+    ``both``: the parts of the group have lines of their own each, and can be told apart: all may be damaged.
     """
 
     verdict: RaceWord
@@ -289,16 +311,28 @@ def decide(
         belief = {rest: 1.0 - fault} | _shares(open_to, fault)
         return Decision(rest, (rest,), belief, 1.0 / max(sure, LEAST_FACTOR))
     weight = {part: weight_of(part, evidence[part], rules) for part in candidates}
-    belief = {rest: 1.0 - fault} | _shares(weight, fault)
     best = max(candidates, key=weight.__getitem__)
     rivals = [weight[best] / weight[part] for part in candidates if part != best]
     margin = min([passed[best], *rivals])
-    if best != "ball" and all(passed[race] >= rules.both_factor for race in RACES):
-        other: Part = "outer" if best == "inner" else "inner"
-        return Decision(best, (best, other), belief, margin, both=True)
+    besides = [part for part in PARTS if part != best and _damaged_besides(part, evidence, passed, rules)]
+    weight |= {part: weight_of(part, evidence[part], rules) for part in besides}
+    belief = {rest: 1.0 - fault} | _shares(weight, fault)
+    if besides and passed[best] >= rules.both_factor:
+        besides.sort(key=weight.__getitem__, reverse=True)
+        return Decision(best, (best, *besides), belief, margin, both=True)
     group = tuple(part for part in candidates if weight[part] * rules.group_factor >= weight[best])
     open_race = all(race in group for race in RACES)
     return Decision("inner_or_outer" if open_race else best, group, belief, margin)
+
+
+def _damaged_besides(
+    part: Part, evidence: Mapping[Part, PartEvidence], passed: Mapping[Part, float], rules: RaceRules
+) -> bool:
+    """Whether a part that is not the foremost has lines that the foremost one does not explain."""
+    if part != "ball":
+        return passed[part] >= rules.both_factor
+    # A race's strikes make those of the ball small against the rest of the envelope, and no less regular.
+    return passed[part] >= rules.beside_ball_factor and evidence[part].z >= rules.beside_ball_z
 
 
 def _belief_strength(

@@ -17,7 +17,6 @@ import scipy.fft
 from daqsvc.bearing.race.decision import (
     MOST_MARGIN,
     MOST_UNCERTAINTY,
-    RACES,
     EnvelopeView,
     Scales,
     decide,
@@ -29,6 +28,7 @@ from daqsvc.bearing.race.lines import (
     NOTCHED_HARMONICS,
     TEETH,
     false_alarm_probability,
+    fundamental,
     highest_order,
     part_lines,
 )
@@ -47,9 +47,12 @@ from daqsvc.bearing.race.verdict import (
     RaceVerdict,
     band_levels,
 )
+from daqsvc.dsp.drive_lines import TOP_ORDER, LineLevels, drive_lines
 from daqsvc.dsp.envelope import levelled, line_power, squared_envelope, whiten
-from daqsvc.dsp.quality.accelerometers import checked
-from daqsvc.dsp.speed.harmonics import shaft_rate, slow_series
+from daqsvc.dsp.quality import UnfitError
+from daqsvc.dsp.quality.accelerometers import LEAST_BAND, checked
+from daqsvc.dsp.quality.occupied import occupied_top_hz
+from daqsvc.dsp.speed.harmonics import REMEDY, shaft_rate, slow_series
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -58,6 +61,7 @@ if TYPE_CHECKING:
 
     from daqsvc.bearing.geometry import BearingOrders
     from daqsvc.bearing.race.track import SpeedTrack
+    from daqsvc.dsp.drive_lines import DriveLines
 
 
 LOG_OFFSET = np.float32(1e-3)
@@ -75,11 +79,12 @@ class RaceFeatures:
         levels: mean square in octave bands.
         speed_rpm: of the shaft, as its harmonics show it.
         speed_unconfirmed: why they do not confirm it; empty if they do.
-        other_speed: whether they speak for another one instead.
+        rival_rpm: the speed that they speak for instead; None if they do not.
         revolutions: of the shaft in the record.
         notes: what is odd about the samples.
         repairs: what was wrong with them and put right.
         lost: share of the record that the repairs left nothing of.
+        drives: gears and motors whose lines stand out, and are taken for no part's.
         spectrum: envelope spectrum, for figures.
     """
 
@@ -88,11 +93,12 @@ class RaceFeatures:
     levels: BandLevels
     speed_rpm: float
     speed_unconfirmed: str
-    other_speed: bool
+    rival_rpm: float | None
     revolutions: float
     notes: tuple[str, ...]
     repairs: tuple[str, ...]
     lost: float
+    drives: tuple[DriveLines, ...]
     spectrum: EnvelopeSpectrum
 
 
@@ -149,8 +155,10 @@ def verdict_of(features: RaceFeatures, rules: RaceRules, baseline: RaceBaseline 
             if e.testable and e.z >= rules.regular_z and e.severity < e.limit
         ]
     if decision.both:
-        z = " and ".join(f"{evidence[part].z:.1f}" for part in RACES)
-        notes.append(f"inner and outer race both stand out (z {z}): both may be damaged")
+        damaged = [part for part in PARTS if part in decision.group]
+        places = " and ".join(PLACES[part] for part in damaged)
+        z = " and ".join(f"{evidence[part].z:.1f}" for part in damaged)
+        notes.append(f"{places} stand out, each by itself (z {z}): both may be damaged")
     if features.speed_unconfirmed:
         notes.append(f"the speed is not confirmed: {features.speed_unconfirmed}")
     repairs = len(features.repairs)
@@ -163,7 +171,7 @@ def verdict_of(features: RaceFeatures, rules: RaceRules, baseline: RaceBaseline 
             len(notes) - repairs,
             repairs,
             # At another speed the lines of all parts are elsewhere: nothing was looked for in their places.
-            lost=MOST_UNCERTAINTY if features.other_speed else features.lost,
+            lost=features.lost if features.rival_rpm is None else MOST_UNCERTAINTY,
         ),
         lines=features.lines,
         margin=min(decision.margin, MOST_MARGIN),
@@ -175,6 +183,7 @@ def verdict_of(features: RaceFeatures, rules: RaceRules, baseline: RaceBaseline 
         notes=tuple(notes),
         both=decision.both,
         repairs=features.repairs,
+        drives=features.drives,
         spectrum=features.spectrum,
     )
 
@@ -182,21 +191,54 @@ def verdict_of(features: RaceFeatures, rules: RaceRules, baseline: RaceBaseline 
 def race_features(
     samples: NDArray[np.floating], rate_hz: float, speed_rpm: float, bearing: BearingOrders, rules: RaceRules
 ) -> RaceFeatures:
-    """Measure what the decision rests on; arguments and errors as of `race_test`."""
+    """Measure what the decision rests on; arguments and errors as of `race_test`.
+
+    Harmonics of another speed may be of a machine nearby. Where the bearing's own lines stand out at that
+    speed, too, it is this machine that turns at it.
+    """
+    features = _measured(samples, rate_hz, speed_rpm, bearing, rules)
+    if features.rival_rpm is None:
+        return features
+    here = max(e.severity for e in features.evidence.values())
+    # Half and double a speed have many of its harmonics.
+    for rpm in (features.rival_rpm * factor for factor in (1.0, 0.5, 2.0)):
+        try:
+            there = _measured(samples, rate_hz, rpm, bearing, rules).evidence
+        except UnfitError:
+            continue  # too few revolutions at that speed, or in doubt itself: it contradicts nothing
+        part = max(PARTS, key=lambda part: there[part].severity)
+        if decide(there, rules).verdict != "normal" and there[part].severity > here:
+            raise UnfitError(
+                "shaft speed or sample rate",
+                f"is wrong: harmonics of a shaft and lines of the {PLACES[part]} stand out at about "
+                f"{rpm:.0f} rpm, not at {speed_rpm:g} rpm",
+                REMEDY,
+            )
+    return features
+
+
+def _measured(
+    samples: NDArray[np.floating], rate_hz: float, speed_rpm: float, bearing: BearingOrders, rules: RaceRules
+) -> RaceFeatures:
     sound = checked(np.asarray(samples, dtype=np.float64), rate_hz, speed_rpm, (rules.low_hz, rules.high_hz))
     length = scipy.fft.prev_fast_len(len(sound.values), real=True)
     spectrum = scipy.fft.rfft(sound.values[:length])
     notes, repairs = sound.notes, sound.repairs
     holes = np.array(sound.stretches, dtype=np.float64).reshape(-1, 2) / length
     # Of a long record each of these is as large as the record: what has been used is let go.
+    occupied_hz = occupied_top_hz(sound.values, rate_hz)
     del sound
     levels = band_levels(spectrum, length, rate_hz)
     top_hz = min(TOP_SHARE * rate_hz, rules.high_hz)
+    if occupied_hz is not None and occupied_hz < top_hz:
+        top_hz = occupied_hz
+        notes = (*notes, _empty_above(top_hz, rate_hz, rules.low_hz))
     band = whiten(spectrum, length, rate_hz, rules.low_hz, top_hz, rules.whitening_hz)
     top_order = max(highest_order(bearing), NOTCHED_HARMONICS + 1.0)
     stated_hz, step_hz = speed_rpm / 60.0, rate_hz / length
     bins = min(int(top_order * stated_hz / step_hz) + 10, len(band.phase) // 2)
     series, series_hz = slow_series(spectrum, step_hz, stated_hz)
+    line_levels = LineLevels(spectrum, step_hz, TOP_ORDER * stated_hz)
     del spectrum
     phases, sizes = squared_envelope(band.phase, bins), squared_envelope(band.clipped, bins)
     del band
@@ -210,12 +252,16 @@ def race_features(
         series, series_hz, power, 1.0 / step_hz, stated_hz, rules.speed_tolerance, bearing.cage
     )
     revolutions = shaft.rate_hz / step_hz
-    square = view_of(power, line_power(levelled(sizes, holes), bins), revolutions)
+    # On an even angle of the shaft the lines of a motor are none, and in even time those of a gear.
+    drives = drive_lines(line_levels, shaft.rate_hz, sharp=shaft.sharp) if track is None else ()
+    drives = tuple(drive for drive in drives if not _is_bearings(drive, bearing, rules.slip))
+    others = [order for drive in drives for order in drive.explained(top_order)]
+    square = view_of(power, line_power(levelled(sizes, holes), bins), revolutions, others)
     log_phases, log_sizes = (
         line_power(levelled(np.log(envelope + LOG_OFFSET), holes), bins) for envelope in (phases, sizes)
     )
-    log = view_of(log_phases, log_sizes, revolutions)
-    evidence = Scales(square, log, bearing, shaft, revolutions, rules).weigh()
+    log = view_of(log_phases, log_sizes, revolutions, others)
+    evidence = Scales(square, log, bearing, shaft, revolutions, rules, drives).weigh()
     refuse_rivals(evidence, bearing, shaft, rules.slip)
     return RaceFeatures(
         evidence=evidence,
@@ -223,17 +269,42 @@ def race_features(
         levels=levels,
         speed_rpm=60.0 * shaft.rate_hz,
         speed_unconfirmed=shaft.doubt,
-        other_speed=shaft.elsewhere,
+        rival_rpm=None if shaft.rival_hz is None else 60.0 * shaft.rival_hz,
         revolutions=revolutions,
         notes=notes if track is None else (*notes, _wander_note(track)),
         repairs=repairs,
         lost=float(np.diff(holes, axis=1).sum()),
+        drives=drives,
         spectrum=EnvelopeSpectrum(
             order=np.arange(bins) / revolutions,
             amplitude=np.sqrt(square.power),
             floor=np.sqrt(square.depth.floor),
         ),
     )
+
+
+def _is_bearings(drive: DriveLines, bearing: BearingOrders, slip: float) -> bool:
+    """Whether a gear's mate would turn as often as a part is struck: more likely it is the bearing."""
+    return drive.kind == "gear" and any(
+        abs((drive.spacing or 0.0) / fundamental(bearing, part) - 1.0) <= slip for part in PARTS
+    )
+
+
+def _empty_above(top_hz: float, rate_hz: float, low_hz: float) -> str:
+    """What to say of a record that holds nothing above some frequency.
+
+    Raises:
+        UnfitError: what it holds is too little to judge a bearing by.
+    """
+    found = f"nothing above {top_hz:.0f} Hz at a sample rate of {rate_hz:g} Hz"
+    why = f"low-passed, or sampled at about {2e-3 * top_hz:.2g} kHz and upsampled"
+    if top_hz < LEAST_BAND * low_hz:
+        raise UnfitError(
+            "channel",
+            f"has {found} ({why}), which leaves the band {low_hz:g} to {top_hz:.0f} Hz",
+            f"record up to {LEAST_BAND * low_hz:.0f} Hz or more",
+        )
+    return f"{found}: {why}; judged by {low_hz:g} to {top_hz:.0f} Hz"
 
 
 def _wander_note(track: SpeedTrack) -> str:

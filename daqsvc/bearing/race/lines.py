@@ -49,7 +49,7 @@ class LineEvidence:
 
     Attributes:
         log_ratio: ``ln(1 + g)`` with ``g`` the generalised log-likelihood ratio for a line, ``[bins]``.
-        notched: bins that belong to harmonics of the shaft, ``[bins]``.
+        notched: bins of lines that are no bearing's, ``[bins]``: harmonics of the shaft, of gears and motors.
         bins_per_order: bins per order of the shaft.
     """
 
@@ -81,19 +81,24 @@ def noise_floor(power: Real, bins_per_order: float) -> Real:
     return np.asarray(running_median(power, round(FLOOR_ORDERS * bins_per_order)) / EXP_MEDIAN)
 
 
-def shaft_notch(power: Real, bins_per_order: float) -> NDArray[np.bool_]:
-    """Bins of the shaft's harmonics with their skirts, and those below the lowest order, ``[bins]``.
+def line_notch(power: Real, bins_per_order: float, others: Sequence[float] = ()) -> NDArray[np.bool_]:
+    """Bins of lines that are no bearing's with their skirts, and those below the lowest order, ``[bins]``.
 
     A skirt reaches down a line's flank as long as it falls, `SKIRT_BINS` bins at most.
+
+    Args:
+        power: envelope spectrum, ``[bins]``.
+        bins_per_order: bins per order of the shaft.
+        others: orders of lines besides the harmonics of the shaft.
     """
     n = len(power)
     notch = np.zeros(n, dtype=np.bool_)
     notch[: int(np.ceil(LOWEST_ORDER * bins_per_order))] = True
-    for harmonic in range(1, NOTCHED_HARMONICS + 1):
-        centre = harmonic * bins_per_order
+    for order in (*range(1, NOTCHED_HARMONICS + 1), *others):
+        centre = order * bins_per_order
         first, last = int(np.ceil(centre - NOTCH_BINS)), int(np.floor(centre + NOTCH_BINS))
-        if last >= n - 1:
-            break
+        if first < 1 or last >= n - 1:
+            continue
         while centre - (first - 1) <= SKIRT_BINS and power[first - 1] < power[first]:
             first -= 1
         while last + 1 < n and last + 1 - centre <= SKIRT_BINS and power[last + 1] < power[last]:
@@ -107,7 +112,7 @@ def hann_averages(bins: NDArray[np.int64]) -> Real:
     return bins / (1.0 + 2.0 * (0.444 * (1.0 - 1.0 / bins) + 0.028 * np.maximum(1.0 - 2.0 / bins, 0.0)))
 
 
-def line_evidence(power: Real, bins_per_order: float) -> LineEvidence:
+def line_evidence(power: Real, bins_per_order: float, others: Sequence[float] = ()) -> LineEvidence:
     """Test every bin, and every bin's neighbourhood of two widths, for more power than its surroundings.
 
     The test is the generalised likelihood ratio of a gamma distribution's scale, one-sided.
@@ -115,9 +120,10 @@ def line_evidence(power: Real, bins_per_order: float) -> LineEvidence:
     Args:
         power: envelope spectrum, ``[bins]``.
         bins_per_order: bins per order of the shaft.
+        others: orders of lines, besides the harmonics of the shaft, that are no bearing's.
     """
     ratio = power / np.maximum(noise_floor(power, bins_per_order), 1e-300)
-    notched = shaft_notch(power, bins_per_order)
+    notched = line_notch(power, bins_per_order, others)
     ratio[notched] = 1.0
     n = len(power)
     best = _excess(np.maximum(ratio, 1.0))

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.bearing.geometry import BearingOrders
+    from daqsvc.dsp.drive_lines import DriveLines
 
     Complex = NDArray[np.complex128]
 
@@ -107,7 +108,7 @@ class RaceVerdict:
     Attributes:
         verdict: the one word; ``"changed"`` needs a baseline.
         group: parts that the evidence cannot tell apart, the verdict among them; or both races.
-        both: whether both races are in the group because each has lines of its own: both may be damaged.
+        both: whether the parts of the group have lines of their own each: all of them may be damaged.
         evidence: what speaks for each part.
         probability: share of belief per word, summing to one, of the words that were weighed.
         lines: kinematic lines found, strongest first.
@@ -121,6 +122,7 @@ class RaceVerdict:
         notes: what a reader should know, e.g. ``"ball not testable here: ..."``.
         repairs: those of the notes that say what was wrong with the samples and put right; while there are
             any, ``"normal"`` clears nothing.
+        drives: gears and motors whose lines stand out, and are taken for no part's.
         spectrum: for figures.
     """
 
@@ -138,6 +140,7 @@ class RaceVerdict:
     notes: tuple[str, ...] = ()
     both: bool = False
     repairs: tuple[str, ...] = ()
+    drives: tuple[DriveLines, ...] = ()
     spectrum: EnvelopeSpectrum | None = field(default=None, repr=False, compare=False)
 
 
@@ -168,8 +171,11 @@ class RaceRules:
             limit of steadiness falls in proportion.
         ball_weight: what a ball's severity counts against a race's.
         group_factor: parts whose weights are within this factor cannot be told apart.
-        both_factor: factor by which both races must pass their limits, each by lines that the other does not
+        both_factor: factor by which two parts must pass their limits, each by lines that the other does not
             explain, for both to be called damaged.
+        beside_ball_z: significance of a ball's lines from which it is called damaged beside a race; beside a
+            race alone they reached 9.5 in measured records.
+        beside_ball_factor: factor by which it must pass its other limits for that.
         unresolved_bins: lines closer to a harmonic of the shaft, in bins, are not resolved from it.
         ball_testable_bins: the same for a ball, below which it is not tested at all.
         smear_share: distance of a line from a harmonic of the shaft, as a share of its order, up to which
@@ -206,6 +212,8 @@ class RaceRules:
     ball_weight: float = 0.6
     group_factor: float = 1.15
     both_factor: float = 1.2
+    beside_ball_z: float = 10.5
+    beside_ball_factor: float = 0.5
     unresolved_bins: float = 4.0
     ball_testable_bins: float = 2.5
     smear_share: float = 0.02

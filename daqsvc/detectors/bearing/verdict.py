@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from daqsvc.bearing.identify import HealthyResidual, ResidualChange
     from daqsvc.bearing.race.verdict import RaceLine, RaceVerdict
     from daqsvc.detectors.bearing.finding import BearingFinding
+    from daqsvc.dsp.drive_lines import DriveLines
     from daqsvc.dsp.quality.unit import AccelerationUnit
 
 _TOLD_LINES = 4
@@ -105,6 +106,7 @@ class BearingVerdict(Verdict):
                 "revolutions": 0 if race is None else race.revolutions,
                 "unit": self.setup.unit,
                 "notes": [] if race is None else list(race.notes),
+                "drives": [] if race is None else [drive_json(drive) for drive in race.drives],
                 "data_quality": self.quality.as_json(),
                 "refused": self.refused,
             }
@@ -199,6 +201,7 @@ class BearingVerdict(Verdict):
             )
         seen = "by its harmonics" if race.speed_seen else "not confirmed by its harmonics"
         lines.append(f"{race.speed_rpm:.1f} rpm {seen}, {race.revolutions:.0f} revolutions")
+        lines += [drive.describe() for drive in race.drives]
         lines += [f"{name}: not judged: {why}" for name, why in self.unfit.items()]
         # Those about the samples are problems of the data.
         lines += [
@@ -263,6 +266,19 @@ def line_json(line: RaceLine) -> dict[str, Any]:
         "order": line.order,
         "evidence_nats": line.evidence,
         "size": line.depth,
+    }
+
+
+def drive_json(drive: DriveLines) -> dict[str, Any]:
+    """A gear or a motor, for the output."""
+    return {
+        "kind": drive.kind,
+        "frequency_hz": drive.frequency_hz,
+        "order": drive.order,
+        "teeth": drive.teeth,
+        "mate_teeth": drive.mate_teeth,
+        "sideband_spacing": drive.spacing,
+        "poles": drive.poles,
     }
 
 

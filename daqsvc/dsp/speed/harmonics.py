@@ -14,8 +14,7 @@ import numpy as np
 import scipy.fft
 
 from daqsvc.dsp.envelope import hann, running_median
-from daqsvc.dsp.quality import UnfitError
-from daqsvc.dsp.speed.lines import find_speed
+from daqsvc.dsp.speed.lines import OtherSpeedError, find_speed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -164,7 +163,7 @@ SCAN = (0.48, 2.1)
 LEAD_NATS = 4.0
 """Lead in votes that another speed may have by chance, or by lines of the bearing."""
 OTHER_NATS = 10.0
-"""Lead in votes of another speed from which on the stated one is refused: three harmonics or more that stand
+"""Lead in votes of another speed from which on the stated one is in doubt: three harmonics or more that stand
 out clearly there and not here."""
 OTHER_LEAST_NATS = 13.0
 """Votes that it must have besides: the most of any speed in 600 records of noise were 10."""
@@ -184,7 +183,7 @@ class ShaftRate:
         seen: whether harmonics of the shaft stand out at that rate, and more so than at any other.
         sharp: whether it is known to a fraction of the search.
         doubt: why they do not confirm it; empty if they do.
-        elsewhere: whether they speak for another one instead.
+        rival_hz: the rate that they speak for instead; None if they do not.
         scan: votes for all speeds about the stated one.
     """
 
@@ -192,7 +191,7 @@ class ShaftRate:
     seen: bool
     sharp: bool = False
     doubt: str = ""
-    elsewhere: bool = False
+    rival_hz: float | None = None
     scan: SpeedScan | None = None
 
     def outvoted(self, rival_hz: float, slip: float) -> bool:
@@ -231,19 +230,16 @@ def shaft_rate(
         stated_hz: stated revolutions per second.
         tolerance: how far to search, as a share.
         cage: order of the bearing's cage.
-
-    Raises:
-        UnfitError: the harmonics of a wholly different speed are there, and none of this one.
     """
     harmonics = shaft_harmonics(series, series_hz, envelope_power, per_hz, stated_hz)
     scan = SpeedScan.of(harmonics, stated_hz, cage)
-    wrong: ValueError | None = None
+    wrong_hz: float | None = None
     enough = series[: int(LINE_REVOLUTIONS * series_hz / stated_hz)]
     line: LineSpeed | None = None
     try:
         line = find_speed(enough[:, np.newaxis], series_hz, stated_hz)
-    except ValueError as error:
-        wrong = error
+    except OtherSpeedError as error:
+        wrong_hz = error.found_hz
     rate_hz, sharp = scan.voted(tolerance), False
     if line is not None and line.seen and line.deviation_hz <= LINE_DEVIATION_SHARE * stated_hz:
         within = abs(line.hz / stated_hz - 1.0) <= tolerance
@@ -252,12 +248,19 @@ def shaft_rate(
     beside = scan.best(np.abs(scan.share - 1.0) <= NEAR)
     if scan.votes_about(beside) > scan.votes_about(rate_hz) + NEAR_NATS:
         rate_hz, sharp = beside, True
-    scan.refuse_other(rate_hz)
-    doubt, elsewhere = scan.doubt(rate_hz)
+    doubt, rival_hz = scan.doubt(rate_hz)
+    far_hz = scan.far_ahead(rate_hz)
     # A damaged ball makes lines at 1X less the cage's rate that can outweigh the shaft's own.
-    if wrong is not None and doubt and not _cage_line(enough, series_hz, (1.0 - cage) * stated_hz):
-        raise UnfitError("shaft speed or sample rate", f"is wrong: {wrong}", REMEDY) from wrong
-    return ShaftRate(rate_hz, not doubt, sharp, doubt, elsewhere, scan)
+    if wrong_hz is not None and doubt and not _cage_line(enough, series_hz, (1.0 - cage) * stated_hz):
+        far_hz = wrong_hz
+    if far_hz is not None:
+        rival_hz = far_hz
+        doubt = (
+            f"far more harmonics of a shaft stand out at about {60.0 * far_hz:.0f} rpm than at "
+            f"{60.0 * stated_hz:g} rpm: those of a machine nearby, unless the speed or the sample rate is "
+            f"wrong; {REMEDY}"
+        )
+    return ShaftRate(rate_hz, not doubt, sharp, doubt, rival_hz, scan)
 
 
 @dataclass(frozen=True, slots=True)
@@ -307,47 +310,44 @@ class SpeedScan:
         about = np.abs(self.rates_hz / rate_hz - 1.0) <= reach
         return float(self.votes[about].max(initial=-np.inf))
 
-    def doubt(self, rate_hz: float) -> tuple[str, bool]:
-        """Why the harmonics do not confirm a rate, empty if they do, and whether they speak for another."""
+    def doubt(self, rate_hz: float) -> tuple[str, float | None]:
+        """Why the harmonics do not confirm a rate, empty if they do, and which one they speak for instead."""
         own = self.votes_about(rate_hz)
         if own < SEEN_NATS:
-            return "no harmonics of the shaft stand out", False
+            return "no harmonics of the shaft stand out", None
         if own - self.harmonics.mains_votes(rate_hz) < NOT_MAINS_NATS:
-            return "only harmonics at multiples of the mains' frequency stand out", False
+            return "only harmonics at multiples of the mains' frequency stand out", None
         other = self.best(self.others)
         if self.votes_about(other) > own + LEAD_NATS:
-            return f"more harmonics stand out at {60.0 * other:.0f} rpm", True
+            return f"more harmonics stand out at {60.0 * other:.0f} rpm", other
         odd, even, half = (
             float(self.harmonics.voices(np.array([rate_hz]), orders).mean())
             for orders in (np.arange(1.0, 9.0, 2.0), np.arange(2.0, 9.0, 2.0), np.arange(0.5, 8.0))
         )
         if half > WHOLE_SHARE * max(odd, even):
-            return f"half orders stand out as well, as if the shaft turned at {30.0 * rate_hz:.0f} rpm", True
+            return (
+                f"half orders stand out as well, as if the shaft turned at {30.0 * rate_hz:.0f} rpm",
+                0.5 * rate_hz,
+            )
         if odd < WHOLE_SHARE * even:
-            return f"only even harmonics stand out, as if the shaft turned at {120.0 * rate_hz:.0f} rpm", True
-        return "", False
+            return (
+                f"only even harmonics stand out, as if the shaft turned at {120.0 * rate_hz:.0f} rpm",
+                2.0 * rate_hz,
+            )
+        return "", None
 
-    def refuse_other(self, rate_hz: float) -> None:
-        """Refuse the stated speed if far more harmonics speak for another one.
-
-        Raises:
-            UnfitError: they do.
-        """
+    def far_ahead(self, rate_hz: float) -> float | None:
+        """Another rate with far more votes; None if there is none."""
         other = self.best(self.others)
         votes = self.votes_about(other)
-        if votes >= OTHER_LEAST_NATS and votes - self.votes_about(rate_hz) > OTHER_NATS:
-            raise UnfitError(
-                "shaft speed or sample rate",
-                f"is wrong: the harmonics of a shaft stand out at about {60.0 * other:.0f} rpm, not at "
-                f"{60.0 * self.stated_hz:g} rpm",
-                REMEDY,
-            )
+        far = votes >= OTHER_LEAST_NATS and votes - self.votes_about(rate_hz) > OTHER_NATS
+        return other if far else None
 
 
 def _cage_line(series: Real, rate_hz: float, line_hz: float) -> bool:
     """Whether the line at 1X less the cage's rate stands out, as a speed of its own."""
     try:
         line = find_speed(series[:, np.newaxis], rate_hz, line_hz)
-    except ValueError:
+    except OtherSpeedError:
         return False
     return line.seen and abs(line.hz / line_hz - 1.0) < CAGE_SLIP

@@ -31,6 +31,22 @@ _OTHER_POWER = 9.0
 """Velocity power of another line over that of the nominal 1X to 3X, from which on it is the shaft's."""
 
 
+class OtherSpeedError(ValueError):
+    """The harmonics of another speed are far stronger.
+
+    Args:
+        found_hz: revolutions per second by the harmonics.
+        nominal_hz: as stated.
+    """
+
+    def __init__(self, found_hz: float, nominal_hz: float) -> None:
+        super().__init__(
+            f"the shaft turns at about {60.0 * found_hz:.0f} rpm by its harmonics, not at "
+            f"{60.0 * nominal_hz:g} rpm (+-{SPEED_SEARCH:.0%}): correct the speed"
+        )
+        self.found_hz = found_hz
+
+
 @dataclass(frozen=True, slots=True)
 class LineSpeed:
     """A speed found.
@@ -60,7 +76,7 @@ def find_speed(centred: Floats, rate_hz: float, nominal_hz: float) -> LineSpeed:
         nominal_hz: nominal revolutions per second.
 
     Raises:
-        ValueError: the harmonics of another speed are far stronger.
+        OtherSpeedError: the harmonics of another speed are far stronger.
     """
     spectrum = _Spectrum.of(centred, rate_hz, nominal_hz)
     _refuse_other_speed(spectrum, nominal_hz)
@@ -155,7 +171,7 @@ def _refuse_other_speed(spectrum: _Spectrum, nominal_hz: float) -> None:
         near = order * line_hz + np.linspace(-1.0, 1.0, 33) * spectrum.resolution_hz
         if spectrum.nats(near, order * line_hz).max() < spectrum.line_nats:
             return
-    raise _other_speed(line_hz, nominal_hz)
+    raise OtherSpeedError(line_hz, nominal_hz)
 
 
 def _refuse_next_speed(spectrum: _Spectrum, nominal_hz: float) -> None:
@@ -164,14 +180,7 @@ def _refuse_next_speed(spectrum: _Spectrum, nominal_hz: float) -> None:
     nats = np.stack([spectrum.nats(order * hz, order * nominal_hz) for order in ORDERS])
     together = (nats > spectrum.line_nats).all(axis=0)
     if together.any():
-        raise _other_speed(float(hz[np.argmax(np.where(together, nats[0], 0.0))]), nominal_hz)
-
-
-def _other_speed(found_hz: float, nominal_hz: float) -> ValueError:
-    return ValueError(
-        f"the shaft turns at about {60.0 * found_hz:.0f} rpm by its harmonics, not at {60.0 * nominal_hz:g} "
-        f"rpm (+-{SPEED_SEARCH:.0%}): correct the speed"
-    )
+        raise OtherSpeedError(float(hz[np.argmax(np.where(together, nats[0], 0.0))]), nominal_hz)
 
 
 def _vertex(grid: Floats, nats: Floats, best: int, reach_hz: float) -> tuple[float, float]:
