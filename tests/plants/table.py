@@ -14,6 +14,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from plants.diagram import draw
 from plants.score import CLEAR, MODELLED, ONLY_1X, SNR_DB, TRUTH, Said, scored
 
 if TYPE_CHECKING:
@@ -76,12 +77,16 @@ def certain(said: Said) -> float:
     )
 
 
+def first_names(said: Sequence[Said]) -> list[Said]:
+    """Runs in which a fault, modelled or not, got the name of a modelled one, first in its group or alone."""
+    return [s for s in said if s.named and not s.refused and s.fault != "healthy" and s.decision in MODELLED]
+
+
 def reliability(said: Sequence[Said]) -> list[str]:
     """How often a first name is true, of all faults, by the probability that it was given with."""
     lines = ["| probability of the first name | names | true |", "|---|---|---|"]
-    names = [s for s in said if s.named and not s.refused and s.fault != "healthy" and s.decision in MODELLED]
     for low, high in pairwise(_BINS):
-        at = [s for s in names if low <= certain(s) < high]
+        at = [s for s in first_names(said) if low <= certain(s) < high]
         true = share(at, lambda s: s.decision in s.true_names)
         lines.append(f"| {low:g} to {min(high, 1.0):g} | {len(at)} | {true} % |")
     return lines
@@ -105,6 +110,8 @@ def main(arguments: Sequence[str]) -> int:
     page = PAGE.read_text(encoding="utf-8")
     before, rest = page.split(begin)
     PAGE.write_text(f"{before}{begin}\n{table}\n{end}{rest.split(end)[1]}", encoding="utf-8")
+    names = [(certain(s), s.decision in s.true_names) for s in first_names(said)]
+    draw({f"{half} half": names}, PAGE.with_name(f"plants-{half.replace(' ', '-')}.svg"))
     return 0
 
 

@@ -81,7 +81,7 @@ def test_records_are_judged_from_raw_channels(tmp_path):
     assert (well.decision, well.alarms_before) == ("normal", 0)
     assert well.revolutions_before == pytest.approx(110.0, abs=5.0)
     assert summary([loaded, well])[2].startswith("| 20 dB | 100.0 % | 100.0 % | 0.0 % of 1 |")
-    assert reliability([loaded])[-1] == "| 0.99 to 1 | 1 | 100.0 % |"
+    assert reliability([loaded])[-2] == "| 0.9 to 0.99 | 1 | 100.0 % |"
     # A change that comes before it is said to have come is a false alarm.
     cases[0]["onset_rev"] = 150.0
     (tmp_path / "cases.json").write_text(json.dumps(cases[:1]))

@@ -10,7 +10,14 @@ import pytest
 from support.rotor_orbits import HEALTHY, ROTOR, SPEED_RAD_S
 
 from daqsvc.rotor.laval import compliance, unbalance_response
-from daqsvc.rotor.synchronous.signatures import damping_misfit, likelihoods
+from daqsvc.rotor.synchronous.baseline import Calibration
+from daqsvc.rotor.synchronous.signatures import (
+    TEMPERATURE,
+    NamingRules,
+    damping_misfit,
+    identify,
+    likelihoods,
+)
 from daqsvc.rotor.synchronous.vectors import HARMONICS, Healthy
 
 ORDER = np.array(HARMONICS)
@@ -202,6 +209,42 @@ def test_without_a_laval_rotor_a_shaft_that_sinks_may_be_softer_or_loaded(down_d
     best, scores = judged(sinks + only(1, 9.0j), machine)
     assert best == "stiffness_loss"
     assert scores["stiffness_loss"] - scores["static_load"] > 5.0
+
+
+def test_without_a_laval_rotor_1x_that_turns_as_the_sink_tells_is_a_softer_support():
+    machine = healthy(0.7, laval=False, ellipticity=0.2)
+    depth = 0.2
+    softer = unbalance_response(0.7 * math.sqrt(1.0 + depth), 0.18) / unbalance_response(0.7, 0.18)
+    sinks = only(0, -1j * depth * ROTOR.sag_um)
+    turned = machine.baseline[1] * (softer - 1.0)
+
+    def lead(turn):
+        _, scores = judged(sinks + only(1, turn), machine)
+        return scores["stiffness_loss"] - scores["static_load"]
+
+    assert lead(turned) > 5.0
+    # As large a change the other way is none that a softer support makes.
+    assert lead(turned) > lead(-turned) + 2.0
+
+
+def test_probabilities_are_of_tempered_evidence():
+    machine = healthy(laval=False, ellipticity=0.2)
+    change = only(0, -5.0j)
+    healthy_run = Calibration(
+        rotor=ROTOR,
+        speed_rpm=SPEED_RAD_S * 30.0 / math.pi,
+        revolutions=100,
+        baseline=machine.baseline,
+        variance=VARIANCE,
+        noise=1e-3,
+        noise_variance=0.01,
+        samples_per_rev=64.0,
+    )
+    found = identify(change, VARIANCE, healthy_run, previous=None, rules=NamingRules())
+    first, second = sorted(found.evidence, key=found.evidence.get, reverse=True)[:2]
+    odds = found.probabilities[first] / found.probabilities[second]
+    assert odds == pytest.approx(math.exp((found.evidence[first] - found.evidence[second]) / TEMPERATURE))
+    assert sum(found.probabilities.values()) == pytest.approx(1.0)
 
 
 def test_without_a_laval_rotor_a_load_may_stiffen_the_oil_film():

@@ -7,7 +7,7 @@ rotor's parameters are averaged over, so that a flexible hypothesis pays for its
 * unbalance: only 1X moves, anyhow; damping loss: only 1X moves, and along what less damping does to it.
 * static load: only the mean position moves; on a machine that is no Laval rotor, 1X may follow it a little.
 * stiffness loss: mean position and 1X move together, by one parameter; on a machine that is no Laval rotor
-  the shaft sinks, and 1X moves by any amount.
+  the shaft sinks, and 1X turns by about what that tells of the natural frequency, or by any amount.
 * rub: a pulse once a revolution, directed inwards where the orbit comes nearest to the wall, passed through
   the rotor, with marks of contact (`daqsvc.rotor.synchronous.contact`); or an orbit that fills the clearance.
 * unmodelled: any components, each by itself. It pays `UNMODELLED_NATS` for explaining everything.
@@ -74,13 +74,16 @@ _STIFFNESS_TOLERANCE = 0.3
 _FOLLOWS = np.array([0.1, 0.3])
 """Parts of a shift by which 1X may follow it where supports are stiffer the more they carry."""
 _FOLLOWING_NATS = 3.0
-_GENERIC_STIFFNESS_NATS = 0.5
-"""What stiffness loss pays where no model ties mean position and 1X together."""
 _SINKS = np.geomspace(0.02, 1.5, 12)
 """Parts of the sag that a shaft sinks by where no model tells how much of it is due to the softer part ..."""
 _SINKS_ASIDE = np.radians([-50.0, -25.0, 0.0, 25.0, 50.0])
 """... and angles off the vertical: an oil film gives way aside, too."""
 _SINKS_WITHIN = 0.25
+_SEEN_OF_SINK = np.array([0.5, 1.0, 2.0])
+"""Loss of the natural frequency's square over what the probes see the shaft sink by, as parts of each."""
+_TURNS_WITHIN = 0.4
+_STILL_SHARE = 0.2
+"""Probability that 1X does not follow a softer support, as far above the critical speed."""
 _STIFFNESS_DAMPING = np.array([0.0, 1.8])
 """A softer support also damps more: relative increase per 1 / k - 1, up to `_MOST_DAMPING`."""
 _MOST_DAMPING = 1.6
@@ -227,6 +230,36 @@ def _sunk(change: complex, variance: float, healthy: Healthy) -> float:
     return log_mean(log_density(change - moved, variance + (_SINKS_WITHIN * np.abs(moved)) ** 2))
 
 
+def _softer(change: Complexes, variance: Floats, healthy: Healthy, *, still: float) -> float:
+    """Log density of mean position and forward 1X where some support gives way under the weight.
+
+    What the shaft sinks by tells how much lower its natural frequency is (Rayleigh's quotient, omega^2 = g
+    over the sag), up to the part that the probes see of it, and that how 1X turns. Or 1X does as it likes.
+    """
+    omega, zeta = (axis.reshape(5, 5)[::2, ::2].ravel() for axis in healthy.rotor.box)
+    depth, aside, part, point = (
+        axis.ravel()
+        for axis in np.meshgrid(_SINKS, _SINKS_ASIDE, _SEEN_OF_SINK, np.arange(len(omega)), indexing="ij")
+    )
+    point = point.astype(np.int64)
+    speed = healthy.speed_rad_s / omega[point]
+    sag_um = max(healthy.rotor.sag_um, 1e-6)
+    sunk: Complexes = np.asarray(-1j * sag_um * depth * np.exp(1j * aside), dtype=np.complex128)
+    softer = speed * np.sqrt(1.0 + depth * part)
+    before, after = unbalance_response(speed, zeta[point]), unbalance_response(softer, zeta[point])
+    # The eccentricity stays: the response in units of it is what changes.
+    turned = healthy.baseline[FORWARD] * (after / before - 1.0)
+    tied = log_mean(
+        log_density(change[DC] - sunk, variance[DC] + (_SINKS_WITHIN * np.abs(sunk)) ** 2)
+        + log_density(change[FORWARD] - turned, variance[FORWARD] + (_TURNS_WITHIN * np.abs(turned)) ** 2)
+    )
+    free = _free(change[FORWARD], variance[FORWARD], healthy.amplitude_um)
+    untied = _sunk(change[DC], variance[DC], healthy) + np.logaddexp(
+        still + math.log(_STILL_SHARE), free + math.log(1.0 - _STILL_SHARE)
+    )
+    return float(np.logaddexp(tied, untied)) - math.log(2.0)
+
+
 def _stiffness_loss(change: Complexes, variance: Floats, healthy: Healthy) -> float:
     moved = float(np.hypot(abs(change[DC]), abs(change[FORWARD])))
     score = _still(change, variance, moved)
@@ -236,14 +269,8 @@ def _stiffness_loss(change: Complexes, variance: Floats, healthy: Healthy) -> fl
         backward = np.logaddexp(
             score[BACKWARD], _free(change[BACKWARD], variance[BACKWARD], healthy.amplitude_um)
         ) - math.log(2.0)
-        sunk = _sunk(change[DC], variance[DC], healthy)
-        # Far above the critical speed 1X hardly knows of the supports.
-        turned = np.logaddexp(
-            score[FORWARD], _free(change[FORWARD], variance[FORWARD], healthy.amplitude_um)
-        ) - math.log(2.0)
-        return (
-            rest - float(score[BACKWARD]) + float(backward) + sunk + float(turned) - _GENERIC_STIFFNESS_NATS
-        )
+        softer = _softer(change, variance, healthy, still=float(score[FORWARD]))
+        return rest - float(score[BACKWARD]) + float(backward) + softer
     omega, zeta = healthy.rotor.box
     loss, point, more = (
         axis.ravel()
@@ -426,6 +453,10 @@ _MISFIT = 0.005
 """Part of the evidence of a change that the shape of a rub's pulse may be off by: where no rotor model fits
 to the last digit, a few nats of thousands say nothing."""
 _RIVALS = frozenset(("rub", "unmodelled"))
+TEMPERATURE = 3.0
+"""What evidence is divided by before it is a probability: no machine is any signature's to the last digit, so
+likelihoods are too sure of themselves. Of finite-element rotors this value makes what is true likeliest (the
+best of each geometry and noise lies from 2 to 5); one that grows with the evidence does worse."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -588,7 +619,8 @@ def _group(
 
 
 def _posterior(scores: Mapping[RotorFault, float]) -> dict[RotorFault, float]:
+    """Probabilities of hypotheses that are equally likely before, by tempered likelihoods."""
     top = max(scores.values())
-    weights = {name: math.exp(score - top) for name, score in scores.items()}
+    weights = {name: math.exp((score - top) / TEMPERATURE) for name, score in scores.items()}
     total = math.fsum(weights.values())
     return {name: weight / total for name, weight in weights.items()}
