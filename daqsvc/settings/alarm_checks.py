@@ -189,7 +189,19 @@ def _setpoints(alarm: SetpointAlarm, at: KeyPath) -> Iterator[Finding]:
     if not setpoints and alarm.zones is None:
         yield Finding(at, "has neither alert nor danger", "add alert, danger or both")
     for (key, value), (above, higher) in pairwise(setpoints.items()):
-        if value >= higher:
+        if value >= higher and alarm.boundaries is not None and value in alarm.boundaries:
+            yield Finding(
+                (*at, above),
+                f"must be above {key} = {value:g}, where zone C begins",
+                f"write {key} as well, or leave {above} to the zones",
+            )
+        elif value >= higher and alarm.boundaries is not None and higher in alarm.boundaries:
+            yield Finding(
+                (*at, key),
+                f"must be below {above} = {higher:g}, where zone D begins",
+                f"write {above} as well, or leave {key} to the zones",
+            )
+        elif value >= higher:
             yield Finding(
                 (*at, key),
                 f"must be below {above} = {higher:g}",

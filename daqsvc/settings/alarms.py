@@ -51,7 +51,7 @@ class Setpoints(BaseAlarm):
     reference_deg: AngleDeg | None = Field(
         default=None,
         description="of a phase: that of the machine in good order, from which setpoints count either way",
-        examples=["135.0"],
+        examples=[135.0],
     )
     zones: Zones | None = Field(
         default=None,

@@ -36,7 +36,11 @@ def with_zones(machine: MachineFile) -> MachineFile:
 
 def _filled(machine: MachineFile, alarm: Alarm) -> Alarm:
     with suppress(UnusableValueError):
-        if isinstance(alarm, SetpointAlarm) and alarm.zones is not None:
+        if (
+            isinstance(alarm, SetpointAlarm)
+            and alarm.zones is not None
+            and not any(zone_checks(machine, alarm, ()))
+        ):
             sensors = [sensor for sensor in machine.sensors if sensor.name in alarm.watched]
             units = {UNITS.get(alarm.measure, sensor.unit) for sensor in sensors}
             at = boundaries(alarm.zones, machine.machine.speed_rpm, units.pop()) if len(units) == 1 else None

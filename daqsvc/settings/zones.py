@@ -39,7 +39,7 @@ class Zones(Section):
     group: Literal[1, 2] | None = Field(
         default=None,
         description="of the velocity: 1 above 300 kW or a shaft height of 315 mm, 2 from 15 kW or 160 mm on",
-        examples=["2"],
+        examples=[2],
     )
     support: Literal["rigid", "flexible"] | None = Field(
         default=None, description="of the velocity: how the machine stands", examples=["rigid"]

@@ -60,6 +60,7 @@ def measure_checks(draft: MachineFile, levels: Levels) -> Iterator[Iterator[Find
         levels: its level detectors.
     """
     yield _keyphasor(draft, levels)
+    yield _revolutions(draft, levels)
     with suppress(UnusableValueError):
         for asked in _all_asked(draft, levels):
             if asked.measure in OF_THE_SHAFT:
@@ -129,21 +130,26 @@ def _samples_per_revolution(draft: MachineFile, sensor: Sensor, at: KeyPath) -> 
         )
 
 
-def _of_the_shaft(draft: MachineFile, levels: Levels, asked: _Asked) -> Iterator[Finding]:
-    """A window holds revolutions enough, a revolution samples enough, and a phase has its mark."""
-    for sensor in asked.sensors:
-        slow = list(_samples_per_revolution(draft, sensor, asked.at))
-        yield from slow
-        if slow:
-            return
+def _revolutions(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
+    """A window holds revolutions enough."""
     speed_rpm, window_s = abs(draft.machine.speed_rpm), levels.window_s
-    if window_s * speed_rpm / 60.0 < _LEAST_REVOLUTIONS:
+    if window_s * speed_rpm / 60.0 < _LEAST_REVOLUTIONS and any(
+        asked.measure in OF_THE_SHAFT for asked in _all_asked(draft, levels)
+    ):
         yield Finding(
-            asked.at,
-            f"a window of {window_s:g} s holds {window_s * speed_rpm / 60.0:.3g} revolutions at "
-            f"{speed_rpm:g} rpm: 1X is not told from what lies beside it",
-            f"write window_s = {_LEAST_REVOLUTIONS * 60.0 / speed_rpm:.3g} or more in [pipeline.levels]",
+            (*_LEVELS, "window_s"),
+            f"{window_s:g} s hold {window_s * speed_rpm / 60.0:.3g} revolutions at {speed_rpm:g} rpm: 1X is "
+            "not told from what lies beside it",
+            f"write window_s = {_LEAST_REVOLUTIONS * 60.0 / speed_rpm:.3g} or more",
         )
+
+
+def _of_the_shaft(draft: MachineFile, levels: Levels, asked: _Asked) -> Iterator[Finding]:
+    """A revolution has samples enough, and a phase has its mark."""
+    slow = [one for sensor in asked.sensors for one in _samples_per_revolution(draft, sensor, asked.at)]
+    if slow:
+        # Of the phase beside an amplitude the same is said once.
+        yield from slow[:1] if asked.at[-1] != "phase" else []
         return
     if asked.measure not in PHASES:
         return
@@ -206,19 +212,24 @@ def _listed(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
 def _zones(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
     """Zones hold for the band of the standard, which depends on the speed."""
     speed_rpm = abs(draft.machine.speed_rpm)
-    wanted_hz = SLOW_BAND_HZ[0] if speed_rpm <= SLOW_RPM else _ISO_LOW_HZ
-    low_hz = levels.velocity_band_hz[0]
+    slow = speed_rpm <= SLOW_RPM
+    wanted_hz = SLOW_BAND_HZ[0] if slow else _ISO_LOW_HZ
+    begins_hz = {VELOCITY: levels.velocity_band_hz[0], SLOW_VELOCITY: SLOW_BAND_HZ[0]}
+    band = f"velocity_band_hz = [{wanted_hz:.1f}, {levels.velocity_band_hz[1]:.1f}] in [pipeline.levels]"
+    remedy = {
+        VELOCITY: f'measure = "{SLOW_VELOCITY}"' if slow else band,
+        SLOW_VELOCITY: f'measure = "{VELOCITY}"',
+    }
     for index, alarm in enumerate(draft.alarms):
         with suppress(UnusableValueError):
-            if not isinstance(alarm, SetpointAlarm) or alarm.zones is None or alarm.measure != VELOCITY:
+            if not isinstance(alarm, SetpointAlarm) or alarm.zones is None or alarm.measure not in VELOCITIES:
                 continue
-            if low_hz > wanted_hz:
-                instead = f'measure = "{SLOW_VELOCITY}"' if speed_rpm <= SLOW_RPM else ""
-                band = f"velocity_band_hz = [{wanted_hz:.1f}, {levels.velocity_band_hz[1]:.1f}]"
+            low_hz = begins_hz[alarm.measure]
+            if low_hz > wanted_hz or (alarm.measure == SLOW_VELOCITY and not slow):
                 yield Finding(
                     ("alarms", index, "zones"),
                     f"are those of a velocity from {wanted_hz:g} Hz on at {speed_rpm:g} rpm, and this one "
                     f"begins at {low_hz:g} Hz",
-                    f"write {instead or band}",
+                    f"write {remedy[alarm.measure]}",
                     fatal=False,
                 )
