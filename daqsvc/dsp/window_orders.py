@@ -31,6 +31,8 @@ SLIP = 0.03
 """A shaft whose speed nobody measures is looked for within this part of the stated one."""
 _PER_LINE = 4
 """Places looked at in the width of a line."""
+_PER_TURN = 16.0
+"""Samples of a revolution that are left for the search: orders beside a multiple of it are 24 dB down."""
 
 
 class WindowOrders(NamedTuple):
@@ -137,13 +139,17 @@ def steady_angle(samples: Floats, turns_per_sample: float) -> Floats:
     if not there.any():
         return np.full(count, math.nan)
     swing = np.where(there, samples - samples[there].mean(), 0.0) * np.hanning(count)
+    # The search needs no more than `_PER_TURN` of a revolution, each the sum of its neighbours.
+    together = max(1, int(1.0 / (_PER_TURN * turns_per_sample)))
+    swing = swing[: count - count % together].reshape(-1, together).sum(axis=1)
+    places = together * np.arange(len(swing))
     reach = SLIP * turns_per_sample
     each_side = math.ceil(_PER_LINE * reach * count)
     step = reach / each_side
     # With one more at either end, so that a line at the end of the search has its vertex.
     near = turns_per_sample + step * np.arange(-each_side - 1, each_side + 2)
     # A few places, one after the other: together they would need a table of all samples by all places.
-    power = np.array([abs(swing @ np.exp(-1j * math.tau * one * np.arange(count))) ** 2 for one in near])
+    power = np.array([abs(swing @ np.exp(-1j * math.tau * one * places)) ** 2 for one in near])
     best = 1 + int(power[1:-1].argmax())
     before, at, after = (float(one) for one in power[best - 1 : best + 2])
     bend = before - 2.0 * at + after

@@ -184,15 +184,15 @@ def _alarms(machine: MachineFile) -> Iterator[Sequence[str]]:
             watched = f"{alarm.measure} of {alarm.sensor}"
         else:
             watched = f"{alarm.measure}, {alarm.vote} of {', '.join(alarm.sensors)}"
-        watched += _more_of(alarm)
         deadband = f"{alarm.deadband:g} {unit}".rstrip()
+        delays = f"on {alarm.on_delay_s:g} s, off {alarm.off_delay_s:g} s"
         multiplied = f", start-up x{alarm.trip_multiply:g}" if alarm.trip_multiply > 1 else ""
         yield (
             alarm.name,
             watched,
             _limits(alarm.alert_low, alarm.alert, unit),
             _limits(alarm.danger_low, alarm.danger, unit),
-            f"{deadband}, on {alarm.on_delay_s:g} s, off {alarm.off_delay_s:g} s{multiplied}{latching}",
+            f"{deadband}, {delays}{multiplied}{_more_of(alarm)}{latching}",
         )
 
 
@@ -200,13 +200,13 @@ def _more_of(alarm: SetpointAlarm) -> str:
     """What else than its own setpoints an alarm is judged by."""
     more = ""
     if alarm.reference_deg is not None:
-        more += f" off {alarm.reference_deg:g} deg"
+        more += f"; off {alarm.reference_deg:g} deg"
     if alarm.boundaries is not None:
-        more += ", zones of ISO 20816-3"
+        more += "; zones of ISO 20816-3"
     if isinstance(alarm, LevelAlarm) and (phase := alarm.phase) is not None:
         limits = (("alert", phase.alert), ("danger", phase.danger))
         known = " and ".join(f"{name} {limit:g}" for name, limit in limits if limit is not None)
-        more += f", phase off {phase.reference_deg:g} deg: {known} deg"
+        more += f"; phase off {phase.reference_deg:g} deg: {known} deg"
     return more
 
 

@@ -14,9 +14,10 @@ from support.paths import ROOT
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.make import alarm_rule
 from daqsvc.alarms.manager import AlarmManager
-from daqsvc.detectors.make import detectors
+from daqsvc.detectors.make import detectors, plugins
 from daqsvc.diagnosis.detector import Window
 from daqsvc.diagnosis.reading import Reading
+from daqsvc.diagnosis.recorded import RecordingOptions
 from daqsvc.publish.make import watched
 from daqsvc.settings import parse_machine_file
 from daqsvc.settings.describe import describe
@@ -44,7 +45,7 @@ class Product:
         self.alarms = AlarmManager(Identity("lab", "edge-1", "specimen-measures"), rules, self.clock)
         self._index = 0
 
-    def run(self, seconds=3.0, *, first=20.0, lag_deg=135.0, second=5.0, lag_2_deg=350.0, g=0.0):
+    def run(self, seconds=3.0, *, first=20.0, lag_deg=135.0, second=5.0, lag_2_deg=350.0, g=0.0, pulses=True):
         """The shaft turns at 600 rpm; what the alarms say."""
         index = self._index + np.arange(round(seconds * RATE_HZ))
         turns = index * 10.0 / RATE_HZ
@@ -56,7 +57,8 @@ class Product:
         housing = g * np.sin(math.tau * 5.0 * index / RATE_HZ) + np.random.default_rng(1).normal(
             0.0, 1e-6, len(index)
         )
-        samples = np.column_stack((x, x, keyphasor_voltage(turns), housing)).astype(np.float32)
+        volts = keyphasor_voltage(turns) if pulses else np.full(len(index), -10.0)
+        samples = np.column_stack((x, x, volts, housing)).astype(np.float32)
         self._index += len(index)
         t_ns = round(self._index * 1e9 / RATE_HZ)
         window = Window(int(index[0]), samples, t_ns, 1e9 / RATE_HZ)
@@ -76,6 +78,33 @@ def test_from_the_file_to_the_alarm_on_a_vector():
     assert product.run(lag_deg=135.0) == [("region", "returned", "normal")]
     assert product.run(first=2.0) == [("region", "raised", "alert")]
     assert "1x_amplitude of probe-x is 1.999 um, lower alert limit 5 um" in product.told[-1]
+
+
+def test_from_the_file_to_what_holds_while_the_keyphasor_is_lost():
+    product = Product()
+    product.run()
+    assert product.run(lag_deg=170.0) == [("region", "raised", "alert")]
+    lost = product.run(10.0, pulses=False)
+    assert lost == [("sensor-ok/probe-x", "raised", "alert"), ("sensor-ok/probe-y", "raised", "alert")]
+    assert "keyphasor has no pulses that tell the angle of the shaft" in product.told[-1]
+    # What needs no angle is judged as ever.
+    assert ("shaft-zones", "raised", "alert") in product.run(first=190.0, second=0.1, pulses=False)
+    assert ("shaft-zones", "returned", "normal") in product.run(pulses=False)
+    back = product.run(15.0)
+    assert sorted(back) == [
+        ("region", "returned", "normal"),
+        ("sensor-ok/probe-x", "returned", "normal"),
+        ("sensor-ok/probe-y", "returned", "normal"),
+    ]
+
+
+def test_a_recording_without_the_keyphasor_has_all_but_the_phases():
+    machine = parsed(SPECIMEN)
+    ((plugin, settings),) = plugins(machine)
+    recorded = plugin.recorded(machine, settings, RecordingOptions())
+    assert recorded.as_recorded({"probe-x", "keyphasor"}) == settings
+    without = recorded.as_recorded({"probe-x"})
+    assert without == settings.model_copy(update={"keyphasor": None})
 
 
 def test_from_the_file_to_the_alarm_on_2x_over_360():
@@ -120,9 +149,11 @@ def test_what_is_listed_is_read_and_told_what_is_not_is_as_before():
 
 def test_what_an_alarm_is_judged_by_is_described():
     text = " ".join(describe(parsed(SPECIMEN)).split())
-    assert "1x_amplitude of probe-x, phase off 135 deg: alert 30 and danger 60 deg" in text
-    assert "2x_phase_lag of probe-y off 350 deg" in text
-    assert "velocity_rms_2_1000 of accel, zones of ISO 20816-3 2.8 mm/s 4.5 mm/s" in text
+    assert "off 0 s; phase off 135 deg: alert 30 and danger 60 deg" in text
+    assert "2x_phase_lag of probe-y 30 deg - 0 deg, on 0 s, off 0 s; off 350 deg" in text
+    assert (
+        "velocity_rms_2_1000 of accel 2.8 mm/s 4.5 mm/s 0 mm/s, on 0 s, off 0 s; zones of ISO 20816-3" in text
+    )
     assert "shaft angle from keyphasor" in text
 
 

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from daqsvc.detectors.levels.shaft_angle import ShaftAngle
     from daqsvc.detectors.levels.statements import Limits
     from daqsvc.diagnosis.detector import Detector
+    from daqsvc.diagnosis.recorded import RecordedDetector, RecordingOptions
     from daqsvc.settings.models import MachineFile, Sensor
 
 
@@ -73,6 +74,14 @@ class LevelsPlugin(DetectorPlugin[Levels]):
         for detector in running:
             if isinstance(detector, LevelDetector):
                 detector.change_setpoints({s.name: _limits(machine, s.name) for s in machine.sensors})
+
+    def recorded(
+        self, machine: MachineFile, settings: Levels, options: RecordingOptions
+    ) -> RecordedDetector[Levels]:
+        """See `DetectorPlugin.recorded`."""
+        from daqsvc.detectors.levels.recorded import RecordedLevels  # noqa: PLC0415 - brings NumPy
+
+        return RecordedLevels(machine, settings, options, self.build)
 
     def readings(self, machine: MachineFile, settings: Levels) -> Iterator[Reading]:
         """See `DetectorPlugin.readings`."""
