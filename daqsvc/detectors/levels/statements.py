@@ -131,10 +131,14 @@ class LevelStatements:
         if quality == "good" or bounds:
             for limit in limits:
                 if limit.measure not in unknown:
-                    span = _span(limit.measure, statistics, bounds)
-                    self._by_limits[sensor, limit] = limit.severity(*span)
-            found = (self._by_limits.get((sensor, limit), "normal") for limit in limits)
-            worst: Severity = max(found, key=_DECISIONS.index, default="normal")
+                    found = limit.severity(*_span(limit.measure, statistics, bounds))
+                    if limit.measure in bounds:
+                        found = max(
+                            found, self._by_limits.get((sensor, limit), "normal"), key=_DECISIONS.index
+                        )
+                    self._by_limits[sensor, limit] = found
+            each = (self._by_limits.get((sensor, limit), "normal") for limit in limits)
+            worst: Severity = max(each, key=_DECISIONS.index, default="normal")
             better = _DECISIONS.index(worst) < _DECISIONS.index(severity)
             severity = severity if better and not bounds.keys() <= set(unknown) else worst
         if quality == "good" or severity != (before or "normal"):

@@ -147,6 +147,14 @@ def test_while_no_pulses_come_1x_is_held_with_a_reason_and_the_rest_goes_on():
     assert (back.quality, back.decision, back.bounds) == ("good", "normal", {})
 
 
+def test_what_stands_of_1x_outlives_windows_that_lack_samples_and_pulses():
+    rig = Rig(Limits("1x_amplitude", 30.0, None))
+    assert rig.steady().decision == "alert"
+    assert rig.turn(first=1.0, lost=0.2)[-1].decision == "alert"
+    assert rig.turn(seconds=3.0, first=1.0, pulses=False)[-1].decision == "alert"
+    assert rig.turn(seconds=2.0, first=1.0)[-1].decision == "normal"
+
+
 def test_what_is_only_listed_and_not_known_is_left_out():
     rig = Rig(listed=["1x_amplitude", "kurtosis"])
     rig.steady()
