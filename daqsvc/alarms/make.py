@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.alarms.rules import DiagnosisRule, LevelRule
+from daqsvc.alarms.rules import Beside, DiagnosisRule, LevelRule
 from daqsvc.alarms.setpoints import Setpoint
 from daqsvc.alarms.voting import VotingRule
 from daqsvc.settings.alarms import DiagnosisAlarm, LevelAlarm
+from daqsvc.settings.measures import PHASE_OF
 
 if TYPE_CHECKING:
     from daqsvc.alarms.rules import Rule
@@ -29,8 +30,25 @@ def alarm_rule(alarm: Alarm) -> Rule:
         round(alarm.off_delay_s * NS_PER_S),
         alarm.alert_low,
         alarm.danger_low,
+        alarm.reference_deg,
+        alarm.boundaries,
     )
     rest = (alarm.measure, setpoint, alarm.latching, alarm.trip_multiply, alarm.first_out_group)
     if isinstance(alarm, LevelAlarm):
-        return LevelRule(alarm.name, alarm.sensor, *rest)
+        return LevelRule(alarm.name, alarm.sensor, *rest, _phase(alarm))
     return VotingRule(alarm.name, alarm.sensors, alarm.vote, *rest)
+
+
+def _phase(alarm: LevelAlarm) -> Beside | None:
+    """The limits of the phase beside those of the amplitude."""
+    if (phase := alarm.phase) is None:
+        return None
+    setpoint = Setpoint(
+        phase.alert,
+        phase.danger,
+        phase.deadband,
+        round(alarm.on_delay_s * NS_PER_S),
+        round(alarm.off_delay_s * NS_PER_S),
+        reference_deg=phase.reference_deg,
+    )
+    return Beside(PHASE_OF[alarm.measure], setpoint)

@@ -32,6 +32,9 @@ DEPARTURE = "departure"
 TOO_HIGH, TOO_LOW = "high", "low"
 """What is found of a measure that can be either."""
 
+PHASE = "phase"
+"""What is found where an amplitude is within its limits, and its phase is not."""
+
 MACHINE_GROUP = "machine"
 """The first-out group of an alarm that names none: all alarms of the machine compete."""
 
@@ -144,6 +147,18 @@ class Rule(Protocol):
         ...
 
 
+class Beside(NamedTuple):
+    """A second measure of an alarm.
+
+    Attributes:
+        measure: key in `Diagnosis.statistics`.
+        setpoint: the limits, in the unit of the measure.
+    """
+
+    measure: str
+    setpoint: Setpoint
+
+
 @dataclass(frozen=True, slots=True)
 class LevelRule:
     """An alarm on a measure of one sensor, fed by the diagnoses of ``levels/<sensor>``.
@@ -156,6 +171,8 @@ class LevelRule:
         latching: whether the alarm outlives its condition until it is reset.
         trip_multiply: factor on the limits while the machine starts up.
         group: the first-out group that it competes in.
+        beside: another measure of the sensor with limits of its own: the phase of an amplitude. The level is
+            that of the worse of the two; start-up does not multiply its limits.
     """
 
     alarm: str
@@ -165,6 +182,7 @@ class LevelRule:
     latching: bool = False
     trip_multiply: float = 1.0
     group: str = MACHINE_GROUP
+    beside: Beside | None = None
 
     @property
     def detectors(self) -> tuple[str, ...]:
@@ -183,7 +201,11 @@ class LevelRule:
 
     def limits(self, units: Mapping[str, str]) -> str:
         """See `Rule.limits`."""
-        return self.setpoint.in_words(units.get(self.measure, ""))
+        limits = self.setpoint.in_words(units.get(self.measure, ""))
+        if self.beside is None:
+            return limits
+        measure, setpoint = self.beside
+        return f"{limits}, {measure} {setpoint.in_words(units.get(measure, ''))}"
 
     def watch(self) -> Watch:
         """A fresh memory for this rule."""
@@ -293,6 +315,7 @@ class MeasureWatch:
             return level, self._nearer(bounds)
         if value is not None:
             self._factor = factor
+            value = self.setpoint.judged(value)
             return self.monitor.update(value, diagnosis.t_ns, self._factor), value
         self.monitor.hold()
         if not self._reported_absent:
@@ -323,7 +346,13 @@ class MeasureWatch:
         return TOO_LOW if limit.lower else TOO_HIGH
 
     def in_words(self, diagnosis: Diagnosis, sensor: str, value: float) -> str:
-        """The value of ``sensor`` and the limit that makes the present level of it."""
+        """The value of ``sensor`` and the limit that makes the present level of it.
+
+        Args:
+            diagnosis: where it comes from.
+            sensor: name of the sensor.
+            value: as `find` gives it.
+        """
         unit = f" {diagnosis.units[self._measure]}" if self._measure in diagnosis.units else ""
         limit = self.monitor.reached(value)
         measured = f"{self._measure} of {sensor} is {value:.4g}{unit}"
@@ -331,6 +360,14 @@ class MeasureWatch:
             most = "most" if limit is not None and limit.lower else "least"
             lacks = f"{100.0 * (diagnosis.missing_share or 0.0):.2g} % of its samples are missing"
             measured = f"{self._measure} of {sensor} is at {most} {value:.4g}{unit} though {lacks}"
+        elif self.setpoint.reference_deg is not None:
+            phase, reference = diagnosis.statistics[self._measure], self.setpoint.reference_deg
+            measured = (
+                f"{self._measure} of {sensor} is {phase:.4g}{unit}, {value:.4g}{unit} from its reference of "
+                f"{reference:g}{unit}"
+            )
+        if zone := self.setpoint.zone(value):
+            measured += f", zone {zone} of ISO 20816-3"
         if limit is not None:
             side = "lower " if limit.lower else ""
             multiplied = f" times {self._factor:g} at start-up" if self._factor > 1.0 and not side else ""
@@ -347,20 +384,44 @@ class _LevelWatch:
     def __init__(self, rule: LevelRule) -> None:
         self._sensor = rule.sensor
         self._watch = MeasureWatch(rule.alarm, rule.measure, rule.setpoint, rule.trip_multiply)
+        self._beside = None if rule.beside is None else MeasureWatch(rule.alarm, *rule.beside, 1.0)
 
     def find(self, diagnosis: Diagnosis, circumstances: Circumstances) -> RuleFinding | None:
         finding = self._watch.find(diagnosis, circumstances)
-        if finding is None:
-            return None
-        level, value = finding
+        if self._beside is not None:
+            return self._worse(finding, self._beside, diagnosis, circumstances)
+        return None if finding is None else self._finding(diagnosis, *finding)
+
+    def _finding(self, diagnosis: Diagnosis, level: Level, value: float) -> RuleFinding:
         return RuleFinding(
             level, self._watch.side(value), lambda: self._watch.in_words(diagnosis, self._sensor, value)
         )
 
+    def _worse(
+        self,
+        finding: tuple[Level, float] | None,
+        beside: MeasureWatch,
+        diagnosis: Diagnosis,
+        circumstances: Circumstances,
+    ) -> RuleFinding | None:
+        """What the worse of both measures says; None where that one is not known: it holds then."""
+        other = beside.find(diagnosis, circumstances)
+        level = max(self._watch.monitor.level, beside.monitor.level)
+        if finding is not None and finding[0] is level:
+            return self._finding(diagnosis, *finding)
+        if other is None or other[0] is not level:
+            return None
+        return RuleFinding(level, PHASE, lambda: beside.in_words(diagnosis, self._sensor, other[1]))
+
     def hold(self, diagnosis: Diagnosis) -> None:  # noqa: ARG002  there is one sensor only
         self._watch.monitor.hold()
+        if self._beside is not None:
+            self._beside.monitor.hold()
 
     def resume(self, level: Level, event: AlarmEvent) -> str:
+        if self._beside is not None and event.finding == PHASE:
+            self._beside.monitor.resume(level)
+            return event.finding
         sides = {TOO_LOW: True, TOO_HIGH: False}
         self._watch.monitor.resume(level, lower=sides.get(event.finding))
         return event.finding

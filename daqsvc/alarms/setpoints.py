@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
 from daqsvc.alarms.states import Level
+from daqsvc.dsp.phase import deviation_deg
 
 
 class Limit(NamedTuple):
@@ -40,6 +42,8 @@ class Setpoint:
         off_delay_ns: how long it must stay clear of the deadband before the limit counts as left.
         alert_low: at or below this the level is alert; None for no such limit.
         danger_low: at or below this the level is danger; None for no such limit.
+        reference_deg: of a phase: the limits are how far it may be from this one, either way.
+        zones: where zones B, C and D of ISO 20816-3 begin, for who reads of it; None: no zones.
 
     Raises:
         ValueError: no limit, limits out of order or not finite, a negative deadband or delay.
@@ -52,6 +56,8 @@ class Setpoint:
     off_delay_ns: int = 0
     alert_low: float | None = None
     danger_low: float | None = None
+    reference_deg: float | None = None
+    zones: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
         upwards = (
@@ -87,11 +93,20 @@ class Setpoint:
         )
         return tuple(Limit(level, at, lower) for level, at, lower in described if at is not None)
 
+    def judged(self, value: float) -> float:
+        """What of a value is held against the limits: itself, or how far it is from the reference."""
+        return value if self.reference_deg is None else deviation_deg(value, self.reference_deg)
+
+    def zone(self, value: float) -> str:
+        """The zone of a value, ``"A"`` to ``"D"``; empty without zones."""
+        return "" if self.zones is None else "ABCD"[bisect_right(self.zones, value)]
+
     def in_words(self, unit: str) -> str:
         """All limits for a person, e.g. ``"alert 15 um and danger 25 um"``."""
         upwards = sorted(self.limits, key=lambda limit: limit.at)
         words = [f"{'lower ' * one.lower}{one.level.label} {one.at:.4g} {unit}".rstrip() for one in upwards]
-        return " and ".join([", ".join(words[:-1]), words[-1]] if words[1:] else words)
+        said = " and ".join([", ".join(words[:-1]), words[-1]] if words[1:] else words)
+        return said if self.reference_deg is None else f"{said} from {self.reference_deg:g} {unit}".rstrip()
 
     @property
     def lowest(self) -> float | None:

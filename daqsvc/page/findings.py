@@ -9,6 +9,7 @@ from __future__ import annotations
 from html import escape
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from daqsvc.dsp.phase import deviation_deg
 from daqsvc.page.text import level_mark, row, time_mark
 from daqsvc.page.views.modes import in_words
 
@@ -138,9 +139,13 @@ def _evidence(statement: Document, group: set[str]) -> str:
     for name, limit in statement.get("thresholds", {}).items():
         measure, _, which = name.rpartition(".")
         value = statement["statistics"].get(measure)
+        reference = statement["thresholds"].get(f"{measure}.reference")
+        if value is not None and reference is not None:
+            value = deviation_deg(value, reference)
         if which == statement["severity"] and value is not None and limit is not None and value >= limit:
             unit = statement["units"].get(measure, "")
-            beyond.append(f"{measure} is {value:.4g} {unit}, {which} limit {limit:.4g} {unit}".rstrip())
+            off = "" if reference is None else " off its reference"
+            beyond.append(f"{measure} is {value:.4g} {unit}{off}, {which} limit {limit:.4g} {unit}".rstrip())
     return ", ".join(beyond)
 
 

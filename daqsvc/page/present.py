@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from html import escape
 from typing import TYPE_CHECKING, Any
 
+from daqsvc.dsp.phase import deviation_deg
 from daqsvc.page.text import level_mark, row, time_mark
 
 if TYPE_CHECKING:
@@ -14,6 +16,8 @@ if TYPE_CHECKING:
 
 MOST_ROWS = 500
 LIMITS = ("alert", "danger")
+ZONES = ("zone_b", "zone_c", "zone_d")
+"""Thresholds at which the zones of a standard begin."""
 OK = {"good": "OK", "not_ok": "not OK", "missing": "missing"}
 """By the quality of a statement, what a person reads of the sensors behind it."""
 WORST_FIRST = ("not_ok", "missing", "good")
@@ -57,7 +61,13 @@ def _values(statement: Document) -> list[str]:
         if value is None or "." in name:
             continue
         unit = statement["units"].get(name, "")
-        limits = {which: statement["thresholds"].get(f"{name}.{which}") for which in LIMITS}
+        thresholds = statement["thresholds"]
+        limits = {which: thresholds.get(f"{name}.{which}") for which in LIMITS}
         known = [f"{which} {limit:.4g}" for which, limit in limits.items() if limit is not None]
+        if (reference := thresholds.get(f"{name}.reference")) is not None:
+            known.insert(0, f"{deviation_deg(value, reference):.4g} {unit} from {reference:.4g}")
+        begins = [at for which in ZONES if (at := thresholds.get(f"{name}.{which}")) is not None]
+        if len(begins) == len(ZONES):
+            known.insert(0, f"zone {'ABCD'[bisect_right(begins, value)]} of ISO 20816-3")
         texts.append(f"{name} {value:.4g} {unit}".rstrip() + (f" ({', '.join(known)})" if known else ""))
     return texts

@@ -7,10 +7,12 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 from daqsvc.settings.alarms import DiagnosisAlarm, LevelAlarm, SetpointAlarm, VotingAlarm
+from daqsvc.settings.measures import AMPLITUDES, PHASES, UNITS, VELOCITIES
 from daqsvc.settings.plugins import configured, detector_tables
 from daqsvc.settings.problems import Finding, choice
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.sensors import ProximityProbe, TrendValue
+from daqsvc.settings.zone_checks import zone_checks
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -64,7 +66,7 @@ def _vote(draft: MachineFile, alarm: VotingAlarm, at: KeyPath) -> Iterator[Findi
     for position, name in enumerate(alarm.sensors):
         if name in alarm.sensors[:position]:
             yield Finding((*at, "sensors", position), "votes twice", "name each sensor once")
-    if alarm.measure in {"velocity_rms", "crest_factor", "gap_voltage"}:
+    if alarm.measure in UNITS:
         return
     units = {s.unit for s in draft.sensors if s.name in alarm.sensors and s.type != "keyphasor"}
     if len(units) > 1:
@@ -155,8 +157,11 @@ def _start_up_signal(draft: MachineFile, start_up: StartUp) -> Iterator[Finding]
 
 
 _TWO_SIDED = ("value", "gap_voltage")
-"""Measures that can be too low; what is left is a size, and never negative."""
+"""Measures that can be too low, and negative."""
+_SIZES_THAT_FADE = AMPLITUDES
+"""Measures that are never negative, and can be too low all the same: 1X that fades is a change, too."""
 _UPPER = ("alert", "danger")
+_HALF_A_TURN_DEG = 180.0
 
 
 def _setpoint_checks(draft: MachineFile, alarm: SetpointAlarm, at: KeyPath) -> Iterator[Iterator[Finding]]:
@@ -167,7 +172,11 @@ def _setpoint_checks(draft: MachineFile, alarm: SetpointAlarm, at: KeyPath) -> I
         alarm: one of its alarms.
         at: where that stands.
     """
+    yield zone_checks(draft, alarm, at)
     yield _setpoints(alarm, at)
+    yield _phase_alone(alarm, at)
+    if isinstance(alarm, LevelAlarm):
+        yield _phase_limits(alarm, at)
     yield _deadband(alarm, at)
     yield _sensors(draft, alarm, at)
     yield _believed(draft, alarm, at)
@@ -177,10 +186,22 @@ def _setpoint_checks(draft: MachineFile, alarm: SetpointAlarm, at: KeyPath) -> I
 
 def _setpoints(alarm: SetpointAlarm, at: KeyPath) -> Iterator[Finding]:
     setpoints = alarm.setpoints
-    if not setpoints:
+    if not setpoints and alarm.zones is None:
         yield Finding(at, "has neither alert nor danger", "add alert, danger or both")
     for (key, value), (above, higher) in pairwise(setpoints.items()):
-        if value >= higher:
+        if value >= higher and alarm.boundaries is not None and value in alarm.boundaries:
+            yield Finding(
+                (*at, above),
+                f"must be above {key} = {value:g}, where zone C begins",
+                f"write {key} as well, or leave {above} to the zones",
+            )
+        elif value >= higher and alarm.boundaries is not None and higher in alarm.boundaries:
+            yield Finding(
+                (*at, key),
+                f"must be below {above} = {higher:g}, where zone D begins",
+                f"write {above} as well, or leave {key} to the zones",
+            )
+        elif value >= higher:
             yield Finding(
                 (*at, key),
                 f"must be below {above} = {higher:g}",
@@ -189,10 +210,12 @@ def _setpoints(alarm: SetpointAlarm, at: KeyPath) -> Iterator[Finding]:
     if alarm.measure in _TWO_SIDED:
         return
     for key, value in setpoints.items():
-        if key not in _UPPER:
+        if key not in _UPPER and alarm.measure not in _SIZES_THAT_FADE:
+            lower = [*_TWO_SIDED, *_SIZES_THAT_FADE]
             yield Finding(
                 (*at, key),
-                f"does not go with {alarm.measure}: only {' and '.join(_TWO_SIDED)} have lower setpoints",
+                f"does not go with {alarm.measure}: only {', '.join(lower[:-1])} and {lower[-1]} have lower "
+                "setpoints",
                 "remove it",
             )
         elif value <= 0:
@@ -203,12 +226,67 @@ def _setpoints(alarm: SetpointAlarm, at: KeyPath) -> Iterator[Finding]:
             )
 
 
+def _phase_alone(alarm: SetpointAlarm, at: KeyPath) -> Iterator[Finding]:
+    """A phase is held against a reference, and nothing else is."""
+    if alarm.measure not in PHASES:
+        if alarm.reference_deg is not None:
+            remedy = (
+                "write phase = { reference_deg = .., alert = .. } for the phase beside the amplitude"
+                if alarm.measure in AMPLITUDES
+                else "remove it"
+            )
+            yield Finding((*at, "reference_deg"), f"goes with a phase, not with {alarm.measure}", remedy)
+        return
+    if alarm.reference_deg is None:
+        yield Finding(
+            at,
+            f"does not say from where {alarm.measure} counts: its setpoints are how far it may be from a "
+            "reference, either way",
+            "add reference_deg, the phase of the machine in good order, e.g. reference_deg = 135.0",
+        )
+    for key, value in alarm.setpoints.items():
+        if key in _UPPER and value > _HALF_A_TURN_DEG:
+            yield Finding(
+                (*at, key),
+                "is never reached: no phase is farther than 180 deg from another one",
+                "write how far it may be from reference_deg either way, e.g. 30.0",
+            )
+
+
+def _phase_limits(alarm: LevelAlarm, at: KeyPath) -> Iterator[Finding]:
+    """Limits of the phase beside those of the amplitude."""
+    phase, here = alarm.phase, (*at, "phase")
+    if phase is None:
+        return
+    if alarm.measure not in AMPLITUDES:
+        yield Finding(
+            here,
+            f"goes with an amplitude, not with {alarm.measure}",
+            f"write measure = {' or '.join(map(repr, AMPLITUDES))}, or remove it".replace("'", '"'),
+        )
+        return
+    limits = [limit for limit in (phase.alert, phase.danger) if limit is not None]
+    if not limits:
+        yield Finding(here, "has neither alert nor danger", "add alert, danger or both, in degrees")
+    elif phase.alert is not None and phase.danger is not None and phase.alert >= phase.danger:
+        yield Finding(
+            (*here, "alert"),
+            f"must be below danger = {phase.danger:g}",
+            "correct one of the two" if phase.alert == phase.danger else "swap the two, or correct one",
+        )
+    if limits and phase.deadband >= min(limits):
+        yield Finding(
+            (*here, "deadband"),
+            f"must be smaller than the setpoint {min(limits):g}, or the alarm never returns",
+            f"write e.g. deadband = {min(limits) / 20:.3g}",
+        )
+
+
 def _deadband(alarm: SetpointAlarm, at: KeyPath) -> Iterator[Finding]:
     upper = [(value, key) for key, value in alarm.setpoints.items() if key in _UPPER]
     lower = [(value, key) for key, value in alarm.setpoints.items() if key not in _UPPER]
-    if alarm.measure not in _TWO_SIDED:
-        if upper and 0 < min(upper)[0] <= alarm.deadband:
-            yield _never_returns(at, f"the setpoint {min(upper)[0]:g}", min(upper)[0])
+    if upper and alarm.measure not in _TWO_SIDED and 0 < min(upper)[0] <= alarm.deadband:
+        yield _never_returns(at, f"the setpoint {min(upper)[0]:g}", min(upper)[0])
     elif upper and lower:
         (highest, low_key), (lowest, key) = max(lower), min(upper)
         if 0 < lowest - highest <= alarm.deadband:
@@ -271,7 +349,7 @@ def _measure(alarm: SetpointAlarm, sensor: Sensor, at: KeyPath) -> Iterator[Find
             f'is not known: "{sensor.name}" has no sensitivity_mv_per_unit',
             f"add sensitivity_mv_per_unit and zero_v to the sensor, or {instead}",
         )
-    elif measure == "velocity_rms" and isinstance(sensor, ProximityProbe):
+    elif measure in VELOCITIES and isinstance(sensor, ProximityProbe):
         yield Finding(
             here,
             f'needs an accelerometer or a velocity sensor, but "{sensor.name}" is a proximity probe',

@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal, TypeAlias
+from typing import Annotated, ClassVar, Self, TypeAlias
 
-from pydantic import Field
+from pydantic import Field, PrivateAttr
 
-from daqsvc.settings.section import MOST, DelayS, Kinds, Name, NamesDetector, Nats, Quantity, Section, Text
-
-Measure = Literal["rms", "peak", "peak_to_peak", "crest_factor", "velocity_rms", "gap_voltage", "value"]
+from daqsvc.settings.measures import Measure  # noqa: TC001 - pydantic reads the annotations
+from daqsvc.settings.section import (
+    MOST,
+    AngleDeg,
+    DelayS,
+    Kinds,
+    Name,
+    NamesDetector,
+    Nats,
+    Quantity,
+    Section,
+    Text,
+)
+from daqsvc.settings.zones import Boundaries, Zones  # noqa: TC001 - pydantic reads the annotations
 
 
 class BaseAlarm(Section):
@@ -37,6 +48,35 @@ class Setpoints(BaseAlarm):
     trip_multiply: Annotated[
         float, Field(ge=1, le=10, description="factor on alert and danger while the machine starts up")
     ] = 1.0
+    reference_deg: AngleDeg | None = Field(
+        default=None,
+        description="of a phase: that of the machine in good order, from which setpoints count either way",
+        examples=[135.0],
+    )
+    zones: Zones | None = Field(
+        default=None,
+        description="zones of a standard, whose boundaries are the setpoints that are not stated",
+        examples=['{ standard = "iso-20816-3", group = 2, support = "rigid" }'],
+    )
+
+    _boundaries: Boundaries | None = PrivateAttr(default=None)
+
+    @property
+    def boundaries(self) -> Boundaries | None:
+        """Where zones B, C and D begin, in the unit of the measure; None without zones."""
+        return self._boundaries
+
+    def in_zones(self, boundaries: Boundaries) -> Self:
+        """The same, alert where zone C begins and danger where D does, but for what it states itself.
+
+        Args:
+            boundaries: where zones B, C and D begin, in the unit of the measure.
+        """
+        stated = {"alert": self.alert, "danger": self.danger}
+        of_zones = {"alert": boundaries[1], "danger": boundaries[2]}
+        copy = self.model_copy(update={key: of_zones[key] for key, at in stated.items() if at is None})
+        copy._boundaries = boundaries  # noqa: SLF001 - its own
+        return copy
 
     @property
     def setpoints(self) -> dict[str, float]:
@@ -50,12 +90,32 @@ class Setpoints(BaseAlarm):
         return {key: value for key, value in upwards.items() if value is not None}
 
 
+DeviationDeg = Annotated[float, Field(gt=0, le=180)]
+"""How far a phase may be from another one, the shorter way round."""
+
+
+class PhaseLimits(Section):
+    """How far the phase of a component may be from that of the machine in good order."""
+
+    reference_deg: Annotated[
+        AngleDeg, Field(description="phase lag of the machine in good order", examples=[135.0])
+    ]
+    alert: DeviationDeg | None = Field(default=None, description="first setpoint, in degrees either way")
+    danger: DeviationDeg | None = Field(default=None, description="second setpoint, in degrees either way")
+    deadband: Annotated[float, Field(ge=0, le=180)] = Field(
+        default=0.0, description="how far within a setpoint it returns, in degrees"
+    )
+
+
 class LevelAlarm(Setpoints):
     """Setpoints on a measure of one sensor."""
 
     kind: ClassVar[str] = "a level alarm"
 
     sensor: Annotated[Name, Field(description="the sensor it watches", examples=["probe-x"])]
+    phase: PhaseLimits | None = Field(
+        default=None, description="of an amplitude: limits of its phase, which make them one region"
+    )
 
     @property
     def watched(self) -> tuple[str, ...]:

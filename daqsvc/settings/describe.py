@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from daqsvc.settings.alarms import LevelAlarm, SetpointAlarm
 from daqsvc.settings.failures import one_line
 from daqsvc.settings.hooks import PluginFailedError
+from daqsvc.settings.measures import UNITS
 from daqsvc.settings.plugins import (
     StreamWords,
     bus_tables,
@@ -178,22 +179,35 @@ def _alarms(machine: MachineFile) -> Iterator[Sequence[str]]:
             evidence = f"{alarm.evidence_nats:g} nats at least" if alarm.evidence_nats else "none"
             yield alarm.name, alarm.detector, "by mode", "by mode", f"{evidence}{latching}"
             continue
-        unit = {"velocity_rms": "mm/s", "crest_factor": "", "gap_voltage": "V"}.get(
-            alarm.measure, machine.sensor(alarm.watched[0]).unit
-        )
+        unit = UNITS.get(alarm.measure, machine.sensor(alarm.watched[0]).unit)
         if isinstance(alarm, LevelAlarm):
             watched = f"{alarm.measure} of {alarm.sensor}"
         else:
             watched = f"{alarm.measure}, {alarm.vote} of {', '.join(alarm.sensors)}"
         deadband = f"{alarm.deadband:g} {unit}".rstrip()
+        delays = f"on {alarm.on_delay_s:g} s, off {alarm.off_delay_s:g} s"
         multiplied = f", start-up x{alarm.trip_multiply:g}" if alarm.trip_multiply > 1 else ""
         yield (
             alarm.name,
             watched,
             _limits(alarm.alert_low, alarm.alert, unit),
             _limits(alarm.danger_low, alarm.danger, unit),
-            f"{deadband}, on {alarm.on_delay_s:g} s, off {alarm.off_delay_s:g} s{multiplied}{latching}",
+            f"{deadband}, {delays}{multiplied}{_more_of(alarm)}{latching}",
         )
+
+
+def _more_of(alarm: SetpointAlarm) -> str:
+    """What else than its own setpoints an alarm is judged by."""
+    more = ""
+    if alarm.reference_deg is not None:
+        more += f"; off {alarm.reference_deg:g} deg"
+    if alarm.boundaries is not None:
+        more += "; zones of ISO 20816-3"
+    if isinstance(alarm, LevelAlarm) and (phase := alarm.phase) is not None:
+        limits = (("alert", phase.alert), ("danger", phase.danger))
+        known = " and ".join(f"{name} {limit:g}" for name, limit in limits if limit is not None)
+        more += f"; phase off {phase.reference_deg:g} deg: {known} deg"
+    return more
 
 
 def _limits(low: float | None, high: float | None, unit: str) -> str:

@@ -30,6 +30,7 @@ from daqsvc.settings.registry import (
 from daqsvc.settings.schema import declared_at, only_follows, section_of, valid_part, value_at
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.toml_text import MOST_BYTES, TomlTextError, decoded, parse
+from daqsvc.settings.zone_checks import with_zones
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -105,7 +106,7 @@ def _machine_file(
     reading = _Reading(document, spots, path)
     reading.leave_out_broken()
     with collecting() as failures:
-        draft = reading.validate().found_at(Origin(path))
+        draft = with_zones(reading.validate().found_at(Origin(path)))
         facts = _read_files(draft, path, reading.findings)
         reading.findings += check(draft, facts)
     reading.note_failures(draft, failures)

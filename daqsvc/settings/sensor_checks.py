@@ -7,6 +7,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from daqsvc.settings.alarms import SetpointAlarm
+from daqsvc.settings.measures import NOT_1X
 from daqsvc.settings.problems import Finding
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.sensors import Keyphasor, ProximityProbe, TrendValue
@@ -246,7 +247,8 @@ def _reach(
     if measure == "value":
         return low, high
     # From the mean to the farthest sample, where the mean may lie at one end.
-    return (-math.inf, high - low) if measure in {"rms", "peak", "peak_to_peak"} else None
+    ranged = {"rms", "peak", "peak_to_peak", *NOT_1X}
+    return (-math.inf, high - low) if measure in ranged else None
 
 
 def wire_range(draft: MachineFile, sensor: Sensor, facts: Mapping[str, Any]) -> WireRange | None:

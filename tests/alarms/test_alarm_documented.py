@@ -14,10 +14,13 @@ from support.paths import ROOT
 from daqsvc.alarms.commands import Verb
 from daqsvc.alarms.conditions import RESERVED
 from daqsvc.alarms.diagram import state_diagram
+from daqsvc.alarms.make import alarm_rule
 from daqsvc.alarms.states import AlarmState, moves
 from daqsvc.detectors.levels.settings import Levels
-from daqsvc.settings.alarms import AlarmHandling, DiagnosisAlarm, LevelAlarm, Measure, StartUp, VotingAlarm
+from daqsvc.settings.alarms import AlarmHandling, DiagnosisAlarm, LevelAlarm, StartUp, VotingAlarm
+from daqsvc.settings.measures import Measure
 from daqsvc.settings.sensors import TrendValue
+from daqsvc.settings.zones import Zones
 
 TEXT = (ROOT / "docs" / "alarms.md").read_text(encoding="utf-8")
 
@@ -56,7 +59,7 @@ def test_every_state_verb_and_own_alarm_is_explained(word):
 
 def test_the_example_is_valid_has_every_key_and_the_defaults():
     example, _ = map(tomllib.loads, fenced("toml"))
-    level, vote, both_sides, detector = example["alarms"]
+    level, vote, both_sides, region, phase, zones, detector = example["alarms"]
     assert LevelAlarm.model_validate(level).trip_multiply == 2.0
     assert VotingAlarm.model_validate(vote).vote == 2
     assert DiagnosisAlarm.model_validate(detector).evidence_nats == 18.0
@@ -71,7 +74,11 @@ def test_the_example_is_valid_has_every_key_and_the_defaults():
         "alert": 65.0,
         "danger": 75.0,
     }
-    named = {*level, *both_sides, "sensors", "vote"}
+    (*_, acceptance) = alarm_rule(LevelAlarm.model_validate(region)).limits({}).partition(", 1x_phase_lag ")
+    assert acceptance == "alert 30 and danger 60 from 135"
+    assert LevelAlarm.model_validate(phase).reference_deg == 350.0
+    assert LevelAlarm.model_validate(zones).zones == Zones(standard="iso-20816-3", group=2, support="rigid")
+    named = {*level, *both_sides, *region, *phase, *zones, "sensors", "vote"}
     assert named == set(LevelAlarm.model_fields) | set(VotingAlarm.model_fields)
 
 

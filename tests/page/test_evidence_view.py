@@ -76,6 +76,19 @@ def test_present_values_stand_with_their_limits_and_the_state_of_the_sensor() ->
     assert "key" in key
 
 
+def test_a_value_with_zones_says_in_which_it_is_and_a_phase_how_far_it_is_off() -> None:
+    at = {"zone_b": 1.4, "zone_c": 2.8, "zone_d": 4.5}
+    asked = levels(
+        statistics={"velocity_rms": 2.8, "1x_phase_lag": 20.0},
+        units={"velocity_rms": "mm/s", "1x_phase_lag": "deg"},
+        thresholds={f"velocity_rms.{zone}": begins for zone, begins in at.items()}
+        | {"velocity_rms.alert": 2.8, "1x_phase_lag.alert": 25.0, "1x_phase_lag.reference": 350.0},
+    )
+    rows = value_rows(looking(asked))
+    assert "velocity_rms 2.8 mm/s (zone C of ISO 20816-3, alert 2.8)" in rows
+    assert "1x_phase_lag 20 deg (30 deg from 350, alert 25)" in rows
+
+
 def test_a_sensor_that_is_not_ok_says_why_whoever_has_found_it() -> None:
     doubt = said("N", sensors=["left", "right"], quality="not_ok", reason="the gap voltage is -1 V")
     rows = value_rows(looking(levels(), doubt))

@@ -71,6 +71,29 @@ def test_a_value_beyond_its_limit_is_named_with_both() -> None:
     )
 
 
+def test_a_phase_is_beyond_its_limit_by_how_far_it_is_off_its_reference() -> None:
+    levels = said(
+        "alert",
+        detector="levels/probe-x",
+        probabilities={},
+        group=[],
+        evidence={},
+        statistics={"1x_phase_lag": 20.0, "2x_phase_lag": 340.0},
+        units={"1x_phase_lag": "deg", "2x_phase_lag": "deg"},
+        thresholds={
+            "1x_phase_lag.alert": 25.0,
+            "1x_phase_lag.reference": 350.0,
+            "2x_phase_lag.alert": 25.0,
+            "2x_phase_lag.reference": 350.0,
+        },
+    )
+    live = looking(levels)
+    assert sentence(live, live.latest["levels/probe-x"]) == (
+        "levels/probe-x finds a value beyond its alert limit; 1x_phase_lag is 30 deg off its reference, "
+        "alert limit 25 deg."
+    )
+
+
 def test_what_is_held_without_data_says_so() -> None:
     live = looking(said("F1", quality="missing", reason="half of the samples are missing"))
     assert "That is held from before: half of the samples are missing." in sentence(

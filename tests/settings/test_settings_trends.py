@@ -148,7 +148,7 @@ def test_a_speed_that_is_polled_tells_of_a_start_up():
             LAVAL,
             [("alert = 40.0", "alert_low = 1.0\nalert = 40.0")],
             "alarms[0].alert_low",
-            "does not go with rms: only value and gap_voltage have lower setpoints",
+            "does not go with rms: only value, gap_voltage, 1x_amplitude and 2x_amplitude have lower ",
             "remove it",
         ),
         (

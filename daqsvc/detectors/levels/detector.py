@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from daqsvc.detectors.levels.statements import NO_BOUNDS, Evidence, LevelStatements
 from daqsvc.diagnosis.record import silence_reason
-from daqsvc.dsp.levels import band_rms, gapped_band_rms, levels
+from daqsvc.dsp.levels import band_rms, gapped_band_rms, kurtosis, levels
 from daqsvc.dsp.quality.missing import (
     LEAST_KNOWN_ERROR,
     MIN_PRESENT,
@@ -22,12 +23,26 @@ from daqsvc.dsp.quality.missing import (
 )
 from daqsvc.dsp.quality.stuck import StandstillWatch
 from daqsvc.dsp.quality.unit import M_S2_PER_UNIT, RESCALE, beyond_any_unit
+from daqsvc.dsp.window_orders import phase_lag_deg, steady_angle, window_orders
+from daqsvc.settings.measures import (
+    AMPLITUDES,
+    KURTOSIS,
+    NOT_1X,
+    OF_THE_SHAFT,
+    ON_REQUEST,
+    PHASES,
+    SLOW_BAND_HZ,
+    SLOW_VELOCITY,
+    UNITS,
+    VELOCITY,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
+    from daqsvc.detectors.levels.shaft_angle import ShaftAngle
     from daqsvc.detectors.levels.statements import Limits
     from daqsvc.diagnosis.detector import Window
     from daqsvc.diagnosis.record import Diagnosis
@@ -42,6 +57,9 @@ _GLITCH = 2
 """So few samples beyond the gap limits inside a window are interference, not the probe."""
 
 SensorUnit = Literal["um", "mm", "mil", "g", "m/s2", "mm/s"]
+
+_ANY = (0.0, math.inf)
+"""Bounds of a size of which nothing is known."""
 
 # How a band velocity in mm/s comes from the samples: factor, and whether to integrate.
 _TO_VELOCITY: Mapping[str, tuple[float, bool]] = {
@@ -77,6 +95,7 @@ class LevelChannel:
         unit: unit of its samples.
         limits: setpoints of its measures.
         gap: OK limits, for a proximity probe.
+        listed: measures of `ON_REQUEST` that are made of it whether or not they have setpoints.
     """
 
     sensor: str
@@ -84,10 +103,35 @@ class LevelChannel:
     unit: SensorUnit
     limits: Sequence[Limits] = ()
     gap: GapCheck | None = None
+    listed: frozenset[str] = frozenset()
+
+    @property
+    def on_request(self) -> list[str]:
+        """The measures of `ON_REQUEST` that are made of it, in that order."""
+        watched = {limit.measure for limit in self.limits}
+        return [name for name in ON_REQUEST if name in self.listed or name in watched]
+
+
+class _Measured(NamedTuple):
+    """What a window says of one sensor.
+
+    Attributes:
+        statistics: its measures.
+        bounds: of those that are uncertain, or not known at all.
+        unknown: those of the latter that have setpoints although the samples of the sensor are there.
+        reason: why these are not known.
+    """
+
+    statistics: dict[str, float]
+    bounds: dict[str, tuple[float, float]]
+    unknown: tuple[str, ...] = ()
+    reason: str = ""
 
 
 class LevelDetector:
     """RMS, peak, peak-to-peak, crest factor and band velocity of every sensor of a stream, window by window.
+
+    And of those that are asked for it kurtosis, velocity from 2 Hz on, 1X and 2X, and what is not 1X.
 
     Emits one `Diagnosis` per sensor and window, as detector ``levels/<sensor>``. A snapshot is a window by
     itself, whatever its length.
@@ -103,6 +147,8 @@ class LevelDetector:
         channels: the sensors.
         window_s: length of a window.
         velocity_band_hz: band of the velocity, in Hz.
+        speed_rpm: stated speed of the shaft, for 1X and 2X; of its sign nothing depends.
+        shaft: the keyphasor of the stream; None: 1X is looked for near the stated speed, and has no phase.
     """
 
     def __init__(
@@ -114,6 +160,8 @@ class LevelDetector:
         *,
         window_s: float = 0.5,
         velocity_band_hz: tuple[float, float] = (10.0, 1000.0),
+        speed_rpm: float | None = None,
+        shaft: ShaftAngle | None = None,
     ) -> None:
         self.name = f"levels/{stream}"
         self.stream = stream
@@ -121,7 +169,10 @@ class LevelDetector:
         self._statements = LevelStatements(machine, stream, "levels/1")
         self._rate_hz = rate_hz
         self._channels = tuple(channels)
-        self._band_hz = velocity_band_hz
+        self._bands_hz = {VELOCITY: velocity_band_hz, SLOW_VELOCITY: SLOW_BAND_HZ}
+        known = speed_rpm is not None and math.isfinite(speed_rpm)
+        self._turns_per_sample = abs(speed_rpm) / 60.0 / rate_hz if known and speed_rpm else None
+        self._shaft = shaft
         self._standstills = {channel.sensor: StandstillWatch() for channel in self._channels}
         self._next_index = 0
 
@@ -132,21 +183,29 @@ class LevelDetector:
     def warm(self) -> None:
         """Make the taper and the band's weights; there is nothing to compile."""
         for channel in self._channels:
-            self._measure(channel, np.sin(np.arange(self.block, dtype=np.float32)), 0.0)
+            self._measure(channel, np.sin(np.arange(self.block, dtype=np.float32)), 0.0, None)
 
     def process(self, window: Window) -> list[Diagnosis]:
         """See `daqsvc.diagnosis.detector.Detector.process`."""
         diagnoses = [self._skipped(channel, window) for channel in self._channels if window.skipped]
         self._next_index = window.first_index + len(window.samples)
+        angle_rad = self._angle(window)
         block = len(window.samples) if window.snapshot else self.block
         for start in range(0, len(window.samples), block):
             part = window.samples[start : start + block]
             after = len(window.samples) - start - len(part)
             t_ns = window.t_end_ns - round(after * window.period_ns)
+            turned = None if angle_rad is None else angle_rad[start : start + block]
             diagnoses += [
-                self._judge(c, part[:, c.column], window.first_index + start, t_ns) for c in self._channels
+                self._judge(c, part[:, c.column], window.first_index + start, t_ns, turned)
+                for c in self._channels
             ]
         return diagnoses
+
+    def _angle(self, window: Window) -> NDArray[np.float64] | None:
+        """The shaft angle of every sample by the keyphasor, if anything that needs it is asked for."""
+        asked = any(name in OF_THE_SHAFT for channel in self._channels for name in channel.on_request)
+        return self._shaft.of(window) if self._shaft is not None and asked and len(window.samples) else None
 
     def silent(self, silence_s: float, t_ns: int) -> list[Diagnosis]:
         """See `daqsvc.diagnosis.detector.Detector.silent`."""
@@ -163,11 +222,17 @@ class LevelDetector:
         measures += ["gap_voltage"] * (channel.gap is not None) + ["velocity_rms"] * (
             channel.unit in _TO_VELOCITY
         )
+        measures += channel.on_request
         reason = not_judged(channel.sensor, window.skipped)
         return self._state(channel, unseen, {}, "missing", reason, 1.0, nothing_known(measures))
 
     def _judge(
-        self, channel: LevelChannel, samples: NDArray[np.float32], first_index: int, t_ns: int
+        self,
+        channel: LevelChannel,
+        samples: NDArray[np.float32],
+        first_index: int,
+        t_ns: int,
+        angle_rad: NDArray[np.float64] | None,
     ) -> Diagnosis:
         present = np.isfinite(samples)
         count = int(present.sum())
@@ -182,13 +247,14 @@ class LevelDetector:
         known = samples[present]
         if wrong := beyond_any_unit(known):
             return self._state(channel, evidence, {}, "not_ok", f"{channel.sensor} {wrong}; {RESCALE}", share)
-        statistics, bounds = self._measure(channel, samples, share)
+        statistics, bounds, unknown, why = self._measure(channel, samples, share, angle_rad)
         still = self._standstills[channel.sensor].push(known)
         if reason := _beyond_gap(channel, statistics, known) or _dead(channel, len(known), still):
             return self._state(channel, evidence, statistics, "not_ok", reason, share)
-        reason = partly_missing(channel.sensor, len(samples) - count, len(samples), bounds)
+        held = {name: between for name, between in bounds.items() if name not in unknown}
+        reason = partly_missing(channel.sensor, len(samples) - count, len(samples), held) or why
         quality: Quality = "missing" if reason else "good"
-        return self._state(channel, evidence, statistics, quality, reason, share, bounds)
+        return self._state(channel, evidence, statistics, quality, reason, share, bounds, unknown)
 
     def _state(
         self,
@@ -199,8 +265,9 @@ class LevelDetector:
         reason: str,
         missing_share: float = 1.0,
         bounds: Bounds = NO_BOUNDS,
+        unknown: tuple[str, ...] = (),
     ) -> Diagnosis:
-        units = {name: _unit(name, channel.unit) for name in statistics if name != "crest_factor"}
+        units = {name: unit for name in statistics if (unit := UNITS.get(name, channel.unit))}
         return self._statements.state(
             channel.sensor,
             channel.limits,
@@ -211,12 +278,17 @@ class LevelDetector:
             reason,
             missing_share,
             bounds,
+            unknown,
         )
 
     def _measure(
-        self, channel: LevelChannel, samples: NDArray[np.float32], share: float
-    ) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
-        """The measures of a window that lacks a ``share`` of its samples, and the bounds of the uncertain."""
+        self,
+        channel: LevelChannel,
+        samples: NDArray[np.float32],
+        share: float,
+        angle_rad: NDArray[np.float64] | None,
+    ) -> _Measured:
+        """The measures of a window that lacks a ``share`` of its samples."""
         measured = levels(samples)
         known = samples[np.isfinite(samples)]
         bounds = level_bounds(measured, float(known.min()), float(known.max()), share)
@@ -233,19 +305,75 @@ class LevelDetector:
             if "mean" in bounds:
                 volts = sorted(gap.zero_v + end * gap.volts_per_unit for end in bounds["mean"])
                 bounds["gap_voltage"] = (volts[0], volts[1])
+        asked = channel.on_request
         if channel.unit in _TO_VELOCITY:
-            factor, integrate = _TO_VELOCITY[channel.unit]
-            if share:
-                values = samples.astype(np.float64)
-                about = gapped_band_rms(values, self._rate_hz, *self._band_hz, integrate=integrate)
-                if about.error <= LEAST_KNOWN_ERROR:
-                    statistics["velocity_rms"] = factor * about.rms
-                if share > MOST_MISSING or about.error > MOST_ERROR:
-                    bounds["velocity_rms"] = (factor * about.low, factor * about.high)
-            else:
-                rms = band_rms(samples.astype(np.float64), self._rate_hz, *self._band_hz, integrate=integrate)
-                statistics["velocity_rms"] = factor * rms
-        return statistics, bounds
+            self._add_velocity(channel, VELOCITY, samples, share, statistics, bounds)
+            if SLOW_VELOCITY in asked:
+                self._add_velocity(channel, SLOW_VELOCITY, samples, share, statistics, bounds)
+        if KURTOSIS in asked:
+            statistics[KURTOSIS] = kurtosis(samples)
+        reason = ""
+        if of_the_shaft := [name for name in asked if name in OF_THE_SHAFT]:
+            orders, reason = self._orders(channel.sensor, samples.astype(np.float64), angle_rad)
+            statistics |= {name: orders[name] for name in of_the_shaft if name in orders}
+        if share > MOST_MISSING:
+            # As of a crest factor: what is missing may hold anything.
+            bounds |= dict.fromkeys(
+                (name for name in asked if name in statistics and name not in bounds), _ANY
+            )
+        watched = {limit.measure for limit in channel.limits}
+        unknown = tuple(name for name in asked if name in watched and name not in statistics | bounds)
+        bounds |= nothing_known(unknown)
+        return _Measured(statistics, bounds, unknown, reason if unknown else "")
+
+    def _add_velocity(
+        self,
+        channel: LevelChannel,
+        name: str,
+        samples: NDArray[np.float32],
+        share: float,
+        statistics: dict[str, float],
+        bounds: dict[str, tuple[float, float]],
+    ) -> None:
+        factor, integrate = _TO_VELOCITY[channel.unit]
+        values, band_hz = samples.astype(np.float64), self._bands_hz[name]
+        if not share:
+            statistics[name] = factor * band_rms(values, self._rate_hz, *band_hz, integrate=integrate)
+            return
+        about = gapped_band_rms(values, self._rate_hz, *band_hz, integrate=integrate)
+        if about.error <= LEAST_KNOWN_ERROR:
+            statistics[name] = factor * about.rms
+        if share > MOST_MISSING or about.error > MOST_ERROR:
+            bounds[name] = (factor * about.low, factor * about.high)
+
+    def _orders(
+        self, sensor: str, samples: NDArray[np.float64], angle_rad: NDArray[np.float64] | None
+    ) -> tuple[dict[str, float], str]:
+        """What can be told of 1X and 2X in a window, and why the rest cannot."""
+        by_pulses = angle_rad is not None
+        if angle_rad is None:
+            if self._turns_per_sample is None:
+                return {}, f"1X of {sensor} is not known: nobody says how fast the shaft turns"
+            angle_rad = steady_angle(samples, self._turns_per_sample)
+        found = window_orders(samples, angle_rad)
+        if found is None and by_pulses and self._shaft is not None and not np.isfinite(angle_rad[-1]):
+            return {}, (
+                f"1X of {sensor} is not known: {self._shaft.name} has no pulses that tell the angle of the "
+                "shaft; it stands still, or check keyphasor and threshold_v"
+            )
+        if found is None:
+            return {}, (
+                f"1X of {sensor} is not known: no whole revolution of the window has enough samples; "
+                "sample faster, or write a longer window_s"
+            )
+        phases: dict[str, float] = {}
+        if by_pulses:
+            lags = [phase_lag_deg(one, found.deviation) for one in (found.first, found.second)]
+            phases = {name: lag for name, lag in zip(PHASES, lags, strict=True) if lag is not None}
+        sizes = dict(zip(AMPLITUDES, (abs(found.first), abs(found.second)), strict=True))
+        rest = dict(zip(NOT_1X, (found.rest_rms, found.rest_peak_to_peak), strict=True))
+        weak = f"1X or 2X of {sensor} does not stand out of its noise, so that it has no phase"
+        return sizes | phases | rest, weak
 
 
 def _beyond_gap(channel: LevelChannel, statistics: Mapping[str, float], known: NDArray[np.float32]) -> str:
@@ -283,7 +411,3 @@ def _dead(channel: LevelChannel, count: int, still: Standstill | None) -> str:
         f"{channel.sensor} stood still at {value} for {still.samples} of {count} samples: dead or "
         "disconnected for a part of the time; check sensor, cable and supply"
     )
-
-
-def _unit(statistic: str, unit: str) -> str:
-    return {"velocity_rms": "mm/s", "gap_voltage": "V"}.get(statistic, unit)

@@ -9,13 +9,16 @@ import math
 from typing import TYPE_CHECKING
 
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.detectors.levels.measure_checks import measure_checks
 from daqsvc.detectors.levels.settings import Levels
 from daqsvc.diagnosis.plugin import DetectorPlugin
 from daqsvc.diagnosis.reading import STALE_S, Reading
 from daqsvc.diagnosis.snapshots import at_once, patience
+from daqsvc.settings.measures import PHASE_OF, PHASES, UNITS, VELOCITIES
 from daqsvc.settings.models import (
     Accelerometer,
     Keyphasor,
+    LevelAlarm,
     ProximityProbe,
     SetpointAlarm,
     TrendValue,
@@ -28,8 +31,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daqsvc.detectors.levels.detector import GapCheck
+    from daqsvc.detectors.levels.shaft_angle import ShaftAngle
     from daqsvc.detectors.levels.statements import Limits
     from daqsvc.diagnosis.detector import Detector
+    from daqsvc.diagnosis.recorded import RecordedDetector, RecordingOptions
     from daqsvc.settings.models import MachineFile, Sensor
 
 
@@ -70,13 +75,30 @@ class LevelsPlugin(DetectorPlugin[Levels]):
             if isinstance(detector, LevelDetector):
                 detector.change_setpoints({s.name: _limits(machine, s.name) for s in machine.sensors})
 
+    def recorded(
+        self, machine: MachineFile, settings: Levels, options: RecordingOptions
+    ) -> RecordedDetector[Levels]:
+        """See `DetectorPlugin.recorded`."""
+        from daqsvc.detectors.levels.recorded import RecordedLevels  # noqa: PLC0415 - brings NumPy
+
+        return RecordedLevels(machine, settings, options, self.build)
+
     def readings(self, machine: MachineFile, settings: Levels) -> Iterator[Reading]:
         """See `DetectorPlugin.readings`."""
-        del settings
         for sensor in _measured(machine):
             rate_hz = machine.streams[sensor.stream].rate_hz
             silent_s = patience(machine, sensor.stream, rate_hz).ns / NS_PER_S
-            yield from _readings(sensor, max(STALE_S, math.ceil(silent_s)))
+            stale_s = max(STALE_S, math.ceil(silent_s))
+            yield from _readings(sensor, stale_s)
+            if isinstance(sensor, TrendValue):
+                continue
+            has_phase = _keyphasor_beside(machine, settings, sensor)
+            listed = _listed(settings, sensor, has_phase=has_phase)
+            for name in settings.measures:
+                if name in listed:
+                    yield Reading(
+                        f"levels/{sensor.name}", "statistics", name, UNITS.get(name, sensor.unit), stale_s
+                    )
 
     def quality_alarms(self, machine: MachineFile, settings: Levels) -> Iterator[str]:
         """See `DetectorPlugin.quality_alarms`."""
@@ -92,8 +114,16 @@ def _of_stream(machine: MachineFile, settings: Levels, stream: str) -> Iterator[
 
     sensors = [sensor for sensor in machine.sensors if sensor.stream == stream]
     name, rate_hz = machine.machine.name, machine.streams[stream].rate_hz
+    shaft = _shaft_angle(machine, settings, stream)
     channels = [
-        LevelChannel(s.name, machine.column(s), s.unit, _limits(machine, s.name), _gap_check(s))
+        LevelChannel(
+            s.name,
+            machine.column(s),
+            s.unit,
+            _limits(machine, s.name),
+            _gap_check(s),
+            _listed(settings, s, has_phase=shaft is not None),
+        )
         for s in sensors
         if isinstance(s, ProximityProbe | Accelerometer | VelocitySensor)
     ]
@@ -105,6 +135,8 @@ def _of_stream(machine: MachineFile, settings: Levels, stream: str) -> Iterator[
             channels,
             window_s=settings.window_s,
             velocity_band_hz=settings.velocity_band_hz,
+            speed_rpm=machine.machine.speed_rpm,
+            shaft=shaft,
         )
     trends = [
         TrendChannel(s.name, machine.column(s), s.unit, _limits(machine, s.name), s.ok_between)
@@ -118,11 +150,55 @@ def _of_stream(machine: MachineFile, settings: Levels, stream: str) -> Iterator[
 def _limits(machine: MachineFile, sensor: str) -> list[Limits]:
     from daqsvc.detectors.levels.statements import Limits  # noqa: PLC0415 - as above
 
-    return [
-        Limits(alarm.measure, alarm.alert, alarm.danger, alarm.alert_low, alarm.danger_low)
-        for alarm in machine.alarms
-        if isinstance(alarm, SetpointAlarm) and sensor in alarm.watched
-    ]
+    limits: list[Limits] = []
+    for alarm in machine.alarms:
+        if not isinstance(alarm, SetpointAlarm) or sensor not in alarm.watched:
+            continue
+        limits.append(
+            Limits(
+                alarm.measure,
+                alarm.alert,
+                alarm.danger,
+                alarm.alert_low,
+                alarm.danger_low,
+                alarm.reference_deg,
+                alarm.boundaries,
+            )
+        )
+        if isinstance(alarm, LevelAlarm) and (phase := alarm.phase) is not None:
+            limits.append(
+                Limits(PHASE_OF[alarm.measure], phase.alert, phase.danger, reference_deg=phase.reference_deg)
+            )
+    return limits
+
+
+def _shaft_angle(machine: MachineFile, settings: Levels, stream: str) -> ShaftAngle | None:
+    """What follows the keyphasor, if it is in this stream."""
+    from daqsvc.detectors.levels.shaft_angle import ShaftAngle  # noqa: PLC0415 - as above
+    from daqsvc.detectors.shaft.build import keyphasor  # noqa: PLC0415 - as above
+
+    name = settings.keyphasor
+    if name is None or machine.sensor(name).stream != stream:
+        return None
+    grid = machine.grid([name])
+    period = 60.0 * grid.rate_hz / abs(machine.machine.speed_rpm)
+    return ShaftAngle(keyphasor(machine, grid, name), period)
+
+
+def _keyphasor_beside(draft: MachineFile, settings: Levels, sensor: Sensor) -> bool:
+    """Whether the keyphasor is in the stream of a sensor."""
+    named = (one.stream for one in draft.sensors if one.name == settings.keyphasor)
+    return sensor.stream in named
+
+
+def _listed(settings: Levels, sensor: Sensor, *, has_phase: bool) -> frozenset[str]:
+    """What is listed and can be made of a sensor."""
+    casing = isinstance(sensor, Accelerometer | VelocitySensor)
+    return frozenset(
+        name
+        for name in settings.measures
+        if (casing or name not in VELOCITIES) and (has_phase or name not in PHASES)
+    )
 
 
 def _gap_check(sensor: Sensor) -> GapCheck | None:
@@ -167,6 +243,10 @@ def _described(machine: MachineFile, settings: Levels) -> str:
     if casing:
         low_hz, high_hz = settings.velocity_band_hz
         parts.append(f"velocity RMS {low_hz:g} to {high_hz:g} Hz of {', '.join(casing)}")
+    if settings.measures:
+        parts.append(f"{', '.join(settings.measures)} besides")
+    if settings.keyphasor is not None:
+        parts.append(f"shaft angle from {settings.keyphasor}")
     if trends:
         parts.append(
             f"{', '.join(trends)} as they come, or averaged over {settings.window_s:g} s if they are faster"
@@ -192,6 +272,7 @@ def level_checks(draft: MachineFile, levels: Levels) -> Iterator[Iterator[Findin
     yield _window(draft, levels)
     yield _velocity_band(draft, levels)
     yield _lowest_frequency(draft, levels)
+    yield from measure_checks(draft, levels)
 
 
 def _rate_hz(draft: MachineFile, sensor: Sensor) -> float | None:

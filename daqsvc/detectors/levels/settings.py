@@ -7,7 +7,8 @@ from typing import Annotated
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
-from daqsvc.settings.section import Section
+from daqsvc.settings.measures import ListedMeasure  # noqa: TC001 - pydantic reads the annotations
+from daqsvc.settings.section import Name, Section
 
 
 def _ordered_band(band_hz: tuple[float, float]) -> tuple[float, float]:
@@ -30,4 +31,12 @@ class Levels(Section):
     window_s: Annotated[float, Field(ge=1e-3, le=600)] = Field(default=0.5, description="length of a window")
     velocity_band_hz: Annotated[tuple[BandHz, BandHz], AfterValidator(_ordered_band), Field(strict=False)] = (
         Field(default=(10.0, 1000.0), description="band of the velocity RMS (ISO 20816-3: 10 Hz to 1000 Hz)")
+    )
+    measures: Annotated[tuple[ListedMeasure, ...], Field(strict=False, max_length=100)] = Field(
+        default=(), description="what is measured besides, of every sensor that has it, with or without alarm"
+    )
+    keyphasor: Name | None = Field(
+        default=None,
+        description="the keyphasor of 1X and 2X; without one they are looked for near machine.speed_rpm",
+        examples=["keyphasor"],
     )

@@ -6,6 +6,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
 from daqsvc.diagnosis.record import Diagnosis
+from daqsvc.dsp.phase import deviation_deg
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -19,17 +20,35 @@ NO_BOUNDS: Mapping[str, tuple[float, float]] = MappingProxyType({})
 _DECISIONS: tuple[Severity, ...] = ("normal", "alert", "danger")
 
 
+_ZONE_NAMES = ("zone_b", "zone_c", "zone_d")
+
+
 class Limits(NamedTuple):
-    """Setpoints of one measure; None where there is none."""
+    """Setpoints of one measure; None where there is none.
+
+    Attributes:
+        measure: key of the statistics.
+        alert: upper setpoint, in the unit of the measure.
+        danger: the same.
+        alert_low: lower setpoint.
+        danger_low: the same.
+        reference_deg: a phase that the measure is held against: its setpoints are how far it may be from it.
+        zones: where zones B, C and D of a standard begin, in the unit of the measure.
+    """
 
     measure: str
     alert: float | None
     danger: float | None
     alert_low: float | None = None
     danger_low: float | None = None
+    reference_deg: float | None = None
+    zones: tuple[float, float, float] | None = None
 
     def severity(self, low: float, high: float) -> Severity:
         """How bad a value is that lies between ``low`` and ``high``, at least: a limit is reached at it."""
+        if self.reference_deg is not None:
+            # Of a phase between bounds nothing is known.
+            low = high = deviation_deg(low, self.reference_deg) if low == high else 0.0
         if _reached(low, high, self.danger, self.danger_low):
             return "danger"
         return "alert" if _reached(low, high, self.alert, self.alert_low) else "normal"
@@ -42,6 +61,8 @@ class Limits(NamedTuple):
             "danger": self.danger,
             "alert_low": self.alert_low,
             "danger_low": self.danger_low,
+            "reference": self.reference_deg,
+            **dict(zip(_ZONE_NAMES, self.zones or (), strict=False)),
         }
         return {f"{self.measure}.{name}": limit for name, limit in described.items() if limit is not None}
 
@@ -74,6 +95,7 @@ class LevelStatements:
         self._stream = stream
         self._model = model
         self._decided: dict[str, Severity] = {}
+        self._by_limits: dict[tuple[str, Limits], Severity] = {}
 
     def state(
         self,
@@ -86,6 +108,7 @@ class LevelStatements:
         reason: str = "",
         missing_share: float | None = None,
         bounds: Mapping[str, tuple[float, float]] = NO_BOUNDS,
+        unknown: tuple[str, ...] = (),
     ) -> Diagnosis:
         """One statement about one sensor.
 
@@ -100,17 +123,24 @@ class LevelStatements:
             missing_share: share of the samples that are missing; None if that is not what it is about.
             bounds: of the statistics that are uncertain by that, between what they lie; they may make the
                 decision worse, never better.
+            unknown: measures that are not known although the samples are there: what was found of them
+                stands, and the others are judged as ever.
         """
         before = self._decided.get(sensor)
         severity = before or "normal"
         if quality == "good" or bounds:
-            worst: Severity = max(
-                (limit.severity(*_span(limit.measure, statistics, bounds)) for limit in limits),
-                key=_DECISIONS.index,
-                default="normal",
-            )
+            for limit in limits:
+                if limit.measure not in unknown:
+                    found = limit.severity(*_span(limit.measure, statistics, bounds))
+                    if limit.measure in bounds:
+                        found = max(
+                            found, self._by_limits.get((sensor, limit), "normal"), key=_DECISIONS.index
+                        )
+                    self._by_limits[sensor, limit] = found
+            each = (self._by_limits.get((sensor, limit), "normal") for limit in limits)
+            worst: Severity = max(each, key=_DECISIONS.index, default="normal")
             better = _DECISIONS.index(worst) < _DECISIONS.index(severity)
-            severity = severity if bounds and better else worst
+            severity = severity if better and not bounds.keys() <= set(unknown) else worst
         if quality == "good" or severity != (before or "normal"):
             self._decided[sensor] = severity
         return Diagnosis(
