@@ -2,18 +2,19 @@
 
 Pure rolling, inner ring turning, outer ring standing still. Real bearings slip by 1 to 2 %: the cage falls
 behind, and with it the rate at which balls pass the outer race, while they pass the inner race more often.
-A small catalogue, `bearings.toml`, has the figures by a bearing's designation.
+A catalogue, `bearings.toml`, has the figures by a bearing's designation, with the source of each.
 """
 
 from __future__ import annotations
 
 import difflib
 import math
+import re
 import tomllib
 from dataclasses import astuple, dataclass
 from functools import cache
 from importlib.resources import files
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -24,6 +25,10 @@ SUM_TOLERANCE = 0.05
 
 ROUNDED = 2e-3
 """Orders that differ by no larger a share are the same; races slip by ten times as much."""
+
+
+_NAMED = 3
+"""So many bearings of the same orders are named."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +84,8 @@ class BearingOrders:
         """Its designations in the catalogue, e.g. ``"6205"``, or else the four orders."""
         names = [name for name, known in catalogue().items() if self.same_as(known)]
         orders = f"BPFI {self.inner:.5g}, BPFO {self.outer:.5g}, BSF {self.ball:.5g}, FTF {self.cage:.4g}"
-        return " or ".join(names) or orders
+        more = [f"{len(names) - _NAMED} others"] if len(names) > _NAMED else []
+        return " or ".join([*names[:_NAMED], *more]) or orders
 
     def same_as(self, other: BearingOrders) -> bool:
         """Whether all four are those of ``other``, but for how they were rounded."""
@@ -157,39 +163,71 @@ SEALS = (
 """Suffixes of seals and shields: they change nothing inside."""
 
 
+CLEARANCE = re.compile(r"/?C[2-5]$")
+"""Suffix of the clearance inside, which does not move the orders."""
+
+
+@cache
+def _entries() -> Mapping[str, Mapping[str, Any]]:
+    text = files("daqsvc.bearing").joinpath("bearings.toml").read_text(encoding="utf-8")
+    return tomllib.loads(text)
+
+
 @cache
 def catalogue() -> Mapping[str, BearingOrders]:
     """Fault orders of all known bearings, by designation."""
-    text = files("daqsvc.bearing").joinpath("bearings.toml").read_text(encoding="utf-8")
-    return {name: _orders(entry) for name, entry in tomllib.loads(text).items()}
+    return {name: _orders(entry) for name, entry in _entries()["bearings"].items()}
+
+
+def catalogue_source(designation: str) -> str:
+    """Where the entry of a bearing comes from, in a sentence.
+
+    Args:
+        designation: as `bearing_orders` takes it.
+
+    Raises:
+        KeyError: it is not in the catalogue.
+    """
+    entries = _entries()
+    source: str = entries["sources"][entries["bearings"][_known_as(designation)]["source"]]
+    return source
 
 
 def bearing_orders(designation: str) -> BearingOrders:
     """Fault orders of a bearing in the catalogue.
 
     Args:
-        designation: e.g. ``"6205-2RS"``; case, blanks and the seals' suffix do not matter.
+        designation: e.g. ``"6205-2RS"``; case, blanks and the suffixes of seals and clearance do not matter.
 
     Raises:
         KeyError: it is not in the catalogue; the message lists near names.
     """
+    return catalogue()[_known_as(designation)]
+
+
+def _known_as(designation: str) -> str:
+    """The name of a bearing in the catalogue."""
     known = catalogue()
     wanted = designation.upper().replace(" ", "")
-    bare = next((wanted.removesuffix(seal) for seal in SEALS if wanted.endswith(seal)), wanted)
-    for name in (wanted, bare):
+    bare = CLEARANCE.sub("", wanted).rstrip("-")
+    bare = next((bare.removesuffix(seal) for seal in SEALS if bare.endswith(seal)), bare)
+    for name in (wanted, bare, bare.replace("-", "")):
         if name in known:
-            return known[name]
-    near = difflib.get_close_matches(bare, known, n=4, cutoff=0.5) or sorted(known)
+            return name
+    near = difflib.get_close_matches(bare, known, n=4, cutoff=0.5)
+    names = f"near names: {', '.join(near)}" if near else "no name in it is near"
     stem = bare.partition("-")[0]
     # Of a known bearing, only the seals were written in a way that nobody uses.
     meant = f" (did you mean {stem}-2RS?)" if stem in known else ""
     raise KeyError(
-        f"bearing {designation!r} is not in the catalogue; near names: {', '.join(near)}{meant}. "
-        "Give its orders instead: BPFI=..,BPFO=..,BSF=..,FTF=.."
+        f"bearing {designation!r} is not in the catalogue; {names}{meant}. "
+        "Give its dimensions or its orders instead: BPFI=..,BPFO=..,BSF=..,FTF=.."
     )
 
 
-def _orders(entry: Mapping[str, float]) -> BearingOrders:
+def _orders(entry: Mapping[str, Any]) -> BearingOrders:
+    if "bpfi" in entry:
+        return BearingOrders(entry["bpfi"], entry["bpfo"], entry["bsf"], entry["ftf"])
     return BearingGeometry(
         balls=int(entry["balls"]),
         ball_diameter=entry["ball_diameter_mm"],

@@ -6,7 +6,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daqsvc.bearing.geometry import BearingGeometry, BearingOrders, bearing_orders, catalogue
+from daqsvc.bearing.geometry import (
+    BearingGeometry,
+    BearingOrders,
+    bearing_orders,
+    catalogue,
+    catalogue_source,
+)
 
 
 def test_the_drive_end_bearing_of_the_cwru_rig() -> None:
@@ -33,14 +39,80 @@ def test_published_orders(name: str, inner: float, outer: float, ball: float, ca
     assert orders.cage == pytest.approx(cage, rel=2e-3)
 
 
-@pytest.mark.parametrize("name", ["6205", "6205-2RS", "6205-ZZ", "6205 2rs", "6205-2z"])
-def test_seals_case_and_blanks_do_not_matter(name: str) -> None:
+@pytest.mark.parametrize(
+    "name",
+    [
+        "6205",
+        "6205-2RS",
+        "6205-ZZ",
+        "6205 2rs",
+        "6205-2z",
+        "6205/C3",
+        "6205-2RS C3",
+        "6205-2RSH/C3",
+        "6205-C4",
+    ],
+)
+def test_seals_clearance_case_and_blanks_do_not_matter(name: str) -> None:
     assert bearing_orders(name) == catalogue()["6205"]
 
 
+@pytest.mark.parametrize("name", ["7205B", "7205 B", "7205-b", "7205-B-2RS"])
+def test_hyphens_before_a_design_do_not_matter(name: str) -> None:
+    assert bearing_orders(name) == catalogue()["7205B"]
+
+
 def test_an_unknown_bearing_is_named_with_near_ones() -> None:
-    with pytest.raises(KeyError, match=r"'6209-2RS'.*near names: 620.*BPFI="):
-        bearing_orders("6209-2RS")
+    with pytest.raises(KeyError, match=r"'6229-2RS'.*near names: 62.*BPFI="):
+        bearing_orders("6229-2RS")
+    with pytest.raises(KeyError, match=r"near names: 7205B, 7205A"):
+        bearing_orders("7205")
+
+
+def test_the_catalogue_has_200_bearings_each_with_its_source() -> None:
+    assert len(catalogue()) >= 200
+    for name, orders in catalogue().items():
+        assert len(catalogue_source(name)) > 20, name
+        count = orders.inner + orders.outer
+        assert count == pytest.approx(round(count), abs=0.01), name
+        assert orders.outer == pytest.approx(count * orders.cage, rel=5e-3), name
+    assert catalogue_source("6205-2RS").startswith("SKF 6205-2RS JEM")
+    assert catalogue_source("6309").startswith("derived: ")
+    with pytest.raises(KeyError, match="22220"):
+        catalogue_source("22220")
+
+
+@pytest.mark.parametrize(
+    ("name", "outer"),
+    [
+        ("6202", 3.125),
+        ("6208", 3.547),
+        ("6210", 4.093),
+        ("6211", 4.078),
+        ("6212", 4.066),
+        ("6213", 4.099),
+        ("6214", 4.104),
+        ("6303", 2.545),
+        ("6307", 3.006),
+        ("6308", 3.023),
+        ("6309", 3.037),
+        ("6310", 3.047),
+        ("6311", 3.057),
+        ("6312", 3.064),
+        ("6314", 3.076),
+        ("6315", 3.081),
+        ("6316", 3.086),
+        ("6318", 3.093),
+    ],
+)
+def test_what_is_derived_from_ratings_is_near_what_another_maker_publishes(name: str, outer: float) -> None:
+    # Timken, coefficients of basic outer-ring sizes 202K to 318K: other balls, but as many.
+    assert catalogue_source(name).startswith("derived")
+    assert bearing_orders(name).outer == pytest.approx(outer, rel=0.023)
+
+
+def test_bearings_of_the_same_orders_are_not_all_named() -> None:
+    assert str(bearing_orders("6209")).count(" or ") <= 3
 
 
 geometries = st.builds(
