@@ -74,6 +74,8 @@ class DecodedBatch:
         notes: what to add to which of the bus's counters.
         unknown: frames by unknown id, in words.
         wrong_length: frames by stream, and the length of the last of them.
+        malformed: what the first piece was that should have been a frame, and why it is none; empty if there
+            was none, or it has been told before.
         errors: what error frames say, of a bus that has such; see `drivers.can.errors.ErrorCounts`.
         data_frames: frames that carry data, whosever they are.
         drained_ns: when the bus was last known to hold no frame that was sent before; None if there may be
@@ -84,6 +86,7 @@ class DecodedBatch:
     notes: Counter[str] = field(default_factory=Counter)
     unknown: Counter[str] = field(default_factory=Counter)
     wrong_length: dict[str, tuple[int, int]] = field(default_factory=dict)
+    malformed: str = ""
     errors: Any = None
     data_frames: int = 0
     drained_ns: int | None = None

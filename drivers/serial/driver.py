@@ -164,9 +164,10 @@ class SerialDriver:
         if "frames_malformed" in batch.notes:
             self._say_once(
                 "malformed",
-                "%s carries bytes that are no frame; they are counted and left out. If it is all of them, "
+                "%s carries bytes that are no frame; they are counted and left out%s. If it is all of them, "
                 "compare baud, parity, framing and checksum with the device's",
                 self.link.name,
+                f"; {batch.malformed}" if batch.malformed else "",
             )
         for name, count in batch.unknown.items():
             self._count_unknown(name, count)

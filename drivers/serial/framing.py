@@ -24,6 +24,10 @@ ArrivalsOf: TypeAlias = "Callable[[NDArray[np.int64]], NDArray[np.int64]]"
 """When frames arrived (int64 ``[n]``, ns), by where each ends in the bytes that are being cut."""
 
 
+SHOWN_BYTES = 16
+"""So many bytes of what is no frame are shown."""
+
+
 def in_place(ends: NDArray[np.int64]) -> NDArray[np.int64]:
     """Where frames end stands for when they arrived."""
     return ends
@@ -133,6 +137,7 @@ class DelimitedFraming(ABC):
         self._longest = longest
         self._padding = padding
         self._whole = whole
+        self._told = False
         self.restart()
 
     def restart(self) -> None:
@@ -144,6 +149,7 @@ class DelimitedFraming(ABC):
     def cut(self, data: bytes, arrivals_of: ArrivalsOf = in_place) -> DecodedBatch:
         """See `Framing.cut`."""
         batch = DecodedBatch()
+        kept = self._rest
         pieces, cut_off = self._split(data, batch)
         overlong = batch.notes["frames_malformed"] > 0
         if cut_off and not self._whole:
@@ -159,6 +165,13 @@ class DelimitedFraming(ABC):
             # The end of a frame that began before the port was opened is no fault.
             skipped = int(cut_off and not in_step[0])
             self._astray = count_steps(batch, in_step[skipped:], astray=self._astray)
+            strange = np.flatnonzero(~in_step[skipped:])
+            if len(strange) and not self._told:
+                first = int(strange[0]) + skipped
+                # As they came: who sorts pieces may change the buffer.
+                came = kept.tobytes() + data
+                batch.malformed = self._why_no_frame(came[pieces.starts[first] : pieces.stops[first]])
+                self._told = True
         self._astray |= overlong
         return batch
 
@@ -166,6 +179,11 @@ class DelimitedFraming(ABC):
         """See `Framing.ends_in`."""
         del heard
         return self._delimiter in chunk
+
+    def _why_no_frame(self, piece: bytes) -> str:
+        """What a piece is that should have been a frame, and what is wrong with it."""
+        begin = piece[:SHOWN_BYTES].hex(" ")
+        return f"the first has {len(piece)} bytes: {begin}{' ...' if len(piece) > SHOWN_BYTES else ''}"
 
     @abstractmethod
     def _sort(self, pieces: Pieces, batch: DecodedBatch, arrivals_of: ArrivalsOf) -> NDArray[np.bool_]:

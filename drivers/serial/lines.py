@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import binascii
 import math
+import re
 from functools import reduce
 from operator import xor
 from typing import TYPE_CHECKING, Literal, NamedTuple
@@ -21,7 +22,7 @@ from drivers.serial.framing import DelimitedFraming
 from drivers.serial.line_kernels import HARD, KNOWN, OTHER, READ, check_lines, count_stamps, read_lines
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -40,6 +41,11 @@ UNITS_PER_S: Mapping[str, float] = {"s": 1.0, "ms": 1e3, "us": 1e6}
 TIME_COUNTER_BITS = 32
 LATEST_S = 1e12
 """A device's time in s that is later than this is no time."""
+
+SHOWN_CHARACTERS = 80
+"""So many characters of a line that is none are shown."""
+_NUMBER = re.compile(r" *[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)? *")
+_PRINTABLE = frozenset(range(0x20, 0x7F)) | {0x09}
 
 DIGITS: Mapping[Checksum, int] = {"xor": 2, "crc16": 4}
 _SUMS: Mapping[Checksum, Callable[[bytes], int]] = {
@@ -129,6 +135,24 @@ class LineCodec:
         with np.errstate(over="ignore"):
             samples = (values[good, 1:] * self._scale + self._offset).astype(np.float32)[:, None, :]
         return Lines(states != OTHER, good, places[good], samples)
+
+    def why_not(self, fields: Sequence[str]) -> str:
+        """Why the fields of a line, its prefix left out, are no sample."""
+        columns = self._layout.line
+        if len(fields) != len(columns):
+            return f"{len(fields)} columns, the file lists {len(columns)} ({', '.join(columns)})"
+        for name in (self._place, *self._layout.channel_names):
+            text = fields[columns.index(name)]
+            if not _NUMBER.fullmatch(text):
+                return f"column {name} is {text!r}, no number"
+        place = fields[columns.index(self._place)]
+        if self._units_per_s is not None:
+            return f"time {self._place} is {place}, later than any"
+        if not place.strip().isdigit():
+            return f"counter {self._place} is {place}, no whole number from 0 up"
+        if float(place) >= self._counts:
+            return f"counter {self._place} is {place}, by its bits in the file {self._counts - 1:.0f} at most"
+        return "it cannot be read"
 
     def write(self, place: float, sample: NDArray[np.float64]) -> bytes:
         """One line without its checksum and end.
@@ -249,6 +273,25 @@ class LineFraming(DelimitedFraming):
         digits = DIGITS[self._checksum]
         ends = [b"*%0*X" % (digits, value) + self._end for value in sums]
         return [line + end for line, end in zip(lines, ends, strict=True)]
+
+    def _why_no_frame(self, piece: bytes) -> str:
+        shown = piece[:SHOWN_CHARACTERS].decode("ascii", "backslashreplace")
+        said = f'the first line is "{shown}{"..." if len(piece) > SHOWN_CHARACTERS else ""}"'
+        if not all(byte in _PRINTABLE for byte in piece):
+            return f"{said}: no text, as at another baud rate or parity, or of a device that sends no lines"
+        if self._checksum != "none":
+            text, star, sent = piece.rpartition(b"*")
+            if not star:
+                return f"{said}: no checksum behind a *"
+            made = b"%0*X" % (DIGITS[self._checksum], _SUMS[self._checksum](text[text[:1] in {b"$", b"!"} :]))
+            if made != sent.upper():
+                return f"{said}: checksum {sent.decode()}, its text makes {made.decode()}"
+            piece = text
+        fields = piece.decode("ascii").split(self._separator.decode("ascii"))
+        if None in self._by_prefix:
+            return f"{said}: {self._codecs[self._by_prefix[None]].why_not(fields)}"
+        name = self._by_prefix.get(fields[0].encode("ascii"))
+        return f"{said}: {'of no stream' if name is None else self._codecs[name].why_not(fields[1:])}"
 
     def _sort(self, pieces: Pieces, batch: DecodedBatch, arrivals_of: ArrivalsOf) -> NDArray[np.bool_]:
         intact = np.ones(len(pieces.ends), np.bool_)

@@ -454,7 +454,7 @@ def test_what_calibrate_wrote_by_options_is_read_by_options(verb: Run, tmp_path:
             "900",
             "was learnt at 1797 rpm, and the machine turns at 900 rpm; calibrate at 900 rpm",
         ),
-        ("--bearing", "6203", "of another bearing (6205) than is watched there (6203 or 6204"),
+        ("--bearing", "6203", "of another bearing (6205) than is watched there (6203 or ER10K"),
     ):
         code, (found,), _ = verb("analyze", run, *both, option, value, "--calibration", out)
         assert (code, found["verdict"]) == (3, None)

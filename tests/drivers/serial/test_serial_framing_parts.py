@@ -151,6 +151,49 @@ def test_a_sentence_of_a_gps_receiver_is_a_line():
     assert not found.frames["a"].intact.any()
 
 
+@pytest.mark.parametrize(
+    ("spoilt", "said"),
+    [
+        (b"1,2,3,4,5,6,7", '"1,2,3,4,5,6,7": 7 columns, the file lists 3 (seq, x, y)'),
+        (b"1,abc,2", "column x is 'abc', no number"),
+        (b"1,,2", "column x is '', no number"),
+        (b"1.5,1,2", "counter seq is 1.5, no whole number from 0 up"),
+        (b"-3,1,2", "counter seq is -3, no whole number from 0 up"),
+        (b"4294967296,1,2", "counter seq is 4294967296, by its bits in the file 4294967295 at most"),
+        (b"\xfe\x01\x80", '"\\xfe\x01\\x80": no text, as at another baud rate or parity'),
+        (b"7," * 100 + b"7", "..." + '": 101 columns'),
+    ],
+)
+def test_a_line_that_is_none_is_quoted_with_what_is_wrong(spoilt, said):
+    columns = line_layout(("seq", "x", "y"), ("x", "y"), counter="seq")
+    framing = LineFraming({"a": columns}, {"a": 100.0})
+    framing.cut(b"half a line\n")
+    found = framing.cut(b"0,1,2\n" + spoilt + b"\n1,1,2\n")
+    assert found.notes["frames_malformed"] == 1
+    assert said in found.malformed
+    again = framing.cut(spoilt + b"\n")
+    assert (again.notes["frames_malformed"], again.malformed) == (1, ""), "once"
+
+
+@pytest.mark.parametrize(
+    ("piece", "said"), [(b"1,z*00", "checksum 00, its text makes 67"), (b"1,z", "no checksum behind a *")]
+)
+def test_a_checksum_is_quoted_with_what_it_would_be(piece, said):
+    # What can be read is a frame, if a corrupt one.
+    framing = LineFraming({"a": line_layout(("seq", "x"), ("x",), counter="seq")}, {"a": 100.0}, "xor")
+    found = framing.cut(b"x\n" + piece + b"\n")
+    assert found.notes["frames_malformed"] == 1
+    assert said in found.malformed
+
+
+def test_a_binary_piece_that_is_no_frame_is_shown_in_hexadecimal():
+    framing = CobsFraming(BodyCodec({"a": layout()}))
+    framing.cut(b"\x00")
+    found = framing.cut(bytes(range(1, 40)) + b"\x00")
+    assert found.malformed.startswith("the first has 39 bytes: 01 02 03 04")
+    assert found.malformed.endswith("10 ...")
+
+
 def test_records_with_another_delimiter_are_lines_too():
     # As a telephone's logger wrote them: three averages, three accelerations in m/s^2, ms.
     layout = line_layout(("ax", "ay", "az", "x", "y", "z", "t"), ("x", "y", "z"), time="t")
