@@ -163,6 +163,8 @@ SEALS = (
 """Suffixes of seals and shields: they change nothing inside."""
 
 
+DESIGN = re.compile(r"(7[23]\d\dB|NU\d+E)[A-Z0-9]*$")
+"""Designs whose further letters are of the cage, or of pairs: 7205 BECBP, NU 206 ECP."""
 CLEARANCE = re.compile(r"/?C[2-5]$")
 """Suffix of the clearance inside, which does not move the orders."""
 
@@ -211,10 +213,11 @@ def _known_as(designation: str) -> str:
     wanted = designation.upper().replace(" ", "")
     bare = CLEARANCE.sub("", wanted).rstrip("-")
     bare = next((bare.removesuffix(seal) for seal in SEALS if bare.endswith(seal)), bare)
-    for name in (wanted, bare, bare.replace("-", "")):
+    joined = bare.replace("-", "")
+    for name in (wanted, bare, joined, DESIGN.sub(r"\1", joined)):
         if name in known:
             return name
-    near = difflib.get_close_matches(bare, known, n=4, cutoff=0.5)
+    near = difflib.get_close_matches(bare, known, n=4, cutoff=0.6)
     names = f"near names: {', '.join(near)}" if near else "no name in it is near"
     stem = bare.partition("-")[0]
     # Of a known bearing, only the seals were written in a way that nobody uses.

@@ -36,7 +36,8 @@ _SKIRT_BINS = (5, 12)
 """Bins from a line where only one that is smeared, as slip smears a bearing's, has much left ..."""
 _SHARP_DB = 6.0
 """... and how far a narrow one stands above it."""
-_LEAST_TEETH, _MOST_TEETH = 9, 120
+_LEAST_TEETH, _MOST_TEETH = 12, 120
+"""Gears with fewer are rare, as their teeth are cut away at the foot."""
 TOP_ORDER = 2.0 * _MOST_TEETH + 4.0
 """The highest order that is looked at: beside the second harmonic of a mesh."""
 _CARRIER_DB = 6.0
@@ -89,6 +90,13 @@ class DriveLines:
         # The line frequency itself modulates where the phases are not alike.
         multiples = range(1, int(2.0 * highest / self.order) + 2)
         return tuple(0.5 * k * self.order + side for k in multiples for side in pole_pass)
+
+    def describe_as_doubt(self) -> str:
+        """The same of a gear that may be none."""
+        return (
+            f"lines {self.spacing:.4g} orders apart about {self.order:g}X, as of a gear of {self.teeth} "
+            f"teeth and a mate of {self.mate_teeth}, are as far apart as those of a damaged part"
+        )
 
     def describe(self) -> str:
         """One sentence for a person."""
@@ -233,25 +241,33 @@ def _is_modulated(lines: LineLevels, order: int, shaft_hz: float) -> bool:
 
 def _mate(lines: LineLevels, teeth: int, shaft_hz: float) -> int | None:
     """Teeth of the gear whose turning makes pairs of sidebands about a mesh; None if no such pairs show."""
+    scores = {
+        mate: score
+        for mate in range(_LEAST_TEETH, _MOST_TEETH + 1)
+        if (score := _pairs(lines, teeth, teeth / mate, shaft_hz)) > 0.0
+    }
+    if not scores:
+        return None
+    best = max(scores, key=scores.__getitem__)
+    # Every second pair of a slower gear is a faster one's, if all of them show it is the slower one.
+    return max(mate for mate in scores if mate % best == 0)
+
+
+def _pairs(lines: LineLevels, teeth: int, spacing: float, shaft_hz: float) -> float:
+    """How far pairs of sidebands stand out about a mesh and its second harmonic; 0 if too few do."""
     resolution = lines.step_hz / shaft_hz
-    best: tuple[float, int] | None = None
-    for mate in range(_LEAST_TEETH, _MOST_TEETH + 1):
-        spacing = teeth / mate
-        # At whole orders they are the shaft's own; closer than this to a carrier they are its skirt.
-        if abs(spacing - round(spacing)) < 4.0 * resolution or spacing < 6.0 * resolution:
-            continue
-        pairs = [
-            min(lines.narrow_db((carrier * teeth + side * k * spacing) * shaft_hz) for side in (-1, 1))
-            for carrier in (1, 2)
-            for k in _SIDEBAND_ORDERS
-            if abs(k * spacing - round(k * spacing)) > 3.0 * resolution
-        ]
-        if sum(level > _SIDEBAND_DB for level in pairs) < _LEAST_PAIRS or pairs[0] < _SIDEBAND_DB:
-            continue
-        score = sum(max(level, 0.0) for level in pairs)
-        if best is None or score > best[0]:
-            best = score, mate
-    return None if best is None else best[1]
+    # At whole orders they are the shaft's own; closer than this to a carrier they are its skirt.
+    if abs(spacing - round(spacing)) < 4.0 * resolution or spacing < 6.0 * resolution:
+        return 0.0
+    levels = [
+        min(lines.narrow_db((carrier * teeth + side * k * spacing) * shaft_hz) for side in (-1, 1))
+        for carrier in (1, 2)
+        for k in _SIDEBAND_ORDERS
+        if abs(k * spacing - round(k * spacing)) > 3.0 * resolution
+    ]
+    if sum(level > _SIDEBAND_DB for level in levels) < _LEAST_PAIRS or levels[0] < _SIDEBAND_DB:
+        return 0.0
+    return sum(max(level, 0.0) for level in levels)
 
 
 def motor_lines(lines: LineLevels, shaft_hz: float, known: float) -> DriveLines | None:

@@ -57,9 +57,16 @@ def test_seals_clearance_case_and_blanks_do_not_matter(name: str) -> None:
     assert bearing_orders(name) == catalogue()["6205"]
 
 
-@pytest.mark.parametrize("name", ["7205B", "7205 B", "7205-b", "7205-B-2RS"])
-def test_hyphens_before_a_design_do_not_matter(name: str) -> None:
+@pytest.mark.parametrize("name", ["7205B", "7205 B", "7205-b", "7205-B-2RS", "7205 BECBP", "7205BEP/C3"])
+def test_hyphens_and_cages_of_a_design_do_not_matter(name: str) -> None:
     assert bearing_orders(name) == catalogue()["7205B"]
+    assert bearing_orders("NU 206 ECP") == catalogue()["NU206E"]
+
+
+@pytest.mark.parametrize("name", ["7205AC", "6205ETN9", "NU2206ECP"])
+def test_other_designs_are_other_bearings(name: str) -> None:
+    with pytest.raises(KeyError, match="not in the catalogue"):
+        bearing_orders(name)
 
 
 def test_an_unknown_bearing_is_named_with_near_ones() -> None:

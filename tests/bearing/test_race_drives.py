@@ -84,6 +84,25 @@ def test_a_tooth_that_knocks_is_no_damaged_bearing(
     assert "is where the gear has one" in verdict.evidence[part].reason
 
 
+def test_a_mate_that_knocks_is_no_faster_gear_and_no_other_machine() -> None:
+    # Its knocks make lines at all multiples of its speed, so that every second pair is one of a faster mate.
+    verdict = race_test(geared(43, 24, knock=6.0), RATE_HZ, SPEED_RPM, BEARING)
+    assert [(drive.teeth, drive.mate_teeth) for drive in verdict.drives] == [(43, 24)]
+    # The harmonics of the mate's speed are far more than those of the shaft.
+    assert verdict.speed_seen
+    assert verdict.notes == (verdict.notes[0],)
+    assert "outer not testable" in verdict.notes[0]
+
+
+def test_a_mate_that_turns_as_balls_pass_is_told_and_the_bearing_goes_first() -> None:
+    verdict = race_test(geared(61, 17), RATE_HZ, SPEED_RPM, BEARING)
+    assert verdict.drives == ()
+    assert verdict.evidence["outer"].testable
+    (note,) = (note for note in verdict.notes if "mate" in note)
+    assert "lines 3.588 orders apart about 61X" in note
+    assert note.endswith("taken for the bearing's")
+
+
 @pytest.mark.parametrize("part", ["inner", "outer"])
 def test_a_motor_is_no_damaged_bearing(part: str) -> None:
     # The part's line is at twice the mains.

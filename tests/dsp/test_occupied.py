@@ -82,6 +82,7 @@ def test_a_bearing_is_judged_by_what_is_there_and_that_is_told() -> None:
     samples = strikes("outer", 10.0, strength=1.2)
     verdict = race_test(upsampled(samples, 4), 4.0 * RATE_HZ, SPEED_RPM, BEARING)
     assert verdict.verdict == "outer"
+    assert not verdict.repairs, "its ends are no steps of the mean"
     (told,) = (note for note in verdict.notes if note.startswith("nothing above"))
     assert "at a sample rate of 48000 Hz: low-passed, or sampled at about 12 kHz" in told
     whole = race_test(samples, RATE_HZ, SPEED_RPM, BEARING)

@@ -220,19 +220,21 @@ def race_features(
 def _measured(
     samples: NDArray[np.floating], rate_hz: float, speed_rpm: float, bearing: BearingOrders, rules: RaceRules
 ) -> RaceFeatures:
-    sound = checked(np.asarray(samples, dtype=np.float64), rate_hz, speed_rpm, (rules.low_hz, rules.high_hz))
+    channel = np.asarray(samples, dtype=np.float64)
+    occupied_hz = _occupied(channel, rate_hz, rules)
+    top_hz = min(rules.high_hz, occupied_hz or rules.high_hz)
+    sound = checked(channel, rate_hz, speed_rpm, (rules.low_hz, top_hz))
+    del channel
     length = scipy.fft.prev_fast_len(len(sound.values), real=True)
     spectrum = scipy.fft.rfft(sound.values[:length])
     notes, repairs = sound.notes, sound.repairs
     holes = np.array(sound.stretches, dtype=np.float64).reshape(-1, 2) / length
     # Of a long record each of these is as large as the record: what has been used is let go.
-    occupied_hz = occupied_top_hz(sound.values, rate_hz)
     del sound
     levels = band_levels(spectrum, length, rate_hz)
-    top_hz = min(TOP_SHARE * rate_hz, rules.high_hz)
-    if occupied_hz is not None and occupied_hz < top_hz:
-        top_hz = occupied_hz
-        notes = (*notes, _empty_above(top_hz, rate_hz, rules.low_hz))
+    top_hz = min(TOP_SHARE * rate_hz, top_hz)
+    if occupied_hz is not None:
+        notes = (*notes, f"{_empty_above(top_hz, rate_hz)}; judged by {rules.low_hz:g} to {top_hz:.0f} Hz")
     band = whiten(spectrum, length, rate_hz, rules.low_hz, top_hz, rules.whitening_hz)
     top_order = max(highest_order(bearing), NOTCHED_HARMONICS + 1.0)
     stated_hz, step_hz = speed_rpm / 60.0, rate_hz / length
@@ -254,7 +256,12 @@ def _measured(
     revolutions = shaft.rate_hz / step_hz
     # On an even angle of the shaft the lines of a motor are none, and in even time those of a gear.
     drives = drive_lines(line_levels, shaft.rate_hz, sharp=shaft.sharp) if track is None else ()
-    drives = tuple(drive for drive in drives if not _is_bearings(drive, bearing, rules.slip))
+    ambiguous = [drive for drive in drives if _is_bearings(drive, bearing, rules.slip)]
+    notes = (*notes, *(f"{drive.describe_as_doubt()}: taken for the bearing's" for drive in ambiguous))
+    drives = tuple(drive for drive in drives if drive not in ambiguous)
+    for drive in drives:
+        if drive.mate_teeth is not None and drive.spacing is not None:
+            shaft = shaft.explained(drive.spacing * shaft.rate_hz)
     others = [order for drive in drives for order in drive.explained(top_order)]
     square = view_of(power, line_power(levelled(sizes, holes), bins), revolutions, others)
     log_phases, log_sizes = (
@@ -290,21 +297,34 @@ def _is_bearings(drive: DriveLines, bearing: BearingOrders, slip: float) -> bool
     )
 
 
-def _empty_above(top_hz: float, rate_hz: float, low_hz: float) -> str:
-    """What to say of a record that holds nothing above some frequency.
+def _occupied(samples: NDArray[np.float64], rate_hz: float, rules: RaceRules) -> float | None:
+    """Where a record ends within the band of the test; None where it does not.
 
     Raises:
         UnfitError: what it holds is too little to judge a bearing by.
     """
-    found = f"nothing above {top_hz:.0f} Hz at a sample rate of {rate_hz:g} Hz"
-    why = f"low-passed, or sampled at about {2e-3 * top_hz:.2g} kHz and upsampled"
-    if top_hz < LEAST_BAND * low_hz:
+    if samples.ndim != 1 or not (np.isfinite(rate_hz) and rate_hz > 0.0):
+        return None
+    there = np.isfinite(samples)
+    mean = float(samples[there].mean()) if there.any() else 0.0
+    top_hz = occupied_top_hz(np.where(there, samples - mean, 0.0), rate_hz)
+    if top_hz is None or top_hz >= min(TOP_SHARE * rate_hz, rules.high_hz):
+        return None
+    if top_hz < LEAST_BAND * rules.low_hz:
         raise UnfitError(
             "channel",
-            f"has {found} ({why}), which leaves the band {low_hz:g} to {top_hz:.0f} Hz",
-            f"record up to {LEAST_BAND * low_hz:.0f} Hz or more",
+            f"has {_empty_above(top_hz, rate_hz)}, which leaves the band {rules.low_hz:g} to {top_hz:.0f} Hz",
+            f"record up to {LEAST_BAND * rules.low_hz:.0f} Hz or more",
         )
-    return f"{found}: {why}; judged by {low_hz:g} to {top_hz:.0f} Hz"
+    return top_hz
+
+
+def _empty_above(top_hz: float, rate_hz: float) -> str:
+    """What to say of a record that holds nothing above some frequency."""
+    return (
+        f"nothing above {top_hz:.0f} Hz at a sample rate of {rate_hz:g} Hz: low-passed, or sampled at about "
+        f"{2e-3 * top_hz:.2g} kHz and upsampled"
+    )
 
 
 def _wander_note(track: SpeedTrack) -> str:

@@ -7,7 +7,7 @@ whichever lines the other happens to meet.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -194,6 +194,19 @@ class ShaftRate:
     rival_hz: float | None = None
     scan: SpeedScan | None = None
 
+    def explained(self, hz: float) -> ShaftRate:
+        """The same where the harmonics of another rate are known to be something else's.
+
+        Args:
+            hz: rate of the other; its half and its double are it, too.
+        """
+        if self.rival_hz is None or self.scan is None:
+            return self
+        if not any(abs(self.rival_hz / (factor * hz) - 1.0) <= SAME for factor in (0.5, 1.0, 2.0)):
+            return self
+        doubt = self.scan.unseen(self.rate_hz)
+        return replace(self, seen=not doubt, doubt=doubt, rival_hz=None)
+
     def outvoted(self, rival_hz: float, slip: float) -> bool:
         """Whether harmonics stand out at another rate, and more so than at this one.
 
@@ -310,13 +323,20 @@ class SpeedScan:
         about = np.abs(self.rates_hz / rate_hz - 1.0) <= reach
         return float(self.votes[about].max(initial=-np.inf))
 
-    def doubt(self, rate_hz: float) -> tuple[str, float | None]:
-        """Why the harmonics do not confirm a rate, empty if they do, and which one they speak for instead."""
+    def unseen(self, rate_hz: float) -> str:
+        """Why no harmonics of a rate are taken to stand out, whatever others do; empty if they are."""
         own = self.votes_about(rate_hz)
         if own < SEEN_NATS:
-            return "no harmonics of the shaft stand out", None
+            return "no harmonics of the shaft stand out"
         if own - self.harmonics.mains_votes(rate_hz) < NOT_MAINS_NATS:
-            return "only harmonics at multiples of the mains' frequency stand out", None
+            return "only harmonics at multiples of the mains' frequency stand out"
+        return ""
+
+    def doubt(self, rate_hz: float) -> tuple[str, float | None]:
+        """Why the harmonics do not confirm a rate, empty if they do, and which one they speak for instead."""
+        if unseen := self.unseen(rate_hz):
+            return unseen, None
+        own = self.votes_about(rate_hz)
         other = self.best(self.others)
         if self.votes_about(other) > own + LEAD_NATS:
             return f"more harmonics stand out at {60.0 * other:.0f} rpm", other
