@@ -45,8 +45,6 @@ _CARRIER_DB = 6.0
 _MESH_SHARE = 0.06
 """Of the signal's deviation that a mesh has at least: harmonics of a damaged race fall on whole orders by
 chance, and their neighbours look like sidebands then. Those of measured records had mostly up to .05."""
-_ALONE_SHARE = 0.2
-"""The same of a mesh without sidebands of a mate."""
 _LEAST_REVOLUTIONS = 60.0
 """With fewer the sidebands of neighbouring numbers of teeth cannot be told apart."""
 _SIDEBAND_ORDERS = (1, 2, 3)
@@ -66,7 +64,7 @@ class DriveLines:
         frequency_hz: of the mesh, or twice the line frequency.
         order: the same per revolution of the shaft.
         teeth: of the gear on this shaft; None of a motor.
-        mate_teeth: of the gear that it meshes with; None if its sidebands do not show, or of a motor.
+        mate_teeth: of the gear that it meshes with; None of a motor.
         spacing: of the sidebands in orders: the mate's speed, or the pole-pass frequency; None if none show.
         poles: of a motor; None if its speed is not near a synchronous one, or of a gear.
     """
@@ -81,9 +79,7 @@ class DriveLines:
 
     def explained(self, highest: float) -> tuple[float, ...]:
         """Orders at which it makes lines in an envelope, beside the shaft's harmonics, up to one."""
-        if self.kind == "gear":
-            if self.spacing is None:
-                return ()
+        if self.kind == "gear" and self.spacing is not None:
             count = int(highest / self.spacing) + 1
             return tuple(k * self.spacing for k in range(1, count + 1))
         pole_pass = (0.0,) if self.spacing is None else (-self.spacing, 0.0, self.spacing)
@@ -101,24 +97,20 @@ class DriveLines:
     def describe(self) -> str:
         """One sentence for a person."""
         if self.kind == "gear":
-            sentence = f"a gear of {self.teeth} teeth on this shaft meshes at {self.frequency_hz:.1f} Hz"
-            if self.mate_teeth is not None and self.spacing is not None:
-                turns_hz = self.frequency_hz / self.order * self.spacing
-                sentence += (
-                    f"; its mate of {self.mate_teeth} teeth turns at {60.0 * turns_hz:.0f} rpm and makes "
-                    f"sidebands {self.spacing:.4g} orders apart"
-                )
-            return sentence + ": these lines are the gear's, not the bearing's"
-        sentence = (
-            f"a line of an induction motor stands out at {self.frequency_hz:.2f} Hz, twice the line frequency"
-        )
+            turns_hz = self.frequency_hz / self.order * (self.spacing or 0.0)
+            return (
+                f"a gear of {self.teeth} teeth on this shaft meshes at {self.frequency_hz:.1f} Hz; its mate "
+                f"of {self.mate_teeth} teeth turns at {60.0 * turns_hz:.0f} rpm and makes sidebands "
+                f"{self.spacing:.4g} orders apart: these lines are the gear's, not the bearing's"
+            )
+        sentence = f"a line of an induction motor stands out at {self.frequency_hz:.2f} Hz, twice the mains"
         if self.poles is not None:
             sentence += f" ({self.poles} poles"
             if self.spacing is not None:
                 pass_hz = self.frequency_hz / self.order * self.spacing
                 sentence += f", sidebands at the pole-pass frequency of {pass_hz:.2f} Hz"
             sentence += ")"
-        return sentence + ": lines at multiples of the line frequency are the motor's, not the bearing's"
+        return sentence + ": lines at multiples of the mains are the motor's, not the bearing's"
 
 
 class LineLevels:
@@ -205,19 +197,12 @@ def _gear(lines: LineLevels, shaft_hz: float) -> DriveLines | None:
     clear = [z for z in range(_LEAST_TEETH, most + 1) if _is_mesh(lines, z, shaft_hz)]
     # Harmonics of a mesh look like one, too: the lowest of them is the mesh.
     meshes = [z for z in clear if not any(z % lower == 0 for lower in clear if lower < z)]
-    alone: DriveLines | None = None
     for teeth in sorted(meshes, key=lambda z: lines.power(z * shaft_hz), reverse=True):
         mate = _mate(lines, teeth, shaft_hz)
+        # A line without a mate's sidebands may be the blades of a fan, or a bearing that hardly slips.
         if mate is not None:
             return DriveLines("gear", teeth * shaft_hz, float(teeth), teeth, mate, teeth / mate)
-        # A line without sidebands may be the blades of a fan.
-        if (
-            alone is None
-            and lines.share(teeth * shaft_hz) > _ALONE_SHARE
-            and _is_modulated(lines, teeth, shaft_hz)
-        ):
-            alone = DriveLines("gear", teeth * shaft_hz, float(teeth), teeth)
-    return alone
+    return None
 
 
 def _is_mesh(lines: LineLevels, order: int, shaft_hz: float) -> bool:
@@ -233,10 +218,6 @@ def _is_carrier(lines: LineLevels, order: int, shaft_hz: float) -> bool:
         return False
     beside = max(lines.power(hz + side * shaft_hz) for side in (-3, -2, -1, 1, 2, 3))
     return bool(lines.power(hz) > beside * 10.0 ** (0.1 * _CARRIER_DB))
-
-
-def _is_modulated(lines: LineLevels, order: int, shaft_hz: float) -> bool:
-    return all(lines.level_db((order + side) * shaft_hz) > _SIDEBAND_DB for side in (-1, 1))
 
 
 def _mate(lines: LineLevels, teeth: int, shaft_hz: float) -> int | None:

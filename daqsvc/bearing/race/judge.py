@@ -291,10 +291,9 @@ def _measured(
 
 
 def _is_bearings(drive: DriveLines, bearing: BearingOrders, slip: float) -> bool:
-    """Whether a gear's mate would turn as often as a part is struck: more likely it is the bearing."""
-    return drive.kind == "gear" and any(
-        abs((drive.spacing or 0.0) / fundamental(bearing, part) - 1.0) <= slip for part in PARTS
-    )
+    """Whether a gear's mate would turn as often as a part is struck, or as the cage turns."""
+    own = (*(fundamental(bearing, part) for part in PARTS), bearing.cage)
+    return drive.kind == "gear" and any(abs((drive.spacing or 0.0) / order - 1.0) <= slip for order in own)
 
 
 def _occupied(samples: NDArray[np.float64], rate_hz: float, rules: RaceRules) -> float | None:
