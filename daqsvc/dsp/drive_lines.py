@@ -157,7 +157,9 @@ class LineLevels:
 
     def strongest_hz(self, hz: float, reach_hz: float) -> float:
         """Where the strongest bin about a frequency is, between the bins by its neighbours."""
-        first, last = math.ceil((hz - reach_hz) / self.step_hz), math.floor((hz + reach_hz) / self.step_hz)
+        reach = max(_REACH_BINS, reach_hz / self.step_hz)
+        centre = hz / self.step_hz
+        first, last = math.ceil(centre - reach), math.floor(centre + reach)
         peak = first + int(np.argmax(self._power[first : last + 1]))
         low, middle, high = np.sqrt(self._power[peak - 1 : peak + 2])
         return float((peak + (high - low) / (low + middle + high)) * self.step_hz)

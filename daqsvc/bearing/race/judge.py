@@ -52,7 +52,7 @@ from daqsvc.dsp.envelope import levelled, line_power, squared_envelope, whiten
 from daqsvc.dsp.quality import UnfitError
 from daqsvc.dsp.quality.accelerometers import LEAST_BAND, checked
 from daqsvc.dsp.quality.occupied import occupied_top_hz
-from daqsvc.dsp.speed.harmonics import REMEDY, shaft_rate, slow_series
+from daqsvc.dsp.speed.harmonics import NEAR, REMEDY, shaft_rate, slow_series
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -202,6 +202,8 @@ def race_features(
     here = max(e.severity for e in features.evidence.values())
     # Half and double a speed have many of its harmonics.
     for rpm in (features.rival_rpm * factor for factor in (1.0, 0.5, 2.0)):
+        if abs(rpm / speed_rpm - 1.0) <= NEAR:
+            continue
         try:
             there = _measured(samples, rate_hz, rpm, bearing, rules).evidence
         except UnfitError:

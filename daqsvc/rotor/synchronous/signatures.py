@@ -236,6 +236,13 @@ def _softer(change: Complexes, variance: Floats, healthy: Healthy, *, still: flo
     What the shaft sinks by tells how much lower its natural frequency is (Rayleigh's quotient, omega^2 = g
     over the sag), up to the part that the probes see of it, and that how 1X turns. Or 1X does as it likes.
     """
+    free = _free(change[FORWARD], variance[FORWARD], healthy.amplitude_um)
+    untied = _sunk(change[DC], variance[DC], healthy) + np.logaddexp(
+        still + math.log(_STILL_SHARE), free + math.log(1.0 - _STILL_SHARE)
+    )
+    sag_um = healthy.rotor.sag_um
+    if sag_um <= 0.0:
+        return float(untied)  # an upright shaft: nothing sinks that could tell of 1X
     omega, zeta = (axis.reshape(5, 5)[::2, ::2].ravel() for axis in healthy.rotor.box)
     depth, aside, part, point = (
         axis.ravel()
@@ -243,7 +250,6 @@ def _softer(change: Complexes, variance: Floats, healthy: Healthy, *, still: flo
     )
     point = point.astype(np.int64)
     speed = healthy.speed_rad_s / omega[point]
-    sag_um = max(healthy.rotor.sag_um, 1e-6)
     sunk: Complexes = np.asarray(-1j * sag_um * depth * np.exp(1j * aside), dtype=np.complex128)
     softer = speed * np.sqrt(1.0 + depth * part)
     before, after = unbalance_response(speed, zeta[point]), unbalance_response(softer, zeta[point])
@@ -252,10 +258,6 @@ def _softer(change: Complexes, variance: Floats, healthy: Healthy, *, still: flo
     tied = log_mean(
         log_density(change[DC] - sunk, variance[DC] + (_SINKS_WITHIN * np.abs(sunk)) ** 2)
         + log_density(change[FORWARD] - turned, variance[FORWARD] + (_TURNS_WITHIN * np.abs(turned)) ** 2)
-    )
-    free = _free(change[FORWARD], variance[FORWARD], healthy.amplitude_um)
-    untied = _sunk(change[DC], variance[DC], healthy) + np.logaddexp(
-        still + math.log(_STILL_SHARE), free + math.log(1.0 - _STILL_SHARE)
     )
     return float(np.logaddexp(tied, untied)) - math.log(2.0)
 
