@@ -159,10 +159,15 @@ SEALS = (
     "ZZ",
     "VV",
     "DDU",
+    "LLU",
+    "LLB",
+    "RSH",
+    "NR",
 )
 """Suffixes of seals and shields: they change nothing inside."""
 
 
+MAKER = re.compile(r"^(SKF|FAG|INA|NSK|NTN|KOYO|TIMKEN|SNR|NACHI)(?=[A-Z0-9])")
 DESIGN = re.compile(r"(7[23]\d\dB|NU\d+E)[A-Z0-9]*$")
 """Designs whose further letters are of the cage, or of pairs: 7205 BECBP, NU 206 ECP."""
 CLEARANCE = re.compile(r"/?C[2-5]$")
@@ -210,7 +215,10 @@ def bearing_orders(designation: str) -> BearingOrders:
 def _known_as(designation: str) -> str:
     """The name of a bearing in the catalogue."""
     known = catalogue()
-    wanted = designation.upper().replace(" ", "")
+    wanted = MAKER.sub("", designation.upper().replace(" ", ""))
+    if wanted not in known and "/" in wanted[4:]:
+        # Behind a stroke: clearance, grease, tests; but 62/22 is a size.
+        wanted = wanted[:4] + wanted[4:].partition("/")[0]
     bare = CLEARANCE.sub("", wanted).rstrip("-")
     bare = next((bare.removesuffix(seal) for seal in SEALS if bare.endswith(seal)), bare)
     joined = bare.replace("-", "")

@@ -143,8 +143,13 @@ class LineLevels:
         noise = float(np.median(self._power[begin:end]))
         return 10.0 * math.log10(float(self._power[first : last + 1].max()) / max(noise, 1e-300) + 1e-30)
 
-    def narrow_db(self, hz: float) -> float:
-        """The level of a line that is as narrow as the record allows; minus infinity where it is smeared."""
+    def narrow_db(self, hz: float, skirt_share: float = 1.0) -> float:
+        """The level of a line that is as narrow as the record allows; minus infinity where it is smeared.
+
+        Args:
+            hz: where it is.
+            skirt_share: share of the bins beside it that must be low; others may hold another line.
+        """
         centre = round(hz / self.step_hz)
         near, far = _SKIRT_BINS
         if centre < far + 1 or centre + far + 1 > len(self._power):
@@ -152,7 +157,9 @@ class LineLevels:
         skirt = np.r_[
             self._power[centre - far : centre - near + 1], self._power[centre + near : centre + far + 1]
         ]
-        narrow = self._power[centre - 2 : centre + 3].max() > 10.0 ** (0.1 * _SHARP_DB) * skirt.max()
+        narrow = self._power[centre - 2 : centre + 3].max() > 10.0 ** (0.1 * _SHARP_DB) * np.quantile(
+            skirt, skirt_share
+        )
         return self.level_db(hz) if narrow else -math.inf
 
     def strongest_hz(self, hz: float, reach_hz: float) -> float:
@@ -266,6 +273,8 @@ def motor_lines(lines: LineLevels, shaft_hz: float, known: float) -> DriveLines 
         if lines.level_db(twice_hz, reach_hz) < _LINE_DB:
             continue
         found_hz = lines.strongest_hz(twice_hz, reach_hz)
+        if lines.narrow_db(found_hz, skirt_share=0.5) < _LINE_DB:
+            continue  # smeared, as slip smears a bearing's
         order = found_hz / shaft_hz
         beside_hz = abs(order - round(order)) * shaft_hz
         if abs(found_hz - twice_hz) > reach_hz or beside_hz < max(2.0 * lines.step_hz, known * found_hz):

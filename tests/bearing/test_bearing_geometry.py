@@ -57,7 +57,9 @@ def test_seals_clearance_case_and_blanks_do_not_matter(name: str) -> None:
     assert bearing_orders(name) == catalogue()["6205"]
 
 
-@pytest.mark.parametrize("name", ["7205B", "7205 B", "7205-b", "7205-B-2RS", "7205 BECBP", "7205BEP/C3"])
+@pytest.mark.parametrize(
+    "name", ["7205B", "7205 B", "7205-b", "7205-B-2RS", "7205 BECBP", "7205BEP/C3", "FAG 7205-B-XL-TVP"]
+)
 def test_hyphens_and_cages_of_a_design_do_not_matter(name: str) -> None:
     assert bearing_orders(name) == catalogue()["7205B"]
     assert bearing_orders("NU 206 ECP") == catalogue()["NU206E"]

@@ -39,7 +39,7 @@ def test_one_damaged_race_is_one(part: str, seed: int) -> None:
 
 
 @pytest.mark.parametrize("race", ["inner", "outer"])
-@pytest.mark.parametrize(("ball", "strength"), [(1.5, 1.5), (1.5, 3.0), (3.0, 2.0)])
+@pytest.mark.parametrize(("ball", "strength"), [(1.5, 1.5), (1.5, 3.0), (3.0, 2.0), (3.0, 3.0)])
 def test_a_damaged_ball_and_a_damaged_race_are_told_as_two(race: str, ball: float, strength: float) -> None:
     samples = strikes("ball", 10.0, strength=ball, seed=1) + strikes(race, 10.0, strength=strength, seed=2)
     v = race_test(samples, RATE_HZ, SPEED_RPM, BEARING)

@@ -114,6 +114,7 @@ def test_a_motor_is_no_damaged_bearing(part: str) -> None:
     assert not evidence.testable
     assert "is where the motor has one; test it at another speed" in evidence.reason
     assert any("not testable here" in note for note in verdict.notes)
+    assert verdict.probability["normal"] <= 0.5, "damage would not be seen"
 
 
 @pytest.mark.parametrize("part", ["inner", "outer", "ball"])

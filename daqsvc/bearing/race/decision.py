@@ -114,6 +114,8 @@ class Scales:
         self._revolutions = revolutions
         self._rules = rules
         self._drives = drives
+        self.covered: set[Part] = set()
+        """Parts that are not testable, as a gear or a motor has a line where theirs are looked for."""
         # A speed that is not known sharply shifts every line: the search grows by that, and is paid for.
         self._slip = rules.slip if shaft.sharp else rules.slip + rules.speed_tolerance
         self._seen = shaft.seen
@@ -177,6 +179,7 @@ class Scales:
                 e = replace(e, testable=False, reason=_smeared(part, order))
         if e.z < e.z_limit and (drive := self._drive_at(stated)) is not None:
             e = replace(e, testable=False, reason=_covered(stated, drive))
+            self.covered.add(part)
         if part == "ball":
             # A ball's marks come and go with its own tumbling: its lines are too weak for the logarithm.
             e = replace(e, depth=by_square, severity=max(z, 0.0) * by_square)
@@ -318,8 +321,9 @@ def decide(
     weight |= {part: weight_of(part, evidence[part], rules) for part in besides}
     belief = {rest: 1.0 - fault} | _shares(weight, fault)
     if besides and passed[best] >= rules.both_factor:
-        besides.sort(key=weight.__getitem__, reverse=True)
-        return Decision(best, (best, *besides), belief, margin, both=True)
+        # Of two damaged parts each may leave lines where the third is looked for.
+        second = max(besides, key=weight.__getitem__)
+        return Decision(best, (best, second), belief, margin, both=True)
     group = tuple(part for part in candidates if weight[part] * rules.group_factor >= weight[best])
     open_race = all(race in group for race in RACES)
     return Decision("inner_or_outer" if open_race else best, group, belief, margin)

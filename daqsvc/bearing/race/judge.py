@@ -85,6 +85,7 @@ class RaceFeatures:
         repairs: what was wrong with them and put right.
         lost: share of the record that the repairs left nothing of.
         drives: gears and motors whose lines stand out, and are taken for no part's.
+        covered: whether one of them has a line where a part's is looked for.
         spectrum: envelope spectrum, for figures.
     """
 
@@ -99,6 +100,7 @@ class RaceFeatures:
     repairs: tuple[str, ...]
     lost: float
     drives: tuple[DriveLines, ...]
+    covered: bool
     spectrum: EnvelopeSpectrum
 
 
@@ -170,8 +172,9 @@ def verdict_of(features: RaceFeatures, rules: RaceRules, baseline: RaceBaseline 
             decision.probability,
             len(notes) - repairs,
             repairs,
-            # At another speed the lines of all parts are elsewhere: nothing was looked for in their places.
-            lost=features.lost if features.rival_rpm is None else MOST_UNCERTAINTY,
+            # At another speed the lines of all parts are elsewhere, and under those of a drive a part's are
+            # not seen: nothing was looked for in their places.
+            lost=MOST_UNCERTAINTY if features.rival_rpm is not None or features.covered else features.lost,
         ),
         lines=features.lines,
         margin=min(decision.margin, MOST_MARGIN),
@@ -225,7 +228,14 @@ def _measured(
     channel = np.asarray(samples, dtype=np.float64)
     occupied_hz = _occupied(channel, rate_hz, rules)
     top_hz = min(rules.high_hz, occupied_hz or rules.high_hz)
-    sound = checked(channel, rate_hz, speed_rpm, (rules.low_hz, top_hz))
+    least_hz = LEAST_BAND * rules.low_hz
+    sound = checked(channel, rate_hz, speed_rpm, (rules.low_hz, max(top_hz, least_hz)))
+    if occupied_hz is not None and occupied_hz < least_hz:
+        raise UnfitError(
+            "channel",
+            f"has {_empty_above(top_hz, rate_hz)}, which leaves the band {rules.low_hz:g} to {top_hz:.0f} Hz",
+            f"record up to {least_hz:.0f} Hz or more",
+        )
     del channel
     length = scipy.fft.prev_fast_len(len(sound.values), real=True)
     spectrum = scipy.fft.rfft(sound.values[:length])
@@ -270,7 +280,8 @@ def _measured(
         line_power(levelled(np.log(envelope + LOG_OFFSET), holes), bins) for envelope in (phases, sizes)
     )
     log = view_of(log_phases, log_sizes, revolutions, others)
-    evidence = Scales(square, log, bearing, shaft, revolutions, rules, drives).weigh()
+    scales = Scales(square, log, bearing, shaft, revolutions, rules, drives)
+    evidence = scales.weigh()
     refuse_rivals(evidence, bearing, shaft, rules.slip)
     return RaceFeatures(
         evidence=evidence,
@@ -284,6 +295,7 @@ def _measured(
         repairs=repairs,
         lost=float(np.diff(holes, axis=1).sum()),
         drives=drives,
+        covered=bool(scales.covered),
         spectrum=EnvelopeSpectrum(
             order=np.arange(bins) / revolutions,
             amplitude=np.sqrt(square.power),
@@ -299,11 +311,7 @@ def _is_bearings(drive: DriveLines, bearing: BearingOrders, slip: float) -> bool
 
 
 def _occupied(samples: NDArray[np.float64], rate_hz: float, rules: RaceRules) -> float | None:
-    """Where a record ends within the band of the test; None where it does not.
-
-    Raises:
-        UnfitError: what it holds is too little to judge a bearing by.
-    """
+    """Where a record ends within the band of the test; None where it does not."""
     if samples.ndim != 1 or not (np.isfinite(rate_hz) and rate_hz > 0.0):
         return None
     there = np.isfinite(samples)
@@ -311,12 +319,6 @@ def _occupied(samples: NDArray[np.float64], rate_hz: float, rules: RaceRules) ->
     top_hz = occupied_top_hz(np.where(there, samples - mean, 0.0), rate_hz)
     if top_hz is None or top_hz >= min(TOP_SHARE * rate_hz, rules.high_hz):
         return None
-    if top_hz < LEAST_BAND * rules.low_hz:
-        raise UnfitError(
-            "channel",
-            f"has {_empty_above(top_hz, rate_hz)}, which leaves the band {rules.low_hz:g} to {top_hz:.0f} Hz",
-            f"record up to {LEAST_BAND * rules.low_hz:.0f} Hz or more",
-        )
     return top_hz
 
 
