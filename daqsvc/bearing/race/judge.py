@@ -229,7 +229,9 @@ def _measured(
     occupied_hz = _occupied(channel, rate_hz, rules)
     top_hz = min(rules.high_hz, occupied_hz or rules.high_hz)
     least_hz = LEAST_BAND * rules.low_hz
-    sound = checked(channel, rate_hz, speed_rpm, (rules.low_hz, max(top_hz, least_hz)))
+    # Too little of a band is refused behind what else may be wrong, and more to the point.
+    band_hz = rules.low_hz, top_hz if top_hz >= least_hz else rules.high_hz
+    sound = checked(channel, rate_hz, speed_rpm, band_hz)
     if occupied_hz is not None and occupied_hz < least_hz:
         raise UnfitError(
             "channel",
