@@ -140,7 +140,10 @@ $(PLANTS_VENV)/.ready: requirements-plants.lock
 $(PLANTS)/cases.json: $(PLANTS_VENV)/.ready tests/plants/machines.py tests/plants/simulate.py tests/plants/records.py
 	@PYTHONPATH=tests $(PLANTS_VENV)/bin/python -m plants.records $(PLANTS)
 
-bench-diagnosis: $(READY) $(PLANTS)/cases.json
+$(PLANTS)/bank.json: $(PLANTS)/cases.json tests/plants/bank_records.py
+	@PYTHONPATH=tests $(PLANTS_VENV)/bin/python -m plants.bank_records $(PLANTS)
+
+bench-diagnosis: $(READY) $(PLANTS)/cases.json $(PLANTS)/bank.json
 	@PYTHONPATH=tests $(BIN)/python -m plants.table $(PLANTS) $(ARGS)
 
 # What is compiled needs a protobuf of this major version, no older than the compiler: pyproject.toml says which.

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from daqsvc.bearing.baseline import BearingBaseline
     from daqsvc.rotor.calibration.file import CalibrationRecord
     from daqsvc.rotor.calibration.run_up import RunUpFit
+    from daqsvc.rotor.calibration.two_modes import TwoModeFit
     from daqsvc.rotor.synchronous.baseline import Calibration
 
 _OF_CRITICAL = (0.5, 0.7, 0.95, 1.0)
@@ -51,6 +52,7 @@ def as_json(record: CalibrationRecord, asked: Sequence[float] | None, out: Path 
             "run_up": None
             if record.run_up is None
             else {"source": record.run_up_source, **_run_up_json(record.run_up, asked)},
+            "two_modes": None if record.two_modes is None else _two_modes_json(record.two_modes),
             "steady": [
                 {"source": source, **_steady_json(record, calibration)}
                 for calibration, source in zip(record.steady, record.steady_sources, strict=True)
@@ -139,6 +141,19 @@ def _run_up_json(fit: RunUpFit, asked: Sequence[float] | None) -> dict[str, Any]
     }
 
 
+def _two_modes_json(fit: TwoModeFit) -> dict[str, Any]:
+    return {
+        "natural_frequency_hz": fit.natural_frequency_hz,
+        "damping_ratio": fit.damping_ratio,
+        "support_share": fit.modes.support_share,
+        "anisotropy": abs(fit.modes.anisotropy),
+        "gyroscopic": fit.modes.gyroscopic,
+        "fit_error": fit.fit_error,
+        "explains": fit.explains,
+        "verdict": fit.describe(),
+    }
+
+
 def _steady_json(record: CalibrationRecord, calibration: Calibration) -> dict[str, Any]:
     deviations = _deviations(calibration)
     return {
@@ -162,6 +177,8 @@ def as_text(record: CalibrationRecord, asked: Sequence[float] | None) -> str:
     lines: list[str] = []
     if record.run_up is not None:
         lines += _run_up_lines(record.run_up, record.run_up_source, asked)
+        if record.two_modes is not None:
+            lines += _indented([record.two_modes.describe()])
     else:
         rotor = record.rotor
         lines.append(

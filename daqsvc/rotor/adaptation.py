@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 VARIANCE_FACTOR = 1.5
 """How much larger than their own figure the innovations' variance is taken to be after an adaptation: room
 for what orbit and rest do not put right, natural frequency and damping that are off by a few per cent."""
+MODEL_ERROR = 0.1
+"""Part of the healthy orbit that a rotor with two modes may be off by after a fault."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +36,7 @@ class SteadyMotion:
 
     Attributes:
         forward: radius of the part that turns with the shaft.
-        backward: radius of the part that turns against it; 0 on the isotropic rotor of the models.
+        backward: radius of the part that turns against it; 0 on the paper's rotor.
         rest: centre.
         samples: number of samples that it was fitted to.
     """
@@ -108,24 +110,27 @@ def adapted(modes: Sequence[BankMode], motion: SteadyMotion, speed: float) -> tu
             to take over.
     """
     healthy = modes[0].rotor
-    modelled = healthy.orbit(speed)
+    modelled = healthy.orbit(speed) - healthy.runout[1]
     if not modelled or not motion.forward:
         raise ValueError(
             f"rotor bank: an orbit of {abs(motion.forward):.3g} clearances cannot be compared with one of "
             f"{abs(modelled):.3g}; give the rotor the unbalance that it has"
         )
     ratio = motion.forward / modelled
-    load = healthy.k * (motion.rest - healthy.rest)
-    return tuple(
+    turned = [
         replace(
-            mode,
-            rotor=replace(
-                mode.rotor,
-                e=mode.rotor.e * abs(ratio),
-                heavy_spot_rad=math.remainder(mode.rotor.heavy_spot_rad + cmath.phase(ratio), math.tau),
-                g=mode.rotor.g - load.imag,
-                load_x=mode.rotor.load_x + load.real,
-            ),
+            mode.rotor,
+            e=mode.rotor.e * abs(ratio),
+            heavy_spot_rad=math.remainder(mode.rotor.heavy_spot_rad + cmath.phase(ratio), math.tau),
+            runout=(0j, 0j, 0j),
         )
         for mode in modes
-    )
+    ]
+    if healthy.isotropic:
+        load = healthy.load_for(motion.rest - healthy.rest)
+        rotors = [replace(one, g=one.g - load.imag, load_x=one.load_x + load.real) for one in turned]
+    else:
+        # Forward 1X is the model's by now. What is left of the rest no mode explains: it stays as it is.
+        rest, backward = motion.rest - turned[0].rest, motion.backward - turned[0].backward_orbit(speed)
+        rotors = [replace(one, runout=(rest, 0j, backward)) for one in turned]
+    return tuple(replace(mode, rotor=rotor) for mode, rotor in zip(modes, rotors, strict=True))

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.rotor import kernels, sweep
+from daqsvc.rotor import coupled_kernels, kernels, sweep
+from daqsvc.rotor.coupled import couple, coupled_evidence, couplings_at_speed
 from daqsvc.rotor.decision import DecisionRules, Declaration, Departure
-from daqsvc.rotor.discretise import BankMode, alike, at_speed, discretise
+from daqsvc.rotor.discretise import BankMode, at_speed, discretise, steady_evidence, within
 from daqsvc.rotor.observer_batch import FREE, PAPER, BankMemory
 
 if TYPE_CHECKING:
@@ -169,6 +170,9 @@ class ModelBank:
         self.observers = discretise(
             self.modes, noise=noise, duration=duration, variance_factor=variance_factor
         )
+        self.couplings = couple(
+            self.modes, self.observers, noise=noise, duration=duration, variance_factor=variance_factor
+        )
         self.speed = self.modes[0].rotor.w
         speed = abs(self.speed)
         if speed == 0.0:
@@ -177,7 +181,7 @@ class ModelBank:
         if not UNDETERMINED <= decision < count:
             raise ValueError(f"rotor bank: there is no mode {decision}; the {count} modes count from 0")
         self._duration = duration
-        self._memory = BankMemory.new(self.observers, self.rules.log_priors(names))
+        self._memory = BankMemory.new(self.observers, self.couplings, self.rules.log_priors(names))
         self._memory.set_rules(
             self.rules,
             noise=noise,
@@ -212,13 +216,20 @@ class ModelBank:
         if speed * self.speed <= 0.0 or not math.isfinite(speed):
             raise ValueError(f"rotor bank: normalised speed {speed} is not one of a shaft that keeps turning")
         moved = at_speed(self.observers, self.modes, speed, duration=self._duration)
+        couplings = couplings_at_speed(self.couplings, moved, self.modes, speed, duration=self._duration)
+        cos, sin = math.cos(angle_rad), math.sin(angle_rad)
         for fields in (FREE, PAPER):
             states = self._memory.states(fields)
-            kernels.change_orbits(self.observers, moved, math.cos(angle_rad), math.sin(angle_rad), states)
+            if len(couplings):
+                coupled_kernels.change_orbits(
+                    self.observers, self.couplings, moved, couplings, cos, sin, states
+                )
+            else:
+                kernels.change_orbits(self.observers, moved, cos, sin, states)
             self._memory.set_states(fields, states)
-        self.observers = moved
+        self.observers, self.couplings = moved, couplings
         self.speed = speed
-        self._memory.set_observers(moved)
+        self._memory.set_observers(moved, couplings)
         self._compare()
 
     def process(self, xy: Floats, cos: Floats, sin: Floats) -> BankReport:
@@ -250,5 +261,9 @@ class ModelBank:
 
     def _compare(self) -> None:
         """See which modes look alike at the present speed: there is no change between them."""
-        self._alike = alike(self.observers, self._duration, self.rules.alike_nats_per_rev)
+        if len(self.couplings):
+            evidence = coupled_evidence(self.couplings, self.observers, self._duration)
+        else:
+            evidence = steady_evidence(self.observers, self._duration)
+        self._alike = within(evidence, self.rules.alike_nats_per_rev)
         self._memory.set_thresholds(np.where(self._alike, math.inf, self.rules.thresholds(len(self.modes))))

@@ -276,10 +276,24 @@ def steady_evidence(observers: Observers, duration: float) -> Floats:
     resting = np.abs(innovation_gain(observers, 0.0) * np.subtract.outer(rest, rest))
     samples_per_rev = 2.0 * math.pi / abs(speed * duration)
     evidence = 0.5 * samples_per_rev * (turning**2 + resting**2) * observers["precision"]
-    rubs = (observers["substeps"] > 0) & (np.abs(orbit) + np.abs(rest) > 1.0)
+    return rubs_apart(evidence, observers, np.abs(orbit) + np.abs(rest))
+
+
+def rubs_apart(evidence: Floats, observers: Observers, reach: Floats) -> Floats:
+    """Evidence of modes of which one meets the housing is infinite: no other orbit resembles that.
+
+    Args:
+        evidence: float64 ``[M, M]``, changed in place.
+        observers: ``[M]`` of `OBSERVER`.
+        reach: float64 ``[M]``, how far from the centre the orbit comes, in clearances.
+
+    Returns:
+        The same array, 0 on the diagonal.
+    """
+    rubs = (observers["substeps"] > 0) & (reach > 1.0)
     evidence[rubs[:, np.newaxis] != rubs] = math.inf
     np.fill_diagonal(evidence, 0.0)
-    return np.asarray(evidence, dtype=np.float64)
+    return evidence
 
 
 def alike(observers: Observers, duration: float, limit_nats: float) -> Flags:
@@ -293,7 +307,11 @@ def alike(observers: Observers, duration: float, limit_nats: float) -> Flags:
     Returns:
         bool ``[M, M]``, symmetric, false on the diagonal.
     """
-    evidence = steady_evidence(observers, duration)
+    return within(steady_evidence(observers, duration), limit_nats)
+
+
+def within(evidence: Floats, limit_nats: float) -> Flags:
+    """Pairs with less evidence than that in both directions, bool ``[M, M]``, false on the diagonal."""
     pairs = np.maximum(evidence, evidence.T) < limit_nats
     np.fill_diagonal(pairs, val=False)
     return np.asarray(pairs, dtype=np.bool_)

@@ -15,6 +15,15 @@ cannot stand as printed and are corrected here:
 * ``g = G / (M c omega_s^2)``: G is a force, so the mass belongs under it.
 * ``2 zeta = D_s / (M omega_s)`` with omega_s of the healthy shaft: damping does not scale with k.
 
+A machine away from the paper's has two modes where the paper has one: supports that are softer in one
+direction, oil films and gyroscopic moments part them (Genta, "Dynamics of Rotating Systems", 2005, ch. 6).
+With the complex conjugate z* the motion is then
+
+    z'' + (2 zeta - i gamma w) z' + d z*' + (k + i kappa) z + q z* = same right-hand side
+
+which is the paper's rotor where the four further figures are 0; what higher modes add goes with the
+unbalance and the square of the speed.
+
 Coulomb friction opposes the slip at the point of contact, so its sign follows the velocity there.
 The paper leaves that sign out; then a backward whirl feeds on the friction without bound.
 """
@@ -23,7 +32,8 @@ from __future__ import annotations
 
 import cmath
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,6 +47,15 @@ class NormalisedRotor:
         k: stiffness over the stiffness that omega_s was taken with.
         g: static load towards -y, G / (M c omega_s^2).
         load_x: static load towards +x, in the unit of ``g``.
+        cross_stiffness: kappa, stiffness across the deflection, as an oil film has it.
+        anisotropy: q, half the difference of the stiffnesses; its argument is twice the angle of the stiff
+            direction.
+        damping_anisotropy: d, the same of the damping.
+        gyroscopic: gamma, gyroscopic moment over inertia.
+        higher_modes: unbalance response of all higher modes over e w^2 exp(i phi), far below their own
+            speeds.
+        runout: part of the healthy motion that no mode explains, at rest, forward and backward, in
+            clearances; it does not change with a fault.
         contact_stiffness: K* = K_beta / (M c omega_s^2).
         alpha: exponent of the contact force, 1 linear, 1.5 Hertz.
         mu: coefficient of Coulomb friction at the contact.
@@ -55,6 +74,12 @@ class NormalisedRotor:
     heavy_spot_rad: float = 0.0
     contact_radius: float = 250.0
     load_x: float = 0.0
+    cross_stiffness: float = 0.0
+    anisotropy: complex = 0j
+    damping_anisotropy: complex = 0j
+    gyroscopic: float = 0.0
+    higher_modes: complex = 0j
+    runout: tuple[complex, complex, complex] = (0j, 0j, 0j)
 
     def __post_init__(self) -> None:
         _require_positive("normalised rotor", zeta=self.zeta, k=self.k, contact_radius=self.contact_radius)
@@ -67,20 +92,170 @@ class NormalisedRotor:
         if not 1.0 <= self.alpha <= 3.0:
             raise ValueError(f"normalised rotor: alpha is {self.alpha}; a contact has 1 <= alpha <= 3")
 
+    @property
+    def isotropic(self) -> bool:
+        """Whether both axes move alike and on their own: the paper's rotor."""
+        return not (
+            self.cross_stiffness
+            or self.anisotropy
+            or self.damping_anisotropy
+            or self.gyroscopic
+            or self.higher_modes
+            or any(self.runout)
+        )
+
     def orbit(self, w: float | None = None) -> complex:
-        """Complex radius P of the steady orbit without contact, z = P exp(i theta) + rest, in clearances.
+        """Complex radius P of the steady orbit without contact, in clearances.
+
+        z = P exp(i theta) + N exp(-i theta) + rest, with N = `backward_orbit`.
 
         Args:
             w: normalised speed; the rotor's own if not given.
         """
         speed = self.w if w is None else w
         forcing = self.e * speed**2 * cmath.exp(1j * self.heavy_spot_rad)
-        return forcing / (self.k - speed**2 + 2j * self.zeta * speed)
+        forward = self.k - speed**2 + 2j * self.zeta * speed
+        if self.isotropic:
+            return forcing / forward
+        return forcing * (self._compliances(speed)[0] + self.higher_modes) + self.runout[1]
+
+    def backward_orbit(self, w: float | None = None) -> complex:
+        """Complex radius N of the part of the steady orbit that turns against the shaft, in clearances.
+
+        Args:
+            w: normalised speed; the rotor's own if not given.
+        """
+        if self.isotropic:
+            return 0j
+        speed = self.w if w is None else w
+        forcing = self.e * speed**2 * cmath.exp(1j * self.heavy_spot_rad)
+        return (forcing * self._compliances(speed)[1]).conjugate() + self.runout[2]
+
+    def _compliances(self, w: float) -> tuple[complex, complex]:
+        """Radius P, and conjugate of N, of the orbit under a force 1 that turns with the shaft."""
+        sprung, anisotropy = complex(self.k, self.cross_stiffness), self.anisotropy
+        damping = complex(2.0 * self.zeta, -self.gyroscopic * w)
+        forward = sprung - w**2 + 1j * w * damping
+        backward = (sprung - w**2 - 1j * w * damping).conjugate()
+        to_forward = anisotropy + 1j * w * self.damping_anisotropy
+        to_backward = (anisotropy - 1j * w * self.damping_anisotropy).conjugate()
+        p = 1.0 / (forward - to_forward * to_backward / backward)
+        return p, -to_backward / backward * p
 
     @property
     def rest(self) -> complex:
         """Where the disc rests under its static load, in clearances."""
-        return complex(self.load_x, -self.g) / self.k
+        load = complex(self.load_x, -self.g)
+        if self.isotropic:
+            return load / self.k
+        sprung, q = complex(self.k, self.cross_stiffness), self.anisotropy
+        sprung_rest = (sprung.conjugate() * load - q * load.conjugate()) / (abs(sprung) ** 2 - abs(q) ** 2)
+        return sprung_rest + self.runout[0]
+
+    def load_for(self, rest: complex) -> complex:
+        """The static load, x + iy, under which the disc rests there, runout aside."""
+        return complex(self.k, self.cross_stiffness) * rest + self.anisotropy * rest.conjugate()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TwoModes:
+    """What makes a rotor differ from a Laval rotor, as its run-up shows it.
+
+    A shaft that is the same in all directions stands in series with supports that need not be: springs with
+    dampers beside them, both over the mean spring of the supports. Where the supports give way little, a
+    damper that weakens also makes the machine softer, and a spring that weakens gives the damper more to do:
+    both follow from the supports' part in the deflection.
+
+    Attributes:
+        support_share: beta, part of the static deflection that the supports take, 0 to 1; 1: a rigid shaft.
+        support_lag: c over k of the supports, in 1 / omega_s.
+        cross_stiffness: of the supports, across the deflection, as an oil film has it.
+        anisotropy: half the difference of the supports' stiffnesses; its argument is twice the angle of the
+            stiff direction.
+        damping_anisotropy: the same of their damping, in 1 / omega_s.
+        gyroscopic: gamma, gyroscopic moment over inertia.
+        higher_modes: response of all higher modes; see `NormalisedRotor`.
+        runout_um: part of 1X that no mode explains, forward and backward.
+    """
+
+    support_share: float
+    support_lag: float
+    cross_stiffness: float = 0.0
+    anisotropy: complex = 0j
+    damping_anisotropy: complex = 0j
+    gyroscopic: float = 0.0
+    higher_modes: complex = 0j
+    runout_um: tuple[complex, complex] = (0j, 0j)
+
+    def damping_ratio(self) -> float:
+        """Damping ratio zeta, mean of both directions, at the natural frequency."""
+        forward, *_, backward = self._stiffness(1.0, 1.0, 1.0)
+        return (forward.imag + backward.imag) / 4.0
+
+    def put_on(
+        self, rotor: NormalisedRotor, *, damping_ratio: float = 1.0, stiffness_ratio: float = 1.0
+    ) -> NormalisedRotor:
+        """A Laval rotor with these modes: what shaft and supports are together, at its speed.
+
+        Args:
+            rotor: speed, unbalance and contact are its.
+            damping_ratio: of the supports' dampers, over the healthy ones.
+            stiffness_ratio: of the static stiffness, over the healthy one, by softer supports.
+        """
+        w = rotor.w
+        forward, to_forward, to_backward, backward = self._stiffness(w, damping_ratio, stiffness_ratio)
+        stiffened = (forward.real - backward.real) / (2.0 * w**2)
+        return replace(
+            rotor,
+            k=(forward.real + backward.real) / 2.0,
+            zeta=(forward.imag + backward.imag) / (4.0 * w),
+            cross_stiffness=(forward.imag - backward.imag) / 2.0,
+            anisotropy=(to_forward + to_backward.conjugate()) / 2.0,
+            damping_anisotropy=(to_forward - to_backward.conjugate()) / (2j * w),
+            gyroscopic=self.gyroscopic + stiffened,
+            higher_modes=self.higher_modes,
+        )
+
+    def _stiffness(
+        self, w: float, damped: float, stiffness_ratio: float
+    ) -> tuple[complex, complex, complex, complex]:
+        """Dynamic stiffness by rows, for forward and conjugate backward 1X, over the static one."""
+        share = self.support_share
+        spring = share / (1.0 / stiffness_ratio - 1.0 + share)
+        return series_stiffness(
+            share,
+            spring * complex(1.0, self.cross_stiffness),
+            w * damped * self.support_lag,
+            spring * self.anisotropy,
+            w * damped * self.damping_anisotropy,
+        )
+
+
+def series_stiffness(
+    share: Any, spring: Any, damper: Any, anisotropy: Any, damping_anisotropy: Any
+) -> tuple[Any, Any, Any, Any]:
+    """Dynamic stiffness of a shaft in series with its supports, over the static one of both.
+
+    For amplitudes of exp(i theta), forward, and of the conjugate of what turns backward; also for arrays.
+
+    Args:
+        share: part of the static deflection that the supports take.
+        spring: complex stiffness of the supports, over their own; imaginary: across the deflection.
+        damper: w c / k of the supports.
+        anisotropy: see `TwoModes`.
+        damping_anisotropy: the same, times w.
+
+    Returns:
+        The four elements of the 2 x 2 matrix, row by row.
+    """
+    # Supports: what they push back with.
+    a, b = spring + 1j * damper, anisotropy + 1j * damping_anisotropy
+    c, d = anisotropy.conjugate() + 1j * damping_anisotropy.conjugate(), spring.conjugate() + 1j * damper
+    held = share / (a * d - b * c)
+    # Deflections in series add.
+    a, b, c, d = 1.0 - share + held * d, -held * b, -held * c, 1.0 - share + held * a
+    whole = 1.0 / (a * d - b * c)
+    return whole * d, -whole * b, -whole * c, whole * a
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,6 +274,7 @@ class RotorParameters:
         friction: Coulomb coefficient mu of the contact.
         contact_radius_um: radius of the rubbing surface.
         static_load_x_um: how far a static load bends the healthy shaft towards +x.
+        two_modes: what makes it differ from a Laval rotor; None: it is one.
     """
 
     natural_frequency_hz: float
@@ -112,6 +288,7 @@ class RotorParameters:
     friction: float = 0.1
     contact_radius_um: float = 25_000.0
     static_load_x_um: float = 0.0
+    two_modes: TwoModes | None = None
 
     def __post_init__(self) -> None:
         _require_positive(
@@ -150,6 +327,49 @@ class RotorParameters:
             contact_radius=self.contact_radius_um / self.clearance_um,
             load_x=self.static_load_x_um / self.clearance_um,
         )
+
+    def faulty(
+        self,
+        speed_rpm: float,
+        *,
+        damping_ratio: float | None = None,
+        unbalance_ratio: float = 1.0,
+        stiffness_ratio: float = 1.0,
+        static_load_um: complex = 0j,
+    ) -> NormalisedRotor:
+        """The rotor with a fault, at a speed, in normalised quantities.
+
+        Args:
+            speed_rpm: speed of the shaft; negative if it turns clockwise.
+            damping_ratio: damping in place of the healthy one.
+            unbalance_ratio: eccentricity over the healthy one.
+            stiffness_ratio: static stiffness over the healthy one.
+            static_load_um: additional load, as the sag of the healthy shaft under it, x + iy.
+
+        Raises:
+            ValueError: a quantity is outside what the model can mean.
+        """
+        rotor = self.normalised(speed_rpm, damping_ratio)
+        load = static_load_um / self.clearance_um
+        if self.two_modes is None:
+            return replace(
+                rotor,
+                e=rotor.e * unbalance_ratio,
+                k=rotor.k * stiffness_ratio,
+                load_x=rotor.load_x + load.real,
+                g=rotor.g - load.imag,
+            )
+        forward, backward = self.two_modes.runout_um
+        changed = replace(
+            self.two_modes.put_on(
+                rotor, damping_ratio=rotor.zeta / self.damping_ratio, stiffness_ratio=stiffness_ratio
+            ),
+            e=rotor.e * unbalance_ratio,
+            runout=(0j, forward / self.clearance_um, backward / self.clearance_um),
+        )
+        # Weight and load rest on the static stiffness, which dampers have no part in.
+        force = changed.load_for((rotor.rest + load) / stiffness_ratio)
+        return replace(changed, load_x=force.real, g=-force.imag)
 
 
 def _require_positive(what: str, **values: float) -> None:

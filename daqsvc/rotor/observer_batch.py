@@ -1,10 +1,11 @@
 """Memory of a bank for its kernels: eight observers side by side, so that the processor steps them together.
 
 All that a bank knows lies in one piece, `BankMemory`, which is handed over and copied as a whole: a header
-(`HEADER`), groups of observers (`GROUP`), constants of the observers, and evidence of pairs of modes
-(`PAIR`). A group holds constants, estimates and evidence of `WIDTH` modes, one member each; mode m is member
-m % WIDTH of group m // WIDTH. The lengths are part of the type: that is what lets the compiler turn a loop
-over members into vector instructions. Members that no mode needs explain nothing: their likelihood is 0.
+(`HEADER`), groups of observers (`GROUP`), constants of the observers, evidence of pairs of modes (`PAIR`) and
+where the axes are coupled what these observers have besides (`coupled.COUPLED`). A group holds constants,
+estimates and evidence of `WIDTH` modes, one member each; mode m is member m % WIDTH of group m // WIDTH. The
+lengths are part of the type: that is what lets the compiler turn a loop over members into vector
+instructions. Members that no mode needs explain nothing: their likelihood is 0.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.kernels import njit
+from daqsvc.rotor.coupled import COUPLED
 from daqsvc.rotor.discretise import OBSERVER
 from daqsvc.rotor.kernels import ESCAPE_RADIUS, UNDETERMINED
 
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
     Batch = NDArray[np.void]
     Headers = NDArray[np.void]
     Pairs = NDArray[np.void]
+    Couplings = NDArray[np.void]
 
 WIDTH = 8
 """Members in a group: two or one vector registers of float64."""
@@ -68,8 +71,8 @@ GROUP = np.dtype(
 
 HEADER = np.dtype(
     [
-        # what else there is: modes, groups of members, rub observers
-        ("modes", np.int64), ("groups", np.int64), ("rubs", np.int64),
+        # what else there is: modes, groups of members, rub observers; modes with coupled axes, all or none
+        ("modes", np.int64), ("groups", np.int64), ("rubs", np.int64), ("coupled", np.int64),
         # rules
         ("usable_squared", np.float64), ("lead_limit", np.float64), ("first_threshold", np.float64),
         ("identity_nats", np.float64), ("settling_wait", np.int64), ("samples_per_rev", np.int64),
@@ -92,27 +95,31 @@ _HEADER_BYTES = HEADER.itemsize
 _GROUP_BYTES = GROUP.itemsize
 _OBSERVER_BYTES = OBSERVER.itemsize
 _PAIR_BYTES = PAIR.itemsize
+_COUPLED_BYTES = COUPLED.itemsize
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def sections(memory: Bytes) -> tuple[Headers, Batch, Observers, Pairs]:
+def sections(memory: Bytes) -> tuple[Headers, Batch, Observers, Pairs, Couplings]:
     """The parts of a bank's memory.
 
     Args:
         memory: uint8 ``[n]``.
 
     Returns:
-        Views: ``[1]`` of `HEADER`, ``[G]`` of `GROUP`, ``[M]`` of `discretise.OBSERVER` and, row by row,
-        ``[M M]`` of `PAIR`.
+        Views: ``[1]`` of `HEADER`, ``[G]`` of `GROUP`, ``[M]`` of `discretise.OBSERVER`, row by row ``[M M]``
+        of `PAIR`, and ``[M]`` or ``[0]`` of `coupled.COUPLED`.
     """
     headers = memory[:_HEADER_BYTES].view(HEADER)
     batch = _HEADER_BYTES + headers[0]["groups"] * _GROUP_BYTES
-    observers = batch + headers[0]["modes"] * _OBSERVER_BYTES
+    modes = headers[0]["modes"]
+    observers = batch + modes * _OBSERVER_BYTES
+    pairs = observers + modes * modes * _PAIR_BYTES
     return (
         headers,
         memory[_HEADER_BYTES:batch].view(GROUP),
         memory[batch:observers].view(OBSERVER),
-        memory[observers:].view(PAIR),
+        memory[observers:pairs].view(PAIR),
+        memory[pairs:].view(COUPLED),
     )
 
 
@@ -132,26 +139,29 @@ class BankMemory:
         self.memory = memory
 
     @classmethod
-    def new(cls, observers: Observers, log_prior: Floats) -> Self:
+    def new(cls, observers: Observers, couplings: Couplings, log_prior: Floats) -> Self:
         """Memory of a bank that has not seen anything yet.
 
         Args:
             observers: ``[M]`` of `discretise.OBSERVER`.
+            couplings: ``[M]`` of `coupled.COUPLED`, or ``[0]``.
             log_prior: float64 ``[M]``, logarithms of the probabilities that the paper's rule starts from.
         """
         count = len(observers)
         groups = math.ceil(count / WIDTH)
         rubs = np.flatnonzero(observers["substeps"])
         size = _HEADER_BYTES + groups * _GROUP_BYTES + count * _OBSERVER_BYTES + count**2 * _PAIR_BYTES
+        size += len(couplings) * _COUPLED_BYTES
         memory = np.zeros(size, dtype=np.uint8)
         header = memory[:_HEADER_BYTES].view(HEADER)
         header["modes"], header["groups"], header["rubs"] = count, groups, len(rubs)
+        header["coupled"] = len(couplings)
         subject = cls(memory)
         subject.put("rub", rubs)
         subject.batch["threshold"] = math.inf
         subject.put("log_prior", log_prior, -math.inf)
         subject.put("log_odds", log_prior, -math.inf)
-        subject.set_observers(observers)
+        subject.set_observers(observers, couplings)
         return subject
 
     @classmethod
@@ -190,7 +200,7 @@ class BankMemory:
         for column, name in enumerate(fields):
             self.put(name, values[:, column])
 
-    def set_observers(self, observers: Observers) -> None:
+    def set_observers(self, observers: Observers, couplings: Couplings) -> None:
         """Take over the constants of observers; estimates and evidence stay.
 
         The member of a rub observer stands still in the vector loops and adds no evidence there; its own step
@@ -198,8 +208,13 @@ class BankMemory:
 
         Args:
             observers: ``[M]`` of `discretise.OBSERVER`, with rub where there was.
+            couplings: ``[M]`` or ``[0]`` of `coupled.COUPLED`, as many as there were.
         """
-        sections(self.memory)[2][:] = observers
+        parts = sections(self.memory)
+        parts[2][:] = observers
+        reach = parts[4]["reach_squared"].copy()
+        parts[4][:] = couplings
+        parts[4]["reach_squared"] = reach
         linear = observers["substeps"] == 0
         for name in _SAME:
             self.put(name, observers[name])

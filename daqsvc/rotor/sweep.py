@@ -1,12 +1,12 @@
 """A bank's one compiled call for a block: all observers and both rules, sample by sample.
 
 Loops over the members of a group become vector instructions; what is rare or branches (contact, a
-declaration, a lost observer) goes mode by mode. The CUSUM of log-likelihood ratios (Page 1954) stands by one
-mode; every other gathers evidence against that one since an onset of its own. As long as nothing is declared,
-all modes are compared with all.
+declaration, a lost observer, coupled axes) goes mode by mode. The CUSUM of log-likelihood ratios (Page 1954)
+stands by one mode; every other gathers evidence against that one since an onset of its own. As long as
+nothing is declared, all modes are compared with all.
 
-numba's cache on disk looks at the file of a function alone: after a change in `kernels` or `observer_batch`
-this file must be touched, or the cache emptied.
+numba's cache on disk looks at the file of a function alone: after a change in `kernels`, `coupled_kernels` or
+`observer_batch` this file must be touched, or the cache emptied.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import math
 from typing import TYPE_CHECKING
 
 from daqsvc.kernels import njit
+from daqsvc.rotor import coupled_kernels
 from daqsvc.rotor.kernels import UNDETERMINED, correct, guarded, orbit, predict, predict_rub
 from daqsvc.rotor.observer_batch import WIDTH, sections
 
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     Observers = NDArray[np.void]
     Pairs = NDArray[np.void]
     Batch = NDArray[np.void]
+    Couplings = NDArray[np.void]
     Observer = Any  # one element of Observers: numba makes a record of it
     Group = Any
     Header = Any
@@ -220,7 +222,7 @@ def start_anew(memory: Bytes) -> None:
     Args:
         memory: uint8 ``[n]``, see `batch.sections`; changed in place.
     """
-    headers, batch, observers, pairs = sections(memory)
+    headers, batch, observers, pairs, _ = sections(memory)
     _forget(observers, batch, pairs, headers[0])
     headers[0].unusable = headers[0].samples_per_rev + 1
 
@@ -292,6 +294,73 @@ def _coast(observers: Observers, batch: Batch, cos: float, sin: float) -> None:
             paper = guarded(observer, observers[0], cos, sin, paper)
         _set_free(group, member, predict(observer, cos, sin, free))
         _set_paper(group, member, predict(observer, cos, sin, paper))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _guard_coupled(
+    observers: Observers, couplings: Couplings, m: int, cos: float, sin: float, state: State
+) -> State:
+    """The state of one observer; a rub observer that is lost starts anew."""
+    if observers[m].substeps == 0:
+        return state
+    return coupled_kernels.guarded(observers[m], couplings[m], observers[0], couplings[0], cos, sin, state)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _observe_coupled(
+    observers: Observers, couplings: Couplings, batch: Batch, x: float, y: float, cos: float, sin: float
+) -> None:
+    """Observers with coupled axes under both rules: the free-running are stepped, the paper's corrected."""
+    for m in range(len(couplings)):
+        observer, coupling, group, member = observers[m], couplings[m], batch[m // WIDTH], m % WIDTH
+        ox, _, oy, _ = coupled_kernels.orbit(observer, coupling, cos, sin)
+        free = _guard_coupled(observers, couplings, m, cos, sin, _free(group, member))
+        free, group.score[member] = coupled_kernels.correct(coupling, x - ox, y - oy, free)
+        paper = _guard_coupled(observers, couplings, m, cos, sin, _paper(group, member))
+        paper, group.paper_score[member] = coupled_kernels.correct(coupling, x - ox, y - oy, paper)
+        if observer.substeps > 0 and not coupled_kernels.touches(coupling, ox + free[0], oy + free[2]):
+            group.score[member] = min(group.score[member], batch[0].score[0])
+            group.paper_score[member] = min(group.paper_score[member], batch[0].paper_score[0])
+        _set_free(group, member, coupled_kernels.predict(observer, coupling, cos, sin, free))
+        _set_paper(group, member, paper)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _step_paper_coupled(
+    observers: Observers, couplings: Couplings, batch: Batch, cos: float, sin: float
+) -> None:
+    """Estimates under the paper's rule, corrected already, stepped to the next sample."""
+    for m in range(len(couplings)):
+        group, member = batch[m // WIDTH], m % WIDTH
+        state = coupled_kernels.predict(observers[m], couplings[m], cos, sin, _paper(group, member))
+        _set_paper(group, member, state)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _coast_coupled(observers: Observers, couplings: Couplings, batch: Batch, cos: float, sin: float) -> None:
+    """Predict all estimates through a sample that is missing."""
+    for m in range(len(couplings)):
+        observer, coupling, group, member = observers[m], couplings[m], batch[m // WIDTH], m % WIDTH
+        state = _guard_coupled(observers, couplings, m, cos, sin, _free(group, member))
+        _set_free(group, member, coupled_kernels.predict(observer, coupling, cos, sin, state))
+        state = _guard_coupled(observers, couplings, m, cos, sin, _paper(group, member))
+        _set_paper(group, member, coupled_kernels.predict(observer, coupling, cos, sin, state))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _hand_over_coupled(
+    observers: Observers, couplings: Couplings, batch: Batch, cos: float, sin: float, declared: int
+) -> None:
+    """As `_hand_over` does: the declared one's estimate for all, stepped."""
+    dx, du, dy, dv = _paper(batch[declared // WIDTH], declared % WIDTH)
+    ox, ou, oy, ov = coupled_kernels.orbit(observers[declared], couplings[declared], cos, sin)
+    for m in range(len(couplings)):
+        tx, tu, ty, tv = coupled_kernels.orbit(observers[m], couplings[m], cos, sin)
+        state = (dx + ox - tx, du + ou - tu, dy + oy - ty, dv + ov - tv)
+        state = coupled_kernels.predict(observers[m], couplings[m], cos, sin, state)
+        _set_paper(batch[m // WIDTH], m % WIDTH, state)
+    for g in range(len(batch)):
+        batch[g].log_odds[:] = batch[g].log_prior
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -374,8 +443,8 @@ def advance(  # noqa: C901, PLR0912, PLR0915 - one recursion: correct, weigh, de
     Returns:
         ``-1 - k`` if the decision changed at sample k, which is taken in; else n.
     """
-    headers, batch, observers, pairs = sections(memory)
-    header, count = headers[0], len(observers)
+    headers, batch, observers, pairs, couplings = sections(memory)
+    header, count, coupled = headers[0], len(observers), len(couplings) > 0
     if begin == 0:
         header.paper_declarations = 0
     for k in range(begin, len(xy)):
@@ -385,14 +454,20 @@ def advance(  # noqa: C901, PLR0912, PLR0915 - one recursion: correct, weigh, de
             if header.unusable > header.samples_per_rev:
                 _forget(observers, batch, pairs, header)
             header.unusable = 0
-            for g in range(len(batch)):
-                _observe(batch[g], x, y, c, s, _width(g, count))
-            for r in range(header.rubs):
-                m = batch[r // WIDTH].rub[r % WIDTH]
-                _observe_rub(observers[m], observers[0], batch[m // WIDTH], m % WIDTH, c, s)
+            if coupled:
+                _observe_coupled(observers, couplings, batch, x, y, c, s)
+            else:
+                for g in range(len(batch)):
+                    _observe(batch[g], x, y, c, s, _width(g, count))
+                for r in range(header.rubs):
+                    m = batch[r // WIDTH].rub[r % WIDTH]
+                    _observe_rub(observers[m], observers[0], batch[m // WIDTH], m % WIDTH, c, s)
         else:
             header.unusable += 1
-            _coast(observers, batch, c, s)
+            if coupled:
+                _coast_coupled(observers, couplings, batch, c, s)
+            else:
+                _coast(observers, batch, c, s)
         counts = usable and header.settling == 0
         header.settling = max(0, header.settling - 1)
         if not counts:
@@ -431,7 +506,12 @@ def advance(  # noqa: C901, PLR0912, PLR0915 - one recursion: correct, weigh, de
             header.paper_declarations += 1
             header.paper_decision = declared
             header.paper_age = 0
-            _hand_over(observers, batch, c, s, declared)
+            if coupled:
+                _hand_over_coupled(observers, couplings, batch, c, s, declared)
+            else:
+                _hand_over(observers, batch, c, s, declared)
+        elif usable and coupled:
+            _step_paper_coupled(observers, couplings, batch, c, s)
         elif usable:
             for g in range(len(batch)):
                 _step_paper(batch[g], _width(g, count))

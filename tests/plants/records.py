@@ -99,7 +99,7 @@ class Bench:
         q = self._response(self.unbalance)
         self.orbit_rub = q @ self.healthy.places["rub x"], q @ self.healthy.places["rub y"]
         self.whirl_rub_m = float(max(abs(part) for part in self.orbit_rub))
-        self.rest_rub = self._rest("rub")
+        self.rest_rub, self.rest_probe = self._rest("rub"), self._rest("probe")
         self.whirl_m = self.seen(self.unbalance, 1)
         self.clearance_um = 1e6 * (2.0 * abs(self._rest("probe")) + 5.0 * self.whirl_m)
 

@@ -151,13 +151,17 @@ def samples_of(record: Path, snr_db: int, onset_rev: float, seed: int) -> NDArra
     for probe, before in ((z.real, healthy.real), (z.imag, healthy.imag)):
         noise = np.sqrt(before.var() / 10.0 ** (snr_db / 10.0))
         columns.append(probe + noise * rng.standard_normal(len(z)))
-    # The angle begins anywhere; a notch that passes pulls the voltage down, and its end marks angle zero.
+    columns.append(keyphasor_volts(angle, rng))
+    return np.stack(columns, axis=1).astype(np.float32)
+
+
+def keyphasor_volts(angle: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+    """What a keyphasor shows: a notch that passes pulls the voltage down, and its end marks angle zero."""
     past = np.mod(angle + _KEYPHASOR_WIDTH_RAD, 2.0 * np.pi)
     edge = np.interp(
         past, [0.0, 0.1, _KEYPHASOR_WIDTH_RAD - 0.1, _KEYPHASOR_WIDTH_RAD + 0.1, 6.2], [-2, -10, -10, -2, -2]
     )
-    columns.append(edge + 0.02 * rng.standard_normal(len(z)))
-    return np.stack(columns, axis=1).astype(np.float32)
+    return np.asarray(edge + 0.02 * rng.standard_normal(len(angle)))
 
 
 def judge(folder: Path, seed: int, job: tuple[dict[str, object], int]) -> Said:
@@ -188,12 +192,13 @@ def judge(folder: Path, seed: int, job: tuple[dict[str, object], int]) -> Said:
     said: list[Diagnosis] = []
     for begin in range(0, len(samples), detector.block):
         part = samples[begin : begin + detector.block]
-        said += detector.process(_window(part, begin, rate_hz))
+        said += detector.process(window_of(part, begin, rate_hz))
     last = detector.finish()
     return _summed(case, snr_db, [*said, *([last] if last else [])], detector.refused, onset, healthy=healthy)
 
 
-def _window(samples: NDArray[np.float32], first_index: int, rate_hz: float) -> Window:
+def window_of(samples: NDArray[np.float32], first_index: int, rate_hz: float) -> Window:
+    """A block of the stream."""
     period_ns = 1e9 / rate_hz
     return Window(first_index, samples, round((first_index + len(samples) - 1) * period_ns), period_ns)
 

@@ -123,6 +123,55 @@ def move(stages: Sequence[Stage], speed_rad_s: float, revolutions: int, hunting:
         hunting: float64 ``[2]``, relative amplitude of the speed's variation and its period in revolutions.
     """
     rate_hz = speed_rad_s / (2.0 * math.pi) * PER_REV
+    tables = _tables(stages, rate_hz)
+    samples = (revolutions + _SETTLING_REV) * PER_REV
+    at_rev = np.arange(samples) / PER_REV - _SETTLING_REV
+    begins = np.array([stage.begin_rev for stage in stages])
+    which = np.maximum(np.searchsorted(begins, at_rev, side="right") - 1, 0)
+    fine = (np.arange(samples * _SUBSTEPS) + 0.5) / (PER_REV * _SUBSTEPS) - _SETTLING_REV
+    depth, period = hunting
+    angle = 2.0 * math.pi * (fine + depth * period / (2.0 * math.pi) * np.sin(2.0 * math.pi * fine / period))
+    seen = _run(*tables, which, angle, np.ones(len(angle), dtype=np.complex128))
+    kept = slice(_SETTLING_REV * PER_REV, None)
+    turned = (
+        2.0 * math.pi * (at_rev + depth * period / (2.0 * math.pi) * np.sin(2.0 * math.pi * at_rev / period))
+    )
+    return Motion(
+        seen[kept, 0] + 1j * seen[kept, 1], seen[kept, 2] + 1j * seen[kept, 3], turned[kept], rate_hz
+    )
+
+
+def run_through(stages: Sequence[Stage], speeds_rad_s: Floats, revolutions: int) -> Motion:
+    """Let the machine run up evenly in time, from the first speed to the last.
+
+    Args:
+        stages: the machine at each speed; forces at the shaft speed are over its square.
+        speeds_rad_s: float64 ``[S]``, rising.
+        revolutions: how long.
+    """
+    low, high = float(speeds_rad_s[0]), float(speeds_rad_s[-1])
+    rate_hz = high / (2.0 * math.pi) * PER_REV
+    duration_s = 2.0 * math.pi * revolutions / ((low + high) / 2.0)
+    samples = round(duration_s * rate_hz)
+    rate = (high - low) / duration_s
+    settling = round(_SETTLING_REV * 2.0 * math.pi / low * rate_hz)
+    fine = (np.arange((samples + settling) * _SUBSTEPS) + 0.5) / (rate_hz * _SUBSTEPS)
+    fine -= settling / rate_hz
+    begun = np.maximum(fine, 0.0)
+    angle = low * fine + 0.5 * rate * begun**2
+    speed = low + rate * begun
+    at_s = np.maximum((np.arange(samples + settling) - settling) / rate_hz, 0.0)
+    which = np.searchsorted(speeds_rad_s[1:], low + rate * at_s + 0.5 * (speeds_rad_s[1] - low))
+    # With the speed's growth the heavy spot is also pulled along: theta'^2 - i theta''.
+    force = speed**2 - 1j * np.where(fine > 0.0, rate, 0.0)
+    seen = _run(*_tables(stages, rate_hz), which, angle, force)
+    kept = slice(settling, None)
+    turned = low * at_s[kept] + 0.5 * rate * at_s[kept] ** 2
+    return Motion(seen[kept, 0] + 1j * seen[kept, 1], seen[kept, 2] + 1j * seen[kept, 3], turned, rate_hz)
+
+
+def _tables(stages: Sequence[Stage], rate_hz: float) -> tuple[Floats, ...]:
+    """What `_run` steps with: of each stage, and of the machine."""
     step_s = 1.0 / (rate_hz * _SUBSTEPS)
     n = len(stages[0].machine.mass)
     propagators, forced, statics, parameters = [], [], [], []
@@ -140,31 +189,14 @@ def move(stages: Sequence[Stage], speed_rad_s: float, revolutions: int, hunting:
         [first.places[f"{where} {axis}"] for where in ("probe", "rub", "bend") for axis in "xy"]
         + [first.places[f"support {i} y"] for i in (0, 1)]
     )
-    samples = (revolutions + _SETTLING_REV) * PER_REV
-    at_rev = np.arange(samples) / PER_REV - _SETTLING_REV
-    begins = np.array([stage.begin_rev for stage in stages])
-    which = np.maximum(np.searchsorted(begins, at_rev, side="right") - 1, 0)
-    fine = (np.arange(samples * _SUBSTEPS) + 0.5) / (PER_REV * _SUBSTEPS) - _SETTLING_REV
-    depth, period = hunting
-    angle = 2.0 * math.pi * (fine + depth * period / (2.0 * math.pi) * np.sin(2.0 * math.pi * fine / period))
-    state = np.concatenate((first.rest, np.zeros(n)))
-    seen = _run(
+    return (
         np.array(propagators),
         np.array(forced),
         np.array(statics),
         np.array([stage.turning for stage in stages]),
         np.array(parameters),
-        which,
-        angle,
         rows,
-        state,
-    )
-    kept = slice(_SETTLING_REV * PER_REV, None)
-    turned = (
-        2.0 * math.pi * (at_rev + depth * period / (2.0 * math.pi) * np.sin(2.0 * math.pi * at_rev / period))
-    )
-    return Motion(
-        seen[kept, 0] + 1j * seen[kept, 1], seen[kept, 2] + 1j * seen[kept, 3], turned[kept], rate_hz
+        np.concatenate((first.rest, np.zeros(n))),
     )
 
 
@@ -188,7 +220,7 @@ def _parameters(stage: Stage) -> Floats:
 
 
 @numba.njit(cache=True)
-def _run(propagators, forced, statics, turning, parameters, which, angle, rows, state):
+def _run(propagators, forced, statics, turning, parameters, rows, state, which, angle, once):
     samples = len(which)
     n = statics.shape[1]
     seen = np.empty((samples, 4))
@@ -203,13 +235,14 @@ def _run(propagators, forced, statics, turning, parameters, which, angle, rows, 
         for j in range(4):
             seen[i, j] = rows[j] @ state[:n]
         for _ in range(len(angle) // samples):
-            theta = angle[k]
+            theta, at_1x = angle[k], once[k]
             k += 1
             q = state[:n]
             f = statics[stage].copy()
             for order in range(3):
                 c, s = math.cos(order * theta), math.sin(order * theta)
-                f += turning[stage, order].real * c - turning[stage, order].imag * s
+                part = turning[stage, order] * at_1x if order == 1 else turning[stage, order]
+                f += part.real * c - part.imag * s
             if p[3] > 0.0:
                 x, y = rows[2] @ q - p[0], rows[3] @ q - p[1]
                 r = math.hypot(x, y)

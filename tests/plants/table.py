@@ -14,6 +14,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from plants.bank import bank_answers, bank_scored, bank_summary
 from plants.diagram import draw
 from plants.score import CLEAR, MODELLED, ONLY_1X, SNR_DB, TRUTH, Said, scored
 
@@ -99,20 +100,28 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--aside", action="store_true", help="the half that is looked at once, at the end")
     parser.add_argument("--seed", type=int, default=0, help="of the noise, and of what is stated wrongly")
     options = parser.parse_args(arguments)
+    half = "set aside" if options.aside else "tuned"
+    bank = bank_scored(options.folder, aside=options.aside, seed=options.seed)
+    _put(f"bank, {half}", [bank_summary(bank), *(bank_answers(bank, snr) for snr in SNR_DB)], options.seed)
     said = scored(options.folder, aside=options.aside, seed=options.seed)
-    parts = [summary(said), reliability(said), *(answers(said, snr) for snr in SNR_DB)]
-    table = "\n\n".join("\n".join(lines) for lines in parts)
-    print(table)  # noqa: T201
+    _put(half, [summary(said), reliability(said), *(answers(said, snr) for snr in SNR_DB)], options.seed)
     if options.seed:
         return 0
-    half = "set aside" if options.aside else "tuned"
-    begin, end = BEGIN.format(half), END.format(half)
-    page = PAGE.read_text(encoding="utf-8")
-    before, rest = page.split(begin)
-    PAGE.write_text(f"{before}{begin}\n{table}\n{end}{rest.split(end)[1]}", encoding="utf-8")
     names = [(certain(s), s.decision in s.true_names) for s in first_names(said)]
     draw({f"{half} half": names}, PAGE.with_name(f"plants-{half.replace(' ', '-')}.svg"))
     return 0
+
+
+def _put(what: str, parts: Sequence[Sequence[str]], seed: int) -> None:
+    """Print tables, and write them to their place in the page; other seeds are only looked at."""
+    table = "\n\n".join("\n".join(lines) for lines in parts)
+    print(table)  # noqa: T201
+    if seed:
+        return
+    begin, end = BEGIN.format(what), END.format(what)
+    page = PAGE.read_text(encoding="utf-8")
+    before, rest = page.split(begin)
+    PAGE.write_text(f"{before}{begin}\n{table}\n{end}{rest.split(end)[1]}", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -23,7 +23,9 @@ from daqsvc.rotor.calibration.file import (
     save_record,
 )
 from daqsvc.rotor.calibration.run_up import RunUpFit
+from daqsvc.rotor.calibration.two_modes import TwoModeFit
 from daqsvc.rotor.laval import LavalRotor
+from daqsvc.rotor.model import TwoModes
 from daqsvc.rotor.synchronous.baseline import Calibration
 from daqsvc.rotor.synchronous.speed_law import SpeedLaw
 
@@ -85,17 +87,41 @@ fits = st.builds(
 )
 
 
+two_modes = st.builds(
+    TwoModeFit,
+    natural_frequency_hz=positive,
+    damping_ratio=positive,
+    eccentricity_um=complexes,
+    modes=st.builds(
+        TwoModes,
+        support_share=st.floats(min_value=1e-6, max_value=1.0),
+        support_lag=positive,
+        cross_stiffness=number,
+        anisotropy=complexes,
+        damping_anisotropy=complexes,
+        gyroscopic=number,
+        higher_modes=complexes,
+        runout_um=st.tuples(complexes, complexes),
+    ),
+    fit_error=part,
+    speed_range_rpm=st.just((1.0, 2.0)),
+)
+
+
 @st.composite
 def records(draw: st.DrawFn) -> CalibrationRecord:
     rotor = draw(rotors)
     steady = draw(st.lists(calibrations(rotor), max_size=3))
     texts = st.text(st.characters(exclude_categories=["Cs"]), max_size=12)
+    run_up = draw(fits if not steady else st.none() | fits)
+    modes = None if run_up is None else draw(st.none() | two_modes)
     return CalibrationRecord(
         rotor=rotor,
         steady=tuple(steady),
         steady_sources=tuple(draw(texts) for _ in steady),
-        run_up=draw(fits if not steady else st.none() | fits),
+        run_up=run_up,
         run_up_source="run.csv",
+        two_modes=modes and replace(modes, speed_range_rpm=run_up.speed_range_rpm),
         written="2026-01-02T03:04:05Z",
     )
 
@@ -123,6 +149,7 @@ def test_comes_back_to_the_last_bit(record: CalibrationRecord) -> None:
     if record.run_up is not None:
         assert same(record.run_up, back.run_up)
         assert back.run_up_source == "run.csv"
+    assert back.two_modes == record.two_modes
     assert back.steady_sources == record.steady_sources
     assert back.written == record.written
 

@@ -7,12 +7,19 @@ from typing import TYPE_CHECKING
 from daqsvc.detectors.rotor_bank.detector import RotorBankDetector, RotorMode
 from daqsvc.detectors.rotor_bank.modes import fault_of
 from daqsvc.detectors.shaft.build import keyphasor, probes
+from daqsvc.rotor.calibration.file import CalibrationFileError, load_record
 from daqsvc.rotor.decision import DecisionRules
 from daqsvc.rotor.model import RotorParameters
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from daqsvc.detectors.rotor_bank.settings import RotorBank
+    from daqsvc.rotor.calibration.two_modes import TwoModeFit
     from daqsvc.settings.models import MachineFile
+
+_BEYOND = 0.1
+"""So far outside of the speeds of its run-up a rotor is still the one that was identified."""
 
 
 def bank_detector(machine: MachineFile, bank: RotorBank) -> RotorBankDetector:
@@ -21,7 +28,11 @@ def bank_detector(machine: MachineFile, bank: RotorBank) -> RotorBankDetector:
     Args:
         machine: the machine file.
         bank: its rotor bank.
+
+    Raises:
+        CalibrationFileError: the run-up that the observers are to be made of cannot be used.
     """
+    rotor = healthy_rotor(machine, bank)
     grid = machine.grid(bank.sampled_together)
     rate_hz = grid.rate_hz
     return RotorBankDetector(
@@ -31,8 +42,8 @@ def bank_detector(machine: MachineFile, bank: RotorBank) -> RotorBankDetector:
         speed_rpm=machine.machine.speed_rpm,
         probes=probes(machine, grid, bank.probes),
         keyphasor=keyphasor(machine, grid, bank.keyphasor),
-        rotor=healthy_rotor(machine),
-        modes=rotor_modes(bank),
+        rotor=rotor,
+        modes=rotor_modes(machine, bank, rotor),
         noise_um=bank.noise_um,
         process_noise=bank.process_noise,
         rub_process_noise=bank.rub_process_noise,
@@ -60,21 +71,28 @@ def faults(machine: MachineFile, bank: RotorBank) -> dict[str, str]:
         machine: the machine file.
         bank: its rotor bank.
     """
-    rotor = healthy_rotor(machine)
-    return {mode.name: fault_of(mode, rotor) for mode in rotor_modes(bank)}
+    rotor = healthy_rotor(machine, bank)
+    return {mode.name: fault_of(mode, rotor) for mode in rotor_modes(machine, bank, rotor)}
 
 
-def healthy_rotor(machine: MachineFile) -> RotorParameters:
-    """The rotor of a machine file that has a rotor bank, as it should be."""
+def healthy_rotor(machine: MachineFile, bank: RotorBank) -> RotorParameters:
+    """The rotor of a machine file that has a rotor bank, as it should be, or as its run-up showed it.
+
+    Args:
+        machine: the machine file.
+        bank: its rotor bank.
+
+    Raises:
+        CalibrationFileError: the file of the run-up cannot be used.
+    """
     rotor = machine.machine.rotor
-    # detectors/shaft/checks.py: a rotor bank needs [machine.rotor], and these two in it.
+    # detectors/rotor_bank/checks.py: a rotor bank needs [machine.rotor], and these in it.
     assert rotor is not None  # noqa: S101
-    assert rotor.eccentricity_um is not None  # noqa: S101
     assert rotor.contact_stiffness is not None  # noqa: S101
-    return RotorParameters(
+    stated = RotorParameters(
         natural_frequency_hz=rotor.natural_frequency_hz,
         damping_ratio=rotor.damping_ratio,
-        eccentricity_um=rotor.eccentricity_um,
+        eccentricity_um=rotor.eccentricity_um or 0.0,
         heavy_spot_deg=rotor.heavy_spot_deg,
         clearance_um=rotor.clearance_um,
         static_sag_um=rotor.static_sag_um,
@@ -82,14 +100,55 @@ def healthy_rotor(machine: MachineFile) -> RotorParameters:
         contact_radius_um=rotor.contact_radius_um,
         static_load_x_um=rotor.static_load_x_um,
     )
+    if bank.calibration is None:
+        return stated
+    fit = _run_up(machine.resolve(bank.calibration), machine.machine.speed_rpm)
+    return fit.rotor(stated, clockwise=machine.machine.speed_rpm < 0.0)
 
 
-def rotor_modes(bank: RotorBank) -> list[RotorMode]:
-    """The modes of a rotor bank, healthy first."""
+def _run_up(path: Path, speed_rpm: float) -> TwoModeFit:
+    """The rotor's two modes, by a file of ``daqsvc calibrate``.
+
+    Raises:
+        CalibrationFileError: there are none, they do not stand for the machine, or not at its speed.
+    """
+    fit = load_record(path).two_modes
+    if fit is None:
+        raise CalibrationFileError(
+            f"{path}: holds no run-up, of which observers could be made; give daqsvc calibrate a recording "
+            "of a run-up or a coast-down, or remove pipeline.rotor_bank.calibration"
+        )
+    if not fit.explains:
+        raise CalibrationFileError(
+            f"{path}: {fit.describe()}; watch this machine with [pipeline.rotor_synchronous]"
+        )
+    low, high = fit.speed_range_rpm
+    if not low * (1.0 - _BEYOND) <= abs(speed_rpm) <= high * (1.0 + _BEYOND):
+        raise CalibrationFileError(
+            f"{path}: the run-up went from {low:.0f} to {high:.0f} rpm, and machine.speed_rpm is "
+            f"{speed_rpm:g}; record one that passes it"
+        )
+    return fit
+
+
+def rotor_modes(machine: MachineFile, bank: RotorBank, rotor: RotorParameters) -> list[RotorMode]:
+    """The modes of a rotor bank, healthy first.
+
+    Damping is stated over that of [machine.rotor]; of a rotor as its run-up showed it, it is the same part of
+    that one's.
+
+    Args:
+        machine: the machine file.
+        bank: its rotor bank.
+        rotor: what `healthy_rotor` says of it.
+    """
+    stated = machine.machine.rotor
+    assert stated is not None  # noqa: S101 - see `healthy_rotor`
+    damping = rotor.damping_ratio / stated.damping_ratio
     return [
         RotorMode(
             mode.name,
-            mode.damping_ratio,
+            None if mode.damping_ratio is None else mode.damping_ratio * damping,
             mode.severity,
             mode.rub,
             fault=mode.fault,

@@ -34,7 +34,8 @@ def bank_checks(draft: MachineFile, bank: RotorBank) -> Iterator[Iterator[Findin
         bank: its rotor bank.
     """
     yield check_rotor(draft, _BANK, "the model bank")
-    yield _modelled(draft)
+    yield _modelled(draft, bank)
+    yield _measured(bank)
     yield check_sensors(draft, _BANK, bank.probes, bank.keyphasor)
     yield check_geometry(draft, _BANK, bank.probes)
     yield _pulses(draft, bank)
@@ -63,7 +64,17 @@ def check_bank_alarm(bank: RotorBank, at: KeyPath) -> Iterator[Finding]:
         )
 
 
-def _modelled(draft: MachineFile) -> Iterator[Finding]:
+def _measured(bank: RotorBank) -> Iterator[Finding]:
+    """What a run-up does not know of today's machine, its first revolutions tell."""
+    if bank.calibration is not None and bank.calibrate_revolutions == 0:
+        yield Finding(
+            (*_BANK, "calibrate_revolutions"),
+            "is 0, with the rotor from a run-up: its unbalance and its rest may have changed since",
+            "write e.g. calibrate_revolutions = 50",
+        )
+
+
+def _modelled(draft: MachineFile, bank: RotorBank) -> Iterator[Finding]:
     """What only the models of the bank need to know of the rotor."""
     rotor = draft.machine.rotor
     if rotor is None:
@@ -72,6 +83,8 @@ def _modelled(draft: MachineFile) -> Iterator[Finding]:
         ("eccentricity_um", "mass eccentricity", "10.0"),
         ("contact_stiffness", "stiffness of the stator", "30.0"),
     ):
+        if key == "eccentricity_um" and bank.calibration is not None:
+            continue  # a run-up shows it
         with suppress(UnusableValueError):
             if getattr(rotor, key) is None:
                 yield Finding(

@@ -6,7 +6,6 @@ import math
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from daqsvc.rotor.adaptation import VARIANCE_FACTOR
 from daqsvc.rotor.detectability.prediction import detectability
 
 if TYPE_CHECKING:
@@ -49,7 +48,7 @@ def bank_detectability(
         noise=detector.noise,
         duration=detector.duration,
         threshold_nats=detector.rules.thresholds(len(detector.bank_modes)),
-        variance_factor=VARIANCE_FACTOR if settings.calibrate_revolutions > 0 else 1.0,
+        variance_factor=detector.variance_factor if settings.calibrate_revolutions > 0 else 1.0,
         process_noise=process_noise,
         ac_coupled=machine.ac_coupled,
     )

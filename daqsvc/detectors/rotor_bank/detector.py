@@ -22,7 +22,7 @@ from daqsvc.dsp.quality.sound import is_sound
 from daqsvc.dsp.quality.stuck import stands_still
 from daqsvc.dsp.quality.unit import RESCALE, beyond_any_unit
 from daqsvc.dsp.speed.keyphasor import KeyphasorProbe, KeyphasorTracker
-from daqsvc.rotor.adaptation import VARIANCE_FACTOR, SteadyFit, adapted
+from daqsvc.rotor.adaptation import MODEL_ERROR, VARIANCE_FACTOR, SteadyFit, adapted
 from daqsvc.rotor.bank import UNDETERMINED, BankReport, ModelBank
 from daqsvc.rotor.decision import DecisionRules
 
@@ -143,6 +143,7 @@ class RotorBankDetector:
             rub_process_noise=rub_process_noise,
             ac_coupled=ac_coupled,
         )
+        self._clearance_um = rotor.clearance_um
         self._stater = BankDiagnosisBuilder(
             machine=machine,
             detector=name,
@@ -208,6 +209,20 @@ class RotorBankDetector:
     def rules(self) -> DecisionRules:
         """Thresholds and the rule that declares."""
         return self._rules
+
+    @property
+    def variance_factor(self) -> float:
+        """Room for what the models miss: of the noise, and of the orbit where two modes stand for many."""
+        healthy = self._bank_modes[0].rotor
+        if healthy.isotropic:
+            return VARIANCE_FACTOR
+        missed = MODEL_ERROR * math.hypot(abs(healthy.orbit()), abs(healthy.backward_orbit()))
+        return VARIANCE_FACTOR + 0.5 * (missed / self._noise) ** 2
+
+    @property
+    def clearance_um(self) -> float:
+        """Radial clearance, the unit of lengths."""
+        return self._clearance_um
 
     def warm(self) -> None:
         """Compile the kernels on a bank that is thrown away."""
@@ -352,7 +367,7 @@ class RotorBankDetector:
         motion = self._calibration.solve()
         speed = self._direction * 2.0 * math.pi / self._tracker.period_samples / self._duration
         self._bank_modes = adapted(self._bank_modes, motion, speed)
-        self._bank = self._new_bank(variance_factor=VARIANCE_FACTOR, decision=0)
+        self._bank = self._new_bank(variance_factor=self.variance_factor, decision=0)
         self._calibration = None
         self._decision = self._modes[0].name
         report = self._bank.process(np.empty((0, 2)), np.empty(0), np.empty(0))

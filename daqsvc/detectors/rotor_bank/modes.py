@@ -100,14 +100,14 @@ def bank_modes(
                 f"mode {mode.name!r} is a static load of {list(mode.static_load_um)} um, but the probes are "
                 "AC-coupled and show no static position; use DC-coupled probes, or remove the mode"
             )
-        healthy = rotor.normalised(speed_rpm, mode.damping_ratio)
-        x, y = (load / rotor.clearance_um for load in mode.static_load_um)
-        changed = replace(
-            healthy,
-            e=healthy.e * mode.unbalance_ratio,
-            k=healthy.k * mode.stiffness_ratio,
-            load_x=0.0 if ac_coupled else healthy.load_x + x,
-            g=0.0 if ac_coupled else healthy.g - y,
+        changed = rotor.faulty(
+            speed_rpm,
+            damping_ratio=mode.damping_ratio,
+            unbalance_ratio=mode.unbalance_ratio,
+            stiffness_ratio=mode.stiffness_ratio,
+            static_load_um=complex(*mode.static_load_um),
         )
+        if ac_coupled:
+            changed = replace(changed, load_x=0.0, g=0.0)
         made.append(BankMode(mode.name, changed, rub_process_noise if mode.rub else process_noise, mode.rub))
     return tuple(made)

@@ -64,6 +64,8 @@ class RotorBankPlugin(DetectorPlugin[RotorBank]):
             f"noise {settings.noise_um:g} um; "
             f"rule {settings.rule}, {_thresholds(settings)}; "
         )
+        if settings.calibration is not None:
+            text += f"two modes from the run-up in {settings.calibration}; "
         if settings.calibrate_revolutions:
             text += f"unbalance and sag from the first {settings.calibrate_revolutions} revolutions; "
         return f"{text}modes {', '.join(map(_mode, settings.modes))}"
@@ -75,9 +77,12 @@ class RotorBankPlugin(DetectorPlugin[RotorBank]):
         del store
         # Here, not above: the kernels bring a compiler, which costs a second.
         from daqsvc.detectors.rotor_bank.build import bank_detector  # noqa: PLC0415
+        from daqsvc.rotor.calibration.file import CalibrationFileError  # noqa: PLC0415
 
         try:
             return (bank_detector(machine, settings),)
+        except CalibrationFileError as error:
+            raise AssemblyError(f"{machine.path}: pipeline.rotor_bank.calibration: {error}") from error
         except (ValueError, ArithmeticError) as error:
             raise AssemblyError(
                 f"{machine.path}: pipeline.rotor_bank: its observers cannot be made of these figures "
@@ -105,7 +110,11 @@ class RotorBankPlugin(DetectorPlugin[RotorBank]):
             )
         from daqsvc.detectors.rotor_bank import detectability as bank  # noqa: PLC0415 - brings the compiler
 
-        (detector,) = self.build(machine, settings, None)
+        try:
+            (detector,) = self.build(machine, settings, None)
+        except AssemblyError as error:
+            # Who asks names the file.
+            raise ValueError(str(error).removeprefix(f"{machine.path}: ")) from error
         prediction = bank.bank_detectability(machine, settings, detector, options.process_noise)
         return Detectability(bank.as_json(prediction, machine), bank.as_text(prediction, machine))
 

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from daqsvc.settings.files import FilePath  # noqa: TC001 - pydantic reads the annotations
 from daqsvc.settings.section import DampingRatio, Name, Nats, PositionUm, Section
 
 Severity = Literal["normal", "alert", "danger"]
@@ -89,6 +90,11 @@ class RotorBank(Section):
     calibrate_revolutions: Annotated[int, Field(ge=0, le=100_000)] = Field(
         default=0,
         description="healthy revolutions that unbalance and sag are measured over; 0 trusts the file",
+    )
+    calibration: FilePath | None = Field(
+        default=None,
+        description="file of daqsvc calibrate with a run-up: the rotor's two modes as that shows them, in "
+        "place of natural_frequency_hz, damping_ratio and eccentricity_um of [machine.rotor]",
     )
     modes: Annotated[
         tuple[Mode, ...],

@@ -20,8 +20,10 @@ from daqsvc.dsp.quality import recorded as checks
 from daqsvc.dsp.quality.unit import refuse_size
 from daqsvc.dsp.speed.revolutions import KeyphasorCutter
 from daqsvc.rotor.calibration.file import CalibrationRecord
-from daqsvc.rotor.calibration.run_up import LEAST_SPEED_RATIO, fit_run_up
+from daqsvc.rotor.calibration.run_up import LEAST_SPEED_RATIO, fit_run_up, revolutions_of
+from daqsvc.rotor.calibration.two_modes import fit_two_modes
 from daqsvc.rotor.synchronous.baseline import LEAST_REVOLUTIONS, Calibration, NotCalibratableError
+from daqsvc.rotor.synchronous.vectors import synchronous_vectors
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
     from daqsvc.detectors.rotor_synchronous.recorded_speed import RotorSetup
     from daqsvc.recording.recording import Recording
     from daqsvc.rotor.calibration.run_up import RunUpFit
+    from daqsvc.rotor.calibration.two_modes import TwoModeFit
 
     Floats = NDArray[np.float64]
 
@@ -70,7 +73,7 @@ def calibrate_recordings(
     Raises:
         RefusedError: a recording that cannot be the healthy machine, by name and with the reason.
     """
-    run_ups: list[tuple[Recording, RunUpFit]] = []
+    run_ups: list[tuple[Recording, RunUpFit, TwoModeFit]] = []
     steady: list[Recording] = []
     for number, recording in enumerate(recordings):
         try:
@@ -78,14 +81,16 @@ def calibrate_recordings(
             if sweep is None:
                 steady.append(recording)
             else:
-                run_ups.append((recording, fit_run_up(*sweep, recording.rate_hz)))
+                fit = fit_run_up(*sweep, recording.rate_hz)
+                run_ups.append((recording, fit, _two_modes(sweep, fit, recording.rate_hz)))
         except (RefusedError, NotCalibratableError) as error:
             raise _about(recording, error) from None
     if len(run_ups) > 1:
         raise RefusedError(
-            f"{' and '.join(str(recording.source) for recording, _ in run_ups)} are run-ups; give one of them"
+            f"{' and '.join(str(recording.source) for recording, *_ in run_ups)} are run-ups; "
+            "give one of them"
         )
-    run_up_recording, run_up = run_ups[0] if run_ups else (None, None)
+    run_up_recording, run_up, two_modes = run_ups[0] if run_ups else (None, None, None)
     if run_up is not None and (run_up.laval or not rotor_given):
         known = taken.rotor
         rotor = run_up.rotor(clearance_um=known.clearance_um, static_sag_um=known.static_sag_um)
@@ -111,6 +116,15 @@ def calibrate_recordings(
         steady_sources=tuple(str(recording.source) for recording in steady),
         run_up=run_up,
         run_up_source="" if run_up_recording is None else str(run_up_recording.source),
+        two_modes=two_modes,
+    )
+
+
+def _two_modes(sweep: _Sweep, fit: RunUpFit, rate_hz: float) -> TwoModeFit:
+    """The same run-up as a rotor with two modes."""
+    vectors = synchronous_vectors(revolutions_of(sweep.xy_um[:, 0] + 1j * sweep.xy_um[:, 1], sweep.angle_rad))
+    return fit_two_modes(
+        vectors, rate_hz, natural_frequency_hz=fit.natural_frequency_hz, damping_ratio=fit.damping_ratio
     )
 
 

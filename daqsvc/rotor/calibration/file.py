@@ -18,7 +18,9 @@ from pydantic_core import PydanticCustomError
 
 from daqsvc.confined.small_toml import TomlFileError, parse_toml, read_toml
 from daqsvc.rotor.calibration.run_up import RunUpFit
+from daqsvc.rotor.calibration.two_modes import TwoModeFit
 from daqsvc.rotor.laval import LavalRotor
+from daqsvc.rotor.model import TwoModes
 from daqsvc.rotor.synchronous.baseline import SPEED_TOLERANCE, Calibration
 from daqsvc.rotor.synchronous.speed_law import SpeedLaw
 
@@ -42,6 +44,7 @@ class CalibrationRecord:
         steady_sources: the recording that each baseline comes from.
         run_up: what a run-up showed, if there was one.
         run_up_source: the recording of it.
+        two_modes: the same run-up as a rotor with two modes, for a rotor bank.
         written: label of the date, ISO 8601; empty if not known.
     """
 
@@ -50,6 +53,7 @@ class CalibrationRecord:
     steady_sources: tuple[str, ...] = ()
     run_up: RunUpFit | None = None
     run_up_source: str = ""
+    two_modes: TwoModeFit | None = None
     written: str = ""
 
     def at(self, speed_rpm: float | None = None) -> Calibration:
@@ -143,13 +147,19 @@ def _refused(value: object, why: str) -> PydanticCustomError:
     return PydanticCustomError("refused", "{why}", {"why": why, "value": value})
 
 
-def _number(*, above: float = -math.inf, least: float = -math.inf, below: float = math.inf) -> AfterValidator:
+def _number(
+    *,
+    above: float = -math.inf,
+    least: float = -math.inf,
+    below: float = math.inf,
+    most: float = math.inf,
+) -> AfterValidator:
     """A number within bounds."""
-    bounds = (("above", above), ("at least", least), ("below", below))
+    bounds = (("above", above), ("at least", least), ("below", below), ("at most", most))
     wanted = " and ".join(f"{word} {bound:g}" for word, bound in bounds if math.isfinite(bound))
 
     def check(value: float) -> float:
-        if not (value > above and value >= least and value < below):
+        if not (value > above and value >= least and value < below and value <= most):
             raise _refused(value, f"it must be {wanted}; {_RESTORE}")
         return value
 
@@ -204,6 +214,7 @@ def _variances(covariance: list[list[float]]) -> list[list[float]]:
 Positive = Annotated[float, _number(above=0.0)]
 NotNegative = Annotated[float, _number(least=0.0)]
 Tolerance = Annotated[float, _number(least=0.0, below=1.0)]
+Share = Annotated[float, _number(above=0.0, most=1.0)]
 DampingRatio = Annotated[float, _number(above=0.0, below=1.0)]
 Count = Annotated[int, _whole(1)]
 _Row = Annotated[list[float], _list("4 numbers", 4)]
@@ -254,6 +265,42 @@ class _RunUpTable(_CalibrationTable):
             "centre_um": self.centre_um.made(),
         }
         return RunUpFit(**figures)
+
+
+class _TwoModesTable(_CalibrationTable):
+    verdict: str = ""
+    natural_frequency_hz: Positive
+    damping_ratio: Positive
+    eccentricity_um: _ComplexTable
+    support_share: Share
+    support_lag: Positive
+    cross_stiffness: float
+    anisotropy: _ComplexTable
+    damping_anisotropy: _ComplexTable
+    gyroscopic: float
+    higher_modes: _ComplexTable
+    runout_forward_um: _ComplexTable
+    runout_backward_um: _ComplexTable
+    fit_error: NotNegative
+
+    def made(self, speed_range_rpm: tuple[float, float]) -> TwoModeFit:
+        return TwoModeFit(
+            natural_frequency_hz=self.natural_frequency_hz,
+            damping_ratio=self.damping_ratio,
+            eccentricity_um=self.eccentricity_um.made(),
+            modes=TwoModes(
+                support_share=self.support_share,
+                support_lag=self.support_lag,
+                cross_stiffness=self.cross_stiffness,
+                anisotropy=self.anisotropy.made(),
+                damping_anisotropy=self.damping_anisotropy.made(),
+                gyroscopic=self.gyroscopic,
+                higher_modes=self.higher_modes.made(),
+                runout_um=(self.runout_forward_um.made(), self.runout_backward_um.made()),
+            ),
+            fit_error=self.fit_error,
+            speed_range_rpm=speed_range_rpm,
+        )
 
 
 class _ComponentTable(_ComplexTable):
@@ -315,6 +362,7 @@ class _CalibrationFile(_CalibrationTable):
     written: str = ""
     rotor: _RotorTable
     run_up: _RunUpTable | None = None
+    two_modes: _TwoModesTable | None = None
     steady: Annotated[list[_SteadyTable], _list("[[steady]] tables", of=dict)] = []
 
 
@@ -439,6 +487,8 @@ def _lines(record: CalibrationRecord) -> Iterator[str]:
         yield f"static_sag_um = {rotor.static_sag_um!r}"
     if record.run_up is not None:
         yield from _run_up_lines(record.run_up, record.run_up_source)
+    if record.two_modes is not None:
+        yield from _two_modes_lines(record.two_modes)
     for calibration, source in zip(record.steady, record.steady_sources, strict=True):
         if calibration.rotor != rotor:
             raise ValueError(
@@ -469,6 +519,26 @@ def _run_up_lines(fit: RunUpFit, source: str) -> Iterator[str]:
     rows = ",\n    ".join(f"[{', '.join(repr(float(value)) for value in row)}]" for row in fit.covariance)
     yield "# of ln natural_frequency_hz, ln damping_ratio, real and imaginary part of ln eccentricity"
     yield f"covariance = [\n    {rows},\n]"
+
+
+def _two_modes_lines(fit: TwoModeFit) -> Iterator[str]:
+    modes = fit.modes
+    forward, backward = modes.runout_um
+    yield "\n[two_modes]"
+    yield f"verdict = {_quoted(fit.describe())}"
+    yield f"natural_frequency_hz = {fit.natural_frequency_hz!r}  # of the static stiffness"
+    yield f"damping_ratio = {fit.damping_ratio!r}"
+    yield f"eccentricity_um = {_complex(fit.eccentricity_um)}  # {_polar(fit.eccentricity_um)}"
+    yield f"support_share = {modes.support_share!r}  # of the static deflection"
+    yield f"support_lag = {modes.support_lag!r}  # c over k, times the natural frequency in rad/s"
+    yield f"cross_stiffness = {modes.cross_stiffness!r}"
+    yield f"anisotropy = {_complex(modes.anisotropy)}"
+    yield f"damping_anisotropy = {_complex(modes.damping_anisotropy)}"
+    yield f"gyroscopic = {modes.gyroscopic!r}"
+    yield f"higher_modes = {_complex(modes.higher_modes)}"
+    yield f"runout_forward_um = {_complex(forward)}"
+    yield f"runout_backward_um = {_complex(backward)}"
+    yield f"fit_error = {fit.fit_error!r}  # of the whirl, not explained by two modes"
 
 
 def _steady_lines(calibration: Calibration, source: str) -> Iterator[str]:
@@ -537,12 +607,17 @@ def _record(document: Mapping[str, Any], path: Path) -> CalibrationRecord:
     if table.run_up is None and not table.steady:
         raise CalibrationFileError(f"{path}: neither [run_up] nor [[steady]] is there; calibrate again")
     rotor = LavalRotor(**table.rotor.model_dump())
+    run_up = None if table.run_up is None else table.run_up.made()
+    two_modes = None
+    if run_up is not None and table.two_modes is not None:
+        two_modes = table.two_modes.made(run_up.speed_range_rpm)
     return CalibrationRecord(
         rotor=rotor,
         steady=tuple(part.made(rotor) for part in table.steady),
         steady_sources=tuple(part.source for part in table.steady),
-        run_up=None if table.run_up is None else table.run_up.made(),
+        run_up=run_up,
         run_up_source="" if table.run_up is None else table.run_up.source,
+        two_modes=two_modes,
         written=table.written,
     )
 

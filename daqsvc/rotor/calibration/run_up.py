@@ -79,7 +79,7 @@ def fit_run_up(xy_um: Floats, angle_rad: Floats, rate_hz: float) -> RunUpFit:
     if len(xy_um) < 2:
         raise NotCalibratableError("the run-up holds no samples; give a recording of one")
     z = xy_um[:, 0] + 1j * xy_um[:, 1]
-    cut = _revolutions(z, angle_rad)
+    cut = revolutions_of(z, angle_rad)
     speeds_rpm = 60.0 * rate_hz / cut.period_samples
     low, high = float(speeds_rpm.min(initial=math.inf)), float(speeds_rpm.max(initial=0.0))
     if len(cut) < LEAST_REVOLUTIONS:
@@ -104,7 +104,7 @@ def fit_run_up(xy_um: Floats, angle_rad: Floats, rate_hz: float) -> RunUpFit:
     return _conclude(model, omega, zeta, angle_rad, (low, high))
 
 
-def _revolutions(z: Complexes, angle_rad: Floats) -> Revolutions:
+def revolutions_of(z: Complexes, angle_rad: Floats) -> Revolutions:
     """Cut by an angle that is known for every sample."""
     if not np.all(np.diff(angle_rad) > 0.0):
         raise ValueError("the angle of a run-up must grow from sample to sample; unwrap it")
@@ -178,8 +178,8 @@ def _conclude(
     linear, residual, columns = model.solve(omega, zeta)
     covariance = _covariance(model, omega, zeta, linear, residual, columns)
     whirl, left = model.split(omega, zeta, linear)
-    turning = synchronous_vectors(_revolutions(whirl, angle_rad))
-    unexplained = synchronous_vectors(_revolutions(left, angle_rad))
+    turning = synchronous_vectors(revolutions_of(whirl, angle_rad))
+    unexplained = synchronous_vectors(revolutions_of(left, angle_rad))
     usable = turning.usable & unexplained.usable
     turning, unexplained = turning[usable], unexplained[usable]
     samples = turning.samples

@@ -20,6 +20,7 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import ndtr
 
+from daqsvc.rotor.detectability.coupled import CoupledBank, evidence_of
 from daqsvc.rotor.detectability.evidence import (
     Axis,
     Observation,
@@ -179,17 +180,32 @@ class _Kind:
     worst: float
 
 
+def _loaded(rotor: NormalisedRotor, sag: float) -> NormalisedRotor:
+    load = rotor.load_for(complex(0.0, -sag))
+    return replace(rotor, load_x=rotor.load_x + load.real, g=rotor.g - load.imag)
+
+
 _MILDEST = 1e-4
 _KINDS = (
     _Kind("unbalance", lambda _, x: 1.0 + x, lambda r, x: replace(r, e=r.e * (1.0 + x)), 30.0),
     _Kind(
         "damping_loss",
         lambda r, x: r.zeta * (1.0 - x),
-        lambda r, x: replace(r, zeta=r.zeta * (1.0 - x)),
+        lambda r, x: replace(r, zeta=r.zeta * (1.0 - x), damping_anisotropy=r.damping_anisotropy * (1.0 - x)),
         0.98,
     ),
-    _Kind("stiffness_loss", lambda _, x: 1.0 - x, lambda r, x: replace(r, k=r.k * (1.0 - x)), 0.98),
-    _Kind("static_load", lambda _, x: x, lambda r, x: replace(r, g=r.g + r.k * x), 3.0),
+    _Kind(
+        "stiffness_loss",
+        lambda _, x: 1.0 - x,
+        lambda r, x: replace(
+            r,
+            k=r.k * (1.0 - x),
+            cross_stiffness=r.cross_stiffness * (1.0 - x),
+            anisotropy=r.anisotropy * (1.0 - x),
+        ),
+        0.98,
+    ),
+    _Kind("static_load", lambda _, x: x, _loaded, 3.0),
 )
 
 
@@ -412,6 +428,20 @@ def detectability(
         )
     q = modes[0].process_noise if process_noise is None else process_noise
     per_rev = 2.0 * math.pi / (abs(w) * duration)
+    if not all(mode.rotor.isotropic for mode in modes):
+        return _of_two_modes(
+            modes,
+            noise=noise,
+            duration=duration,
+            thresholds=np.broadcast_to(np.asarray(threshold_nats, np.float64), (len(modes), len(modes))),
+            variance_factor=variance_factor,
+            process_noise=q,
+            ac_coupled=ac_coupled,
+            within_rev=within_rev,
+            calibration_rev=calibration_rev,
+            faults=faults,
+            seed=seed,
+        )
 
     def axis(mode: BankMode) -> Axis:
         return Axis(mode, noise=noise, duration=duration, process_noise=q, variance_factor=variance_factor)
@@ -468,6 +498,118 @@ def detectability(
             mode.name
             for mode in modes
             if not mode.rub and abs(mode.rotor.orbit()) + abs(mode.rotor.rest) >= 1.0
+        ),
+    )
+
+
+def _of_two_modes(
+    modes: Sequence[BankMode],
+    *,
+    noise: float,
+    duration: float,
+    thresholds: Floats,
+    variance_factor: float,
+    process_noise: float,
+    ac_coupled: bool,
+    within_rev: float,
+    calibration_rev: float,
+    faults: Sequence[Fault],
+    seed: int,
+) -> BankDetectability:
+    """The same of a bank whose rotor has two modes; see `coupled`."""
+    w = modes[0].rotor.w
+    bank = CoupledBank(modes, noise=noise, duration=duration, variance_factor=variance_factor)
+    rates, delays = bank.changes(thresholds, process_noise, seed)
+    steady = bank.steady()
+    rubs = np.array([mode.rub for mode in modes])
+    computed = ~(rubs | rubs[:, np.newaxis])
+    rates[computed] = steady[computed]
+    weakest = np.minimum(rates, rates.T)
+    ambiguities = []
+    speeds = [w * (1.0 + sign * step * 0.02) for step in range(1, 16) for sign in (-1.0, 1.0)]
+    elsewhere = [(speed, np.minimum(at, at.T)) for speed in speeds for at in (bank.steady(speed),)]
+    for i, j in itertools.combinations(range(len(modes)), 2):
+        if weakest[i, j] >= AMBIGUOUS_NATS_PER_REV:
+            continue
+        delays[i, j] = delays[j, i] = math.inf
+        opens = next(
+            (
+                (speed, float(at[i, j]))
+                for speed, at in elsewhere
+                if computed[i, j] and at[i, j] >= OPEN_NATS_PER_REV
+            ),
+            None,
+        )
+        ambiguities.append(
+            Ambiguity(
+                modes=(modes[i].name, modes[j].name),
+                nats_per_rev=float(weakest[i, j]),
+                opens_at_w=opens and opens[0],
+                open_nats_per_rev=opens and opens[1],
+            )
+        )
+
+    needed = float(thresholds[0, 1:].max()) / within_rev
+    per_rev = 2.0 * math.pi / (abs(w) * duration)
+    rotor = modes[0].rotor
+    white = 2.0 * noise**2 / per_rev
+    variance = white / calibration_rev + (_VECTOR_FLOOR * abs(rotor.orbit())) ** 2
+
+    def smallest(kind: _Kind, *, by_bank: bool) -> float | None:
+        if ac_coupled and kind.fault == "static_load":
+            return None
+
+        def clarity(severity: float) -> float:
+            seen = evidence_of(
+                modes[0],
+                kind.rotor(rotor, severity),
+                noise=noise,
+                duration=duration,
+                variance_factor=variance_factor,
+            )
+            if by_bank:
+                return seen.nats_per_rev / needed
+            return sum(abs(part) ** 2 for part in seen.moved) / variance / VECTOR_THRESHOLD_NATS
+
+        severity = _mildest(clarity, kind.worst)
+        return None if severity is None else kind.quantity(rotor, severity)
+
+    return BankDetectability(
+        modes=tuple(mode.name for mode in modes),
+        w=w,
+        samples_per_rev=per_rev,
+        noise=noise,
+        process_noise=process_noise,
+        pairs=tuple(
+            PairEvidence(
+                truth=modes[j].name,
+                rival=modes[i].name,
+                nats_per_rev=float(rates[j, i]),
+                delay_rev=float(delays[j, i]),
+                threshold_nats=float(thresholds[i, j]),
+                simulated=not computed[i, j],
+            )
+            for j, i in itertools.permutations(range(len(modes)), 2)
+        ),
+        ambiguities=tuple(ambiguities),
+        smallest=tuple(
+            SmallestChange(
+                fault=kind.fault,
+                healthy=kind.quantity(rotor, 0.0),
+                by_bank=smallest(kind, by_bank=True),
+                by_vector=smallest(kind, by_bank=False),
+            )
+            for kind in _KINDS
+            if kind.fault in faults
+        ),
+        within_rev=within_rev,
+        calibration_rev=calibration_rev,
+        false_alarms_per_1000_rev=1000.0 * per_rev * float(np.exp(-thresholds[0, 1:]).sum()),
+        touching=tuple(
+            mode.name
+            for mode in modes
+            if not mode.rub
+            and abs(mode.rotor.orbit()) + abs(mode.rotor.backward_orbit()) + abs(mode.rotor.rest) >= 1.0
         ),
     )
 

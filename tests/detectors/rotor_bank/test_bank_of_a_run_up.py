@@ -1,0 +1,174 @@
+"""A bank whose observers come from a run-up: from the recording to a name, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from support.machine_files import MACHINES, changed, only_problem
+from support.two_mode_rotors import RATE_HZ, Machine, run_up
+
+from daqsvc.cli import main
+from daqsvc.detectors.rotor_bank.build import bank_detector
+from daqsvc.detectors.rotor_bank.plugin import RotorBankPlugin
+from daqsvc.detectors.rotor_bank.settings import RotorBank
+from daqsvc.diagnosis.detector import Window
+from daqsvc.rotor.calibration.file import load_record, save_record
+from daqsvc.settings import parse_machine_file
+from daqsvc.settings.problems import AssemblyError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+pytestmark = pytest.mark.integration
+TWELVE = MACHINES / "laval-rig-twelve-modes.toml"
+MACHINE = Machine()
+SPEED_HZ = 28.0
+NOISE_UM = 2.0
+ON_THIS_RIG = (
+    ("speed_rpm = 600.0", f"speed_rpm = {60.0 * SPEED_HZ}"),
+    ("natural_frequency_hz = 10.0 ", "natural_frequency_hz = 30.0 "),
+    ("clearance_um = 100.0", "clearance_um = 250.0"),
+    ("static_sag_um = 10.0", "static_sag_um = 38.0"),
+    ("rate_hz = 640.0", f"rate_hz = {RATE_HZ}"),
+    ("noise_um = 2.0", f'noise_um = {NOISE_UM}\ncalibration = "rotor.toml"'),
+)
+
+
+def keyphasor_volts(angle):
+    return np.where(np.mod(angle, math.tau) < math.tau - 0.35, -2.0, -10.0)
+
+
+def channels(position, angle, seed=0):
+    rng = np.random.default_rng(seed)
+    noise = NOISE_UM * rng.standard_normal((len(position), 2))
+    return np.column_stack((position.real + noise[:, 0], position.imag + noise[:, 1], keyphasor_volts(angle)))
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory) -> Path:
+    """A folder with the calibration that ``daqsvc calibrate`` makes of a run-up, and the run-up."""
+    folder = tmp_path_factory.mktemp("rig")
+    position, angle = run_up(MACHINE, 8.0, 50.0, 20.0)
+    table = channels(position, angle)
+    header = "x,y,kph"
+    np.savetxt(folder / "run-up.csv", table, fmt="%.3f", delimiter=",", header=header, comments="")
+    arguments = ["calibrate", str(folder / "run-up.csv"), "--probes", "x,y", "--keyphasor", "kph"]
+    arguments += ["--fs", str(RATE_HZ), "--unit", "um", "--clearance-um", "250"]
+    assert main([*arguments, "--out", str(folder / "rotor.toml")]) == 0
+    return folder
+
+
+def machine_of(folder: Path, *more: tuple[str, str]):
+    path = folder / "machine.toml"
+    path.write_text(changed(TWELVE, *ON_THIS_RIG, *more)[0], encoding="utf-8")
+    return parse_machine_file(path.read_text(encoding="utf-8"), path)
+
+
+def settings_of(machine) -> RotorBank:
+    table = machine.pipeline.table(RotorBank)
+    assert table is not None
+    return table
+
+
+def said_of(machine, parts, seed=0):
+    """What the bank says of steady stretches, 60 revolutions each."""
+    detector = bank_detector(machine, settings_of(machine))
+    n = round(60.0 * RATE_HZ / SPEED_HZ)
+    angle = 0.4 + math.tau * SPEED_HZ / RATE_HZ * np.arange(n * len(parts))
+    turn = np.exp(1j * angle)
+    position = np.concatenate(
+        [
+            forward * turn[k * n : k * n + n] + backward / turn[k * n : k * n + n] + one.rest
+            for k, one in enumerate(parts)
+            for forward, backward in (one.orbit(SPEED_HZ),)
+        ]
+    )
+    samples = channels(position, angle, seed).astype(np.float32)
+    said = []
+    for begin in range(0, len(samples), detector.block):
+        part = samples[begin : begin + detector.block]
+        last = begin + len(part) - 1
+        said += detector.process(Window(begin, part, round(last * 1e9 / RATE_HZ), 1e9 / RATE_HZ))
+    return detector, said
+
+
+def test_the_run_up_is_in_the_file(calibrated):
+    record = load_record(calibrated / "rotor.toml")
+    assert record.two_modes is not None
+    assert record.two_modes.explains
+    assert record.two_modes.modes.support_share == pytest.approx(1.0 / 3.0, abs=0.06)
+    text = (calibrated / "rotor.toml").read_text(encoding="utf-8")
+    assert "two modes explain 1X from" in text
+    assert "[two_modes]" in text
+
+
+@pytest.mark.parametrize(
+    ("fault", "part"), [("damping_loss", MACHINE.damped(0.4)), ("stiffness_loss", MACHINE.softened(0.7))]
+)
+def test_faults_of_a_machine_that_is_no_laval_rotor_are_named(calibrated, fault, part):
+    detector, said = said_of(machine_of(calibrated), [MACHINE, part])
+    healthy = [one for one in said if one.end_index < 60.0 * RATE_HZ / SPEED_HZ and one.quality == "good"]
+    assert {one.decision for one in healthy} <= {"undetermined", "N"}
+    assert healthy[-1].decision == "N"
+    assert detector.faults[said[-1].decision] == fault
+
+
+def test_a_run_up_needs_healthy_revolutions_beside_it(calibrated):
+    problem, _ = only_problem(
+        TWELVE, *ON_THIS_RIG, ("calibrate_revolutions = 20", "calibrate_revolutions = 0")
+    )
+    assert "calibrate_revolutions" in str(problem)
+    assert "write e.g. calibrate_revolutions = 50" in str(problem)
+
+
+def test_the_eccentricity_need_not_be_stated(calibrated):
+    machine = machine_of(calibrated, ("eccentricity_um = 10.0 ", "#"))
+    assert bank_detector(machine, settings_of(machine)).bank_modes[0].rotor.e > 0.0
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda record: replace(record, two_modes=None), "holds no run-up"),
+        (
+            lambda record: replace(record, two_modes=replace(record.two_modes, fit_error=0.4)),
+            r"two modes do not explain .*rotor_synchronous",
+        ),
+        (
+            lambda record: replace(
+                record,
+                run_up=replace(record.run_up, speed_range_rpm=(2400.0, 3000.0)),
+            ),
+            "the run-up went from 2400 to 3000 rpm, and machine.speed_rpm is 1680",
+        ),
+    ],
+)
+def test_what_cannot_be_used_is_said(calibrated, tmp_path, spoil, said):
+    machine = machine_of(tmp_path)
+    save_record(spoil(load_record(calibrated / "rotor.toml")), tmp_path / "rotor.toml")
+    with pytest.raises(AssemblyError, match=said) as caught:
+        RotorBankPlugin().check_files(machine, settings_of(machine))
+    assert "pipeline.rotor_bank.calibration" in str(caught.value)
+    assert "rotor.toml" in str(caught.value)
+
+
+def test_a_file_that_is_not_there_is_said(tmp_path):
+    machine = machine_of(tmp_path)
+    with pytest.raises(AssemblyError, match=r"rotor\.toml: No such file"):
+        RotorBankPlugin().check_files(machine, settings_of(machine))
+
+
+def test_what_can_be_told_apart_is_known_beforehand(calibrated, capsys):
+    machine_of(calibrated)
+    assert main(["detectability", str(calibrated / "machine.toml"), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    pairs = {(pair["truth"], pair["rival"]): pair for pair in told["pairs"]}
+    assert pairs["D1", "N"]["nats_per_rev"] > 1.0
+    assert pairs["U3", "N"]["delay_rev"] < pairs["U1", "N"]["delay_rev"]
+    smallest = {change["fault"]: change for change in told["smallest_change"]}
+    assert 1.0 < smallest["unbalance"]["by_bank"] < 1.3

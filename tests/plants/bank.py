@@ -1,0 +1,282 @@
+"""What the live bank says of the plants' machines, its observers identified from their run-up.
+
+The run-up is read in noise of 20 dB, once for each geometry; then every record at three noise levels.
+Stated is what an engineer would state: sag by the natural frequency, the clearance by the drawing, and levels
+of each fault that need not be the true ones. The delay is compared with that of a test that is told when the
+change comes: the same observers' evidence, summed from that sample on.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+import zlib
+from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+from plants.score import PER_REV, SNR_DB, keyphasor_volts, window_of
+
+from daqsvc.detectors.rotor_bank.detector import RotorBankDetector
+from daqsvc.detectors.rotor_bank.modes import RotorMode, bank_modes
+from daqsvc.dsp.probes import Probe
+from daqsvc.dsp.speed.keyphasor import KeyphasorProbe
+from daqsvc.rotor import coupled_kernels
+from daqsvc.rotor.calibration.run_up import fit_run_up, revolutions_of
+from daqsvc.rotor.calibration.two_modes import TwoModeFit, fit_two_modes
+from daqsvc.rotor.coupled import couple, state_matrix
+from daqsvc.rotor.decision import DecisionRules
+from daqsvc.rotor.discretise import discretise
+from daqsvc.rotor.laval import STANDARD_GRAVITY_M_S2
+from daqsvc.rotor.model import RotorParameters
+from daqsvc.rotor.synchronous.vectors import synchronous_vectors
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    Case = dict[str, object]
+
+ONSET_REV = 90
+_RULES = DecisionRules(settle_revolutions=4.0)
+_STATOR, _FRICTION = 2.0, 0.1
+_LEVELS: dict[str, tuple[float, ...]] = {
+    "unbalance": (1.4, 1.8, 2.5),
+    "damping_loss": (0.7, 0.5, 0.35),
+    "stiffness_loss": (0.97, 0.94, 0.9, 0.85, 0.8, 0.75, 0.7, 0.6),
+    "static_load": (0.5, 1.0),
+    "rub": (4.5, 5.5),
+}
+_SETTLING_REV = 30
+"""Revolutions of a told test's observers before the change."""
+
+
+@dataclass(frozen=True, slots=True)
+class BankSaid:
+    """What the bank said of a record at one signal-to-noise ratio.
+
+    Attributes:
+        case: its name.
+        geometry: of the machine.
+        fault: what happened.
+        snr_db: ratio.
+        false_alarms: departures before anything happened.
+        fault_said: what it says at the end; empty without a name.
+        group: all that it may be, by what was said at the end.
+        delay: revolutions from the change to the departure; None if there was none.
+        told_delay: the same of a test that is told when the change comes.
+        onset_error: revolutions that the stated onset is late.
+    """
+
+    case: str
+    geometry: str
+    fault: str
+    snr_db: int
+    false_alarms: int
+    fault_said: str
+    group: tuple[str, ...]
+    delay: float | None
+    told_delay: float | None
+    onset_error: float | None
+
+    @property
+    def right(self) -> bool:
+        """Whether it is what happened, and nothing else; a healthy machine may look like a fault."""
+        return self.fault_said == self.fault and (self.fault == "healthy" or set(self.group) == {self.fault})
+
+    @property
+    def wrong(self) -> bool:
+        """Whether it has a name, and what happened is not among what it may be."""
+        return self.fault_said not in {"", "healthy"} and not self.told
+
+    @property
+    def told(self) -> bool:
+        """Whether what happened is among what was said."""
+        return self.fault in self.group
+
+
+@functools.lru_cache(maxsize=16)
+def identified(folder: Path, geometry: str, seed: int) -> TwoModeFit:
+    """Two modes of a geometry, from its run-up."""
+    with np.load(folder / f"bank-{geometry}-run-up.npz".replace(" ", "-")) as kept:
+        z, angle, rate_hz = kept["z_um"].astype(np.complex128), kept["angle_rad"], float(kept["rate_hz"])
+    rng = np.random.default_rng([seed, zlib.crc32(geometry.encode())])
+    noise = math.sqrt(float(np.var(z)) / 2.0 / 100.0)
+    z = z + noise * (rng.standard_normal(len(z)) + 1j * rng.standard_normal(len(z)))
+    nearest = fit_run_up(np.column_stack((z.real, z.imag)), angle, rate_hz)
+    return fit_two_modes(
+        synchronous_vectors(revolutions_of(z, angle)),
+        rate_hz,
+        natural_frequency_hz=nearest.natural_frequency_hz,
+        damping_ratio=nearest.damping_ratio,
+    )
+
+
+def _modes(rotor: RotorParameters, speed_rpm: float, whirl_um: float) -> list[RotorMode]:
+    """Levels of every fault; without those that the machine cannot run in, as it would whirl by itself."""
+    damping_ratio = rotor.damping_ratio
+    made = {
+        "unbalance": lambda name, level: RotorMode(name, unbalance_ratio=level),
+        "damping_loss": lambda name, level: RotorMode(name, damping_ratio=level * damping_ratio),
+        "stiffness_loss": lambda name, level: RotorMode(name, stiffness_ratio=level),
+        "static_load": lambda name, level: RotorMode(name, static_load_um=(0.0, -level * whirl_um)),
+        "rub": lambda name, level: RotorMode(name, unbalance_ratio=level, rub=True),
+    }
+    modes = [RotorMode("healthy 0")] + [
+        made[fault](f"{fault} {number}", level)
+        for fault, levels in _LEVELS.items()
+        for number, level in enumerate(levels, 1)
+    ]
+    rotors = [one.rotor for one in bank_modes(modes, rotor, speed_rpm)]
+    return [
+        mode
+        for mode, one in zip(modes, rotors, strict=True)
+        if np.linalg.eigvals(state_matrix(one, one.w)).real.max() < 0.0
+    ]
+
+
+def judge_bank(folder: Path, seed: int, job: tuple[Case, int]) -> BankSaid:
+    """Run the bank over a record."""
+    case, snr_db = job
+    with np.load(folder / f"{case['name']}.npz") as kept:
+        z, angle = kept["z_um"].astype(np.complex128), kept["angle_rad"]
+    rng = np.random.default_rng([seed, snr_db, zlib.crc32(str(case["name"]).encode())])
+    noise_um = math.sqrt(float(np.var(z[: ONSET_REV * PER_REV])) / 2.0 / 10.0 ** (snr_db / 10.0))
+    z = z + noise_um * (rng.standard_normal(len(z)) + 1j * rng.standard_normal(len(z)))
+    samples = np.stack((z.real, z.imag, keyphasor_volts(angle, rng)), axis=1).astype(np.float32)
+    fit = identified(folder, str(case["geometry"]), seed)
+    speed_rpm = float(case["speed_rpm"])  # type: ignore[arg-type]
+    rotor = fit.rotor(
+        RotorParameters(
+            natural_frequency_hz=fit.natural_frequency_hz,
+            damping_ratio=fit.damping_ratio,
+            eccentricity_um=1.0,
+            clearance_um=float(case["clearance_um"]),  # type: ignore[arg-type]
+            static_sag_um=1e6 * STANDARD_GRAVITY_M_S2 / (math.tau * fit.natural_frequency_hz) ** 2,
+            contact_stiffness=_STATOR,
+            friction=_FRICTION,
+        )
+    )
+    rate_hz = speed_rpm / 60.0 * PER_REV
+    detector = RotorBankDetector(
+        machine=str(case["geometry"]),
+        stream="shaft",
+        rate_hz=rate_hz,
+        speed_rpm=speed_rpm,
+        probes=(Probe("x", 0, 0.0), Probe("y", 1, 90.0)),
+        keyphasor=KeyphasorProbe("keyphasor", 2, -6.0),
+        rotor=rotor,
+        modes=_modes(rotor, speed_rpm, float(case["whirl_um"])),  # type: ignore[arg-type]
+        noise_um=noise_um,
+        calibrate_revolutions=40,
+        rules=_RULES,
+    )
+    alarms, delay, onset, before, end = 0, None, None, "", None
+    for begin in range(0, len(samples), detector.block):
+        for said in detector.process(window_of(samples[begin : begin + detector.block], begin, rate_hz)):
+            at = said.end_index / PER_REV
+            changed = said.decision not in {"undetermined", "healthy 0"}
+            if changed and before in {"", "undetermined", "healthy 0"}:
+                if at <= ONSET_REV:
+                    alarms += 1
+                elif delay is None:
+                    delay, onset = at - ONSET_REV, said.first_index / PER_REV - ONSET_REV
+            before, end = said.decision, said
+    assert end is not None
+    fault = str(case["fault"])
+    group = dict.fromkeys(name.rsplit(" ", 1)[0] for name in (end.decision, *map(str, end.group)))
+    return BankSaid(
+        case=str(case["name"]),
+        geometry=str(case["geometry"]),
+        fault=fault,
+        snr_db=snr_db,
+        false_alarms=alarms,
+        fault_said=end.decision.rsplit(" ", 1)[0] if " " in end.decision else "",
+        group=tuple(name for name in group if name not in {"undetermined", "departure"}),
+        delay=delay,
+        told_delay=_told_delay(detector, z, angle, fault),
+        onset_error=onset,
+    )
+
+
+def _told_delay(
+    detector: RotorBankDetector, z: NDArray[np.complex128], angle: NDArray[np.float64], fault: str
+) -> float | None:
+    """Revolutions until the evidence of any level of the fault, summed from the change on, is enough."""
+    if fault == "healthy":
+        return None
+    modes = [m for m in detector.bank_modes if m.name.rsplit(" ", 1)[0] in {"healthy", fault}]
+    figures = {
+        "noise": detector.noise,
+        "duration": detector.duration,
+        "variance_factor": detector.variance_factor,
+    }
+    observers = discretise(modes, **figures)
+    couplings = couple(modes, observers, **figures)
+    part = slice((ONSET_REV - _SETTLING_REV) * PER_REV, None)
+    clearance = detector.clearance_um
+    xy = np.column_stack((z[part].real, z[part].imag)) / clearance
+    states, scores = np.zeros((len(modes), 4)), np.empty((len(modes), len(xy)))
+    states[observers["substeps"] > 0] = np.nan
+    cos, sin = np.cos(angle[part]), np.sin(angle[part])
+    coupled_kernels.run_free(xy, cos, sin, observers, couplings, states, scores)
+    evidence = np.cumsum((scores[1:] - scores[0])[:, _SETTLING_REV * PER_REV :], axis=1).max(axis=0)
+    passed = np.flatnonzero(evidence >= _RULES.threshold_nats)
+    return float(passed[0] + 1) / PER_REV if len(passed) else None
+
+
+def bank_summary(said: Sequence[BankSaid]) -> list[str]:
+    """One row for every ratio."""
+    lines = [
+        "| SNR | right | told | wrong | not seen | healthy right | false alarms | onset off | delay ratio |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for snr in SNR_DB:
+        at = [one for one in said if one.snr_db == snr]
+        faults = [one for one in at if one.fault != "healthy"]
+        healthy = [one for one in at if one.fault == "healthy"]
+        both = [one.delay / one.told_delay for one in faults if one.delay and one.told_delay]
+        off = [abs(one.onset_error) for one in faults if one.onset_error is not None]
+
+        def share(of: Callable[[BankSaid], bool], runs: Sequence[BankSaid]) -> str:
+            return f"{100.0 * sum(map(of, runs)) / len(runs):.1f} %"
+
+        lines.append(
+            f"| {snr} dB | {share(lambda one: one.right, faults)} | {share(lambda one: one.told, faults)} | "
+            f"{share(lambda one: one.wrong, faults)} of {len(faults)} | "
+            f"{share(lambda one: one.delay is None, faults)} | {share(lambda one: one.right, healthy)} | "
+            f"{sum(one.false_alarms for one in at)} in {ONSET_REV * len(at)} revolutions | "
+            f"{np.median(off):.2f} rev | {np.median(both):.2f} |"
+        )
+    return lines
+
+
+def bank_answers(said: Sequence[BankSaid], snr_db: int) -> list[str]:
+    """What each fault is called on each machine at one ratio."""
+    lines = [f"| machine, {snr_db} dB | " + " | ".join(_LEVELS) + " |", "|---|" + "---|" * len(_LEVELS)]
+    at = [one for one in said if one.snr_db == snr_db]
+    for machine in dict.fromkeys(one.geometry for one in at):
+        cells = []
+        for fault in _LEVELS:
+            runs = [one for one in at if (one.geometry, one.fault) == (machine, fault)]
+            found = Counter(" or ".join(sorted(one.group)) or "departure" for one in runs)
+            told = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in found.most_common())
+            cells.append(told)
+        lines.append(f"| {machine} | " + " | ".join(cells) + " |")
+    return lines
+
+
+def bank_scored(
+    folder: Path, *, aside: bool, seed: int = 0, snr_db: Sequence[int] = SNR_DB
+) -> list[BankSaid]:
+    """Judge all records of one half."""
+    cases = json.loads((folder / "bank.json").read_text())
+    jobs = [(case, snr) for case in cases if case["aside"] == aside for snr in snr_db]
+    with ProcessPoolExecutor(2) as pool:
+        return list(pool.map(partial(judge_bank, folder, seed), jobs, chunksize=11))

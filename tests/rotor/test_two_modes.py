@@ -1,0 +1,142 @@
+"""Two modes from a run-up: what they are, and that faults derived from them come true."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from support.two_mode_rotors import RATE_HZ, UNIT_HZ, Machine, run_up
+
+from daqsvc.rotor.calibration.run_up import fit_run_up, revolutions_of
+from daqsvc.rotor.calibration.two_modes import TwoModeFit, fit_two_modes
+from daqsvc.rotor.model import RotorParameters
+from daqsvc.rotor.synchronous.baseline import NotCalibratableError
+from daqsvc.rotor.synchronous.vectors import synchronous_vectors
+
+MACHINE = Machine()
+KNOWN = RotorParameters(
+    natural_frequency_hz=1.0, damping_ratio=0.1, eccentricity_um=1.0, clearance_um=200.0, static_sag_um=40.0
+)
+
+
+def fitted(position, angle):
+    nearest = fit_run_up(np.column_stack((position.real, position.imag)), angle, RATE_HZ)
+    return nearest, fit_two_modes(
+        synchronous_vectors(revolutions_of(position, angle)),
+        RATE_HZ,
+        natural_frequency_hz=nearest.natural_frequency_hz,
+        damping_ratio=nearest.damping_ratio,
+    )
+
+
+@cache
+def identified(noise_um: float = 0.0) -> TwoModeFit:
+    position, angle = run_up(MACHINE, 8.0, 50.0, 25.0)
+    rng = np.random.default_rng(3)
+    noise = noise_um * (rng.standard_normal(len(position)) + 1j * rng.standard_normal(len(position)))
+    return fitted(position + noise, angle)[1]
+
+
+def off(machine: Machine, speed_hz: float, **fault: object) -> float:
+    """How far a derived orbit is from the true one, in parts of that."""
+    fit = identified()
+    rotor = fit.rotor(KNOWN).faulty(60.0 * speed_hz, **fault)
+    forward, backward = machine.orbit(speed_hz)
+    return math.hypot(
+        abs(KNOWN.clearance_um * rotor.orbit() - forward),
+        abs(KNOWN.clearance_um * rotor.backward_orbit() - backward),
+    ) / math.hypot(abs(forward), abs(backward))
+
+
+def test_one_laval_rotor_does_not_explain_what_two_modes_do():
+    nearest, fit = fitted(*run_up(MACHINE, 8.0, 50.0, 25.0))
+    assert not nearest.laval
+    assert nearest.fit_error > 0.15
+    assert fit.fit_error < 0.01
+    assert fit.explains
+    assert "two modes explain 1X from 4" in fit.describe()
+
+
+@pytest.mark.parametrize("noise_um", [0.0, 2.0])
+def test_the_figures_are_those_of_the_machine(noise_um):
+    fit = identified(noise_um)
+    support = sum(MACHINE.supports) / 2.0
+    static = 1.0 / (1.0 / MACHINE.shaft + 1.0 / support)
+    assert fit.natural_frequency_hz == pytest.approx(UNIT_HZ * math.sqrt(static), rel=0.02)
+    assert fit.modes.support_share == pytest.approx(MACHINE.shaft / (MACHINE.shaft + support), abs=0.04)
+    lag = MACHINE.dampers[0] / support * fit.natural_frequency_hz / UNIT_HZ
+    assert fit.modes.support_lag == pytest.approx(lag, rel=0.15)
+    uneven = (MACHINE.supports[0] - MACHINE.supports[1]) / 2.0 / support
+    assert fit.modes.anisotropy == pytest.approx(uneven, abs=0.03)
+    assert abs(fit.modes.damping_anisotropy) < 0.03
+    assert abs(fit.eccentricity_um) == pytest.approx(abs(MACHINE.eccentricity_um), rel=0.03)
+
+
+@pytest.mark.parametrize("speed_hz", [20.0, 28.0, 38.0])
+def test_orbits_of_derived_faults_come_true(speed_hz):
+    assert off(MACHINE, speed_hz) < 0.02
+    damping = identified().damping_ratio
+    assert off(MACHINE.damped(0.5), speed_hz, damping_ratio=0.5 * damping) < 0.02
+    # Supports at .6 of their stiffness, and what is left of the static one with the shaft in series.
+    share = MACHINE.shaft / (MACHINE.shaft + sum(MACHINE.supports) / 2.0)
+    left = 1.0 / (1.0 - share + share / 0.6)
+    assert off(MACHINE.softened(0.6), speed_hz, stiffness_ratio=left) < 0.05
+
+
+def test_damping_alone_would_be_far_off():
+    # Without the supports' share a weaker damper leaves the frequency where it was.
+    fit = identified()
+    rotor = fit.rotor(KNOWN)
+    alone = rotor.faulty(60.0 * 28.0)
+    halved = replace(alone, zeta=0.5 * alone.zeta, damping_anisotropy=0.5 * alone.damping_anisotropy)
+    forward, _ = MACHINE.damped(0.5).orbit(28.0)
+    naive = abs(KNOWN.clearance_um * halved.orbit() - forward) / abs(forward)
+    derived = off(MACHINE.damped(0.5), 28.0, damping_ratio=0.5 * fit.damping_ratio)
+    assert naive > 3.0 * derived
+
+
+def test_weight_rests_on_the_static_stiffness():
+    rotor = identified().rotor(KNOWN)
+    assert rotor.faulty(1500.0).rest == pytest.approx(-40.0j / 200.0)
+    assert rotor.faulty(1500.0, damping_ratio=0.4 * rotor.damping_ratio).rest == pytest.approx(-0.2j)
+    assert rotor.faulty(1500.0, stiffness_ratio=0.8).rest == pytest.approx(-0.25j)
+    assert rotor.faulty(1500.0, static_load_um=20.0 + 0j).rest == pytest.approx(0.1 - 0.2j)
+
+
+def test_a_shaft_that_turns_clockwise_has_the_mirrored_orbit():
+    fit = identified()
+    against, clockwise = fit.rotor(KNOWN), fit.rotor(KNOWN, clockwise=True)
+    for fault in ({}, {"stiffness_ratio": 0.8}, {"unbalance_ratio": 2.0}):
+        one, other = against.faulty(1500.0, **fault), clockwise.faulty(-1500.0, **fault)
+        for angle in (0.0, 0.7, 2.0):
+            turn = np.exp(1j * angle)
+            z = one.orbit() * turn + one.backward_orbit() / turn
+            mirrored = other.orbit() / turn + other.backward_orbit() * turn
+            assert mirrored == pytest.approx(-np.conj(z), abs=1e-9)
+
+
+def test_a_laval_rotor_is_one_of_two_modes():
+    alike = Machine(supports=(3.0, 3.0))
+    nearest, fit = fitted(*run_up(alike, 8.0, 50.0, 25.0))
+    assert nearest.laval
+    assert fit.fit_error < 0.01
+    assert abs(fit.modes.anisotropy) < 0.01
+    assert abs(fit.modes.runout_um[1]) < 0.2
+
+
+def test_what_no_two_modes_make_is_said():
+    position, angle = run_up(MACHINE, 8.0, 50.0, 25.0)
+    strange = position + 30.0 * np.exp(1j * (angle + 3.0 * np.sin(angle / 40.0)))
+    _, fit = fitted(strange, angle)
+    assert not fit.explains
+    assert "a rotor bank cannot be made" in fit.describe()
+
+
+def test_too_few_revolutions_are_refused():
+    position, angle = run_up(MACHINE, 8.0, 50.0, 25.0)
+    vectors = synchronous_vectors(revolutions_of(position, angle))
+    with pytest.raises(NotCalibratableError, match="only 10 revolutions"):
+        fit_two_modes(vectors[:10], RATE_HZ, natural_frequency_hz=28.0, damping_ratio=0.1)
