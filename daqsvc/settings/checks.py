@@ -27,6 +27,7 @@ from daqsvc.settings.plugins import (
 from daqsvc.settings.problems import Finding, choice, unique
 from daqsvc.settings.registry import broken_drivers
 from daqsvc.settings.rotor_physics import physics_checks
+from daqsvc.settings.rounding import rounded_down
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.sensor_checks import (
     check_alarm_reach,
@@ -318,8 +319,8 @@ def _fine_enough(draft: MachineFile, max_error_us: float) -> Iterator[Finding]:
             (*_ALIGNMENT, "max_error_us"),
             f"{max_error_us:g} us are {error_deg:.3g} deg of a revolution at {speed_rpm:g} rpm: as much as a "
             "fault moves the phase",
-            f"write max_error_us = {_COARSE_DEG / 6.0 / speed_rpm * 1e6:.3g} or less, or bring the sensors "
-            "together in one stream",
+            f"write max_error_us = {rounded_down(_COARSE_DEG / 6.0 / speed_rpm * 1e6)} or less, or bring the "
+            "sensors together in one stream",
             fatal=False,
         )
 
@@ -411,5 +412,6 @@ def _check_memory(draft: MachineFile) -> Iterator[Finding]:
         ("pipeline", "ring_s"),
         f"the rings of {draft.pipeline.ring_s:g} s would take {together / 1e9:.3g} GB, most of it for stream "
         f'"{most}" at {draft.streams[most].rate_hz:g} Hz, and this computer has {there / 1e9:.3g} GB',
-        f"write ring_s = {fitting_s:.2g} or less in [pipeline], or correct rate_hz of the stream",
+        f"write ring_s = {rounded_down(fitting_s, 2)} or less in [pipeline], or correct rate_hz of the "
+        "stream",
     )

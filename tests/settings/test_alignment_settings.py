@@ -37,7 +37,7 @@ def test_an_error_that_is_a_fault_s_worth_of_phase_is_warned_of() -> None:
         if "max_error_us" in w.key
     ]
     assert "2000 us are 18 deg of a revolution at 1500 rpm" in warning.message
-    assert warning.remedy.startswith("write max_error_us = 1.11e+03 or less")
+    assert warning.remedy.startswith("write max_error_us = 1110 or less")
 
 
 def test_a_revolution_needs_samples_in_every_stream() -> None:

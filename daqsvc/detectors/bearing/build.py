@@ -20,6 +20,7 @@ from daqsvc.detectors.bearing.settings import BEARING
 from daqsvc.dsp.quality.unit import M_S2_PER_UNIT
 from daqsvc.dsp.speed.keyphasor import KeyphasorProbe
 from daqsvc.settings.models import Keyphasor
+from daqsvc.settings.rounding import rounded_up
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -169,7 +170,8 @@ def _two_sensors(machine: MachineFile, settings: WatchedBearing, index: int) -> 
     if rate_hz < least_hz:
         raise ValueError(
             f"pipeline.bearing.bearings[{index}].model: at {rate_hz:g} samples a second the races of this "
-            f"bearing look alike; sample at {least_hz:.0f} Hz or faster, or remove model and rotor_sensor"
+            f"bearing look alike; sample at {rounded_up(least_hz, 4)} Hz or faster, or remove model and "
+            "rotor_sensor"
         )
     return TwoSensors(rotor.name, column, PairModel(parameters, m_s2_per_unit, model.mismatch))
 

@@ -10,6 +10,7 @@ from daqsvc.detectors.bearing.kinematics import orders_by
 from daqsvc.detectors.bearing.settings import WINDOW_S
 from daqsvc.detectors.shaft.checks import LEAST_FOR_PULSES, named
 from daqsvc.settings.problems import Finding, choice, unique
+from daqsvc.settings.rounding import rounded_up
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -226,7 +227,7 @@ def _pulses(draft: MachineFile, settings: Bearing) -> Iterator[Finding]:
             (*_BEARING, "keyphasor"),
             f"is sampled {samples:.3g} times a revolution ({rate_hz:g} Hz at {speed_rpm:g} rpm): its pulses "
             f"need {LEAST_FOR_PULSES:g}",
-            f"sample at {LEAST_FOR_PULSES * speed_rpm / 60.0:.4g} Hz or faster",
+            f"sample at {rounded_up(LEAST_FOR_PULSES * speed_rpm / 60.0, 4)} Hz or faster",
         )
 
 

@@ -18,6 +18,7 @@ from daqsvc.settings.measures import (
 )
 from daqsvc.settings.models import LevelAlarm, SetpointAlarm
 from daqsvc.settings.problems import Finding, choice
+from daqsvc.settings.rounding import rounded_up
 from daqsvc.settings.section import UnusableValueError
 
 if TYPE_CHECKING:
@@ -126,7 +127,8 @@ def _samples_per_revolution(draft: MachineFile, sensor: Sensor, at: KeyPath) -> 
             at,
             f'"{sensor.name}" is sampled {samples:.3g} times a revolution ({rate_hz:g} Hz at {speed_rpm:g} '
             f"rpm); 1X and 2X need {LEAST_SAMPLES_PER_REVOLUTION:g}",
-            f"sample at {LEAST_SAMPLES_PER_REVOLUTION * speed_rpm / 60.0:.4g} Hz or faster, or remove it",
+            f"sample at {rounded_up(LEAST_SAMPLES_PER_REVOLUTION * speed_rpm / 60.0, 4)} Hz or faster, or "
+            "remove it",
         )
 
 
@@ -140,7 +142,7 @@ def _revolutions(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
             (*_LEVELS, "window_s"),
             f"{window_s:g} s hold {window_s * speed_rpm / 60.0:.3g} revolutions at {speed_rpm:g} rpm: 1X is "
             "not told from what lies beside it",
-            f"write window_s = {_LEAST_REVOLUTIONS * 60.0 / speed_rpm:.3g} or more",
+            f"write window_s = {rounded_up(_LEAST_REVOLUTIONS * 60.0 / speed_rpm)} or more",
         )
 
 
@@ -193,7 +195,7 @@ def _slow_velocity(draft: MachineFile, levels: Levels, asked: _Asked) -> Iterato
             asked.at,
             f"a window of {levels.window_s:g} s holds {low_hz * levels.window_s:.3g} periods of {low_hz:g} "
             "Hz: what is that slow is not told from the mean value",
-            f"write window_s = {_LEAST_PERIODS / low_hz:.3g} or more in [pipeline.levels]",
+            f"write window_s = {rounded_up(_LEAST_PERIODS / low_hz)} or more in [pipeline.levels]",
             fatal=False,
         )
 

@@ -25,6 +25,7 @@ from daqsvc.settings.models import (
     VelocitySensor,
 )
 from daqsvc.settings.problems import Finding
+from daqsvc.settings.rounding import rounded_up
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -286,7 +287,7 @@ def _window(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
     slow = [(draft.streams[name].rate_hz, name) for name in waveforms if name in draft.streams]
     if slow and window_s * min(slow)[0] < _LEAST_WINDOW_SAMPLES:
         slowest_hz, name = min(slow)
-        remedy = f"write window_s = {_LEAST_WINDOW_SAMPLES / slowest_hz:.3g} or more"
+        remedy = f"write window_s = {rounded_up(_LEAST_WINDOW_SAMPLES / slowest_hz)} or more"
         yield Finding(
             at,
             f"{window_s:g} s at {slowest_hz:g} Hz are fewer than {_LEAST_WINDOW_SAMPLES} samples",
@@ -296,7 +297,8 @@ def _window(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
         yield Finding(
             at,
             f"a ring of {ring_s:g} s must hold at least {_RING_WINDOWS} windows",
-            f"write ring_s = {_RING_WINDOWS * window_s:g} or more in [pipeline], or a shorter window",
+            f"write ring_s = {rounded_up(_RING_WINDOWS * window_s, 6)} or more in [pipeline], or a "
+            "shorter window",
         )
 
 
@@ -340,8 +342,8 @@ def _lowest_frequency(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
             ("pipeline", "levels", "window_s"),
             f"{window_s:g} s hold {low_hz * window_s:.3g} periods of {low_hz:g} Hz, the lowest frequency of "
             "velocity_band_hz: its velocity is not told from the mean value",
-            f"write window_s = {_LEAST_PERIODS / low_hz:.3g} or more, or begin the band at "
-            f"{_LEAST_PERIODS / window_s:.3g} Hz",
+            f"write window_s = {rounded_up(_LEAST_PERIODS / low_hz)} or more, or begin the band at "
+            f"{rounded_up(_LEAST_PERIODS / window_s)} Hz",
             fatal=False,
         )
 

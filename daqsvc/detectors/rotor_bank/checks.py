@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from daqsvc.detectors.shaft.checks import LEAST_FOR_PULSES, check_geometry, check_rotor, check_sensors, named
 from daqsvc.settings.problems import Finding, unique
 from daqsvc.settings.rotor_physics import rest_um, whirl_um
+from daqsvc.settings.rounding import rounded_up
 from daqsvc.settings.section import UnusableValueError
 
 if TYPE_CHECKING:
@@ -106,7 +107,7 @@ def _pulses(draft: MachineFile, bank: RotorBank) -> Iterator[Finding]:
             (*_BANK, "keyphasor"),
             f"is sampled {samples:.3g} times a revolution ({rate_hz:g} Hz at {speed_rpm:g} rpm): its pulses "
             f"need {LEAST_FOR_PULSES:g}",
-            f"sample at {LEAST_FOR_PULSES * speed_rpm / 60.0:.4g} Hz or faster",
+            f"sample at {rounded_up(LEAST_FOR_PULSES * speed_rpm / 60.0, 4)} Hz or faster",
         )
 
 

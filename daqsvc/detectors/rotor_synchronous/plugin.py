@@ -9,6 +9,7 @@ from daqsvc.detectors.shaft.checks import check_geometry, check_rotor, check_sen
 from daqsvc.diagnosis.plugin import Detectability, DetectorPlugin, UnfitOptionError
 from daqsvc.diagnosis.reading import Reading
 from daqsvc.settings.problems import AssemblyError, Finding
+from daqsvc.settings.rounding import rounded_up
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -195,6 +196,6 @@ def _samples_per_rev(draft: MachineFile, synchronous: RotorSynchronous) -> Itera
             (*_SYNCHRONOUS, "probes"),
             f"are sampled {samples:.3g} times a revolution ({rate_hz:g} Hz at {speed_rpm:g} rpm); 1X and 2X "
             f"need {_LEAST_SAMPLES_PER_REV:g}",
-            f"sample at {_LEAST_SAMPLES_PER_REV * speed_rpm / 60.0:.4g} Hz or faster, "
+            f"sample at {rounded_up(_LEAST_SAMPLES_PER_REV * speed_rpm / 60.0, 4)} Hz or faster, "
             "or remove [pipeline.rotor_synchronous]",
         )

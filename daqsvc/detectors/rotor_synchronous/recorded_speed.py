@@ -17,6 +17,7 @@ from daqsvc.dsp.speed.orbit import AT_THE_EDGE, estimate_speed, refuse_elsewhere
 from daqsvc.dsp.speed.steadiness import Trend, trend_of_orbit, trend_of_pulses
 from daqsvc.rotor.synchronous.baseline import LEAST_REVOLUTIONS
 from daqsvc.rotor.synchronous.watch import WatchRules
+from daqsvc.settings.rounding import rounded_up
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -186,7 +187,7 @@ def refuse_coarse(period_samples: float, rate_hz: float) -> None:
         raise RefusedError(
             f"a revolution has {period_samples:.3g} samples ({rate_hz:.6g} Hz at "
             f"{60.0 * rate_hz / period_samples:.1f} rpm); 1X and 2X need {LEAST_SAMPLES}: sample at "
-            f"{LEAST_SAMPLES * rate_hz / period_samples:.6g} Hz or faster"
+            f"{rounded_up(LEAST_SAMPLES * rate_hz / period_samples, 6)} Hz or faster"
         )
 
 

@@ -170,7 +170,7 @@ def test_two_sensors_of_a_bearing_tell_its_races_by_direction() -> None:
 
 def test_a_rate_too_low_for_the_rolling_elements_stops_it() -> None:
     pair = f'{TYPE}\nrotor_sensor = "accel-fe"\n{MODEL}'
-    with pytest.raises(AssemblyError, match=r"bearings\[0\].model: at 7000 samples .* at 7716 Hz"):
+    with pytest.raises(AssemblyError, match=r"bearings\[0\].model: at 7000 samples .* at 7717 Hz"):
         detector(machine((TYPE, pair), ("rate_hz = 25_600.0", "rate_hz = 7_000.0")))
 
 

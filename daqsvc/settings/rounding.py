@@ -1,0 +1,36 @@
+"""Figures in remedies, rounded to the side that is accepted: who writes one is not refused again."""
+
+from __future__ import annotations
+
+from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
+
+_NOISE = 1e-12
+"""Relative error of a few floating-point operations: 0.30000000000000004 is 0.3, and not 0.301."""
+
+
+def rounded_up(value: float, digits: int = 3) -> str:
+    """The least figure of so many digits that is no less: for "or more".
+
+    Args:
+        value: bound, finite.
+        digits: significant ones, from 1.
+    """
+    return _rounded(value, digits, ROUND_CEILING)
+
+
+def rounded_down(value: float, digits: int = 3) -> str:
+    """The largest figure of so many digits that is no more: for "or less".
+
+    Args:
+        value: bound, finite.
+        digits: significant ones, from 1.
+    """
+    return _rounded(value, digits, ROUND_FLOOR)
+
+
+def _rounded(value: float, digits: int, rounding: str) -> str:
+    nearest = float(f"{value:.{digits}g}")
+    if abs(nearest - value) > _NOISE * abs(value):
+        nearest = float(Context(prec=digits, rounding=rounding).create_decimal(Decimal(value)))
+    # 12 300 and not 1.23e+04: people read it.
+    return f"{nearest:.15g}"
