@@ -377,3 +377,10 @@ def test_velocity_from_2_hz_needs_its_rate_and_wants_its_window():
     assert problem.key == "pipeline.levels.measures[0]"
     assert "must be below 500 Hz, half the rate" in problem.message
     assert "velocity_band_hz = [2.0, 400.0]" in problem.remedy
+
+
+def test_a_measure_without_brackets_is_refused_with_how_to_write_it():
+    listed = 'measures = ["kurtosis", "velocity_rms_2_1000", "2x_amplitude", "not_1x_rms"]'
+    problem, _ = only_problem(SPECIMEN, (listed, 'measures = "kurtosis"'))
+    assert problem.message == "must be an array in brackets"
+    assert problem.remedy.startswith('write measures = ["kurtosis"] (')

@@ -33,7 +33,9 @@ class Levels(Section):
         Field(default=(10.0, 1000.0), description="band of the velocity RMS (ISO 20816-3: 10 Hz to 1000 Hz)")
     )
     measures: Annotated[tuple[ListedMeasure, ...], Field(strict=False, max_length=100)] = Field(
-        default=(), description="what is measured besides, of every sensor that has it, with or without alarm"
+        default=(),
+        description="what is measured besides, of every sensor that has it, with or without alarm",
+        examples=['["kurtosis"]'],
     )
     keyphasor: Name | None = Field(
         default=None,
