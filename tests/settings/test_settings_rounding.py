@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import re
+from typing import TYPE_CHECKING
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.machine_files import only_problem, parsed
+from support.machine_files import LAVAL, MACHINES, changed
 from support.paths import ROOT
 
+from daqsvc.settings import MachineFileError, parse_machine_file
 from daqsvc.settings.rounding import rounded_down, rounded_up
 
+if TYPE_CHECKING:
+    from pathlib import Path
+
+SYNCHRONOUS = MACHINES / "rotor-synchronous.toml"
+TWO_BUSES = MACHINES / "rotor-two-buses.toml"
 SPECIMEN = ROOT / "tests" / "guard" / "specimens" / "specimen-measures.toml"
 POSITIVE = st.floats(1e-9, 1e9)
 DIGITS = st.integers(1, 6)
@@ -43,10 +52,28 @@ def test_figures_are_written_as_people_write_them(value, digits, up, down):
     assert rounded_down(value, digits) == down
 
 
-@pytest.mark.parametrize("speed_rpm", [590, 610, 907, 1111])
-def test_a_window_that_the_remedy_states_is_accepted(speed_rpm):
-    speed = ("speed_rpm = 600.0", f"speed_rpm = {speed_rpm}.0")
-    problem, _ = only_problem(SPECIMEN, speed, ("window_s = 1.0", "window_s = 0.05"))
-    assert problem.key == "pipeline.levels.window_s"
-    stated = problem.remedy.removeprefix("write ").removesuffix(" or more")
-    parsed(SPECIMEN, speed, ("window_s = 1.0", stated))
+def remedies(path: Path, key: str, *replacements: tuple[str, str]) -> list[str]:
+    """What is said to be done about a key, errors and warnings."""
+    text, _ = changed(path, *replacements)
+    try:
+        found = parse_machine_file(text, path).warnings
+    except MachineFileError as error:
+        found = error.problems
+    return [one.remedy for one in found if one.key == key]
+
+
+@pytest.mark.parametrize(
+    ("path", "key", "speed_rpm", "setting", "refused"),
+    [
+        (SPECIMEN, "pipeline.levels.window_s", (600.0, 590.0), "window_s = 1.0", 0.05),
+        (LAVAL, "pipeline.rotor_bank.keyphasor", (600.0, 601.27), "rate_hz = 640.0", 30.0),
+        (SYNCHRONOUS, "pipeline.rotor_synchronous.probes", (1500.0, 1511.13), "rate_hz = 1600.0", 250.0),
+        (TWO_BUSES, "pipeline.alignment.max_error_us", (1500.0, 1507.0), "max_error_us = 200.0", 2000.0),
+    ],
+)
+def test_the_figure_that_a_remedy_states_is_accepted(path, key, speed_rpm, setting, refused):
+    speed = (f"speed_rpm = {speed_rpm[0]}", f"speed_rpm = {speed_rpm[1]}")
+    name = setting.split(" = ")[0]
+    (remedy,) = remedies(path, key, speed, (setting, f"{name} = {refused}"))
+    stated = float(re.match(r"(?:write \w+ = |sample at )([0-9.]+)", remedy)[1])
+    assert remedies(path, key, speed, (setting, f"{name} = {stated}")) == []
