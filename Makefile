@@ -11,6 +11,7 @@
 # make soak  ten minutes of all that can happen to several machines; make soak SECONDS=86400 a day of it
 # make bench-diagnosis  names given to machines that nobody modelled (finite elements), into docs/plants.md
 # make bench-data  the tables of the documentation, anew from the measured recordings
+# make docs   the site of the documentation, in build/docs/html; fails if a link leads nowhere
 # make deb    a Debian package of the service, in dist/; apt install ./dist/daqsvc_*.deb
 # make test-wheel  the everyday tests against the wheel in dist/, installed in a venv of its own
 # make hooks  have git check every commit
@@ -35,7 +36,7 @@ export OMP_NUM_THREADS ?= 1
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.cache/kernels
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-long hil check guard measure bench bench-data bench-diagnosis dist deb nothing-lost soak test-wheel hooks proto lock clean
+.PHONY: help demo test test-long hil check guard measure bench bench-data bench-diagnosis docs dist deb nothing-lost soak test-wheel hooks proto lock clean
 
 help:
 	@sed -n 's/^# \(make.*\)/\1/p' Makefile
@@ -71,6 +72,20 @@ check: $(READY)
 bench: $(READY)
 	@missed=; for bench in tests/bench/bench_*.py; do PYTHONPATH=$(CURDIR):tests $(BIN)/python $$bench || missed="$$missed $$bench"; done; \
 	if [ -n "$$missed" ]; then echo "make: targets were missed by$$missed"; exit 1; fi
+
+# In an environment of its own: nothing of it is part of the service. The network is only needed to set that up.
+DOCS := build/docs/html
+DOCS_VENV := .venv-docs
+$(DOCS_VENV)/.ready: requirements-docs.lock
+	@$(PYTHON) -m venv $(DOCS_VENV)
+	@$(DOCS_VENV)/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes --no-deps -r requirements-docs.lock
+	@touch $@
+
+docs: $(DOCS_VENV)/.ready
+	@rm -rf $(DOCS)
+	@$(DOCS_VENV)/bin/python -m sphinx --builder html --fail-on-warning --keep-going --nitpicky --quiet --fresh-env \
+		--doctree-dir build/docs/doctrees docs $(DOCS)
+	@echo "the documentation is in $(DOCS)/index.html"
 
 # Built with what requirements-dev.lock pins: nothing is fetched meanwhile. Times are those of the commit, so that
 # the same commit makes the same wheel.
@@ -155,8 +170,9 @@ lock:
 	uv pip compile pyproject.toml --all-extras --group dev --universal --generate-hashes --no-emit-index-url --python-version 3.11 --no-header --quiet -o requirements-dev.lock
 	uv pip compile pyproject.toml --all-extras --universal --generate-hashes --no-emit-index-url --python-version 3.11 --no-header --quiet -c requirements-dev.lock -o requirements.lock
 	uv pip compile pyproject.toml --extra dbc --extra page --universal --generate-hashes --no-emit-index-url --python-version 3.11 --no-header --quiet -c requirements-dev.lock -o requirements-service.lock
+	uv pip compile requirements-docs.in --universal --generate-hashes --no-emit-index-url --python-version 3.11 --no-header --quiet -o requirements-docs.lock
 	uv pip compile requirements-plants.in --universal --generate-hashes --no-emit-index-url --python-version 3.11 --no-header --quiet -o requirements-plants.lock
 	echo 'setuptools>=77' | uv pip compile - --universal --generate-hashes --no-emit-index-url --python-version 3.11 --no-header --quiet -c requirements-dev.lock -o requirements-build.lock
 
 clean:
-	rm -rf $(VENV) $(PLANTS_VENV) .cache build *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) $(PLANTS_VENV) $(DOCS_VENV) .cache build *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis

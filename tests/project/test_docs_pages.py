@@ -1,0 +1,44 @@
+"""Every page of the documentation is listed in its index, and what it links to is there.
+
+Anchors, and what the site makes of it all: test_docs_site.py.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING
+
+import pytest
+from support.paths import ROOT
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+DOCS = ROOT / "docs"
+PAGES = sorted(DOCS.rglob("*.md"))
+TEXTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *PAGES]
+LISTED = re.compile(r"^(?:- |\| )\[[^\[\]]+\]\(([^()\s#]+\.md)\)", re.MULTILINE)
+FENCED = re.compile(r"^ *(`{3,}).*?^ *\1 *$", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"\]\(([^()\s#]+)(?:#[^()\s]*)?\)")
+
+
+def lists(page: Path) -> list[Path]:
+    """The pages that a page lists, and those that a README.md among them lists, as the site has them."""
+    found = [(page.parent / name).resolve() for name in LISTED.findall(page.read_text("utf-8"))]
+    return found + [below for page in found if page.name == "README.md" for below in lists(page)]
+
+
+def test_every_page_is_listed_once_with_a_line_that_says_when_to_read_it() -> None:
+    index = DOCS / "index.md"
+    assert sorted(lists(index)) == [page for page in PAGES if page != index]
+    text = index.read_text("utf-8")
+    assert re.findall("(?m)^## (.*)", text) == ["Tutorials", "How-to guides", "Reference", "Explanation"]
+    entries = [line for line in text.splitlines() if line.startswith("- ")]
+    assert [entry for entry in entries if not re.match(r"- \[.+\]\(.+\): .{20,}\.$", entry)] == []
+
+
+@pytest.mark.sources
+@pytest.mark.parametrize("text", TEXTS, ids=lambda text: f"{text.relative_to(ROOT)}")
+def test_what_is_linked_is_there(text: Path) -> None:
+    links = [link for link in LINK.findall(FENCED.sub("", text.read_text("utf-8"))) if ":" not in link]
+    assert [link for link in links if not (text.parent / link).exists()] == []

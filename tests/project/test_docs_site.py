@@ -1,0 +1,80 @@
+"""``make docs``: what the site makes of pages that are written for a forge, and at what its build fails."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from typing import TYPE_CHECKING
+from urllib.parse import unquote
+
+import pytest
+from support.made_once import made_once
+from support.paths import ROOT
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+pytestmark = [pytest.mark.integration, pytest.mark.long, pytest.mark.sources]
+LEFT_OUT = shutil.ignore_patterns(".*", "__pycache__", "*.egg-info", "build", "dist")
+OURS = re.compile(r'(?:src|href)="(?!https?:|data:|mailto:)([^"#?]+)')
+
+
+def make_docs(tree: Path) -> subprocess.CompletedProcess[str]:
+    """Build the site of a copy of this tree, with the Sphinx that this tree has or sets up now."""
+    command = ["make", "docs", f"DOCS_VENV={ROOT / '.venv-docs'}"]
+    return subprocess.run(command, cwd=tree, check=False, capture_output=True, text=True, timeout=280)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The built site."""
+
+    def build(folder: Path) -> Path:
+        shutil.copytree(ROOT, folder / "tree", ignore=LEFT_OUT)
+        made = make_docs(folder / "tree")
+        assert made.returncode == 0, made.stdout + made.stderr
+        return folder / "tree" / "build" / "docs" / "html"
+
+    return made_once(tmp_path_factory, "docs-site", build)
+
+
+def test_all_that_the_pages_need_is_in_the_site(site: Path) -> None:
+    pages = list(site.rglob("*.html"))
+    assert len(pages) >= len(list((ROOT / "docs").rglob("*.md")))
+    for page in pages:
+        text = page.read_text("utf-8")
+        assert not re.search(r'<(?:script|img|link)[^>]* (?:src|href)="(?:https?:)?//', text), page
+        assert [link for link in OURS.findall(text) if not (page.parent / unquote(link)).exists()] == [], page
+    for style in site.rglob("*.css"):
+        assert not re.search(r"(?:url\(|@import)\W*(?:https?:)?//", style.read_text("utf-8")), style
+
+
+def test_links_of_the_readme_lead_to_pages_and_copies_of_files(site: Path) -> None:
+    text = (site / "readme.html").read_text("utf-8")
+    assert 'href="edge-box.html#reload"' in text
+    assert 'href="decisions/README.html"' in text
+    assert 'href="contributing.html"' in text
+    [copy] = re.findall(r'href="(_downloads/\w+/serial-probes.toml)"', text)
+    assert (site / copy).read_bytes() == (ROOT / "config/machines/serial-probes.toml").read_bytes()
+    # A folder has no page: its name stays.
+    assert re.search(r"<code[^>]*><span[^>]*>config/machines/</span></code> has some", text)
+
+
+def test_the_side_has_the_lists_of_the_index(site: Path) -> None:
+    text = (site / "mqtt.html").read_text("utf-8")
+    captions = re.findall(r'<p class="caption"[^>]*><span class="caption-text">(.*?)</span>', text)
+    assert captions == ["Tutorials", "How-to guides", "Reference", "Explanation"]
+    assert re.search(r'<a class="reference internal" href="decisions/0003-sqlite-outbox.html">', text)
+
+
+def test_the_build_fails_at_links_that_lead_nowhere_and_names_each(tmp_path: Path) -> None:
+    shutil.copytree(ROOT, tmp_path / "tree", ignore=LEFT_OUT)
+    docs = tmp_path / "tree" / "docs"
+    with (docs / "history.md").open("a") as page:
+        page.write("\n[a](no-page.md), [b](alarms.md#no-heading), [c](#not-here), [d](../config/no.toml)\n")
+    (docs / "forgotten.md").write_text("# In no list\n")
+    made = make_docs(tmp_path / "tree")
+    assert made.returncode != 0
+    for what in ("no-page.md", "no-heading", "not-here", "no.toml", "forgotten.md"):
+        assert what in made.stderr, made.stderr
