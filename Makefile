@@ -12,6 +12,7 @@
 # make bench-diagnosis  names given to machines that nobody modelled (finite elements), into docs/plants.md
 # make bench-data  the tables of the documentation, anew from the measured recordings
 # make docs   the site of the documentation, in build/docs/html; fails if a link leads nowhere
+# make evaluation  the tables of docs/evaluate.md, anew from the figures on the other pages
 # make deb    a Debian package of the service, in dist/; apt install ./dist/daqsvc_*.deb
 # make test-wheel  the everyday tests against the wheel in dist/, installed in a venv of its own
 # make hooks  have git check every commit
@@ -36,7 +37,7 @@ export OMP_NUM_THREADS ?= 1
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.cache/kernels
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-long hil check guard measure bench bench-data bench-diagnosis docs dist deb nothing-lost soak test-wheel hooks proto lock clean
+.PHONY: help demo test test-long hil check guard measure bench bench-data bench-diagnosis docs evaluation dist deb nothing-lost soak test-wheel hooks proto lock clean
 
 help:
 	@sed -n 's/^# \(make.*\)/\1/p' Makefile
@@ -142,6 +143,10 @@ soak: $(READY)
 
 bench-data: $(READY)
 	@for table in tests/bench/data_*.py; do $(BIN)/python $$table || exit 1; done
+	@$(BIN)/python docs/make_evaluation.py
+
+evaluation: $(READY)
+	@$(BIN)/python docs/make_evaluation.py
 
 # Rotors by finite elements, in an environment of their own: what makes them is no part of the service. The lock is
 # complete; left to itself pip looks for extras that it does not have.
@@ -160,6 +165,7 @@ $(PLANTS)/bank.json: $(PLANTS)/cases.json tests/plants/bank_records.py
 
 bench-diagnosis: $(READY) $(PLANTS)/cases.json $(PLANTS)/bank.json
 	@PYTHONPATH=tests $(BIN)/python -m plants.table $(PLANTS) $(ARGS)
+	@$(BIN)/python docs/make_evaluation.py
 
 # What is compiled needs a protobuf of this major version, no older than the compiler: pyproject.toml says which.
 proto: $(READY)

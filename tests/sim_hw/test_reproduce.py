@@ -9,6 +9,7 @@ import csv
 import io
 import json
 import math
+import re
 import subprocess
 import sys
 from typing import TYPE_CHECKING, Any
@@ -17,6 +18,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
+from support.paths import ROOT
 
 from daqsvc import cli
 from sim_hw.reproduce import command, results
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
 
 pytestmark = pytest.mark.integration
 FIGURES = sorted(f"fig{number}.png" for number in range(4, 11))
+NUMBER = re.compile(r"[-+]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?")
 # Measured on another implementation of the same bank, 200 seeds: revolutions for F1, F1L2, F1L3 at 0 dB.
 KNOWN_DELAYS_REV = {"paper": (1.30, 0.94, 0.70), "cusum": (1.93, 2.06, 1.44)}
 
@@ -186,6 +189,26 @@ def test_paper_rule_is_often_wrong_and_the_service_is_not(rows: dict[str, dict[s
     assert all(rate <= 0.3 for rate in cusum.values())
     assert rows["order-cusum"]["values"]["changes"] == 4
     assert rows["order-paper"]["values"]["changes"] > 4
+
+
+@pytest.mark.long
+@pytest.mark.sources
+def test_the_table_of_the_documentation_is_what_comes_out(rows: dict[str, dict[str, Any]]) -> None:
+    """Words and verdicts to the letter, figures to a tenth: the last digits differ between processors."""
+    page = (
+        (ROOT / "docs" / "reproduce.md").read_text("utf-8").partition("<!-- table: daqsvc reproduce -->")[2]
+    )
+    lines = [line for line in page.partition("<!-- end of table -->")[0].splitlines() if line.startswith("|")]
+    tolerance = {"rel": 0.1, "abs": 0.01}
+    for line, row in zip(lines[2:], rows.values(), strict=True):
+        _, paper, obtained, agrees, _ = (cell.strip() for cell in line.strip("|").split("|"))
+        assert paper == (row["paper"] or "(nothing)")
+        assert agrees == {True: "yes", False: "no", None: "-"}[row["agrees"]]
+        assert NUMBER.sub("#", obtained) == NUMBER.sub("#", row["obtained"])
+        found, written = (
+            [float(n.replace(",", "")) for n in NUMBER.findall(text)] for text in (row["obtained"], obtained)
+        )
+        assert found == pytest.approx(written, **tolerance), row["name"]
 
 
 # How delays and wrong changes are counted.
