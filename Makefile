@@ -2,7 +2,7 @@
 # make test   the tests; make test ROOM=rotor those of one room, a folder of tests/
 # make test-long  the long ones: statistics over hundreds of runs, soak, fuzz; of one room likewise
 # make hil    tests on real CAN interfaces (vcan), and of the unit under systemd, in a guest kernel; as root
-# make check  formatting, lint, types, layers
+# make check  formatting, lint, types, layers, spelling and plain English
 # make bench  speed, as ratios measured in one run
 # make dist   what a release consists of, in dist/: wheel, and a CycloneDX list of everything it is installed with
 # make guard  is what users see as before? make guard ARGS=--take takes the golden texts anew
@@ -69,6 +69,8 @@ check: $(READY)
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports
+	@$(BIN)/codespell
+	@PYTHONPATH=tests $(BIN)/python -m prose
 
 bench: $(READY)
 	@missed=; for bench in tests/bench/bench_*.py; do PYTHONPATH=$(CURDIR):tests $(BIN)/python $$bench || missed="$$missed $$bench"; done; \

@@ -308,7 +308,7 @@ class AlarmService:
     def _forget(self, events: Iterable[AlarmEvent]) -> list[asyncio.Future[int]]:
         """Say of alarms that nobody knows any more that they are normal: the broker shows how they stood.
 
-        Of those that were never told of, the broker shows nothing.
+        The broker has nothing about those that were never published.
         """
         ever = self.outbox.known_topics
         return [
@@ -342,7 +342,7 @@ class AlarmService:
         return max((message.sequence for message in latest if message.topic == self._witness), default=0)
 
     def _take_witness(self, payload: bytes) -> None:
-        """See whether the broker was told of a run that the disk never heard of.
+        """See whether the broker has messages of a run that the disk has no trace of.
 
         Such a run leaves nothing on the disk, but what it has said of the journal is retained at the broker.
         """
@@ -416,7 +416,7 @@ class AlarmService:
         self._confirm(committed)
 
     async def keep_time(self) -> None:
-        """Have come to pass what time alone brings, and what the service says of itself; until cancelled."""
+        """Apply what time alone changes, and what the service reports about itself; until cancelled."""
         was_backed = True
         for tick in itertools.count():
             is_backed = not (self.outbox.counters.shut or self.outbox.counters.unbacked)

@@ -33,9 +33,10 @@ LOOK_S = 0.2
 
 
 class KernelCompiler:
-    """Has kernels compiled, one at a time, by a process that is begun at need and ends when it has no work.
+    """Has kernels compiled, one at a time, by a process of its own.
 
-    It ends with this process, however that ends. If it is lost no other is begun.
+    The process starts with the first kernel and ends when it has no work. It ends with this process,
+    however that ends. If it is lost no other is begun.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""What others are told of a machine: its streams, and the machine file that is in force."""
+"""What others get to know about a machine: its streams, and the machine file that is in force."""
 
 from __future__ import annotations
 

@@ -84,7 +84,7 @@ MOST_ASKED = 16
 LONGEST_FILE = 16_000_000
 """Of a file that goes into a snapshot."""
 PATIENCE_NS = 5 * NS_PER_S
-"""How much longer a snapshot lasts, at most, for detectors to say what they make of its samples."""
+"""How much longer a snapshot lasts, at most, for detectors to state what they find in its samples."""
 HOLD_NS = 2 * MEMORY_EVERY_NS + SPARE_NS
 """How long the change to the next file waits for detectors to say what they remember."""
 AGAIN_NS = 10 * NS_PER_S
@@ -287,7 +287,7 @@ class MachineRecorder:
         store: directory of the machine's part of the store.
         clock: the service's clock.
         supervisor: of the machine; told once of each kind of trouble.
-        is_judging: whether a detector has samples of which it has not said yet what it makes of them.
+        is_judging: whether a detector has samples that it has not evaluated yet.
 
     Attributes:
         counters: what it has done.

@@ -59,7 +59,7 @@ class Vitals:
 
     Attributes:
         now_ns: monotonic clock.
-        conditions_reported: conditions of the service that were ever told of, also before a restart.
+        conditions_reported: conditions of the service that were ever reported, also before a restart.
         free_bytes: free space on the store's disk; None if nobody has looked.
         waiting: alarm events in memory that the disk has not taken.
         write_errors: failed writes of alarms so far.

@@ -135,7 +135,7 @@ class StatusReport:
         latest, measured = dict(self._latest), dict(self._measured)
         # Before a block can come: the newest sample is then the last one that the figures count.
         newest = {name: sample async for name, sample in _by_turns(self._newest())}
-        # What the service says of itself concerns each of its machines.
+        # What the service reports about itself concerns each of its machines.
         of_machine = self._alarms.managers[self._machine.machine.name]
         alarms = {**self._alarms.manager.alarms, **of_machine.alarms}
         return _Seen(

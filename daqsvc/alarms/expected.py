@@ -31,7 +31,7 @@ class Expected:
 
         Args:
             active_detectors: the detectors that will make statements, with the sensors that these rest on.
-            conditions: names of what the service will say of itself.
+            conditions: names of what the service will report about itself.
         """
         for detector, sensors in active_detectors.items():
             self.quality.setdefault(quality_alarm(detector, sensors), {})[detector] = sensors

@@ -222,7 +222,7 @@ class AlarmManager:
         Args:
             events: the last event of each alarm, in the order in which they were published.
             active_detectors: the detectors that will make statements, with the sensors that these rest on.
-            conditions: names of what the service will say of itself by `condition`.
+            conditions: names of what the service will report about itself by `condition`.
             restarted: whether that may have been long ago; False in a replay, where it was just now.
 
         Returns:

@@ -55,7 +55,7 @@ _IN_WORDS = {
 
 
 class RuleFinding(NamedTuple):
-    """What a rule makes of a diagnosis.
+    """What a rule finds in a diagnosis.
 
     Attributes:
         level: the level by now.

@@ -1,10 +1,10 @@
 """Voting: one alarm on the same measure of several sensors, raised when enough of them agree.
 
-A sensor that is missing samples or not OK has no vote, and its vote counts for neither side; where it is
-beyond a limit whatever the missing samples were, it votes for that limit, and still not against. A level is
-reached when enough sensors that can be judged say so; it is left when not even all the silent ones could make
-up the number; between the two it stays as it was. Sensors that drop out therefore neither raise the alarm nor
-clear it, and the number of votes that it takes stays the same.
+A sensor that is missing samples or not OK has no vote: it counts for neither side. If it is beyond a limit
+whatever the missing samples were, it votes for that limit; it never votes against one. A level is reached
+when enough sensors vote for it. It is left when there would be too few votes even if every sensor without a
+vote voted for it. Between the two it stays as it was. Sensors that drop out therefore neither raise the alarm
+nor clear it, and the number of votes that it takes stays the same.
 """
 
 from __future__ import annotations

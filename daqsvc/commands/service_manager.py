@@ -1,4 +1,4 @@
-"""What systemd is told of a service: that it is ready, how it stands, that it gets on, that it stops.
+"""What a service reports to systemd: that it is ready, its status, that it is alive, that it stops.
 
 The protocol is sd_notify(3): datagrams of assignments to the socket that ``$NOTIFY_SOCKET`` names. Without
 that nothing is told and nothing is watched.
@@ -174,7 +174,7 @@ class ServiceManager:
 
 
 class _Follower:
-    """What has been told of one service."""
+    """What one service has reported."""
 
     def __init__(self, manager: ServiceManager, service: Service) -> None:
         self._manager = manager

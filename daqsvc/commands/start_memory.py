@@ -56,7 +56,7 @@ def unchanged(smaps: Iterable[str]) -> Iterator[tuple[int, int]]:
     """Address and length of the parts of shared libraries that are read or run, and nobody has written to.
 
     Other files are left alone: they may be unmapped meanwhile, and something else be there. What the loader
-    has written to and then protected is no longer what the file holds, be it in memory or swapped out.
+    has written to and then protected is no longer what the file holds, in memory or swapped out.
 
     Args:
         smaps: lines of ``/proc/PID/smaps`` (proc(5)).

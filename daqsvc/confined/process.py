@@ -93,7 +93,9 @@ class _Running:
 
 
 class ConfinedProcess:
-    """Calls functions in a process of its own, one at a time; it is begun at need, and anew after a loss.
+    """Calls functions in a process of its own, one at a time.
+
+    The process starts with the first call, and again after a loss.
 
     Calls of several threads wait for each other. It ends with `close`, or with this process.
 

@@ -26,7 +26,7 @@ _FITTED = 5
 _WORST_CONDITION = 25.0
 """Largest spread of the normal equations' eigenvalues: what is missing must not lie in one piece too long."""
 _SURE_OF_PHASE = 6.0
-"""A phase is told of an amplitude that is so many of its standard deviations: to 10 degrees."""
+"""A phase is given if the amplitude is so many of its standard deviations: it is then good to 10 degrees."""
 SLIP = 0.03
 """A shaft whose speed nobody measures is looked for within this part of the stated one."""
 _PER_LINE = 4

@@ -212,7 +212,7 @@ class Replay:
         machine: the machine file to judge by.
         directory: for what detectors keep.
         pace: how fast it goes; None for as fast as it can.
-        heard: told of each alarm event when it comes about.
+        heard: called with each alarm event when it comes about.
 
     Raises:
         ReplayError: the snapshot is none that can be replayed.
@@ -704,7 +704,7 @@ async def replay(
         machine: the machine file to judge by; None for that of the snapshot.
         directory: empty; for files.
         pace: how fast it goes; None for as fast as it can.
-        heard: told of each alarm event when it comes about.
+        heard: called with each alarm event when it comes about.
 
     Raises:
         ReplayError: it cannot be replayed.

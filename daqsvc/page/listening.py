@@ -60,7 +60,7 @@ class Listening(ABC):
         return f"{error}" or type(error).__name__
 
     async def first(self, timeout_s: float) -> MachineLive | None:
-        """The machine, as soon as something was told of it; None if nothing is in time."""
+        """The machine, as soon as something was received about it; None if nothing is in time."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout_s):
                 await self._has_begun.wait()

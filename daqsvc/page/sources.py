@@ -36,7 +36,7 @@ class Heard(Protocol):
         ...
 
     async def first(self, timeout_s: float) -> MachineLive | None:
-        """The machine, as soon as something was told of it; None if nothing is in time."""
+        """The machine, as soon as something was received about it; None if nothing is in time."""
         ...
 
     def wanting(self, streams: Iterable[str]) -> AbstractContextManager[None]:

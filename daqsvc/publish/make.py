@@ -37,7 +37,7 @@ def output_set(
 
     Args:
         machine: the machine file.
-        conditions: names of what the service may say of itself, outputs aside.
+        conditions: names of what the service may report about itself, outputs aside.
         others: machine files of the same box, whose machines they tell of, too.
     """
     installed, tables = output_plugins(), {path: tables for path, _, tables in configured_outputs(machine)}
@@ -102,7 +102,7 @@ def watched(machine: MachineFile, conditions: Iterable[str] = (), *, spared: boo
 
     Args:
         machine: the machine file.
-        conditions: names of what the service may say of itself.
+        conditions: names of what the service may report about itself.
         spared: whether a detector's plugin that fails is said and left out, and the others are asked.
 
     Raises:

@@ -75,8 +75,8 @@ class OutputPort:
     """What an output works with.
 
     Attributes:
-        machines: by name, what there is to tell of each machine. The last one has what the service says of
-            itself as well; where there are several, it stands for the service alone, without readings.
+        machines: by name, what there is to report about each machine. The last one has what the service
+            reports about itself as well; where there are several, it is the service alone, without readings.
         store: directory of what survives restarts.
         clock: the service's clock.
         outbox: the alarm events, on disk and numbered; an output goes on after the last one that it has told
@@ -166,7 +166,7 @@ class OutputSet:
         machines: see `OutputPort.machines`.
         make: makes them, by the path of their table.
         topic_root: first part of the topics by which events are known in the outbox.
-        conditions: names of all that they may say of themselves.
+        conditions: names of all that they may report about themselves.
         outdated: see `OutputPlugin.outdated`, of those that the file has no table for.
     """
 

@@ -92,7 +92,7 @@ class BankReport:
     def group(self) -> tuple[int, ...]:
         """Indices of the modes that cannot be told apart, the decision among them; empty if it stands alone.
 
-        Be it that the evidence so far does not tell them, or that their steady orbits are the same at this
+        Either the evidence so far does not tell them apart, or their steady orbits are the same at this
         speed.
         """
         decision = self._figure("decision")

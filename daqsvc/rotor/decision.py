@@ -28,7 +28,7 @@ class DecisionRules:
     """Thresholds of both rules.
 
     A mean time between failures belongs into these: a threshold is ln(1 / pi) of the prior pi per
-    decision, so a rarer transition gets a higher one (`from_rates`). As a prior it would re-declare the
+    decision, so a rarer transition gets a higher one (`from_rates`). As a prior it would redeclare the
     favourite at every sample.
 
     Attributes:

@@ -7,7 +7,7 @@ one phi that brings them closest to the present ones. What remains,
     T = min over phi of sum over orders h, channels c of nu ln(1 + |d_hc|^2 / (nu u_hc^2)),
     d_hc = p_hc - exp(i h phi) b_hc
 
-is the departure: each term is -ln of the probability of such a change by chance, so T of an unchanged
+is the departure. Each term is -ln of the probability of such a change by chance, so T of an unchanged
 machine is Gamma distributed, and smaller by the choice of phi. u^2 is the variance of the two means, of nu
 degrees of freedom, by the spectra of their own blocks beside each order and by what each order drifted.
 

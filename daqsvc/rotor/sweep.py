@@ -163,7 +163,7 @@ def stand_by(mode: int, batch: Batch, pairs: Pairs, header: Header) -> None:
 _REGISTER = 4
 """Members are looped over in whole vector registers of this many."""
 _DRIFT = -1e3
-"""Logarithm of odds from which the paper's are counted from their leader anew, lest digits get lost."""
+"""Logarithm of odds from which the paper's are counted from their leader again, to lose no digits."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

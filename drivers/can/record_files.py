@@ -238,8 +238,8 @@ class Logs(Protocol):
 class LogFolder:
     """Files named by bus and UTC start, e.g. ``can0-20261121T133215.250000Z.blf``; the oldest make room.
 
-    Only files with such names are taken away. The folder must be there: made at need, it would fill the
-    wrong disk whenever the right one is not mounted.
+    Only files with such names are taken away. The folder must be there: if it were made here, it
+    would fill the wrong disk whenever the right one is not mounted.
 
     Args:
         folder: holds them.

@@ -349,7 +349,7 @@ class LevelDetector:
     def _orders(
         self, sensor: str, samples: NDArray[np.float64], angle_rad: NDArray[np.float64] | None
     ) -> tuple[dict[str, float], str]:
-        """What can be told of 1X and 2X in a window, and why the rest cannot."""
+        """What a window shows of 1X and 2X, and why it does not show the rest."""
         by_pulses = angle_rad is not None
         if angle_rad is None:
             if self._turns_per_sample is None:

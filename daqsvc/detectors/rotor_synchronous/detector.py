@@ -253,7 +253,7 @@ class RotorSynchronousDetector:
         return RotorWatch(rotor, self._rate_hz, calibration=calibration, rules=rules)
 
     def _revolution(self, revolution: Revolution) -> Diagnosis | None:
-        """One revolution: what it is worth, what the watch makes of it, and what is worth saying."""
+        """One revolution: its quality, what the watch finds in it, and what is worth reporting."""
         if self.ac_coupled:
             revolution = revolution.without_mean()
         self._speed_rpm = 60.0 * self._rate_hz / float(revolution.vector.period_samples[0])

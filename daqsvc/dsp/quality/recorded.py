@@ -319,7 +319,7 @@ def complaints(reasons: Iterable[str]) -> tuple[Complaint, ...]:
 def lacks_mean(samples: Floats) -> bool:
     """Whether both probes swing about zero in the end, as AC-coupled ones do.
 
-    The first half does not count: what the coupling makes of switching on takes its time to die away.
+    The first half does not count: AC coupling answers switching on with a transient that takes time to decay.
 
     Args:
         samples: float64 ``[n, 2]`` in um, NaN where missing.

@@ -70,7 +70,7 @@ class AccessChoice:
         if is_everywhere(self.host) and not self.names:
             raise UnsafeError(
                 f"the page listens at {self.host}, and nobody knows by which names it is opened: give "
-                "--host-name for each, be it an address of this machine"
+                "--host-name for each, also if it is an address of this machine"
             )
         if self.is_local or self.user_header:
             return

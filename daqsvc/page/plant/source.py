@@ -76,7 +76,7 @@ class PlantSource:
         return told
 
     async def _begun(self, machine: str) -> None:
-        """Wait, soon after the begin, until the broker has told of a machine, or of any."""
+        """Wait, soon after the start, until the broker has sent something about a machine, or about any."""
         self.begin()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout_at(self._begun_s + BEGIN_S):

@@ -45,7 +45,7 @@ _SHOWN = 200
 
 
 class HomeAssistantLink(MqttLink):
-    """Tells Home Assistant of each machine, and takes away what it was told of before.
+    """Describes each machine to Home Assistant, and removes what it described before.
 
     Args:
         settings: whether and how often to tell.

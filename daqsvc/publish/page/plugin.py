@@ -93,7 +93,7 @@ def _open_to_the_network(settings: Page) -> Iterator[Finding]:
         yield Finding(
             ("page", "listen"),
             "is every address of the box, and nobody knows by which names the page is opened",
-            'write host_names = ["..."] with each, be it an address of the box',
+            'write host_names = ["..."] with each, also if it is an address of the box',
         )
     if address is None or address.is_local or settings.user_header is not None:
         return

@@ -1,1 +1,1 @@
-"""What a rotor says of itself: run-ups, Bode plots, and the file that keeps it."""
+"""What is measured of a rotor: run-ups, Bode plots, and the file that keeps it."""

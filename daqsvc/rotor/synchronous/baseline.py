@@ -294,7 +294,7 @@ def _long_run_variance(vectors: Complexes, white: float, memory: float) -> Float
 
 
 def _refuse_no_orbit(vectors: Complexes, white: float) -> None:
-    """Whether there is an orbit that turns with the shaft, once in a revolution, be it steady or not."""
+    """Whether there is an orbit that turns with the shaft, once in a revolution, whether steady or not."""
     size = np.sqrt(np.mean(np.abs(vectors) ** 2, axis=0))
     if np.sum(size[1:] ** 2) < 4.0 * white * (1.0 + _LEAST_WHIRL / math.sqrt(len(vectors))):
         raise NotCalibratableError(

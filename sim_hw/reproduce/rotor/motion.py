@@ -188,7 +188,7 @@ def escape_with_printed_signs(rotor: PlantParameters, start: Floats) -> float:
 
     outside.terminal = True  # type: ignore[attr-defined]
     per_rev = 2.0 * math.pi / rotor.speed_ratio
-    # Short steps, lest a trial step reaches the radius at which the plant gives up.
+    # Short steps, so that no trial step reaches the radius at which the plant gives up.
     solution = solve_ivp(
         derivative, (0.0, 20.0 * per_rev), start, events=(touches, outside), max_step=1e-2, rtol=1e-8
     )

@@ -1,0 +1,106 @@
+"""The check of prose finds what it is for, where it is, and nothing else."""
+
+from __future__ import annotations
+
+import tomllib
+from typing import TYPE_CHECKING
+
+import pytest
+from prose.rules import KINDS, VOCABULARY, length, prose_files, rules, sentences
+from prose.texts import texts_of
+from support.paths import ROOT
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+LONG = "The line is quiet and " * 30 + "then it is used."
+
+
+def found(file: Path) -> list[tuple[int, str]]:
+    return [(finding.text.line, finding.message) for finding in rules().findings(texts_of(file))]
+
+
+@pytest.mark.parametrize(
+    ("name", "before", "after"),
+    [
+        ("page.md", "# Title\n\nA sentence.\n\n", "\n"),
+        ("item.md", "# Title\n\n- An item.\n- ", "\n- another\n"),
+        ("table.md", "| a | b |\n|---|---|\n| ", " | cell |\n"),
+        ("module.py", '"""One line.\n\n', '\n"""\n'),
+        ("function.py", 'def f():\n    """', '"""\n'),
+        ("attribute.py", 'X = 1\n"""', '"""\n'),
+        ("comment.py", "x = 1\ny = 2\n# ", "\n"),
+        ("remark.py", "x = 1\ny = 2\nz = 3  # ", "\n"),
+        ("message.py", 'def f(x):\n    pass\n    raise ValueError("', '")\n'),
+        ("formatted.py", 'def f(x):\n    pass\n    raise ValueError(f"{x} and {x}: ', '")\n'),
+        ("machine.toml", "x = 1\ny = 2\n# ", "\n"),
+        ("remark.toml", "x = 1\ny = 2\nz = 3  # ", "\n"),
+    ],
+)
+@pytest.mark.parametrize("bad", [LONG, "It was made at need."])
+def test_a_bad_sentence_is_found_wherever_prose_lies(
+    name: str, before: str, after: str, bad: str, tmp_path: Path
+) -> None:
+    file = tmp_path / name
+    file.write_text(f"{before}{bad}{after}", "utf-8")
+    [(line, message)] = found(file)
+    assert line == before.count("\n") + 1
+    assert ("words in a sentence" in message) == (bad is LONG)
+    file.write_text(f"{before}The line is quiet.{after}", "utf-8")
+    assert found(file) == []
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "```sh\nmake it at need\n```\n",
+        "`made at need` is a key.\n",
+        "See [this page](made-at-need.md).\n",
+        "    made at need\n",
+    ],
+)
+def test_code_and_links_of_a_page_are_no_prose(code: str, tmp_path: Path) -> None:
+    file = tmp_path / "page.md"
+    file.write_text(f"# Title\n\n{code}", "utf-8")
+    assert found(file) == []
+
+
+@pytest.mark.parametrize(
+    "entry", tomllib.loads(VOCABULARY.read_text("utf-8"))["phrase"], ids=lambda e: e["avoid"]
+)
+def test_an_entry_of_the_vocabulary_is_whole(entry: dict[str, str]) -> None:
+    assert {*entry} - {"in"} == {"avoid", "write", "why"}
+    assert {*entry.get("in", KINDS)} <= {*KINDS}
+
+
+def test_a_limit_is_there_for_each_kind_of_text() -> None:
+    assert {*rules().longest} == {*KINDS}
+
+
+@pytest.mark.parametrize(
+    ("text", "count"),
+    [
+        ("One sentence. Another one? Yes! `x` is a key.", 4),
+        ("It takes 0.5 s, e.g. on CAN, at 3.2 kHz.", 1),
+        ("See docs/can.md for more.", 1),
+        ('He wrote "no frame." Then it came.', 2),
+    ],
+)
+def test_sentences_end_where_they_end(text: str, count: int) -> None:
+    assert len(sentences(text)) == count
+
+
+def test_marks_are_no_words() -> None:
+    assert length("a - b = `x` / 2") == 4
+
+
+@pytest.mark.sources
+def test_pages_machine_files_and_sources_are_all_read() -> None:
+    files = {str(file.relative_to(ROOT)) for file in prose_files()}
+    assert {
+        "README.md",
+        "docs/alarms.md",
+        "docs/decisions/README.md",
+        "config/machines/laval-rig.toml",
+    } <= files
+    assert {"daqsvc/cli.py", "drivers/base.py", "sim_hw/sim_command.py"} <= files
