@@ -24,6 +24,7 @@ SOURCES = (
     "drivers",
     "edge-box",
     "fleet",
+    "outbox",
     "page",
     "plants",
     "race-test",
@@ -108,7 +109,7 @@ def test_every_command_exists() -> None:
 
 
 def test_every_link_leads_to_a_page_and_a_heading() -> None:
-    for name in ("evaluate.md",):
+    for name in ("evaluate.md", "comparison.md"):
         for target in set(re.findall(r"\]\(([\w.-]+\.md(?:#[\w-]+)?)\)", (DOCS / name).read_text("utf-8"))):
             page, _, anchor = target.partition("#")
             text = (DOCS / page).read_text("utf-8")
