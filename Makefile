@@ -12,6 +12,7 @@
 # make bench-diagnosis  names given to machines that nobody modelled (finite elements), into docs/plants.md
 # make bench-data  the tables of the documentation, anew from the measured recordings
 # make docs   the site of the documentation, in build/docs/html; fails if a link leads nowhere
+# make pictures  docs/pictures, anew from the product; make pictures ARGS=timebase one of them
 # make evaluation  the tables of docs/evaluate.md, anew from the figures on the other pages
 # make deb    a Debian package of the service, in dist/; apt install ./dist/daqsvc_*.deb
 # make test-wheel  the everyday tests against the wheel in dist/, installed in a venv of its own
@@ -37,7 +38,7 @@ export OMP_NUM_THREADS ?= 1
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.cache/kernels
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-long hil check guard measure bench bench-data bench-diagnosis docs evaluation dist deb nothing-lost soak test-wheel hooks proto lock clean
+.PHONY: help demo test test-long hil check guard measure bench bench-data bench-diagnosis docs evaluation pictures dist deb nothing-lost soak test-wheel hooks proto lock clean
 
 help:
 	@sed -n 's/^# \(make.*\)/\1/p' Makefile
@@ -146,6 +147,9 @@ soak: $(READY)
 bench-data: $(READY)
 	@for table in tests/bench/data_*.py; do $(BIN)/python $$table || exit 1; done
 	@$(BIN)/python docs/make_evaluation.py
+
+pictures: $(READY)
+	@PYTHONPATH=docs $(BIN)/python -m make_pictures $(ARGS)
 
 evaluation: $(READY)
 	@$(BIN)/python docs/make_evaluation.py

@@ -1,0 +1,20 @@
+"""All pictures by the name of their file."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from make_pictures import alarm_states, architecture, outbox, timebase
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from matplotlib.figure import Figure
+
+PICTURES: Mapping[str, Callable[[], Figure]] = {
+    "architecture": architecture.flow,
+    "layers": architecture.contract,
+    "timebase": timebase.picture,
+    "alarm-states": alarm_states.states,
+    "outbox": outbox.picture,
+}
