@@ -297,7 +297,7 @@ def speed(docs: Path) -> Iterator[Row]:
         f"{modbus[1]} of its rate",
         "loopback; with samples placed in time as the result",
         "make bench",
-        "modbus.md#pymodbus-and-how-fast-it-is",
+        "modbus.md#speed",
     )
     screen = Page(docs, "page.md")
     yield Row(
