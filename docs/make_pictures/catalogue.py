@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from make_pictures import alarm_states, architecture, outbox, timebase
+from make_pictures import alarm_states, architecture, detectors, outbox, timebase
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -17,4 +17,5 @@ PICTURES: Mapping[str, Callable[[], Figure]] = {
     "timebase": timebase.picture,
     "alarm-states": alarm_states.states,
     "outbox": outbox.picture,
+    **{f"detector-{key.replace('_', '-')}": draw for key, draw in detectors.DETECTORS.items()},
 }

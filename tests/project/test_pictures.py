@@ -13,7 +13,7 @@ from support.paths import ROOT
 
 sys.path.append(str(ROOT / "docs"))
 
-from make_pictures import alarm_states, architecture
+from make_pictures import alarm_states, architecture, detectors
 from make_pictures.catalogue import PICTURES
 from make_pictures.style import save, use
 
@@ -27,6 +27,8 @@ pytestmark = [pytest.mark.integration, pytest.mark.sources]
 FOLDER = ROOT / "docs" / "pictures"
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e-?\d+)?")
 TOLERANCE_PX = 2.0
+LONG = {"detector-bearing"}
+"""What takes more than some seconds."""
 
 
 @pytest.fixture(autouse=True)
@@ -63,11 +65,19 @@ def same(one: Path, other: Path) -> bool:
     )
 
 
-@pytest.mark.parametrize("name", PICTURES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.long if name in LONG else ()) for name in PICTURES]
+)
 def test_a_picture_is_what_its_script_makes(name: str, tmp_path: Path) -> None:
     """If this fails, run: make pictures."""
     save(PICTURES[name](), tmp_path / "now.svg")
     assert same(FOLDER / f"{name}.svg", tmp_path / "now.svg")
+
+
+def test_every_detector_that_comes_with_daqsvc_has_a_picture() -> None:
+    assert set(detectors.DETECTORS) == set(
+        architecture.PROJECT["project"]["entry-points"]["daqsvc.detectors"]
+    )
 
 
 def test_there_is_no_other_picture_and_a_page_shows_each() -> None:
