@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 DOCS = Path(__file__).parent
 EVALUATION = "evaluate.md"
 BEGIN, END = "<!-- table: make evaluation ({}) -->", "<!-- end of table ({}) -->"
-HEAD = "| what | measured | how | again by | page |\n|---|---|---|---|---|"
+HEAD = "| what | measured | how, and the command that measures again |\n|---|---|---|"
 SNR_DB = ("20 dB", "10 dB", "0 dB")
 
 
@@ -98,8 +98,7 @@ class Row(NamedTuple):
     page: str
 
     def __str__(self) -> str:
-        title = self.page.partition("#")[0]
-        return f"| {self.what} | {self.measured} | {self.how} | `{self.command}` | [{title}]({self.page}) |"
+        return f"| [{self.what}]({self.page}) | {self.measured} | {self.how}: `{self.command}` |"
 
 
 def paper(docs: Path) -> Iterator[Row]:
@@ -109,7 +108,7 @@ def paper(docs: Path) -> Iterator[Row]:
     yield Row(
         "statements of the paper that could be compared",
         f"{verdicts.count('yes')} of {len(verdicts)} agree",
-        "each experiment of section V from scratch; why the others do not agree is said",
+        "each experiment of section V from scratch; the page gives the reasons of the others",
         again,
         "reproduce.md#what-came-out",
     )

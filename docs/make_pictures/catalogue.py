@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from make_pictures import alarm_states, architecture, detectors, outbox, timebase
+from make_pictures import alarm_states, architecture, detectors, outbox, several_machines, timebase
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -17,5 +17,6 @@ PICTURES: Mapping[str, Callable[[], Figure]] = {
     "timebase": timebase.picture,
     "alarm-states": alarm_states.states,
     "outbox": outbox.picture,
+    "several-machines": several_machines.picture,
     **{f"detector-{key.replace('_', '-')}": draw for key, draw in detectors.DETECTORS.items()},
 }
