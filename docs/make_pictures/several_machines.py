@@ -1,4 +1,4 @@
-"""What machines cost one service, from the table of ``make bench`` that stands in docs/several-machines.md."""
+"""What machines cost one service, from the table of ``make bench`` in docs/several-machines.md."""
 
 from __future__ import annotations
 
