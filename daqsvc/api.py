@@ -2,9 +2,9 @@
 
 A package registers a `DriverPlugin` in the group of entry points ``daqsvc.drivers`` under the name that
 ``driver = "..."`` of a bus gives, a `DetectorPlugin` in ``daqsvc.detectors`` under the key of its table in
-``[pipeline]``, or an `OutputPlugin` in ``daqsvc.outputs`` under the path of its table. ``docs/drivers.md``,
-``docs/detectors.md`` and ``docs/outputs.md`` show one of each. Names leave this module only with a new major
-version.
+``[pipeline]``, or an `OutputPlugin` in ``daqsvc.outputs`` under the path of its table.
+``docs/write-a-driver.md``, ``docs/detectors.md`` and ``docs/outputs.md`` show one of each. Names leave
+this module only with a new major version.
 """
 
 from daqsvc.acquisition.assembler import StreamAssembler

@@ -260,7 +260,7 @@ def bearings(docs: Path) -> Iterator[Row]:
 
 def speed(docs: Path) -> Iterator[Row]:
     """What it costs."""
-    cost = Page(docs, "drivers.md")
+    cost = Page(docs, "driver-contract.md")
     for name in (
         "three channels of 3.2 kS/s over CAN FD, levels and a rotor bank",
         "500 lines of text a second, levels",
@@ -271,7 +271,7 @@ def speed(docs: Path) -> Iterator[Row]:
             f"{row['the whole service']} CPU seconds a second",
             "the whole service, x86-64, two cores that others use as well",
             "make bench",
-            "drivers.md",
+            "driver-contract.md",
         )
     ladder = Page(docs, "several-machines.md").row("64", after="## What a machine costs")
     yield Row(

@@ -1,4 +1,4 @@
-"""The contract between a driver and the service; ``docs/drivers.md`` has it in words and by example.
+"""The contract between a driver and the service; ``docs/driver-contract.md`` has it in words.
 
 A driver owns one link. It takes frames off the bus, decodes them in bulk, and delivers blocks; it
 keeps the link up by itself, counts what goes wrong, and lets no exception out. Drivers register by

@@ -147,7 +147,7 @@ class BusTable(DriverKind):
         if isinstance(bus, UnknownBus):
             return  # its driver is the finding
         if bus is not None and isinstance(bus, self.buses) != isinstance(layout, self.layouts):
-            remedy = "correct bus, or describe what comes over it; docs/drivers.md has the layouts"
+            remedy = "correct bus, or describe what comes over it; docs/ has a page for each bus"
             yield Finding((*at, "layout"), f'is {layout.kind}, and bus "{stream.bus}" is {bus.kind}', remedy)
 
     def describe_bus(self, machine: MachineFile, name: str) -> str:

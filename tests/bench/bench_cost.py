@@ -56,7 +56,7 @@ CAN_HZ = 3200.0
 LINES_HZ = 500.0
 MOST_CAN = 0.04
 MOST_LINES = 0.025
-"""CPU seconds for a second of the machine, at the most: docs/drivers.md has what was measured."""
+"""CPU seconds for a second of the machine, at the most: docs/driver-contract.md has what was measured."""
 
 LINES = """
 schema_version = 1

@@ -1,4 +1,4 @@
-"""The worked example of docs/drivers.md: installed as a third party's package is, it serves a machine."""
+"""The example of docs/write-a-driver.md: installed as a third party's package is, it serves a machine."""
 
 from __future__ import annotations
 
@@ -163,9 +163,11 @@ def test_a_package_that_cannot_be_loaded_is_named_with_its_bus(
 
 
 def test_the_documentation_shows_the_example_as_it_is() -> None:
-    text = (DOCS / "drivers.md").read_text()
+    text = (DOCS / "write-a-driver.md").read_text()
     for name in ("tcp_frames.py", "pyproject.toml", "machine.toml"):
-        assert (DRIVER / name).read_text().strip() in text, f"docs/drivers.md does not show {name} as it is"
+        assert (DRIVER / name).read_text().strip() in text, (
+            f"docs/write-a-driver.md does not show {name} as it is"
+        )
 
 
 @pytest.mark.parametrize(("example", "most"), [(DRIVER, 60), (DETECTOR, 40)], ids=["driver", "detector"])

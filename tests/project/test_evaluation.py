@@ -21,7 +21,7 @@ SOURCES = (
     "alarms",
     "alignment",
     "bearing",
-    "drivers",
+    "driver-contract",
     "edge-box",
     "fleet",
     "outbox",

@@ -1,0 +1,52 @@
+"""What docs/can.md, serial.md and replay.md show can be used as it is."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from support.machine_files import MACHINES
+from support.paths import ROOT
+
+from daqsvc.settings import parse_machine_file
+
+HEAD = (MACHINES / "laval-rig.toml").read_text("utf-8").split("[machine.rotor]")[0]
+SENSOR = '[[sensors]]\nname = "s"\ntype = "accelerometer"\nunit = "g"\n'
+SENSOR += 'stream = "{stream}"\nchannel = "{channel}"\n'
+STREAM = '[streams.{stream}]\nbus = "{bus}"\nrate_hz = 100.0\n'
+
+
+def blocks(page: str) -> list[str]:
+    return re.findall(r"```toml\n(.*?)```", (ROOT / "docs" / page).read_text("utf-8"), re.DOTALL)
+
+
+def machine(text: str, stream: str, channel: str):
+    return parse_machine_file(
+        HEAD + text + SENSOR.format(stream=stream, channel=channel), MACHINES / "machine.toml"
+    )
+
+
+@pytest.mark.parametrize(("place", "stream", "channel"), [(1, "shaft", "kph"), (2, "housing", "y")])
+def test_a_layout_of_the_can_page_fits_its_bus(place, stream, channel):
+    bus, *_ = parts = blocks("can.md")
+    text = f"{bus}\n{STREAM.format(stream=stream, bus='can0')}\n{parts[place]}\n{parts[-1]}\n"
+    assert machine(text, stream, channel).buses["can0"].record.keep_mb == 2048
+
+
+def test_the_keys_of_a_serial_port_are_all_shown_with_their_defaults():
+    bus, lines, _ = blocks("serial.md")
+    shown = machine(bus + lines[lines.index("[streams") :], "casing", "v").buses["casing"]
+    least = machine(lines.replace('checksum = "xor"', ""), "casing", "v").buses["casing"]
+    assert shown == least
+
+
+@pytest.mark.parametrize(("place", "stream", "channel"), [(1, "casing", "h"), (2, "shaft", "kph")])
+def test_a_serial_port_of_the_page_has_a_stream(place, stream, channel):
+    assert machine(blocks("serial.md")[place], stream, channel).streams[stream].rate_hz > 100
+
+
+def test_a_table_is_replayed_as_the_page_shows():
+    bus, layout = blocks("replay.md")
+    text = bus.replace("run-up.blf", "run-up.csv").replace('channel = "1"', "")
+    made = machine(f"{text}\n{STREAM.format(stream='x', bus='can0')}{layout}\n", "x", "x")
+    assert made.buses["can0"].at_end == "stop"
