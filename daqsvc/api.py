@@ -32,6 +32,7 @@ from drivers.base import BusCounters, BusOptionError, BusPort, DeviceAbsentError
 from drivers.frames import FrameLayout, LayoutError
 from drivers.plugin import DriverPlugin
 from drivers.reconnect import Attempt, CannotOpenError, in_thread, run_with_reconnect
+from drivers.sniffing import Sniffed, Sniffer, SniffError, SniffTable
 from drivers.stream_driver import StreamDriver, assembler_of
 
 __all__ = [
@@ -76,6 +77,10 @@ __all__ = [
     "Section",
     "Sensor",
     "Severity",
+    "SniffError",
+    "SniffTable",
+    "Sniffed",
+    "Sniffer",
     "Stream",
     "StreamAssembler",
     "StreamDriver",

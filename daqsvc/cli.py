@@ -34,6 +34,7 @@ from daqsvc.commands.reload import ReloadCommand
 from daqsvc.commands.replay import ReplayCommand
 from daqsvc.commands.run import RunCommand
 from daqsvc.commands.snapshot import SnapshotCommand
+from daqsvc.commands.sniff import SniffCommand
 from daqsvc.commands.status import StatusCommand
 from daqsvc.commands.trend import TrendCommand
 
@@ -195,6 +196,7 @@ def commands() -> dict[str, Command]:
         "export": ExportCommand(load, kernel_cache.prepare),
         "detectability": DetectabilityCommand(load, kernel_cache.prepare),
         "example": ExampleCommand(),
+        "sniff": SniffCommand(),
         "record": RecordCommand(load, start_logging),
     }
     for point in entry_points(group=COMMANDS):

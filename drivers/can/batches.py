@@ -156,7 +156,7 @@ class FrameDemultiplexer:
         decoded.note("frames_overrun", batch.overrun)
         decoded.note("frames_malformed", batch.malformed)
         chosen: dict[int, list[NDArray[np.intp]]] = {}
-        for frame_id, rows in _by_id(batch.ids):
+        for frame_id, rows in by_id(batch.ids):
             if frame_id & ERROR:
                 decoded.note("frames_error", len(rows))
                 counts = ErrorCounts.of(batch.ids[rows] & np.uint32(error_classes), batch.data[rows, :8])
@@ -207,7 +207,7 @@ class FrameDemultiplexer:
             decoded.frames[spec.name] = spec.layout.decode(payloads, batch.arrival_ns[rows])
 
 
-def _by_id(ids: NDArray[np.uint32]) -> Iterator[tuple[int, NDArray[np.intp]]]:
+def by_id(ids: NDArray[np.uint32]) -> Iterator[tuple[int, NDArray[np.intp]]]:
     """Each id with the rows it is in, in their order; error frames all under one."""
     if not len(ids):
         return

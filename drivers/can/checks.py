@@ -368,7 +368,9 @@ class FrameTime(NamedTuple):
     most_s: float
 
 
-def frame_time(length: int, *, extended: bool, bitrate: int, data_bitrate: int | None = None) -> FrameTime:
+def frame_time(
+    length: int, *, extended: bool, bitrate: int, data_bitrate: int | None = None, fd: bool = False
+) -> FrameTime:
     """Time that one data frame takes on the wire, intermission included.
 
     Args:
@@ -376,8 +378,9 @@ def frame_time(length: int, *, extended: bool, bitrate: int, data_bitrate: int |
         extended: whether the id has 29 bits rather than 11.
         bitrate: nominal bit/s.
         data_bitrate: bit/s of the data phase of a CAN FD frame; None if it does not switch.
+        fd: whether it is a CAN FD frame whatever its length.
     """
-    if length <= CLASSIC_MAX_LENGTH:
+    if length <= CLASSIC_MAX_LENGTH and not fd:
         # SOF, id, RTR, IDE, r0, DLC (extended: SRR, 18 more id bits and r1 as well), data, CRC.
         stuffed = (39 if extended else 19) + 8 * length + 15
         total = stuffed + _TAIL_BITS

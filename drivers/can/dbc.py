@@ -72,10 +72,7 @@ def layout_from_dbc(
     def field(name: str) -> Field:
         if name not in signals:
             raise LayoutError(f"message {message!r} of {path} has no signal {name!r}; it has {list(signals)}")
-        signal = signals[name]
-        kind: Kind = "float" if signal.is_float else "signed" if signal.is_signed else "unsigned"
-        order: ByteOrder = "little" if signal.byte_order == "little_endian" else "big"
-        return Field(signal.start, signal.length, kind, order)
+        return signal_field(signals[name])
 
     names = [] if counter is None else [counter]
     names += [name for column in channels.values() for name in column]
@@ -166,6 +163,29 @@ def check_dbc(layout: DbcLayout, file: Path, at: KeyPath) -> tuple[DbcMessage | 
         pages=_pages(message, [name for _, name in _asked(layout, at)]),
     )
     return facts, list(_signal_findings(layout, message, at))
+
+
+def messages_of(file: Path) -> list[Message]:
+    """Every message that a DBC file describes.
+
+    Raises:
+        LayoutError: the file cannot be read, or cantools is not installed.
+    """
+    database = _database(file, ())
+    if isinstance(database, Finding):
+        raise LayoutError(f"{database.message}. Remedy: {database.remedy}")
+    return list(database.messages)
+
+
+def signal_field(signal: Signal) -> Field:
+    """Where a signal lies in a frame, and how its bits are read.
+
+    Raises:
+        LayoutError: it has a width that no number has.
+    """
+    kind: Kind = "float" if signal.is_float else "signed" if signal.is_signed else "unsigned"
+    order: ByteOrder = "little" if signal.byte_order == "little_endian" else "big"
+    return Field(signal.start, signal.length, kind, order)
 
 
 def _database(file: Path, at: KeyPath) -> Database | Finding:

@@ -43,6 +43,7 @@ VERBS = (
     "export",
     "detectability",
     "example",
+    "sniff",
     "record",
     "demo",
     "reproduce",

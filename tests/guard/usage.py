@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 from guard.verbs import answer
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from guard.verbs import Answer
 
 VALUES = ("", "nonsense", "-1", "0", "1e400", "nan", "a,b")
-_BARE_WORDS = 3
-"""usage: daqsvc VERB"""
+_BARE_WORDS = 2
+"""usage: daqsvc, before the verb"""
 
 _REFUSED = "--no-such-option"
 """Ends every command line of `wrong_values`, so that none that is right by chance is carried out."""
@@ -145,6 +145,12 @@ record machines/laval-rig.toml --out no/such/folder/log.blf
 record machines/laval-rig.toml --out log.blf --bus no-such
 record machines/serial-probes.toml --out log.blf
 record machines/rotor-two-buses.toml --out log.blf
+sniff nonsense
+sniff can
+sniff can no-such-interface --seconds 0
+sniff can no-such-interface --bitrate 5
+sniff can no-such-interface --dbc absent.dbc
+sniff can no-such-interface --interface no-such
 demo --scenario no-such
 demo --scenario machines/laval-rig.toml
 demo --recording absent.npz
@@ -172,10 +178,12 @@ reproduce --out machines/laval-rig.toml/folder
 
 
 def helps() -> Iterator[Answer]:
-    """The help of the whole and of every verb."""
+    """The help of the whole, of every verb, and of the verbs below one."""
     yield (whole := answer("--help"))
     for verb in verbs(whole.out):
-        yield answer(verb, "--help")
+        yield (told := answer(verb, "--help"))
+        for below in verbs(told.out):
+            yield answer(verb, below, "--help")
 
 
 def verbs(help_text: str) -> list[str]:
@@ -188,11 +196,11 @@ def wrong_lines() -> Iterator[Answer]:
     """Every verb with too little, with too much, and with an unknown option; `MISUSES`."""
     yield answer()
     for told in list(helps())[1:]:
-        verb = told.arguments[0]
-        if _needs_something(told.out):
-            yield answer(verb)
-        yield answer(verb, _REFUSED)
-        yield answer(verb, *["file"] * 9, _REFUSED)
+        verb = told.arguments[:-1]
+        if _needs_something(told.out, verb):
+            yield answer(*verb)
+        yield answer(*verb, _REFUSED)
+        yield answer(*verb, *["file"] * 9, _REFUSED)
     for line in MISUSES:
         yield answer(*line.split())
 
@@ -200,25 +208,26 @@ def wrong_lines() -> Iterator[Answer]:
 def wrong_values() -> Iterator[str]:
     """What each option of each verb says of values, a line each."""
     for told in list(helps())[1:]:
-        verb = told.arguments[0]
-        files = ["file"] * _needs_something(told.out)
+        words = told.arguments[:-1]
+        verb = " ".join(words)
+        files = ["file"] * _needs_something(told.out, words)
         for option, takes_value in _options(told.out):
             for value in VALUES if takes_value else ("nonsense",):
-                given = answer(verb, *files, f"{option}={value}", _REFUSED)
+                given = answer(*words, *files, f"{option}={value}", _REFUSED)
                 said = given.err.strip().removeprefix(f"daqsvc {verb}: ")
                 if f"unrecognized arguments: {_REFUSED}" in said:
                     said = "accepted"
                 yield f"{verb} {option}={value}: {said} (exit code {given.code})"
             if takes_value:
-                yield f"{verb} {option}: {answer(verb, *files, option).err.strip()}"
+                yield f"{verb} {option}: {answer(*words, *files, option).err.strip()}"
 
 
-def _needs_something(help_text: str) -> bool:
+def _needs_something(help_text: str, verb: Sequence[str]) -> bool:
     """Whether the usage line of a verb has anything but what may be left out."""
     usage = " ".join(help_text.partition("\n\n")[0].split())
     while (shorter := re.sub(r"\[[^\[\]]*\]", "", usage)) != usage:
         usage = shorter
-    return len(usage.split()) > _BARE_WORDS
+    return len(usage.split()) > _BARE_WORDS + len(verb)
 
 
 def _options(help_text: str) -> list[tuple[str, bool]]:

@@ -1,0 +1,110 @@
+"""``daqsvc sniff KIND ...``: what is on a bus, before there is any machine file."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+import threading
+from contextlib import contextmanager
+from importlib.metadata import entry_points
+from typing import TYPE_CHECKING, Any
+
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, signals_to_end
+from drivers.can.sniff import CanSniffer
+from drivers.sniffing import Sniffer, SniffError
+
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import Iterator
+
+    from drivers.sniffing import Sniffed, SniffTable
+
+SNIFFERS = "daqsvc.sniffers"
+
+
+class SniffCommand:
+    """``daqsvc sniff KIND ...``; other packages register kinds by entry point in ``daqsvc.sniffers``."""
+
+    help = "what is on a bus, before there is a machine file; ends with tables to begin one with"
+    description = (
+        "Look at a bus without a machine file, and print what is on it. At the end come tables of a machine "
+        "file to begin with. Ctrl-C ends it early; what was found until then is printed (docs/sniff.md)."
+    )
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """See `daqsvc.cli.Command.add_arguments`."""
+        kinds = parser.add_subparsers(dest="kind", metavar="KIND", required=True, title="verbs")
+        for name, sniffer in sniffers().items():
+            kind = kinds.add_parser(name, help=sniffer.help, description=sniffer.description)
+            sniffer.add_arguments(kind)
+            kind.add_argument("--json", action="store_true", help="one JSON object")
+            kind.set_defaults(sniffer=sniffer)
+
+    def run(self, arguments: argparse.Namespace) -> int:
+        """See `daqsvc.cli.Command.run`."""
+        sniffer: Sniffer = arguments.sniffer
+        try:
+            with _stopping() as stop:
+                found = sniffer.sniff(arguments, stop, _tell)
+        except SniffError as error:
+            _tell(f"daqsvc: {error}")
+            return EXIT_USAGE if error.usage else EXIT_FAILED
+        print(_as_json(found) if arguments.json else _as_text(found))  # noqa: T201 - what the verb is for
+        if found.problem:
+            sys.stdout.flush()
+            _tell(f"daqsvc: {found.problem}")
+        return EXIT_FAILED if found.problem else EXIT_OK
+
+
+def sniffers() -> dict[str, Sniffer]:
+    """Every kind of bus that can be looked at, by the name of its driver."""
+    known: dict[str, Sniffer] = {"can": CanSniffer()}
+    for point in entry_points(group=SNIFFERS):
+        try:
+            made = point.load()()
+        except Exception as error:  # noqa: BLE001 - whatever a package does must not take the others along
+            _tell(f"daqsvc: sniff {point.name} is left out: {error}")
+            continue
+        if isinstance(made, Sniffer):
+            known[point.name] = made
+        else:
+            _tell(f"daqsvc: sniff {point.name} is left out: it is not derived from Sniffer of daqsvc.api")
+    return known
+
+
+@contextmanager
+def _stopping() -> Iterator[threading.Event]:
+    """What is set by Ctrl-C and by the signals that end a program."""
+    stop = threading.Event()
+
+    def handle(_number: int, _frame: Any) -> None:
+        stop.set()
+
+    before = {number: signal.signal(number, handle) for number in signals_to_end()}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _as_json(found: Sniffed) -> str:
+    return json.dumps({**found.figures, "machine_file": found.fragment, "problem": found.problem})
+
+
+def _as_text(found: Sniffed) -> str:
+    parts = [part if isinstance(part, str) else _drawn(part) for part in found.parts]
+    if found.fragment:
+        parts.append(f"To begin a machine file with (docs/machine-file.md has the rest):\n\n{found.fragment}")
+    return "\n\n".join(part.rstrip() for part in parts if part)
+
+
+def _drawn(table: SniffTable) -> str:
+    from daqsvc.commands.tables import aligned  # noqa: PLC0415 - each verb imports only what it needs
+
+    return aligned(table.titles, table.rows)
+
+
+def _tell(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)  # noqa: T201

@@ -1,0 +1,572 @@
+"""``daqsvc sniff can``: which ids come over a CAN bus, how often, and the values by a DBC file."""
+
+from __future__ import annotations
+
+import errno
+import json
+import subprocess
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from drivers.sniffing import (
+    Sniffed,
+    Sniffer,
+    SniffError,
+    SniffTable,
+    quoted,
+    rounded_rate,
+    sensor_lines,
+    table_name,
+    unused,
+)
+
+if TYPE_CHECKING:
+    import argparse
+    import threading
+    from collections.abc import Callable, Iterator, Sequence
+
+    from drivers.can.batches import CanSource
+    from drivers.can.dbc_traffic import DbcTraffic, MessageTraffic
+    from drivers.can.settings import CanBus
+    from drivers.can.traffic import IdTraffic, Traffic
+
+SECONDS = 5.0
+LONGEST_SECONDS = 3600.0
+TYPICAL_BITRATE = 500_000
+_POLL_S = 0.1
+_SHOWN_BYTES = 16
+_NETWORK = Path("/sys/class/net")
+_ARPHRD_CAN = 280
+"""``/sys/class/net/NAME/type`` of a CAN interface (linux/if_arp.h)."""
+_IP_S = 2.0
+
+
+class CanSniffer(Sniffer):
+    """See `drivers.sniffing.Sniffer`."""
+
+    help = "listen to a CAN bus: ids, rates, bytes that change, and values by a DBC file"
+    description = (
+        "Listen to a CAN or CAN FD bus and print each id that comes, how often and how evenly, how long its "
+        "frames are and which bytes change; with a DBC file also the values of its signals. Nothing is sent."
+    )
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """See `drivers.sniffing.Sniffer.add_arguments`."""
+        parser.add_argument("channel", metavar="INTERFACE", help="the CAN interface, e.g. can0")
+        parser.add_argument("--dbc", type=Path, metavar="FILE", help="describes messages and signals")
+        parser.add_argument(
+            "--seconds",
+            type=float,
+            default=SECONDS,
+            metavar="S",
+            help=f"how long to listen (default: {SECONDS:g})",
+        )
+        parser.add_argument(
+            "--fd",
+            action="store_true",
+            help="CAN FD frames are on the bus; interfaces of the kernel take them anyway",
+        )
+        parser.add_argument(
+            "--bitrate", type=int, metavar="BIT/S", help="of the bus, for its load (default: ask the kernel)"
+        )
+        parser.add_argument(
+            "--data-bitrate", type=int, metavar="BIT/S", help="of the data of CAN FD frames, likewise"
+        )
+        parser.add_argument(
+            "--interface",
+            default="socketcan",
+            metavar="NAME",
+            help="kind of interface, as python-can names it (default: socketcan, those of the kernel)",
+        )
+
+    def sniff(
+        self, arguments: argparse.Namespace, stop: threading.Event, tell: Callable[[str], None]
+    ) -> Sniffed:
+        """See `drivers.sniffing.Sniffer.sniff`."""
+        from daqsvc.acquisition.clock import SystemClock  # noqa: PLC0415 - only for who listens
+        from drivers.can.traffic import Traffic  # noqa: PLC0415
+
+        facts = _kernel_facts(arguments.channel) if arguments.interface == "socketcan" else _NO_FACTS
+        bus = _bus(arguments, facts)
+        if not 0 < arguments.seconds <= LONGEST_SECONDS:
+            raise SniffError(
+                f"--seconds {arguments.seconds:g}: give a time above 0, up to {LONGEST_SECONDS:g} s",
+                usage=True,
+            )
+        dbc = None if arguments.dbc is None else _dbc(arguments.dbc)
+        source = _opened(bus, SystemClock())
+        traffic = Traffic()
+        tell(f"listening to {bus.channel} for {arguments.seconds:g} s; Ctrl-C ends it early")
+        begin_s = time.monotonic()
+        try:
+            lost = _listen(source, traffic, dbc, stop, begin_s + arguments.seconds)
+        finally:
+            source.close()
+        return _Report(bus, traffic, dbc, arguments.dbc, time.monotonic() - begin_s, lost).sniffed()
+
+
+class _KernelFacts(NamedTuple):
+    """What the kernel says of an interface: its bit rates, where it is a real one."""
+
+    bitrate: int | None = None
+    data_bitrate: int | None = None
+
+
+_NO_FACTS = _KernelFacts()
+
+
+def _kernel_facts(channel: str) -> _KernelFacts:
+    """Bit rates of an interface, as ``ip`` shows them; none where there is no ``ip``, or no bit rate."""
+    command = ["ip", "-json", "-details", "link", "show", "dev", channel]
+    try:
+        done = subprocess.run(command, capture_output=True, timeout=_IP_S, check=True)  # noqa: S603
+        shown = json.loads(done.stdout)[0]["linkinfo"]["info_data"]
+        return _KernelFacts(
+            (shown.get("bittiming") or {}).get("bitrate"), (shown.get("data_bittiming") or {}).get("bitrate")
+        )
+    except (OSError, subprocess.SubprocessError, ValueError, LookupError, TypeError, AttributeError):
+        return _NO_FACTS
+
+
+def _bus(arguments: argparse.Namespace, facts: _KernelFacts) -> CanBus:
+    """The table that a machine file would have for the bus.
+
+    Raises:
+        SniffError: an argument is no value that it could have.
+    """
+    from pydantic import ValidationError  # noqa: PLC0415 - only for who listens
+
+    from drivers.can.settings import CanBus  # noqa: PLC0415
+
+    data_bitrate = arguments.data_bitrate or facts.data_bitrate
+    table = {
+        "driver": "can",
+        "interface": arguments.interface,
+        "channel": arguments.channel,
+        "fd": arguments.fd or arguments.data_bitrate is not None,
+        "bitrate": arguments.bitrate or facts.bitrate,
+        "data_bitrate": data_bitrate,
+        "filter": False if arguments.interface == "socketcan" else None,
+    }
+    try:
+        return CanBus.model_validate({key: value for key, value in table.items() if value is not None})
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = {"channel": "INTERFACE"}.get(f"{first['loc'][0]}", f"--{first['loc'][0]}".replace("_", "-"))
+        raise SniffError(f"{key} {first['input']!r}: {first['msg']}", usage=True) from error
+
+
+def _dbc(file: Path) -> DbcTraffic:
+    from drivers.can.dbc import messages_of  # noqa: PLC0415 - only for who listens
+    from drivers.can.dbc_traffic import DbcTraffic  # noqa: PLC0415
+    from drivers.fields import LayoutError  # noqa: PLC0415
+
+    try:
+        return DbcTraffic(messages_of(file))
+    except LayoutError as error:
+        raise SniffError(f"--dbc: {error}", usage=True) from error
+
+
+def _opened(bus: CanBus, clock: Any) -> CanSource:
+    """The open bus.
+
+    Raises:
+        SniffError: it cannot be opened; says what to do.
+    """
+    if bus.interface == "socketcan":
+        from drivers.can.batches import IdMatch  # noqa: PLC0415 - only for who listens
+        from drivers.can.socketcan import open_socketcan  # noqa: PLC0415
+
+        try:
+            return open_socketcan(bus, [IdMatch(0, 0)], clock, recorded=True)
+        except OSError as error:
+            raise SniffError(_why_not_open(error, bus.channel)) from error
+    from can.interfaces import BACKENDS  # noqa: PLC0415 - slow to import
+
+    from daqsvc.settings.problems import choice  # noqa: PLC0415
+    from drivers.can.adapter import open_adapter  # noqa: PLC0415
+
+    if bus.interface not in BACKENDS:
+        remedy = f"{choice(bus.interface, BACKENDS)}; or install the python-can plugin that brings it"
+        raise SniffError(
+            f"--interface {bus.interface}: python-can knows no such interface. Remedy: {remedy}", usage=True
+        )
+    try:
+        return open_adapter(bus, clock)
+    except Exception as error:
+        said = f"{error}" or type(error).__name__
+        raise SniffError(
+            f"{bus.interface} {bus.channel} cannot be opened: {said}. Remedy: see what is plugged in and "
+            "whether its driver is installed (docs/can.md)"
+        ) from error
+
+
+def _why_not_open(error: OSError, channel: str) -> str:
+    if error.errno == errno.ENODEV:
+        there = can_interfaces()
+        listed = (
+            f"CAN interfaces of this computer: {', '.join(there)}" if there else "it has no CAN interface"
+        )
+        return (
+            f"there is no CAN interface {channel} ({listed}). Remedy: plug the adapter in and see `dmesg`, "
+            f"or correct the name; for a virtual bus: ip link add dev {channel} type vcan"
+        )
+    if error.errno == errno.ENETDOWN:
+        return f"{channel} is down. Remedy: {_set_up(channel)}"
+    return f"{channel} cannot be opened: {error.strerror or error}"
+
+
+def can_interfaces() -> list[str]:
+    """CAN interfaces of this computer."""
+
+    def is_can(interface: Path) -> bool:
+        try:
+            return int((interface / "type").read_text()) == _ARPHRD_CAN
+        except (OSError, ValueError):
+            return False
+
+    try:
+        return sorted(path.name for path in _NETWORK.iterdir() if is_can(path))
+    except OSError:
+        return []
+
+
+def _set_up(channel: str, bitrate: int | None = None) -> str:
+    """The command that sets an interface up."""
+    if channel.startswith("vcan"):
+        return f"ip link set {channel} up"
+    return f"ip link set {channel} up type can bitrate {bitrate or TYPICAL_BITRATE}"
+
+
+def _listen(
+    source: CanSource, traffic: Traffic, dbc: DbcTraffic | None, stop: threading.Event, until_s: float
+) -> str:
+    """Take in frames until it is time, or the bus is lost; returns why it was lost, else nothing."""
+    from drivers.can.batches import BusOffError  # noqa: PLC0415 - only for who listens
+    from drivers.can.errors import BUS_OFF_REASON  # noqa: PLC0415
+    from drivers.reconnect import words  # noqa: PLC0415
+
+    while not stop.is_set() and (left_s := until_s - time.monotonic()) > 0:
+        try:
+            batch = source.read(min(left_s, _POLL_S))
+        except BusOffError:
+            return BUS_OFF_REASON
+        except Exception as error:  # noqa: BLE001 - adapters raise what they like
+            return words(error)
+        traffic.take(batch, source.error_classes)
+        if dbc is not None:
+            dbc.take(batch)
+        if len(batch.ids):
+            source.gather(stop)
+    return ""
+
+
+class _Report(NamedTuple):
+    """What was heard, in words, in figures and as a machine file."""
+
+    bus: CanBus
+    traffic: Traffic
+    dbc: DbcTraffic | None
+    dbc_file: Path | None
+    seconds: float
+    lost: str
+
+    def sniffed(self) -> Sniffed:
+        """All of it."""
+        heard = bool(self.traffic.ids)
+        return Sniffed(
+            list(self._parts()), self._figures(), self._fragment() if heard else "", self._problem()
+        )
+
+    @property
+    def _fd(self) -> bool:
+        return self.bus.fd or self.traffic.fd
+
+    @property
+    def _ids(self) -> list[IdTraffic]:
+        """By how urgent they are on the bus."""
+        return sorted(
+            self.traffic.ids.values(), key=lambda one: (one.extended, one.arbitration_id, one.remote)
+        )
+
+    @property
+    def _load(self) -> tuple[float, float] | None:
+        if self.bus.bitrate is None:
+            return None
+        return self.traffic.load(self.seconds, self.bus.bitrate, self.bus.data_bitrate)
+
+    def _problem(self) -> str:
+        name = self.bus.channel
+        if self.lost:
+            return f"{name} was lost after {self.seconds:.1f} s: {self.lost}. Remedy: {_set_up(name)}"
+        if self.traffic.ids:
+            return ""
+        if self.traffic.error_frames:
+            return (
+                f"{name}: no frame in {self.seconds:.1f} s, but {self.traffic.error_frames} error frames: "
+                "the bit rate is most likely wrong. Remedy: take the one of the devices, `ip link set "
+                f"{name} down`, then `{_set_up(name, self.bus.bitrate)}`; check termination and wiring"
+            )
+        return (
+            f"{name}: no frame in {self.seconds:.1f} s. Remedy: see that the devices are powered and send "
+            "without being asked; that CAN_H and CAN_L are not swapped, with 120 ohm at both ends; and that "
+            f"the bit rate is theirs (`ip link set {name} down`, then `{_set_up(name, self.bus.bitrate)}`)"
+        )
+
+    def _parts(self) -> Iterator[str | SniffTable]:
+        frames, ids = self.traffic.frames, self._ids
+        summary = (
+            f"{self.bus.channel}: {frames} frames in {self.seconds:.1f} s, {len(ids)} {_plural('id', ids)}"
+        )
+        if (load := self._load) is not None and self.bus.bitrate is not None:
+            from daqsvc.settings.buses import percent  # noqa: PLC0415 - only for who listens
+
+            summary += f", load {percent(*load)} of {self.bus.bitrate:,} bit/s"
+        elif frames:
+            summary += "; give --bitrate to see the load of the bus"
+        yield summary
+        if self.traffic.dropped:
+            yield f"{self.traffic.dropped} frames were dropped: this computer was too slow for them."
+        if self.traffic.error_frames:
+            yield self._errors()
+        if ids:
+            titles: tuple[str, ...] = (
+                "id",
+                "kind",
+                "bytes",
+                "frames/s",
+                "period",
+                "std",
+                "bytes that change",
+                "last payload",
+            )
+            titles += ("counter",) if any(one.counter for one in ids) else ()
+            titles += ("message",) if self.dbc else ()
+            yield SniffTable(titles, [self._id_row(one, len(titles)) for one in ids])
+        if self.dbc is not None:
+            yield from self._dbc_parts(self.dbc)
+
+    def _id_row(self, one: IdTraffic, columns: int) -> list[str]:
+        row = [
+            _id(one.arbitration_id, extended=one.extended),
+            one.kind,
+            _ranges(one.lengths),
+            "-" if one.rate_hz is None else f"{one.rate_hz:.4g}",
+            _ms(one.period_s),
+            _ms(one.period_std_s),
+            _ranges(one.changed_bytes) or "none",
+            _payload(one.last) or "-",
+        ]
+        message = None if self.dbc is None else self.dbc.message_of(one.frame_id)
+        if columns - len(row) == 1 + (self.dbc is not None):
+            row.append(f"{one.counter}" if one.counter else "-")
+        if self.dbc is not None:
+            row.append("not in the DBC file" if message is None else message.name)
+        return row
+
+    def _errors(self) -> str:
+        errors = self.traffic.errors
+        counts = ", ".join(f"{name} {count}" for name, count in errors.counts.items())
+        state = "" if errors.state is None else f"; the controller is {errors.state}"
+        return f"{self.traffic.error_frames} error frames: {counts or 'of no known class'}{state}"
+
+    def _dbc_parts(self, dbc: DbcTraffic) -> Iterator[str | SniffTable]:
+        rows = [
+            [
+                message.name,
+                signal.name,
+                *_values(signal.last, signal.least, signal.most),
+                signal.unit or "-",
+                signal.choice or ("counts frames" if signal.counts else ""),
+            ]
+            for message in dbc.heard
+            for signal in message.signals
+            if signal.frames
+        ]
+        if rows:
+            yield SniffTable(("message", "signal", "last", "min", "max", "unit", ""), rows)
+        for message in dbc.heard:
+            if message.short:
+                yield (
+                    f"{message.name}: {message.short} of {message.frames} frames have fewer than the "
+                    f"{message.length} bytes of the DBC file, and are left out above."
+                )
+            yield from (f"{message.name}: {reason}." for reason in message.unusable)
+        if dbc.missing:
+            named = [f"{one.name} ({_id(one.frame_id, extended=one.extended)})" for one in dbc.missing]
+            yield f"In the DBC file, but not heard: {', '.join(named)}"
+        strange = [one for one in self._ids if not one.remote and dbc.message_of(one.frame_id) is None]
+        if strange:
+            named = [_id(one.arbitration_id, extended=one.extended) for one in strange]
+            yield f"Heard, but not in the DBC file: {', '.join(named)}"
+
+    def _figures(self) -> dict[str, Any]:
+        load = self._load
+        return {
+            "bus": "can",
+            "interface": self.bus.interface,
+            "channel": self.bus.channel,
+            "seconds": round(self.seconds, 3),
+            "frames": self.traffic.frames,
+            "frames_dropped": self.traffic.dropped,
+            "error_frames": self.traffic.error_frames,
+            "errors": self.traffic.errors.counts,
+            "controller_state": self.traffic.errors.state,
+            "bitrate": self.bus.bitrate,
+            "load": None if load is None else {"least": load[0], "most": load[1]},
+            "ids": [self._id_figures(one) for one in self._ids],
+            **({} if self.dbc is None else {"dbc": self._dbc_figures(self.dbc)}),
+        }
+
+    def _id_figures(self, one: IdTraffic) -> dict[str, Any]:
+        message = None if self.dbc is None else self.dbc.message_of(one.frame_id)
+        return {
+            "id": one.arbitration_id,
+            "extended": one.extended,
+            "remote": one.remote,
+            "fd": any(wire.fd for wire in one.wires),
+            "bit_rate_switch": any(wire.switches for wire in one.wires),
+            "frames": one.frames,
+            "lengths": one.lengths,
+            "rate_hz": one.rate_hz,
+            "period_s": one.period_s,
+            "period_std_s": one.period_std_s,
+            "period_min_s": None if one.frames < 2 else one.shortest_s,
+            "period_max_s": None if one.frames < 2 else one.longest_s,
+            "changed_bytes": one.changed_bytes,
+            "last": one.last.hex(),
+            "counter": None if one.counter is None else one.counter._asdict(),
+            "message": None if message is None else message.name,
+        }
+
+    def _dbc_figures(self, dbc: DbcTraffic) -> dict[str, Any]:
+        return {
+            "messages": [
+                {
+                    "message": message.name,
+                    "id": message.frame_id,
+                    "frames": message.frames,
+                    "frames_short": message.short,
+                    "signals": [
+                        {
+                            "signal": signal.name,
+                            "unit": signal.unit,
+                            "last": signal.last,
+                            "min": signal.least,
+                            "max": signal.most,
+                            "counts_frames": signal.counts,
+                        }
+                        for signal in message.signals
+                        if signal.frames
+                    ],
+                }
+                for message in dbc.heard
+            ],
+            "not_heard": [message.name for message in dbc.missing],
+        }
+
+    def _fragment(self) -> str:
+        name = table_name(self.bus.channel.rpartition("/")[2], "can0")
+        lines = [
+            f"[buses.{name}]",
+            'driver = "can"',
+            f"interface = {quoted(self.bus.interface)}",
+            f"channel = {quoted(self.bus.channel)}",
+        ]
+        lines += ["fd = true"] * self._fd
+        if self.bus.bitrate is not None:
+            lines.append(f"bitrate = {self.bus.bitrate:_}")
+        if self._fd and self.bus.data_bitrate is not None:
+            lines.append(f"data_bitrate = {self.bus.data_bitrate:_}")
+        taken: set[str] = set()
+        sensors: set[str] = set()
+        for message in self.dbc.heard if self.dbc is not None else ():
+            lines += ["", *self._stream(message, name, taken, sensors)]
+        unknown = [
+            one
+            for one in self._ids
+            if not one.remote and (self.dbc is None or self.dbc.message_of(one.frame_id) is None)
+        ]
+        if unknown:
+            lines += [
+                "",
+                "# Where samples lie in these frames is in the manuals of the devices, or in a DBC file:",
+            ]
+            lines += [f"#   {_in_words(one)}" for one in unknown]
+        return "\n".join(lines)
+
+    def _stream(self, message: MessageTraffic, bus: str, taken: set[str], sensors: set[str]) -> Sequence[str]:
+        """A stream of a message, as far as one can be made of what is known."""
+        of_ids = [one for key in sorted(message.ids) if (one := self.traffic.ids[key]).rate_hz is not None]
+        channels = [s for s in message.signals if s.frames and not s.counts and not s.multiplexed]
+        if any(signal.multiplexed for signal in message.signals):
+            return [f"# {message.name} is multiplexed: make a stream for each page (docs/can.md)"]
+        if len(of_ids) != 1 or not channels or message.short:
+            return [f"# {message.name} came too seldom, or not as the DBC file describes it"]
+        rate_hz = of_ids[0].rate_hz
+        assert rate_hz is not None and self.dbc_file is not None  # noqa: S101, PT018 - for the type checker
+        name = unused(table_name(message.name.lower(), "stream"), taken)
+        counter = message.counter
+        return [
+            f"[streams.{name}]",
+            f"bus = {quoted(bus)}",
+            f"rate_hz = {rounded_rate(rate_hz)}    # as measured; the device's manual has the exact one",
+            "",
+            f"[streams.{name}.layout]",
+            f"dbc = {quoted(f'{self.dbc_file.absolute()}')}",
+            f"message = {quoted(message.name)}",
+            "no_counter = true    # none was seen"
+            if counter is None
+            else f'counter = {{ signal = {quoted(counter.name)}, counts = "frames" }}',
+            "channels = [",
+            *(f"  {{ name = {quoted(s.name)}, signals = [{quoted(s.name)}] }}," for s in channels),
+            "]",
+            *sensor_lines(
+                name,
+                {s.name: s.unit for s in channels if s.unit}
+                or dict.fromkeys((s.name for s in channels), "1"),
+                sensors,
+            ),
+        ]
+
+
+def _id(frame_id: int, *, extended: bool) -> str:
+    return f"0x{frame_id:08X}" if extended else f"0x{frame_id:03X}"
+
+
+def _in_words(one: IdTraffic) -> str:
+    counter = f", counter at {one.counter}" if one.counter else ""
+    rate = "once" if one.rate_hz is None else f"{rounded_rate(one.rate_hz):g}/s"
+    changing = _ranges(one.changed_bytes)
+    return (
+        f"{_id(one.arbitration_id, extended=one.extended)}: {_ranges(one.lengths)} bytes, {rate}, "
+        f"{f'bytes {changing} change' if changing else 'always the same'}{counter}"
+    )
+
+
+def _ranges(numbers: Sequence[int]) -> str:
+    """Numbers in order, those in a row as a range: ``0-3, 7``."""
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][1] + 1:
+            runs[-1][1] = number
+        else:
+            runs.append([number, number])
+    return ", ".join(f"{low}" if low == high else f"{low}-{high}" for low, high in runs)
+
+
+def _plural(word: str, things: Sequence[object]) -> str:
+    return word if len(things) == 1 else f"{word}s"
+
+
+def _ms(time_s: float | None) -> str:
+    return "-" if time_s is None else f"{1e3 * time_s:.4g} ms"
+
+
+def _payload(data: bytes) -> str:
+    return data[:_SHOWN_BYTES].hex(" ") + (" ..." if len(data) > _SHOWN_BYTES else "")
+
+
+def _values(*values: float) -> list[str]:
+    return [f"{value:.6g}" for value in values]

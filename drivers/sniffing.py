@@ -1,0 +1,146 @@
+"""What a driver brings to ``daqsvc sniff``: a look at a bus of its kind before there is any machine file.
+
+A sniffer listens or asks, and says what it found: for a person, for a program, and as tables of a machine
+file to begin with. Those of this tree are named in `daqsvc.commands.sniff`; a package of its own registers
+one by entry point in the group ``daqsvc.sniffers``, under the name of its driver.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+
+from daqsvc.settings.units import unit_of
+
+if TYPE_CHECKING:
+    import argparse
+    import threading
+    from collections.abc import Callable, Mapping, Sequence
+
+
+LONGEST_UNIT = 16
+"""Letters that the unit of a sensor may have."""
+
+
+class SniffError(Exception):
+    """Nothing can be seen; the message names the thing, what is wrong with it, and the remedy.
+
+    Args:
+        message: for a person, one line.
+        usage: whether the arguments are wrong, rather than the bus.
+    """
+
+    def __init__(self, message: str, *, usage: bool = False) -> None:
+        super().__init__(message)
+        self.usage = usage
+
+
+class SniffTable(NamedTuple):
+    """Rows with a title above each column."""
+
+    titles: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+@dataclass(frozen=True, slots=True)
+class Sniffed:
+    """What was found on a bus.
+
+    Attributes:
+        parts: the same for a person, in this order: texts of whole lines, and tables.
+        figures: the same for a program; of what JSON has.
+        fragment: tables of a machine file to begin with, in TOML; empty if there is nothing to propose.
+        problem: what is wrong, with what to check; empty if nothing is. It makes the verb fail.
+    """
+
+    parts: Sequence[str | SniffTable]
+    figures: Mapping[str, Any]
+    fragment: str = ""
+    problem: str = ""
+
+
+class Sniffer(ABC):
+    """One kind of bus for ``daqsvc sniff KIND``; importing its module must be cheap.
+
+    Attributes:
+        help: one line for the list of kinds.
+        description: what ``daqsvc sniff KIND --help`` begins with.
+    """
+
+    help: ClassVar[str]
+    description: ClassVar[str]
+
+    @abstractmethod
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Declare the arguments; heavy imports belong into `sniff`."""
+
+    @abstractmethod
+    def sniff(
+        self, arguments: argparse.Namespace, stop: threading.Event, tell: Callable[[str], None]
+    ) -> Sniffed:
+        """Look at the bus. Nothing may wait for longer than some 0.2 s without a look at ``stop``.
+
+        Args:
+            arguments: as parsed.
+            stop: set when the person has seen enough; what was found so far is still returned.
+            tell: says one line while it goes on.
+
+        Raises:
+            SniffError: nothing can be seen at all.
+        """
+
+
+def quoted(text: str) -> str:
+    """A text as TOML has it."""
+    return json.dumps(text, ensure_ascii=False)
+
+
+def table_name(text: str, otherwise: str) -> str:
+    """A name for a table of a machine file, which needs no quotes; ``otherwise`` if nothing is left of it."""
+    return re.sub(r"[^A-Za-z0-9_]+", "-", text).strip("-")[:40] or otherwise
+
+
+def sensor_lines(stream: str, channels: Mapping[str, str], taken: set[str]) -> list[str]:
+    """A table ``[[sensors]]`` for each channel of a stream, of the type that its unit is usual for.
+
+    Args:
+        stream: its name.
+        channels: the unit of each channel; ``1`` where none is known.
+        taken: names of sensors that there are; the new ones are added.
+    """
+    lines: list[str] = []
+    for channel, text in channels.items():
+        known = unit_of(text)
+        unit = text.strip() if known is None else known.name
+        kind = {"g": "accelerometer", "m/s2": "accelerometer", "mm/s": "velocity"}.get(unit, "trend")
+        if kind == "trend":
+            unit = text.strip()
+        if not (0 < len(unit) <= LONGEST_UNIT and unit.isprintable()):
+            unit = "1"
+        lines += [
+            "",
+            "[[sensors]]",
+            f"name = {quoted(unused(table_name(channel.lower(), 'sensor'), taken))}",
+            f"type = {quoted(kind)}",
+            f"stream = {quoted(stream)}",
+            f"channel = {quoted(channel)}",
+            f"unit = {quoted(unit)}",
+        ]
+    return lines
+
+
+def unused(name: str, taken: set[str]) -> str:
+    """A name that nothing has yet; it is taken then."""
+    free, number = name, 2
+    while free in taken:
+        free, number = f"{name}-{number}", number + 1
+    taken.add(free)
+    return free
+
+
+def rounded_rate(rate_hz: float) -> float:
+    """A rate that was measured, to three digits."""
+    return float(f"{rate_hz:.3g}")

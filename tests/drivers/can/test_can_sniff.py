@@ -1,0 +1,274 @@
+"""``daqsvc sniff can`` on the virtual bus between processes; on interfaces of the kernel: tests/hil."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import tomllib
+from typing import TYPE_CHECKING, Any
+
+import can
+import pytest
+from support.paths import ROOT
+from support.waiting import PATIENCE_S
+
+from daqsvc.cli import main
+from drivers.can import sniff, socketcan
+from sim_hw.bus_socket import UnixBus
+from sim_hw.bus_socket_hub import Hub
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+pytestmark = pytest.mark.integration
+DBC = ROOT / "config" / "devices" / "triaxial-accelerometer.dbc"
+BEGIN = 'schema_version = 1\nsite = "lab"\nbox = "edge-1"\n\n[machine]\nname = "fan"\nspeed_rpm = 1480.0\n\n'
+
+
+@pytest.fixture
+def hub(tmp_path: Path) -> Iterator[Hub]:
+    hub = Hub(str(tmp_path / "bus"))
+    hub.start()
+    try:
+        yield hub
+    finally:
+        hub.stop()
+
+
+@contextlib.contextmanager
+def talking(path: Path, say: Callable[[UnixBus, int], None]) -> Iterator[None]:
+    """Have somebody talk on the bus, every few milliseconds until this ends."""
+    done = threading.Event()
+
+    def talk() -> None:
+        with UnixBus(str(path), fd=True, hub="join") as bus, contextlib.suppress(can.CanError):
+            number = 0
+            while not done.wait(0.005):
+                say(bus, number)
+                number += 1
+
+    thread = threading.Thread(target=talk)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
+
+
+def accelerations(bus: UnixBus, number: int) -> None:
+    payload = bytes([number % 256, 0, 8, 0, 0, 0, 0xF0, 0])
+    bus.send(can.Message(arbitration_id=513, is_extended_id=False, data=payload))
+    bus.send(can.Message(arbitration_id=0x18FF0102, data=bytes(range(24)), is_fd=True, bitrate_switch=True))
+
+
+def words(tmp_path: Path, *more: str) -> list[str]:
+    return ["sniff", "can", str(tmp_path / "bus"), "--interface", "unixbus", "--fd", *more]
+
+
+def figures(text: str) -> dict[str, Any]:
+    found = json.loads(text)
+    assert isinstance(found, dict)
+    return found
+
+
+@pytest.mark.usefixtures("hub")
+def test_ids_values_and_load_are_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rates = ("--bitrate", "500000", "--data-bitrate", "2000000")
+    with talking(tmp_path / "bus", accelerations):
+        code = main(words(tmp_path, "--seconds", "0.5", "--dbc", f"{DBC}", *rates))
+    said = capsys.readouterr().out
+    assert code == 0
+    lines = [line.split() for line in said.splitlines()]
+    assert [word for word in lines[0] if word in {"load", "of", "500,000", "bit/s"}] == [
+        "load",
+        "of",
+        "500,000",
+        "bit/s",
+    ]
+    rows = {line[0]: " ".join(line) for line in lines if line}
+    assert "11 bit 8 " in rows["0x201"]
+    assert "0 " in rows["0x201"].partition(" ms ")[2]
+    assert rows["0x201"].endswith("byte 0, 8 bit, +1 Acceleration")
+    assert "29 bit, FD 24 " in rows["0x18FF0102"]
+    assert rows["0x18FF0102"].endswith("0e 0f ... - not in the DBC file")
+    assert "Acceleration AccelX 1.024 1.024 1.024 g" in said.replace("  ", " ").replace("  ", " ")
+    assert "Acceleration  Sequence" in said
+    assert "counts frames" in said
+    assert "Heard, but not in the DBC file: 0x18FF0102" in said
+
+
+@pytest.mark.usefixtures("hub")
+def test_what_it_proposes_passes_check_in_a_whole_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with talking(tmp_path / "bus", accelerations):
+        assert main(words(tmp_path, "--seconds", "0.5", "--json", "--dbc", f"{DBC}")) == 0
+    found = figures(capsys.readouterr().out)
+    machine = tmp_path / "machine.toml"
+    machine.write_text(BEGIN + found["machine_file"])
+    assert main(["check", f"{machine}"]) == 0
+    said = capsys.readouterr()
+    assert said.err == ""
+    [stream] = tomllib.loads(found["machine_file"])["streams"].values()
+    assert stream["layout"]["counter"] == {"signal": "Sequence", "counts": "frames"}
+    assert [channel["name"] for channel in stream["layout"]["channels"]] == [
+        *("AccelX", "AccelY", "AccelZ", "Status")
+    ]
+    by_id = {one["id"]: one for one in found["ids"]}
+    assert stream["rate_hz"] == pytest.approx(by_id[513]["rate_hz"], rel=0.006)
+    assert by_id[513]["changed_bytes"] == [0]
+    assert by_id[0x18FF0102]["bit_rate_switch"] is True
+    assert found["dbc"]["not_heard"] == []
+    sensors = tomllib.loads(found["machine_file"])["sensors"]
+    assert [(one["name"], one["type"], one["unit"]) for one in sensors] == [
+        (name, "accelerometer", "g") for name in ("accelx", "accely", "accelz")
+    ]
+
+
+@pytest.mark.usefixtures("hub")
+def test_without_a_dbc_file_the_proposal_has_the_bus_and_says_what_is_missing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with talking(tmp_path / "bus", accelerations):
+        assert main(words(tmp_path, "--seconds", "0.5", "--bitrate", "250000", "--json")) == 0
+    fragment = figures(capsys.readouterr().out)["machine_file"]
+    assert tomllib.loads(fragment) == {
+        "buses": {
+            "bus": {
+                "driver": "can",
+                "interface": "unixbus",
+                "channel": str(tmp_path / "bus"),
+                "fd": True,
+                "bitrate": 250_000,
+            }
+        }
+    }
+    whole = (ROOT / "config" / "machines" / "virtual-rig.toml").read_text()
+    table = whole[whole.index("[buses.can0]") : whole.index("[streams.shaft]")]
+    machine = tmp_path / "machine.toml"
+    machine.write_text(whole.replace(table, fragment + "\n\n").replace('bus = "can0"', 'bus = "bus"'))
+    assert main(["check", f"{machine}"]) == 0
+    assert capsys.readouterr().err == ""
+    assert "#   0x201: 8 bytes, " in fragment
+    assert "bytes 0 change, counter at byte 0, 8 bit, +1" in fragment
+    assert "always the same" in fragment
+
+
+@pytest.mark.usefixtures("hub")
+def test_a_silent_bus_is_a_failure_that_says_what_to_check(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(words(tmp_path, "--seconds", "0.1")) == 1
+    said = capsys.readouterr()
+    assert "0 frames in 0.1 s" in said.out
+    assert "To begin a machine file" not in said.out
+    assert "no frame in 0.1 s. Remedy: see that the devices are powered" in said.err
+    assert "up type can bitrate 500000" in said.err
+
+
+def test_a_bus_that_is_lost_ends_it_and_what_was_heard_is_shown(
+    hub: Hub, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def say(bus: UnixBus, number: int) -> None:
+        accelerations(bus, number)
+        if number == 100:
+            threading.Thread(target=hub.stop).start()
+
+    with talking(tmp_path / "bus", say):
+        assert main(words(tmp_path, "--seconds", "60")) == 1
+    said = capsys.readouterr()
+    assert "0x201" in said.out
+    assert "was lost after" in said.err
+
+
+@pytest.mark.usefixtures("hub")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_ends_it_early_and_shows_what_was_heard(tmp_path: Path, number: signal.Signals) -> None:
+    command = [sys.executable, "-m", "daqsvc", *words(tmp_path, "--seconds", "600", "--json")]
+    with talking(tmp_path / "bus", accelerations):
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        try:
+            assert process.stderr is not None
+            assert process.stderr.readline().startswith("listening to ")
+            threading.Event().wait(0.3)  # time for some frames
+            process.send_signal(number)
+            output, said = process.communicate(timeout=PATIENCE_S)
+        finally:
+            process.kill()
+            process.communicate()
+    assert (process.returncode, said) == (0, "")
+    assert {one["id"] for one in figures(output)["ids"]} == {513, 0x18FF0102}
+
+
+@pytest.mark.parametrize(
+    ("number", "words"),
+    [
+        (
+            errno.ENODEV,
+            "there is no CAN interface can7 (CAN interfaces of this computer: can0, vcan3). Remedy: plug",
+        ),
+        (errno.ENETDOWN, "can7 is down. Remedy: ip link set can7 up type can bitrate 500000"),
+    ],
+)
+def test_an_interface_that_is_not_there_or_down_is_one_line_with_the_remedy(
+    number: int,
+    words: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    for name, kind in (("lo", 772), ("can0", 280), ("vcan3", 280)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "type").write_text(f"{kind}\n")
+    monkeypatch.setattr(sniff, "_NETWORK", tmp_path)
+    monkeypatch.setattr(socketcan, "open_socketcan", refuse)
+    assert main(["sniff", "can", "can7"]) == 1
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert words in said.err
+    assert len(said.err.splitlines()) == 1
+
+
+def test_bit_rates_of_the_kernel_are_read_where_there_are_some(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    shown = {"info_data": {"bittiming": {"bitrate": 250_000}, "data_bittiming": {"bitrate": 2_000_000}}}
+    program = tmp_path / "ip"
+    program.write_text(f"#!/bin/sh\ncat <<'END'\n{json.dumps([{'linkinfo': shown}])}\nEND\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    assert sniff._kernel_facts("can0") == (250_000, 2_000_000)
+    program.write_text("#!/bin/sh\nexit 1\n")
+    assert sniff._kernel_facts("can0") == (None, None)
+    monkeypatch.setenv("PATH", f"{tmp_path / 'nowhere'}")
+    assert sniff._kernel_facts("can0") == (None, None)
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (("--seconds", "0"), "--seconds 0: give a time above 0"),
+        (("--seconds", "nan"), "--seconds nan: give a time above 0"),
+        (("--bitrate", "5"), "--bitrate 5: "),
+        (("--dbc", "absent.dbc"), "--dbc: there is no file"),
+        (("--interface", "peek"), "--interface peek: python-can knows no such interface. Remedy: "),
+    ],
+)
+def test_wrong_arguments_are_one_line(
+    more: tuple[str, str], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["sniff", "can", "can7", *more]) == 2
+    said = capsys.readouterr().err
+    assert words in said
+    assert len(said.splitlines()) == 1
