@@ -5,6 +5,7 @@ from __future__ import annotations
 from daqsvc.commands import early_signals  # before all that takes long
 
 # isort: split
+import argparse
 import atexit
 import contextlib
 import errno
@@ -39,7 +40,6 @@ from daqsvc.commands.status import StatusCommand
 from daqsvc.commands.trend import TrendCommand
 
 if TYPE_CHECKING:
-    import argparse
     from collections.abc import Sequence
 
     from daqsvc.settings import MachineFile
@@ -64,6 +64,19 @@ class Command(Protocol):
         ...
 
 
+class _SchemaAction(argparse.Action):
+    """Prints a schema and ends, as ``--version`` does: no other argument is needed."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, help: str) -> None:  # noqa: A002 - argparse
+        super().__init__(option_strings, dest, nargs=0, default=argparse.SUPPRESS, help=help)
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from daqsvc.settings.json_schema import machine_schema_text  # noqa: PLC0415 - it reads all plugins
+
+        print(machine_schema_text(), end="", flush=True)  # noqa: T201 - this is what the option is for
+        parser.exit()
+
+
 class CheckCommand:
     """``daqsvc check FILE ...``."""
 
@@ -82,6 +95,11 @@ class CheckCommand:
             nargs="+",
             metavar="FILE",
             help="the machine file (TOML); or several of one box",
+        )
+        parser.add_argument(
+            "--schema",
+            action=_SchemaAction,
+            help="print the JSON Schema of machine files, for editors, and exit: docs/machine-file.md",
         )
 
     def run(self, arguments: argparse.Namespace) -> int:

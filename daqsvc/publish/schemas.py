@@ -1,4 +1,4 @@
-"""The JSON Schemas of all payloads, and the files in ``docs/schemas`` that consumers read.
+"""The JSON Schemas of all payloads and of the machine file, in ``docs/schemas`` for consumers and editors.
 
 ``python -m daqsvc.publish.schemas docs/schemas`` writes the files.
 """
@@ -16,6 +16,7 @@ from daqsvc.publish.live.request import LiveRequestPayload
 from daqsvc.publish.mqtt.commands import CommandPayload, ResponsePayload, SnapshotCommandPayload
 from daqsvc.publish.payloads import AlarmPayload, AvailabilityPayload, DiagnosisPayload, StatusPayload
 from daqsvc.publish.service_status import ServiceStatusPayload
+from daqsvc.settings.json_schema import machine_schema_text
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -36,6 +37,8 @@ PAYLOADS: Mapping[str, type[BaseModel]] = {
     "daqsvc.summary/1": SummaryPayload,
 }
 """Every payload by the value of its ``schema`` key."""
+MACHINE_FILE = "machine.schema.json"
+"""The file with the schema of the machine file; `daqsvc check --schema` prints the same."""
 
 
 def json_schemas() -> dict[str, dict[str, Any]]:
@@ -50,7 +53,7 @@ def json_schemas() -> dict[str, dict[str, Any]]:
 
 
 def schema_files() -> dict[str, str]:
-    """Name and text of each schema file."""
+    """Name and text of each schema file of a payload."""
     return {
         f"{name.replace('/', '-')}.json": json.dumps(schema, indent=2) + "\n"
         for name, schema in json_schemas().items()
@@ -58,8 +61,8 @@ def schema_files() -> dict[str, str]:
 
 
 def write(directory: Path) -> None:
-    """Write the schema files into a directory."""
-    for name, text in schema_files().items():
+    """Write the schema files into a directory, that of the machine file with them."""
+    for name, text in {**schema_files(), MACHINE_FILE: machine_schema_text()}.items():
         (directory / name).write_text(text, encoding="utf-8")
 
 

@@ -26,25 +26,37 @@ class BaseAlarm(Section):
     """What all alarms have."""
 
     name: Annotated[Name, Field(description="name of the alarm", examples=["shaft-vibration"])]
-    latching: bool = Field(default=False, description="whether it stays until it is reset")
-    first_out_group: Name = Field(default="machine", description="alarms among which the first one is marked")
+    latching: bool = Field(default=False, description="whether the alarm stays until it is reset")
+    first_out_group: Name = Field(
+        default="machine", description="name of the group of alarms among which the first one is marked"
+    )
 
 
 class Setpoints(BaseAlarm):
     """Setpoints on a measure, in its unit (velocity RMS in mm/s)."""
 
     measure: Annotated[Measure, Field(description="what is held against the setpoints", examples=["rms"])]
-    alert: Quantity | None = Field(default=None, description="first setpoint")
-    danger: Quantity | None = Field(default=None, description="second setpoint")
+    alert: Quantity | None = Field(
+        default=None, description="first setpoint, in the unit of the measure", examples=[40.0]
+    )
+    danger: Quantity | None = Field(
+        default=None, description="second setpoint, in the unit of the measure", examples=[60.0]
+    )
     alert_low: Quantity | None = Field(
-        default=None, description="first lower setpoint, of what can be too low"
+        default=None, description="first lower setpoint, of what can be too low", examples=[4.0]
     )
-    danger_low: Quantity | None = Field(default=None, description="second lower setpoint")
+    danger_low: Quantity | None = Field(
+        default=None, description="second lower setpoint, of what can be too low", examples=[2.0]
+    )
     deadband: Annotated[float, Field(ge=0, le=MOST)] = Field(
-        default=0.0, description="how far from a setpoint it returns"
+        default=0.0, description="how far the value must go back from a setpoint before the alarm returns"
     )
-    on_delay_s: DelayS = Field(default=0.0, description="how long beyond it before it is raised")
-    off_delay_s: DelayS = Field(default=0.0, description="how long clear of it before it returns")
+    on_delay_s: DelayS = Field(
+        default=0.0, description="how long the value must be beyond a setpoint before the alarm is raised"
+    )
+    off_delay_s: DelayS = Field(
+        default=0.0, description="how long the value must be clear of it before the alarm returns"
+    )
     trip_multiply: Annotated[
         float, Field(ge=1, le=10, description="factor on alert and danger while the machine starts up")
     ] = 1.0
@@ -100,10 +112,15 @@ class PhaseLimits(Section):
     reference_deg: Annotated[
         AngleDeg, Field(description="phase lag of the machine in good order", examples=[135.0])
     ]
-    alert: DeviationDeg | None = Field(default=None, description="first setpoint, in degrees either way")
-    danger: DeviationDeg | None = Field(default=None, description="second setpoint, in degrees either way")
+    alert: DeviationDeg | None = Field(
+        default=None, description="first setpoint, in degrees either way", examples=[30.0]
+    )
+    danger: DeviationDeg | None = Field(
+        default=None, description="second setpoint, in degrees either way", examples=[60.0]
+    )
     deadband: Annotated[float, Field(ge=0, le=180)] = Field(
-        default=0.0, description="how far within a setpoint it returns, in degrees"
+        default=0.0,
+        description="how far within a setpoint the phase must be before the alarm returns, in degrees",
     )
 
 
@@ -178,16 +195,22 @@ Alarm: TypeAlias = Annotated[
 class StartUp(Section):
     """How a start-up is recognised, during which ``trip_multiply`` holds: a range, a rate, or either."""
 
-    detector: Annotated[Text, Field(description="whose statements hold the signal"), NamesDetector()]
-    measure: Text = Field(default="speed", description="the signal among its statistics")
+    detector: Annotated[
+        Text, Field(description="the detector whose statements hold the signal"), NamesDetector()
+    ]
+    measure: Text = Field(default="speed", description="the signal among the statistics of the detector")
     between: Annotated[tuple[Quantity, Quantity], Field(strict=False)] | None = Field(
-        default=None, description="the signal lies in this range", examples=[[300.0, 2700.0]]
+        default=None,
+        description="the machine starts up while the signal lies in this range",
+        examples=[[300.0, 2700.0]],
     )
     change_per_s: Annotated[float, Field(ge=1e-9, le=MOST)] | None = Field(
-        default=None, description="the signal changes at least so fast"
+        default=None,
+        description="the machine starts up while the signal changes at least so fast",
+        examples=[20.0],
     )
     at_most_s: Annotated[float, Field(ge=0.1, le=86_400)] = Field(
-        default=120.0, description="how long it may last at most"
+        default=120.0, description="how long a start-up may last at most"
     )
 
 
@@ -200,15 +223,21 @@ class AlarmHandling(Section):
     chatter_raises: Annotated[int, Field(ge=0, le=1000)] = Field(
         default=5, description="raises within the window beyond which an alarm chatters; 0: never"
     )
-    chatter_window_s: AlarmSeconds = Field(default=60.0, description="the window that these are counted over")
+    chatter_window_s: AlarmSeconds = Field(
+        default=60.0, description="the window that raises of one alarm are counted over"
+    )
     chatter_quiet_s: AlarmSeconds = Field(
-        default=60.0, description="how long it must stand still to be quiet"
+        default=60.0, description="how long an alarm that chatters must not change before it counts as quiet"
     )
     flood_alarms: Annotated[int, Field(ge=0, le=100_000)] = Field(
         default=10, description="alarms within the window beyond which they are a flood; 0: never"
     )
-    flood_window_s: AlarmSeconds = Field(default=600.0, description="the window that these are counted over")
+    flood_window_s: AlarmSeconds = Field(
+        default=600.0, description="the window that alarms of a flood are counted over"
+    )
     shelve_at_most_s: Annotated[float, Field(ge=1, le=31_622_400)] = Field(
         default=28_800.0, description="the longest time to shelve an alarm"
     )
-    start_up: StartUp | None = Field(default=None, description="when trip_multiply holds")
+    start_up: StartUp | None = Field(
+        default=None, description="how a start-up is recognised, during which trip_multiply holds"
+    )

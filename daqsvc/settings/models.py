@@ -86,11 +86,17 @@ class Rotor(Section):
         Field(
             ge=0.01,
             le=10_000,
-            description="undamped natural frequency, omega_s / 2 pi",
+            description="undamped natural frequency of the rotor, omega_s / 2 pi",
             examples=[10.0],
         ),
     ]
-    damping_ratio: Annotated[DampingRatio, Field(description="zeta of the healthy rotor", examples=[0.18])]
+    damping_ratio: Annotated[
+        DampingRatio,
+        Field(
+            description="damping ratio zeta of the healthy rotor, as a fraction of critical damping",
+            examples=[0.18],
+        ),
+    ]
     eccentricity_um: Annotated[float, Field(ge=1e-3, le=10_000)] | None = Field(
         default=None, description="mass eccentricity epsilon; for the model bank", examples=[10.0]
     )
@@ -135,7 +141,11 @@ class Machine(Section):
     """The machine that is watched."""
 
     name: Annotated[Name, Field(description="name of the machine", examples=["laval-rig"])]
-    description: Line = Field(default="", description="what a person should know about it")
+    description: Line = Field(
+        default="",
+        description="what a person should know about it",
+        examples=["cooling water pump 2, hall B"],
+    )
     speed_rpm: Annotated[
         float,
         AfterValidator(_turning),
@@ -146,7 +156,7 @@ class Machine(Section):
             examples=[600.0],
         ),
     ]
-    rotor: Rotor | None = Field(default=None, description="needed by the rotor's detectors")
+    rotor: Rotor | None = Field(default=None, description="the rotor; its detectors need it")
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,7 +190,7 @@ class MachineFile(Section):
     machine: Annotated[Machine, Field(description="the machine that is watched")]
     buses: Annotated[
         dict[Name, AnyBus],
-        Field(min_length=1, max_length=64, description="the buses, by name"),
+        Field(min_length=1, max_length=64, description="the buses that samples come over, by name"),
         AfterValidator(FrozenTables),
     ]
     streams: Annotated[
@@ -193,14 +203,19 @@ class MachineFile(Section):
         Field(strict=False, min_length=1, max_length=MOST_ENTRIES, description="the sensors"),
     ]
     pipeline: Annotated[Pipeline, INSTALLED] = Field(
-        default_factory=no_detectors, description="what is computed"
+        default_factory=no_detectors, description="the detectors, and how much of the past they can reach"
     )
     alarms: Annotated[tuple[Alarm, ...], Field(strict=False, max_length=MOST_ENTRIES)] = Field(
         default=(), description="the alarms"
     )
     alarm_handling: AlarmHandling = Field(default=AlarmHandling(), description="what holds for all alarms")
-    recorder: Recorder | None = Field(default=None, description="what is recorded")
-    store: Store | None = Field(default=None, description="the journal's place")
+    recorder: Recorder | None = Field(
+        default=None, description="the recorder of snapshots; none are made if absent"
+    )
+    store: Store | None = Field(
+        default=None,
+        description="where the journal is kept, which survives a power cut; none is kept if absent",
+    )
 
     _origin: Origin = PrivateAttr(default_factory=Origin)
 

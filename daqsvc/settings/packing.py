@@ -92,12 +92,16 @@ class PackedCounter(Section):
     """The running count in each frame that tells loss and gives a sample its place in time."""
 
     byte: Annotated[
-        int, Field(ge=0, lt=LONGEST_FRAME, description="where it lies in the payload", examples=[0])
+        int,
+        Field(ge=0, lt=LONGEST_FRAME, description="first byte of the counter in the payload", examples=[0]),
     ]
-    bits: Annotated[Literal[8, 16, 32], Field(description="its width", examples=[16])]
+    bits: Annotated[Literal[8, 16, 32], Field(description="width of the counter", examples=[16])]
     counts: Annotated[
         Counts,
-        Field(description="what it counts; of samples, the first one in the frame", examples=["samples"]),
+        Field(
+            description="what the counter counts; of samples, the first one in the frame",
+            examples=["samples"],
+        ),
     ]
 
     @property
@@ -109,7 +113,9 @@ class PackedCounter(Section):
 class Counter(PackedCounter):
     """The counter of a frame that is short, or has it at its beginning."""
 
-    byte: Annotated[int, Field(ge=0, le=63, description="where it lies in the payload", examples=[0])]
+    byte: Annotated[
+        int, Field(ge=0, le=63, description="first byte of the counter in the payload", examples=[0])
+    ]
 
 
 class Channel(Section):
@@ -119,9 +125,17 @@ class Channel(Section):
     """
 
     name: Annotated[Name, Field(description="name of the channel", examples=["x"])]
-    type: Annotated[RawType, Field(description="the raw type of a sample", examples=["int16"])]
-    scale: Annotated[Scale, Field(description="worth of one count", examples=[0.0005])]
-    offset: Quantity = Field(default=0.0, description="wire value of the raw value 0")
+    type: Annotated[RawType, Field(description="raw type of a sample", examples=["int16"])]
+    scale: Annotated[
+        Scale,
+        Field(
+            description="what one count of the raw value is worth, in V or the unit of the sensor",
+            examples=[0.0005],
+        ),
+    ]
+    offset: Quantity = Field(
+        default=0.0, description="what the raw value 0 is worth, in V or the unit of the sensor"
+    )
     valid_raw: ValidRaw | None = Field(default=None, description=VALID_RAW, examples=["[-32767, 32767]"])
 
     @property

@@ -29,10 +29,11 @@ class Pipeline(Section):
     """
 
     ring_s: Annotated[float, Field(ge=0.01, le=3600)] = Field(
-        default=30.0, description="length of each stream's ring"
+        default=30.0, description="how much of the past is kept in memory, of each stream"
     )
     alignment: Alignment | None = Field(
-        default=None, description="sensors of a rotor detector in several streams"
+        default=None,
+        description="how sensors of a rotor detector that lie in several streams are aligned in time",
     )
 
     def table(self, kind: type[TableT]) -> TableT | None:

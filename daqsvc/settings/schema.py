@@ -56,8 +56,8 @@ def section_of(declared: Any, value: object) -> type[Section] | None:
     kinds = kinds_of(declared)
     if kinds is not None:
         return kinds.choose(value) if isinstance(value, dict) else None
-    bare = _bare(declared)
-    return bare if _is_section(bare) else None
+    bare = bare_type(declared)
+    return bare if is_section(bare) else None
 
 
 def kinds_of(declared: Any) -> Kinds | None:
@@ -74,7 +74,7 @@ def declared_at(root: type[Section], document: Any, path: KeyPath) -> Any:
         value = value_at(document, path[:depth])
         section = section_of(declared, value)
         if section is None:
-            declared = _element_type(declared)
+            declared = element_type(declared)
         elif step in section.model_fields:
             declared = field_type(section.model_fields[str(step)])
         else:
@@ -88,9 +88,9 @@ def _homes(root: type[Section]) -> Mapping[str, tuple[str, ...]]:
     homes: dict[str, list[str]] = {}
 
     def walk(declared: Any, path: str) -> None:
-        kinds, bare = kinds_of(declared), _bare(declared)
-        element = _element_type(declared)
-        if kinds is not None or _is_section(bare):
+        kinds, bare = kinds_of(declared), bare_type(declared)
+        element = element_type(declared)
+        if kinds is not None or is_section(bare):
             for section in kinds.sections if kinds is not None else (bare,):
                 for name, field in section.model_fields.items():
                     places = homes.setdefault(name, [])
@@ -146,14 +146,14 @@ def valid_part(section: type[Section], table: Mapping[str, Any]) -> Section:
 
 def _valid_value(declared: Any, value: Any) -> Any:
     try:
-        return _adapter(declared).validate_python(value)
+        return adapter(declared).validate_python(value)
     except ValidationError as error:
         if any(not item["loc"] and not only_follows(item, value) for item in error.errors()):
             raise  # the whole is wrong, not something in it
         section = section_of(declared, value)
         if section is not None and isinstance(value, dict):
             return valid_part(section, value)
-        container, element = get_origin(_bare(declared)), _element_type(declared)
+        container, element = get_origin(bare_type(declared)), element_type(declared)
         if section_of(element, {}) is not None:
             if container is dict and isinstance(value, dict):
                 return FrozenTables({key: _valid_value(element, item) for key, item in value.items()})
@@ -162,21 +162,22 @@ def _valid_value(declared: Any, value: Any) -> Any:
         raise
 
 
-def _adapter(declared: Any) -> TypeAdapter[Any]:
+def adapter(declared: Any) -> TypeAdapter[Any]:
     """What validates a value of that type; to make one takes longer than to use it."""
     known = _adapters.get(id(declared))
     if known is None:
         # A section brings its configuration along; for any other type it must be said.
-        config = None if _is_section(_bare(declared)) else _STRICT
+        config = None if is_section(bare_type(declared)) else _STRICT
         known = _adapters[id(declared)] = (declared, TypeAdapter(declared, config=config))
     return known[1]
 
 
-def _is_section(bare: Any) -> TypeGuard[type[Section]]:
+def is_section(bare: Any) -> TypeGuard[type[Section]]:
+    """Whether a type is that of a table with keys of its own."""
     return isinstance(bare, type) and issubclass(bare, Section)
 
 
-def _bare(declared: Any) -> Any:
+def bare_type(declared: Any) -> Any:
     """A type without its annotations and without ``| None``."""
     while True:
         if get_origin(declared) is Annotated:
@@ -187,9 +188,9 @@ def _bare(declared: Any) -> Any:
             return declared
 
 
-def _element_type(declared: Any) -> Any:
+def element_type(declared: Any) -> Any:
     """The type of the elements of an array or of the values of a table with free keys; None if neither."""
-    bare = _bare(declared)
+    bare = bare_type(declared)
     if get_origin(bare) is tuple:
         return get_args(bare)[0]
     if get_origin(bare) is dict and get_args(bare)[1] is not Any:

@@ -10,6 +10,8 @@ from pydantic_core import PydanticCustomError
 
 from daqsvc.settings.section import MOST, AngleDeg, Kinds, Line, Name, Quantity, Section, Volts
 
+TYPE = "what kind of sensor it is"
+
 
 def _not_zero(sensitivity_mv_per_unit: float) -> float:
     if sensitivity_mv_per_unit == 0:
@@ -62,7 +64,9 @@ class BaseSensor(Section):
     channel: Annotated[Name, Field(description="its channel in that stream", examples=["x"])]
     sensitivity_mv_per_unit: Annotated[float, Field(ge=-MOST, le=MOST), AfterValidator(_not_zero)] | None = (
         Field(
-            default=None, description="mV per unit; absent if the channel already carries the physical unit"
+            default=None,
+            description="sensitivity of the sensor; absent if the channel already carries the physical unit",
+            examples=[7.87],
         )
     )
     zero_v: Volts = Field(default=0.0, description="voltage that stands for 0 in the physical unit")
@@ -83,14 +87,16 @@ class ProximityProbe(BaseSensor):
 
     kind: ClassVar[str] = "a proximity probe"
 
-    type: Literal["proximity"]
+    type: Annotated[Literal["proximity"], Field(description=TYPE, examples=["proximity"])]
     unit: Annotated[Literal["um", "mm", "mil"], Field(description="unit of the position", examples=["um"])]
     gap_ok_v: Annotated[tuple[Volts, Volts], AfterValidator(_ordered), Field(strict=False)] | None = Field(
         default=None,
         description="OK limits of the mean gap voltage, in V; needed where that is known",
         examples=["[-18.0, -2.0]"],
     )
-    angle_deg: AngleDeg | None = Field(default=None, description="where it points, from +x against the clock")
+    angle_deg: AngleDeg | None = Field(
+        default=None, description="where the sensor points, from +x against the clock", examples=[45.0]
+    )
     ac_coupled: bool = Field(
         default=False, description="says that it shows motion only, not the static position of the shaft"
     )
@@ -101,9 +107,11 @@ class Accelerometer(BaseSensor):
 
     kind: ClassVar[str] = "an accelerometer"
 
-    type: Literal["accelerometer"]
+    type: Annotated[Literal["accelerometer"], Field(description=TYPE, examples=["accelerometer"])]
     unit: Annotated[Literal["g", "m/s2"], Field(description="unit of the acceleration", examples=["g"])]
-    angle_deg: AngleDeg | None = Field(default=None, description="where it points, from +x against the clock")
+    angle_deg: AngleDeg | None = Field(
+        default=None, description="where the sensor points, from +x against the clock", examples=[45.0]
+    )
 
 
 class VelocitySensor(BaseSensor):
@@ -111,7 +119,7 @@ class VelocitySensor(BaseSensor):
 
     kind: ClassVar[str] = "a velocity sensor"
 
-    type: Literal["velocity"]
+    type: Annotated[Literal["velocity"], Field(description=TYPE, examples=["velocity"])]
     unit: Annotated[Literal["mm/s"], Field(description="unit of the velocity", examples=["mm/s"])]
 
 
@@ -120,13 +128,16 @@ class Keyphasor(BaseSensor):
 
     kind: ClassVar[str] = "a keyphasor"
 
-    type: Literal["keyphasor"]
+    type: Annotated[Literal["keyphasor"], Field(description=TYPE, examples=["keyphasor"])]
     unit: Annotated[Literal["V"], Field(description="unit of the pulse", examples=["V"])]
     threshold_v: Annotated[Volts, Field(description="level that a pulse crosses, in V", examples=[-6.0])]
     hysteresis_v: Annotated[float, Field(ge=0, le=1000)] = Field(
-        default=0.5, description="how far back before the next crossing counts"
+        default=0.5,
+        description="how far the signal must go back from threshold_v before the next crossing counts",
     )
-    edge: Literal["rising", "falling"] = Field(default="rising", description="the edge that marks angle zero")
+    edge: Literal["rising", "falling"] = Field(
+        default="rising", description="edge of the pulse that marks angle zero"
+    )
 
 
 class TrendValue(BaseSensor):
@@ -134,7 +145,7 @@ class TrendValue(BaseSensor):
 
     kind: ClassVar[str] = "a trend value"
 
-    type: Literal["trend"]
+    type: Annotated[Literal["trend"], Field(description=TYPE, examples=["trend"])]
     unit: Annotated[
         str,
         AfterValidator(_printable),
@@ -154,7 +165,7 @@ class _UntypedSensor(BaseSensor, extra="ignore"):
 
     type: Annotated[
         Literal["proximity", "accelerometer", "velocity", "keyphasor", "trend"],
-        Field(description="what kind of sensor it is", examples=["proximity"]),
+        Field(description=TYPE, examples=["proximity"]),
     ]
     unit: Annotated[Line, Field(description="unit of the samples", examples=["um"])]
 

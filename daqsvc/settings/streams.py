@@ -31,7 +31,7 @@ class Stream(Section):
         Field(ge=1e-4, le=10_000_000, description="samples per second and channel", examples=[640.0]),
     ]
     reorder_window_ms: Annotated[float, Field(ge=0, le=1000)] = Field(
-        default=10.0, description="how long a gap may wait for a late frame"
+        default=10.0, description="how long a gap in the count may wait for a late frame"
     )
     latency_ms: Annotated[float, Field(ge=-10_000, le=10_000)] = Field(
         default=0.0,

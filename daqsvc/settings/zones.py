@@ -34,18 +34,21 @@ class Zones(Section):
     """Zones of a standard: by default zone C is alert and zone D is danger."""
 
     standard: Annotated[
-        Literal["iso-20816-3"], Field(description="whose zones they are", examples=["iso-20816-3"])
+        Literal["iso-20816-3"],
+        Field(description="the standard whose zones they are", examples=["iso-20816-3"]),
     ]
     group: Literal[1, 2] | None = Field(
         default=None,
-        description="of the velocity: 1 above 300 kW or a shaft height of 315 mm, 2 from 15 kW or 160 mm on",
+        description="group of the machine, for velocities: 1 above 300 kW or a shaft height of 315 mm, "
+        "2 from 15 kW or 160 mm on",
         examples=[2],
     )
     support: Literal["rigid", "flexible"] | None = Field(
-        default=None, description="of the velocity: how the machine stands", examples=["rigid"]
+        default=None, description="how the machine stands, for velocities", examples=["rigid"]
     )
     shaft: bool = Field(
-        default=False, description="whether they are those of the shaft, peak to peak, by machine.speed_rpm"
+        default=False,
+        description="whether the zones are those of shaft vibration, peak to peak, by machine.speed_rpm",
     )
 
 

@@ -40,10 +40,10 @@ class CanRecord(Section):
     ]
     format: Literal["blf", "asc", "candump"] = Field(default="blf", description="which kind of CAN log")
     file_mb: Annotated[int, Field(ge=1, le=4000)] = Field(
-        default=64, description="a file that is this large is ended, and another one begun"
+        default=64, description="size of a file, at which another one is begun"
     )
     keep_mb: Annotated[int, Field(ge=2, le=100_000_000)] = Field(
-        default=2048, description="what all files may take together; the oldest are taken away"
+        default=2048, description="size of all files together, beyond which the oldest are deleted"
     )
 
 
@@ -56,10 +56,16 @@ class CanBus(Bus):
     interface: Annotated[Text, Field(description="the python-can interface", examples=["socketcan"])]
     channel: Annotated[Text, Field(description="the channel of that interface", examples=["can0"])]
     fd: Annotated[bool, Field(description="whether CAN FD frames are on the bus", examples=[True])] = False
-    bitrate: Annotated[int, Field(ge=1000, le=1_000_000, description="bit/s")] | None = None
-    data_bitrate: Annotated[int, Field(ge=1000, le=20_000_000, description="bit/s of FD data")] | None = None
+    bitrate: Annotated[int, Field(ge=1000, le=1_000_000)] | None = Field(
+        default=None, description="bit rate of the bus", examples=[500_000]
+    )
+    data_bitrate: Annotated[int, Field(ge=1000, le=20_000_000)] | None = Field(
+        default=None, description="bit rate of the data of CAN FD frames", examples=[2_000_000]
+    )
     options: dict[str, Any] = Field(
-        default={}, description="handed to python-can as they are; none with SocketCAN"
+        default={},
+        description="further options, given to python-can as they are; none with SocketCAN",
+        examples=["{ receive_own_messages = false }"],
     )
     receive_buffer_bytes: Annotated[int, Field(ge=4096, le=1 << 30)] = Field(
         default=4 << 20, description="SocketCAN: what the kernel holds for us; a frame takes some 400 of it"
@@ -68,6 +74,7 @@ class CanBus(Bus):
         default=None,
         description="SocketCAN: let the kernel leave out frames of no stream, uncounted; if left out, it "
         "does so unless the bus is recorded",
+        examples=[True],
     )
     record: CanRecord | None = Field(default=None, description="record every frame received in files")
 
@@ -83,7 +90,7 @@ class PlainLayout(PackedFields):
 
     kind: ClassVar[str] = "a layout without a DBC file"
 
-    id: Annotated[int, Field(ge=0, le=0x1FFF_FFFF, description="the frame's CAN id", examples=["0x101"])]
+    id: Annotated[int, Field(ge=0, le=0x1FFF_FFFF, description="CAN id of the frames", examples=["0x101"])]
     extended: bool = Field(default=False, description="whether the id has 29 bits rather than 11")
     any_priority: bool = Field(
         default=False,
@@ -95,18 +102,18 @@ class PlainLayout(PackedFields):
         Field(ge=0, le=64, description="payload length in bytes", examples=[64]),
         AfterValidator(_payload_length),
     ]
-    byte_order: Literal["little", "big"] = Field(default="little", description="of counter and samples")
-    counter: (
-        Annotated[
-            Counter,
-            Field(
-                description="the frame's counter", examples=['{ byte = 0, bits = 16, counts = "samples" }']
-            ),
-        ]
-        | None
-    ) = None
+    byte_order: Literal["little", "big"] = Field(
+        default="little", description="byte order of counter and samples"
+    )
+    counter: Counter | None = Field(
+        default=None,
+        description="the counter in each frame",
+        examples=['{ byte = 0, bits = 16, counts = "samples" }'],
+    )
     no_counter: bool = Field(default=False, description=NO_COUNTER)
-    crc_byte: Annotated[int, Field(ge=0, le=62, description="byte where a CRC-16 starts")] | None = None
+    crc_byte: Annotated[int, Field(ge=0, le=62)] | None = Field(
+        default=None, description="byte where a CRC-16 starts", examples=[62]
+    )
     first_byte: Annotated[int, Field(ge=0, le=63, description="where the samples start", examples=[2])]
     samples_per_frame: Annotated[int, Field(ge=1, le=64, description="samples per channel", examples=[10])]
     channels: Annotated[
@@ -157,7 +164,10 @@ class DbcCounter(Section):
     signal: Annotated[Text, Field(description="the counter's signal", examples=["Sequence"])]
     counts: Annotated[
         Counts,
-        Field(description="what it counts; of samples, the first one in the frame", examples=["frames"]),
+        Field(
+            description="what the counter counts; of samples, the first one in the frame",
+            examples=["frames"],
+        ),
     ]
 
 
@@ -184,18 +194,18 @@ class DbcLayout(Layout):
     kind: ClassVar[str] = "a layout from a DBC file"
     mark: ClassVar[str] = "dbc"
 
-    dbc: Annotated[FilePath, Field(description="the DBC file, relative to the machine file")]
+    dbc: Annotated[
+        FilePath, Field(description="the DBC file, relative to the machine file", examples=["triaxial.dbc"])
+    ]
     message: Annotated[
         Text,
         Field(description="the message that carries the samples", examples=["Acceleration"]),
     ]
-    counter: (
-        Annotated[
-            DbcCounter,
-            Field(description="the frame's counter", examples=['{ signal = "Sequence", counts = "frames" }']),
-        ]
-        | None
-    ) = None
+    counter: DbcCounter | None = Field(
+        default=None,
+        description="the counter in each frame",
+        examples=['{ signal = "Sequence", counts = "frames" }'],
+    )
     no_counter: bool = Field(default=False, description=NO_COUNTER)
     channels: Annotated[
         tuple[DbcChannel, ...],

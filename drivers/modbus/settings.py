@@ -64,8 +64,10 @@ class Writable(Section):
     """Holding registers of a unit that may be written."""
 
     unit: Annotated[UnitAddress, Field(description="address of the unit", examples=[1])]
-    address: Annotated[Address, Field(description="first register, from 0", examples=[100])]
-    count: Annotated[int, Field(ge=1, le=123)] = 1
+    address: Annotated[Address, Field(description="first register, counted from 0", examples=[100])]
+    count: Annotated[int, Field(ge=1, le=123)] = Field(
+        default=1, description="how many registers from address on may be written"
+    )
 
 
 class _ModbusBus(Bus):
@@ -79,7 +81,8 @@ class _ModbusBus(Bus):
     )
     demotion_s: Annotated[float, Field(ge=0.1, le=3600)] = Field(
         default=10.0,
-        description="how long at first, before one request probes whether it is back; doubles up to 60 s",
+        description="how long a unit is set aside at first, before one request probes whether it is back; "
+        "doubles up to 60 s",
     )
     writes: Annotated[tuple[Writable, ...], Field(strict=False, max_length=1024)] = Field(
         default=(), description="registers that may be written; nothing else ever is"
@@ -99,10 +102,13 @@ class ModbusTcpBus(_ModbusBus):
     kind: ClassVar[str] = "a Modbus TCP bus"
 
     transport: Annotated[
-        Literal["tcp"], Field(description='"tcp", or "rtu" for a serial port', examples=["tcp"])
+        Literal["tcp"],
+        Field(description='how the units are reached: "tcp", or "rtu" for a serial port', examples=["tcp"]),
     ]
-    host: Annotated[Host, Field(description="the server", examples=["192.0.2.10"])]
-    tcp_port: Annotated[int, Field(ge=1, le=65_535)] = 502
+    host: Annotated[Host, Field(description="host name or IP address of the server", examples=["192.0.2.10"])]
+    tcp_port: Annotated[int, Field(ge=1, le=65_535)] = Field(
+        default=502, description="TCP port of the server"
+    )
 
     @property
     def where(self) -> str:
@@ -120,14 +126,20 @@ class ModbusRtuBus(_ModbusBus):
 
     kind: ClassVar[str] = "a Modbus RTU bus"
 
-    transport: Annotated[Literal["rtu"], Field(description="a serial port", examples=["rtu"])]
-    serial_port: Annotated[DevicePath, Field(description="its device file", examples=["/dev/ttyUSB0"])]
-    baud: Annotated[int, Field(ge=300, le=4_000_000, description="bit/s", examples=[19_200])]
-    parity: Literal["none", "even", "odd"] = "even"
-    stop_bits: Literal[1, 2] = 1
+    transport: Annotated[
+        Literal["rtu"],
+        Field(description='how the units are reached: "rtu" for a serial port, or "tcp"', examples=["rtu"]),
+    ]
+    serial_port: Annotated[
+        DevicePath, Field(description="device file of the serial port", examples=["/dev/ttyUSB0"])
+    ]
+    baud: Annotated[int, Field(ge=300, le=4_000_000, description="bit rate of the line", examples=[19_200])]
+    parity: Literal["none", "even", "odd"] = Field(default="even", description="parity bit of each character")
+    stop_bits: Literal[1, 2] = Field(default=1, description="stop bits of each character")
     quiet_ms: WaitMs | None = Field(
         default=None,
         description="silence after a request without reply, at least timeout_ms; that longer after opening",
+        examples=[1000.0],
     )
 
     @property
@@ -153,13 +165,20 @@ class _Quantity(Section):
     name: Annotated[Name, Field(description="name of the channel", examples=["velocity-x"])]
     type: Annotated[RegisterType, Field(description="what the registers hold", examples=["uint16"])]
     order: Order = Field(
-        default="ABCD", description="of bytes and words: ABCD is big-endian, CDAB has its words exchanged"
+        default="ABCD",
+        description="order of bytes and words: ABCD is big-endian, CDAB has its words exchanged",
     )
     bits: Annotated[tuple[BitNumber, BitNumber], Field(strict=False)] | None = Field(
-        default=None, description="lowest bit and number of bits, for a part of an unsigned number"
+        default=None,
+        description="lowest bit and number of bits, for a part of an unsigned number",
+        examples=["[0, 12]"],
     )
-    scale: Scale = Field(default=1.0, description="worth of one count")
-    offset: Quantity = Field(default=0.0, description="wire value of the raw value 0")
+    scale: Scale = Field(
+        default=1.0, description="what one count of the raw value is worth, in V or the unit of the sensor"
+    )
+    offset: Quantity = Field(
+        default=0.0, description="what the raw value 0 is worth, in V or the unit of the sensor"
+    )
 
     @property
     def registers(self) -> int:
@@ -170,7 +189,9 @@ class _Quantity(Section):
 class RegisterChannel(_Quantity):
     """One quantity at an address."""
 
-    address: Annotated[Address, Field(description="its first register, from 0", examples=[0])]
+    address: Annotated[
+        Address, Field(description="first register of the channel, counted from 0", examples=[0])
+    ]
 
     @property
     def first(self) -> int:
@@ -182,7 +203,7 @@ class SampleChannel(_Quantity):
     """One quantity in a sample of several registers."""
 
     place: Annotated[int, Field(ge=0, lt=MAX_REGISTERS)] = Field(
-        description="its first register within a sample, from 0", examples=[0]
+        description="first register of the channel within a sample, counted from 0", examples=[0]
     )
 
     @property
@@ -223,7 +244,9 @@ class _Sampled(_ModbusLayout):
         ),
     ]
     poll_ms: WaitMs | None = Field(
-        default=None, description="how often to look for more; by rate and room in the device unless given"
+        default=None,
+        description="how often to look for more samples; by rate and room in the device if absent",
+        examples=[50.0],
     )
 
     @property
@@ -258,8 +281,10 @@ class RegistersLayout(_ModbusLayout):
 
     kind: ClassVar[str] = 'a layout with way = "registers"'
 
-    way: Annotated[Literal["registers"], Field(description="how samples are got", examples=["registers"])]
-    table: Table = "holding"
+    way: Annotated[
+        Literal["registers"], Field(description="how samples are read from the unit", examples=["registers"])
+    ]
+    table: Table = Field(default="holding", description="which registers are read")
     channels: Annotated[
         tuple[RegisterChannel, ...],
         Field(
@@ -271,7 +296,7 @@ class RegistersLayout(_ModbusLayout):
         ),
     ]
     max_gap: Annotated[int, Field(ge=0, lt=MAX_REGISTERS)] = Field(
-        default=8, description="registers nobody wants that may be read along to save a request"
+        default=8, description="registers between two channels that may be read with them to save a request"
     )
     max_count: Annotated[int, Field(ge=4, le=MAX_REGISTERS)] = Field(
         default=MAX_REGISTERS, description="registers in a request, at most"
@@ -279,7 +304,11 @@ class RegistersLayout(_ModbusLayout):
     forbidden: Annotated[
         tuple[Annotated[tuple[Address, Address], Field(strict=False)], ...],
         Field(strict=False, max_length=1024),
-    ] = Field(default=(), description="first and last register of ranges that must never be read")
+    ] = Field(
+        default=(),
+        description="first and last register of ranges that must never be read",
+        examples=["[[100, 120]]"],
+    )
 
     @property
     def channel_names(self) -> tuple[str, ...]:
@@ -305,8 +334,10 @@ class RegistersLayout(_ModbusLayout):
 class FifoCount(Section):
     """The running count of samples at the head of a queue."""
 
-    bits: CountBits = 16
-    low_word_first: bool = False
+    bits: CountBits = Field(default=16, description="width of the count")
+    low_word_first: bool = Field(
+        default=False, description="whether a count of 32 bits has its low word in the first register"
+    )
 
     @property
     def registers(self) -> int:
@@ -333,7 +364,9 @@ class FifoCount(Section):
 class RegisterCount(FifoCount):
     """A running count of samples in registers."""
 
-    address: Annotated[Address, Field(description="its first register, from 0", examples=[0])]
+    address: Annotated[
+        Address, Field(description="first register of the count, counted from 0", examples=[0])
+    ]
 
 
 class FifoLayout(_Sampled):
@@ -341,11 +374,19 @@ class FifoLayout(_Sampled):
 
     kind: ClassVar[str] = 'a layout with way = "fifo"'
 
-    way: Annotated[Literal["fifo"], Field(description="how samples are got", examples=["fifo"])]
+    way: Annotated[
+        Literal["fifo"], Field(description="how samples are read from the unit", examples=["fifo"])
+    ]
     address: Annotated[Address, Field(description="pointer of the queue", examples=[0])]
-    count: FifoCount = FifoCount()
+    count: FifoCount = Field(
+        default=FifoCount(),
+        description="the count of samples at the head of the queue",
+        examples=["{ bits = 32 }"],
+    )
     acknowledge: Address | None = Field(
-        default=None, description="holding register that is told how far the queue has been taken"
+        default=None,
+        description="holding register to which is written how far the queue has been read",
+        examples=[200],
     )
 
     @property
@@ -372,14 +413,18 @@ class RingLayout(_Sampled):
 
     kind: ClassVar[str] = 'a layout with way = "ring"'
 
-    way: Annotated[Literal["ring"], Field(description="how samples are got", examples=["ring"])]
-    table: Table = "holding"
-    count: Annotated[RegisterCount, Field(description="the write counter", examples=["{ address = 0 }"])]
+    way: Annotated[
+        Literal["ring"], Field(description="how samples are read from the unit", examples=["ring"])
+    ]
+    table: Table = Field(default="holding", description="which registers are read")
+    count: Annotated[
+        RegisterCount, Field(description="the count of samples written so far", examples=["{ address = 0 }"])
+    ]
     address: Annotated[Address, Field(description="first register of the ring", examples=[16])]
     depth: Annotated[
         int,
         AfterValidator(_power_of_two),
-        Field(ge=2, le=32_768, description="samples in it", examples=[256]),
+        Field(ge=2, le=32_768, description="samples that the ring holds", examples=[256]),
     ]
 
     @property
@@ -409,7 +454,7 @@ class BlockTrigger(Section):
     """How to make the device take a block."""
 
     address: Annotated[Address, Field(description="holding register to write", examples=[98])]
-    value: Annotated[int, Field(ge=0, le=65_535)] = 1
+    value: Annotated[int, Field(ge=0, le=65_535)] = Field(default=1, description="what to write there")
     every_s: Annotated[float, Field(ge=0.1, le=86_400)] = Field(
         default=60.0, description="how often to write it: each costs a sensor with a battery a part of that"
     )
@@ -420,15 +465,21 @@ class WaveformLayout(_Sampled):
 
     kind: ClassVar[str] = 'a layout with way = "waveform"'
 
-    way: Annotated[Literal["waveform"], Field(description="how samples are got", examples=["waveform"])]
-    table: Table = "holding"
+    way: Annotated[
+        Literal["waveform"], Field(description="how samples are read from the unit", examples=["waveform"])
+    ]
+    table: Table = Field(default="holding", description="which registers are read")
     block_id: Annotated[
         Address, Field(description="register that changes with every block, from 1 on", examples=[0])
     ]
     address: Annotated[Address, Field(description="first register of the block", examples=[100])]
     samples: Annotated[int, Field(ge=1, le=1_000_000, description="samples in a block", examples=[1024])]
-    page: BlockPage | None = None
-    trigger: BlockTrigger | None = None
+    page: BlockPage | None = Field(
+        default=None, description="the window on a block that is too long for the address space"
+    )
+    trigger: BlockTrigger | None = Field(
+        default=None, description="how to make the device take a block; it takes them by itself if absent"
+    )
 
     @property
     def summary(self) -> str:

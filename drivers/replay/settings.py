@@ -21,7 +21,7 @@ class ReplayBus(Bus):
 
     kind: ClassVar[str] = "a replayed bus"
 
-    driver: Annotated[Literal["replay"], Field(description="which driver plays it", examples=["replay"])]
+    driver: Annotated[Literal["replay"], Field(description="which driver reads the bus", examples=["replay"])]
     file: Annotated[
         FilePath,
         Field(
@@ -40,10 +40,10 @@ class ReplayBus(Bus):
     ] = None
     at_end: Literal["stop", "loop", "wait"] = Field(
         default="stop",
-        description="what to do at its end: stop, play it again, or wait for more",
+        description="what to do at the end of the file: stop, play it again, or wait for more",
     )
     pace: Literal["recorded", "unpaced"] = Field(
-        default="recorded", description="as it was recorded, or as fast as it can be taken in"
+        default="recorded", description="how fast it is played: as it was recorded, or as fast as possible"
     )
     max_memory_gb: float | None = Field(
         default=None,
@@ -74,12 +74,16 @@ class TableColumn(Section):
     column: Annotated[
         Text,
         Field(
-            description="its column: a name in the first line of a CSV file, or an array of an NPZ file",
+            description="column of the table: a name in the first line of a CSV file, or an array of NPZ",
             examples=["probe_x_v"],
         ),
     ]
-    scale: Scale = Field(default=1.0, description="wire value of the value 1")
-    offset: Quantity = Field(default=0.0, description="wire value of the value 0")
+    scale: Scale = Field(
+        default=1.0, description="what a 1 in the table is worth, in V or the unit of the sensor"
+    )
+    offset: Quantity = Field(
+        default=0.0, description="what a 0 in the table is worth, in V or the unit of the sensor"
+    )
 
 
 class TableLayout(Layout):

@@ -67,10 +67,10 @@ class SerialBus(Bus):
             examples=["/dev/serial/by-id/usb-FTDI_FT232R_A1B2C3D4-if00-port0"],
         ),
     ]
-    baud: Annotated[int, Field(ge=50, le=12_000_000, description="bit/s", examples=[921_600])]
-    data_bits: Literal[7, 8] = Field(default=8, description="bits of a character")
-    parity: Literal["none", "even", "odd"] = Field(default="none", description="of a character")
-    stop_bits: Literal[1, 2] = Field(default=1, description="of a character")
+    baud: Annotated[int, Field(ge=50, le=12_000_000, description="bit rate of the line", examples=[921_600])]
+    data_bits: Literal[7, 8] = Field(default=8, description="data bits of each character")
+    parity: Literal["none", "even", "odd"] = Field(default="none", description="parity bit of each character")
+    stop_bits: Literal[1, 2] = Field(default=1, description="stop bits of each character")
     flow_control: Literal["none", "rts-cts", "xon-xoff"] = Field(
         default="none", description="whether and how the device is told to wait"
     )
@@ -97,7 +97,7 @@ class _BinaryBus(SerialBus):
     crc: Literal["ibm-3740", "xmodem", "none"] = Field(
         default="ibm-3740", description="the CRC-16 at the end of each frame"
     )
-    crc_order: Literal["big", "little"] = Field(default="big", description="its byte order")
+    crc_order: Literal["big", "little"] = Field(default="big", description="byte order of the CRC")
     stream_ids: bool = Field(
         default=False, description="whether each frame begins with a byte that names its stream"
     )
@@ -150,13 +150,14 @@ class LinesBus(SerialBus):
 
     framing: Annotated[Literal["lines"], Field(description="what tells frames apart", examples=["lines"])]
     checksum: Literal["none", "xor", "crc16"] = Field(
-        default="none", description="behind a * at the end of each line, in hexadecimal; xor as in NMEA 0183"
+        default="none",
+        description="checksum behind a * at the end of each line, in hexadecimal; xor as in NMEA 0183",
     )
     delimiter: Annotated[
         str,
         AfterValidator(_delimiter),
-        Field(min_length=1, max_length=1, description="at the end of each line"),
-    ] = "\n"
+        Field(min_length=1, max_length=1),
+    ] = Field(default="\n", description="character at the end of each line")
 
     @property
     def summary(self) -> str:
@@ -180,11 +181,17 @@ class SerialLayout(Layout):
             examples=[124],
         ),
     ]
-    stream_id: Annotated[int, Field(ge=0, le=255, description="the byte that names the stream")] | None = None
-    byte_order: Literal["little", "big"] = Field(default="little", description="of counter and samples")
+    stream_id: Annotated[int, Field(ge=0, le=255)] | None = Field(
+        default=None, description="the byte that names the stream, on a port with stream_ids", examples=[1]
+    )
+    byte_order: Literal["little", "big"] = Field(
+        default="little", description="byte order of counter and samples"
+    )
     counter: Annotated[
         Counter,
-        Field(description="the frame's counter", examples=['{ byte = 0, bits = 32, counts = "samples" }']),
+        Field(
+            description="the counter in each frame", examples=['{ byte = 0, bits = 32, counts = "samples" }']
+        ),
     ]
     first_byte: Annotated[
         int, Field(ge=0, lt=LONGEST_PAYLOAD, description="where the samples start", examples=[4])
@@ -231,23 +238,29 @@ class SerialLayout(Layout):
 class LineCounter(Section):
     """The column that counts lines, and so samples."""
 
-    column: Annotated[Name, Field(description="which column it is", examples=["seq"])]
-    bits: Literal[8, 16, 32] = Field(default=32, description="its width: it begins again at 0 after 2**bits")
+    column: Annotated[Name, Field(description="name of the column that counts", examples=["seq"])]
+    bits: Literal[8, 16, 32] = Field(
+        default=32, description="width of the counter: it begins again at 0 after 2**bits"
+    )
 
 
 class LineTime(Section):
     """The column with the time of the device's own clock, of a device that does not count its lines."""
 
-    column: Annotated[Name, Field(description="which column it is", examples=["t"])]
-    unit: Annotated[Literal["s", "ms", "us"], Field(description="its unit", examples=["ms"])]
+    column: Annotated[Name, Field(description="name of the column with the time", examples=["t"])]
+    unit: Annotated[Literal["s", "ms", "us"], Field(description="unit of that time", examples=["ms"])]
 
 
 class LineChannel(Section):
     """One quantity of a line: wire value = value * scale + offset, as for a channel of a frame."""
 
     name: Annotated[Name, Field(description="name of the channel, and of its column", examples=["x"])]
-    scale: Scale = Field(default=1.0, description="wire value of a 1")
-    offset: Quantity = Field(default=0.0, description="wire value of a 0")
+    scale: Scale = Field(
+        default=1.0, description="what a 1 in the line is worth, in V or the unit of the sensor"
+    )
+    offset: Quantity = Field(
+        default=0.0, description="what a 0 in the line is worth, in V or the unit of the sensor"
+    )
 
 
 class LineLayout(Layout):
@@ -266,18 +279,19 @@ class LineLayout(Layout):
             examples=['["seq", "x", "y"]'],
         ),
     ]
-    separator: Annotated[
-        str, AfterValidator(_separator), Field(min_length=1, max_length=1, description="between columns")
-    ] = ","
-    prefix: (
-        Annotated[
-            str,
-            Field(pattern=r"^[!$]?[A-Za-z0-9_-]+$", max_length=16, description="first field of each line"),
-        ]
-        | None
-    ) = None
-    counter: LineCounter | None = Field(default=None, description="the column that counts")
-    time: LineTime | None = Field(default=None, description="the device's time, where it does not count")
+    separator: Annotated[str, AfterValidator(_separator), Field(min_length=1, max_length=1)] = Field(
+        default=",", description="character between two columns"
+    )
+    prefix: Annotated[str, Field(pattern=r"^[!$]?[A-Za-z0-9_-]+$", max_length=16)] | None = Field(
+        default=None,
+        description="first field of each line of this stream; lines with another one are not of it",
+        examples=["$VIB"],
+    )
+    counter: LineCounter | None = Field(default=None, description="the column that counts lines")
+    time: LineTime | None = Field(
+        default=None,
+        description="the column with the device's time, of a device that does not count its lines",
+    )
     channels: Annotated[
         tuple[LineChannel, ...],
         Field(

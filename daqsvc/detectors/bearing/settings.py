@@ -24,10 +24,29 @@ DampingNsPerM = Annotated[float, Field(ge=1e-6, le=1e9)]
 class FaultOrders(Section):
     """How often the parts of a bearing meet, per revolution of the shaft."""
 
-    bpfi: Annotated[Order, Field(description="balls pass a point of the inner race", examples=[5.415])]
-    bpfo: Annotated[Order, Field(description="balls pass a point of the outer race", examples=[3.585])]
-    bsf: Annotated[Order, Field(description="a ball turns about itself", examples=[2.357])]
-    ftf: Annotated[Order, Field(description="the cage turns", examples=[0.398])]
+    bpfi: Annotated[
+        Order,
+        Field(
+            description="how often balls pass a point of the inner race, per revolution of the shaft",
+            examples=[5.415],
+        ),
+    ]
+    bpfo: Annotated[
+        Order,
+        Field(
+            description="how often balls pass a point of the outer race, per revolution of the shaft",
+            examples=[3.585],
+        ),
+    ]
+    bsf: Annotated[
+        Order,
+        Field(
+            description="how often a ball turns about itself, per revolution of the shaft", examples=[2.357]
+        ),
+    ]
+    ftf: Annotated[
+        Order, Field(description="how often the cage turns, per revolution of the shaft", examples=[0.398])
+    ]
 
 
 class RollingGeometry(Section):
@@ -36,11 +55,21 @@ class RollingGeometry(Section):
     balls: Annotated[int, Field(ge=3, le=500, description="balls or rollers of one row", examples=[9])]
     ball_diameter_mm: Annotated[
         float,
-        Field(ge=0.01, le=10_000, description="of a ball, or of a roller at its middle", examples=[7.94]),
+        Field(
+            ge=0.01,
+            le=10_000,
+            description="diameter of a ball, or of a roller at its middle",
+            examples=[7.94],
+        ),
     ]
     pitch_diameter_mm: Annotated[
         float,
-        Field(ge=0.01, le=100_000, description="of the circle through their centres", examples=[39.04]),
+        Field(
+            ge=0.01,
+            le=100_000,
+            description="diameter of the circle through the centres of balls or rollers",
+            examples=[39.04],
+        ),
     ]
     contact_deg: Annotated[float, Field(ge=0, lt=90)] = Field(
         default=0.0, description="contact angle; 0 for deep-groove and cylindrical roller bearings"
@@ -52,18 +81,28 @@ class ThreeMasses(Section):
 
     masses_kg: Annotated[
         tuple[MassKg, MassKg, MassKg],
-        Field(strict=False, description="rotor, rolling elements, housing", examples=["[4.0, 0.0185, 2.0]"]),
+        Field(
+            strict=False,
+            description="masses of rotor, rolling elements and housing",
+            examples=["[4.0, 0.0185, 2.0]"],
+        ),
     ]
     stiffness_n_per_m: Annotated[
         tuple[StiffnessNPerM, StiffnessNPerM, StiffnessNPerM],
-        Field(strict=False, description="shaft, contact, housing", examples=["[2e7, 1e8, 5e7]"]),
+        Field(
+            strict=False, description="stiffness of shaft, contact and housing", examples=["[2e7, 1e8, 5e7]"]
+        ),
     ]
     damping_n_s_per_m: Annotated[
         tuple[DampingNsPerM, DampingNsPerM, DampingNsPerM],
-        Field(strict=False, description="shaft, contact, housing", examples=["[200.0, 300.0, 2000.0]"]),
+        Field(
+            strict=False,
+            description="damping of shaft, contact and housing",
+            examples=["[200.0, 300.0, 2000.0]"],
+        ),
     ]
     mismatch: Annotated[float, Field(ge=0, le=0.4)] = Field(
-        default=0.1, description="share by which each of these figures may be wrong"
+        default=0.1, description="share by which masses, stiffness and damping may be wrong"
     )
 
 
@@ -73,16 +112,25 @@ class WatchedBearing(Section):
     name: Annotated[Name, Field(description="name of the bearing", examples=["drive-end"])]
     sensor: Annotated[Name, Field(description="the accelerometer on its housing", examples=["accel-de"])]
     type: Text | None = Field(
-        default=None, description='designation in the catalogue, e.g. "6205-2RS"; or orders, or geometry'
+        default=None,
+        description='designation in the catalogue, e.g. "6205-2RS"; or orders, or geometry',
+        examples=["6205-2RS"],
     )
-    orders: FaultOrders | None = Field(default=None, description="its fault orders, in place of type")
+    orders: FaultOrders | None = Field(
+        default=None, description="fault orders of the bearing, in place of type"
+    )
     geometry: RollingGeometry | None = Field(
-        default=None, description="its dimensions, in place of type: ball and roller bearings of any kind"
+        default=None,
+        description="dimensions of the bearing, in place of type: of ball and roller bearings of any kind",
     )
     rotor_sensor: Name | None = Field(
-        default=None, description="accelerometer that moves with the rotor, to tell the races by direction"
+        default=None,
+        description="accelerometer that moves with the rotor, to tell the races apart by direction",
+        examples=["accel-rotor"],
     )
-    model: ThreeMasses | None = Field(default=None, description="the bearing's masses and springs, for that")
+    model: ThreeMasses | None = Field(
+        default=None, description="the bearing's masses and springs, needed by rotor_sensor"
+    )
 
     @property
     def sensors(self) -> tuple[Name, ...]:
@@ -104,16 +152,20 @@ class Bearing(Section):
         ),
     ]
     keyphasor: Name | None = Field(
-        default=None, description="what measures the speed; without it, the machine keeps to speed_rpm"
+        default=None,
+        description="the keyphasor that measures the speed; without it, the machine keeps to speed_rpm",
+        examples=["keyphasor"],
     )
     calibrate_s: Annotated[float, Field(ge=10, le=120)] = Field(
         default=30.0, description="first seconds, which are the healthy state; kept over restarts"
     )
     calibration: FilePath | None = Field(
-        default=None, description="file with the healthy state, in place of the first seconds"
+        default=None,
+        description="file of daqsvc calibrate with the healthy state, in place of the first seconds",
+        examples=["motor.calibration.toml"],
     )
     false_alarm_probability: Annotated[float, Field(ge=1e-9, le=0.1)] = Field(
-        default=1e-4, description='of calling the unchanged machine "changed", at each look'
+        default=1e-4, description="probability of calling an unchanged machine changed, at each evaluation"
     )
 
     repeatability_db: Annotated[float, Field(ge=0, le=6)] = Field(

@@ -28,7 +28,9 @@ BandHz = Annotated[float, Field(ge=0.001, le=5_000_000)]
 class Levels(Section):
     """RMS, peak, crest factor and velocity RMS of every vibration sensor, window by window."""
 
-    window_s: Annotated[float, Field(ge=1e-3, le=600)] = Field(default=0.5, description="length of a window")
+    window_s: Annotated[float, Field(ge=1e-3, le=600)] = Field(
+        default=0.5, description="length of the windows that levels are measured over"
+    )
     velocity_band_hz: Annotated[tuple[BandHz, BandHz], AfterValidator(_ordered_band), Field(strict=False)] = (
         Field(default=(10.0, 1000.0), description="band of the velocity RMS (ISO 20816-3: 10 Hz to 1000 Hz)")
     )

@@ -21,21 +21,27 @@ class Mode(Section):
     """A state of the rotor that the bank has a model for: what differs from [machine.rotor], at one level."""
 
     name: Annotated[Name, Field(description="name of the mode", examples=["F1"])]
-    severity: Annotated[Severity, Field(description="how bad it is", examples=["alert"])]
-    fault: Fault | None = Field(default=None, description="what it is; told from what differs if absent")
+    severity: Annotated[Severity, Field(description="how bad the mode is", examples=["alert"])]
+    fault: Fault | None = Field(
+        default=None,
+        description="the fault that the mode stands for; told by what differs from a healthy rotor if absent",
+        examples=["damping_loss"],
+    )
     damping_ratio: DampingRatio | None = Field(
-        default=None, description="the rotor's damping in it; that of [machine.rotor] if absent"
+        default=None,
+        description="damping ratio of the rotor in this mode; that of [machine.rotor] if absent",
+        examples=[0.10],
     )
     unbalance_ratio: Annotated[float, Field(ge=0, le=1000)] = Field(
-        default=1.0, description="eccentricity over the healthy one"
+        default=1.0, description="eccentricity in this mode over that of the healthy rotor"
     )
     stiffness_ratio: Annotated[float, Field(ge=0.01, le=100)] = Field(
-        default=1.0, description="stiffness of the shaft over the healthy one"
+        default=1.0, description="stiffness of the shaft in this mode over that of the healthy one"
     )
     static_load_um: Annotated[tuple[PositionUm, PositionUm], Field(strict=False)] = Field(
-        default=(0.0, 0.0), description="additional sag towards +x and +y, of the healthy shaft"
+        default=(0.0, 0.0), description="additional sag in this mode, towards +x and +y"
     )
-    rub: bool = Field(default=False, description="whether the rotor can touch the stator in it")
+    rub: bool = Field(default=False, description="whether the rotor can touch the stator in this mode")
 
     @property
     def differs(self) -> tuple[str, ...]:
@@ -61,7 +67,9 @@ class RotorBank(Section):
         tuple[Name, Name],
         Field(strict=False, description="the two proximity probes", examples=['["probe-x", "probe-y"]']),
     ]
-    keyphasor: Annotated[Name, Field(description="the keyphasor", examples=["keyphasor"])]
+    keyphasor: Annotated[
+        Name, Field(description="the keyphasor, which marks angle zero", examples=["keyphasor"])
+    ]
     noise_um: Annotated[
         float,
         Field(ge=1e-3, le=10_000, description="standard deviation of the sensor noise", examples=[2.0]),
@@ -76,10 +84,14 @@ class RotorBank(Section):
         default=25.0, description="evidence that declares a healthier mode"
     )
     false_alarms_per_1000_rev: Annotated[float, Field(ge=1e-9, le=10_000)] | None = Field(
-        default=None, description="accepted on a healthy machine, in place of threshold_nats"
+        default=None,
+        description="false alarms that are accepted on a healthy machine, in place of threshold_nats",
+        examples=[0.1],
     )
     mtbf_hours: Annotated[float, Field(ge=1e-3, le=1e9)] | None = Field(
-        default=None, description="mean time between failures, in place of back_threshold_nats"
+        default=None,
+        description="mean time between failures of the machine, in place of back_threshold_nats",
+        examples=[20_000.0],
     )
     identity_nats: Nats = Field(
         default=3.0, description="lead over the other candidates that names the fault"
@@ -95,6 +107,7 @@ class RotorBank(Section):
         default=None,
         description="file of daqsvc calibrate with a run-up: the rotor's two modes as that shows them, in "
         "place of natural_frequency_hz, damping_ratio and eccentricity_um of [machine.rotor]",
+        examples=["pump.calibration.toml"],
     )
     modes: Annotated[
         tuple[Mode, ...],

@@ -24,11 +24,14 @@ class RotorSynchronous(Section):
         tuple[Name, Name],
         Field(strict=False, description="the two proximity probes", examples=['["probe-x", "probe-y"]']),
     ]
-    keyphasor: Name | None = Field(default=None, description="the keyphasor, if there is one")
+    keyphasor: Name | None = Field(
+        default=None, description="the keyphasor, if there is one", examples=["keyphasor"]
+    )
     speed_source: SpeedSource | None = Field(
         default=None,
         description="what tells the shaft angle: keyphasor; fixed, machine.speed_rpm is exact; orbit, the 1X "
         "itself, around machine.speed_rpm. The keyphasor if there is one, else fixed",
+        examples=["orbit"],
     )
     calibrate_revolutions: Annotated[int, Field(ge=20, le=10_000)] = Field(
         default=50,
@@ -38,9 +41,10 @@ class RotorSynchronous(Section):
         default=None,
         description="file of daqsvc calibrate: the rotor, and the healthy state in place of the first "
         "revolutions unless it holds a run-up only",
+        examples=["pump.calibration.toml"],
     )
     false_alarms_per_1000_rev: Annotated[float, Field(ge=1e-9, le=10)] = Field(
-        default=0.1, description="accepted on a healthy machine"
+        default=0.1, description="false alarms that are accepted on a healthy machine"
     )
     natural_frequency_tolerance_percent: Percent = Field(
         default=20.0, description="how far off machine.rotor.natural_frequency_hz may be"

@@ -104,7 +104,7 @@ class MqttCommands(Section):
         default=60.0, description="how old a command may be when it arrives"
     )
     max_bytes: Annotated[int, Field(ge=256, le=65_536)] = Field(
-        default=4096, description="the longest command that is looked at"
+        default=4096, description="length of the longest command that is read"
     )
 
 
@@ -124,24 +124,42 @@ class Mqtt(Section):
     ]
     insecure: bool = Field(default=False, description="says that mqtt:// without TLS is meant")
     client_id: ClientId | None = Field(
-        default=None, description="how the broker knows this box; daqsvc-<site>:<box> if absent"
+        default=None,
+        description="client id, by which the broker knows this box; daqsvc-<site>:<box> if absent",
+        examples=["edge-1"],
     )
-    username: Text | None = Field(default=None, description="user at the broker")
-    password_file: FilePath | None = Field(default=None, description="file whose first line is the password")
+    username: Text | None = Field(
+        default=None, description="name of the user at the broker", examples=["edge-1"]
+    )
+    password_file: FilePath | None = Field(
+        default=None,
+        description="file whose first line is the password",
+        examples=["/etc/daqsvc/mqtt.password"],
+    )
     password_credential: Name | None = Field(
-        default=None, description="systemd credential (LoadCredential=) in place of password_file"
+        default=None,
+        description="systemd credential (LoadCredential=) in place of password_file",
+        examples=["mqtt-password"],
     )
     ca_file: FilePath | None = Field(
-        default=None, description="certificates (PEM) to trust in place of the system's"
+        default=None,
+        description="certificates (PEM) to trust in place of the system's",
+        examples=["/etc/daqsvc/ca.pem"],
     )
     cert_file: FilePath | None = Field(
-        default=None, description="certificate (PEM) that the box shows to the broker"
+        default=None,
+        description="certificate (PEM) that the box shows to the broker",
+        examples=["/etc/daqsvc/edge-1.pem"],
     )
     key_file: FilePath | None = Field(
-        default=None, description="its private key (PEM), if not in cert_file; not encrypted"
+        default=None,
+        description="private key (PEM) of that certificate, if not in cert_file; not encrypted",
+        examples=["/etc/daqsvc/edge-1.key"],
     )
     key_credential: Name | None = Field(
-        default=None, description="systemd credential (LoadCredential=) in place of key_file"
+        default=None,
+        description="systemd credential (LoadCredential=) in place of key_file",
+        examples=["mqtt-key"],
     )
     keepalive_s: Annotated[int, Field(ge=1, le=65535)] = Field(
         default=30, description="how soon the broker notices that the box is gone"
@@ -153,7 +171,8 @@ class Mqtt(Section):
         Field(default="daqsvc", description="first part of every topic")
     )
     telemetry_expiry_s: Annotated[float, Field(ge=1, le=86_400)] = Field(
-        default=600.0, description="how long diagnoses and status are worth being delivered late"
+        default=600.0,
+        description="age beyond which the broker drops diagnoses and status that it could not deliver",
     )
     commands: MqttCommands = Field(default=MqttCommands(), description="commands that come over the broker")
 

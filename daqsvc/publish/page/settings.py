@@ -36,19 +36,29 @@ class Page(Section):
 
     listen: ListenAddress = Field(default=DEFAULT, description="host and TCP port where the page listens")
     host_names: Annotated[tuple[Text, ...], Field(strict=False, max_length=MOST_NAMES)] = Field(
-        default=(), description="names of the page in addresses, beyond this box"
+        default=(),
+        description="host names by which the page is called from other computers",
+        examples=['["edge-1.example"]'],
     )
-    certificate_file: FilePath | None = Field(default=None, description="certificate of TLS, in PEM")
-    private_key_file: FilePath | None = Field(default=None, description="its private key, in PEM")
+    certificate_file: FilePath | None = Field(
+        default=None, description="certificate of TLS, in PEM", examples=["/etc/daqsvc/page.pem"]
+    )
+    private_key_file: FilePath | None = Field(
+        default=None, description="private key of that certificate, in PEM", examples=["/etc/daqsvc/page.key"]
+    )
     accounts_file: FilePath | None = Field(
-        default=None, description="accounts to sign in with, made by daqsvc account"
+        default=None,
+        description="file with accounts to sign in with, made by daqsvc account",
+        examples=["/etc/daqsvc/accounts"],
     )
     user_header: Annotated[Text, AfterValidator(_header)] | None = Field(
-        default=None, description="header in which a reverse proxy says who asks"
+        default=None,
+        description="header in which a reverse proxy names the user who asks",
+        examples=["X-Remote-User"],
     )
     proxies: Annotated[
         tuple[Annotated[Text, AfterValidator(_ip_address)], ...], Field(strict=False, max_length=MOST_NAMES)
-    ] = Field(default=(), description="IP addresses of that proxy")
+    ] = Field(default=(), description="IP addresses of that proxy", examples=['["127.0.0.1"]'])
     operators: Annotated[tuple[Text, ...], Field(strict=False, max_length=1000)] = Field(
-        default=(), description="users of that proxy who may handle alarms"
+        default=(), description="users of that proxy who may handle alarms", examples=['["ada"]']
     )
