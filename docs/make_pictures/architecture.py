@@ -128,6 +128,30 @@ def people(axes: Axes, alarms: tuple[float, float], size: tuple[float, float]) -
     axes.text(alarms[0] + 6, 94.0, name, ha="left", va="center", fontsize=8)
 
 
+def driver() -> Figure:
+    """What a driver does between the bus and the ring."""
+    assembler = import_module("daqsvc.acquisition.assembler").StreamAssembler.__name__
+    block = import_module("daqsvc.acquisition.samples").SampleBlock.__name__
+    figure = new(1.55)
+    axes = blank(figure, 700.0, 148.6)
+    frame = ((103.0, 589.0, 589.0, 103.0), (12.0, 12.0, 132.0, 132.0))
+    axes.fill(*frame, facecolor="none", edgecolor=QUIET, linestyle="--", linewidth=1.0)
+    axes.text(113.0, 116.0, "driver: one link, opened again when it is lost", fontsize=8.5, color=QUIET)
+    stops = (
+        (44.0, 76.0, ["bus"]),
+        (177.0, 126.0, ["read in bulk", "bytes, stamped"]),
+        (331.0, 126.0, ["decode", "as arrays"]),
+        (504.0, 150.0, [assembler, "order, loss, time"]),
+        (656.0, 76.0, ["ring"]),
+    )
+    for x, width, lines in stops:
+        box(axes, (x, 62.0), (width, 52.0), lines, HEALTHY)
+    for (x1, w1, _), (x2, w2, _) in pairwise(stops):
+        arrow(axes, (x1 + w1 / 2, 62.0), (x2 - w2 / 2, 62.0))
+    axes.text(696.0, 98.0, block, ha="right", fontsize=8)
+    return figure
+
+
 def contract() -> Figure:
     """The layers: a package imports what is below it, never what is above."""
     rows = layers()

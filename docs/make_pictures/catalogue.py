@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 PICTURES: Mapping[str, Callable[[], Figure]] = {
     "architecture": architecture.flow,
+    "driver": architecture.driver,
     "layers": architecture.contract,
     "timebase": timebase.picture,
     "alignment": alignment.picture,
