@@ -104,10 +104,11 @@ dist: $(READY)
 
 # What the service needs and no more. Between two releases the number of commits makes each package newer than the last.
 DEB := $(DIST)/deb
-deb: dist
+deb: dist docs
 	@command -v dh >/dev/null || { echo "make: debhelper is missing; install it with: apt-get install debhelper"; exit 1; }
 	@test -x /usr/bin/python3.11 || { echo "make: Debian's own Python is missing; install it with: apt-get install python3.11"; exit 1; }
-	@mkdir -p $(DEB)/source && cp -r packaging/debian requirements-service.lock config docs $(DEB)/source/
+	@mkdir -p $(DEB)/source && cp -r packaging/debian requirements-service.lock config docs CHANGELOG.md $(DEB)/source/
+	@cp -r $(DOCS) $(DEB)/source/html
 	@cp config/systemd/daqsvc@.service config/systemd/daqsvc.sysusers.conf $(DEB)/source/debian/
 	@mv $(DEB)/source/debian/daqsvc.sysusers.conf $(DEB)/source/debian/daqsvc.sysusers
 	@version=$$($(BIN)/python -c 'import daqsvc; print(daqsvc.__version__)'); \

@@ -26,6 +26,7 @@ highlight_language = "text"
 myst_heading_anchors = 5
 
 html_theme = "furo"
+html_favicon = "favicon.svg"
 html_title = f"daqsvc {release}"
 # The same sources make the same files: no times, no copies of the sources.
 html_last_updated_fmt = None

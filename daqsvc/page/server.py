@@ -34,7 +34,7 @@ from starlette.responses import (
     Response,
     StreamingResponse,
 )
-from starlette.routing import Route
+from starlette.routing import Mount, Route
 
 from daqsvc import __version__
 from daqsvc.acquisition.clock import NS_PER_S
@@ -42,6 +42,7 @@ from daqsvc.page.access.person import peer_of
 from daqsvc.page.access.ways import COOKIE, ByAccounts, OpenHere, SignInError
 from daqsvc.page.charts import THEMES
 from daqsvc.page.detectable import Detectabilities
+from daqsvc.page.documentation import WHY_NOT, Documentation
 from daqsvc.page.guard import FRAMING, Admitted, FormError, Forms, Guarded
 from daqsvc.page.handling import MOST_EVENTS, Said, alarms_page, handle
 from daqsvc.page.listening import NOT_OURS
@@ -76,7 +77,12 @@ LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
 
 
 def application(
-    source: MachineSource, access: Access | None = None, *, hosts: Collection[str] = (), tls: bool = False
+    source: MachineSource,
+    access: Access | None = None,
+    *,
+    hosts: Collection[str] = (),
+    tls: bool = False,
+    documentation: Path | None = None,
 ) -> Starlette:
     """The page of a box; ``state.close`` ends what browsers listen to.
 
@@ -85,9 +91,10 @@ def application(
         access: who may look, and who may act; None for anybody, and nobody.
         hosts: names that it goes by, beside those of this box for itself.
         tls: whether browsers reach it over TLS.
+        documentation: the folder of its site; None if it is not here.
     """
     access = access or OpenHere()
-    page = _Page(source, access, tls=tls)
+    page = _Page(source, access, tls=tls, has_documentation=documentation is not None)
     routes = [
         Route("/", page.plant),
         Route("/plant.json", page.plant_rows),
@@ -105,6 +112,9 @@ def application(
         Route("/events/{machine}/{view}", page.events),
         Route("/figures/{machine}/{view}", page.figures),
         Route("/static/{name}", _static),
+        Mount("/docs", Documentation(documentation))
+        if documentation
+        else Route("/docs/{path:path}", page.no_documentation),
     ]
 
     middleware = [
@@ -118,10 +128,11 @@ def application(
 
 
 class _Page:
-    def __init__(self, source: MachineSource, access: Access, *, tls: bool) -> None:
+    def __init__(self, source: MachineSource, access: Access, *, tls: bool, has_documentation: bool) -> None:
         self._source = source
         self._access = access
         self._tls = tls
+        self._has_documentation = has_documentation
         self._forms = Forms()
         self._said = Said()
         self._detectabilities = Detectabilities()
@@ -368,6 +379,10 @@ class _Page:
             "views": [{"name": one.name, "title": one.title, "absent": one.why_not(live)} for one in views],
         }
 
+    async def no_documentation(self, request: Request) -> Response:
+        """Say how to get it."""
+        return self._absent(request, "Documentation", WHY_NOT, again=False)
+
     def _absent(self, request: Request, name: str, why: str, *, again: bool = True) -> Response:
         page = self._html(request, "absent.html", title=name, why=why, again=again)
         page.status_code = 404
@@ -375,7 +390,12 @@ class _Page:
 
     def _html(self, request: Request, template: str, **values: Any) -> HTMLResponse:
         person: Person | None = request.state.person
-        about = {"version": __version__, "person": person, "token": self._forms.token(person)}
+        about = {
+            "version": __version__,
+            "has_documentation": self._has_documentation,
+            "person": person,
+            "token": self._forms.token(person),
+        }
         return HTMLResponse(self._templates.get_template(template).render(**about | values))
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import uvicorn
 
+from daqsvc.page.documentation import built_site
 from daqsvc.page.server import application
 
 if TYPE_CHECKING:
@@ -97,7 +98,7 @@ def serve(
         if key:
             print(f"who opens {where}operator?key={key} may handle alarms", flush=True)  # noqa: T201
         hosts = (*choice.names, *(() if choice.is_local else (_bracketed(choice.host),)))
-        app = application(source, access, hosts=hosts, tls=tls)
+        app = application(source, access, hosts=hosts, tls=tls, documentation=built_site())
         config = uvicorn.Config(
             app,
             log_level="warning",

@@ -16,6 +16,8 @@ from support.deb_package import packages
 from support.made_once import made_once
 from support.paths import ROOT
 
+from daqsvc.page.documentation import PLACES
+
 pytestmark = [pytest.mark.integration, pytest.mark.long, pytest.mark.sources, pytest.mark.timeout(600)]
 
 LOCK = ROOT / "requirements-service.lock"
@@ -54,6 +56,22 @@ def test_it_holds_the_service_and_no_more(root: Path) -> None:
         assert examples == {p.name for p in (ROOT / "config" / kind).iterdir()}
     # What was compiled when it was built is what runs: the service cannot write there.
     assert len(list(site.glob("daqsvc/__pycache__/*.pyc"))) == len(list(site.glob("daqsvc/*.py")))
+
+
+def test_it_holds_the_site_of_the_documentation_where_the_page_looks_for_it(root: Path) -> None:
+    site = root / PLACES[1].relative_to("/")
+    assert (site / "index.html").read_text("utf-8").startswith("<!doctype html>")
+    pages = {page.relative_to(ROOT / "docs").with_suffix("") for page in (ROOT / "docs").rglob("*.md")}
+    assert {page.relative_to(site).with_suffix("") for page in site.rglob("*.html")} >= pages
+    assert "keyphasor" in (site / "searchindex.js").read_text("utf-8")
+    assert not list(site.rglob("*.gz")), "a browser opens none"
+    # A terminal shows the pages, too; not those that only include a file from elsewhere.
+    texts = {page.name for page in (root / "usr/share/doc/daqsvc").glob("*.md")}
+    assert texts == {page.name for page in (ROOT / "docs").glob("*.md")} - {
+        "readme.md",
+        "contributing.md",
+        "changelog.md",
+    }
 
 
 def test_nothing_in_it_names_the_place_where_it_was_built(root: Path) -> None:

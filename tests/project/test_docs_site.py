@@ -3,40 +3,24 @@
 from __future__ import annotations
 
 import re
-import shutil
-import subprocess
 from typing import TYPE_CHECKING
 from urllib.parse import unquote
 
 import pytest
-from support.made_once import made_once
+from support.docs_site import built_docs, copied_tree, make_docs
 from support.paths import ROOT
 
 if TYPE_CHECKING:
     from pathlib import Path
 
 pytestmark = [pytest.mark.integration, pytest.mark.long, pytest.mark.sources]
-LEFT_OUT = shutil.ignore_patterns(".*", "__pycache__", "*.egg-info", "build", "dist")
 OURS = re.compile(r'(?:src|href)="(?!https?:|data:|mailto:)([^"#?]+)')
-
-
-def make_docs(tree: Path) -> subprocess.CompletedProcess[str]:
-    """Build the site of a copy of this tree, with the Sphinx that this tree has or sets up now."""
-    command = ["make", "docs", f"DOCS_VENV={ROOT / '.venv-docs'}"]
-    return subprocess.run(command, cwd=tree, check=False, capture_output=True, text=True, timeout=280)
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The built site."""
-
-    def build(folder: Path) -> Path:
-        shutil.copytree(ROOT, folder / "tree", ignore=LEFT_OUT)
-        made = make_docs(folder / "tree")
-        assert made.returncode == 0, made.stdout + made.stderr
-        return folder / "tree" / "build" / "docs" / "html"
-
-    return made_once(tmp_path_factory, "docs-site", build)
+    return built_docs(tmp_path_factory)
 
 
 def test_all_that_the_pages_need_is_in_the_site(site: Path) -> None:
@@ -69,12 +53,12 @@ def test_the_side_has_the_lists_of_the_index(site: Path) -> None:
 
 
 def test_the_build_fails_at_links_that_lead_nowhere_and_names_each(tmp_path: Path) -> None:
-    shutil.copytree(ROOT, tmp_path / "tree", ignore=LEFT_OUT)
-    docs = tmp_path / "tree" / "docs"
+    tree = copied_tree(tmp_path)
+    docs = tree / "docs"
     with (docs / "history.md").open("a") as page:
         page.write("\n[a](no-page.md), [b](alarms.md#no-heading), [c](#not-here), [d](../config/no.toml)\n")
     (docs / "forgotten.md").write_text("# In no list\n")
-    made = make_docs(tmp_path / "tree")
+    made = make_docs(tree)
     assert made.returncode != 0
     for what in ("no-page.md", "no-heading", "not-here", "no.toml", "forgotten.md"):
         assert what in made.stderr, made.stderr

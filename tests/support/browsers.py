@@ -87,6 +87,6 @@ async def tab(browser: Browser, **options: Any) -> AsyncIterator[Page]:
     page.on("request", lambda asked: None if "//127.0.0.1:" in asked.url else wrong.append(asked.url))
     try:
         yield page
-        assert wrong == []
+        assert wrong == [], wrong
     finally:
         await context.close()

@@ -18,7 +18,9 @@ from support.made_once import made_in
 from support.paths import ROOT
 
 KEPT = ROOT / ".cache" / "deb"
-_NOT_IN_IT = shutil.ignore_patterns(".*", "tests", "__pycache__", "*.egg-info", "build", "dist")
+_NOT_COPIED = (".*", "__pycache__", "*.egg-info", "build", "dist")
+# Pages of the documentation link to tests; what is packed is hardly another for that.
+_NOT_IN_IT = shutil.ignore_patterns(*_NOT_COPIED, "tests")
 
 
 def packages() -> tuple[Path, Path]:
@@ -33,7 +35,7 @@ def packages() -> tuple[Path, Path]:
 
 
 def _digest(tree: Path) -> str:
-    """Of all that `_build` copies."""
+    """Of all that is packed."""
     digest = hashlib.sha256()
     for folder, folders, files in os.walk(tree):
         left_out = _NOT_IN_IT(folder, [*folders, *files])
@@ -47,10 +49,11 @@ def _digest(tree: Path) -> str:
 def _build(folder: Path) -> tuple[Path, Path]:
     shutil.rmtree(folder)  # what a build that was interrupted has left
     tree = folder / "tree"
-    shutil.copytree(ROOT, tree, ignore=_NOT_IN_IT)
+    shutil.copytree(ROOT, tree, ignore=shutil.ignore_patterns(*_NOT_COPIED))
     ready = Path(sys.prefix) / ".ready"
     built = subprocess.run(
-        ["make", "--assume-old", str(ready), "deb", f"VENV={sys.prefix}", "DIST=out"],
+        ["make", "--assume-old", str(ready), "deb", f"VENV={sys.prefix}", "DIST=out",
+         f"DOCS_VENV={ROOT / '.venv-docs'}"],
         cwd=tree, check=False, capture_output=True, text=True, timeout=560,
     )  # fmt: skip
     assert built.returncode == 0, built.stdout + built.stderr
