@@ -21,6 +21,7 @@ SOURCES = (
     "alarms",
     "alignment",
     "bearing",
+    "detectability",
     "driver-contract",
     "edge-box",
     "fleet",
@@ -84,6 +85,15 @@ def test_a_page_that_lost_its_table_is_named(maker: ModuleType, tmp_path: Path) 
         shutil.copy(file, tmp_path)
     (tmp_path / "plants.md").write_text("# Nothing here\n", "utf-8")
     with pytest.raises(maker.FigureIsMissingError, match=r"plants\.md"):
+        maker.evaluation(tmp_path)
+
+
+def test_a_column_that_has_another_name_is_named(maker: ModuleType, tmp_path: Path) -> None:
+    for file in DOCS.glob("*.md"):
+        shutil.copy(file, tmp_path)
+    page = tmp_path / "detectability.md"
+    page.write_text(page.read_text("utf-8").replace("| SNR |", "| ratio |"), "utf-8")
+    with pytest.raises(maker.FigureIsMissingError, match="no column 'SNR'"):
         maker.evaluation(tmp_path)
 
 
