@@ -248,7 +248,7 @@ def bearings(docs: Path) -> Iterator[Row]:
         "race-test.md#what-it-reaches",
     )
     other = page.find(
-        r"of (\d+) records with a damaged race (\d+) were named right, of (\d+) with a damaged ball (\w+)"
+        r"Of (\d+) records with a damaged race (\d+) were named right, of (\d+) with a damaged ball (\w+)"
     )
     yield Row(
         "sensors away from the bearing",

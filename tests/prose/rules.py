@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import tomllib
 from dataclasses import dataclass
@@ -21,9 +22,9 @@ if TYPE_CHECKING:
     from prose.texts import Text
 
 VOCABULARY = ROOT / "tests" / "prose" / "vocabulary.toml"
-KINDS = ("page", "message", "docstring", "comment")
+KINDS = ("page", "record", "cell", "message", "docstring", "comment")
 
-_END = re.compile(r"""(?<=[.!?])["')\]*]*\s+(?=["'(*\[]*[A-Z`])""")
+_END = re.compile(r"""(?<=[.!?])(?<!e\.g\.)(?<!i\.e\.)["')\]*]*\s+(?=["'(*\[]*[A-Z\d`])""")
 _WORD = re.compile(r"\w")
 
 
@@ -64,7 +65,7 @@ class Rules:
     def findings(self, texts: Iterable[Text]) -> Iterator[Finding]:
         """All that is to be mended, in the order of the texts."""
         for text in texts:
-            most = self.longest[text.kind]
+            most = self.longest.get(text.kind, math.inf)
             for sentence in sentences(text.words):
                 if (words := length(sentence)) > most:
                     beginning = " ".join(sentence.split()[:8])

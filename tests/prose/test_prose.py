@@ -43,6 +43,9 @@ def test_a_bad_sentence_is_found_wherever_prose_lies(
 ) -> None:
     file = tmp_path / name
     file.write_text(f"{before}{bad}{after}", "utf-8")
+    if name == "table.md" and bad is LONG:
+        assert found(file) == []  # a cell is a list, often
+        return
     [(line, message)] = found(file)
     assert line == before.count("\n") + 1
     assert ("words in a sentence" in message) == (bad is LONG)
@@ -73,15 +76,27 @@ def test_an_entry_of_the_vocabulary_is_whole(entry: dict[str, str]) -> None:
     assert {*entry.get("in", KINDS)} <= {*KINDS}
 
 
-def test_a_limit_is_there_for_each_kind_of_text() -> None:
-    assert {*rules().longest} == {*KINDS}
+def test_a_limit_is_there_for_each_kind_of_text_but_cells() -> None:
+    assert {*rules().longest} == {*KINDS} - {"cell"}
+
+
+@pytest.mark.parametrize("name", ["CHANGELOG.md", "decisions/0001-a-choice.md"])
+def test_records_of_the_past_may_have_longer_sentences(name: str, tmp_path: Path) -> None:
+    limits = rules().longest
+    assert limits["record"] > limits["page"]
+    sentence = " ".join(["word"] * limits["record"]) + "."
+    (tmp_path / "decisions").mkdir()
+    for file, is_record in ((tmp_path / name, True), (tmp_path / "page.md", False)):
+        file.write_text(f"# Title\n\n{sentence}\n", "utf-8")
+        assert (found(file) == []) is is_record
 
 
 @pytest.mark.parametrize(
     ("text", "count"),
     [
         ("One sentence. Another one? Yes! `x` is a key.", 4),
-        ("It takes 0.5 s, e.g. on CAN, at 3.2 kHz.", 1),
+        ("It takes 0.5 s, e.g. on CAN, at 3.2 kHz, e.g. 5 times.", 1),
+        ("It was refused. 20 of them were not.", 2),
         ("See docs/can.md for more.", 1),
         ('He wrote "no frame." Then it came.', 2),
     ],

@@ -50,18 +50,22 @@ class Text:
 def texts_of(file: Path) -> Iterator[Text]:
     """All prose of a page, a module or a TOML file."""
     readers = {".md": _of_page, ".py": _of_module, ".toml": _of_toml}
-    for line, kind, words in readers[file.suffix](file.read_text("utf-8")):
+    is_record = file.name == "CHANGELOG.md" or file.parent.name == "decisions"
+    for line, found, words in readers[file.suffix](file.read_text("utf-8")):
+        kind = "record" if is_record and found == "page" else found
         if plain := " ".join(_LITERAL.sub(CODE, words).split()):
             yield Text(file, line, kind, plain)
 
 
 def _of_page(text: str) -> Iterator[tuple[int, str, str]]:
-    line = 1
+    line, kind = 1, "page"
     for token in MarkdownIt("commonmark").enable("table").parse(text):
         if token.map:
             line = token.map[0] + 1
-        if token.type == "inline":
-            yield line, "page", "".join(_visible(token.children or []))
+        if token.type in {"table_open", "table_close"}:
+            kind = "cell" if token.type == "table_open" else "page"
+        elif token.type == "inline":
+            yield line, kind, "".join(_visible(token.children or []))
 
 
 def _visible(tokens: list[Token]) -> Iterator[str]:
