@@ -17,6 +17,7 @@
 # make deb    a Debian package of the service, in dist/; apt install ./dist/daqsvc_*.deb
 # make test-wheel  the everyday tests against the wheel in dist/, installed in a venv of its own
 # make hooks  have git check every commit
+# make reference  the pages of docs/reference, anew from the code, and the schemas of docs/schemas
 # make proto  the module of the Sparkplug payload, anew from its schema
 # Each sets up what it needs in .venv; nothing else on the machine is touched.
 
@@ -38,7 +39,7 @@ export OMP_NUM_THREADS ?= 1
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.cache/kernels
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-long hil check guard measure bench bench-data bench-diagnosis docs evaluation pictures dist deb nothing-lost soak test-wheel hooks proto lock clean
+.PHONY: help demo test test-long hil check guard measure bench bench-data bench-diagnosis docs reference evaluation pictures dist deb nothing-lost soak test-wheel hooks proto lock clean
 
 help:
 	@sed -n 's/^# \(make.*\)/\1/p' Makefile
@@ -173,6 +174,10 @@ $(PLANTS)/bank.json: $(PLANTS)/cases.json tests/plants/bank_records.py
 bench-diagnosis: $(READY) $(PLANTS)/cases.json $(PLANTS)/bank.json
 	@PYTHONPATH=tests $(BIN)/python -m plants.table $(PLANTS) $(ARGS)
 	@$(BIN)/python docs/make_evaluation.py
+
+reference: $(READY)
+	@$(BIN)/python -m daqsvc.reference docs/reference
+	@$(BIN)/python -m daqsvc.publish.schemas docs/schemas
 
 # What is compiled needs a protobuf of this major version, no older than the compiler: pyproject.toml says which.
 proto: $(READY)

@@ -37,7 +37,7 @@ class RecordCommand:
     description = (
         "Record every frame that comes over a CAN bus in one log file, without the rest of the service. "
         "SIGINT (Ctrl-C) or SIGTERM end it. At the end print as JSON what was recorded, and what the streams "
-        'of the machine file make of it. The file can be replayed (driver = "replay") or opened by any tool '
+        'of the machine file do with it. The file can be replayed (driver = "replay") or opened by any tool '
         "that reads CAN logs."
     )
 

@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
+SCHEMA_ABOUT = "name and version of the payload"
+
+
 def _finite_or_none(value: Any) -> Any:
     """JSON knows neither NaN nor infinity: what is not a finite number becomes null."""
     return None if isinstance(value, float) and not math.isfinite(value) else value
@@ -57,8 +60,8 @@ class JsonPayload(BaseModel):
 class Stamped(JsonPayload):
     """A payload that says whose it is and when it was true."""
 
-    site: str
-    box: str
+    site: str = Field(description="the site, as the machine file names it")
+    box: str = Field(description="the box, as the machine file names it")
     time: str = Field(description="ISO 8601, UTC, microseconds; a label, the wall clock may step")
     wall_ns: int = Field(description="the same instant in nanoseconds since 1970-01-01T00:00Z")
     monotonic_ns: int = Field(description="the same instant on the box's monotonic clock; orders events")
@@ -67,28 +70,32 @@ class Stamped(JsonPayload):
 class WindowPayload(JsonPayload):
     """Which samples a statement rests on: absolute sample indices of the stream."""
 
-    stream: str
-    first_index: int
+    stream: str = Field(description="the stream whose samples are counted")
+    first_index: int = Field(description="the first sample")
     end_index: int = Field(description="one past the last sample")
 
 
 class _Statement(JsonPayload):
-    detector: str
-    decision: str
-    severity: Severity
-    changed: bool
+    detector: str = Field(description="name of the detector")
+    decision: str = Field(description="what the detector has decided, e.g. normal or a mode")
+    severity: Severity = Field(description="how bad that is")
+    changed: bool = Field(description="whether the decision is another one than before")
     probabilities: dict[str, Number] = Field(description="by mode; empty if the detector has none")
     group: tuple[str, ...] = Field(description="modes that the evidence cannot tell apart")
-    statistics: dict[str, Number]
+    statistics: dict[str, Number] = Field(description="what was measured, by name")
     units: dict[str, str] = Field(description="units of the statistics that have one")
-    thresholds: dict[str, Number]
+    thresholds: dict[str, Number] = Field(
+        description="what the statistics and the evidence are held against, by name"
+    )
     evidence: dict[str, Number] = Field(description="log-likelihood ratios in nats")
     revolutions: Number = Field(description="shaft revolutions since the detector started")
-    window: WindowPayload
-    quality: Quality
+    window: WindowPayload = Field(description="the samples that the statement rests on")
+    quality: Quality = Field(
+        description="whether the samples and sensors are good, samples are missing, or a sensor is not OK"
+    )
     reason: str = Field(description="why the quality is not good")
-    sensors: tuple[str, ...]
-    model: str
+    sensors: tuple[str, ...] = Field(description="names of the sensors that the statement rests on")
+    model: str = Field(description="name and version of the model that it rests on")
     where: str = Field("", description="the part of the machine that it is about, e.g. a bearing; or empty")
     missing_share: Number = Field(
         None, description="share of the window's samples that are missing; null if the detector does not say"
@@ -108,34 +115,34 @@ class CausePayload(_Statement):
 class PreviousPayload(JsonPayload):
     """How the alarm stood before the event."""
 
-    state: AlarmState
-    level: Severity
+    state: AlarmState = Field(description="state before the event")
+    level: Severity = Field(description="level before the event")
 
 
 class DoubtPayload(JsonPayload):
     """What a detector has against a sensor."""
 
-    detector: str
+    detector: str = Field(description="name of the detector")
     quality: Quality = Field(description="what it said last")
     not_ok: bool = Field(description="whether it said not_ok since it was last good")
-    reason: str
-    sensors: tuple[str, ...]
+    reason: str = Field(description="why, in a sentence")
+    sensors: tuple[str, ...] = Field(description="names of the sensors that it is about")
 
 
 class AlarmPayload(Stamped):
     """One event of one alarm; the latest one is the alarm's state."""
 
-    schema_: Literal["daqsvc.alarm/1"] = Field("daqsvc.alarm/1", alias="schema")
+    schema_: Literal["daqsvc.alarm/1"] = Field("daqsvc.alarm/1", alias="schema", description=SCHEMA_ABOUT)
     id: str = Field(description="unique; a message that comes twice has the same id")
     sequence: int = Field(description="rises from event to event of the box, never used twice")
-    machine: str
-    alarm: str
+    machine: str = Field(description="name of the machine")
+    alarm: str = Field(description="name of the alarm")
     occurrence: str | None = Field(description="id of the activation; null if normal before and after")
-    kind: EventKind
-    state: AlarmState
-    level: Severity
-    previous: PreviousPayload
-    message: str
+    kind: EventKind = Field(description="why the event was sent")
+    state: AlarmState = Field(description="state of the alarm after the event")
+    level: Severity = Field(description="how bad it is; of a latching alarm the worst since it was raised")
+    previous: PreviousPayload = Field(description="state and level before the event")
+    message: str = Field(description="the event in a sentence")
     by: str = Field(description="the person who asked for it; empty if the data or time did it")
     reason: str = Field("", description="why, in that person's words")
     holds: tuple[AlarmState, ...] = Field((), description="what covers the alarm, strongest first")
@@ -149,14 +156,16 @@ class AlarmPayload(Stamped):
     doubts: tuple[DoubtPayload, ...] = Field(
         (), description="of a quality alarm: what is said against the sensor"
     )
-    cause: CausePayload
+    cause: CausePayload = Field(description="the statement of a detector behind the event")
 
 
 class DiagnosisPayload(Stamped, _Statement):
     """One statement of one detector."""
 
-    schema_: Literal["daqsvc.diagnosis/1"] = Field("daqsvc.diagnosis/1", alias="schema")
-    machine: str
+    schema_: Literal["daqsvc.diagnosis/1"] = Field(
+        "daqsvc.diagnosis/1", alias="schema", description=SCHEMA_ABOUT
+    )
+    machine: str = Field(description="name of the machine")
 
 
 class Figures(RootModel[dict[str, "WholeOrNumber | str | Figures"]]):
@@ -166,17 +175,21 @@ class Figures(RootModel[dict[str, "WholeOrNumber | str | Figures"]]):
 class StatusPayload(Stamped):
     """Figures of the service itself, nested by what they belong to."""
 
-    schema_: Literal["daqsvc.status/1"] = Field("daqsvc.status/1", alias="schema")
+    schema_: Literal["daqsvc.status/1"] = Field("daqsvc.status/1", alias="schema", description=SCHEMA_ABOUT)
     machines: tuple[str, ...] = Field((), description="those that the box watches, by their names in topics")
-    figures: Figures
+    figures: Figures = Field(
+        description="figures of the service, by what they belong to: docs/reference/counters.md"
+    )
 
 
 class AvailabilityPayload(Stamped):
     """Whether the box is there; in a last will, the time is that of the connection that it belongs to."""
 
-    schema_: Literal["daqsvc.availability/1"] = Field("daqsvc.availability/1", alias="schema")
-    state: Literal["online", "offline"]
-    reason: str
+    schema_: Literal["daqsvc.availability/1"] = Field(
+        "daqsvc.availability/1", alias="schema", description=SCHEMA_ABOUT
+    )
+    state: Literal["online", "offline"] = Field(description="whether the box speaks")
+    reason: str = Field(description="why: connected, stopped, or connection lost")
 
 
 def alarm_payload(event: AlarmEvent, sequence: int, series: str) -> AlarmPayload:

@@ -9,7 +9,7 @@ from pydantic import Field
 from daqsvc.alarms.states import AlarmState  # noqa: TC001 - as below
 from daqsvc.diagnosis.record import Severity  # noqa: TC001 - pydantic reads the annotations
 from daqsvc.dsp.quality import Quality  # noqa: TC001 - as above
-from daqsvc.publish.payloads import Figures, JsonPayload, Number, Stamped
+from daqsvc.publish.payloads import SCHEMA_ABOUT, Figures, JsonPayload, Number, Stamped
 
 SCHEMA: Literal["daqsvc.service-status/1"] = "daqsvc.service-status/1"
 
@@ -19,32 +19,32 @@ SensorState = Literal["ok", "not_ok", "missing", "unknown"]
 class BusPayload(JsonPayload):
     """How a bus stands."""
 
-    driver: str
-    state: Literal["up", "down"]
+    driver: str = Field(description="name of the driver")
+    state: Literal["up", "down"] = Field(description="whether the bus is up")
     reason: str = Field(description="why it is down")
 
 
 class StreamPayload(JsonPayload):
     """How a stream stands."""
 
-    bus: str
+    bus: str = Field(description="name of the bus")
     rate_hz: Number = Field(description="measured rate; null before it is known, and while nothing comes")
-    configured_rate_hz: float
+    configured_rate_hz: float = Field(description="rate in the machine file")
     age_s: Number = Field(description="age of the newest sample; null before the first one")
     doubt: str = Field(description="why nothing can be judged by its samples; empty if it can")
-    samples_received: int
-    samples_lost: int
+    samples_received: int = Field(description="samples that came")
+    samples_lost: int = Field(description="samples that never came")
 
 
 class ChannelPayload(JsonPayload):
     """The newest sample of a channel, and whether its sensor is OK."""
 
-    stream: str
-    channel: str
+    stream: str = Field(description="name of the stream")
+    channel: str = Field(description="name of the channel")
     sensor: str | None = Field(description="null if no sensor of the machine file is on it")
     value: Number = Field(description="null if the newest sample is missing, or none has come")
-    unit: str
-    age_s: Number
+    unit: str = Field(description="unit of the value")
+    age_s: Number = Field(description="age of the newest sample; null before the first one")
     state: SensorState = Field(description="what the detectors say of the sensor")
     reason: str = Field(description="why it is not ok")
 
@@ -52,37 +52,37 @@ class ChannelPayload(JsonPayload):
 class MeasurePayload(JsonPayload):
     """One figure of a detector."""
 
-    value: Number
-    unit: str
+    value: Number = Field(description="the figure; null if it is not known")
+    unit: str = Field(description="its unit; empty for a pure number")
 
 
 class StatementPayload(JsonPayload):
     """What a detector has said last."""
 
-    detector: str
-    sensors: tuple[str, ...]
-    where: str
-    decision: str
-    severity: Severity
-    quality: Quality
+    detector: str = Field(description="name of the detector")
+    sensors: tuple[str, ...] = Field(description="names of the sensors that the statement rests on")
+    where: str = Field(description="the part of the machine that it is about; or empty")
+    decision: str = Field(description="what the detector has decided")
+    severity: Severity = Field(description="how bad that is")
+    quality: Quality = Field(description="whether the samples and sensors are good")
     reason: str = Field(description="why the quality is not good")
     age_s: Number = Field(description="age of the last sample that it rests on")
     measures: dict[str, MeasurePayload] = Field(description="of the last statement that had any")
     measures_age_s: Number = Field(description="age of these; null if there are none")
-    probabilities: dict[str, Number]
+    probabilities: dict[str, Number] = Field(description="by mode; empty if the detector has none")
 
 
 class StandingAlarmPayload(JsonPayload):
     """An alarm that is not normal."""
 
-    alarm: str
-    state: AlarmState
-    level: Severity
-    occurrence: str | None
+    alarm: str = Field(description="name of the alarm")
+    state: AlarmState = Field(description="its state")
+    level: Severity = Field(description="how bad it is")
+    occurrence: str | None = Field(description="id of the activation; null if there is none")
     age_s: Number = Field(description="since it changed last")
     shelved_until_wall_ns: int | None = Field(None, description="when shelving ends; null if not shelved")
     first_out: bool = Field(False, description="it was the first of its group to stand")
-    message: str
+    message: str = Field(description="its latest event in a sentence")
 
 
 class AlarmsPayload(JsonPayload):
@@ -98,7 +98,9 @@ class OutboxPayload(JsonPayload):
     depth: int = Field(description="alarm events on disk that the broker has not acknowledged")
     waiting: int = Field(description="alarm events in memory that are not on disk yet")
     oldest_age_s: Number = Field(description="age of the oldest event for the broker; null if none waits")
-    journal: Literal["written", "not open", "not written"]
+    journal: Literal["written", "not open", "not written"] = Field(
+        description="whether alarm events are written to the disk"
+    )
 
 
 class OutputPayload(JsonPayload):
@@ -114,16 +116,16 @@ class OutputPayload(JsonPayload):
 class ServiceStatusPayload(Stamped):
     """How everything stands that the service knows."""
 
-    schema_: Literal["daqsvc.service-status/1"] = Field(SCHEMA, alias="schema")
-    machine: str
-    version: str
-    uptime_s: float
-    buses: dict[str, BusPayload]
-    streams: dict[str, StreamPayload]
-    channels: tuple[ChannelPayload, ...]
-    statements: tuple[StatementPayload, ...]
-    alarms: AlarmsPayload
-    outbox: OutboxPayload
+    schema_: Literal["daqsvc.service-status/1"] = Field(SCHEMA, alias="schema", description=SCHEMA_ABOUT)
+    machine: str = Field(description="name of the machine")
+    version: str = Field(description="version of daqsvc")
+    uptime_s: float = Field(description="how long the service has been running, in s")
+    buses: dict[str, BusPayload] = Field(description="the buses, by name")
+    streams: dict[str, StreamPayload] = Field(description="the streams, by name")
+    channels: tuple[ChannelPayload, ...] = Field(description="the channels with their newest samples")
+    statements: tuple[StatementPayload, ...] = Field(description="what each detector has said last")
+    alarms: AlarmsPayload = Field(description="how the alarms stand")
+    outbox: OutboxPayload = Field(description="what waits for the broker and for the disk")
     outputs: dict[str, OutputPayload] = Field(description="by table; empty if the machine file has none")
     faults: dict[str, dict[str, dict[str, int]]] = Field(
         description="what was lost or went wrong since the start: by kind, name and cause; none that is 0"

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import Field
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.publish.payloads import Stamped, stamp_now
+from daqsvc.publish.payloads import SCHEMA_ABOUT, Stamped, stamp_now
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -53,9 +53,11 @@ DIGITS_OF_A_NUMBER = 3
 class ReadingsPayload(Stamped):
     """What one detector finds and measures, rounded, for people to look at."""
 
-    schema_: Literal["daqsvc.readings/1"] = Field("daqsvc.readings/1", alias="schema")
-    machine: str
-    detector: str
+    schema_: Literal["daqsvc.readings/1"] = Field(
+        "daqsvc.readings/1", alias="schema", description=SCHEMA_ABOUT
+    )
+    machine: str = Field(description="name of the machine")
+    detector: str = Field(description="name of the detector")
     finding: str | None = Field(
         description="the decision, with all that it cannot be told apart from, joined by 'or'; null without "
         "good data, and of a detector that only measures"

@@ -10,7 +10,7 @@ from pydantic_core import from_json, to_json
 
 from daqsvc.alarms.states import AlarmState
 from daqsvc.diagnosis.record import Severity  # noqa: TC001 - pydantic reads the annotations
-from daqsvc.publish.payloads import JsonPayload, Stamped, stamp_now
+from daqsvc.publish.payloads import SCHEMA_ABOUT, JsonPayload, Stamped, stamp_now
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -32,19 +32,19 @@ class StandingPayload(JsonPayload):
         description="ON from raising to return or reset; null while the alarm is covered (suppressed, "
         "shelved or out of service), or is not raised and what it rests on is not OK: nobody can say then"
     )
-    state: AlarmState
-    level: Severity
+    state: AlarmState = Field(description="state of the alarm")
+    level: Severity = Field(description="how bad it is")
     occurrence: str | None = Field(description="id of the activation; null if normal")
     time: str | None = Field(description="ISO 8601, UTC, of the latest event; null if there was none yet")
-    message: str
+    message: str = Field(description="its latest event in a sentence")
 
 
 class SummaryPayload(Stamped):
     """Every alarm of a machine as it stands."""
 
-    schema_: Literal["daqsvc.summary/1"] = Field("daqsvc.summary/1", alias="schema")
-    machine: str
-    alarms: dict[str, StandingPayload]
+    schema_: Literal["daqsvc.summary/1"] = Field("daqsvc.summary/1", alias="schema", description=SCHEMA_ABOUT)
+    machine: str = Field(description="name of the machine")
+    alarms: dict[str, StandingPayload] = Field(description="the alarms, by name")
 
 
 class Summary:

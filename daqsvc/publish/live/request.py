@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from daqsvc.alarms.commands import JsonCommand, Line
+from daqsvc.publish.payloads import SCHEMA_ABOUT
 
 LONGEST_LEASE_S = 60.0
 MOST_BYTES = 32 * 1024
@@ -16,7 +17,7 @@ MOST_BYTES = 32 * 1024
 class LiveRequestPayload(JsonCommand):
     """A request for live data; the topic names the machine and the viewer."""
 
-    schema_: Literal["daqsvc.live-request/1"] = Field(alias="schema")
+    schema_: Literal["daqsvc.live-request/1"] = Field(alias="schema", description=SCHEMA_ABOUT)
     feed: Annotated[int, Field(ge=0, lt=10**15)] = Field(
         description="number of the feed, chosen by the viewer: another number starts a new feed"
     )

@@ -32,7 +32,7 @@ from daqsvc.alarms.commands import (
     faults_of,
 )
 from daqsvc.outbox.command_ids import REMEMBERED
-from daqsvc.publish.payloads import Stamped, stamp_now
+from daqsvc.publish.payloads import SCHEMA_ABOUT, Stamped, stamp_now
 from daqsvc.publish.topics import ANSWER
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ _EXPIRES = "how old the command may become, if less than the machine file allows
 class CommandPayload(CommandMessage):
     """One command; what is asked, and of which machine, stands in the topic."""
 
-    schema_: Literal["daqsvc.command/1"] = Field(alias="schema")
+    schema_: Literal["daqsvc.command/1"] = Field(alias="schema", description=SCHEMA_ABOUT)
     id: CommandId
     alarm: Annotated[str, Field(pattern=r"^[A-Za-z0-9_./-]{1,200}$")] = Field(description="name of the alarm")
     by: Person = Field(description="who asks")
@@ -96,7 +96,7 @@ class CommandPayload(CommandMessage):
 class SnapshotCommandPayload(JsonCommand):
     """A wish for a snapshot; of which machine stands in the topic."""
 
-    schema_: Literal["daqsvc.snapshot-command/1"] = Field(alias="schema")
+    schema_: Literal["daqsvc.snapshot-command/1"] = Field(alias="schema", description=SCHEMA_ABOUT)
     id: CommandId
     by: Person = Field(description="who asks")
     issued_at: IssuedAt
@@ -107,11 +107,13 @@ class SnapshotCommandPayload(JsonCommand):
 class ResponsePayload(Stamped):
     """What came of a command."""
 
-    schema_: Literal["daqsvc.response/1"] = Field("daqsvc.response/1", alias="schema")
+    schema_: Literal["daqsvc.response/1"] = Field(
+        "daqsvc.response/1", alias="schema", description=SCHEMA_ABOUT
+    )
     id: str | None = Field(description="id of the command; null if it could not be read")
-    machine: str
-    verb: str
-    accepted: bool
+    machine: str = Field(description="name of the machine")
+    verb: str = Field(description="what was asked")
+    accepted: bool = Field(description="whether it was carried out")
     reason: str = Field(description="why it was refused; empty if it was not")
     events: tuple[str, ...] = Field(description="ids of the alarm events that followed")
     path: str = Field(default="", description="file of the snapshot on the box; empty if none was made")

@@ -1,0 +1,97 @@
+"""The page of the alarms that every service has by itself, and of the states and events of all alarms."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from daqsvc.alarms.events import EventKind
+from daqsvc.alarms.quality import PREFIXES
+from daqsvc.alarms.states import AlarmState
+from daqsvc.publish.mqtt.conditions import CERTIFICATE, REFUSED
+from daqsvc.reference.markdown import code, page, table
+from daqsvc.self_check import BUS_CONTROLLER, BUS_OVERRUN, BUS_RECORDING, STORE
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+OWN: Mapping[str, str] = {
+    "sensor-ok/": "samples of the sensor are missing, or it is not OK",
+    "detector-ok/": "samples of the detector are missing, or a sensor that it rests on is not OK",
+    "store/disk": "less is free on the disk than `reserve_mb` of `[store]`",
+    "store/journal": "alarm events are not written to the disk",
+    "store/damage": "a damaged file of the store was set aside in the last minute",
+    "store/telemetry": "telemetry was dropped in the last minute",
+    "store/audit-log": "a command was refused in the last minute because it could not be written down",
+    "broker/refused": "the broker refuses messages on some topic",
+    "certificate/": "the certificate `client`, `ca` or `broker` ends in less than 14 days, or has ended",
+    "bus-overrun/": "frames or bytes of the bus were lost in a full buffer in the last minute",
+    "bus-controller/": "the CAN controller of the bus is error-passive or bus-off",
+    "bus-recording/": "frames of the bus could not be recorded in the last minute",
+}
+"""Alarms of the service itself; behind a slash at the end stands the name of what they are about."""
+STATES: Mapping[str, str] = {
+    "normal": "the condition does not stand, and nobody has anything to do",
+    "active_unacknowledged": "the condition stands, and nobody has acknowledged it",
+    "active_acknowledged": "the condition stands, and somebody has acknowledged it",
+    "returned_unacknowledged": "the condition has gone before anybody acknowledged it",
+    "latched_unacknowledged": "it has gone, nobody has acknowledged it, and the alarm waits to be reset",
+    "latched_acknowledged": "the condition has gone, and the alarm waits to be reset",
+    "shelved": "a person has put the alarm aside for a stated time",
+    "suppressed": "a sensor that the alarm rests on is not OK",
+    "out_of_service": "a person has taken the alarm out of service",
+}
+EVENTS: Mapping[str, str] = {
+    "raised": "a new occurrence begins",
+    "escalated": "the level has risen",
+    "lowered": "the level has fallen, but not to normal",
+    "changed": "the cause is known better, or is another one, at the same level; or the limits are others",
+    "returned": "the condition has gone",
+    "latched": "the condition has gone, and the alarm waits to be reset",
+    "recurred": "the condition has come back before the alarm was reset",
+    "acknowledged": "a person has acknowledged the alarm",
+    "reset": "a person has reset the alarm",
+    "suppressed": "a sensor that the alarm rests on is not OK",
+    "unsuppressed": "the sensors of the alarm are good again",
+    "shelved": "a person has put the alarm aside for a stated time, or changed that time",
+    "unshelved": "that time is over, or a person has ended it",
+    "bypassed": "a person has taken the alarm out of service",
+    "unbypassed": "a person has put the alarm back into service",
+    "chattering": "the alarm was raised so often that its returns are held back",
+    "quiet": "the alarm does not chatter any more",
+}
+
+
+def gaps() -> Iterator[str]:
+    """Alarms of the service, states and kinds of events that nothing describes."""
+    alarms = (*PREFIXES, *STORE, REFUSED, CERTIFICATE, BUS_OVERRUN, BUS_CONTROLLER, BUS_RECORDING)
+    for what, names, known in (
+        ("alarm", alarms, OWN),
+        ("state", [*AlarmState], STATES),
+        ("event", [*EventKind], EVENTS),
+    ):
+        for name in names:
+            if name not in known:
+                yield f"{what} {name} is described nowhere: daqsvc.reference.alarms"
+
+
+def pages() -> dict[str, str]:
+    """Text of each page, by file name."""
+    own = ((code(f"{name}NAME" if name.endswith("/") else name), text) for name, text in OWN.items())
+    return {
+        "alarms.md": page(
+            "Alarms, their states and events",
+            _ABOUT,
+            "## Alarms of the service",
+            "Beside the alarms of the machine file. `NAME` is a sensor, a detector, a certificate or a bus.",
+            table(("alarm", "stands while"), own),
+            "## States",
+            table(("state", "what it says"), ((code(name), text) for name, text in STATES.items())),
+            "## Kinds of events",
+            table(("kind", "why the event was sent"), ((code(name), text) for name, text in EVENTS.items())),
+        )
+    }
+
+
+_ABOUT = """Names of alarms, states and events as they stand in messages, in the log and in `daqsvc
+alarms`. When exactly an alarm comes and goes: [alarms.md](../alarms.md); what to do about those of the
+service: [commands.md](../commands.md)."""
