@@ -13,6 +13,7 @@ from support.paths import ROOT
 if TYPE_CHECKING:
     from pathlib import Path
 
+MADE_OF_OTHERS = {"readme", "contributing", "changelog"}
 LONG = "The line is quiet and " * 30 + "then it is used."
 
 
@@ -119,3 +120,12 @@ def test_pages_machine_files_and_sources_are_all_read() -> None:
         "config/machines/laval-rig.toml",
     } <= files
     assert {"daqsvc/cli.py", "drivers/base.py", "sim_hw/sim_command.py"} <= files
+
+
+PAGES = sorted(page for page in (ROOT / "docs").glob("*.md") if page.stem not in {"index", *MADE_OF_OTHERS})
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_a_page_begins_with_whom_it_is_for(page: Path) -> None:
+    _, first, *_ = texts_of(page)
+    assert first.words.startswith("This page is for ")
