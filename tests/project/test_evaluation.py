@@ -118,6 +118,21 @@ def test_every_command_exists() -> None:
     assert kinds == {"make", "daqsvc", "python", "pytest"}
 
 
+def test_a_figure_in_a_limit_stands_on_a_page_that_it_links() -> None:
+    section = (DOCS / "evaluate.md").read_text("utf-8").partition("## Where it is weak")[2]
+    limits = section.partition("\n## ")[0].split("\n- ")[1:]
+    checked = 0
+    for limit in limits:
+        links = re.findall(r"\]\(([\w.-]+\.md)", limit)
+        pages = " ".join(" ".join((DOCS / page).read_text("utf-8").split()) for page in links)
+        for figure in re.findall(
+            r"\d+(?:\.\d+)?(?:, \d+ and \d+)? (?:%|ms)", re.sub(r"\]\(\S+\)", "]", limit)
+        ):
+            assert figure in pages, (figure, links)
+            checked += 1
+    assert checked >= 3
+
+
 def test_every_link_leads_to_a_page_and_a_heading() -> None:
     for name in ("evaluate.md", "comparison.md"):
         for target in set(re.findall(r"\]\(([\w.-]+\.md(?:#[\w-]+)?)\)", (DOCS / name).read_text("utf-8"))):
