@@ -1,0 +1,286 @@
+"""Every fenced block of the documentation is one that works: each kind is checked in its own way.
+
+``PYTHONPATH=tests python -m support.snippets`` lists them. One that cannot be run says why in a comment
+before it: ``<!-- not run: ... -->``. docs/tutorials has tests of its own.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import functools
+import json
+import re
+import runpy
+import shlex
+import tomllib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jsonschema
+import numpy as np
+import pytest
+from scipy.io import savemat
+from support.bearing_signals import INNER, RATE_HZ, healthy, knocks
+from support.machine_files import MACHINES
+from support.paths import ROOT
+from support.run_ups import RATE_HZ as RUN_UP_HZ
+from support.run_ups import record
+from support.snippets import PAGES, Snippet, completed, snippets
+
+from daqsvc.cli import _chosen, commands, main, parser
+from daqsvc.settings import MachineFileError
+from daqsvc.settings.load import machine_file_of
+from sim_hw.plants import rotor as plant
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+pytestmark = pytest.mark.integration
+ALL = [
+    snippet
+    for page in PAGES
+    if not page.is_relative_to(ROOT / "docs" / "tutorials")
+    for snippet in snippets(page)
+]
+EXAMPLES = {path.read_text("utf-8").strip() for path in (ROOT / "docs").glob("example_*/*") if path.is_file()}
+"""Files that pages show; their own tests install and run them."""
+TESTED = {
+    ("docs/alarms.md", "toml"): "tests/alarms/test_alarm_documented.py",
+    ("docs/can.md", "toml"): "tests/drivers/test_bus_pages.py",
+    ("docs/comparison.md", "toml"): "tests/project/test_comparison.py",
+    ("docs/detectors.md", "toml"): "tests/detectors/test_example_detector.py",
+    ("docs/modbus.md", "toml"): "tests/drivers/modbus/test_modbus_documented.py",
+    ("docs/outputs.md", "toml"): "tests/publish/test_example_output.py",
+    ("docs/replay.md", "toml"): "tests/drivers/test_bus_pages.py",
+}
+"""Pages whose parts need others around them: the tests that put these together."""
+PARSED = {"toml": tomllib.loads, "json": lambda text: [*map(json.loads, objects(text))]}
+REMARKS = {"", "text", "{include}"}
+"""What a terminal shows, of which the commands are checked; and what only the site reads."""
+ELSEWHERE = {"sql", "yaml", "mermaid"}
+"""Languages of other programs."""
+RUNNING = {"analyze", "calibrate", "check", "detectability", "example", "export"}
+"""Verbs that end by themselves and need no service; of these all lines run whose files `folder` has."""
+PROGRAMS = {
+    *("daqsvc", "make", "pip", "python", "python3", "python3.11", "git", "bash"),
+    *(
+        "apt",
+        "apt-get",
+        "systemctl",
+        "systemd-sysusers",
+        "install",
+        "cd",
+        "cp",
+        "mkdir",
+        "rm",
+        "sed",
+        "sha256sum",
+    ),
+    *("candump", "dask", "ip", "mosquitto_sub", "psql"),
+}
+"""Else it is no command but what one has answered."""
+MAKEFILE = (ROOT / "Makefile").read_text("utf-8")
+
+
+def of(*languages: str) -> Any:
+    found = [one for one in ALL if one.language in languages]
+    return pytest.mark.parametrize("snippet", found, ids=lambda one: one.name)
+
+
+def objects(text: str) -> Iterator[str]:
+    """The objects of JSON that stand one after the other."""
+    decoder, at = json.JSONDecoder(), 0
+    text = text.strip()
+    while at < len(text):
+        _, end = decoder.raw_decode(text, at)
+        yield text[at:end]
+        at = end + len(text[end:]) - len(text[end:].lstrip())
+
+
+def test_every_language_is_checked_in_some_way() -> None:
+    assert {one.language for one in ALL} <= {"sh", "toml", "python", "json"} | REMARKS | ELSEWHERE
+
+
+def test_few_blocks_are_not_run_and_each_says_why() -> None:
+    left_out = [one for one in ALL if one.why_not_run]
+    assert all(len(one.why_not_run) > 10 for one in left_out)
+    assert len(left_out) <= 8, [one.name for one in left_out]
+
+
+@pytest.mark.parametrize(("page", "language"), TESTED)
+def test_the_test_of_a_page_reads_it(page: str, language: str) -> None:
+    assert [one for one in ALL if one.name.startswith(f"{page}:") and one.language == language]
+    assert Path(page).name in (ROOT / TESTED[page, language]).read_text("utf-8")
+
+
+@functools.cache
+def machines() -> dict[Path, dict[str, Any]]:
+    """The examples, the paper's rig first."""
+    files = sorted(MACHINES.glob("*.toml"), key=lambda file: (file.stem != "laval-rig", file.stem))
+    return {file: tomllib.loads(file.read_text("utf-8")) for file in files}
+
+
+@of("toml")
+def test_a_part_of_a_machine_file_fits_an_example(snippet: Snippet) -> None:
+    part = tomllib.loads(snippet.text)
+    page = f"{snippet.page.relative_to(ROOT)}"
+    if (page, "toml") in TESTED or snippet.text.strip() in EXAMPLES:
+        return
+    why = []
+    for file, machine in machines().items():
+        try:
+            machine_file_of(part if "machine" in part else completed(machine, part), file)
+        except MachineFileError as error:
+            why.append(f"{error}")
+        else:
+            return
+    pytest.fail("\n".join([f"{snippet.name} fits no example:", *why[:1]]))
+
+
+@of("json")
+def test_json_is_what_its_schema_says(snippet: Snippet) -> None:
+    for text in objects(snippet.text):
+        told = json.loads(text)
+        schema = ROOT / "docs" / "schemas" / f"{told.get('schema', '').replace('/', '-')}.json"
+        if schema.is_file():
+            jsonschema.validate(told, json.loads(schema.read_text("utf-8")))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Recordings and machine files under the names that the pages give them."""
+    made = tmp_path_factory.mktemp("snippets")
+    (made / "config").symlink_to(ROOT / "config")
+    changed = [plant.Change(70.0, plant.PlantParameters(damping_ratio=0.10))]
+    motion = plant.simulate(plant.PlantParameters(), changed, revolutions=140.0, samples_per_rev=64.0)
+    x, y = motion.in_um(100.0)
+    np.savez(made / "run.npz", x=x, y=y, fs=5111.0 / 60.0 * 64.0)
+    up, angle = record(noise_um=0.5)
+    np.savez(
+        made / "run-up.npz", x=up[:, 0], y=up[:, 1], kph=plant.keyphasor_voltage(angle / (2.0 * np.pi)),
+        fs=RUN_UP_HZ,
+    )  # fmt: skip
+    good = healthy(10.0, 1)
+    bad = healthy(10.0, 2) + knocks(10.0, INNER, 3)
+    for number in ("105", "130"):
+        savemat(made / f"{number}.mat", {f"X{number}_DE_time": bad})
+    np.savez(made / "105.npz", de=bad, fs=RATE_HZ)
+    np.savez(made / "healthy.npz", **{"accel-de": good, "accel-fe": healthy(10.0, 4)}, fs=RATE_HZ)
+    for name in ("machine", "pump"):
+        (made / f"{name}.toml").write_text((MACHINES / "laval-rig.toml").read_text("utf-8"))
+    # A second machine of the same box: on another interface, and [mqtt] and [store] stand in the first file.
+    text = (MACHINES / "bearing.toml").read_text("utf-8").replace("edge-3", "edge-1").replace("can0", "can1")
+    (made / "fan.toml").write_text(re.sub(r"(?ms)^\[(?:mqtt|store)\]$.*?(?=^\[|\Z)", "", text))
+    return made
+
+
+@of("python")
+def test_python_is_whole(snippet: Snippet) -> None:
+    ast.parse(snippet.text)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "snippet",
+    [one for one in ALL if one.language == "python" and not one.why_not_run],
+    ids=lambda one: one.name,
+)
+def test_python_runs(snippet: Snippet, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    file = folder / "snippet.py"
+    file.write_text(snippet.text)
+    # What the text of a page says that there is.
+    runpy.run_path(f"{file}", init_globals={"samples": healthy(10.0, 2, rate_hz=25_600.0)})
+
+
+def simple(command: str) -> Iterator[list[str]]:
+    """The simple commands of a line, each as its words, without redirection and variables that are set."""
+    lexer = shlex.shlex(command, posix=True, punctuation_chars="();<>|&")
+    lexer.whitespace_split = True
+    words: list[str] = []
+    for word in [*lexer, ";"]:
+        if set(word) <= set("();|&"):
+            while words and re.match(r"\w+=", words[0]):
+                del words[0]
+            if words:
+                yield words
+            words = []
+        else:
+            words.append(word)
+
+
+def shown(language: str) -> Iterator[tuple[str, list[str]]]:
+    for snippet in ALL:
+        for command in snippet.commands if snippet.language == language else ():
+            for words in simple(command):
+                yield snippet.name, words[1:] if words[0] == "sudo" else words
+
+
+SHOWN = [*shown("sh"), *shown("")]
+OURS = [(name, words[1:]) for name, words in SHOWN if words[0].rpartition("/")[2] == "daqsvc"]
+
+
+def chosen(words: list[str]) -> list[str]:
+    """The arguments, without brackets around what may be left out and without what goes into a file."""
+    words = words[: words.index(">")] if ">" in words else words
+    return [word.strip("[]") for word in words]
+
+
+@pytest.mark.parametrize(("name", "words"), OURS, ids=[f"{name} {shlex.join(words)}" for name, words in OURS])
+def test_a_verb_and_its_options_are_there(
+    name: str, words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with contextlib.suppress(SystemExit):  # what has no verb, as --version
+        _chosen(parser(commands()), chosen(words))
+    assert capsys.readouterr().err == "", name
+
+
+def test_every_command_is_of_a_known_program() -> None:
+    programs = {(name, words[0].rpartition("/")[2]) for name, words in SHOWN}
+    assert sorted((name, program) for name, program in programs if program not in PROGRAMS) == []
+
+
+def test_targets_of_make_and_files_of_the_repository_are_there() -> None:
+    targets = set(re.findall(r"(?m)^([a-z-]+):", MAKEFILE))
+    for name, words in SHOWN:
+        if words[0] == "make":
+            assert {word for word in words[1:] if "=" not in word} <= targets, (name, words)
+        # In a value of ARGS, too.
+        for path in re.findall(r"(?:^|[ =])((?:config|tests|requirements)[\w./@-]+)", " ".join(words)):
+            assert (ROOT / path).exists(), (name, path)
+
+
+def can_run(words: list[str], folder: Path) -> bool:
+    """Whether a line is one for `folder`: it names files that are there, and nothing of another computer."""
+    if words[0] not in RUNNING or any(word.startswith("/") or "://" in word for word in words):
+        return False
+    if any(word.endswith("...") or word in {"FILE", "MACHINE.toml"} for word in words):
+        return False
+    before = ["", *words]
+    files = [
+        word
+        for option, word in zip(before, words, strict=False)
+        if re.search(r"\.\w{2,5}$|/$", word) and option not in {"--out", "--to", "--plot"} and "=" not in word
+    ]
+    no_files = words[0] == "example" or files
+    return bool(no_files) and all((folder / file).exists() for file in files) and "--live" not in words
+
+
+@pytest.mark.long
+def test_lines_that_can_run_do(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(folder)
+    ran = []
+    for name, words in OURS:
+        line = chosen(words)
+        if not can_run(line, folder):
+            continue
+        if line[0] == "example" and "--out" in line:
+            (folder / line[-1]).unlink(missing_ok=True)  # it writes over nothing
+        with contextlib.suppress(SystemExit):  # after --schema
+            code = main(line)
+            assert code == 0, (name, shlex.join(line), capsys.readouterr().err)
+        ran.append(line[0])
+    assert set(ran) == RUNNING
