@@ -10,7 +10,7 @@ import numpy as np
 from drivers.can.batches import ERROR, EXTENDED, EXTENDED_ID, PRIORITY, REMOTE, by_id
 from drivers.can.checks import LEAST_COUNTER_BITS
 from drivers.can.dbc import selecting_values, signal_field
-from drivers.can.traffic import LEAST_COUNTS
+from drivers.counter_search import LEAST_COUNTS
 from drivers.fields import FieldGroup, LayoutError, j1939_valid_raw
 
 if TYPE_CHECKING:

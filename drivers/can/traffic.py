@@ -13,36 +13,13 @@ from daqsvc.acquisition.clock import NS_PER_S
 from drivers.can.batches import BIT_RATE_SWITCH, ERROR, EXTENDED, EXTENDED_ID, FD, LONGEST, REMOTE, by_id
 from drivers.can.checks import FrameTime, frame_time
 from drivers.can.errors import ErrorCounts
+from drivers.counter_search import CounterSearch
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from drivers.can.batches import CanBatch
-
-LEAST_COUNTS = 8
-"""Frames after which bytes that grew by the same step each time are taken for a counter."""
-
-_BYTE_STEPS, _WORD_STEPS = 256, 65_536
-
-
-class FrameCounter(NamedTuple):
-    """Bytes that grow by the same step from frame to frame.
-
-    Attributes:
-        byte: the first of them.
-        bits: 8 or 16; a wider one looks like 16 as long as its upper bytes do not change.
-        order: byte order; of 8 bits it does not matter.
-        step: by how much it grows.
-    """
-
-    byte: int
-    bits: int
-    order: str
-    step: int
-
-    def __str__(self) -> str:
-        order = f" {self.order}" if self.bits > 8 else ""
-        return f"byte {self.byte}, {self.bits} bit{order}, +{self.step}"
+    from drivers.counter_search import FrameCounter
 
 
 class Wire(NamedTuple):
@@ -51,36 +28,6 @@ class Wire(NamedTuple):
     length: int
     fd: bool
     switches: bool
-
-
-class _Steps:
-    """Whether numbers in a payload grow by one step each.
-
-    Args:
-        modulus: of the numbers.
-    """
-
-    def __init__(self, modulus: int) -> None:
-        self._modulus = modulus
-        self._step: NDArray[np.int64] | None = None
-        self._constant: NDArray[np.bool_] | None = None
-
-    def take(self, values: NDArray[np.int64]) -> None:
-        """The next numbers ``[n, places]``, the last of those before among them."""
-        steps = np.diff(values, axis=0) % self._modulus
-        if not len(steps):
-            return
-        if self._step is None or self._constant is None:
-            self._step, self._constant = steps[0], np.ones(steps.shape[1], np.bool_)
-        self._constant &= (steps == self._step).all(axis=0)
-
-    @property
-    def found(self) -> dict[int, int]:
-        """The step by place, of those that have one."""
-        if self._step is None or self._constant is None:
-            return {}
-        places = np.flatnonzero(self._constant & (self._step != 0))
-        return {int(place): int(self._step[place]) for place in places}
 
 
 @dataclass(slots=True)
@@ -109,13 +56,10 @@ class IdTraffic:
     longest_s: float = 0.0
     changed: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(LONGEST, np.uint8))
     _first: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(LONGEST, np.uint8))
-    _before: NDArray[np.uint8] | None = None
     _first_gap_s: float | None = None
     _gap_sum: float = 0.0
     _gap_squares: float = 0.0
-    _bytes: _Steps = field(default_factory=lambda: _Steps(_BYTE_STEPS))
-    _little: _Steps = field(default_factory=lambda: _Steps(_WORD_STEPS))
-    _big: _Steps = field(default_factory=lambda: _Steps(_WORD_STEPS))
+    _counters: CounterSearch = field(default_factory=CounterSearch)
 
     @property
     def arbitration_id(self) -> int:
@@ -172,15 +116,7 @@ class IdTraffic:
     @property
     def counter(self) -> FrameCounter | None:
         """What looks like a counter; None if nothing does."""
-        if self.frames <= LEAST_COUNTS or self.remote:
-            return None
-        alone = self._bytes.found
-        # Of 16 bits only where the upper byte was seen to carry; else its own 8 bits say as much.
-        for order, steps, upper in (("little", self._little.found, 1), ("big", self._big.found, 0)):
-            for place, step in steps.items():
-                if self.changed[place + upper] and place + 1 - upper in alone:
-                    return FrameCounter(place, 16, order, step)
-        return next((FrameCounter(place, 8, "little", step) for place, step in alone.items()), None)
+        return self._counters.found
 
     def take(
         self,
@@ -201,22 +137,15 @@ class IdTraffic:
             self.wires[Wire(length, bool(flags & FD), bool(flags & BIT_RATE_SWITCH))] += 1
         held = 0 if self.remote else lengths[:, None]
         payloads = np.where(np.arange(data.shape[1]) < held, data, np.uint8(0))
-        if self._before is None:
+        if not self.frames:
             self.first_ns = int(arrival_ns[0])
             self._first = payloads[0]
-            times_ns, rows = arrival_ns, payloads
-        else:
-            times_ns = np.concatenate(([self.last_ns], arrival_ns))
-            rows = np.concatenate((self._before[None], payloads))
+        times_ns = np.concatenate(([self.last_ns], arrival_ns)) if self.frames else arrival_ns
         self._note_gaps(np.diff(times_ns) / NS_PER_S)
         self.changed |= np.bitwise_or.reduce(payloads ^ self._first, axis=0)
-        numbers = rows.astype(np.int64)
-        self._bytes.take(numbers)
-        self._little.take(numbers[:, :-1] + 256 * numbers[:, 1:])
-        self._big.take(256 * numbers[:, :-1] + numbers[:, 1:])
+        self._counters.take(payloads)
         self.frames += len(lengths)
         self.last_ns = int(arrival_ns[-1])
-        self._before = payloads[-1]
         self.last = b"" if self.remote else payloads[-1, : int(lengths[-1])].tobytes()
 
     def _note_gaps(self, gaps_s: NDArray[np.float64]) -> None:

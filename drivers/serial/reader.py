@@ -131,7 +131,7 @@ class SerialReader(threading.Thread):
         self._under_way = threading.BoundedSemaphore(BATCHES_UNDER_WAY)
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self.cutter = threading.Thread(target=self._cut_on, name=f"cutter of {name}", daemon=True)
-        self._line_errors = _line_errors(self._fd)
+        self._line_errors = line_errors(self._fd)
         self._line_errors_due_ns = 0
 
     def start(self) -> None:
@@ -263,7 +263,7 @@ class SerialReader(threading.Thread):
         if self._line_errors is None or now_ns < self._line_errors_due_ns:
             return
         self._line_errors_due_ns = now_ns + LINE_ERRORS_EVERY_NS
-        before, now = self._line_errors, _line_errors(self._fd)
+        before, now = self._line_errors, line_errors(self._fd)
         if now is None:
             return
         self._line_errors = now
@@ -304,7 +304,7 @@ def close_port(device: serial.Serial) -> None:
         logger.info("closing serial port %s, which is gone: %s", device.port, error)
 
 
-def _line_errors(fd: int) -> LineErrors | None:
+def line_errors(fd: int) -> LineErrors | None:
     """The UART's counts; None if the port has none, as pseudo-terminals and many USB adapters."""
     counts = array.array("i", [0] * 20)
     try:

@@ -151,6 +151,10 @@ sniff can no-such-interface --seconds 0
 sniff can no-such-interface --bitrate 5
 sniff can no-such-interface --dbc absent.dbc
 sniff can no-such-interface --interface no-such
+sniff serial
+sniff serial no/such/port
+sniff serial no/such/port --baud 0
+sniff serial no/such/port --seconds 0
 demo --scenario no-such
 demo --scenario machines/laval-rig.toml
 demo --recording absent.npz

@@ -147,7 +147,7 @@ async def test_what_is_wrong_is_said_once_with_its_remedy(tmp_path: Path, caplog
 async def test_errors_of_the_uart_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     looks = iter([(1, 2, 3, 4), (2, 4, 3, 2**31 + 4), (2, 9, 3, -(2**31) + 5)])
     last = (2, 9, 3, -(2**31) + 5)
-    monkeypatch.setattr(serial_reader, "_line_errors", lambda _: serial_reader.LineErrors(*next(looks, last)))
+    monkeypatch.setattr(serial_reader, "line_errors", lambda _: serial_reader.LineErrors(*next(looks, last)))
     monkeypatch.setattr(serial_reader, "LINE_ERRORS_EVERY_NS", 0)
     driver = lines_driver(tmp_path / "port", [])
     with PseudoTerminal(tmp_path / "port"):

@@ -86,9 +86,9 @@ def test_the_counts_of_a_uart_are_told_apart(monkeypatch: pytest.MonkeyPatch):
         return 0
 
     monkeypatch.setattr(serial_reader.fcntl, "ioctl", answer)
-    assert serial_reader._line_errors(0) == (106, 107 + 110, 108, 109)
+    assert serial_reader.line_errors(0) == (106, 107 + 110, 108, 109)
 
 
 def test_a_port_without_such_counts_has_none(tmp_path: Path):
     with PseudoTerminal(tmp_path / "port") as cable:
-        assert serial_reader._line_errors(cable.fd) is None
+        assert serial_reader.line_errors(cable.fd) is None

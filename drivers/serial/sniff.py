@@ -1,0 +1,553 @@
+"""``daqsvc sniff serial``: which baud rate a device has, and what it sends."""
+
+from __future__ import annotations
+
+import errno
+import os
+import select
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from drivers.sniffing import (
+    Sniffed,
+    Sniffer,
+    SniffError,
+    SniffTable,
+    quoted,
+    rounded_rate,
+    sensor_lines,
+    table_name,
+    unused,
+)
+
+if TYPE_CHECKING:
+    import argparse
+    import threading
+    from collections.abc import Callable, Iterator, Sequence
+
+    from drivers.serial.recognise import BinaryFrames, Column, Recognised, TextLines
+
+BAUDS = (115_200, 9600, 19_200, 57_600, 38_400, 230_400, 460_800, 921_600, 4800, 2400, 1200)
+"""Tried in this order, until one is beyond doubt."""
+TRY_S = 1.0
+TRY_BYTES = 512
+"""So many bytes are enough to judge a rate."""
+SECONDS = 5.0
+LONGEST_SECONDS = 3600.0
+MOST_KEPT = 1 << 20
+"""Bytes that are kept of what comes."""
+_POLL_MS = 100
+_READ = 65_536
+_SHOWN_LINES = 8
+_SHOWN_ROWS = 8
+_ROW = 16
+_WIDEST = 100
+BY_ID = Path("/dev/serial/by-id")
+
+
+class Heard(NamedTuple):
+    """What came over an open port.
+
+    Attributes:
+        data: the bytes, the last `MOST_KEPT` of them.
+        received: how many came.
+        first_s: when the first came, host monotonic.
+        last_s: when the last did.
+        errors: characters that the UART found without a stop bit; 0 where it does not count.
+        lost: why the port was lost; empty if it was not.
+    """
+
+    data: bytes
+    received: int
+    first_s: float
+    last_s: float
+    errors: int
+    lost: str = ""
+
+
+class Tried(NamedTuple):
+    """One baud rate: how it was opened, what came, and what that is."""
+
+    baud: int
+    parity: str
+    heard: Heard
+    found: Recognised
+
+
+class SerialSniffer(Sniffer):
+    """See `drivers.sniffing.Sniffer`."""
+
+    help = "listen to a serial port: baud rate, first bytes, columns of lines or frames"
+    description = (
+        "Listen to a serial port: try the usual baud rates, show the first bytes, and say whether they are "
+        "lines of text or binary frames, with columns, sync word, length, CRC and counter. Nothing is sent."
+    )
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """See `drivers.sniffing.Sniffer.add_arguments`."""
+        parser.add_argument("port", metavar="PORT", help="path of the port, e.g. /dev/ttyUSB0")
+        parser.add_argument(
+            "--baud", type=int, metavar="BIT/S", help="the baud rate (default: try the usual ones)"
+        )
+        parser.add_argument(
+            "--seconds",
+            type=float,
+            default=SECONDS,
+            metavar="S",
+            help=f"how long to listen, once the rate is found (default: {SECONDS:g})",
+        )
+
+    def sniff(
+        self, arguments: argparse.Namespace, stop: threading.Event, tell: Callable[[str], None]
+    ) -> Sniffed:
+        """See `drivers.sniffing.Sniffer.sniff`."""
+        if not 0 < arguments.seconds <= LONGEST_SECONDS:
+            wrong = f"--seconds {arguments.seconds:g}: give a time above 0, up to {LONGEST_SECONDS:g} s"
+            raise SniffError(wrong, usage=True)
+        if arguments.baud is not None and not 50 <= arguments.baud <= 12_000_000:
+            wrong = f"--baud {arguments.baud}: give a rate from 50 to 12000000 bit/s"
+            raise SniffError(wrong, usage=True)
+        bauds = BAUDS if arguments.baud is None else (arguments.baud,)
+        tried = _try_all(arguments.port, bauds, stop, tell) if arguments.baud is None else []
+        best = max(tried, key=lambda one: one.found.score, default=None)
+        silent = best is not None and not any(one.heard.received for one in tried)
+        if (best is None or not (silent or best.heard.lost)) and not stop.is_set():
+            baud, parity = (bauds[0], "none") if best is None else (best.baud, best.parity)
+            tell(f"listening to {arguments.port} at {baud} bit/s for {arguments.seconds:g} s; Ctrl-C ends it")
+            best = _try(arguments.port, baud, parity, arguments.seconds, MOST_KEPT, stop)
+        if best is None:
+            raise SniffError(f"{arguments.port}: it was ended before a byte came")
+        return _Report(arguments.port, tried, best, arguments.baud is not None).sniffed()
+
+
+def _try_all(
+    port: str, bauds: Sequence[int], stop: threading.Event, tell: Callable[[str], None]
+) -> list[Tried]:
+    """The baud rates until one is beyond doubt; with parity where none was without."""
+    from drivers.serial.recognise import CONCLUSIVE  # noqa: PLC0415 - only for who listens
+
+    tried: list[Tried] = []
+    for parity in ("none", "even"):
+        for baud in bauds:
+            if stop.is_set():
+                return tried
+            tell(f"trying {port} at {baud} bit/s{'' if parity == 'none' else f', {parity} parity'}")
+            tried.append(one := _try(port, baud, parity, TRY_S, TRY_BYTES, stop))
+            if one.found.score >= CONCLUSIVE or one.heard.lost:
+                return tried
+        if not any(one.heard.errors for one in tried):
+            break  # parity that is not expected shows as missing stop bits
+    return tried
+
+
+def _try(port: str, baud: int, parity: str, seconds: float, enough: int, stop: threading.Event) -> Tried:
+    """Listen at one rate.
+
+    Raises:
+        SniffError: the port cannot be opened.
+    """
+    from drivers.serial.recognise import recognised  # noqa: PLC0415 - only for who listens
+
+    with _opened(port, baud, parity) as device:
+        heard = _listen(device.fileno(), seconds, enough, stop)
+    return Tried(baud, parity, heard, recognised(heard.data, heard.errors))
+
+
+def _opened(port: str, baud: int, parity: str) -> Any:
+    import termios  # noqa: PLC0415 - only for who listens
+
+    import serial  # noqa: PLC0415
+
+    from drivers.tty import is_pseudo_terminal, why_not_open  # noqa: PLC0415
+
+    even = parity == "even" and not is_pseudo_terminal(port)
+    try:
+        return serial.Serial(
+            port,
+            baudrate=baud,
+            parity=serial.PARITY_EVEN if even else serial.PARITY_NONE,
+            timeout=0,
+            inter_byte_timeout=0,
+            exclusive=True,
+        )
+    except (OSError, ValueError, termios.error) as error:
+        why = why_not_open(error, port, "the name").replace("the service's user", "your user")
+        there = serial_ports()
+        more = f" (ports of this computer: {', '.join(there)})" if there and "there is no" in why else ""
+        raise SniffError(f"{port} cannot be opened: {why}{more}") from error
+
+
+def serial_ports() -> list[str]:
+    """Serial ports of this computer that were plugged in, by the names that stay."""
+    try:
+        return sorted(str(path) for path in BY_ID.iterdir())
+    except OSError:
+        return []
+
+
+def _listen(descriptor: int, seconds: float, enough: int, stop: threading.Event) -> Heard:
+    """Take what comes, until it is time, there is enough, or the port is lost."""
+    from drivers.serial.reader import line_errors  # noqa: PLC0415 - only for who listens
+
+    poll = select.poll()
+    poll.register(descriptor, select.POLLIN)
+    data = bytearray()
+    before = line_errors(descriptor)
+    count, lost = 0, ""
+    first_s = last_s = begin_s = time.monotonic()
+    whole = enough >= MOST_KEPT
+    while not stop.is_set() and time.monotonic() < begin_s + seconds and (whole or count < enough):
+        if not poll.poll(_POLL_MS):
+            continue
+        try:
+            chunk = os.read(descriptor, _READ)
+        except BlockingIOError:
+            continue
+        except OSError as error:
+            lost = os.strerror(error.errno or errno.EIO)
+            break
+        if not chunk:
+            lost = "it was unplugged"
+            break
+        last_s = time.monotonic()
+        first_s = first_s if count else last_s
+        count += len(chunk)
+        data += chunk
+        del data[:-MOST_KEPT]
+    after = None if lost else line_errors(descriptor)
+    errors = 0 if before is None or after is None else (after.framing_errors - before.framing_errors) % 2**32
+    return Heard(bytes(data), count, first_s, last_s, errors, lost)
+
+
+def dump(data: bytes) -> str:
+    """Bytes in hexadecimal beside what they are as text, 16 on a line."""
+    rows = []
+    for at in range(0, len(data), _ROW):
+        row = data[at : at + _ROW]
+        text = "".join(chr(byte) if 0x20 <= byte < 0x7F else "." for byte in row)
+        rows.append(f"{at:06x}  {row.hex(' '):<{3 * _ROW - 1}}  {text}")
+    return "\n".join(rows)
+
+
+class _Report(NamedTuple):
+    """What was heard, in words, in figures and as a machine file."""
+
+    port: str
+    tried: Sequence[Tried]
+    best: Tried
+    asked: bool
+
+    def sniffed(self) -> Sniffed:
+        """All of it."""
+        return Sniffed(list(self._parts()), self._figures(), self._fragment(), self._problem())
+
+    @property
+    def _what(self) -> TextLines | BinaryFrames | None:
+        return self.best.found.what
+
+    @property
+    def _parity(self) -> str:
+        return self.best.found.parity or self.best.parity
+
+    @property
+    def _character(self) -> str:
+        bits = 7 if self.best.found.parity else 8
+        return f"{bits}{self._parity[0].upper()}1"
+
+    @property
+    def _rate_hz(self) -> float | None:
+        """Lines or frames a second; None where it cannot be told."""
+        from drivers.serial.recognise import BinaryFrames, TextLines  # noqa: PLC0415 - only for who listens
+
+        heard, what = self.best.heard, self._what
+        seconds = heard.last_s - heard.first_s
+        if seconds <= 0 or what is None:
+            return None
+        if isinstance(what, TextLines):
+            per_frame = len(heard.data) / max(1, heard.data.count(what.delimiter.encode()))
+        else:
+            assert isinstance(what, BinaryFrames)  # noqa: S101 - for the type checker
+            per_frame = what.length + (2 if what.framing == "cobs" else 0)
+        return max(heard.received - per_frame, 0) / per_frame / seconds or None
+
+    def _problem(self) -> str:
+        heard = self.best.heard
+        if heard.lost:
+            return f"{self.port} was lost: {heard.lost}. Remedy: plug it in again and see `dmesg`"
+        if not heard.received and not any(one.heard.received for one in self.tried):
+            return (
+                f"{self.port}: no byte came. Remedy: see that the device is powered and sends without being "
+                "asked, that its TX leads to RX of this port (for RS-485: A to A, B to B), and that ground "
+                "is connected; a Modbus device is asked: daqsvc sniff modbus"
+            )
+        if self._what is None:
+            tried = f"--baud {self.best.baud}" if self.asked else "each of the usual baud rates"
+            return (
+                f"{self.port}: bytes come, but by {tried} they are neither lines of text nor frames of one "
+                "length. Remedy: state the device's rate by --baud; see that nobody else drives the line"
+            )
+        return ""
+
+    def _parts(self) -> Iterator[str | SniffTable]:
+        from drivers.serial.recognise import TextLines  # noqa: PLC0415 - only for who listens
+
+        heard = self.best.heard
+        if len(self.tried) > 1:
+            rows = [_tried_row(one) for one in self.tried]
+            yield SniffTable(("bit/s", "bytes", "framing errors", "text", "score"), rows)
+        if not heard.received:
+            yield f"{self.port}: no byte came"
+            return
+        per_s = heard.received / max(heard.last_s - heard.first_s, 1e-3)
+        line = f"{self.best.baud} bit/s, {self._character}"
+        yield f"{self.port} at {line}: {heard.received} bytes, {per_s:.0f}/s"
+        begin = heard.data[: _ROW * _SHOWN_ROWS]
+        yield f"The first bytes:\n{dump(begin)}"
+        what = self._what
+        if isinstance(what, TextLines):
+            yield from self._lines(what)
+        elif what is not None:
+            yield self._frames(what)
+
+    def _lines(self, what: TextLines) -> Iterator[str | SniffTable]:
+        shown = "\n".join(line[:_WIDEST] for line in what.lines[:_SHOWN_LINES])
+        yield f"The first lines:\n{_printable(shown)}"
+        words = [f"{len(what.columns)} columns" if len(what.columns) != 1 else "1 column"]
+        words += [f"separated by {quoted(what.separator)}"] * bool(what.separator)
+        words += [f"each line begins with {what.prefix}"] * bool(what.prefix)
+        words += ["the first line names them"] * what.header
+        words += [f"checksum {what.checksum}"] * (what.checksum != "none")
+        words += [f"{what.other} of {len(what.lines)} lines have another number of columns"] * bool(
+            what.other
+        )
+        rate = "" if self._rate_hz is None else f", {self._rate_hz:.4g} lines/s"
+        yield f"Lines of text{rate}: {'; '.join(words)}"
+        counter, time_column = _counter(what), self._time(what)
+        rows = []
+        for one in what.columns:
+            limits = (f"{one.least:g}", f"{one.most:g}") if one.numeric else ("", "")
+            use = "counts" if one is counter else "time" if one is time_column else ""
+            rows.append((one.name, "number" if one.numeric else "text", *limits, one.last[:24], use))
+        yield SniffTable(("column", "kind", "min", "max", "last", ""), rows)
+
+    def _time(self, what: TextLines) -> Column | None:
+        """The column that has the device's time, if none counts."""
+        if _counter(what) is not None:
+            return None
+        growing = [one for one in what.columns if one.grows and self._time_unit(what, one) is not None]
+        return growing[0] if growing else None
+
+    def _time_unit(self, what: TextLines, column: Column) -> str | None:
+        """The unit in which a column grows by as much as lines take; None if there is none."""
+        if self._rate_hz is None or len(what.lines) < 2:
+            return None
+        per_line = (column.most - column.least) / (len(what.lines) - what.header - what.other - 1 or 1)
+        for unit, per_s in (("s", 1.0), ("ms", 1e3), ("us", 1e6)):
+            if 0.8 < per_line * self._rate_hz / per_s < 1.25:
+                return unit
+        return None
+
+    def _frames(self, what: BinaryFrames) -> str:
+        name = "COBS frames"
+        if what.framing == "sync":
+            name = f"Frames behind the sync word {what.sync.hex(' ')}"
+        rate = "" if self._rate_hz is None else f", {self._rate_hz:.4g} frames/s"
+        check = "no check that is known"
+        if what.crc:
+            order = f", {what.crc_order} endian" if what.crc_bytes > 1 else ""
+            begin = "" if what.crc_from or not what.sync else ", sync word included"
+            check = f"check {what.crc}{order}{begin}"
+        counter = f"counter at {what.counter}" if what.counter else "no counter"
+        return (
+            f"{name}{rate}: {what.length} bytes, of them {what.payload_length} of payload; {check}; "
+            f"{counter} (bytes of the payload count from 0)"
+        )
+
+    def _figures(self) -> dict[str, Any]:
+        from drivers.serial.recognise import TextLines  # noqa: PLC0415 - only for who listens
+
+        heard, what = self.best.heard, self._what
+        figures: dict[str, Any] = {
+            "bus": "serial",
+            "port": self.port,
+            "baud": self.best.baud,
+            "character": self._character,
+            "bytes": heard.received,
+            "framing_errors": heard.errors,
+            "score": round(self.best.found.score, 3),
+            "tried": [{"baud": one.baud, "score": round(one.found.score, 3)} for one in self.tried],
+            "first_bytes": heard.data[: _ROW * _SHOWN_ROWS].hex(),
+            "rate_hz": self._rate_hz,
+            "framing": None,
+        }
+        if isinstance(what, TextLines):
+            figures |= {
+                "framing": "lines",
+                "delimiter": what.delimiter,
+                "separator": what.separator,
+                "prefix": what.prefix,
+                "checksum": what.checksum,
+                "header": what.header,
+                "columns": [
+                    {"name": one.name, "numeric": one.numeric, "min": one.least, "max": one.most}
+                    for one in what.columns
+                ],
+                "lines": list(what.lines[:_SHOWN_LINES]),
+                "lines_other": what.other,
+            }
+        elif what is not None:
+            figures |= {
+                "framing": what.framing,
+                "sync_word": what.sync.hex(),
+                "frame_length": what.length,
+                "payload_length": what.payload_length,
+                "crc": what.crc,
+                "crc_order": what.crc_order,
+                "counter": None if what.counter is None else what.counter._asdict(),
+            }
+        return figures
+
+    def _fragment(self) -> str:
+        from drivers.serial.recognise import TextLines  # noqa: PLC0415 - only for who listens
+
+        what = self._what
+        if what is None:
+            return ""
+        name = table_name(Path(self.port).name.lower(), "serial0")
+        head = [
+            f"[buses.{name}]",
+            'driver = "serial"',
+            f"port = {quoted(lasting_name(self.port))}",
+            f"baud = {self.best.baud:_}",
+        ]
+        head += ["data_bits = 7"] * (self.best.found.parity is not None)
+        head += [f"parity = {quoted(self._parity)}"] * (self._parity != "none")
+        if isinstance(what, TextLines):
+            return "\n".join([*head, *self._lines_tables(what, name)])
+        return "\n".join([*head, *self._frames_tables(what, name)])
+
+    def _lines_tables(self, what: TextLines, bus: str) -> Iterator[str]:
+        yield 'framing = "lines"'
+        if what.checksum in {"xor", "crc16"}:
+            yield f"checksum = {quoted(what.checksum)}"
+        if what.delimiter != "\n":
+            yield f"delimiter = {quoted(what.delimiter)}"
+        yield ""
+        counter, time_column = _counter(what), self._time(what)
+        numbers = [one for one in what.columns if one.numeric and one not in {counter, time_column}]
+        place = counter or time_column
+        if place is None or not numbers or self._rate_hz is None:
+            yield "# A stream needs a column that counts lines, or one with the device's time, and a column"
+            yield "# of numbers beside it; have the device send them (docs/serial.md)."
+            return
+        names = _names(what.columns)
+        yield "[streams.lines]"
+        yield f"bus = {quoted(bus)}"
+        yield f"rate_hz = {rounded_rate(self._rate_hz)}    # as measured; see the device's manual"
+        yield ""
+        yield "[streams.lines.layout]"
+        if what.prefix:
+            yield f"prefix = {quoted(what.prefix)}"
+        yield f"line = [{', '.join(quoted(name) for name in names.values())}]"
+        if what.separator != ",":
+            yield f"separator = {quoted(what.separator)}"
+        if counter is not None:
+            bits = 8 if counter.most < 256 else 16 if counter.most < 65_536 else 32
+            table = f"{{ column = {quoted(names[counter])}, bits = {bits} }}"
+            yield f"counter = {table}    # as far as it was seen; see the manual"
+        else:
+            unit = self._time_unit(what, place)
+            yield f'time = {{ column = {quoted(names[place])}, unit = "{unit}" }}'
+        yield f"channels = [{', '.join(f'{{ name = {quoted(names[one])} }}' for one in numbers)}]"
+        yield from sensor_lines("lines", {names[one]: "1" for one in numbers}, set())
+
+    def _frames_tables(self, what: BinaryFrames, bus: str) -> Iterator[str]:
+        yield f"framing = {quoted(what.framing)}"
+        if what.sync:
+            yield f"sync_word = {quoted(what.sync.hex())}"
+        driver_checks = what.crc in {"ibm-3740", "xmodem"} and what.crc_from == len(what.sync)
+        yield f"crc = {quoted(what.crc if driver_checks else 'none')}"
+        if driver_checks and what.crc_order == "little":
+            yield 'crc_order = "little"'
+        payload = what.payload_length + (0 if driver_checks else what.crc_bytes)
+        yield ""
+        counter, packed = what.counter, _packed(what)
+        if counter is None or packed is None or self._rate_hz is None:
+            yield f"# A stream needs a counter: none was found in the {payload} bytes of payload, or nothing"
+            yield "# behind it. See the manual of the device (docs/serial.md)."
+            return
+        samples = packed.samples_per_frame
+        yield "[streams.frames]"
+        yield f"bus = {quoted(bus)}"
+        yield f"rate_hz = {rounded_rate(self._rate_hz * samples)}    # as measured; see the device's manual"
+        yield ""
+        yield "[streams.frames.layout]    # what is behind the counter is a guess: see the device's manual"
+        yield f"payload_length = {payload}"
+        if counter.order == "big":
+            yield 'byte_order = "big"'
+        counts = "frames" if counter.step == 1 else "samples"
+        yield f'counter = {{ byte = {counter.byte}, bits = {packed.counter_bits}, counts = "{counts}" }}'
+        yield f"first_byte = {counter.byte + packed.counter_bits // 8}"
+        yield f"samples_per_frame = {samples}"
+        names = [f"c{k + 1}" for k in range(packed.channels)]
+        listed = ", ".join(f'{{ name = "{one}", type = "int16", scale = 1.0 }}' for one in names)
+        yield f"channels = [{listed}]"
+        yield from sensor_lines("frames", dict.fromkeys(names, "1"), set())
+
+
+class _Packed(NamedTuple):
+    """How samples of two bytes may lie behind the counter of a frame."""
+
+    counter_bits: int
+    samples_per_frame: int
+    channels: int
+
+
+def _packed(what: BinaryFrames) -> _Packed | None:
+    """What fits; None if nothing does."""
+    counter = what.counter
+    if counter is None:
+        return None
+    bits, end = counter.bits, len(what.sync) + counter.byte + counter.bits // 8
+    if bits == 16 and counter.order == "little" and what.payload_length - counter.byte >= 6:
+        # The upper half of 32 bits, which has not carried yet.
+        upper = what.frames[:, end : end + 2]
+        bits = 16 if upper.any() else 32
+    room = what.payload_length - counter.byte - bits // 8
+    channels = room // (2 * counter.step)
+    return None if channels < 1 else _Packed(bits, counter.step, channels)
+
+
+def _tried_row(one: Tried) -> Sequence[str]:
+    heard, found = one.heard, one.found
+    return (
+        f"{one.baud}{'' if one.parity == 'none' else f', {one.parity} parity'}",
+        f"{heard.received}",
+        f"{heard.errors}",
+        f"{100 * found.printable:.0f} %",
+        f"{found.score:.2f}",
+    )
+
+
+def _counter(what: TextLines) -> Column | None:
+    """The column that counts lines: whole numbers, always by 1."""
+    return next((one for one in what.columns if one.numeric and one.step == 1 and one.least >= 0), None)
+
+
+def _names(columns: Sequence[Column]) -> dict[Column, str]:
+    """Names of columns that a machine file can have, each once."""
+    taken: set[str] = set()
+    return {one: unused(table_name(one.name, "column"), taken) for one in columns}
+
+
+def lasting_name(port: str) -> str:
+    """The name of a port that stays the same when it is plugged in again; its own where it has none."""
+    for name in serial_ports():
+        if Path(name).resolve() == Path(port).resolve():
+            return name
+    return str(Path(port).absolute())
+
+
+def _printable(text: str) -> str:
+    return "".join(letter if letter.isprintable() or letter == "\n" else "?" for letter in text)

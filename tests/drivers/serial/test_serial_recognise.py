@@ -1,0 +1,235 @@
+"""What a stream of bytes is, and that a wrong baud rate does not look like the right one."""
+
+from __future__ import annotations
+
+import binascii
+import struct
+from functools import reduce
+from operator import xor
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from cobs import cobs
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.examples import examples
+from support.uart_waves import sampled, wave
+
+from drivers.serial.recognise import CHECKS, BinaryFrames, TextLines, recognised
+from drivers.serial.sniff import BAUDS, TRY_BYTES
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+pytestmark = pytest.mark.property
+
+
+def numbers(seed: int, frames: int, channels: int) -> np.ndarray:
+    return np.random.default_rng(seed).normal(0, 700, (frames, channels)).round(2)
+
+
+def lines(
+    seed: int, *, frames: int = 80, channels: int = 3, separator: str = ",", end: str = "\r\n"
+) -> bytes:
+    return "".join(
+        separator.join([f"{k}", *(f"{value:.2f}" for value in row)]) + end
+        for k, row in enumerate(numbers(seed, frames, channels))
+    ).encode()
+
+
+def payloads(seed: int, *, frames: int = 80, channels: int = 3) -> list[bytes]:
+    rows = numbers(seed, frames, channels).astype(np.int16)
+    return [struct.pack("<H", k) + row.astype("<i2").tobytes() for k, row in enumerate(rows)]
+
+
+def behind_sync(seed: int, *, channels: int = 3, crc: str = "ibm-3740", order: str = "big") -> bytes:
+    size, check = CHECKS[crc]
+    return b"".join(
+        b"\xa5\x5a" + payload + check(payload).to_bytes(size, "big" if order == "big" else "little")
+        for payload in payloads(seed, channels=channels)
+    )
+
+
+def in_cobs(seed: int, *, channels: int = 3) -> bytes:
+    return b"".join(
+        cobs.encode(payload + binascii.crc_hqx(payload, 0xFFFF).to_bytes(2, "big")) + b"\0"
+        for payload in payloads(seed, channels=channels)
+    )
+
+
+SENT: dict[str, Callable[[int], bytes]] = {"lines": lines, "sync": behind_sync, "cobs": in_cobs}
+
+
+def scores(data: bytes, baud: int, gap_bits: int) -> dict[int, float]:
+    levels = wave(data, gap_bits=gap_bits, gap_every=12)
+    found = {}
+    for rate in BAUDS:
+        heard = sampled(levels, baud / rate)
+        cut = heard.data[:TRY_BYTES]
+        share = len(cut) / max(1, len(heard.data))
+        found[rate] = recognised(cut, round(heard.framing_errors * share)).score
+    return found
+
+
+@settings(max_examples=examples(45), deadline=None)
+@given(
+    kind=st.sampled_from(sorted(SENT)),
+    baud=st.sampled_from(BAUDS),
+    seed=st.integers(0, 10_000),
+    gap_bits=st.sampled_from([0, 3, 40]),
+    begin=st.integers(0, 30),
+)
+def test_the_rate_of_the_sender_is_the_best_of_all(
+    kind: str, baud: int, seed: int, gap_bits: int, begin: int
+) -> None:
+    found = scores(SENT[kind](seed)[begin:], baud, gap_bits)
+    best = max(found, key=lambda rate: found[rate])
+    assert best == baud, found
+    assert found[best] >= 0.9, found
+    assert max(score for rate, score in found.items() if rate != baud) < 0.8, found
+
+
+@settings(max_examples=examples(45), deadline=None)
+@given(
+    kind=st.sampled_from(sorted(SENT)),
+    baud=st.sampled_from(BAUDS),
+    seed=st.integers(0, 10_000),
+    gap_bits=st.sampled_from([0, 3, 40]),
+)
+def test_the_bytes_alone_tell_the_rate_where_the_port_counts_no_errors(
+    kind: str, baud: int, seed: int, gap_bits: int
+) -> None:
+    levels = wave(SENT[kind](seed), gap_bits=gap_bits, gap_every=12)
+    found = {rate: recognised(sampled(levels, baud / rate).data[:TRY_BYTES]).score for rate in BAUDS}
+    assert max(found, key=lambda rate: found[rate]) == baud, found
+
+
+@settings(max_examples=examples(60), deadline=None)
+@given(
+    channels=st.integers(1, 9),
+    separator=st.sampled_from([",", ";", "\t", " "]),
+    end=st.sampled_from(["\n", "\r\n", "\r"]),
+    begin=st.integers(0, 10),
+    seed=st.integers(0, 1000),
+)
+def test_columns_of_lines_are_counted(channels: int, separator: str, end: str, begin: int, seed: int) -> None:
+    data = lines(seed, frames=40, channels=channels, separator=separator, end=end)
+    what = recognised(data[begin:]).what
+    assert isinstance(what, TextLines)
+    assert (what.separator, len(what.columns)) == (separator, channels + 1)
+    assert what.delimiter == ("\r" if end == "\r" else "\n")
+    assert all(column.numeric for column in what.columns)
+    assert what.columns[0].step == 1
+    assert not what.header
+    assert what.other == 0
+
+
+def test_a_header_a_prefix_texts_and_a_checksum_are_seen() -> None:
+    named = recognised(
+        b"t_ms,x,y,state\n" + b"".join(b"%d,%d.5,-3,ok\n" % (7 * k, k % 5) for k in range(30))
+    ).what
+    assert isinstance(named, TextLines)
+    assert named.header
+    assert [column.name for column in named.columns] == ["t_ms", "x", "y", "state"]
+    assert [column.numeric for column in named.columns] == [True, True, True, False]
+    assert (named.columns[1].least, named.columns[1].most) == (0.5, 4.5)
+
+    def nmea(number: int) -> bytes:
+        text = b"ACC,%d,%d" % (number, number * number)
+        return b"$%b*%02X\r\n" % (text, reduce(xor, text))
+
+    sent = b"".join(map(nmea, range(30)))
+    framed = recognised(sent).what
+    assert isinstance(framed, TextLines)
+    assert (framed.prefix, framed.checksum, len(framed.columns)) == ("$ACC", "xor", 2)
+    spoilt = recognised(sent.replace(b"*", b"*F").replace(b"\r", b"")[:-2]).what
+    assert isinstance(spoilt, TextLines)
+    assert spoilt.checksum != "xor"
+
+
+def test_a_line_with_another_number_of_columns_is_counted() -> None:
+    what = recognised(b"".join(b"%d,1,2\n" % k if k != 5 else b"5,1\n" for k in range(20))).what
+    assert isinstance(what, TextLines)
+    assert (len(what.columns), what.other) == (3, 1)
+
+
+@settings(max_examples=examples(40), deadline=None)
+@given(
+    crc=st.sampled_from([name for name, (size, _) in CHECKS.items() if size == 2]),
+    order=st.sampled_from(["big", "little"]),
+    channels=st.integers(1, 12),
+    begin=st.integers(0, 40),
+    seed=st.integers(0, 1000),
+)
+def test_sync_word_length_and_check_of_frames_are_found(
+    crc: str, order: str, channels: int, begin: int, seed: int
+) -> None:
+    found = recognised(behind_sync(seed, channels=channels, crc=crc, order=order)[begin:])
+    what = found.what
+    assert isinstance(what, BinaryFrames)
+    assert (what.sync, what.length) == (b"\xa5\x5a", 2 + 2 + 2 * channels + 2)
+    assert (what.crc, what.crc_order, what.crc_from) == (crc, order, 2)
+    assert found.score == 1.0
+    assert what.counter is not None
+    assert (what.counter.byte, what.counter.step) == (0, 1)
+    assert what.payload_length == 2 + 2 * channels
+
+
+@pytest.mark.parametrize("crc", ["crc-8", "sum-8", "xor-8"])
+def test_checks_of_one_byte_are_found(crc: str) -> None:
+    what = recognised(behind_sync(3, channels=4, crc=crc)).what
+    assert isinstance(what, BinaryFrames)
+    assert (what.sync, what.crc, what.payload_length) == (b"\xa5\x5a", crc, 10)
+
+
+def test_frames_without_a_check_are_found_and_are_less_sure() -> None:
+    data = b"".join(b"\xa5\x5a" + payload for payload in payloads(1, channels=4))
+    found = recognised(data[3:])
+    assert isinstance(found.what, BinaryFrames)
+    assert (found.what.sync, found.what.length, found.what.crc) == (b"\xa5\x5a", 12, "")
+    assert 0.5 < found.score < 0.9
+
+
+@settings(max_examples=examples(30), deadline=None)
+@given(channels=st.integers(1, 12), begin=st.integers(0, 40), seed=st.integers(0, 1000))
+def test_cobs_frames_are_found(channels: int, begin: int, seed: int) -> None:
+    what = recognised(in_cobs(seed, channels=channels)[begin:]).what
+    assert isinstance(what, BinaryFrames)
+    assert (what.framing, what.length, what.crc) == ("cobs", 2 + 2 * channels + 2, "ibm-3740")
+    assert what.counter is not None
+
+
+@pytest.mark.parametrize("parity", ["even", "odd"])
+def test_seven_bits_with_parity_are_told_from_the_bytes(parity: str) -> None:
+    levels = wave(lines(5), data_bits=7, parity=parity)
+    found = recognised(sampled(levels, 1.0).data)
+    assert found.parity == parity
+    assert isinstance(found.what, TextLines)
+    assert len(found.what.columns) == 4
+    assert recognised(lines(5)).parity is None
+
+
+def test_eight_bits_with_parity_show_as_missing_stop_bits_until_it_is_expected() -> None:
+    levels = wave(lines(5), parity="even")
+    blind, right = sampled(levels, 1.0), sampled(levels, 1.0, parity_bit=True)
+    assert blind.framing_errors > 0
+    assert (
+        recognised(blind.data, blind.framing_errors).score
+        < recognised(right.data, right.framing_errors).score
+    )
+    assert recognised(right.data, right.framing_errors).score >= 0.9
+
+
+@settings(max_examples=examples(60), deadline=None)
+@given(data=st.binary(max_size=600))
+def test_nothing_is_too_strange(data: bytes) -> None:
+    assert 0.0 <= recognised(data).score <= 1.0
+
+
+def test_noise_and_silence_are_nothing() -> None:
+    noise = np.random.default_rng(0).integers(0, 256, 4000, np.uint8).tobytes()
+    for data in (noise, bytes(4000), b"\xff" * 4000, b"U" * 4000, b""):
+        found = recognised(data)
+        assert found.what is None
+        assert found.score < 0.5

@@ -1,0 +1,228 @@
+"""``daqsvc sniff serial`` on pseudo-terminals; they have no baud rate, see test_serial_recognise.py."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import tomllib
+from typing import TYPE_CHECKING, Any
+
+import pytest
+import serial
+from support.waiting import PATIENCE_S
+
+from daqsvc.cli import main
+from drivers.serial import sniff
+from drivers.serial.recognise import CHECKS
+from sim_hw.nodes.serial_node import PseudoTerminal
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+pytestmark = pytest.mark.integration
+BEGIN = 'schema_version = 1\nsite = "lab"\nbox = "edge-1"\n\n[machine]\nname = "fan"\nspeed_rpm = 1480.0\n\n'
+
+
+@pytest.fixture
+def cable(tmp_path: Path) -> Iterator[PseudoTerminal]:
+    with PseudoTerminal(tmp_path / "ttyUSB0") as cable:
+        yield cable
+
+
+@contextlib.contextmanager
+def talking(cable: PseudoTerminal, say: Callable[[int], bytes]) -> Iterator[None]:
+    """Have the device send, every few milliseconds until this ends."""
+    done = threading.Event()
+
+    def talk() -> None:
+        number = 0
+        while not done.wait(0.004) and cable.plugged:
+            with contextlib.suppress(OSError):
+                number += cable.send(say(number))
+
+    thread = threading.Thread(target=talk)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
+
+
+def line(number: int) -> bytes:
+    return b"%d,%d.25,-1.5,%d\r\n" % (number, number % 7, 1000 - number % 3)
+
+
+def frame(number: int) -> bytes:
+    payload = number.to_bytes(4, "little") + bytes([number * 7 % 256, 1, number * 31 % 256, 2])
+    return b"\xa5\x5a" + payload + CHECKS["ibm-3740"][1](payload).to_bytes(2, "big")
+
+
+def figures(cable: PseudoTerminal, capsys: pytest.CaptureFixture[str], *more: str) -> dict[str, Any]:
+    assert main(["sniff", "serial", f"{cable.path}", "--seconds", "0.6", "--json", *more]) == 0
+    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return found
+
+
+def check(tmp_path: Path, fragment: str, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    """What it proposes, after it has passed `daqsvc check` in a whole file."""
+    machine = tmp_path / "machine.toml"
+    machine.write_text(BEGIN + fragment)
+    code = main(["check", f"{machine}"])
+    said = capsys.readouterr()
+    assert (code, said.err) == (0, "")
+    return tomllib.loads(fragment)
+
+
+def test_lines_are_shown_with_their_columns(
+    cable: PseudoTerminal, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with talking(cable, line):
+        assert main(["sniff", "serial", f"{cable.path}", "--seconds", "0.6"]) == 0
+    said = capsys.readouterr()
+    assert "trying " in said.err
+    assert "2e 32 35 2c 2d 31 2e 35 2c" in said.out
+    assert '4 columns; separated by ","' in said.out
+    rows = {
+        row.split()[0]: row.split() for row in said.out.splitlines() if row[:2] in {"c1", "c2", "c3", "c4"}
+    }
+    assert rows["c1"][-1] == "counts"
+    assert rows["c3"][1:5] == ["number", "-1.5", "-1.5", "-1.5"]
+    assert 'framing = "lines"' in said.out
+
+
+def test_what_it_proposes_for_lines_passes_check(
+    cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with talking(cable, line):
+        found = figures(cable, capsys)
+    assert (found["framing"], found["separator"], len(found["columns"])) == ("lines", ",", 4)
+    tables = check(tmp_path, found["machine_file"], capsys)
+    [bus], [stream] = tables["buses"].values(), tables["streams"].values()
+    assert bus["port"] == f"{cable.path}"
+    assert stream["layout"]["counter"]["column"] == "c1"
+    assert [one["name"] for one in stream["layout"]["channels"]] == ["c2", "c3", "c4"]
+    assert stream["rate_hz"] == pytest.approx(found["rate_hz"], rel=0.006)
+
+
+def test_a_column_of_time_and_a_header_are_used(
+    cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import time
+
+    begin_s = time.monotonic()
+
+    def say(number: int) -> bytes:
+        head = b"" if number else b"t [ms];accel x;temp\n"
+        return head + b"%d;%d.5;20.5\n" % (1000 * (time.monotonic() - begin_s), number % 5)
+
+    with talking(cable, say):
+        found = figures(cable, capsys, "--baud", "57600")
+    assert found["header"] is True
+    tables = check(tmp_path, found["machine_file"], capsys)
+    [bus], [stream] = tables["buses"].values(), tables["streams"].values()
+    assert bus["baud"] == 57_600
+    assert stream["layout"]["separator"] == ";"
+    assert stream["layout"]["line"] == ["t-ms", "accel-x", "temp"]
+    assert stream["layout"]["time"] == {"column": "t-ms", "unit": "ms"}
+
+
+def test_what_it_proposes_for_frames_passes_check(
+    cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with talking(cable, frame):
+        found = figures(cable, capsys)
+    assert (found["framing"], found["sync_word"], found["crc"]) == ("sync", "a55a", "ibm-3740")
+    assert found["payload_length"] == 8
+    tables = check(tmp_path, found["machine_file"], capsys)
+    [bus], [stream] = tables["buses"].values(), tables["streams"].values()
+    assert (bus["sync_word"], bus["crc"]) == ("a55a", "ibm-3740")
+    assert stream["layout"]["payload_length"] == 8
+    assert stream["layout"]["counter"]["byte"] == 0
+    assert stream["layout"]["counter"]["counts"] == "frames"
+
+
+def test_a_silent_port_and_noise_are_failures_that_say_what_to_check(
+    cable: PseudoTerminal, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sniff, "TRY_S", 0.05)
+    assert main(["sniff", "serial", f"{cable.path}"]) == 1
+    said = capsys.readouterr()
+    assert "no byte came. Remedy: see that the device is powered" in said.err
+    noise = iter(os.urandom(1_000_000))
+    with talking(cable, lambda _: bytes(next(noise) for _ in range(40))):
+        assert main(["sniff", "serial", f"{cable.path}", "--seconds", "0.3", "--baud", "9600"]) == 1
+    said = capsys.readouterr()
+    assert "they are neither lines of text nor frames of one length. Remedy: " in said.err
+    assert "To begin a machine file" not in said.out
+
+
+def test_a_port_that_is_pulled_ends_it_and_what_came_is_shown(
+    cable: PseudoTerminal, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def say(number: int) -> bytes:
+        if number == 100:
+            cable.unplug()
+        return line(number)
+
+    with talking(cable, say):
+        assert main(["sniff", "serial", f"{cable.path}", "--seconds", "60", "--baud", "115200"]) == 1
+    said = capsys.readouterr()
+    assert "4 columns" in said.out
+    assert f"{cable.path} was lost: " in said.err
+    assert "Remedy: plug it in again" in said.err
+
+
+def test_a_port_that_is_busy_absent_or_not_ours_is_one_line(
+    cable: PseudoTerminal, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def said(port: object) -> str:
+        assert main(["sniff", "serial", f"{port}"]) == 1
+        words = capsys.readouterr().err.splitlines()[-1]
+        assert words.startswith(f"daqsvc: {port} cannot be opened: ")
+        return words
+
+    with serial.Serial(f"{cable.path}", exclusive=True):
+        assert "another program has it open; stop that program" in said(cable.path)
+    by_id = tmp_path / "by-id"
+    by_id.mkdir()
+    (by_id / "usb-Pico-if00").symlink_to(cable.path)
+    monkeypatch.setattr(sniff, "BY_ID", by_id)
+    assert sniff.lasting_name(f"{cable.path}") == f"{by_id}/usb-Pico-if00"
+    words = said(tmp_path / "absent")
+    assert "plug the device in, or correct the name" in words
+    assert f"ports of this computer: {by_id}/usb-Pico-if00" in words
+
+    def refuse(*_: object, **__: object) -> None:
+        raise serial.SerialException(errno.EACCES, "could not open port")
+
+    monkeypatch.setattr(serial, "Serial", refuse)
+    assert "permission denied; " in (words := said(cable.path))
+    assert "your user" in words
+
+
+def test_ctrl_c_ends_it_early_and_shows_what_came(cable: PseudoTerminal) -> None:
+    command = [sys.executable, "-m", "daqsvc", "sniff", "serial", f"{cable.path}", "--json"]
+    with talking(cable, line):
+        process = subprocess.Popen(
+            [*command, "--seconds", "600"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        try:
+            assert process.stderr is not None
+            while not process.stderr.readline().startswith("listening to "):
+                pass
+            threading.Event().wait(0.5)  # time for some lines
+            process.send_signal(signal.SIGINT)
+            output, said = process.communicate(timeout=PATIENCE_S)
+        finally:
+            process.kill()
+            process.communicate()
+    assert (process.returncode, said) == (0, "")
+    assert len(json.loads(output)["columns"]) == 4
