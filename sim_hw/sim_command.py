@@ -39,9 +39,10 @@ class SimCommand:
 
     help = "put simulated devices on a bus, for the service or any other client"
     description = (
-        "Put the devices of a machine file on their buses and play a scenario or a measured recording: CAN "
-        "frames over a virtual bus between processes or SocketCAN, a Modbus server, a serial port behind a "
-        "pseudo-terminal. At the end, or when stopped, print as JSON what was sent and what was done to it."
+        "Put the devices of a machine file on their buses and play a scenario or a measured recording. A "
+        "device is CAN frames over a virtual bus between processes or SocketCAN, a Modbus server, or a "
+        "serial port behind a pseudo-terminal. At the end, or when stopped, print as JSON what was sent "
+        "and what was done to it."
     )
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:

@@ -190,7 +190,7 @@ class AlarmVerb:
         self.help = help_line
         self.description = (
             f"{description} The service that runs on the store carries it out and writes it to its audit "
-            "log; the exit code is 0 once that is on disk, and 1 if it is refused or no service runs."
+            "log. The exit code is 0 once that is on disk, and 1 if it is refused or no service runs."
         )
         self._verb = verb
         self._load = load

@@ -26,10 +26,11 @@ class DetectabilityCommand(VerbWithKernels):
 
     help = "say what can be told apart on a machine's rotor, how soon, and from which change on"
     description = (
-        "Say, before any fault happens, what the rotor bank of a machine file can tell apart: evidence "
-        "between every two modes in nats a revolution, expected delay of its alarms, smallest visible "
-        "change of every kind, and which modes look the same at this speed. Without a rotor bank, what the "
-        "synchronous vector of [pipeline.rotor_synchronous] can see: by its calibration, or by --noise-um."
+        "Say, before any fault happens, what the rotor bank of a machine file can tell apart: the evidence "
+        "between every two modes in nats a revolution, and the expected delay of its alarms. It also says "
+        "the smallest visible change of every kind, and which modes look the same at this speed. Without a "
+        "rotor bank, what the synchronous vector of [pipeline.rotor_synchronous] can see: by its "
+        "calibration, or by --noise-um."
     )
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:

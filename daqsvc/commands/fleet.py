@@ -32,8 +32,8 @@ class FleetCommand:
     help = "what the archive of a fleet shows: changes, missed faults, false alarms and their cost"
     description = (
         "Report on the results that daqsvc analyze ARCHIVE --cluster wrote: of each machine where its "
-        "verdict changed, and, against a CSV table of known faults, what was missed, and what false alarms "
-        "there were and what they cost (docs/fleet.md)."
+        "verdict changed. Against a CSV table of known faults it also says what was missed, what false "
+        "alarms there were and what they cost (docs/fleet.md)."
     )
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:

@@ -30,8 +30,8 @@ class ReplayCommand(VerbWithKernels):
     help = "judge a snapshot again: the same detectors and alarms over the same samples"
     description = (
         "Play the samples of a snapshot into the rings, detectors and alarms of the service, as fast as it "
-        "goes or at a speed, print the alarms that come of it, and hold them and every statement of the "
-        "detectors against what the service said then, to the last bit. With a machine file that judges "
+        "goes or at a speed. Print the alarms that come of it, and compare them and every statement of the "
+        "detectors with what the service said then, to the last bit. With a machine file that judges "
         "instead of the one in the snapshot. Exit code: 0 if it was judged, with --check 1 if anything "
         "differs or nothing could be compared, 3 if it cannot be read or judged, 2 for wrong usage."
     )

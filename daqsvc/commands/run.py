@@ -59,10 +59,11 @@ class RunCommand:
         "Run the service for one machine file, or for several machines that share their buses, one journal "
         "and one connection to the broker: acquire, diagnose, and publish alarms. SIGTERM, SIGINT "
         "(Ctrl-C) or the loss of its terminal stop it within two seconds; alarms that the broker has not "
-        "acknowledged stay in the journal and go out at the next start. Exit codes: 0 it was stopped; 1 it "
-        "could not start; 2 the machine file has errors; 3 something without which it is useless was lost, "
-        f"such as the writer of the journal; {EXIT_HUNG} something hung while it stopped, and it was ended "
-        f"by force; {EXIT_STUCK} its event loop stood still, and it was ended by force."
+        "acknowledged stay in the journal and go out at the next start. Exit code 0: it was stopped. Exit "
+        "code 1: it could not start. Exit code 2: the machine file has errors. Exit code 3: something "
+        "without which it is useless was lost, such as the writer of the journal. Exit code "
+        f"{EXIT_HUNG}: something hung while it stopped, and it was ended by force. Exit code {EXIT_STUCK}: "
+        "its event loop stood still, and it was ended by force."
     )
 
     def __init__(

@@ -48,7 +48,8 @@ class CanSniffer(Sniffer):
     help = "listen to a CAN bus: ids, rates, bytes that change, and values by a DBC file"
     description = (
         "Listen to a CAN or CAN FD bus and print each id that comes, how often and how evenly, how long its "
-        "frames are and which bytes change; with a DBC file also the values of its signals. Nothing is sent."
+        "frames are and which bytes change. With a DBC file also print the values of its signals. Nothing is "
+        "sent."
     )
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
