@@ -3,7 +3,6 @@
 - A link to a file of the repository leads to a copy of it, one to a folder to its README.md; where there is
   none, the words stay, without the link. A link that leads nowhere is left as it is: the build fails at it.
 - index.md, and README.md of a folder, list pages; these lists are the contents at the side of the site.
-- Diagrams in Mermaid stay text: what draws them would come from the network.
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from docutils import nodes
-from pygments.lexers.special import TextLexer
 
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
@@ -107,5 +105,4 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.connect("source-read", _read)
     app.connect("include-read", _read_included)
     app.connect("doctree-read", _note_anchors)
-    app.add_lexer("mermaid", TextLexer)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

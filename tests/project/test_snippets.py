@@ -55,29 +55,16 @@ TESTED = {
     ("docs/replay.md", "toml"): "tests/drivers/test_bus_pages.py",
 }
 """Pages whose parts need others around them: the tests that put these together."""
-PARSED = {"toml": tomllib.loads, "json": lambda text: [*map(json.loads, objects(text))]}
 REMARKS = {"", "text", "{include}"}
 """What a terminal shows, of which the commands are checked; and what only the site reads."""
-ELSEWHERE = {"sql", "yaml", "mermaid"}
+ELSEWHERE = {"sql", "yaml"}
 """Languages of other programs."""
 RUNNING = {"analyze", "calibrate", "check", "detectability", "example", "export"}
 """Verbs that end by themselves and need no service; of these all lines run whose files `folder` has."""
 PROGRAMS = {
-    *("daqsvc", "make", "pip", "python", "python3", "python3.11", "git", "bash"),
-    *(
-        "apt",
-        "apt-get",
-        "systemctl",
-        "systemd-sysusers",
-        "install",
-        "cd",
-        "cp",
-        "mkdir",
-        "rm",
-        "sed",
-        "sha256sum",
-    ),
-    *("candump", "dask", "ip", "mosquitto_sub", "psql"),
+    *("daqsvc", "make", "pip", "python", "python3", "python3.11", "git"),
+    *("apt", "apt-get", "systemctl", "systemd-sysusers", "ip", "candump", "mosquitto_sub", "psql", "dask"),
+    *("cd", "cp", "install", "mkdir", "rm", "sed", "sha256sum"),
 }
 """Else it is no command but what one has answered."""
 MAKEFILE = (ROOT / "Makefile").read_text("utf-8")
