@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, cast
 
+from daqsvc.errors.machine_file import NOT_OF_ONE_BOX, TOO_MUCH_MEMORY
 from daqsvc.settings.alarms import AlarmHandling
 from daqsvc.settings.checks import bus_checks, failure, memory_bytes, memory_share, needed_bytes
 from daqsvc.settings.error_messages import dotted
@@ -17,6 +18,7 @@ from daqsvc.settings.registry import no_detectors
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
+    from daqsvc.errors.code import Code
     from daqsvc.settings.buses import Bus
     from daqsvc.settings.problems import Finding, KeyPath
     from drivers.plugin import DriverPlugin
@@ -88,11 +90,13 @@ class Box:
         return stream if self.is_single else f"{machine}/{stream}"
 
 
-def _problem(file: MachineFile, path: KeyPath, value: object, message: str, remedy: str) -> Problem:
+def _problem(
+    file: MachineFile, path: KeyPath, value: object, message: str, remedy: str, code: Code = NOT_OF_ONE_BOX
+) -> Problem:
     """Of one file; ``path`` is that of a key, or of a table of the box, and empty for the whole file."""
     key = f"[{path[0]}]" if len(path) == 1 and path[0] in [*_tables(file)] else dotted(path)
     line = line_of(file.text, path) if path else None
-    return Problem(file.path, line, key, f"{value}", message, remedy)
+    return Problem(file.path, line, key, f"{value}", message, remedy, code)
 
 
 def _of_the_box(files: Sequence[MachineFile]) -> Iterator[Problem]:
@@ -214,7 +218,9 @@ def _together(own: MachineFile, files: Sequence[MachineFile]) -> Iterator[Proble
             file = by_name.get(named) or next((f for f in files if named in f.buses), own)
             path = tuple(step.removeprefix(f"{named}/") for step in map(str, finding.path))
             line = line_of(file.text, path) if file is not own else None
-            yield Problem(file.path, line, dotted(finding.path), "", finding.message, finding.remedy)
+            yield Problem(
+                file.path, line, dotted(finding.path), "", finding.message, finding.remedy, finding.code
+            )
 
 
 def _outputs_of_several(own: MachineFile, files: Sequence[MachineFile]) -> Iterator[Problem]:
@@ -226,7 +232,9 @@ def _outputs_of_several(own: MachineFile, files: Sequence[MachineFile]) -> Itera
             findings = [failure(own, failed)]
         for finding in findings:
             line = line_of(text, finding.path)
-            yield Problem(own.path, line, dotted(finding.path), "", finding.message, finding.remedy)
+            yield Problem(
+                own.path, line, dotted(finding.path), "", finding.message, finding.remedy, finding.code
+            )
 
 
 def _memory(files: Sequence[MachineFile]) -> Iterator[Problem]:
@@ -242,4 +250,5 @@ def _memory(files: Sequence[MachineFile]) -> Iterator[Problem]:
             f"the rings of all {len(files)} machines would take {together / 1e9:.3g} GB, and this computer "
             f"has {there / 1e9:.3g} GB",
             "write a shorter ring_s in [pipeline] of each file",
+            TOO_MUCH_MEMORY,
         )

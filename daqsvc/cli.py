@@ -26,6 +26,7 @@ from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, Argument
 from daqsvc.commands.calibrate import CalibrateCommand
 from daqsvc.commands.detectability import DetectabilityCommand
 from daqsvc.commands.example import ExampleCommand
+from daqsvc.commands.explain import ExplainCommand
 from daqsvc.commands.export import ExportCommand
 from daqsvc.commands.fleet import FleetCommand
 from daqsvc.commands.machine_files import load_box
@@ -215,6 +216,7 @@ def commands() -> dict[str, Command]:
         "detectability": DetectabilityCommand(load, kernel_cache.prepare),
         "example": ExampleCommand(),
         "sniff": SniffCommand(),
+        "explain": ExplainCommand(),
         "record": RecordCommand(load, start_logging),
     }
     for point in entry_points(group=COMMANDS):

@@ -38,7 +38,7 @@ def fault_names(machine: MachineFile) -> dict[str, dict[str, str]]:
             told = plugin.faults(machine, settings)
             named |= {str(detector): {**faults} for detector, faults in told.items()}
         except PluginFailedError as failed:
-            log.error("%s; its decisions are shown as they are", failed)  # noqa: TRY400
+            log.error("%s", failed.followed_by("; its decisions are shown as they are"))  # noqa: TRY400
     return named
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import BaseModel
 
 from daqsvc.control import ReloadRefusedError
+from daqsvc.errors.service import NEEDS_RESTART
 from daqsvc.outbox.limits import OutboxLimits
 from daqsvc.publish.make import topic_root, watched
 from daqsvc.settings.error_messages import dotted
@@ -150,6 +151,7 @@ def _restart(files: Sequence[MachineFile], path: KeyPath, wanted: object, was: o
         "" if wanted is None else _json(wanted),
         message,
         RESTART,
+        NEEDS_RESTART,
     )
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
 from daqsvc.acquisition.standing import tell_nobody
+from daqsvc.errors.buses import BUS_OPTION
 from daqsvc.settings.hooks import failing_in
 from daqsvc.settings.problems import AssemblyError
 from daqsvc.settings.registry import bus_tables, driver_of_layout
@@ -85,7 +86,7 @@ def bus_driver(
         with failing_in(machine.path, f"buses.{name}"):
             return plugin.build(plugin.absolute(machine, bus), port)
     except BusOptionError as error:
-        raise AssemblyError(f"{machine.path}: buses.{name}: {error}") from error
+        raise AssemblyError(f"{machine.path}: buses.{name}: {error}", code=BUS_OPTION) from error
 
 
 def bus_port(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
+from daqsvc.errors.buses import WRONG_LAYOUT
 from daqsvc.settings.buses import Bus, Layout
 from daqsvc.settings.hooks import contract, may_raise
 from daqsvc.settings.packing import PackedLayout
@@ -46,7 +47,9 @@ class DriverPlugin(BusTable, Generic[BusT]):
         """
         layout = machine.streams[stream].layout
         if not isinstance(layout, PackedLayout):
-            raise AssemblyError(f"{machine.path}: streams.{stream}.layout: no driver decodes {layout.kind}")
+            raise AssemblyError(
+                f"{machine.path}: streams.{stream}.layout: no driver decodes {layout.kind}", code=WRONG_LAYOUT
+            )
         return packed_layout(in_units(layout, machine, stream), layout.frame_bytes)
 
     @may_raise(AssemblyError, BusOptionError, LayoutError)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING
 
+from daqsvc.errors.machine_file import NO_MACHINE_FILE
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
@@ -84,7 +86,7 @@ def _files(paths: Sequence[Path]) -> list[Path]:
         if not inside:
             words = "no machine file (*.toml) is in this directory"
             remedy = "copy an example into it: daqsvc example"
-            raise MachineFileError([Problem(path, None, "", "", words, remedy)])
+            raise MachineFileError([Problem(path, None, "", "", words, remedy, NO_MACHINE_FILE)])
         files += inside
     return list(dict.fromkeys(files))
 

@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from daqsvc.commands.machine_files import load_machines, read_box
+from daqsvc.errors.code import with_code
+from daqsvc.errors.service import UNUSABLE_STORE
 
 if TYPE_CHECKING:
     import argparse
@@ -91,11 +93,12 @@ def store_doubts(machine: MachineFile) -> Iterator[str]:
         if why and not was_read:
             refuse_newer_header(store / JOURNAL)  # only this account may be able to read it
     except (NewerOutboxError, StorePathError) as error:
-        raise AssemblyError(f"{at}: {harmless(f'{error}')}") from None
+        raise AssemblyError(f"{at}: {harmless(f'{error}')}", code=UNUSABLE_STORE) from None
     if why and is_read_only(store):
-        yield f"{at}: daqsvc run would keep the alarms in memory only, and lose them at its end: {why}"
+        said = f"daqsvc run would keep the alarms in memory only, and lose them at its end: {why}"
+        yield with_code(f"{at}: {said}", UNUSABLE_STORE)
     elif why:
-        yield f"{at}: daqsvc run could not start as {who}: {why}"
+        yield with_code(f"{at}: daqsvc run could not start as {who}: {why}", UNUSABLE_STORE)
 
 
 def _refuse_newer(store: Path) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, cast
 
+from daqsvc.errors.machine_file import PLUGIN_FAILED
 from daqsvc.settings.failures import BrokenContractError
 from daqsvc.settings.hooks import PluginFailedError, failing_in
 from daqsvc.settings.plugins import configured
@@ -49,16 +50,21 @@ def detectors(machine: MachineFile, store: Path | None = None) -> list[Detector]
         if not built and plugin.detector is not None and followed:
             raise AssemblyError(
                 f"the plugin of {plugin.detector!r} makes no detector, and alarm {followed[0]!r} follows it; "
-                "remove the alarm, or have the plugin make one"
+                "remove the alarm, or have the plugin make one",
+                code=PLUGIN_FAILED,
             )
         for detector in built:
             if detector.name in made:
-                raise AssemblyError(f"two detectors are named {detector.name!r}; have the plugin number them")
+                raise AssemblyError(
+                    f"two detectors are named {detector.name!r}; have the plugin number them",
+                    code=PLUGIN_FAILED,
+                )
             named = plugin.detector
             if named is not None and detector.name.partition("/")[0] != named.partition("/")[0]:
                 raise AssemblyError(
                     f"the plugin of {named!r} makes a detector {detector.name!r}, which no alarm follows; "
-                    f"name it {named!r}, or set `detector` of the plugin"
+                    f"name it {named!r}, or set `detector` of the plugin",
+                    code=PLUGIN_FAILED,
                 )
             made[detector.name] = detector
     return list(made.values())

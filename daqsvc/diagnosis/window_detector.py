@@ -12,6 +12,7 @@ import numpy as np
 
 from daqsvc.diagnosis.record import Diagnosis, Severity
 from daqsvc.diagnosis.statements import see_names, see_numbers, see_severity, see_texts
+from daqsvc.errors.machine_file import NO_SUCH_NAME, RING_TOO_SHORT, SAMPLED_APART
 from daqsvc.settings.failures import BrokenContractError
 from daqsvc.settings.problems import AssemblyError
 
@@ -79,21 +80,24 @@ class WindowDetector(ABC):
             if sensor not in known:
                 raise AssemblyError(
                     f"detector {name} ({type(self).__module__}.{type(self).__qualname__}) takes samples of "
-                    f"{sensor!r:.60}, which is no sensor; name some of {', '.join(known)} in its table"
+                    f"{sensor!r:.60}, which is no sensor; name some of {', '.join(known)} in its table",
+                    code=NO_SUCH_NAME,
                 )
         resolved = [known[sensor] for sensor in sensors]
         streams = {sensor.stream for sensor in resolved}
         if len(streams) != 1:
             raise AssemblyError(
                 f"detector {name} takes samples of one stream together, and its sensors "
-                f"{', '.join(sensors)} are in {', '.join(sorted(streams)) or 'none'}; give it sensors of one"
+                f"{', '.join(sensors)} are in {', '.join(sorted(streams)) or 'none'}; give it sensors of one",
+                code=SAMPLED_APART,
             )
         ring_s = machine.pipeline.ring_s
         length: Any = window_s if isinstance(cast("object", window_s), Real) else math.nan
         if not 0.0 < length <= ring_s / _RING_WINDOWS:  # NaN is not, either
             raise AssemblyError(
                 f"detector {name}: window_s is {window_s!r:.60}; make it a number above 0 and at most "
-                f"{ring_s / _RING_WINDOWS:g}, so that a ring of {ring_s:g} s holds {_RING_WINDOWS} windows"
+                f"{ring_s / _RING_WINDOWS:g}, so that a ring of {ring_s:g} s holds {_RING_WINDOWS} windows",
+                code=RING_TOO_SHORT,
             )
         self.name = name
         self.stream = resolved[0].stream

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from daqsvc.reference import alarms, counters, keys, messages, metrics, process, verbs
+from daqsvc.reference import alarms, counters, errors, keys, messages, metrics, process, verbs
 from daqsvc.reference.markdown import NOTE, WordsMissingError, page
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-_MAKERS = (keys, verbs, counters, metrics, messages, alarms, process)
+_MAKERS = (keys, verbs, counters, metrics, messages, alarms, process, errors)
 LIST = "README.md"
 
 
@@ -65,6 +65,7 @@ _FIRST = (
     "keys.md",
     "verbs.md",
     "process.md",
+    "errors.md",
     "alarms.md",
     "topics.md",
     "payloads.md",

@@ -10,6 +10,7 @@ from typing import Annotated, NamedTuple, TypeAlias
 from pydantic import AfterValidator
 from pydantic_core import PydanticCustomError
 
+from daqsvc.errors.machine_file import BAD_ADDRESS, BAD_PATH
 from daqsvc.settings.buses import Device
 from daqsvc.settings.section import Text
 
@@ -35,7 +36,7 @@ def _host(text: str) -> str:
     raise PydanticCustomError(
         "host",
         "is no name or address of a host" if _SCHEME.match(text) is None else "is a URL, not a host",
-        {"remedy": f'write host = "{example}"{also}'},
+        {"remedy": f'write host = "{example}"{also}', "code": BAD_ADDRESS},
     )
 
 
@@ -63,7 +64,10 @@ def _device_path(path: str) -> str:
         raise PydanticCustomError(
             "device_path",
             "is not the whole path of a port",
-            {"remedy": f"write it from the root, e.g. /dev/serial/by-id/... or /dev/{path or 'ttyS0'}"},
+            {
+                "remedy": f"write it from the root, e.g. /dev/serial/by-id/... or /dev/{path or 'ttyS0'}",
+                "code": BAD_PATH,
+            },
         )
     return path
 
@@ -131,7 +135,9 @@ def is_everywhere(host: str) -> bool:
 def _listening(text: str) -> str:
     if address_of(text) is None:
         remedy = 'write an address of this machine and a port, e.g. listen = "127.0.0.1:9000" or "[::1]:9000"'
-        raise PydanticCustomError("listen", "is no address to listen at", {"remedy": remedy})
+        raise PydanticCustomError(
+            "listen", "is no address to listen at", {"remedy": remedy, "code": BAD_ADDRESS}
+        )
     return text
 
 

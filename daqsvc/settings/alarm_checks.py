@@ -6,6 +6,30 @@ from contextlib import suppress
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
+from daqsvc.errors.alarms import (
+    ALWAYS_STARTING,
+    DEADBAND,
+    NEVER_REACHED,
+    NO_REFERENCE,
+    NO_SETPOINT,
+    NOT_MEASURED,
+    NOT_OF_STANDARD,
+    RESERVED_NAME,
+    SETPOINT_ORDER,
+    SILENT_DETECTOR,
+    TRIP_MULTIPLY,
+    UNFIT_MEASURE,
+    UNFIT_SETPOINT,
+    VOTE,
+)
+from daqsvc.errors.machine_file import (
+    INCOMPLETE,
+    NO_EFFECT,
+    NO_SUCH_NAME,
+    SPEED_UNKNOWN,
+    WRONG_ORDER,
+    WRONG_SENSOR_TYPE,
+)
 from daqsvc.settings.alarms import DiagnosisAlarm, LevelAlarm, SetpointAlarm, VotingAlarm
 from daqsvc.settings.measures import AMPLITUDES, PHASES, UNITS, VELOCITIES
 from daqsvc.settings.plugins import configured, detector_tables
@@ -51,7 +75,10 @@ def alarm_checks(draft: MachineFile) -> Iterator[Iterator[Finding]]:
 def _name(name: str, at: KeyPath) -> Iterator[Finding]:
     if name in _TAKEN:
         yield Finding(
-            (*at, "name"), "is an alarm that the service raises itself", "give this one another name"
+            (*at, "name"),
+            "is an alarm that the service raises itself",
+            "give this one another name",
+            code=RESERVED_NAME,
         )
 
 
@@ -62,10 +89,11 @@ def _vote(draft: MachineFile, alarm: VotingAlarm, at: KeyPath) -> Iterator[Findi
             (*at, "vote"),
             f"cannot be reached by {count} sensors",
             f"write vote = {count} or less, or add sensors",
+            code=VOTE,
         )
     for position, name in enumerate(alarm.sensors):
         if name in alarm.sensors[:position]:
-            yield Finding((*at, "sensors", position), "votes twice", "name each sensor once")
+            yield Finding((*at, "sensors", position), "votes twice", "name each sensor once", code=VOTE)
     if alarm.measure in UNITS:
         return
     units = {s.unit for s in draft.sensors if s.name in alarm.sensors and s.type != "keyphasor"}
@@ -74,6 +102,7 @@ def _vote(draft: MachineFile, alarm: VotingAlarm, at: KeyPath) -> Iterator[Findi
             (*at, "sensors"),
             f"one setpoint for sensors in {' and '.join(sorted(units))}",
             "let only sensors of one unit vote together",
+            code=VOTE,
         )
 
 
@@ -81,7 +110,9 @@ def _detector(draft: MachineFile, alarm: DiagnosisAlarm, at: KeyPath) -> Iterato
     """The detector that an alarm follows is there and can raise it."""
     keys = {plugin.detector: key for key, plugin in detector_tables().items() if plugin.detector is not None}
     if alarm.detector not in keys:
-        yield Finding((*at, "detector"), "there is no such detector", choice(alarm.detector, keys))
+        yield Finding(
+            (*at, "detector"), "there is no such detector", choice(alarm.detector, keys), code=NO_SUCH_NAME
+        )
         return
     key = keys[alarm.detector]
     settings = getattr(draft.pipeline, key)
@@ -90,6 +121,7 @@ def _detector(draft: MachineFile, alarm: DiagnosisAlarm, at: KeyPath) -> Iterato
             (*at, "detector"),
             "this detector is not configured",
             f"write a table [pipeline.{key}], or remove the alarm",
+            code=SILENT_DETECTOR,
         )
         return
     yield from detector_tables()[key].alarm_checks(settings, at)
@@ -97,9 +129,11 @@ def _detector(draft: MachineFile, alarm: DiagnosisAlarm, at: KeyPath) -> Iterato
 
 def _start_up(draft: MachineFile, start_up: StartUp) -> Iterator[Finding]:
     if start_up.between is None and start_up.change_per_s is None:
-        yield Finding(_START_UP, "has neither between nor change_per_s", "add one of the two, or both")
+        yield Finding(
+            _START_UP, "has neither between nor change_per_s", "add one of the two, or both", code=INCOMPLETE
+        )
     if start_up.between is not None and not start_up.between[0] < start_up.between[1]:
-        yield Finding((*_START_UP, "between"), "is no range", "write the lower end first")
+        yield Finding((*_START_UP, "between"), "is no range", "write the lower end first", code=WRONG_ORDER)
     yield from _never_up(draft, start_up)
     yield from _start_up_signal(draft, start_up)
     if not any(isinstance(alarm, SetpointAlarm) and alarm.trip_multiply > 1 for alarm in draft.alarms):
@@ -108,6 +142,7 @@ def _start_up(draft: MachineFile, start_up: StartUp) -> Iterator[Finding]:
             "has no effect: no alarm has a trip_multiply",
             "write e.g. trip_multiply = 2.0 in an alarm on a level, or remove it",
             fatal=False,
+            code=NO_EFFECT,
         )
 
 
@@ -122,6 +157,7 @@ def _never_up(draft: MachineFile, start_up: StartUp) -> Iterator[Finding]:
             (*_START_UP, "between"),
             f"holds machine.speed_rpm, {speed_rpm:g} rpm: the machine would always be starting up",
             f"end it below {speed_rpm:g}, e.g. between = [{0.1 * speed_rpm:g}, {0.9 * speed_rpm:g}]",
+            code=ALWAYS_STARTING,
         )
 
 
@@ -136,6 +172,7 @@ def _start_up_signal(draft: MachineFile, start_up: StartUp) -> Iterator[Finding]
             "no detector of this machine states a speed",
             f"write a table {' or '.join(tables)}, take a trend value that is the speed, or remove "
             "[alarm_handling.start_up] and every trip_multiply",
+            code=SPEED_UNKNOWN,
         )
     elif start_up.detector not in signals:
         there = (
@@ -147,12 +184,14 @@ def _start_up_signal(draft: MachineFile, start_up: StartUp) -> Iterator[Finding]
             if there
             else "there is no such detector in [pipeline]",
             choice(start_up.detector, list(signals)),
+            code=NO_SUCH_NAME,
         )
     elif start_up.measure not in signals[start_up.detector]:
         yield Finding(
             (*_START_UP, "measure"),
             f"is nothing that {start_up.detector} states while the machine starts up",
             choice(start_up.measure, signals[start_up.detector]),
+            code=NO_SUCH_NAME,
         )
 
 
@@ -187,25 +226,28 @@ def _setpoint_checks(draft: MachineFile, alarm: SetpointAlarm, at: KeyPath) -> I
 def _setpoints(alarm: SetpointAlarm, at: KeyPath) -> Iterator[Finding]:
     setpoints = alarm.setpoints
     if not setpoints and alarm.zones is None:
-        yield Finding(at, "has neither alert nor danger", "add alert, danger or both")
+        yield Finding(at, "has neither alert nor danger", "add alert, danger or both", code=NO_SETPOINT)
     for (key, value), (above, higher) in pairwise(setpoints.items()):
         if value >= higher and alarm.boundaries is not None and value in alarm.boundaries:
             yield Finding(
                 (*at, above),
                 f"must be above {key} = {value:g}, where zone C begins",
                 f"write {key} as well, or leave {above} to the zones",
+                code=SETPOINT_ORDER,
             )
         elif value >= higher and alarm.boundaries is not None and higher in alarm.boundaries:
             yield Finding(
                 (*at, key),
                 f"must be below {above} = {higher:g}, where zone D begins",
                 f"write {above} as well, or leave {key} to the zones",
+                code=SETPOINT_ORDER,
             )
         elif value >= higher:
             yield Finding(
                 (*at, key),
                 f"must be below {above} = {higher:g}",
                 "correct one of the two" if value == higher else "swap the two, or correct one of them",
+                code=SETPOINT_ORDER,
             )
     if alarm.measure in _TWO_SIDED:
         return
@@ -217,12 +259,14 @@ def _setpoints(alarm: SetpointAlarm, at: KeyPath) -> Iterator[Finding]:
                 f"does not go with {alarm.measure}: only {', '.join(lower[:-1])} and {lower[-1]} have lower "
                 "setpoints",
                 "remove it",
+                code=UNFIT_SETPOINT,
             )
         elif value <= 0:
             yield Finding(
                 (*at, key),
                 f"must be greater than 0: {alarm.measure} is never less",
                 "write a positive setpoint",
+                code=UNFIT_SETPOINT,
             )
 
 
@@ -235,7 +279,12 @@ def _phase_alone(alarm: SetpointAlarm, at: KeyPath) -> Iterator[Finding]:
                 if alarm.measure in AMPLITUDES
                 else "remove it"
             )
-            yield Finding((*at, "reference_deg"), f"goes with a phase, not with {alarm.measure}", remedy)
+            yield Finding(
+                (*at, "reference_deg"),
+                f"goes with a phase, not with {alarm.measure}",
+                remedy,
+                code=UNFIT_SETPOINT,
+            )
         return
     if alarm.reference_deg is None:
         yield Finding(
@@ -243,6 +292,7 @@ def _phase_alone(alarm: SetpointAlarm, at: KeyPath) -> Iterator[Finding]:
             f"does not say from where {alarm.measure} counts: its setpoints are how far it may be from a "
             "reference, either way",
             "add reference_deg, the phase of the machine in good order, e.g. reference_deg = 135.0",
+            code=NO_REFERENCE,
         )
     for key, value in alarm.setpoints.items():
         if key in _UPPER and value > _HALF_A_TURN_DEG:
@@ -250,6 +300,7 @@ def _phase_alone(alarm: SetpointAlarm, at: KeyPath) -> Iterator[Finding]:
                 (*at, key),
                 "is never reached: no phase is farther than 180 deg from another one",
                 "write how far it may be from reference_deg either way, e.g. 30.0",
+                code=NEVER_REACHED,
             )
 
 
@@ -263,22 +314,27 @@ def _phase_limits(alarm: LevelAlarm, at: KeyPath) -> Iterator[Finding]:
             here,
             f"goes with an amplitude, not with {alarm.measure}",
             f"write measure = {' or '.join(map(repr, AMPLITUDES))}, or remove it".replace("'", '"'),
+            code=UNFIT_SETPOINT,
         )
         return
     limits = [limit for limit in (phase.alert, phase.danger) if limit is not None]
     if not limits:
-        yield Finding(here, "has neither alert nor danger", "add alert, danger or both, in degrees")
+        yield Finding(
+            here, "has neither alert nor danger", "add alert, danger or both, in degrees", code=NO_SETPOINT
+        )
     elif phase.alert is not None and phase.danger is not None and phase.alert >= phase.danger:
         yield Finding(
             (*here, "alert"),
             f"must be below danger = {phase.danger:g}",
             "correct one of the two" if phase.alert == phase.danger else "swap the two, or correct one",
+            code=SETPOINT_ORDER,
         )
     if limits and phase.deadband >= min(limits):
         yield Finding(
             (*here, "deadband"),
             f"must be smaller than the setpoint {min(limits):g}, or the alarm never returns",
             f"write e.g. deadband = {min(limits) / 20:.3g}",
+            code=DEADBAND,
         )
 
 
@@ -299,6 +355,7 @@ def _never_returns(at: KeyPath, than: str, room: float) -> Finding:
         (*at, "deadband"),
         f"must be smaller than {than}, or the alarm never returns",
         f"write e.g. deadband = {room / 20:.3g}",
+        code=DEADBAND,
     )
 
 
@@ -307,10 +364,15 @@ def _sensors(draft: MachineFile, alarm: SetpointAlarm, at: KeyPath) -> Iterator[
     for position, name in enumerate(alarm.watched):
         here = (*at, "sensor") if isinstance(alarm, LevelAlarm) else (*at, "sensors", position)
         if name not in sensors:
-            yield Finding(here, "there is no such sensor", choice(name, sensors))
+            yield Finding(here, "there is no such sensor", choice(name, sensors), code=NO_SUCH_NAME)
         elif sensors[name].type == "keyphasor":
             vibration = [other for other, described in sensors.items() if described.type != "keyphasor"]
-            yield Finding(here, "is a keyphasor, which measures no vibration", choice(name, vibration))
+            yield Finding(
+                here,
+                "is a keyphasor, which measures no vibration",
+                choice(name, vibration),
+                code=WRONG_SENSOR_TYPE,
+            )
         else:
             yield from _measure(alarm, sensors[name], at)
 
@@ -324,6 +386,7 @@ def _measure(alarm: SetpointAlarm, sensor: Sensor, at: KeyPath) -> Iterator[Find
                 here,
                 f'needs a waveform, but "{sensor.name}" is a trend value, a level that the device measures',
                 f'write measure = "value", with setpoints in {sensor.unit}',
+                code=UNFIT_MEASURE,
             )
         return
     if measure == "peak" and isinstance(sensor, ProximityProbe):
@@ -333,6 +396,7 @@ def _measure(alarm: SetpointAlarm, sensor: Sensor, at: KeyPath) -> Iterator[Find
             "are peak to peak, about twice that",
             'write measure = "peak_to_peak", with setpoints from peak to peak',
             fatal=False,
+            code=NOT_OF_STANDARD,
         )
     instead = f'write measure = "rms" or "peak", with setpoints in {sensor.unit}'
     if measure == "value":
@@ -340,20 +404,28 @@ def _measure(alarm: SetpointAlarm, sensor: Sensor, at: KeyPath) -> Iterator[Find
             here,
             f'needs a trend value, but "{sensor.name}" is {sensor.kind}, of which waveforms are expected',
             f'{instead}, or type = "trend" if the device sends a level of it',
+            code=UNFIT_MEASURE,
         )
     elif measure == "gap_voltage" and not isinstance(sensor, ProximityProbe):
-        yield Finding(here, f'needs a proximity probe, but "{sensor.name}" is {sensor.kind}', instead)
+        yield Finding(
+            here,
+            f'needs a proximity probe, but "{sensor.name}" is {sensor.kind}',
+            instead,
+            code=UNFIT_MEASURE,
+        )
     elif measure == "gap_voltage" and sensor.sensitivity_mv_per_unit is None:
         yield Finding(
             here,
             f'is not known: "{sensor.name}" has no sensitivity_mv_per_unit',
             f"add sensitivity_mv_per_unit and zero_v to the sensor, or {instead}",
+            code=UNFIT_MEASURE,
         )
     elif measure in VELOCITIES and isinstance(sensor, ProximityProbe):
         yield Finding(
             here,
             f'needs an accelerometer or a velocity sensor, but "{sensor.name}" is a proximity probe',
             instead,
+            code=UNFIT_MEASURE,
         )
 
 
@@ -374,6 +446,7 @@ def _believed(draft: MachineFile, alarm: SetpointAlarm, at: KeyPath) -> Iterator
                     (*at, setpoint),
                     f"is never reached: it lies outside {limits_text}, where that is not believed",
                     f"correct it, or {key} of the sensor",
+                    code=NEVER_REACHED,
                 )
             room = value - limits[0] if setpoint in _UPPER else limits[1] - value
             if 0 < room <= alarm.deadband:
@@ -398,6 +471,7 @@ def _measured(draft: MachineFile, alarm: SetpointAlarm, at: KeyPath) -> Iterator
             (*at, "sensor" if one else "sensors"),
             "nothing measures its level" if one else "nothing measures their levels",
             f"write a table {' or '.join(tables)} (it may be empty), or remove the alarm",
+            code=NOT_MEASURED,
         )
 
 
@@ -410,10 +484,16 @@ def _trip_multiply(draft: MachineFile, alarm: SetpointAlarm, at: KeyPath) -> Ite
             here,
             "never holds: nothing says when the machine starts up",
             "write a table [alarm_handling.start_up], or remove it",
+            code=TRIP_MULTIPLY,
         )
     upper = [value for key, value in alarm.setpoints.items() if key in _UPPER]
     if alarm.measure in _TWO_SIDED and min(upper, default=0.0) <= 0:
-        yield Finding(here, "multiplies alert and danger, which must be greater than 0 for that", "remove it")
+        yield Finding(
+            here,
+            "multiplies alert and danger, which must be greater than 0 for that",
+            "remove it",
+            code=TRIP_MULTIPLY,
+        )
 
 
 def _named(draft: MachineFile) -> dict[str, Sensor]:

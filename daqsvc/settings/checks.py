@@ -13,6 +13,18 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+from daqsvc.errors.machine_file import (
+    COARSE_ALIGNMENT,
+    NAMED_TWICE,
+    NO_EFFECT,
+    NO_SUCH_DRIVER,
+    NO_SUCH_NAME,
+    PLUGIN_FAILED,
+    SNAPSHOTS_OVERLAP,
+    SPEED_UNKNOWN,
+    TOO_MUCH_MEMORY,
+    UNUSED_BUS,
+)
 from daqsvc.settings.alarm_checks import alarm_checks
 from daqsvc.settings.error_messages import dotted
 from daqsvc.settings.failures import BrokenContractError
@@ -88,7 +100,7 @@ def failure(draft: MachineFile, failed: PluginFailedError) -> Finding:
     at = next(_places(draft, failed), ())
     table = at[:2] if at[:1] in {("buses",), ("streams",)} else at
     remedy = failed.failure.or_remove(dotted(table))
-    return Finding(at, failed.failure.said, remedy, fatal=bool(at))
+    return Finding(at, failed.failure.said, remedy, fatal=bool(at), code=PLUGIN_FAILED)
 
 
 def _places(draft: MachineFile, failed: PluginFailedError) -> Iterator[KeyPath]:
@@ -213,10 +225,10 @@ def _check_drivers(draft: MachineFile) -> Iterator[Finding]:
             at = ("buses", name, "driver")
             if bus.driver in broken:
                 why = broken[bus.driver]
-                yield Finding(at, why.said, why.or_remove(f"buses.{name}"))
+                yield Finding(at, why.said, why.or_remove(f"buses.{name}"), code=PLUGIN_FAILED)
             elif bus.driver not in installed:
                 remedy = f"{choice(bus.driver, installed)}; or install the package that brings it"
-                yield Finding(at, "no such driver is installed", remedy)
+                yield Finding(at, "no such driver is installed", remedy, code=NO_SUCH_DRIVER)
 
 
 def _check_devices(draft: MachineFile) -> Iterator[Finding]:
@@ -227,7 +239,12 @@ def _check_devices(draft: MachineFile) -> Iterator[Finding]:
             device = bus.device
             owner = name if device is None else owners.setdefault(device.identity, name)
             if device is not None and owner != name:
-                yield Finding(("buses", name, device.key), f'belongs to bus "{owner}" already', device.remedy)
+                yield Finding(
+                    ("buses", name, device.key),
+                    f'belongs to bus "{owner}" already',
+                    device.remedy,
+                    code=NAMED_TWICE,
+                )
 
 
 def _check_unused(draft: MachineFile) -> Iterator[Finding]:
@@ -236,7 +253,11 @@ def _check_unused(draft: MachineFile) -> Iterator[Finding]:
     for name in draft.buses:
         if name not in used:
             yield Finding(
-                ("buses", name), "no stream comes over this bus", "remove it, or add its streams", fatal=False
+                ("buses", name),
+                "no stream comes over this bus",
+                "remove it, or add its streams",
+                fatal=False,
+                code=UNUSED_BUS,
             )
 
 
@@ -248,13 +269,20 @@ def _check_channels(layout: Layout, at: KeyPath) -> Iterator[Finding]:
 def _check_stream_bus(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[Finding]:
     """The stream's bus exists."""
     if stream.bus not in draft.buses:
-        yield Finding((*at, "bus"), "there is no such bus", choice(stream.bus, draft.buses))
+        yield Finding(
+            (*at, "bus"), "there is no such bus", choice(stream.bus, draft.buses), code=NO_SUCH_NAME
+        )
 
 
 def _check_sensor_channel(draft: MachineFile, sensor: Sensor, at: KeyPath) -> Iterator[Finding]:
     """The sensor's stream and channel exist."""
     if sensor.stream not in draft.streams:
-        yield Finding((*at, "stream"), "there is no such stream", choice(sensor.stream, draft.streams))
+        yield Finding(
+            (*at, "stream"),
+            "there is no such stream",
+            choice(sensor.stream, draft.streams),
+            code=NO_SUCH_NAME,
+        )
         return
     channels = draft.streams[sensor.stream].layout.channel_names
     if sensor.channel not in channels:
@@ -262,6 +290,7 @@ def _check_sensor_channel(draft: MachineFile, sensor: Sensor, at: KeyPath) -> It
             (*at, "channel"),
             f'stream "{sensor.stream}" has no such channel',
             choice(sensor.channel, channels),
+            code=NO_SUCH_NAME,
         )
 
 
@@ -277,6 +306,7 @@ def _check_channel_use(draft: MachineFile) -> Iterator[Finding]:
                     f'channel "{sensor.channel}" of stream "{sensor.stream}" belongs to '
                     f'sensor "{draft.sensors[owner].name}" already',
                     "give each sensor a channel of its own",
+                    code=NAMED_TWICE,
                 )
 
 
@@ -307,6 +337,7 @@ def _used(draft: MachineFile) -> Iterator[Finding]:
         "has no effect: no detector of the rotor has its sensors in several streams",
         "remove it",
         fatal=False,
+        code=NO_EFFECT,
     )
 
 
@@ -322,6 +353,7 @@ def _fine_enough(draft: MachineFile, max_error_us: float) -> Iterator[Finding]:
             f"write max_error_us = {rounded_down(_COARSE_DEG / 6.0 / speed_rpm * 1e6)} or less, or bring the "
             "sensors together in one stream",
             fatal=False,
+            code=COARSE_ALIGNMENT,
         )
 
 
@@ -381,6 +413,7 @@ def _check_speed_steps(draft: MachineFile) -> Iterator[Finding]:
         ("recorder", "every_rpm"),
         "asks for snapshots by the speed, and no detector of this machine states one",
         f'write a table {" or ".join(tables)}, a sensor of type "trend" in rpm, or remove every_rpm',
+        code=SPEED_UNKNOWN,
     )
 
 
@@ -397,6 +430,7 @@ def _check_schedule(draft: MachineFile) -> Iterator[Finding]:
             "(before_s and after_s): they would overlap",
             f"write every_s = {math.ceil(lasts_s)} or more, or have all recorded with continuous = true",
             fatal=False,
+            code=SNAPSHOTS_OVERLAP,
         )
 
 
@@ -414,4 +448,5 @@ def _check_memory(draft: MachineFile) -> Iterator[Finding]:
         f'"{most}" at {draft.streams[most].rate_hz:g} Hz, and this computer has {there / 1e9:.3g} GB',
         f"write ring_s = {rounded_down(fitting_s, 2)} or less in [pipeline], or correct rate_hz of the "
         "stream",
+        code=TOO_MUCH_MEMORY,
     )

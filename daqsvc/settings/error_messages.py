@@ -7,6 +7,18 @@ import re
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 
+from daqsvc.errors.machine_file import (
+    BAD_NAME,
+    BAD_TEXT,
+    MISSING_KEY,
+    NOT_ONE_OF,
+    OUT_OF_RANGE,
+    SECRET_IN_FILE,
+    UNKNOWN_KEY,
+    VALUE_REFUSED,
+    WRONG_LENGTH,
+    WRONG_TYPE,
+)
 from daqsvc.settings.aliases import meant_key
 from daqsvc.settings.registry import first_detector
 from daqsvc.settings.schema import declared_at, homes_of, kinds_of, section_of, value_at
@@ -18,6 +30,7 @@ if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
     from pydantic_core import ErrorDetails
 
+    from daqsvc.errors.code import Code
     from daqsvc.settings.problems import KeyPath
     from daqsvc.settings.section import Section
 
@@ -26,6 +39,29 @@ _FALSE_WORDS = {"0", "off", "false", "n", "no"}
 _MOST_IN_A_ROW = 4
 """Values that belong together, e.g. the two ends of a range; whatever may be longer is a list."""
 _SECRET = re.compile(r"pass|secret|token|credential", re.IGNORECASE)
+
+
+_CODES: Mapping[str, Code] = {
+    "missing": MISSING_KEY,
+    "extra_forbidden": UNKNOWN_KEY,
+    **dict.fromkeys(
+        (
+            *("bool_type", "int_type", "float_type", "string_type", "path_type"),
+            *("tuple_type", "model_type", "section_type", "dict_type"),
+        ),
+        WRONG_TYPE,
+    ),
+    **dict.fromkeys(
+        ("finite_number", "greater_than", "greater_than_equal", "less_than", "less_than_equal"), OUT_OF_RANGE
+    ),
+    "literal_error": NOT_ONE_OF,
+    "string_pattern_mismatch": BAD_NAME,
+    "string_too_short": BAD_TEXT,
+    "string_too_long": BAD_TEXT,
+    "too_short": WRONG_LENGTH,
+    "too_long": WRONG_LENGTH,
+}
+"""By the type that pydantic gives an error; what is not listed is refused by a validator."""
 
 
 def dotted(path: KeyPath) -> str:
@@ -67,16 +103,22 @@ class ErrorFormatter:
         self._root = root
         self._document = document
 
-    def say(self, error: ErrorDetails, path: KeyPath) -> tuple[str, str]:
-        """Message (to be read after the value) and remedy for an error at ``path``."""
+    def say(self, error: ErrorDetails, path: KeyPath) -> tuple[str, str, Code]:
+        """Message (to be read after the value), remedy and code for an error at ``path``."""
         context = error.get("ctx", {})
+        code: Code = context.get("code", _CODES.get(error["type"], VALUE_REFUSED))
+        if error["type"] == "extra_forbidden" and is_secret(path):
+            code = SECRET_IN_FILE
+        elif error["type"] == "missing" and isinstance(path[-1], int):
+            code = WRONG_LENGTH
         if "remedy" in context:
-            return error["msg"], str(context["remedy"])
+            return error["msg"], str(context["remedy"]), code
         say: Callable[[KeyPath, Mapping[str, Any]], tuple[str, str]]
         say = getattr(self, f"_{error['type']}", self._other)
         message, remedy = say(path, context)
         # Of a validator that raises a ValueError pydantic says "Value error, " before its words.
-        return message or f"is not valid: {str(context.get('error', '')) or error['msg']}", remedy
+        message = message or f"is not valid: {str(context.get('error', '')) or error['msg']}"
+        return message, remedy, code
 
     # Each method below is named after the pydantic error type it puts into words.
 

@@ -5,10 +5,15 @@ from __future__ import annotations
 import os
 import stat
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
+
+from daqsvc.errors.machine_file import BAD_PATH, TOO_LARGE, UNREADABLE_FILE
+
+if TYPE_CHECKING:
+    from daqsvc.errors.code import Code
 
 _LONGEST_PATH = 1024
 _LONGEST_NAME = 255
@@ -20,11 +25,13 @@ class UnreadableFileError(Exception):
 
     Attributes:
         remedy: what to do about it.
+        code: of the kind of mistake.
     """
 
-    def __init__(self, message: str, remedy: str) -> None:
+    def __init__(self, message: str, remedy: str, code: Code) -> None:
         super().__init__(message)
         self.remedy = remedy
+        self.code = code
 
 
 def read_bounded(path: Path, most_bytes: int) -> bytes:
@@ -45,9 +52,11 @@ def read_bounded(path: Path, most_bytes: int) -> bytes:
     try:
         kind = os.fstat(descriptor).st_mode
         if stat.S_ISDIR(kind):
-            raise UnreadableFileError("is a directory", "name a file in it")
+            raise UnreadableFileError("is a directory", "name a file in it", UNREADABLE_FILE)
         if not stat.S_ISREG(kind):
-            raise UnreadableFileError("is no ordinary file, but a device, pipe or socket", "name a file")
+            raise UnreadableFileError(
+                "is no ordinary file, but a device, pipe or socket", "name a file", UNREADABLE_FILE
+            )
         with os.fdopen(descriptor, "rb", closefd=False) as file:
             data = file.read(most_bytes + 1)
     except OSError as error:
@@ -56,18 +65,20 @@ def read_bounded(path: Path, most_bytes: int) -> bytes:
         os.close(descriptor)
     if len(data) > most_bytes:
         limit = f"{most_bytes / 1e6:.3g} MB"
-        raise UnreadableFileError(f"is larger than {limit}", "see whether it is the right file")
+        raise UnreadableFileError(f"is larger than {limit}", "see whether it is the right file", TOO_LARGE)
     return data
 
 
 def _cannot_be_opened(path: Path, error: OSError) -> UnreadableFileError:
     if isinstance(error, FileNotFoundError):
-        return UnreadableFileError("there is no such file", "correct the path")
+        return UnreadableFileError("there is no such file", "correct the path", UNREADABLE_FILE)
     if isinstance(error, PermissionError):
         return UnreadableFileError(
-            "may not be read by this user", f"chmod a+r {path}, or run as a user who may"
+            "may not be read by this user", f"chmod a+r {path}, or run as a user who may", UNREADABLE_FILE
         )
-    return UnreadableFileError(f"cannot be read: {error.strerror or error}", "make the file readable")
+    return UnreadableFileError(
+        f"cannot be read: {error.strerror or error}", "make the file readable", UNREADABLE_FILE
+    )
 
 
 def shortened(text: str, most: int) -> str:
@@ -82,13 +93,16 @@ def _usable_path(path: Path) -> Path:
         raise PydanticCustomError(
             "path_text",
             "is no path: it is too long, or holds what cannot be printed",
-            {"remedy": "correct it"},
+            {"remedy": "correct it", "code": BAD_PATH},
         )
     if "$" in text:
         raise PydanticCustomError(
             "path_variable",
             "holds a variable of the shell, which nobody puts in here",
-            {"remedy": 'write the path in full, or from "~", the home of the user that runs the service'},
+            {
+                "remedy": 'write the path in full, or from "~", the home of the user that runs the service',
+                "code": BAD_PATH,
+            },
         )
     try:
         return path.expanduser()
@@ -96,7 +110,7 @@ def _usable_path(path: Path) -> Path:
         raise PydanticCustomError(
             "path_home",
             "begins at a home that is not known here",
-            {"remedy": "write the path in full, e.g. /var/lib/daqsvc"},
+            {"remedy": "write the path in full, e.g. /var/lib/daqsvc", "code": BAD_PATH},
         ) from None
 
 

@@ -13,6 +13,8 @@ from functools import cache, partial
 from inspect import get_annotations, isfunction, signature
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar, get_args
 
+from daqsvc.errors.code import with_code
+from daqsvc.errors.machine_file import PLUGIN_FAILED
 from daqsvc.settings.answers import meaning, misfit, short, shown
 from daqsvc.settings.failures import BrokenContractError, failure, packages
 from daqsvc.settings.problems import AssemblyError
@@ -93,11 +95,15 @@ class PluginFailedError(AssemblyError, UnusableValueError):
         self.failure = failure(error, type(by), hook)
         self.file: Path | None = None
         self.table = by.__table__
-        super().__init__(self.failure.said)
+        super().__init__(self.failure.said, code=PLUGIN_FAILED)
 
     def __str__(self) -> str:
+        return self.followed_by("")
+
+    def followed_by(self, more: str) -> str:
+        """What has failed and where, and ``more`` behind it."""
         places = "".join(f"{place}: " for place in (self.file, self.table) if place)
-        return f"{places}{self.words}"
+        return with_code(f"{places}{self.words}{more}", self.code)
 
     @property
     def words(self) -> str:

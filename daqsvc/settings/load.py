@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
+from daqsvc.errors.machine_file import PLUGIN_FAILED, UNKNOWN_KEY
 from daqsvc.settings.checks import check, failure
 from daqsvc.settings.error_messages import ErrorFormatter, dotted, is_secret, suggested_key
 from daqsvc.settings.failures import one_line
@@ -66,7 +67,7 @@ def load_machine_file(path: Path) -> MachineFile:
         if isinstance(error.__cause__, FileNotFoundError):
             remedy = "correct the path, or begin with an example: daqsvc example"
         line = error.line if isinstance(error, TomlTextError) else None
-        raise MachineFileError([Problem(path, line, "", "", str(error), remedy)]) from None
+        raise MachineFileError([Problem(path, line, "", "", str(error), remedy, error.code)]) from None
     return parse_machine_file(text, path)
 
 
@@ -83,7 +84,8 @@ def parse_machine_file(text: str, path: Path) -> MachineFile:
     try:
         document, spots = parse(text)
     except TomlTextError as error:
-        raise MachineFileError([Problem(path, error.line, "", "", str(error), error.remedy)]) from None
+        problem = Problem(path, error.line, "", "", str(error), error.remedy, error.code)
+        raise MachineFileError([problem]) from None
     return _machine_file(document, spots, path, text)
 
 
@@ -137,7 +139,7 @@ class _Reading:
                 table = value_at(self._document, path[:-1])
                 if isinstance(table, dict):
                     del table[path[-1]]
-                    self.findings.append(Finding(path, why.said, why.or_remove(name)))
+                    self.findings.append(Finding(path, why.said, why.or_remove(name), code=PLUGIN_FAILED))
                     self._lacks_detector |= path[0] == "pipeline"
 
     def note_failures(self, draft: MachineFile, failures: Iterable[PluginFailedError]) -> None:
@@ -156,7 +158,9 @@ class _Reading:
         more = len(unknown) - _MOST_PROBLEMS
         if more > 0:
             self.findings.append(
-                Finding((), f"{more:,} more unknown keys are not listed", "correct these first")
+                Finding(
+                    (), f"{more:,} more unknown keys are not listed", "correct these first", code=UNKNOWN_KEY
+                )
             )
         self._say(unknown, self._document)
         meant = self._without_unknown_keys([error["loc"] for error in unknown]) if unknown else self._document
@@ -188,8 +192,8 @@ class _Reading:
         words = ErrorFormatter(machine_file_model(), document)
         for error in islice(errors, _MOST_PROBLEMS):
             path = tuple(step for step in error["loc"] if step != "[key]")
-            message, remedy = words.say(error, path)
-            self.findings.append(Finding(path, message, remedy))
+            message, remedy, code = words.say(error, path)
+            self.findings.append(Finding(path, message, remedy, code=code))
 
     def problems(self) -> tuple[list[Problem], list[Problem]]:
         """What makes the file unusable, and what is worth a warning; both in the order of the file."""
@@ -228,7 +232,7 @@ class _Reading:
             self._spots[path[:end]].line for end in range(len(path), -1, -1) if path[:end] in self._spots
         )
         message, remedy = one_line(finding.message), one_line(finding.remedy)
-        return Problem(self._path, line, dotted(path), source, message, remedy)
+        return Problem(self._path, line, dotted(path), source, message, remedy, finding.code)
 
     def _as_written(self, path: KeyPath) -> KeyPath:
         """A path of the document as it was meant, in the keys that the file really has."""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import AfterValidator, Field, PrivateAttr
 from pydantic_core import PydanticCustomError
 
+from daqsvc.errors.machine_file import STANDSTILL
 from daqsvc.settings.alarms import (
     Alarm,
     AlarmHandling,
@@ -132,7 +133,7 @@ def _turning(speed_rpm: float) -> float:
         raise PydanticCustomError(
             "standstill",
             "is a shaft that stands still",
-            {"remedy": "write the nominal speed, negative if the shaft turns clockwise"},
+            {"remedy": "write the nominal speed, negative if the shaft turns clockwise", "code": STANDSTILL},
         )
     return speed_rpm
 

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
+from daqsvc.errors.buses import FIELD_OUTSIDE, FIELDS_OVERLAP, LOSS_UNNOTICED, RAW_VALUES
+from daqsvc.errors.machine_file import CONTRADICTION, WRONG_ORDER, WRONG_SCALE
 from daqsvc.settings.buses import Layout, WireRange
 from daqsvc.settings.problems import Finding
 from daqsvc.settings.section import MOST, MOST_CHANNELS, Name, Quantity, Section
@@ -52,13 +54,13 @@ def _not_zero(scale: float) -> float:
         raise PydanticCustomError(
             "zero_scale",
             "would make every sample the same",
-            {"remedy": "write what one count of the raw value is worth, e.g. 0.0005"},
+            {"remedy": "write what one count of the raw value is worth, e.g. 0.0005", "code": WRONG_SCALE},
         )
     if not LEAST_SCALE <= abs(scale) <= LARGEST_SCALE:
         raise PydanticCustomError(
             "scale_size",
             "is what no count of a raw value is worth",
-            {"remedy": "write what one count of the raw value is worth, e.g. 0.0005"},
+            {"remedy": "write what one count of the raw value is worth, e.g. 0.0005", "code": WRONG_SCALE},
         )
     return scale
 
@@ -75,7 +77,10 @@ def _ordered_raw(limits: tuple[float, float]) -> tuple[float, float]:
         raise PydanticCustomError(
             "valid_raw_order",
             "the least raw value that is a measurement must come first, and the largest be another",
-            {"remedy": "write e.g. [-32767, 32767] if -32768 says that there is no value"},
+            {
+                "remedy": "write e.g. [-32767, 32767] if -32768 says that there is no value",
+                "code": WRONG_ORDER,
+            },
         )
     return limits
 
@@ -274,6 +279,7 @@ def packed_room(layout: PackedFields, at: KeyPath) -> Iterator[Finding]:
                 (*at, key),
                 f"{what} would take bytes {start} to {end - 1} of a frame of {layout.frame_length} bytes",
                 _make_room(layout, key, end - start),
+                code=FIELD_OUTSIDE,
             )
     inside = [field for field in fields if field[3] <= layout.frame_length]
     for (_, first, start, end), (key, what, later_start, later_end) in combinations(inside, 2):
@@ -283,6 +289,7 @@ def packed_room(layout: PackedFields, at: KeyPath) -> Iterator[Finding]:
                 f"{what} (bytes {later_start} to {later_end - 1}) would overlap {first} "
                 f"(bytes {start} to {end - 1})",
                 _make_way(layout, key, what, end, later_end - later_start),
+                code=FIELDS_OVERLAP,
             )
 
 
@@ -322,6 +329,7 @@ def valid_raw(channels: Sequence[Channel], at: KeyPath) -> Iterator[Finding]:
                 (*at, index, "valid_raw"),
                 f"does not lie within what {channel.type} can carry, {least:g} to {largest:g}",
                 "write the raw values as the device sends them, before scale and offset",
+                code=RAW_VALUES,
             )
         elif (
             channel.valid_raw is not None
@@ -332,6 +340,7 @@ def valid_raw(channels: Sequence[Channel], at: KeyPath) -> Iterator[Finding]:
                 (*at, index, "valid_raw"),
                 f"has a fraction, which no {channel.type} can carry",
                 "write whole numbers: raw values as the device sends them, before scale and offset",
+                code=RAW_VALUES,
             )
 
 
@@ -343,10 +352,12 @@ def counted(layout: _Counted, at: KeyPath) -> Iterator[Finding]:
             "is missing: it tells what was lost, and what the time of a sample is",
             "say where the device's counter lies; if it sends none, write no_counter = true, and loss is "
             "estimated from the times of arrival",
+            code=LOSS_UNNOTICED,
         )
     elif layout.counter is not None and layout.no_counter:
         yield Finding(
             (*at, "no_counter"),
             "contradicts counter",
             "leave it out if the device counts, else remove counter",
+            code=CONTRADICTION,
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar, cast
 
+from daqsvc.errors.buses import WRONG_LAYOUT
 from daqsvc.settings import registry
 from daqsvc.settings.buses import UnknownBus
 from daqsvc.settings.hooks import contract
@@ -148,7 +149,12 @@ class BusTable(DriverKind):
             return  # its driver is the finding
         if bus is not None and isinstance(bus, self.buses) != isinstance(layout, self.layouts):
             remedy = "correct bus, or describe what comes over it; docs/ has a page for each bus"
-            yield Finding((*at, "layout"), f'is {layout.kind}, and bus "{stream.bus}" is {bus.kind}', remedy)
+            yield Finding(
+                (*at, "layout"),
+                f'is {layout.kind}, and bus "{stream.bus}" is {bus.kind}',
+                remedy,
+                code=WRONG_LAYOUT,
+            )
 
     def describe_bus(self, machine: MachineFile, name: str) -> str:
         """What was understood of a bus, for a person."""

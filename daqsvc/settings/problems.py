@@ -7,9 +7,14 @@ from difflib import get_close_matches
 from itertools import islice
 from typing import TYPE_CHECKING, TypeAlias
 
+from daqsvc.errors.code import with_code
+from daqsvc.errors.machine_file import NAMED_TWICE
+
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
+
+    from daqsvc.errors.code import Code
 
 KeyPath: TypeAlias = tuple[str | int, ...]
 """A place in the file: keys, and 0-based positions in arrays, e.g. ``("sensors", 0, "name")``."""
@@ -28,12 +33,14 @@ class Finding:
         message: what is wrong, to be read after the value.
         remedy: what to do about it.
         fatal: False for a warning.
+        code: of the kind of mistake; None where a plugin from outside has none.
     """
 
     path: KeyPath
     message: str
     remedy: str
     fatal: bool = True
+    code: Code | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +54,7 @@ class Problem:
         value: the value as the file has it; empty if there is none, secrets masked.
         message: what is wrong with it.
         remedy: what to do about it.
+        code: see `Finding`.
     """
 
     file: Path
@@ -55,12 +63,13 @@ class Problem:
     value: str
     message: str
     remedy: str
+    code: Code | None = None
 
     def __str__(self) -> str:
         place = f"{self.file}:{self.line}" if self.line is not None else f"{self.file}"
         subject = f"{self.key} = {self.value}" if self.value else self.key
         middle = f"{subject}: " if subject else ""
-        return f"{place}: {middle}{self.message}. Remedy: {self.remedy}"
+        return with_code(f"{place}: {middle}{self.message}. Remedy: {self.remedy}", self.code)
 
 
 class MachineFileError(Exception):
@@ -79,7 +88,19 @@ class MachineFileError(Exception):
 
 
 class AssemblyError(Exception):
-    """A machine file that is sound by itself asks for something that is not there, or cannot be made."""
+    """A machine file that is sound by itself asks for something that is not there, or cannot be made.
+
+    Args:
+        message: what is wrong, and what to do about it.
+        code: of the kind of mistake; None where a plugin from outside has none.
+    """
+
+    def __init__(self, message: str, *, code: Code | None = None) -> None:
+        super().__init__(message)
+        self.code = code
+
+    def __str__(self) -> str:
+        return with_code(super().__str__(), self.code)
 
 
 def choice(wanted: str, known: Iterable[str]) -> str:
@@ -101,4 +122,5 @@ def unique(names: list[str], at: KeyPath, what: str) -> Iterator[Finding]:
                 (*at, index, "name"),
                 f"is the name of an earlier {what} already",
                 f"give each {what} a name of its own",
+                code=NAMED_TWICE,
             )

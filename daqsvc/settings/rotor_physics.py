@@ -10,6 +10,8 @@ import math
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
+from daqsvc.errors.alarms import NEVER_REACHED
+from daqsvc.errors.machine_file import ROTOR_FIGURES
 from daqsvc.settings.alarms import SetpointAlarm
 from daqsvc.settings.problems import Finding
 from daqsvc.settings.section import UnusableValueError
@@ -77,6 +79,7 @@ def _sag(rotor: Rotor) -> Iterator[Finding]:
             f"lays the shaft on the stator: it would rest {rest:.4g} um from the middle of a clearance of "
             f"{clearance_um:g} um",
             "correct the sag, or the clearance (it is the radial one)",
+            code=ROTOR_FIGURES,
         )
 
 
@@ -95,6 +98,7 @@ def _orbit(draft: MachineFile, rotor: Rotor) -> Iterator[Finding]:
             f"whirl by {whirl:.4g} um about a rest at {rest:.4g} um, in a clearance of "
             f"{clearance_um:g} um",
             remedy,
+            code=ROTOR_FIGURES,
         )
     elif eccentricity_um >= clearance_um:
         yield Finding(
@@ -103,6 +107,7 @@ def _orbit(draft: MachineFile, rotor: Rotor) -> Iterator[Finding]:
             "above, this rotor rubs",
             remedy,
             fatal=False,
+            code=ROTOR_FIGURES,
         )
 
 
@@ -116,6 +121,7 @@ def _running_speed(draft: MachineFile, rotor: Rotor) -> Iterator[Finding]:
             "nothing that it tells shows in the orbit",
             "write it in Hz, and machine.speed_rpm in revolutions a minute",
             fatal=False,
+            code=ROTOR_FIGURES,
         )
 
 
@@ -135,5 +141,6 @@ def _setpoints(draft: MachineFile, rotor: Rotor) -> Iterator[Finding]:
                     f"{rotor.clearance_um:g} um {alarm.measure} is {reach_um:g} um at most",
                     "correct it, or clearance_um (the radial one) of [machine.rotor]",
                     fatal=False,
+                    code=NEVER_REACHED,
                 )
                 break

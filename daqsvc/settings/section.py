@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NoReturn, Self
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ModelWrapValidatorHandler, model_validator
 from pydantic_core import PydanticCustomError, core_schema
 
+from daqsvc.errors.machine_file import BAD_TEXT, PLUGIN_FAILED, WRONG_TYPE
 from daqsvc.settings.failures import failure
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ def _printable(text: str) -> str:
         raise PydanticCustomError(
             "text_not_printable",
             "holds what cannot be printed",
-            {"remedy": "take out line ends, tabs and control characters"},
+            {"remedy": "take out line ends, tabs and control characters", "code": BAD_TEXT},
         )
     return text
 
@@ -87,7 +88,7 @@ class Section(BaseModel):
         except Exception as error:
             said, remedy, _ = failure(error, cls, "a validator")
             raise PydanticCustomError(
-                "validator_failed", "{said}", {"said": said, "remedy": remedy}
+                "validator_failed", "{said}", {"said": said, "remedy": remedy, "code": PLUGIN_FAILED}
             ) from error
 
     if not TYPE_CHECKING:  # a type checker must go on refusing attributes that do not exist
@@ -150,5 +151,5 @@ class Kinds:
         if isinstance(value, Section):
             return value
         if not isinstance(value, dict):
-            raise PydanticCustomError("section_type", "must be a table")
+            raise PydanticCustomError("section_type", "must be a table", {"code": WRONG_TYPE})
         return self.choose(value).model_validate(value)

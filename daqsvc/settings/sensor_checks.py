@@ -6,6 +6,15 @@ import math
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from daqsvc.errors.alarms import NEVER_REACHED
+from daqsvc.errors.machine_file import (
+    BEYOND_CHANNEL,
+    GAP_VOLTAGE,
+    INCOMPLETE,
+    PROBES_IN_LINE,
+    UNLIKELY_SENSITIVITY,
+    WRONG_SCALE,
+)
 from daqsvc.settings.alarms import SetpointAlarm
 from daqsvc.settings.measures import NOT_1X
 from daqsvc.settings.problems import Finding
@@ -57,6 +66,7 @@ def check_voltages(draft: MachineFile, sensor: Sensor, at: KeyPath) -> Iterator[
                 (*at, "zero_v"),
                 "has no effect without sensitivity_mv_per_unit",
                 "add sensitivity_mv_per_unit, or remove zero_v if the channel carries the physical unit",
+                code=INCOMPLETE,
             )
         if probe is not None and probe.gap_ok_v is not None:
             yield Finding(
@@ -64,6 +74,7 @@ def check_voltages(draft: MachineFile, sensor: Sensor, at: KeyPath) -> Iterator[
                 "cannot be checked: without sensitivity_mv_per_unit the gap voltage is not known",
                 "add sensitivity_mv_per_unit and zero_v, and let the channel carry volts; or remove it",
                 fatal=False,
+                code=GAP_VOLTAGE,
             )
         return
     if probe is None:
@@ -74,6 +85,7 @@ def check_voltages(draft: MachineFile, sensor: Sensor, at: KeyPath) -> Iterator[
                 (*at, "gap_ok_v"),
                 "is missing: OK limits of the mean gap voltage, in V",
                 f'add gap_ok_v = [-18.0, -2.0] to the entry "{probe.name}" of sensors, as its manual has it',
+                code=GAP_VOLTAGE,
             )
         return
     low_v, high_v = probe.gap_ok_v
@@ -86,6 +98,7 @@ def check_voltages(draft: MachineFile, sensor: Sensor, at: KeyPath) -> Iterator[
             "shaft belongs",
             "write the gap voltage with the shaft centred, with its sign, e.g. zero_v = "
             f"{(low_v + high_v) / 2:g}; or correct gap_ok_v",
+            code=GAP_VOLTAGE,
         )
     elif _of_a_rotor(draft, probe.name):
         yield Finding(
@@ -93,6 +106,7 @@ def check_voltages(draft: MachineFile, sensor: Sensor, at: KeyPath) -> Iterator[
             "has no zero_v: its position counts from 0 V, far from where the shaft is",
             f"add the gap voltage with the shaft centred, e.g. zero_v = {(low_v + high_v) / 2:g}",
             fatal=False,
+            code=GAP_VOLTAGE,
         )
 
 
@@ -127,6 +141,7 @@ def check_sensitivity(sensor: Sensor, at: KeyPath) -> Iterator[Finding]:
         f"{usual.example:g}",
         "; ".join(meant) or f"write it in mV per {sensor.unit}, from the sensor's calibration sheet",
         fatal=not built,
+        code=UNLIKELY_SENSITIVITY,
     )
 
 
@@ -150,6 +165,7 @@ def check_probe_angles(draft: MachineFile) -> Iterator[Finding]:
             "motion only",
             "correct it, unless the two probes are at different bearings",
             fatal=False,
+            code=PROBES_IN_LINE,
         )
 
 
@@ -168,16 +184,23 @@ def check_reach(
             (*at, "channel"),
             f"is taken in volts, and one count of it would be {wire.step:g} V",
             f"write scale = {wire.step / 1000:g} in the layout if the device counts mV",
+            code=WRONG_SCALE,
         )
     if isinstance(sensor, ProximityProbe) and sensor.sensitivity_mv_per_unit is not None:
         limits = sensor.gap_ok_v
         if limits is not None and (limits[1] < low or high < limits[0]):
             yield Finding(
-                (*at, "gap_ok_v"), f"is never met: the channel carries {low:g} to {high:g} V", remedy
+                (*at, "gap_ok_v"),
+                f"is never met: the channel carries {low:g} to {high:g} V",
+                remedy,
+                code=BEYOND_CHANNEL,
             )
         elif not low <= sensor.zero_v <= high:
             yield Finding(
-                (*at, "zero_v"), f"is never measured: the channel carries {low:g} to {high:g} V", remedy
+                (*at, "zero_v"),
+                f"is never measured: the channel carries {low:g} to {high:g} V",
+                remedy,
+                code=BEYOND_CHANNEL,
             )
     elif isinstance(sensor, TrendValue) and sensor.ok_between is not None:
         least, largest = _in_units(sensor, wire)
@@ -186,6 +209,7 @@ def check_reach(
                 (*at, "ok_between"),
                 f"is never met: the channel carries {least:g} to {largest:g} {sensor.unit}",
                 remedy,
+                code=BEYOND_CHANNEL,
             )
     elif isinstance(sensor, Keyphasor):
         least, largest = _in_units(sensor, wire)
@@ -194,6 +218,7 @@ def check_reach(
                 (*at, "threshold_v"),
                 f"is never crossed: the channel carries {least:g} to {largest:g} V",
                 remedy,
+                code=BEYOND_CHANNEL,
             )
 
 
@@ -223,6 +248,7 @@ def check_alarm_reach(draft: MachineFile, facts: Mapping[str, Any]) -> Iterator[
                                 ("alarms", index, key),
                                 f'is never reached: the channel of "{name}" carries {_range(reach, unit)}',
                                 "correct it, or scale and sensitivity of the channel and its sensor",
+                                code=NEVER_REACHED,
                             )
 
 

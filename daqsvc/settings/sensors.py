@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
+from daqsvc.errors.machine_file import BAD_TEXT, UNLIKELY_SENSITIVITY, WRONG_ORDER
 from daqsvc.settings.section import MOST, AngleDeg, Kinds, Line, Name, Quantity, Section, Volts
 
 TYPE = "what kind of sensor it is"
@@ -20,14 +21,18 @@ def _not_zero(sensitivity_mv_per_unit: float) -> float:
             "cannot be zero",
             {
                 "remedy": "copy the figure from the sensor's calibration sheet, or leave it out if the "
-                "channel already carries the physical unit"
+                "channel already carries the physical unit",
+                "code": UNLIKELY_SENSITIVITY,
             },
         )
     if abs(sensitivity_mv_per_unit) < 1 / MOST:
         raise PydanticCustomError(
             "small_sensitivity",
             "is what no sensor has",
-            {"remedy": "copy the figure from the sensor's calibration sheet, in mV per unit"},
+            {
+                "remedy": "copy the figure from the sensor's calibration sheet, in mV per unit",
+                "code": UNLIKELY_SENSITIVITY,
+            },
         )
     return sensitivity_mv_per_unit
 
@@ -40,7 +45,8 @@ def _ordered(limits: tuple[float, float]) -> tuple[float, float]:
             {
                 "remedy": f"write [{min(limits)}, {max(limits)}]"
                 if limits[0] > limits[1]
-                else "write two different limits, e.g. [-18.0, -2.0]"
+                else "write two different limits, e.g. [-18.0, -2.0]",
+                "code": WRONG_ORDER,
             },
         )
     return limits
@@ -51,7 +57,7 @@ def _printable(unit: str) -> str:
         raise PydanticCustomError(
             "unit_text",
             "is no unit: it holds spaces at an end, or what cannot be printed",
-            {"remedy": 'write e.g. unit = "degC"'},
+            {"remedy": 'write e.g. unit = "degC"', "code": BAD_TEXT},
         )
     return unit
 

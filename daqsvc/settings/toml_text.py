@@ -10,6 +10,7 @@ import re
 import tomllib
 from typing import TYPE_CHECKING, Any
 
+from daqsvc.errors.machine_file import NOT_TOML, NOT_UTF8, TOO_LARGE
 from daqsvc.settings.error_messages import dotted
 from daqsvc.settings.locate import Spot, TooMuchError, locate
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
+    from daqsvc.errors.code import Code
     from daqsvc.settings.problems import KeyPath
 
 MOST_BYTES = 1 << 20
@@ -40,12 +42,14 @@ class TomlTextError(Exception):
 
     Attributes:
         remedy: what to do about it.
+        code: of the kind of mistake.
         line: where, from 1; None if it concerns the text as a whole.
     """
 
-    def __init__(self, message: str, remedy: str, line: int | None = None) -> None:
+    def __init__(self, message: str, remedy: str, code: Code, line: int | None = None) -> None:
         super().__init__(message)
         self.remedy = remedy
+        self.code = code
         self.line = line
 
 
@@ -63,7 +67,7 @@ def decoded(data: bytes, path: Path) -> str:
         what = f"byte {data[error.start]:#04x} at column {column}"
         if data[:2] in {b"\xff\xfe", b"\xfe\xff"}:
             what = "it looks like UTF-16"
-        raise TomlTextError(f"is not UTF-8: {what}", f"save {path.name} as UTF-8", line) from None
+        raise TomlTextError(f"is not UTF-8: {what}", f"save {path.name} as UTF-8", NOT_UTF8, line) from None
 
 
 def parse(text: str) -> tuple[dict[str, Any], Mapping[KeyPath, Spot]]:
@@ -77,12 +81,14 @@ def parse(text: str) -> tuple[dict[str, Any], Mapping[KeyPath, Spot]]:
     """
     text = text.removeprefix("\ufeff")
     if len(text) > MOST_BYTES:
-        raise TomlTextError(f"is larger than {MOST_BYTES / 1e6:.3g} MB", "see whether it is the right file")
+        raise TomlTextError(
+            f"is larger than {MOST_BYTES / 1e6:.3g} MB", "see whether it is the right file", TOO_LARGE
+        )
     if (match := _LONG_KEY.search(text)) is not None:
         raise _too_deep(_line_at(text, match.start()))
     if (match := _LONG_NUMBER.search(text)) is not None:
         raise TomlTextError(
-            "has a number with hundreds of digits", "write a number", _line_at(text, match.start())
+            "has a number with hundreds of digits", "write a number", TOO_LARGE, _line_at(text, match.start())
         )
     try:
         # With its last line ended: else tomllib has no line number for a mistake there.
@@ -97,7 +103,10 @@ def parse(text: str) -> tuple[dict[str, Any], Mapping[KeyPath, Spot]]:
         if error.deep:
             raise _too_deep(error.line) from None
         raise TomlTextError(
-            f"holds more than {MOST_VALUES:,} values", "see whether it is the right file", error.line
+            f"holds more than {MOST_VALUES:,} values",
+            "see whether it is the right file",
+            TOO_LARGE,
+            error.line,
         ) from None
     _check_sizes(document, spots)
     return document, spots
@@ -113,6 +122,7 @@ def _check_sizes(document: dict[str, Any], spots: Mapping[KeyPath, Spot]) -> Non
             raise TomlTextError(
                 f"{subject} {len(value):,} entries: a machine file has at most {MOST_ENTRIES:,} in one place",
                 "see whether it is the right file",
+                TOO_LARGE,
                 spots[path].line,
             )
         if isinstance(value, dict):
@@ -123,6 +133,7 @@ def _check_sizes(document: dict[str, Any], spots: Mapping[KeyPath, Spot]) -> Non
             raise TomlTextError(
                 f"{dotted(path)} is too large for a whole number of TOML (64 bits)",
                 "correct it",
+                TOO_LARGE,
                 spots[path].line,
             )
 
@@ -131,6 +142,7 @@ def _too_deep(line: int | None) -> TomlTextError:
     return TomlTextError(
         f"is nested too deeply: a machine file has at most {MOST_DEPTH} tables and arrays within each other",
         "write fewer brackets inside brackets, and keys with fewer dots",
+        TOO_LARGE,
         line,
     )
 
@@ -160,5 +172,6 @@ def _syntax_error(text: str, reason: str) -> TomlTextError:
     return TomlTextError(
         f"is not valid TOML: {reason}",
         "correct the TOML there: text stands in quotes, tables are [name], values are key = value",
+        NOT_TOML,
         line,
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
+from daqsvc.errors.alarms import UNFIT_ZONES
 from daqsvc.settings.alarms import SetpointAlarm
 from daqsvc.settings.measures import UNITS, VELOCITIES
 from daqsvc.settings.problems import Finding
@@ -72,18 +73,21 @@ def _of_shaft(alarm: SetpointAlarm, zones: Zones, watched: list[Sensor], here: K
             (*here, key),
             "says nothing of the shaft, whose zones follow from machine.speed_rpm alone",
             "remove it, or shaft = true for the zones of the velocity",
+            code=UNFIT_ZONES,
         )
     elif stranger is not None:
         yield Finding(
             (*here, "shaft"),
             f'needs proximity probes, but "{stranger.name}" is {stranger.kind}',
             'write group and support in place of it, with measure = "velocity_rms"',
+            code=UNFIT_ZONES,
         )
     elif alarm.measure != "peak_to_peak":
         yield Finding(
             (*here, "shaft"),
             f"are zones of the displacement from peak to peak, not of {alarm.measure}",
             'write measure = "peak_to_peak", or setpoints in place of zones',
+            code=UNFIT_ZONES,
         )
 
 
@@ -97,6 +101,7 @@ def _of_housing(
             here,
             f'are those of the velocity of a housing, but "{probes[0].name}" is {probes[0].kind}',
             'write zones = { standard = "iso-20816-3", shaft = true }',
+            code=UNFIT_ZONES,
         )
     elif alarm.measure not in VELOCITIES and not (alarm.measure == "value" and watched and not others):
         what = f'"{others[0].name}" is in {others[0].unit}' if others else f"{alarm.measure} is none"
@@ -104,6 +109,7 @@ def _of_housing(
             here,
             f"are those of a velocity in mm/s, but {what}",
             'write measure = "velocity_rms", or setpoints in place of zones',
+            code=UNFIT_ZONES,
         )
     elif zones.group is None or zones.support is None:
         lacks = [key for key in ("group", "support") if getattr(zones, key) is None]
@@ -112,4 +118,5 @@ def _of_housing(
             f"lack {' and '.join(lacks)}: the zones of the velocity are other ones for each class of machine",
             'write e.g. { standard = "iso-20816-3", group = 2, support = "rigid" }, or shaft = true with '
             "proximity probes",
+            code=UNFIT_ZONES,
         )

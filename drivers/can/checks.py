@@ -6,6 +6,17 @@ from contextlib import suppress
 from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
+from daqsvc.errors.buses import (
+    BUS_TOO_SLOW,
+    CAN_ID,
+    FRAME_LENGTH,
+    NO_SUCH_INTERFACE,
+    NOT_IN_ONE_FRAME,
+    NOT_TOLD_APART,
+    TOO_LITTLE_KEPT,
+    UNFIT_COUNTER,
+)
+from daqsvc.errors.machine_file import CONTRADICTION, NAMED_TWICE, NO_EFFECT, WRONG_SCALE
 from daqsvc.settings.buses import BUSY
 from daqsvc.settings.packing import counted, packed_room, valid_raw
 from daqsvc.settings.problems import Finding, choice
@@ -106,12 +117,14 @@ def check_plain_layout(layout: PlainLayout, at: KeyPath) -> Iterator[Finding]:
             (*at, "id"),
             "does not fit into 11 bits (0x7ff)",
             "write extended = true if the device sends 29-bit ids, else correct the id",
+            code=CAN_ID,
         )
     if layout.any_priority and not layout.extended:
         yield Finding(
             (*at, "any_priority"),
             "cannot be with an id of 11 bits: it has no priority to leave out",
             "write extended = true, since all ids of SAE J1939 have 29 bits; else leave any_priority out",
+            code=CAN_ID,
         )
     yield from packed_room(layout, at)
     yield from valid_raw(layout.channels, (*at, "channels"))
@@ -128,6 +141,7 @@ def check_signals(layout: DbcLayout, at: KeyPath) -> Iterator[Finding]:
                 f"has {len(channel.signals)} samples in a frame, but channel "
                 f'"{layout.channels[0].name}" has {layout.samples_per_frame}',
                 "name as many signals for every channel of the stream",
+                code=NOT_IN_ONE_FRAME,
             )
         for place, signal in enumerate(channel.signals):
             if signal in taken:
@@ -135,6 +149,7 @@ def check_signals(layout: DbcLayout, at: KeyPath) -> Iterator[Finding]:
                     (*path, place),
                     f"is taken by {taken[signal]} already",
                     "name each signal once",
+                    code=NAMED_TWICE,
                 )
             taken[signal] = f'channel "{channel.name}"'
 
@@ -153,6 +168,7 @@ def check_frame_length(
             f"has {facts.length} bytes: only CAN FD carries more than 8, "
             f'and bus "{stream.bus}" is classic CAN',
             f"write fd = true in [buses.{stream.bus}], or make the frame 8 bytes or shorter",
+            code=FRAME_LENGTH,
         )
 
 
@@ -170,6 +186,7 @@ def check_bus_load(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> It
                 ("buses", bus, "bitrate"),
                 f"is too slow: the streams on the bus would take it {100 * load:,.0f} % of the time at least",
                 remedy,
+                code=BUS_TOO_SLOW,
             )
         elif load > BUSY:
             yield Finding(
@@ -178,6 +195,7 @@ def check_bus_load(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> It
                 f"bits, {100 * most:.0f} % with the most there can be; frames of low priority come late",
                 remedy,
                 fatal=False,
+                code=BUS_TOO_SLOW,
             )
 
 
@@ -195,6 +213,7 @@ def check_counter(stream: Stream, message: DbcMessage | None, at: KeyPath) -> It
             f"frames, and tells nothing of what was lost",
             f"name a counter of {LEAST_COUNTER_BITS} bits or more; if the device sends none, write "
             "no_counter = true in its place, and loss is estimated from the times of arrival",
+            code=UNFIT_COUNTER,
         )
         return
     step = facts.samples_per_frame if facts.counts_samples else 1
@@ -204,6 +223,7 @@ def check_counter(stream: Stream, message: DbcMessage | None, at: KeyPath) -> It
             f"a counter of {facts.counter_bits} bits cannot tell frames of {step} samples apart: it wraps "
             "within four of them",
             'have the device send a wider counter, or count "frames"',
+            code=UNFIT_COUNTER,
         )
         return
     per_count = 1 if facts.counts_samples else facts.samples_per_frame
@@ -215,6 +235,7 @@ def check_counter(stream: Stream, message: DbcMessage | None, at: KeyPath) -> It
             f"{stream.rate_hz:g} Hz: the loss in a longer gap is estimated from the host clock",
             'have the device send a wider counter, or count "frames"',
             fatal=False,
+            code=UNFIT_COUNTER,
         )
 
 
@@ -235,6 +256,7 @@ def check_ids(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterato
                     ("streams", name, "layout", key),
                     f'id {facts.frame_id:#x} on bus "{stream.bus}" belongs to stream "{owner}" already',
                     "give each stream of a bus an id of its own, as the devices send it",
+                    code=NOT_TOLD_APART,
                 )
 
 
@@ -259,12 +281,14 @@ def check_interfaces(draft: MachineFile) -> Iterator[Finding]:
                     ("buses", name, "interface"),
                     "python-can knows no such interface",
                     f"{choice(bus.interface, BACKENDS)}; or install the python-can plugin that brings it",
+                    code=NO_SUCH_INTERFACE,
                 )
             elif isinstance(bus, CanBus) and bus.interface == "socketcan" and bus.options:
                 yield Finding(
                     ("buses", name, "options"),
                     "mean nothing to SocketCAN",
                     f"remove {', '.join(bus.options)}; set the interface up by `ip link set {bus.channel}`",
+                    code=NO_EFFECT,
                 )
 
 
@@ -281,12 +305,14 @@ def check_can_keys(draft: MachineFile) -> Iterator[Finding]:
                     "has no effect on classic CAN",
                     "write fd = true if CAN FD frames are on the bus, or remove it",
                     fatal=False,
+                    code=NO_EFFECT,
                 )
             elif bus.data_bitrate is not None and bus.bitrate is not None and bus.data_bitrate < bus.bitrate:
                 yield Finding(
                     (*at, "data_bitrate"),
                     f"is less than bitrate = {bus.bitrate:,}, and the data of CAN FD never go slower",
                     "swap the two, or correct one of them",
+                    code=CONTRADICTION,
                 )
             if bus.interface == "socketcan":
                 continue
@@ -297,6 +323,7 @@ def check_can_keys(draft: MachineFile) -> Iterator[Finding]:
                         f'has no effect with interface "{bus.interface}", only with SocketCAN',
                         "remove it",
                         fatal=False,
+                        code=NO_EFFECT,
                     )
 
 
@@ -309,6 +336,7 @@ def check_recorded_buses(draft: MachineFile) -> Iterator[Finding]:
                     ("buses", name, "record", "keep_mb"),
                     f"keeps no finished file beside the one being written, of up to {bus.record.file_mb} MB",
                     f"keep {2 * bus.record.file_mb} MB or more, or write smaller files (file_mb)",
+                    code=TOO_LITTLE_KEPT,
                 )
 
 
@@ -338,6 +366,7 @@ def check_dbc_unit(
             else f"{statement}: wrong by a factor of {max(factor, 1 / factor):.4g}",
             _unit_remedy(sensor, unit, factor),
             fatal=known,
+            code=WRONG_SCALE,
         )
         return
 

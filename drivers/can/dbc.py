@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daqsvc.errors.buses import DBC_FILE, DBC_SIGNAL, NOT_IN_ONE_FRAME, UNFIT_COUNTER
+from daqsvc.errors.machine_file import NO_SUCH_NAME
 from daqsvc.settings.files import UnreadableFileError, read_bounded, shortened
 from daqsvc.settings.packing import LARGEST_SCALE, LEAST_SCALE
 from daqsvc.settings.problems import Finding, choice
@@ -149,7 +151,12 @@ def check_dbc(layout: DbcLayout, file: Path, at: KeyPath) -> tuple[DbcMessage | 
     messages = {message.name: message for message in database.messages}
     if layout.message not in messages:
         return None, [
-            Finding((*at, "message"), f"{file} has no such message", choice(layout.message, messages))
+            Finding(
+                (*at, "message"),
+                f"{file} has no such message",
+                choice(layout.message, messages),
+                code=NO_SUCH_NAME,
+            )
         ]
     message = messages[layout.message]
     facts = DbcMessage(
@@ -194,7 +201,9 @@ def _database(file: Path, at: KeyPath) -> Database | Finding:
     try:
         from cantools.database import can, load_string  # noqa: PLC0415 - an extra, and slow to import
     except ImportError:
-        return Finding(here, "needs cantools, which is not installed", "pip install 'daqsvc[dbc]'")
+        return Finding(
+            here, "needs cantools, which is not installed", "pip install 'daqsvc[dbc]'", code=DBC_FILE
+        )
     try:
         data = read_bounded(file, MOST_DBC_BYTES)
     except UnreadableFileError as error:
@@ -204,8 +213,9 @@ def _database(file: Path, at: KeyPath) -> Database | Finding:
                 here,
                 f"there is no file {file}",
                 "correct the path; a relative one starts at the directory of the machine file",
+                code=DBC_FILE,
             )
-        return Finding(here, f"{file} {error}", remedy)
+        return Finding(here, f"{file} {error}", remedy, code=DBC_FILE)
     text = data.decode("cp1252", "replace")
     try:
         _see_sizes(text)
@@ -216,9 +226,10 @@ def _database(file: Path, at: KeyPath) -> Database | Finding:
             here,
             f"{file} cannot be read as a DBC file: {reason}",
             "open it in the tool it came from and export it as DBC again",
+            code=DBC_FILE,
         )
     if not isinstance(database, can.Database):
-        return Finding(here, f"{file} describes no CAN messages", "give another DBC file")
+        return Finding(here, f"{file} describes no CAN messages", "give another DBC file", code=DBC_FILE)
     return database
 
 
@@ -274,7 +285,9 @@ def _signal_findings(layout: DbcLayout, message: Message, at: KeyPath) -> Iterat
     asked = _asked(layout, at)
     for path, name in asked:
         if name not in signals:
-            yield Finding(path, f'message "{message.name}" has no such signal', choice(name, signals))
+            yield Finding(
+                path, f'message "{message.name}" has no such signal', choice(name, signals), code=NO_SUCH_NAME
+            )
     names = [name for _, name in asked]
     if not all(_pages(message, names).values()):
         yield Finding(
@@ -282,6 +295,7 @@ def _signal_findings(layout: DbcLayout, message: Message, at: KeyPath) -> Iterat
             f'no frame of message "{message.name}" holds all of {", ".join(names)}: they are on different '
             "pages of its multiplexer",
             "make a stream for each page, with a counter that is on it",
+            code=NOT_IN_ONE_FRAME,
         )
     if layout.counter is not None and layout.counter.signal in signals:
         yield from _counter(signals[layout.counter.signal], (*at, "counter", "signal"))
@@ -298,6 +312,7 @@ def _counter(counter: Signal, at: KeyPath) -> Iterator[Finding]:
             at,
             "is signed or a float; a counter runs from 0 upwards and wraps",
             "name the signal that counts, or declare it unsigned (@1+) in the DBC file",
+            code=UNFIT_COUNTER,
         )
     elif counter.scale != 1:
         yield Finding(
@@ -305,6 +320,7 @@ def _counter(counter: Signal, at: KeyPath) -> Iterator[Finding]:
             f"has the scale {counter.scale:g} in the DBC file: the raw value is counted, and one count of it "
             "would then be something else than a frame or a sample",
             "name a signal that grows by 1; if this one does, write (1,0) in the DBC file",
+            code=UNFIT_COUNTER,
         )
     elif counter.maximum is not None:
         largest, all_ones = float(counter.maximum) - float(counter.offset), 2**counter.length - 1
@@ -316,6 +332,7 @@ def _counter(counter: Signal, at: KeyPath) -> Iterator[Finding]:
                 "see what the device sends: if it ends there, write no_counter = true in place of counter, "
                 "else correct the range in the DBC file",
                 fatal=False,
+                code=UNFIT_COUNTER,
             )
 
 
@@ -326,6 +343,7 @@ def _place(signal: Signal, length: int, at: KeyPath) -> Iterator[Finding]:
             at,
             f"does not lie within the {length} bytes of its message in the DBC file",
             "correct the signal, or the length of the message, in the DBC file",
+            code=DBC_SIGNAL,
         )
     if at[-2] == "signals":
         yield from _scale(signal, at)
@@ -346,20 +364,26 @@ def _scale(signal: Signal, at: KeyPath) -> Iterator[Finding]:
             at,
             "has the scale 0 in the DBC file, which would make every sample the same",
             "write in the DBC file what one count of the raw value is worth, e.g. (0.0005,0)",
+            code=DBC_SIGNAL,
         )
     elif not LEAST_SCALE <= abs(scale) <= LARGEST_SCALE or not abs(offset) <= LARGEST_SCALE:
         yield Finding(
             at,
             f"has the scale {scale:g} and the offset {offset:g} in the DBC file, which no quantity has",
             "write in the DBC file what one count of the raw value is worth, e.g. (0.0005,0)",
+            code=DBC_SIGNAL,
         )
     if signal.is_float and signal.length not in {32, 64}:
         yield Finding(
             at,
             f"is a float of {signal.length} bits in the DBC file, and there is none",
             "correct its length to 32 or 64, or its type (SIG_VALTYPE_), in the DBC file",
+            code=DBC_SIGNAL,
         )
     elif not 1 <= signal.length <= 64:
         yield Finding(
-            at, f"has {signal.length} bits in the DBC file", "correct its length there: a number has 1 to 64"
+            at,
+            f"has {signal.length} bits in the DBC file",
+            "correct its length there: a number has 1 to 64",
+            code=DBC_SIGNAL,
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from daqsvc.errors.buses import WRONG_LAYOUT
 from daqsvc.settings.buses import percent
 from daqsvc.settings.plugins import StreamWords
 from daqsvc.settings.problems import AssemblyError
@@ -178,4 +179,4 @@ def frame_layout(machine: MachineFile, stream: str) -> FrameLayout:
             extended=layout.extended,
             any_priority=layout.any_priority,
         )
-    raise AssemblyError(f"{machine.path}: stream {stream!r} does not come in CAN frames")
+    raise AssemblyError(f"{machine.path}: stream {stream!r} does not come in CAN frames", code=WRONG_LAYOUT)

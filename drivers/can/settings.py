@@ -9,6 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
+from daqsvc.errors.buses import FRAME_LENGTH
 from daqsvc.settings.buses import Bus, Device, Layout, WireRange
 from daqsvc.settings.files import FilePath  # noqa: TC001 - pydantic reads the annotations
 from daqsvc.settings.packing import NO_COUNTER, VALID_RAW, Channel, Counter, Counts, PackedFields, ValidRaw
@@ -23,7 +24,10 @@ def _payload_length(length: int) -> int:
         raise PydanticCustomError(
             "payload_length",
             "is not a length that a CAN frame can have",
-            {"remedy": "take 0 to 8 (classic CAN), or 12, 16, 20, 24, 32, 48 or 64 (CAN FD)"},
+            {
+                "remedy": "take 0 to 8 (classic CAN), or 12, 16, 20, 24, 32, 48 or 64 (CAN FD)",
+                "code": FRAME_LENGTH,
+            },
         )
     return length
 

@@ -8,6 +8,17 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import TYPE_CHECKING, NamedTuple
 
+from daqsvc.errors.buses import (
+    BITS,
+    BUS_TOO_SLOW,
+    FORBIDDEN_REGISTERS,
+    NO_ROOM_FOR_REGISTERS,
+    REGISTERS_OVERLAP,
+    UNIT_ADDRESS,
+    WRITE_NOT_ALLOWED,
+    WRONG_LAYOUT,
+)
+from daqsvc.errors.machine_file import WRONG_ORDER
 from daqsvc.settings.buses import BUSY
 from daqsvc.settings.problems import Finding
 from daqsvc.settings.section import UnusableValueError
@@ -46,12 +57,14 @@ def check_modbus(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[Fi
                 (*at, "layout"),
                 "is not one of registers, and its bus is a Modbus line",
                 'write way = "registers", "fifo", "ring" or "waveform", and unit',
+                code=WRONG_LAYOUT,
             )
         elif isinstance(layout, _LAYOUTS) and bus is not None:
             yield Finding(
                 (*at, "layout"),
                 f'is one of registers, but bus "{stream.bus}" is no Modbus line',
                 'correct bus, or write driver = "modbus" and transport in its table',
+                code=WRONG_LAYOUT,
             )
         return
     if not isinstance(layout, _LAYOUTS) or not isinstance(bus, _BUSES):
@@ -59,7 +72,10 @@ def check_modbus(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[Fi
     path: KeyPath = (*at, "layout")
     if isinstance(bus, ModbusRtuBus) and not 1 <= layout.unit <= 247:
         yield Finding(
-            (*path, "unit"), "is no address of a unit on a serial line", "take 1 to 247, as set in the unit"
+            (*path, "unit"),
+            "is no address of a unit on a serial line",
+            "take 1 to 247, as set in the unit",
+            code=UNIT_ADDRESS,
         )
     yield from _check_bits(layout, path)
     yield from check_channel_overlaps(layout, path)
@@ -81,6 +97,7 @@ def check_line_load(draft: MachineFile) -> Iterator[Finding]:
                     ("buses", name, "baud"),
                     f"is too slow: {asked} at least, with units that answer at once",
                     remedy,
+                    code=BUS_TOO_SLOW,
                 )
             elif load.usual > BUSY:
                 yield Finding(
@@ -90,6 +107,7 @@ def check_line_load(draft: MachineFile) -> Iterator[Finding]:
                     "holds all others up",
                     remedy,
                     fatal=False,
+                    code=BUS_TOO_SLOW,
                 )
 
 
@@ -108,6 +126,7 @@ def _check_bits(layout: ModbusLayout, path: KeyPath) -> Iterator[Finding]:
                 (*path, "channels", index, "bits"),
                 f"are no part of {channel.type}",
                 "write [lowest bit, number of bits] of an unsigned type that holds them, e.g. [0, 4]",
+                code=BITS,
             )
 
 
@@ -123,6 +142,7 @@ def _check_room(layout: ModbusLayout, path: KeyPath) -> Iterator[Finding]:
             (*path, "channels"),
             f"take {width} registers a sample, and a reply has room for {room}",
             "leave out channels, or read them in another way",
+            code=NO_ROOM_FOR_REGISTERS,
         )
     if isinstance(layout, RingLayout):
         end = layout.address + layout.depth * width
@@ -131,6 +151,7 @@ def _check_room(layout: ModbusLayout, path: KeyPath) -> Iterator[Finding]:
                 (*path, "depth"),
                 f"is more than half of what a count of {layout.count.bits} bits can tell",
                 "write count = { ..., bits = 32 }, if the device has it",
+                code=NO_ROOM_FOR_REGISTERS,
             )
     elif isinstance(layout, WaveformLayout):
         registers = layout.samples * width if layout.page is None else layout.page.registers
@@ -142,19 +163,26 @@ def _check_room(layout: ModbusLayout, path: KeyPath) -> Iterator[Finding]:
             (*path, "address"),
             f"leaves no room: the samples would end at register {end - 1}, beyond {ADDRESSES - 1}",
             "correct the address, or the number of samples",
+            code=NO_ROOM_FOR_REGISTERS,
         )
 
 
 def _check_forbidden(layout: RegistersLayout, path: KeyPath) -> Iterator[Finding]:
     for index, (first, last) in enumerate(layout.forbidden):
         if first > last:
-            yield Finding((*path, "forbidden", index), "ends before it begins", f"write [{last}, {first}]")
+            yield Finding(
+                (*path, "forbidden", index),
+                "ends before it begins",
+                f"write [{last}, {first}]",
+                code=WRONG_ORDER,
+            )
         for place, channel in enumerate(layout.channels):
             if channel.address <= last and first < channel.address + channel.registers:
                 yield Finding(
                     (*path, "channels", place, "address"),
                     f"lies in the forbidden registers {first} to {last}",
                     "leave out the channel, or narrow the forbidden range",
+                    code=FORBIDDEN_REGISTERS,
                 )
 
 
@@ -176,6 +204,7 @@ def _check_writes(
                 f'would have to be written, and bus "{name}" does not allow it',
                 f"add {{ unit = {layout.unit}, address = {address}, count = {count} }} to writes in "
                 f"[buses.{name}]",
+                code=WRITE_NOT_ALLOWED,
             )
 
 
@@ -231,6 +260,7 @@ def _clash(
         f"correct the two: {one.type} takes {one.registers} register{'s' if one.registers > 1 else ''}, "
         f"so the next number begins at {end} or later",
         fatal=not whole and (floats or not within),
+        code=REGISTERS_OVERLAP,
     )
 
 
@@ -279,6 +309,7 @@ def _among_samples(control: _Block, name: str, samples: Sequence[tuple[str, _Blo
                 f"register {control.first} is {control.what}, but lies among {whose}, registers "
                 f"{block.first} to {block.last}",
                 _REMEDY,
+                code=REGISTERS_OVERLAP,
             )
             return
 
@@ -290,6 +321,7 @@ def _twice(control: _Block, others: Sequence[_Block]) -> Iterator[Finding]:
                 control.path,
                 f"register {control.first} is {other.what} already, and cannot be {control.what} too",
                 _REMEDY,
+                code=REGISTERS_OVERLAP,
             )
             return
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeAlias
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
+from daqsvc.errors.buses import RING_DEPTH
 from daqsvc.settings.addresses import DevicePath, Host, serial_port
 from daqsvc.settings.buses import Block, Bus, Device, Layout, WireRange
 from daqsvc.settings.packing import Scale  # noqa: TC001 - pydantic reads the annotations
@@ -55,7 +56,7 @@ def _power_of_two(depth: int) -> int:
         raise PydanticCustomError(
             "ring_depth",
             "is not a power of two: where a sample lies would not be known once the counter wraps",
-            {"remedy": f"set the device to {below} or {2 * below} places"},
+            {"remedy": f"set the device to {below} or {2 * below} places", "code": RING_DEPTH},
         )
     return depth
 

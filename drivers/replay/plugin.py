@@ -5,6 +5,8 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from daqsvc.errors.buses import NOT_PLAYABLE, WRONG_LAYOUT
+from daqsvc.errors.machine_file import NO_EFFECT, WRONG_SCALE
 from daqsvc.recording.formats import CAN_LOGS, named_as_can_log
 from daqsvc.settings.problems import Finding
 from daqsvc.settings.section import UnusableValueError
@@ -68,7 +70,9 @@ def check_replay_buses(draft: MachineFile) -> Iterator[Finding]:
             file = draft.resolve(bus.file)
             if file.exists() and not file.is_file():
                 what = "a folder" if file.is_dir() else "a pipe or a device"
-                yield Finding(("buses", name, "file"), f"is no file but {what}", "name a file")
+                yield Finding(
+                    ("buses", name, "file"), f"is no file but {what}", "name a file", code=NOT_PLAYABLE
+                )
             else:
                 yield from _check_format(bus, ("buses", name))
             if bus.at_end == "wait" and bus.file.suffix.lower() != ".log":
@@ -76,6 +80,7 @@ def check_replay_buses(draft: MachineFile) -> Iterator[Finding]:
                     ("buses", name, "at_end"),
                     f"{bus.file.name} cannot be read while it is written: only a candump log (.log) can",
                     'write at_end = "stop" or "loop", or have a candump log written',
+                    code=NOT_PLAYABLE,
                 )
 
 
@@ -85,16 +90,21 @@ def _check_format(bus: ReplayBus, at: KeyPath) -> Iterator[Finding]:
             (*at, "file"),
             "is a data base, which cannot be played",
             f"make a BLF of it: can_logconvert {bus.file.name} {bus.file.stem}.blf",
+            code=NOT_PLAYABLE,
         )
     elif not (bus.is_table or named_as_can_log(bus.file)) and (remedy := _unknown_format(bus.file)):
         yield Finding(
-            (*at, "file"), "has an ending that no reader is known for, so that it cannot be played", remedy
+            (*at, "file"),
+            "has an ending that no reader is known for, so that it cannot be played",
+            remedy,
+            code=NOT_PLAYABLE,
         )
     if bus.is_table and bus.channel is not None:
         yield Finding(
             (*at, "channel"),
             f"means nothing to a table of samples, which {bus.file.name} is",
             "remove it; the columns are named in the layouts of the streams",
+            code=NO_EFFECT,
         )
 
 
@@ -119,6 +129,7 @@ def check_replayed(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[
                 (*at, "layout", "columns"),
                 f'bus "{stream.bus}" has no columns: only the replay of a table has ({TABLES})',
                 "describe the frames of the bus, or correct the bus of the stream",
+                code=WRONG_LAYOUT,
             )
         for index, column in enumerate(layout.columns):
             if column.scale == 0:
@@ -126,6 +137,7 @@ def check_replayed(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[
                     (*at, "layout", "columns", index, "scale"),
                     "would make every sample the same",
                     "write what the value 1 is worth, e.g. 0.001",
+                    code=WRONG_SCALE,
                 )
     elif table or (isinstance(bus, ReplayBus) and not isinstance(layout, PlainLayout | DbcLayout)):
         wanted = "columns of a table" if table else "CAN frames"
@@ -133,4 +145,5 @@ def check_replayed(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[
             (*at, "layout"),
             f'bus "{stream.bus}" replays {wanted}, and this describes something else',
             "write columns = [{ name = ..., column = ... }]" if table else "describe the frames of the log",
+            code=WRONG_LAYOUT,
         )

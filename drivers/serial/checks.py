@@ -7,6 +7,16 @@ from contextlib import suppress
 from itertools import combinations
 from typing import TYPE_CHECKING
 
+from daqsvc.errors.buses import (
+    BUS_TOO_SLOW,
+    FIELD_OUTSIDE,
+    FIELDS_OVERLAP,
+    LOSS_UNNOTICED,
+    NOT_TOLD_APART,
+    PORT_MAY_CHANGE,
+    WRONG_LAYOUT,
+)
+from daqsvc.errors.machine_file import CONTRADICTION, INCOMPLETE, NAMED_TWICE, NO_EFFECT, NO_SUCH_NAME
 from daqsvc.settings.buses import BUSY
 from daqsvc.settings.problems import Finding, choice
 from daqsvc.settings.section import UnusableValueError
@@ -33,6 +43,7 @@ def check_serial(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[Fi
                 path,
                 f'is no layout of a line, and bus "{stream.bus}" carries lines',
                 'write line = ["seq", "x"], the names of the columns',
+                code=WRONG_LAYOUT,
             )
             return
         if layout.separator == bus.delimiter:
@@ -40,6 +51,7 @@ def check_serial(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[Fi
                 (*path, "separator"),
                 f'is the delimiter of bus "{stream.bus}" too',
                 "correct one of them, as the device sends it",
+                code=CONTRADICTION,
             )
     elif isinstance(bus, CobsBus | SyncBus):
         if not isinstance(layout, SerialLayout):
@@ -47,6 +59,7 @@ def check_serial(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[Fi
                 path,
                 f'is no layout of a binary serial frame, and bus "{stream.bus}" carries such frames',
                 "write payload_length (and stream_id if stream_ids = true) in place of id and length",
+                code=WRONG_LAYOUT,
             )
             return
         yield from _check_id(bus, stream.bus, layout, path)
@@ -55,6 +68,7 @@ def check_serial(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[Fi
             path,
             f'is one of a serial port, but bus "{stream.bus}" is none',
             'correct bus, or write driver = "serial", port, baud and framing in its table',
+            code=WRONG_LAYOUT,
         )
         return
     if isinstance(layout, LineLayout):
@@ -75,6 +89,7 @@ def check_serial_ports(draft: MachineFile) -> Iterator[Finding]:
                     "may be another device once a port has been re-plugged",
                     "write its path below /dev/serial/by-id (ls -l /dev/serial/by-id)",
                     fatal=False,
+                    code=PORT_MAY_CHANGE,
                 )
             yield from _check_streams(draft, name, bus)
 
@@ -85,12 +100,14 @@ def _check_id(bus: CobsBus | SyncBus, name: str, layout: SerialLayout, path: Key
             (*path, "stream_id"),
             f'is missing: frames on bus "{name}" begin with the id of their stream',
             f"add stream_id = 1, as the device sends it, or write stream_ids = false in [buses.{name}]",
+            code=INCOMPLETE,
         )
     if not bus.stream_ids and layout.stream_id is not None:
         yield Finding(
             (*path, "stream_id"),
             f'has no effect: bus "{name}" carries no stream ids',
             f"write stream_ids = true in [buses.{name}], or remove it",
+            code=NO_EFFECT,
         )
 
 
@@ -106,6 +123,7 @@ def _check_room(layout: SerialLayout, path: KeyPath) -> Iterator[Finding]:
                 (*path, key),
                 f"{what} would take bytes {start} to {end - 1} of a payload of {layout.payload_length} bytes",
                 f"write payload_length = {end} or more, or fewer samples_per_frame",
+                code=FIELD_OUTSIDE,
             )
     for (_, first, _, end), (key, what, later, later_end) in combinations(
         sorted(fields, key=lambda f: f[2]), 2
@@ -115,6 +133,7 @@ def _check_room(layout: SerialLayout, path: KeyPath) -> Iterator[Finding]:
                 (*path, key),
                 f"{what} (bytes {later} to {later_end - 1}) would overlap {first} (up to byte {end - 1})",
                 f"move {what} to byte {end} or behind, as the device sends it",
+                code=FIELDS_OVERLAP,
             )
 
 
@@ -127,6 +146,7 @@ def _check_columns(layout: LineLayout, path: KeyPath) -> Iterator[Finding]:
                 (*path, "line", place),
                 "is the name of an earlier column already",
                 "give each column its own name",
+                code=NAMED_TWICE,
             )
         seen.add(name)
     if layout.counter is None and layout.time is None:
@@ -134,17 +154,22 @@ def _check_columns(layout: LineLayout, path: KeyPath) -> Iterator[Finding]:
             path,
             "has neither counter nor time: lost lines would not be noticed",
             'add counter = { column = "seq" } or time = { column = "t", unit = "ms" }, whichever it sends',
+            code=LOSS_UNNOTICED,
         )
     if layout.counter is not None and layout.time is not None:
         yield Finding(
             (*path, "time"),
             "has no effect beside counter, which tells loss exactly",
             "remove time; its column may stay in line",
+            code=NO_EFFECT,
         )
     for key, part in (("counter", layout.counter), ("time", layout.time)):
         if part is not None and part.column not in layout.line:
             yield Finding(
-                (*path, key, "column"), "the line has no such column", choice(part.column, layout.line)
+                (*path, key, "column"),
+                "the line has no such column",
+                choice(part.column, layout.line),
+                code=NO_SUCH_NAME,
             )
     for index, channel in enumerate(layout.channels):
         if channel.name not in layout.line:
@@ -152,6 +177,7 @@ def _check_columns(layout: LineLayout, path: KeyPath) -> Iterator[Finding]:
                 (*path, "channels", index, "name"),
                 "the line has no such column",
                 choice(channel.name, layout.line),
+                code=NO_SUCH_NAME,
             )
 
 
@@ -179,6 +205,7 @@ def _check_streams(draft: MachineFile, name: str, bus: SerialBus) -> Iterator[Fi
                     ("streams", key, "layout", what),
                     f'does not tell this stream from "{owner}" on the same port',
                     f"give each stream of a port {where} of its own, as the device sends it",
+                    code=NOT_TOLD_APART,
                 )
             owners[mark] = key
             characters_per_s += stream.rate_hz / layout.samples_per_frame * _least_characters(bus, layout)
@@ -191,6 +218,7 @@ def _check_streams(draft: MachineFile, name: str, bus: SerialBus) -> Iterator[Fi
             f"{needed:,.0f} bit/s at least, {100 * needed / bus.baud:,.0f} % of it",
             "correct the rates of the streams, or set port and device to a faster rate",
             fatal=not fits,
+            code=BUS_TOO_SLOW,
         )
 
 

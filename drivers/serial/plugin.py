@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from daqsvc.errors.buses import WRONG_LAYOUT
 from daqsvc.settings.problems import AssemblyError
 from drivers.frames import FrameLayout
 from drivers.plugin import DriverPlugin, in_units, packed, raw_limits
@@ -50,7 +51,9 @@ class SerialPlugin(DriverPlugin[SerialBus]):
         if isinstance(layout, LineLayout):
             return layout
         if not isinstance(layout, SerialLayout):
-            raise AssemblyError(f"{machine.path}: stream {stream!r} does not come over a serial port")
+            raise AssemblyError(
+                f"{machine.path}: stream {stream!r} does not come over a serial port", code=WRONG_LAYOUT
+            )
         return FrameLayout.plain(
             frame_id=layout.stream_id or 0,
             length=layout.payload_length,

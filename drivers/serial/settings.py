@@ -7,6 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
+from daqsvc.errors.machine_file import BAD_TEXT
 from daqsvc.settings.addresses import DevicePath, serial_port
 from daqsvc.settings.buses import Bus, Device, Layout, WireRange
 from daqsvc.settings.packing import (
@@ -31,7 +32,7 @@ def _sync_word(text: str) -> str:
         raise PydanticCustomError(
             "sync_word",
             f"is not 1 to {LONGEST_SYNC_WORD} bytes in hexadecimal",
-            {"remedy": 'write the bytes that each frame begins with, e.g. "a55a"'},
+            {"remedy": 'write the bytes that each frame begins with, e.g. "a55a"', "code": BAD_TEXT},
         )
     return text
 
@@ -41,7 +42,7 @@ def _separator(text: str) -> str:
         raise PydanticCustomError(
             "separator",
             "cannot stand between numbers",
-            {"remedy": 'write the character that the device puts there, e.g. "," or ";"'},
+            {"remedy": 'write the character that the device puts there, e.g. "," or ";"', "code": BAD_TEXT},
         )
     return text
 
@@ -51,7 +52,7 @@ def _delimiter(text: str) -> str:
         raise PydanticCustomError(
             "delimiter",
             "cannot stand at the end of a line",
-            {"remedy": r'write the character that the device puts there, e.g. "\n" or ";"'},
+            {"remedy": r'write the character that the device puts there, e.g. "\n" or ";"', "code": BAD_TEXT},
         )
     return text
 

@@ -314,6 +314,7 @@ def test_a_copy_of_a_store_that_belongs_to_root_is_a_warning_with_its_remedy(
     assert (code, err) == (0, "")
     assert f"could not start as nobody: {owned}/outbox.sqlite belongs to root, and nobody, as whom the" in out
     assert f"chown -R nobody {owned}" in out
+    assert "[S02]" in out
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can be somebody else for a while")

@@ -376,6 +376,7 @@ async def test_what_cannot_be_is_refused_whole(tmp_path: Path) -> None:
                 await service.reload()
             [reason] = refused.value.reasons
             assert words in reason
+            assert reason.endswith("[F07]" if "fast" in reason else "[S01]")
             place, line, _ = reason.split(":", 2)
             assert place == f"{file}"
             written = words.partition(" =")[0].rpartition(".")[2]

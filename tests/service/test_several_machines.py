@@ -113,6 +113,7 @@ def test_files_that_do_not_make_one_box_are_refused_with_what_is_wrong() -> None
     sparkplug = f'{MQTT.format(port=1883)}[mqtt.sparkplug]\ndevice = "fan"\n'
     said = refused(machine("one", 1), machine("two", 2, sparkplug))
     assert 'mqtt.sparkplug.device: "fan" names one device' in said, said
+    assert said.endswith("[O06]")
     with pytest.MonkeyPatch.context() as small:
         small.setattr("daqsvc.box.memory_bytes", lambda: 20_000_000)
         said = refused(machine("one", 1, "", long), machine("two", 2))
@@ -377,6 +378,7 @@ def test_a_directory_is_checked_as_one_box(
     empty.mkdir()
     assert main(["check", f"{empty}"]) == 2
     assert f"{empty}: no machine file (*.toml) is in this directory. Remedy: " in caplog.text
+    assert "daqsvc example [F26]" in caplog.text
 
 
 @pytest.mark.long

@@ -34,6 +34,7 @@ from daqsvc.service import Service
 from daqsvc.settings import describe, hooks, parse_machine_file, registry
 from daqsvc.settings.plugins import StreamWords
 from daqsvc.settings.problems import AssemblyError, Finding
+from drivers.base import BusOptionError
 from drivers.make import bus_drivers
 
 if TYPE_CHECKING:
@@ -645,7 +646,7 @@ def test_words_that_fail_end_check_with_an_error(
             assert main(["check", str(file)]) == 2
         said = capsys.readouterr()
         assert said.err.startswith(f"{file}: {table}: {failed}")
-        assert said.err.endswith(f" mend it, or remove [{table}]\n")
+        assert said.err.endswith(f" mend it, or remove [{table}] [F23]\n")
         assert "128 bytes, 30 x 2 samples" in " ".join(said.out.split())
 
 
@@ -659,6 +660,17 @@ def test_a_driver_that_cannot_be_made_is_named_with_its_bus(monkeypatch: pytest.
     )
     assert str(caught.value).startswith(said)
     assert "(tcp_frames.py, line " in str(caught.value)
+
+
+def test_an_option_that_a_driver_cannot_use_is_named_with_its_bus(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refusing(*_: Any) -> Never:
+        raise BusOptionError("depth", "is odd", "write an even one")
+
+    monkeypatch.setattr(class_at("tcp_frames.LoggerPlugin"), "build", refusing)
+    machine = parse_machine_file(MACHINE.read_text(), MACHINE)
+    with pytest.raises(AssemblyError) as caught:
+        bus_drivers(machine, SystemClock(), lambda _: None)
+    assert f"{caught.value}" == f"{MACHINE}: buses.logger: depth is odd; write an even one [B25]"
 
 
 def test_a_detector_that_cannot_be_made_is_named_with_its_table(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -712,3 +724,4 @@ def test_words_of_a_validator_are_said_as_they_are(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(module.LoggerPlugin, "buses", (picky,))
     [problem] = [one for one in problems_of(MACHINE.read_text(), MACHINE) if one.key == "buses.logger.host"]
     assert problem.message == "is not valid: 127.0.0.1 is no address"
+    assert f"{problem}".endswith("[F25]")

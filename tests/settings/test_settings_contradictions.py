@@ -370,6 +370,7 @@ def test_scales_of_a_dbc_file_that_cannot_be_meant(tmp_path, old, new, key, mess
     problem = outcome(text, tmp_path / "m.toml")[0][f"streams.housing.layout.{key}"]
     assert message in problem.message
     assert "DBC file" in problem.remedy
+    assert f"{problem}".endswith("[B06]" if key == "counter.signal" and "scale" in message else "[B14]")
     assert problem.line
 
 

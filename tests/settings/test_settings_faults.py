@@ -232,7 +232,7 @@ def test_a_problem_reads_as_one_line():
     text, line = changed(LAVAL, ("fd = true", 'fd = "yes"'))
     (problem,) = problems_of(text, Path("config/x.toml"))
     assert str(problem) == (
-        f'config/x.toml:{line}: buses.can0.fd = "yes": must be true or false. Remedy: write fd = true'
+        f'config/x.toml:{line}: buses.can0.fd = "yes": must be true or false. Remedy: write fd = true [F07]'
     )
 
 

@@ -9,6 +9,15 @@ from typing import TYPE_CHECKING
 from daqsvc.detectors.bearing.kinematics import orders_by
 from daqsvc.detectors.bearing.settings import WINDOW_S
 from daqsvc.detectors.shaft.checks import LEAST_FOR_PULSES, named
+from daqsvc.errors.detectors import BEARING_FIGURES, RACES_ALIKE, TOO_SLOW_A_MACHINE, WINDOW_TOO_SHORT
+from daqsvc.errors.machine_file import (
+    INCOMPLETE,
+    NO_SUCH_NAME,
+    RING_TOO_SHORT,
+    SAMPLED_APART,
+    SAMPLED_TOO_SLOWLY,
+    WRONG_SENSOR_TYPE,
+)
 from daqsvc.settings.problems import Finding, choice, unique
 from daqsvc.settings.rounding import rounded_up
 
@@ -62,18 +71,25 @@ def _kinematics(bearing: WatchedBearing, at: KeyPath) -> Iterator[Finding]:
             f"has both {' and '.join(told)}" if told else "has neither type nor orders",
             'write type = "6205-2RS", or orders = { bpfi = .., bpfo = .., bsf = .., ftf = .. }, or '
             "geometry = { balls = .., ball_diameter_mm = .., pitch_diameter_mm = .. }",
+            code=BEARING_FIGURES,
         )
     if bearing.geometry is not None:
         try:
             orders_by(bearing.geometry)
         except ValueError as error:
-            yield Finding((*at, "geometry"), f"is of no bearing: {error}", "measure again, or look it up")
+            yield Finding(
+                (*at, "geometry"),
+                f"is of no bearing: {error}",
+                "measure again, or look it up",
+                code=BEARING_FIGURES,
+            )
     orders = bearing.orders
     if orders is not None and not orders.ftf < 0.5 < orders.bpfo < orders.bpfi:
         yield Finding(
             (*at, "orders"),
             "are not those of a bearing whose outer ring stands still: ftf < 0.5 < bpfo < bpfi",
             "give them per revolution of the shaft, not in Hz",
+            code=BEARING_FIGURES,
         )
     elif orders is not None:
         yield from _geometry(orders, (*at, "orders"))
@@ -92,6 +108,7 @@ def _geometry(orders: FaultOrders, at: KeyPath) -> Iterator[Finding]:
             f"make {balls:.4g} balls, for which bpfo + bpfi stands: a bearing has a whole number of them",
             "compare bpfo and bpfi with the data sheet of the bearing",
             fatal=False,
+            code=BEARING_FIGURES,
         )
     elif abs(orders.bpfo / orders.ftf / balls - 1.0) > _OFF:
         yield Finding(
@@ -100,6 +117,7 @@ def _geometry(orders: FaultOrders, at: KeyPath) -> Iterator[Finding]:
             f"{orders.bpfo / balls:.4g} times a revolution",
             f"write ftf = {orders.bpfo / balls:.4g}, or compare all of them with the data sheet",
             fatal=False,
+            code=BEARING_FIGURES,
         )
     ratio = 1.0 - 2.0 * orders.bpfo / balls
     most = (1.0 - ratio**2) / (2.0 * ratio)
@@ -109,6 +127,7 @@ def _geometry(orders: FaultOrders, at: KeyPath) -> Iterator[Finding]:
             f"is more than {most:.4g}, how often a ball of this bearing can turn about itself",
             "write half of it if the data sheet counts both races that a damaged ball meets in a turn",
             fatal=False,
+            code=BEARING_FIGURES,
         )
 
 
@@ -120,10 +139,15 @@ def _sensors(draft: MachineFile, bearing: WatchedBearing, at: KeyPath) -> Iterat
         if name is None:
             continue
         if name not in sensors:
-            yield Finding((*at, key), "there is no such sensor", choice(name, accelerometers))
+            yield Finding(
+                (*at, key), "there is no such sensor", choice(name, accelerometers), code=NO_SUCH_NAME
+            )
         elif name not in accelerometers:
             yield Finding(
-                (*at, key), 'must be a sensor of type "accelerometer"', choice(name, accelerometers)
+                (*at, key),
+                'must be a sensor of type "accelerometer"',
+                choice(name, accelerometers),
+                code=WRONG_SENSOR_TYPE,
             )
         elif sensors[name].stream in draft.streams:
             rate_hz = draft.streams[sensors[name].stream].rate_hz
@@ -132,6 +156,7 @@ def _sensors(draft: MachineFile, bearing: WatchedBearing, at: KeyPath) -> Iterat
                     (*at, key),
                     f"is sampled at {rate_hz:g} Hz: a bearing rings above 400 Hz",
                     f"sample at {_LEAST_RATE_HZ:g} Hz or faster",
+                    code=SAMPLED_TOO_SLOWLY,
                 )
 
 
@@ -143,13 +168,17 @@ def _direction(draft: MachineFile, bearing: WatchedBearing, at: KeyPath) -> Iter
             (*at, there),
             f"is of no use without {missing}",
             f"add {missing}, or remove it: the races are then told by their lines alone",
+            code=INCOMPLETE,
         )
         return
     if bearing.rotor_sensor is None:
         return
     if bearing.rotor_sensor == bearing.sensor:
         yield Finding(
-            (*at, "rotor_sensor"), "is the sensor on the housing", "name the one that moves with the rotor"
+            (*at, "rotor_sensor"),
+            "is the sensor on the housing",
+            "name the one that moves with the rotor",
+            code=RACES_ALIKE,
         )
         return
     sensor = named(draft).get(bearing.sensor)
@@ -162,6 +191,7 @@ def _direction(draft: MachineFile, bearing: WatchedBearing, at: KeyPath) -> Iter
             f"at {rate_hz:g} Hz inner and outer race look alike to any two sensors of most bearings",
             f"sample at {_DIRECTION_RATE_HZ:g} Hz or faster, or remove it",
             fatal=False,
+            code=RACES_ALIKE,
         )
 
 
@@ -178,6 +208,7 @@ def _one_stream(draft: MachineFile, settings: Bearing) -> Iterator[Finding]:
                     (*_BEARING, "bearings", index, key),
                     f'is in stream "{other.stream}", but "{first.name}" is in stream "{first.stream}"',
                     "take sensors of one stream: bearings of a machine are compared",
+                    code=SAMPLED_APART,
                 )
 
 
@@ -189,9 +220,16 @@ def _keyphasor(draft: MachineFile, settings: Bearing) -> Iterator[Finding]:
     sensors = named(draft)
     keyphasors = [name for name, sensor in sensors.items() if sensor.type == "keyphasor"]
     if settings.keyphasor not in sensors:
-        yield Finding(at, "there is no such sensor", choice(settings.keyphasor, keyphasors))
+        yield Finding(
+            at, "there is no such sensor", choice(settings.keyphasor, keyphasors), code=NO_SUCH_NAME
+        )
     elif settings.keyphasor not in keyphasors:
-        yield Finding(at, 'must be a sensor of type "keyphasor"', choice(settings.keyphasor, keyphasors))
+        yield Finding(
+            at,
+            'must be a sensor of type "keyphasor"',
+            choice(settings.keyphasor, keyphasors),
+            code=WRONG_SENSOR_TYPE,
+        )
     else:
         first, own = sensors.get(settings.bearings[0].sensor), sensors[settings.keyphasor].stream
         if first is not None and own != first.stream:
@@ -199,6 +237,7 @@ def _keyphasor(draft: MachineFile, settings: Bearing) -> Iterator[Finding]:
                 at,
                 f'is in stream "{own}", but "{first.name}" is in stream "{first.stream}"',
                 "sample both in one stream, or remove it: the machine is then taken to keep to speed_rpm",
+                code=SAMPLED_APART,
             )
 
 
@@ -212,6 +251,7 @@ def _speed(draft: MachineFile) -> Iterator[Finding]:
             f"a window of {WINDOW_S:g} s has {revolutions:.3g} revolutions at {speed_rpm:g} rpm; the lines "
             f"of a bearing need {_LEAST_REVOLUTIONS:g}",
             "remove it: this machine is too slow for it",
+            code=TOO_SLOW_A_MACHINE,
         )
 
 
@@ -228,6 +268,7 @@ def _pulses(draft: MachineFile, settings: Bearing) -> Iterator[Finding]:
             f"is sampled {samples:.3g} times a revolution ({rate_hz:g} Hz at {speed_rpm:g} rpm): its pulses "
             f"need {LEAST_FOR_PULSES:g}",
             f"sample at {rounded_up(LEAST_FOR_PULSES * speed_rpm / 60.0, 4)} Hz or faster",
+            code=SAMPLED_TOO_SLOWLY,
         )
 
 
@@ -254,6 +295,7 @@ def _lines(draft: MachineFile, bearing: WatchedBearing, at: KeyPath) -> Iterator
             f"is sampled at {rate_hz:g} Hz, and the inner race's line lies at {line_hz:.0f} Hz: samples tell "
             f"nothing above {rate_hz / 2.0:g} Hz",
             f"sample at {2.5 * line_hz:.0f} Hz or faster, or correct the orders or machine.speed_rpm",
+            code=SAMPLED_TOO_SLOWLY,
         )
 
 
@@ -264,6 +306,7 @@ def _ring(draft: MachineFile) -> Iterator[Finding]:
             _BEARING,
             f"a ring of {ring_s:g} s must hold at least {_RING_WINDOWS} windows of {WINDOW_S:g} s",
             f"write ring_s = {_RING_WINDOWS * WINDOW_S:g} or more in [pipeline]",
+            code=RING_TOO_SHORT,
         )
 
 
@@ -281,4 +324,5 @@ def _blocks(draft: MachineFile, settings: Bearing) -> Iterator[Finding]:
             f"are {block.samples / stream.rate_hz:.3g} s at {stream.rate_hz:g} Hz; a bearing is "
             f"judged by {_LEAST_BLOCK_S:g} s or more",
             f"make the device take blocks of {least} samples, or remove [pipeline.bearing]",
+            code=WINDOW_TOO_SHORT,
         )

@@ -9,6 +9,7 @@ from daqsvc.detectors.bearing.kinematics import orders_by
 from daqsvc.detectors.bearing.settings import BEARING, Bearing
 from daqsvc.diagnosis.plugin import DetectorPlugin
 from daqsvc.diagnosis.reading import Reading
+from daqsvc.errors.detectors import UNFIT_BEARING
 from daqsvc.settings.problems import AssemblyError
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ class BearingPlugin(DetectorPlugin[Bearing]):
         try:
             return (bearing_detector(machine, settings, store),)
         except ValueError as error:
-            raise AssemblyError(f"{machine.path}: {error}") from error
+            raise AssemblyError(f"{machine.path}: {error}", code=UNFIT_BEARING) from error
 
     def check_files(self, machine: MachineFile, settings: Bearing) -> None:
         """See `DetectorPlugin.check_files`: its calibration, and that its bearings are known."""

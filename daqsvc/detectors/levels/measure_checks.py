@@ -6,6 +6,16 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, NamedTuple
 
 from daqsvc.dsp.window_orders import LEAST_SAMPLES_PER_REVOLUTION
+from daqsvc.errors.alarms import UNFIT_ZONES
+from daqsvc.errors.detectors import BAND_TOO_HIGH, NEEDS_KEYPHASOR, WINDOW_TOO_SHORT
+from daqsvc.errors.machine_file import (
+    NAMED_TWICE,
+    NO_EFFECT,
+    NO_SUCH_NAME,
+    SAMPLED_APART,
+    SAMPLED_TOO_SLOWLY,
+    WRONG_SENSOR_TYPE,
+)
 from daqsvc.settings.measures import (
     OF_THE_SHAFT,
     PHASE_OF,
@@ -100,11 +110,13 @@ def _keyphasor(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
         return
     sensors = {sensor.name: sensor for sensor in draft.sensors}
     if name not in sensors:
-        yield Finding(at, "there is no such sensor", choice(name, sensors))
+        yield Finding(at, "there is no such sensor", choice(name, sensors), code=NO_SUCH_NAME)
         return
     if sensors[name].type != "keyphasor":
         suitable = [sensor.name for sensor in draft.sensors if sensor.type == "keyphasor"]
-        yield Finding(at, 'must be a sensor of type "keyphasor"', choice(name, suitable))
+        yield Finding(
+            at, 'must be a sensor of type "keyphasor"', choice(name, suitable), code=WRONG_SENSOR_TYPE
+        )
         return
     yield from _samples_per_revolution(draft, sensors[name], at)
     if not any(asked.measure in OF_THE_SHAFT for asked in _all_asked(draft, levels)):
@@ -113,6 +125,7 @@ def _keyphasor(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
             "has no effect: no measure of 1X or 2X is listed or watched",
             'write e.g. measures = ["1x_amplitude", "1x_phase_lag"], or remove it',
             fatal=False,
+            code=NO_EFFECT,
         )
 
 
@@ -129,6 +142,7 @@ def _samples_per_revolution(draft: MachineFile, sensor: Sensor, at: KeyPath) -> 
             f"rpm); 1X and 2X need {LEAST_SAMPLES_PER_REVOLUTION:g}",
             f"sample at {rounded_up(LEAST_SAMPLES_PER_REVOLUTION * speed_rpm / 60.0, 4)} Hz or faster, or "
             "remove it",
+            code=SAMPLED_TOO_SLOWLY,
         )
 
 
@@ -143,6 +157,7 @@ def _revolutions(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
             f"{window_s:g} s hold {window_s * speed_rpm / 60.0:.3g} revolutions at {speed_rpm:g} rpm: 1X is "
             "not told from what lies beside it",
             f"write window_s = {rounded_up(_LEAST_REVOLUTIONS * 60.0 / speed_rpm)} or more",
+            code=WINDOW_TOO_SHORT,
         )
 
 
@@ -163,6 +178,7 @@ def _of_the_shaft(draft: MachineFile, levels: Levels, asked: _Asked) -> Iterator
             f'write keyphasor = "{keyphasors[0]}" in [pipeline.levels]'
             if keyphasors
             else "add a sensor of type keyphasor, or watch the amplitude only",
+            code=NEEDS_KEYPHASOR,
         )
         return
     streams = [sensor.stream for sensor in draft.sensors if sensor.name == levels.keyphasor]
@@ -174,6 +190,7 @@ def _of_the_shaft(draft: MachineFile, levels: Levels, asked: _Asked) -> Iterator
             f'"{apart[0].name}" is in stream "{apart[0].stream}", but keyphasor "{levels.keyphasor}" is in '
             f'stream "{streams[0]}": a phase is told of what is sampled with its mark',
             "take a sensor and a keyphasor of one stream, or watch the amplitude only",
+            code=SAMPLED_APART,
         )
 
 
@@ -188,6 +205,7 @@ def _slow_velocity(draft: MachineFile, levels: Levels, asked: _Asked) -> Iterato
                 f'"{sensor.stream}" (sensor "{sensor.name}")',
                 'sample faster, or take measure = "velocity_rms" with e.g. '
                 f"velocity_band_hz = [{low_hz:.1f}, {0.8 * half_hz:.1f}]",
+                code=BAND_TOO_HIGH,
             )
             return
     if low_hz * levels.window_s < _LEAST_PERIODS and asked.sensors:
@@ -197,6 +215,7 @@ def _slow_velocity(draft: MachineFile, levels: Levels, asked: _Asked) -> Iterato
             "Hz: what is that slow is not told from the mean value",
             f"write window_s = {rounded_up(_LEAST_PERIODS / low_hz)} or more in [pipeline.levels]",
             fatal=False,
+            code=WINDOW_TOO_SHORT,
         )
 
 
@@ -205,10 +224,12 @@ def _listed(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
     for index, measure in enumerate(levels.measures):
         at = (*_LEVELS, "measures", index)
         if measure in levels.measures[:index]:
-            yield Finding(at, "is listed twice", "name each measure once", fatal=False)
+            yield Finding(at, "is listed twice", "name each measure once", fatal=False, code=NAMED_TWICE)
         elif not any(sensor.type in _SAMPLED and _has(sensor, measure) for sensor in draft.sensors):
             kind = "accelerometer or velocity sensor" if measure in VELOCITIES else "sensor"
-            yield Finding(at, f"has no effect: no {kind} sends a waveform", "remove it", fatal=False)
+            yield Finding(
+                at, f"has no effect: no {kind} sends a waveform", "remove it", fatal=False, code=NO_EFFECT
+            )
 
 
 def _zones(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
@@ -234,4 +255,5 @@ def _zones(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
                     f"begins at {low_hz:g} Hz",
                     f"write {remedy[alarm.measure]}",
                     fatal=False,
+                    code=UNFIT_ZONES,
                 )

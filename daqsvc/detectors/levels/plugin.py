@@ -14,6 +14,8 @@ from daqsvc.detectors.levels.settings import Levels
 from daqsvc.diagnosis.plugin import DetectorPlugin
 from daqsvc.diagnosis.reading import STALE_S, Reading
 from daqsvc.diagnosis.snapshots import at_once, patience
+from daqsvc.errors.detectors import BAND_TOO_HIGH, WINDOW_TOO_SHORT
+from daqsvc.errors.machine_file import NO_EFFECT, RING_TOO_SHORT
 from daqsvc.settings.measures import PHASE_OF, PHASES, UNITS, VELOCITIES
 from daqsvc.settings.models import (
     Accelerometer,
@@ -292,6 +294,7 @@ def _window(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
             at,
             f"{window_s:g} s at {slowest_hz:g} Hz are fewer than {_LEAST_WINDOW_SAMPLES} samples",
             remedy + _if_no_waveform(draft, name),
+            code=WINDOW_TOO_SHORT,
         )
     if ring_s < _RING_WINDOWS * window_s:
         yield Finding(
@@ -299,6 +302,7 @@ def _window(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
             f"a ring of {ring_s:g} s must hold at least {_RING_WINDOWS} windows",
             f"write ring_s = {rounded_up(_RING_WINDOWS * window_s, 6)} or more in [pipeline], or a "
             "shorter window",
+            code=RING_TOO_SHORT,
         )
 
 
@@ -313,6 +317,7 @@ def _velocity_band(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
             "band of its device",
             "remove it",
             fatal=False,
+            code=NO_EFFECT,
         )
     for sensor in casing:
         rate_hz = _rate_hz(draft, sensor)
@@ -328,6 +333,7 @@ def _velocity_band(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
                 f"the band {low_hz:g} Hz to {high_hz:g} Hz must end below {rate_hz / 2:g} Hz, half the rate "
                 f'of stream "{sensor.stream}" (sensor "{sensor.name}")',
                 remedy + _if_no_waveform(draft, sensor.stream),
+                code=BAND_TOO_HIGH,
             )
             return
 
@@ -345,6 +351,7 @@ def _lowest_frequency(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
             f"write window_s = {rounded_up(_LEAST_PERIODS / low_hz)} or more, or begin the band at "
             f"{rounded_up(_LEAST_PERIODS / window_s)} Hz",
             fatal=False,
+            code=WINDOW_TOO_SHORT,
         )
 
 

@@ -7,6 +7,7 @@ from typing import Annotated
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
+from daqsvc.errors.machine_file import WRONG_ORDER
 from daqsvc.settings.measures import ListedMeasure  # noqa: TC001 - pydantic reads the annotations
 from daqsvc.settings.section import Name, Section
 
@@ -17,7 +18,7 @@ def _ordered_band(band_hz: tuple[float, float]) -> tuple[float, float]:
         raise PydanticCustomError(
             "band_order",
             "is not a band: it needs 0 < lower edge < upper edge, in Hz",
-            {"remedy": "write e.g. [10.0, 1000.0]"},
+            {"remedy": "write e.g. [10.0, 1000.0]", "code": WRONG_ORDER},
         )
     return band_hz
 

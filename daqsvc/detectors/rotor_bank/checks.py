@@ -10,6 +10,18 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from daqsvc.detectors.shaft.checks import LEAST_FOR_PULSES, check_geometry, check_rotor, check_sensors, named
+from daqsvc.errors.alarms import SILENT_DETECTOR
+from daqsvc.errors.detectors import (
+    FALSE_ALARM_RATE,
+    HEALTHY_MODE,
+    MODE_TOUCHES,
+    MODE_UNSEEN,
+    MODE_WITHOUT_FAULT,
+    NEEDS_ROTOR,
+    NO_REVOLUTIONS,
+    NOISE_TOO_LARGE,
+)
+from daqsvc.errors.machine_file import CONTRADICTION, SAMPLED_TOO_SLOWLY
 from daqsvc.settings.problems import Finding, unique
 from daqsvc.settings.rotor_physics import rest_um, whirl_um
 from daqsvc.settings.rounding import rounded_up
@@ -62,6 +74,7 @@ def check_bank_alarm(bank: RotorBank, at: KeyPath) -> Iterator[Finding]:
             (*at, "detector"),
             'would never raise it: pipeline.rotor_bank.rule = "paper" gives probabilities only',
             'write rule = "cusum", or remove the alarm',
+            code=SILENT_DETECTOR,
         )
 
 
@@ -72,6 +85,7 @@ def _measured(bank: RotorBank) -> Iterator[Finding]:
             (*_BANK, "calibrate_revolutions"),
             "is 0, with the rotor from a run-up: its unbalance and its rest may have changed since",
             "write e.g. calibrate_revolutions = 50",
+            code=NO_REVOLUTIONS,
         )
 
 
@@ -92,6 +106,7 @@ def _modelled(draft: MachineFile, bank: RotorBank) -> Iterator[Finding]:
                     ("machine", "rotor", key),
                     f"is missing: {about}; the model bank needs it",
                     f"add e.g. {key} = {example} to [machine.rotor], or remove [pipeline.rotor_bank]",
+                    code=NEEDS_ROTOR,
                 )
 
 
@@ -108,6 +123,7 @@ def _pulses(draft: MachineFile, bank: RotorBank) -> Iterator[Finding]:
             f"is sampled {samples:.3g} times a revolution ({rate_hz:g} Hz at {speed_rpm:g} rpm): its pulses "
             f"need {LEAST_FOR_PULSES:g}",
             f"sample at {rounded_up(LEAST_FOR_PULSES * speed_rpm / 60.0, 4)} Hz or faster",
+            code=SAMPLED_TOO_SLOWLY,
         )
 
 
@@ -119,15 +135,17 @@ def _healthy_mode(draft: MachineFile, bank: RotorBank) -> Iterator[Finding]:
             (*at, "severity"),
             "the first mode is the healthy one",
             'write severity = "normal", or put the healthy mode first',
+            code=HEALTHY_MODE,
         )
     if healthy.fault is not None:
-        yield Finding((*at, "fault"), "the first mode is the healthy one", "remove it")
+        yield Finding((*at, "fault"), "the first mode is the healthy one", "remove it", code=HEALTHY_MODE)
     for key in healthy.differs:
         if key != "damping_ratio":
             yield Finding(
                 (*at, key),
                 "the first mode is the healthy one: the rotor as [machine.rotor] describes it",
                 "remove it, and correct [machine.rotor]",
+                code=HEALTHY_MODE,
             )
     rotor = draft.machine.rotor
     if rotor is not None and healthy.damping_ratio not in {None, rotor.damping_ratio}:
@@ -135,6 +153,7 @@ def _healthy_mode(draft: MachineFile, bank: RotorBank) -> Iterator[Finding]:
             (*at, "damping_ratio"),
             f"differs from damping_ratio = {rotor.damping_ratio:g} of [machine.rotor], the healthy rotor",
             "remove it, or correct one of the two",
+            code=HEALTHY_MODE,
         )
 
 
@@ -153,13 +172,19 @@ def _mode_fault(draft: MachineFile, mode: Mode, at: KeyPath) -> Iterator[Finding
     if mode.fault is not None:
         made, example = makes[mode.fault]
         if not made:
-            yield Finding((*at, "fault"), "nothing in this mode makes it that", f"write e.g. {example}")
+            yield Finding(
+                (*at, "fault"),
+                "nothing in this mode makes it that",
+                f"write e.g. {example}",
+                code=MODE_WITHOUT_FAULT,
+            )
     elif at[-1] != 0 and not any(made for made, _ in makes.values()):
         examples = ", ".join(example.split(" = ")[0] for _, example in makes.values())
         yield Finding(
             at,
             f'mode "{mode.name}" does not differ from the healthy rotor for the worse',
             f"set one of {examples}, or remove the mode",
+            code=MODE_WITHOUT_FAULT,
         )
 
 
@@ -170,6 +195,7 @@ def _static_load(draft: MachineFile, mode: Mode, at: KeyPath) -> Iterator[Findin
             (*at, "static_load_um"),
             "cannot be seen: a probe of the bank is AC-coupled and shows no static position",
             "use DC-coupled probes (ac_coupled = false), or remove the mode",
+            code=MODE_UNSEEN,
         )
 
 
@@ -186,7 +212,10 @@ def _rates(bank: RotorBank) -> Iterator[Finding]:
     ):
         if getattr(bank, rate) is not None and nats in bank.model_fields_set:
             yield Finding(
-                (*_BANK, nats), f"is given by {rate} already", f"remove one of the two, e.g. {nats}"
+                (*_BANK, nats),
+                f"is given by {rate} already",
+                f"remove one of the two, e.g. {nats}",
+                code=CONTRADICTION,
             )
     wanted = bank.false_alarms_per_1000_rev
     if wanted is not None and wanted >= _MOST_PER_1000_REV:
@@ -194,6 +223,7 @@ def _rates(bank: RotorBank) -> Iterator[Finding]:
             (*_BANK, "false_alarms_per_1000_rev"),
             "would be a false alarm at every revolution",
             "write e.g. 0.02, which takes 16 nats of evidence on a bank of four modes",
+            code=FALSE_ALARM_RATE,
         )
 
 
@@ -223,6 +253,7 @@ def _noise(rotor: Rotor, bank: RotorBank) -> Iterator[Finding]:
             ("pipeline", "rotor_bank", "noise_um"),
             f"hides every motion within clearance_um = {rotor.clearance_um:g}",
             "correct one of the two; probes have some 0.1 to 5 um",
+            code=NOISE_TOO_LARGE,
         )
 
 
@@ -242,6 +273,7 @@ def _natural_frequency(draft: MachineFile, rotor: Rotor, bank: RotorBank) -> Ite
             f"is not seen at {min(rates_hz):g} Hz, the rate of the bank's probes: half of that is the "
             "highest frequency that samples tell",
             f"sample faster than {needed_hz:g} Hz, or correct it",
+            code=SAMPLED_TOO_SLOWLY,
         )
 
 
@@ -270,4 +302,5 @@ def _mode(draft: MachineFile, rotor: Rotor, mode: Mode, at: KeyPath) -> Iterator
             "contact",
             "write rub = true in it, or a smaller fault",
             fatal=False,
+            code=MODE_TOUCHES,
         )

@@ -8,6 +8,7 @@ from daqsvc.detectors.rotor_bank.checks import bank_checks, check_bank_alarm
 from daqsvc.detectors.rotor_bank.settings import ROTOR_BANK, RotorBank
 from daqsvc.diagnosis.plugin import Detectability, DetectorPlugin, UnfitOptionError
 from daqsvc.diagnosis.reading import Reading
+from daqsvc.errors.detectors import CALIBRATION_FILE, NO_OBSERVERS
 from daqsvc.settings.problems import AssemblyError
 
 if TYPE_CHECKING:
@@ -82,11 +83,14 @@ class RotorBankPlugin(DetectorPlugin[RotorBank]):
         try:
             return (bank_detector(machine, settings),)
         except CalibrationFileError as error:
-            raise AssemblyError(f"{machine.path}: pipeline.rotor_bank.calibration: {error}") from error
+            raise AssemblyError(
+                f"{machine.path}: pipeline.rotor_bank.calibration: {error}", code=CALIBRATION_FILE
+            ) from error
         except (ValueError, ArithmeticError) as error:
             raise AssemblyError(
                 f"{machine.path}: pipeline.rotor_bank: its observers cannot be made of these figures "
-                f"({error}); correct noise_um, process_noise, modes, or [machine.rotor]"
+                f"({error}); correct noise_um, process_noise, modes, or [machine.rotor]",
+                code=NO_OBSERVERS,
             ) from error
 
     def check_files(self, machine: MachineFile, settings: RotorBank) -> None:

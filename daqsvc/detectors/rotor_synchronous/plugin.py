@@ -8,6 +8,8 @@ from daqsvc.detectors.rotor_synchronous.settings import ROTOR_SYNCHRONOUS, Rotor
 from daqsvc.detectors.shaft.checks import check_geometry, check_rotor, check_sensors, named
 from daqsvc.diagnosis.plugin import Detectability, DetectorPlugin, UnfitOptionError
 from daqsvc.diagnosis.reading import Reading
+from daqsvc.errors.detectors import CALIBRATION_FILE, NEEDS_KEYPHASOR
+from daqsvc.errors.machine_file import NO_EFFECT, SAMPLED_TOO_SLOWLY
 from daqsvc.settings.problems import AssemblyError, Finding
 from daqsvc.settings.rounding import rounded_up
 
@@ -114,7 +116,9 @@ def _healthy_rotor(
         return healthy_rotor(machine, settings)
     except CalibrationFileError as error:
         raise AssemblyError(
-            f"{machine.path}: pipeline.rotor_synchronous.calibration = {str(settings.calibration)!r}: {error}"
+            f"{machine.path}: pipeline.rotor_synchronous.calibration = {str(settings.calibration)!r}: "
+            f"{error}",
+            code=CALIBRATION_FILE,
         ) from error
 
 
@@ -172,6 +176,7 @@ def _speed_source(synchronous: RotorSynchronous) -> Iterator[Finding]:
             (*_SYNCHRONOUS, "speed_source"),
             "needs a keyphasor, and none is named",
             'add keyphasor, or write speed_source = "fixed" or "orbit"',
+            code=NEEDS_KEYPHASOR,
         )
     elif synchronous.reference != "keyphasor" and synchronous.keyphasor is not None:
         yield Finding(
@@ -179,6 +184,7 @@ def _speed_source(synchronous: RotorSynchronous) -> Iterator[Finding]:
             f'is not looked at: the shaft angle comes from speed_source = "{synchronous.reference}"',
             'write speed_source = "keyphasor", or remove it',
             fatal=False,
+            code=NO_EFFECT,
         )
 
 
@@ -198,4 +204,5 @@ def _samples_per_rev(draft: MachineFile, synchronous: RotorSynchronous) -> Itera
             f"need {_LEAST_SAMPLES_PER_REV:g}",
             f"sample at {rounded_up(_LEAST_SAMPLES_PER_REV * speed_rpm / 60.0, 4)} Hz or faster, "
             "or remove [pipeline.rotor_synchronous]",
+            code=SAMPLED_TOO_SLOWLY,
         )

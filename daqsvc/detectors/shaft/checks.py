@@ -5,6 +5,14 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from daqsvc.errors.detectors import NEEDS_ANGLES, NEEDS_ROTOR
+from daqsvc.errors.machine_file import (
+    NAMED_TWICE,
+    NO_SUCH_NAME,
+    PROBES_IN_LINE,
+    SAMPLED_APART,
+    WRONG_SENSOR_TYPE,
+)
 from daqsvc.settings.problems import Finding, choice
 
 if TYPE_CHECKING:
@@ -25,6 +33,7 @@ def check_rotor(draft: MachineFile, at: KeyPath, who: str) -> Iterator[Finding]:
             at,
             f"{who} needs the rotor's data",
             f"write a table [machine.rotor], or remove [{'.'.join(map(str, at))}]",
+            code=NEEDS_ROTOR,
         )
 
 
@@ -41,10 +50,12 @@ def check_sensors(
         asked.append(((*at, "keyphasor"), keyphasor, "keyphasor"))
     for path, name, wanted in asked:
         if name not in sensors:
-            yield Finding(path, "there is no such sensor", choice(name, sensors))
+            yield Finding(path, "there is no such sensor", choice(name, sensors), code=NO_SUCH_NAME)
         elif sensors[name].type != wanted:
             suitable = [sensor.name for sensor in draft.sensors if sensor.type == wanted]
-            yield Finding(path, f'must be a sensor of type "{wanted}"', choice(name, suitable))
+            yield Finding(
+                path, f'must be a sensor of type "{wanted}"', choice(name, suitable), code=WRONG_SENSOR_TYPE
+            )
     if draft.pipeline.alignment is not None:
         return
     streams = {
@@ -61,6 +72,7 @@ def check_sensors(
                 f'is in stream "{streams[probe]}", but {other} "{its_name}" is in stream "{stream}"',
                 "take sensors of one stream, or write a table [pipeline.alignment]: it puts samples that are "
                 "not taken at the same instants on one grid",
+                code=SAMPLED_APART,
             )
 
 
@@ -68,7 +80,7 @@ def check_geometry(draft: MachineFile, detector: KeyPath, probes: tuple[str, str
     """The two probes look at the shaft from directions that tell x from y."""
     at: KeyPath = (*detector, "probes")
     if probes[0] == probes[1]:
-        yield Finding((*at, 1), "is the same probe twice", "name two different probes")
+        yield Finding((*at, 1), "is the same probe twice", "name two different probes", code=NAMED_TWICE)
         return
     sensors = named(draft)
     angles: list[float] = []
@@ -81,6 +93,7 @@ def check_geometry(draft: MachineFile, detector: KeyPath, probes: tuple[str, str
                 (*at, index),
                 f'sensor "{name}" does not say where it points',
                 f'add angle_deg to the entry "{name}" of sensors, e.g. {90 * index}.0',
+                code=NEEDS_ANGLES,
             )
         else:
             angles.append(probe.angle_deg)
@@ -92,6 +105,7 @@ def check_geometry(draft: MachineFile, detector: KeyPath, probes: tuple[str, str
                 f"the probes point along one line ({angles[0]:g} and {angles[1]:g} deg): they see one "
                 "direction of the motion only",
                 "correct angle_deg of the sensors, or take probes that are some 90 deg apart",
+                code=PROBES_IN_LINE,
             )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from daqsvc.errors.outputs import OPEN_TO_NETWORK
 from daqsvc.publish.metrics.settings import DEFAULT, Metrics
 from daqsvc.publish.plugin import OutputPlugin
 from daqsvc.settings.addresses import address_of
@@ -50,4 +51,5 @@ def _open_to_the_network(settings: Metrics) -> Iterator[Finding]:
             "lets everybody in that network read the metrics: there is no password and no encryption",
             f'write listen = "{DEFAULT}" if Prometheus runs on this box, or let a firewall admit it alone',
             fatal=False,
+            code=OPEN_TO_NETWORK,
         )

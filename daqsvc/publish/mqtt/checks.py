@@ -5,6 +5,8 @@ from __future__ import annotations
 import stat
 from typing import TYPE_CHECKING
 
+from daqsvc.errors.machine_file import CONTRADICTION, INCOMPLETE, NO_EFFECT
+from daqsvc.errors.outputs import CREDENTIAL_FILE, CREDENTIAL_OPEN, UNENCRYPTED
 from daqsvc.publish.mqtt.settings import FILES, LONGEST_PASSWORD, first_line
 from daqsvc.settings.addresses import is_loopback
 from daqsvc.settings.problems import Finding
@@ -49,6 +51,7 @@ def _credential_files(draft: MachineFile, mqtt: Mqtt) -> Iterator[Finding]:
                 ("mqtt", key),
                 "is no regular file, and reading it might never end",
                 "name a file with that content",
+                code=CREDENTIAL_FILE,
             )
         elif key in {"password_file", "key_file"}:
             yield from _secret(key, path, mode)
@@ -61,12 +64,14 @@ def _secret(key: str, path: Path, mode: int) -> Iterator[Finding]:
             "can be read by every user of this machine",
             f"chmod o-rwx {path}, and replace what is in it",
             fatal=False,
+            code=CREDENTIAL_OPEN,
         )
     if key == "password_file" and _first_line_bytes(path) > LONGEST_PASSWORD:
         yield Finding(
             ("mqtt", key),
             f"has a first line of more than {LONGEST_PASSWORD} bytes, which MQTT cannot carry",
             "write the password, and nothing else, into its first line",
+            code=CREDENTIAL_FILE,
         )
 
 
@@ -84,12 +89,14 @@ def _transport(mqtt: Mqtt) -> Iterator[Finding]:
             ("mqtt", "url"),
             "would go over the network unencrypted, and to whoever answers",
             "write mqtts://, or insecure = true if that is meant",
+            code=UNENCRYPTED,
         )
     if mqtt.tls and mqtt.insecure:
         yield Finding(
             ("mqtt", "insecure"),
             "contradicts mqtts://, which always verifies the broker",
             "remove it; a broker with a certificate of your own is trusted by ca_file",
+            code=CONTRADICTION,
         )
     for key in ("ca_file", "cert_file"):
         if not mqtt.tls and getattr(mqtt, key) is not None:
@@ -98,6 +105,7 @@ def _transport(mqtt: Mqtt) -> Iterator[Finding]:
                 "has no effect with mqtt://, which uses no certificates",
                 "write mqtts:// in the url, or remove it",
                 fatal=False,
+                code=NO_EFFECT,
             )
 
 
@@ -107,7 +115,10 @@ def _credentials(mqtt: Mqtt) -> Iterator[Finding]:
     for key in ("key_file", "key_credential"):
         if getattr(mqtt, key) is not None and mqtt.cert_file is None:
             yield Finding(
-                ("mqtt", key), "is a key without a certificate", "add cert_file to [mqtt], or remove it"
+                ("mqtt", key),
+                "is a key without a certificate",
+                "add cert_file to [mqtt], or remove it",
+                code=INCOMPLETE,
             )
     keys = [key for key in ("password_file", "password_credential") if getattr(mqtt, key) is not None]
     if not keys:
@@ -115,7 +126,10 @@ def _credentials(mqtt: Mqtt) -> Iterator[Finding]:
     host = mqtt.host  # not usable if the user stands in the url: that has been said, with what to do
     if mqtt.username is None:
         yield Finding(
-            ("mqtt", keys[0]), "is a password without a user", "add username to [mqtt], or remove it"
+            ("mqtt", keys[0]),
+            "is a password without a user",
+            "add username to [mqtt], or remove it",
+            code=INCOMPLETE,
         )
     if not mqtt.tls and not is_loopback(host):
         yield Finding(
@@ -123,13 +137,17 @@ def _credentials(mqtt: Mqtt) -> Iterator[Finding]:
             f"the password would go to {host} unencrypted",
             "write mqtts:// in the url",
             fatal=False,
+            code=UNENCRYPTED,
         )
 
 
 def _one_source(mqtt: Mqtt, file: str, credential: str) -> Iterator[Finding]:
     if getattr(mqtt, file) is not None and getattr(mqtt, credential) is not None:
         yield Finding(
-            ("mqtt", credential), f"is given besides {file}, and only one can be right", "remove one of them"
+            ("mqtt", credential),
+            f"is given besides {file}, and only one can be right",
+            "remove one of them",
+            code=CONTRADICTION,
         )
 
 
@@ -140,4 +158,5 @@ def _open_to_commands(mqtt: Mqtt) -> Iterator[Finding]:
             f"commands would come from {mqtt.host} unencrypted, and from whoever answers there",
             "write mqtts:// in the url, or enabled = false",
             fatal=False,
+            code=UNENCRYPTED,
         )

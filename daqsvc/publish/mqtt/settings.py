@@ -10,6 +10,7 @@ from urllib.parse import SplitResult, urlsplit
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
+from daqsvc.errors.machine_file import BAD_ADDRESS, SECRET_IN_FILE
 from daqsvc.settings.files import FilePath  # noqa: TC001 - pydantic reads the annotations
 from daqsvc.settings.section import ClientId, Name, Section, Text
 
@@ -30,27 +31,37 @@ _DEFAULT_PORTS = {"mqtt": 1883, "mqtts": 8883}
 
 def _split_url(url: str) -> SplitResult:
     """The parts of a broker's address; the value is kept out of every message, it may hold a password."""
-    remedy = {"remedy": 'write "mqtts://broker.example:8883", or "mqtt://..." with insecure = true'}
+    no_address = PydanticCustomError(
+        "broker_url",
+        "is not the address of an MQTT broker",
+        {
+            "remedy": 'write "mqtts://broker.example:8883", or "mqtt://..." with insecure = true',
+            "code": BAD_ADDRESS,
+        },
+    )
     try:
         parts = urlsplit(url)
         port = parts.port
     except ValueError:
-        raise PydanticCustomError("broker_url", "is not the address of an MQTT broker", remedy) from None
+        raise no_address from None
     if parts.username is not None or parts.password is not None:
         raise PydanticCustomError(
             "broker_url_secret",
             "must not hold a user name or password",
             {
                 "remedy": "take them out of the url, write username and password_file instead, "
-                "and change the password: it has been in a file that others can read"
+                "and change the password: it has been in a file that others can read",
+                "code": SECRET_IN_FILE,
             },
         )
     if parts.scheme not in _DEFAULT_PORTS or not parts.hostname or port == 0:
-        raise PydanticCustomError("broker_url", "is not the address of an MQTT broker", remedy)
+        raise no_address
     _check_host(parts.hostname)
     if parts.path not in {"", "/"} or parts.query or parts.fragment:
         raise PydanticCustomError(
-            "broker_url", "has something after host and port", {"remedy": "end the url after the port"}
+            "broker_url",
+            "has something after host and port",
+            {"remedy": "end the url after the port", "code": BAD_ADDRESS},
         )
     return parts
 
@@ -69,7 +80,8 @@ def _check_host(host: str) -> None:
             "has a host that cannot be the name of one",
             {
                 "remedy": "correct it: parts of letters, digits and '-', 1 to 63 of them each, with a dot "
-                "between two parts"
+                "between two parts",
+                "code": BAD_ADDRESS,
             },
         )
 

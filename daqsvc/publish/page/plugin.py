@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from daqsvc.errors.machine_file import CONTRADICTION, INCOMPLETE
+from daqsvc.errors.outputs import HOST_NAMES, OPEN_TO_NETWORK
 from daqsvc.publish.page.settings import DEFAULT, Page
 from daqsvc.publish.plugin import OutputPlugin
 from daqsvc.settings.addresses import address_of, is_everywhere
@@ -78,12 +80,18 @@ def _pairs(settings: Page) -> Iterator[Finding]:
         ("operators", "user_header"),
     ):
         if getattr(settings, one) and not getattr(settings, other):
-            yield Finding(("page", one), f"is of no use without {other}", f"write {other}, or remove {one}")
+            yield Finding(
+                ("page", one),
+                f"is of no use without {other}",
+                f"write {other}, or remove {one}",
+                code=INCOMPLETE,
+            )
     if settings.accounts_file is not None and settings.user_header is not None:
         yield Finding(
             ("page", "accounts_file"),
             "is given besides user_header, and only one can say who asks",
             "remove one of them",
+            code=CONTRADICTION,
         )
 
 
@@ -94,6 +102,7 @@ def _open_to_the_network(settings: Page) -> Iterator[Finding]:
             ("page", "listen"),
             "is every address of the box, and nobody knows by which names the page is opened",
             'write host_names = ["..."] with each, also if it is an address of the box',
+            code=HOST_NAMES,
         )
     if address is None or address.is_local or settings.user_header is not None:
         return
@@ -103,4 +112,5 @@ def _open_to_the_network(settings: Page) -> Iterator[Finding]:
             "lets others than this box reach the page, which needs TLS and accounts then",
             "write certificate_file, private_key_file and accounts_file; or user_header and proxies, behind "
             f'a reverse proxy; or listen = "{DEFAULT}"',
+            code=OPEN_TO_NETWORK,
         )

@@ -8,6 +8,7 @@ from typing import Annotated
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
+from daqsvc.errors.machine_file import BAD_ADDRESS, BAD_TEXT
 from daqsvc.settings.addresses import ListenAddress  # noqa: TC001 - pydantic reads the annotations
 from daqsvc.settings.files import FilePath  # noqa: TC001
 from daqsvc.settings.section import Section, Text
@@ -21,13 +22,15 @@ def _ip_address(text: str) -> str:
         return f"{ipaddress.ip_address(text)}"
     except ValueError:
         remedy = 'write e.g. "127.0.0.1"'
-        raise PydanticCustomError("ip_address", "is no IP address", {"remedy": remedy}) from None
+        raise PydanticCustomError(
+            "ip_address", "is no IP address", {"remedy": remedy, "code": BAD_ADDRESS}
+        ) from None
 
 
 def _header(text: str) -> str:
     if not (text.isascii() and text.replace("-", "").isalnum()):
         remedy = 'write a name of letters, digits and -, e.g. "X-Remote-User"'
-        raise PydanticCustomError("header", "is no name of a header", {"remedy": remedy})
+        raise PydanticCustomError("header", "is no name of a header", {"remedy": remedy, "code": BAD_TEXT})
     return text
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from daqsvc.errors.outputs import ONE_DEVICE, OTHER_ENCRYPTION, SAME_CLIENT_ID
 from daqsvc.publish.mqtt.settings import Mqtt, is_tls
 from daqsvc.publish.plugin import OutputPlugin
 from daqsvc.publish.sparkplug.settings import Sparkplug
@@ -35,6 +36,7 @@ class SparkplugPlugin(OutputPlugin[Sparkplug]):
                 ("mqtt", "sparkplug", "device"),
                 f'"{settings.device}" names one device, and each of several machines is one',
                 "remove it: the name of each machine is its device id",
+                code=ONE_DEVICE,
             )
 
     def describe(self, machine: MachineFile, settings: Sparkplug) -> str:
@@ -62,10 +64,12 @@ def _beside_mqtt(draft: MachineFile, settings: Sparkplug) -> Iterator[Finding]:
                 ("mqtt", "sparkplug", "servers", number),
                 "has other encryption than mqtt.url, whose credentials it would get",
                 f"write {'mqtts' if mqtt.tls else 'mqtt'}:// in both",
+                code=OTHER_ENCRYPTION,
             )
     if settings.client_id is not None and settings.client_id == mqtt.client_id_of(draft):
         yield Finding(
             ("mqtt", "sparkplug", "client_id"),
             f'is "{settings.client_id}" like that of [mqtt]: a broker ends one connection for the other',
             "remove it, or write another",
+            code=SAME_CLIENT_ID,
         )

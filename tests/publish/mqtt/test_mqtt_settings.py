@@ -101,6 +101,7 @@ def test_a_password_that_everybody_can_read_is_warned_of(tmp_path):
     path.chmod(0o644)
     (warning,) = machine((PASSWORD, f'password_file = "{path}"')).warnings
     assert "can be read by every user" in warning.message
+    assert str(warning).endswith("[O02]")
     path.chmod(0o640)
     assert machine((PASSWORD, f'password_file = "{path}"')).warnings == ()
 

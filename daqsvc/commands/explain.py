@@ -1,0 +1,66 @@
+"""``daqsvc explain``: what the code at the end of a message means."""
+
+from __future__ import annotations
+
+import sys
+import textwrap
+from typing import TYPE_CHECKING
+
+from daqsvc.commands.arguments import EXIT_OK, EXIT_USAGE
+
+if TYPE_CHECKING:
+    import argparse
+
+    from daqsvc.errors.code import Code
+
+_COLUMNS = 100
+
+
+class ExplainCommand:
+    """``daqsvc explain [CODE ...]``."""
+
+    help = "what the code at the end of a message means, and what to do about it"
+    description = (
+        "Print what the code at the end of a message means, what leads to it, and what to do about it: "
+        "daqsvc explain F01. Without a code, list all of them."
+    )
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """See `daqsvc.cli.Command.add_arguments`."""
+        parser.add_argument("codes", nargs="*", metavar="CODE", help="e.g. F01 (default: list them)")
+
+    def run(self, arguments: argparse.Namespace) -> int:
+        """See `daqsvc.cli.Command.run`."""
+        from daqsvc.errors.table import CODES  # noqa: PLC0415 - texts that no other verb needs
+
+        wanted = [text.strip("[]").upper() for text in arguments.codes]
+        unknown = [text for text in wanted if text not in CODES]
+        if unknown:
+            words = f"there is no code {unknown[0]!r}; daqsvc explain lists them"
+            print(f"daqsvc explain: {words}", file=sys.stderr)  # noqa: T201 - errors go to stderr
+            return EXIT_USAGE
+        print("\n\n".join(_told(CODES[text]) for text in wanted) or _listed())  # noqa: T201 - what the verb is for
+        return EXIT_OK
+
+
+def _told(code: Code) -> str:
+    parts = {
+        "Cause": code.cause,
+        "Remedy": code.remedy,
+        "More": f"docs/{code.page}, docs/reference/errors.md#{code.id.lower()}",
+    }
+    blocks = [f"{code}  {code.title}"]
+    for name, text in parts.items():
+        lines = textwrap.wrap(text, _COLUMNS, break_long_words=False, break_on_hyphens=False)
+        blocks.append("\n".join([f"{name}:", *(f"  {line}" for line in lines)]))
+    return "\n".join(blocks)
+
+
+def _listed() -> str:
+    from daqsvc.errors.table import CODES, GROUPS, group_title  # noqa: PLC0415 - as above
+
+    blocks = []
+    for letter in GROUPS:
+        codes = [f"  {code}  {code.title}" for code in CODES.values() if code.id.startswith(letter)]
+        blocks.append("\n".join([group_title(letter), *codes]))
+    return "\n\n".join(blocks)

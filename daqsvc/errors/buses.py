@@ -1,0 +1,190 @@
+"""Buses, frames and drivers."""
+
+from daqsvc.errors.code import Code
+
+_PAGE = "can.md"
+
+WRONG_LAYOUT = Code(
+    "B01",
+    "The layout does not belong to this bus",
+    "A layout says how samples lie in what the bus carries: CAN frames, registers, lines or binary "
+    "frames. This one is for another kind of bus.",
+    "Correct bus of the stream, or write the keys of a layout for this bus.",
+    "driver-contract.md",
+)
+FIELD_OUTSIDE = Code(
+    "B02",
+    "A field reaches beyond the frame",
+    "By place, type and number of samples a channel or counter would take bytes that the frame does not "
+    "have.",
+    "Correct the place or the number of samples, or make the frame longer, as the device sends it.",
+    _PAGE,
+)
+FIELDS_OVERLAP = Code(
+    "B03",
+    "Two fields of a frame overlap",
+    "Two channels, or a channel and the counter, would take the same bytes.",
+    "Compare the places with the description of the device.",
+    _PAGE,
+)
+RAW_VALUES = Code(
+    "B04",
+    "valid_raw does not fit the type of the channel",
+    "valid_raw has raw values, before scale and offset. These cannot come in the type of the channel.",
+    "Write the least and the largest whole number that the device sends for a measurement.",
+    _PAGE,
+)
+LOSS_UNNOTICED = Code(
+    "B05",
+    "Lost samples would not be noticed",
+    "A counter in each frame or line tells what was lost and when a sample was taken. A time in each line"
+    " does so less exactly.",
+    "Say where the counter is. If the device sends none, write no_counter = true: loss is then estimated.",
+    "driver-contract.md",
+)
+UNFIT_COUNTER = Code(
+    "B06",
+    "The counter does not fit",
+    "It wraps too soon to tell a gap from a turn, does not count by 1 from 0, or is signed or a float.",
+    "Name another counter, have the device send a wider one, or write no_counter = true.",
+    "driver-contract.md",
+)
+CAN_ID = Code(
+    "B07",
+    "The id is none of this kind of frame",
+    "Ids of CAN have 11 bits, or 29 with extended = true. Ids of SAE J1939 have 29.",
+    "Correct the id, or write extended = true.",
+    _PAGE,
+)
+FRAME_LENGTH = Code(
+    "B08",
+    "No frame has that length",
+    "A frame of classic CAN has up to 8 bytes, one of CAN FD up to 64 in steps.",
+    "Correct the length, or write fd = true in the table of the bus.",
+    _PAGE,
+)
+NOT_TOLD_APART = Code(
+    "B09",
+    "Two streams cannot be told apart",
+    "Streams on one bus differ by their id, prefix or stream_id, and these have the same.",
+    "Give each stream its own, as the devices send it.",
+    "driver-contract.md",
+)
+BUS_TOO_SLOW = Code(
+    "B10",
+    "The bus is too slow for its streams, or nearly so",
+    "Rates and lengths of all frames or requests together take most of the time of the bus, or more than "
+    "that. What does not fit comes late or is lost.",
+    "Correct rate_hz of the streams, raise the bit rate of bus and devices, or divide the streams among "
+    "buses.",
+    "driver-contract.md",
+)
+NO_SUCH_INTERFACE = Code(
+    "B11",
+    "The interface of CAN is not known",
+    "python-can has no interface of this name, or the package that brings it is not installed.",
+    "Correct the name, or install the plugin of python-can for the device.",
+    _PAGE,
+)
+TOO_LITTLE_KEPT = Code(
+    "B12",
+    "Too little of the recorded frames is kept",
+    "keep_mb holds no finished file beside the one that is being written.",
+    "Write keep_mb as twice file_mb or more.",
+    _PAGE,
+)
+DBC_FILE = Code(
+    "B13",
+    "The DBC file cannot be used",
+    "It is not there, cannot be read, describes no messages, or cantools is not installed.",
+    "Correct the path, or export the file from its tool again. cantools comes with pip install "
+    "'daqsvc[dbc]'.",
+    _PAGE,
+)
+DBC_SIGNAL = Code(
+    "B14",
+    "A signal of the DBC file cannot be used",
+    "Its length, place, type or scale in the DBC file is none that a frame or a quantity can have.",
+    "Correct the signal in the DBC file.",
+    _PAGE,
+)
+NOT_IN_ONE_FRAME = Code(
+    "B15",
+    "Channels of one stream do not come together",
+    "All channels of a stream have the same number of samples in each frame. Signals on different pages "
+    "of a multiplexer never come in one frame.",
+    "Make a stream of each group that comes together.",
+    _PAGE,
+)
+UNIT_ADDRESS = Code(
+    "B16",
+    "No unit on a serial line has this address",
+    "Units of Modbus on a serial line have addresses 1 to 247. 0 is for all of them, and none answers.",
+    "Write the address that is set in the unit.",
+    "modbus.md",
+)
+NO_ROOM_FOR_REGISTERS = Code(
+    "B17",
+    "The registers do not fit",
+    "A reply of Modbus has room for 125 registers, addresses end at 65535, and a ring must be small "
+    "enough for its counter.",
+    "Leave out channels, or correct address, depth or number of samples.",
+    "modbus.md",
+)
+FORBIDDEN_REGISTERS = Code(
+    "B18",
+    "A channel lies in forbidden registers",
+    "forbidden lists registers that must never be read, since reading changes something in the unit.",
+    "Leave out the channel, or narrow the forbidden range.",
+    "modbus.md",
+)
+WRITE_NOT_ALLOWED = Code(
+    "B19",
+    "The bus does not allow this write",
+    "Nothing is written to a unit unless the table of the bus lists the registers.",
+    "Add the registers to writes of the bus, if they may be written.",
+    "modbus.md",
+)
+REGISTERS_OVERLAP = Code(
+    "B20",
+    "Registers are used twice",
+    "Two channels share a register, or a register that steers the reading lies among the samples.",
+    "Compare addresses and types with the register map of the unit. A float32 or int32 takes two registers.",
+    "modbus.md",
+)
+BITS = Code(
+    "B21",
+    "The bits are no part of the register",
+    "bits names the lowest bit and the number of bits of an unsigned type. These do not lie in it.",
+    "Write e.g. bits = [0, 4] for the lowest four.",
+    "modbus.md",
+)
+RING_DEPTH = Code(
+    "B22",
+    "The ring of the unit has no fitting depth",
+    "If the depth is no power of two, the place of a sample is not known once the counter has wrapped.",
+    "Set the device to a depth of 2, 4, 8, ... places.",
+    "modbus.md",
+)
+NOT_PLAYABLE = Code(
+    "B23",
+    "The recording cannot be played",
+    "It is no file, has an ending that no reader is known for, or cannot be read while it is written.",
+    "Name a candump log, BLF, ASC, MDF or a table of samples; convert others.",
+    "replay.md",
+)
+PORT_MAY_CHANGE = Code(
+    "B24",
+    "The name of the port may change",
+    "Names such as /dev/ttyUSB0 are given in the order of plugging. After re-plugging another device may "
+    "have it.",
+    "Write the path below /dev/serial/by-id.",
+    "serial.md",
+)
+BUS_OPTION = Code(
+    "B25",
+    "The driver cannot use an option of the bus",
+    "The interface or port refuses a value of the table of the bus.",
+    "Correct the option that the message names, as the manual of the interface has it.",
+    _PAGE,
+)

@@ -1,0 +1,32 @@
+"""What a code is, and where it stands in a message."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Code:
+    """A kind of mistake or fault.
+
+    Attributes:
+        id: the letter of its group and a number, e.g. ``F01``; never used again for anything else.
+        title: what is wrong, as a heading.
+        cause: what it means, and what usually leads to it.
+        remedy: what to do about it.
+        page: where to read on, a page of ``docs/``; may name a heading, e.g. ``alarms.md#votes``.
+    """
+
+    id: str
+    title: str
+    cause: str
+    remedy: str
+    page: str
+
+    def __str__(self) -> str:
+        return self.id
+
+
+def with_code(text: str, code: Code | None) -> str:
+    """A message with its code at the end; as it is without one, e.g. that of a plugin from outside."""
+    return f"{text} [{code}]" if code is not None else text

@@ -1,0 +1,331 @@
+"""The machine file.
+
+Errors of the file as a whole, of its keys, and of sensors. Those of buses, detectors, alarms and outputs
+have groups of their own.
+"""
+
+from daqsvc.errors.code import Code
+
+_PAGE = "machine-file.md"
+
+UNREADABLE_FILE = Code(
+    "F01",
+    "The file cannot be read",
+    "There is no such file, it is a directory or a device, or this user may not read it.",
+    "Correct the path, or give the user of the service the right to read the file: chmod a+r FILE.",
+    _PAGE,
+)
+NOT_UTF8 = Code(
+    "F02",
+    "The file is not UTF-8",
+    "A machine file is text in UTF-8. Some editors, mostly on Windows, save in UTF-16 or in an older code"
+    " page.",
+    'Save the file as "UTF-8" in the editor.',
+    _PAGE,
+)
+NOT_TOML = Code(
+    "F03",
+    "The file is not valid TOML",
+    "The text breaks the rules of TOML at the line that is named. Usually a quote or a bracket is not "
+    "closed, or a text has no quotes. Or a key stands there twice, or a number has a decimal comma or a "
+    "unit.",
+    'Correct the line. Tables are written [name], values key = value, texts "in quotes", numbers 1.5.',
+    _PAGE,
+)
+TOO_LARGE = Code(
+    "F04",
+    "The file is larger than a machine file can be",
+    "Size, depth, numbers and entries have limits far above what a machine needs. Usually the wrong file "
+    "was given.",
+    "See whether it is the right file. Watch a very large plant with several machine files.",
+    _PAGE,
+)
+UNKNOWN_KEY = Code(
+    "F05",
+    "The key is unknown",
+    "No table takes unknown keys, since a misspelt limit would have no effect. The key is misspelt, "
+    "stands in the wrong table, or belongs to another kind of this table.",
+    "Write the key that the message suggests, move the key to its table, or remove it.",
+    _PAGE,
+)
+MISSING_KEY = Code(
+    "F06",
+    "A key is missing",
+    "The table cannot be understood without this key, and no default would be right for every machine.",
+    "Add the key. The message has an example.",
+    _PAGE,
+)
+WRONG_TYPE = Code(
+    "F07",
+    "The value is of another type",
+    "The key takes a number, a text, true or false, an array or a table, and the value is something else."
+    " Often quotes are missing, or there are too many of them.",
+    'Write numbers, true and false without quotes, texts "in quotes", arrays [in, brackets].',
+    _PAGE,
+)
+OUT_OF_RANGE = Code(
+    "F08",
+    "The value is out of range",
+    "Every number has bounds: beyond them no machine, sensor or device works. Usually the value has "
+    "another unit than the name of the key says (_s seconds, _hz hertz, _um micrometres, _rpm revolutions"
+    " a minute).",
+    "Write the value in the unit that the name of the key ends with.",
+    _PAGE,
+)
+NOT_ONE_OF = Code(
+    "F09",
+    "The value is none of those that there are",
+    "The key takes one of a few words or numbers, which the message lists.",
+    "Write one of them as it is listed, in lower case.",
+    _PAGE,
+)
+BAD_NAME = Code(
+    "F10",
+    "The name has characters that no name can have",
+    "Names stand in topics of MQTT, in names of files and in log lines. So they have letters, digits, "
+    "'_', '.' and '-' only.",
+    "Write the name without spaces, umlauts and other signs. A description may have them.",
+    _PAGE,
+)
+BAD_TEXT = Code(
+    "F11",
+    "The text has not the form that this key takes",
+    "The text is empty or too long, has line ends or control characters, or is not written as the key "
+    "needs it.",
+    "Write it as in the example of the message.",
+    _PAGE,
+)
+WRONG_LENGTH = Code(
+    "F12",
+    "The array has too few or too many entries",
+    "Pairs such as ranges have exactly two values. Lists have an upper limit, and some must not be empty.",
+    "Write as many values as the message says.",
+    _PAGE,
+)
+BAD_PATH = Code(
+    "F13",
+    "The path cannot be used",
+    "The path is too long, has a variable of the shell, which is not put in here, or does not begin at "
+    "the root where it must.",
+    "Write the path in full. A relative path starts at the directory of the machine file.",
+    _PAGE,
+)
+BAD_ADDRESS = Code(
+    "F14",
+    "The address cannot be used",
+    "It is no name or address of a host, or no URL of a broker. Often a port stands in the host, or a "
+    "scheme such as http:// before it.",
+    "Write it as in the example of the message, and the port in its own key where there is one.",
+    _PAGE,
+)
+WRONG_ORDER = Code(
+    "F15",
+    "The two ends of a range are in the wrong order",
+    "A range is written with its lower end first, and its ends must differ.",
+    "Swap the two values, or make them differ.",
+    _PAGE,
+)
+SECRET_IN_FILE = Code(
+    "F16",
+    "A password stands in the machine file",
+    "A machine file is read by many, copied and sent to others. So it names a file that holds the password.",
+    "Write the password into a file that only the service can read, name it in password_file, and change "
+    "the password: it has been in a file that others can read.",
+    "mqtt.md",
+)
+NO_SUCH_NAME = Code(
+    "F17",
+    "There is nothing of that name",
+    "A key refers to a bus, stream, channel, sensor, detector or signal by its name, and there is none. "
+    "Usually the name is misspelt here or where it is defined.",
+    "Write one of the names that the message lists, or define what is missing.",
+    _PAGE,
+)
+NAMED_TWICE = Code(
+    "F18",
+    "A name, or what it stands for, is used twice",
+    "Two entries have one name, one entry is listed twice, or two claim the same channel or device.",
+    "Give each a name or a channel of its own.",
+    _PAGE,
+)
+NO_EFFECT = Code(
+    "F19",
+    "The key has no effect",
+    "Nothing uses the key in this file, because of the other keys of its table or because what it is for "
+    "is missing.",
+    "Remove the key, or add what the message names.",
+    _PAGE,
+)
+CONTRADICTION = Code(
+    "F20",
+    "Two keys contradict each other",
+    "Both keys say the same in different ways, or exclude each other, and only one can be right.",
+    "Remove or correct one of the two.",
+    _PAGE,
+)
+INCOMPLETE = Code(
+    "F21",
+    "The key needs another key",
+    "The table says only a part of what is needed: this key is of no use without the one that the message"
+    " names.",
+    "Add the other key, or remove this one.",
+    _PAGE,
+)
+NO_SUCH_DRIVER = Code(
+    "F22",
+    "The driver is not installed",
+    "No installed package has a driver of this name.",
+    "Correct the name. A driver from outside comes with its package: install that into the environment of"
+    " daqsvc.",
+    "write-a-driver.md",
+)
+PLUGIN_FAILED = Code(
+    "F23",
+    "A plugin failed",
+    "A driver, detector or output cannot be loaded, or its code failed. The message names the file and "
+    "the line.",
+    "Install the package again. If that does not help, report it to the authors of the package, and "
+    "remove its table until then.",
+    "architecture.md",
+)
+TOO_MUCH_MEMORY = Code(
+    "F24",
+    "The samples do not fit the memory",
+    "The rings of all streams are larger than half of the memory of this computer. Their size is rate_hz "
+    "times channels times ring_s.",
+    "Write a smaller ring_s in [pipeline], or correct rate_hz.",
+    _PAGE,
+)
+VALUE_REFUSED = Code(
+    "F25",
+    "The value is refused",
+    "The model of this table refuses the value for a reason of its own, which the message gives.",
+    "Do what the message says. A table of a plugin from outside is described by its package.",
+    _PAGE,
+)
+NO_MACHINE_FILE = Code(
+    "F26",
+    "No machine file is in the directory",
+    "A directory stands for all *.toml files in it that do not begin with a dot.",
+    "Write a machine file there. daqsvc example shows some to begin with.",
+    "several-machines.md",
+)
+NOT_OF_ONE_BOX = Code(
+    "F27",
+    "The machine files do not fit each other",
+    "One process watches all machines of a box. So site, box, buses of one name, the store and outputs "
+    "must be alike, and each machine needs a name of its own.",
+    "Make the tables alike, or write them in one of the files only.",
+    "several-machines.md",
+)
+UNUSED_BUS = Code(
+    "F28",
+    "No stream comes over the bus",
+    "The bus is opened, and nothing is read from it.",
+    "Add its streams, or remove the bus.",
+    "driver-contract.md",
+)
+SPEED_UNKNOWN = Code(
+    "F29",
+    "Nothing states the speed of the machine",
+    "A key asks for the speed while the machine runs, and neither a detector nor a trend value states it.",
+    "Add a detector that states the speed, or a sensor of type trend in rpm; or remove the key.",
+    _PAGE,
+)
+SNAPSHOTS_OVERLAP = Code(
+    "F30",
+    "Snapshots by the clock overlap",
+    "every_s is shorter than before_s and after_s together: each snapshot would begin within the one before.",
+    "Write a larger every_s, or continuous = true if all is to be recorded.",
+    "recorder.md",
+)
+COARSE_ALIGNMENT = Code(
+    "F31",
+    "Streams are aligned too coarsely for the speed",
+    "The error that max_error_us allows is a large angle at this speed. A detector takes it for a change "
+    "of the phase.",
+    "Write a smaller max_error_us, or take the sensors together in one stream.",
+    "alignment.md",
+)
+WRONG_SENSOR_TYPE = Code(
+    "F32",
+    "The sensor is of another type",
+    "The key takes sensors of one type only, e.g. accelerometers, proximity probes or a keyphasor.",
+    "Name a sensor of that type, or correct the type of the sensor.",
+    _PAGE,
+)
+SAMPLED_APART = Code(
+    "F33",
+    "Sensors that belong together come in different streams",
+    "What is compared sample by sample must be taken at the same instants. Streams have clocks of their own.",
+    "Name sensors of one stream, or write [pipeline.alignment] where the message names it.",
+    "alignment.md",
+)
+SAMPLED_TOO_SLOWLY = Code(
+    "F34",
+    "The sampling rate is too low",
+    "Samples tell nothing above half of their rate, and pulses or orders of the shaft need several "
+    "samples each revolution.",
+    "Sample faster, or correct rate_hz, machine.speed_rpm or the frequencies that are asked for.",
+    _PAGE,
+)
+RING_TOO_SHORT = Code(
+    "F35",
+    "The ring does not hold enough windows",
+    "A detector reads its windows from the ring of the last seconds, which must hold several of them.",
+    "Write a larger ring_s in [pipeline], or a shorter window.",
+    _PAGE,
+)
+UNLIKELY_SENSITIVITY = Code(
+    "F36",
+    "The sensitivity is not that of such a sensor",
+    "Usually it was written in V in place of mV, or for another unit (m/s2 for g, mm for um).",
+    "Copy it from the calibration sheet, in mV per unit of the sensor.",
+    _PAGE,
+)
+GAP_VOLTAGE = Code(
+    "F37",
+    "The gap voltage of a proximity probe is missing or does not fit",
+    "The mean voltage tells where the shaft is and whether the probe works. It needs zero_v, gap_ok_v and"
+    " sensitivity_mv_per_unit, all in the range that the probe gives, usually negative.",
+    "Write them as in the manual of the probe, with their signs.",
+    _PAGE,
+)
+PROBES_IN_LINE = Code(
+    "F38",
+    "Two probes point along one line",
+    "Together they see one direction of the motion only. An orbit needs two directions.",
+    "Correct angle_deg of the sensors, or take probes that are some 90 degrees apart.",
+    _PAGE,
+)
+BEYOND_CHANNEL = Code(
+    "F39",
+    "The channel cannot carry such a value",
+    "By its type, scale and offset, and by the sensitivity of its sensor, the channel never has the value"
+    " that is written.",
+    "Correct the value, or scale, offset and sensitivity.",
+    _PAGE,
+)
+WRONG_SCALE = Code(
+    "F40",
+    "Scale or unit of a channel cannot be right",
+    "The scale is 0, makes one count a value that no channel has, or contradicts the unit that is stated,"
+    " e.g. mV for V.",
+    "Write in scale what one count of the raw value is worth, in the unit of the channel.",
+    "can.md",
+)
+ROTOR_FIGURES = Code(
+    "F41",
+    "Figures of the rotor contradict each other",
+    "By the figures of [machine.rotor] the shaft would lie on the stator, rub all the time, or run far "
+    "from its natural frequency. Usually one has another unit, or the clearance is not the radial one.",
+    "Correct the figure that the message names.",
+    "rotor-figures.md",
+)
+STANDSTILL = Code(
+    "F42",
+    "The nominal speed is 0",
+    "machine.speed_rpm is the speed at which the machine runs. A machine that stands still has no vibration.",
+    "Write the nominal speed, negative if the shaft turns clockwise.",
+    _PAGE,
+)
