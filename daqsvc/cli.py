@@ -30,6 +30,7 @@ from daqsvc.commands.explain import ExplainCommand
 from daqsvc.commands.export import ExportCommand
 from daqsvc.commands.fleet import FleetCommand
 from daqsvc.commands.machine_files import load_box
+from daqsvc.commands.new.command import NewCommand
 from daqsvc.commands.page import PageCommand
 from daqsvc.commands.record import RecordCommand
 from daqsvc.commands.reload import ReloadCommand
@@ -217,6 +218,7 @@ def commands() -> dict[str, Command]:
         "example": ExampleCommand(),
         "sniff": SniffCommand(),
         "explain": ExplainCommand(),
+        "new": NewCommand(),
         "record": RecordCommand(load, start_logging),
     }
     for point in entry_points(group=COMMANDS):

@@ -44,6 +44,7 @@ VERBS = (
     "detectability",
     "example",
     "sniff",
+    "new",
     "record",
     "demo",
     "reproduce",

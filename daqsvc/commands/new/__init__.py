@@ -1,0 +1,1 @@
+"""``daqsvc new``: a first machine file, by a few questions."""

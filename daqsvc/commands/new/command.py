@@ -1,0 +1,233 @@
+"""``daqsvc new``: asks a few questions, and writes a first machine file that can be used."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import sys
+import tempfile
+import tomllib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE
+from daqsvc.commands.new.question import SENSOR, short_name
+from daqsvc.commands.new.topics import TOPICS
+
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import Iterator, Mapping
+
+    from daqsvc.commands.new.question import Answers, Question
+
+
+class NewCommand:
+    """``daqsvc new [FILE]``."""
+
+    help = "write a first machine file: asks a few questions"
+    description = (
+        "Ask a few questions about a machine and write a machine file, with comments, that daqsvc check "
+        "accepts. Enter takes the default, ? explains a question, Ctrl-C ends and writes nothing. Every "
+        "answer is an option as well: with all of them, or with --yes, nothing is asked."
+    )
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """See `daqsvc.cli.Command.add_arguments`."""
+        parser.add_argument(
+            "file", type=Path, nargs="?", metavar="FILE", help="to write (default: the machine's name .toml)"
+        )
+        parser.add_argument("--yes", action="store_true", help="take the default of whatever is not answered")
+        parser.add_argument("--overwrite", action="store_true", help="write over a file that is there")
+        parser.add_argument(
+            "--answers", type=Path, metavar="TOML", help="file with answers: the options below as its keys"
+        )
+        group = parser.add_argument_group("answers")
+        group.add_argument(
+            f"--{SENSOR}",
+            action="append",
+            default=[],
+            metavar="CHANNEL.TOPIC=ANSWER",
+            help="of one channel, e.g. x.type=accelerometer; TOPIC is type, name, unit, sensitivity, angle, "
+            "threshold, bearing; with Modbus values address, register-type, order, scale, too",
+        )
+        for key, topic in TOPICS.items():
+            group.add_argument(
+                f"--{key}", dest=f"answer {key}", metavar="ANSWER", help=topic.text.replace("%", "%%")
+            )
+
+    def run(self, arguments: argparse.Namespace) -> int:
+        """See `daqsvc.cli.Command.run`."""
+        from daqsvc.commands.new.interview import AnswerError, Given, conduct  # noqa: PLC0415 - slow to import
+        from daqsvc.commands.new.machine_text import machine_text  # noqa: PLC0415
+
+        person = sys.stdin.isatty() and sys.stdout.isatty()
+        try:
+            given = Given(_given(arguments), arguments.yes)
+            if arguments.file is not None:
+                _see_place(arguments.file)
+            if person and not arguments.yes:
+                _say("Enter takes what is in brackets, ? explains, Ctrl-C ends and writes nothing.\n")
+            folder = arguments.file or Path("machine.toml")
+            ask = _ask if person and not arguments.yes else None
+            answers = conduct(folder, given, ask, lambda reason: _say(f"  {reason}"))
+            file = arguments.file or Path(f"{short_name(answers['name'])}.toml")
+            text = machine_text(answers, shlex.quote(file.name))
+            if file.exists() and not arguments.overwrite:
+                file = _other_file(file, ask)
+                text = machine_text(answers, shlex.quote(file.name))
+            _write(file, text)
+        except AnswerError as error:
+            return _failed(f"{error}", EXIT_USAGE)
+        except EOFError:
+            return _failed("the input has ended; nothing was written", EXIT_FAILED)
+        except OSError as error:
+            return _failed(f"{error.filename} cannot be written: {error.strerror}", EXIT_FAILED)
+        return _report(file, text, answers)
+
+
+def _given(arguments: argparse.Namespace) -> dict[str, str]:
+    """The answers of the command line and of the file of answers, by key; the command line wins."""
+    from daqsvc.commands.new.interview import AnswerError  # noqa: PLC0415 - slow to import
+
+    given = {} if arguments.answers is None else _of_file(arguments.answers)
+    for key in TOPICS:
+        answer = getattr(arguments, f"answer {key}")
+        if answer is not None:
+            given[key] = answer
+    for text in arguments.sensor:
+        key, equals, answer = text.partition("=")
+        if not equals or "." not in key:
+            raise AnswerError(f"--{SENSOR} {text}: write CHANNEL.TOPIC=ANSWER, e.g. x.type=accelerometer")
+        given[f"{SENSOR}.{key}"] = answer
+    return given
+
+
+def _of_file(path: Path) -> dict[str, str]:
+    from daqsvc.commands.new.interview import AnswerError  # noqa: PLC0415 - slow to import
+
+    try:
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise AnswerError(f"--answers {path}: {error.strerror}") from None
+    except ValueError as error:  # of TOML, or of UTF-8
+        raise AnswerError(f"--answers {path} is no TOML: {error}") from None
+    answers = dict(_flat(document))
+    for key in answers:
+        if key not in TOPICS and not key.startswith(f"{SENSOR}."):
+            from daqsvc.settings.problems import choice  # noqa: PLC0415 - slow to import
+
+            raise AnswerError(f"--answers {path}: there is no question {key!r}; {choice(key, TOPICS)}")
+    return answers
+
+
+def _flat(table: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
+    """The answers of a table and those within it, as they would be typed."""
+    for key, value in table.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{before}{key}.")
+        else:
+            yield f"{before}{key}", _typed(value)
+
+
+def _typed(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return ", ".join(map(_typed, value)) if isinstance(value, list) else f"{value}"
+
+
+def _see_place(file: Path) -> None:
+    """Say before all questions that a file could not be written."""
+    from daqsvc.commands.new.interview import AnswerError  # noqa: PLC0415 - slow to import
+
+    if file.is_dir():
+        raise AnswerError(f"{file} is a directory; name a file in it, e.g. {file / 'pump.toml'}")
+    if not file.parent.is_dir():
+        raise AnswerError(f"there is no directory {file.parent}; make it first: mkdir -p {file.parent}")
+
+
+def _ask(question: Question) -> str:
+    """What a person types; ``?`` is answered with help."""
+    bracket = "" if question.default is None else f" [{question.default}]"
+    _say(question.topic.text)
+    width = max(map(len, question.choices or [""]))
+    for choice, about in (question.choices or {}).items():
+        if about:
+            _say(f"    {choice:<{width}}  {about}")
+    words = [choice for choice, about in (question.choices or {}).items() if not about]
+    options = f" {', '.join(words)}" if words else ""
+    while True:
+        text = input(f" {options}{bracket}: ").strip()
+        if text == "?":
+            _say(f"  {question.topic.help}")
+        elif text:
+            return text
+        elif question.default is not None:
+            return question.default
+        else:
+            _say("  there is no default: type an answer, or ? for help")
+
+
+def _other_file(file: Path, ask: Any) -> Path:
+    """What to do about a file that is there already: write over it, or take another name.
+
+    Raises:
+        AnswerError: nobody is there to say.
+    """
+    from daqsvc.commands.new.interview import AnswerError  # noqa: PLC0415 - slow to import
+
+    if ask is None:
+        raise AnswerError(f"{file} is there already; give another FILE, or --overwrite")
+    while file.exists():
+        text = input(f"{file} is there already. Another name, or overwrite: ").strip()
+        if text == "overwrite":
+            break
+        if text:
+            file = file.with_name(text) if "/" not in text else Path(text)
+    return file
+
+
+def _write(file: Path, text: str) -> None:
+    """Write a file as a whole, or not at all."""
+    with tempfile.NamedTemporaryFile("w", encoding="utf-8", dir=file.parent, prefix=".", delete=False) as out:
+        try:
+            out.write(text)
+            out.flush()
+            mask = os.umask(0)
+            os.umask(mask)
+            Path(out.name).chmod(0o666 & ~mask)
+            Path(out.name).replace(file)
+        except BaseException:
+            Path(out.name).unlink(missing_ok=True)
+            raise
+
+
+def _report(file: Path, text: str, answers: Answers) -> int:
+    """Say what was written, and what to type next."""
+    from daqsvc.commands.new.buses import BUSES  # noqa: PLC0415 - slow to import
+    from daqsvc.commands.new.interview import checked  # noqa: PLC0415
+
+    machine = checked(text, file)
+    quoted = shlex.quote(f"{file}")
+    _say(f"\n{file} is written; daqsvc check finds no error in it.")
+    for warning in machine.warnings:
+        _say(f"{warning}")
+    beside, about = BUSES[answers["bus"]].beside(quoted)
+    commands = {
+        f"daqsvc check {quoted}": "what was understood",
+        f"daqsvc run {quoted}": "watches the machine, until Ctrl-C",
+        beside: about,
+    }
+    width = max(map(len, commands))
+    _say("\nNext:")
+    for command, what in commands.items():
+        _say(f"  {command:<{width}}    {what}")
+    return EXIT_OK
+
+
+def _say(text: str) -> None:
+    print(text)  # noqa: T201 - this is what the verb is for
+
+
+def _failed(why: str, code: int) -> int:
+    print(f"daqsvc new: {why}", file=sys.stderr)  # noqa: T201 - errors go to stderr
+    return code

@@ -1,0 +1,142 @@
+"""From questions to answers: each is held to what ``daqsvc check`` would say of the file that comes of it."""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from daqsvc.commands.new.machine_text import machine_text, questions
+from daqsvc.commands.new.question import SENSOR, Answers, Question
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from pathlib import Path
+
+    from daqsvc.settings import MachineFile
+
+
+class AnswerError(Exception):
+    """An answer that was given beforehand cannot be used, or is missing; says which option it is."""
+
+
+@dataclass(frozen=True, slots=True)
+class Given:
+    """What was answered beforehand.
+
+    Attributes:
+        texts: by the key of the question.
+        defaults: whether the default is taken of all others.
+    """
+
+    texts: Mapping[str, str]
+    defaults: bool
+
+
+def conduct(
+    file: Path, given: Given, ask: Callable[[Question], str] | None, say: Callable[[str], None]
+) -> Answers:
+    """All answers.
+
+    Args:
+        file: the machine file that will be written.
+        given: what was answered beforehand.
+        ask: asks a person; None where there is nobody.
+        say: tells that person why an answer is asked for again.
+
+    Raises:
+        AnswerError: what was given cannot be used, or something is missing.
+    """
+    answers: Answers = {}
+    asked: list[str] = []
+    for question in questions(answers, file.parent):
+        asked.append(question.key)
+        if question.key in given.texts:
+            reason = take(question, given.texts[question.key], answers, file)
+            if reason is not None:
+                raise AnswerError(f"{option(question.key)} {given.texts[question.key]}: {reason}")
+        elif question.default is not None and (given.defaults or question.quiet):
+            reason = take(question, question.default, answers, file)
+            if reason is not None:
+                raise AnswerError(
+                    f"{option(question.key)} must be given: {question.default} does not do: {reason}"
+                )
+        elif ask is None:
+            raise AnswerError(_missing(question))
+        else:
+            while (reason := take(question, ask(question), answers, file)) is not None:
+                say(reason)
+    _refuse_others(given, asked)
+    return answers
+
+
+def take(question: Question, text: str, answers: Answers, file: Path) -> str | None:
+    """Take an answer; why it cannot be taken, if so."""
+    try:
+        answers[question.key] = question.read(text)
+    except ValueError as error:
+        return f"{error}"
+    reason = refusal(answers, file)
+    if reason is not None:
+        del answers[question.key]
+    return reason
+
+
+def refusal(answers: Answers, file: Path) -> str | None:
+    """What ``daqsvc check`` would say if all other answers were the defaults; None if it would be content."""
+    complete = dict(answers)
+    for question in questions(complete, file.parent):
+        if question.key not in complete:
+            if question.default is None:
+                return None  # nobody knows yet
+            complete[question.key] = question.read(question.default)
+    from daqsvc.settings.problems import AssemblyError, MachineFileError  # noqa: PLC0415 - slow to import
+
+    try:
+        checked(machine_text(complete, file.name), file)
+    except MachineFileError as error:
+        problem = error.problems[0]
+        subject = f"{problem.key} = {problem.value}" if problem.value else problem.key
+        return f"{subject}: {problem.message}. Remedy: {problem.remedy}"
+    except AssemblyError as error:
+        return f"{error}"
+    return None
+
+
+def checked(text: str, file: Path) -> MachineFile:
+    """The machine file in a text, held to what ``daqsvc check`` holds it to.
+
+    Raises:
+        MachineFileError: it cannot be used.
+        AssemblyError: a file that it names cannot, or a bearing is not known.
+    """
+    from daqsvc.detectors.make import check_files  # noqa: PLC0415 - slow to import
+    from daqsvc.publish.make import check_outputs  # noqa: PLC0415
+    from daqsvc.settings.load import parse_machine_file  # noqa: PLC0415
+
+    machine = parse_machine_file(text, file)
+    check_files(machine)
+    check_outputs(machine)
+    return machine
+
+
+def option(key: str) -> str:
+    """How an answer is given on the command line."""
+    if key.startswith(f"{SENSOR}."):
+        return f"--{SENSOR} {key.removeprefix(f'{SENSOR}.')}="
+    return f"--{key}"
+
+
+def _missing(question: Question) -> str:
+    words = f"{question.topic.text} Give {option(question.key)}"
+    more = "" if question.default is None else f", or --yes for {question.default} and all other defaults"
+    return f"{words}{more}; there is no terminal to ask at"
+
+
+def _refuse_others(given: Given, asked: list[str]) -> None:
+    """What was given and nobody asked for is a slip of the pen, or of another bus."""
+    for key in given.texts:
+        if key not in asked:
+            close = difflib.get_close_matches(key, asked, n=1)
+            hint = f"did you mean {option(close[0])}?" if close else "leave it out"
+            raise AnswerError(f"{option(key)} is not asked for with these answers; {hint}")

@@ -1,0 +1,111 @@
+"""A whole new machine file: what is asked, in order, and its text."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from daqsvc.commands.new import question as q
+from daqsvc.commands.new.buses import BUSES
+from daqsvc.commands.new.question import NONE, Answers, Question
+from daqsvc.commands.new.sensors import (
+    alarm_tables,
+    limit_questions,
+    pipeline_tables,
+    sensor_questions,
+    sensor_tables,
+)
+from daqsvc.commands.new.toml_lines import entry
+from daqsvc.commands.new.topics import TOPICS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+
+def questions(answers: Answers, folder: Path) -> Iterator[Question]:
+    """The questions, each as the answers before make it.
+
+    Args:
+        answers: those before; whoever takes a question puts its answer there before the next one.
+        folder: of the machine file, where relative paths start.
+    """
+    choices = {word: bus.about for word, bus in BUSES.items()}
+    yield Question("bus", TOPICS["bus"], q.one_of(choices), "virtual", choices)
+    bus = BUSES[answers["bus"]]
+    virtual = answers["bus"] == "virtual"
+    yield Question("name", TOPICS["name"], q.title, "rig" if virtual else "machine")
+    yield Question("site", TOPICS["site"], q.name, "plant", quiet=True)
+    yield Question("box", TOPICS["box"], q.name, "edge-1", quiet=True)
+    yield from bus.questions(answers, folder)
+    yield Question("speed", TOPICS["speed"], q.speed_rpm, "600" if virtual else "1480", quiet=virtual)
+    yield Question("rate", TOPICS["rate"], q.rate_hz, f"{bus.rate_hz(answers):g}", quiet=virtual)
+    yield from sensor_questions(answers)
+    yield from limit_questions(answers)
+    yield from _broker_questions(answers)
+
+
+def _broker_questions(answers: Answers) -> Iterator[Question]:
+    yield Question("broker", TOPICS["broker"], q.text_or_none, NONE)
+    if answers["broker"] is None:
+        return
+    yield Question("username", TOPICS["username"], q.text_or_none, NONE)
+    if answers["username"] is not None:
+        file = "/etc/daqsvc/mqtt-password"
+        yield Question("password-file", TOPICS["password-file"], q.line, file)
+    yield Question("home-assistant", TOPICS["home-assistant"], q.yes_no, "no", q.YES_NO)
+
+
+def machine_text(answers: Answers, file: str) -> str:
+    """The text of the machine file.
+
+    Args:
+        answers: to all `questions`.
+        file: its name, for the commands that its first comment shows.
+    """
+    lines = [*_head(answers, file), *_machine(answers), *BUSES[answers["bus"]].tables(answers), ""]
+    lines += [*sensor_tables(answers), *pipeline_tables(answers), *alarm_tables(answers), *_broker(answers)]
+    return "\n".join(line.rstrip() for line in lines).rstrip() + "\n"
+
+
+def _head(answers: Answers, file: str) -> Iterator[str]:
+    yield f"# {answers['name']}: a machine file of daqsvc, made by daqsvc new."
+    yield "#"
+    yield f"#   daqsvc check {file}    says what it understood, or everything that is wrong"
+    yield f"#   daqsvc run {file}      watches the machine; while it runs, after a change here:"
+    yield f"#   daqsvc reload {file}   takes the change over"
+    yield "#"
+    yield "# Change first: the sensors (sensitivities, places), then the limits of the alarms."
+    yield "# Units are part of every name. Relative paths start at the folder of this file."
+    yield ""
+
+
+def _machine(answers: Answers) -> Iterator[str]:
+    yield entry("schema_version", 1)
+    yield entry("site", answers["site"], "site, box and machine are part of every topic")
+    yield entry("box", answers["box"], "the computer that daqsvc runs on")
+    yield ""
+    yield "[machine]"
+    yield entry("name", q.short_name(answers["name"]))
+    if answers["name"] != q.short_name(answers["name"]):
+        yield entry("description", answers["name"])
+    yield entry("speed_rpm", answers["speed"], "nominal; negative if the shaft turns clockwise")
+    yield ""
+
+
+def _broker(answers: Answers) -> Iterator[str]:
+    url = answers["broker"]
+    if url is None:
+        yield "# Alarms stand in the journal of this box: daqsvc alarms. To send them to an MQTT broker, too:"
+        yield "# [mqtt]"
+        yield '# url = "mqtts://broker.example:8883"'
+        return
+    yield "[mqtt]"
+    yield entry("url", url)
+    if url.startswith("mqtt://"):
+        yield entry("insecure", value=True, comment="says that it is meant: nothing is encrypted")
+    if answers["username"] is not None:
+        yield entry("username", answers["username"])
+        yield entry("password_file", answers["password-file"], "its first line; only daqsvc may read it")
+    if answers["home-assistant"]:
+        yield ""
+        yield "[mqtt.home_assistant]            # the machine shows up there by itself"

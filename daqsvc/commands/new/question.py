@@ -1,0 +1,168 @@
+"""A question of ``daqsvc new``, and how what is typed becomes a value."""
+
+from __future__ import annotations
+
+import math
+import re
+import unicodedata
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+Answers = dict[str, Any]
+"""Values by the key of their question."""
+
+NONE = "none"
+LONGEST_NAME = 64
+SENSOR = "sensor"
+"""First part of the keys that belong to one channel: ``sensor.CHANNEL.TOPIC``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """What a question is about, whatever its default.
+
+    Attributes:
+        text: the question.
+        help: a sentence for whoever types ``?``.
+    """
+
+    text: str
+    help: str
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """A question as the answers before have made it.
+
+    Attributes:
+        key: of the answer; also the name of the option.
+        topic: what it is about.
+        read: makes a value of the text, or raises `ValueError` with the reason.
+        default: text that is taken for an empty answer; None where there must be one.
+        choices: what may be answered, with what each means; empty if it is free.
+        quiet: whether the default is taken without asking, unless an option says something else.
+    """
+
+    key: str
+    topic: Topic
+    read: Callable[[str], Any]
+    default: str | None = None
+    choices: Mapping[str, str] | None = None
+    quiet: bool = False
+
+
+def sensor_key(channel: str, topic: str) -> str:
+    """Key of a question about one channel."""
+    return f"{SENSOR}.{channel}.{topic}"
+
+
+def one_of(choices: Mapping[str, str]) -> Callable[[str], str]:
+    """One of some words, or the beginning of it that only it has."""
+
+    def read(text: str) -> str:
+        word = text.lower()
+        if word in choices:
+            return word
+        begun = [choice for choice in choices if word and choice.startswith(word)]
+        if len(begun) != 1:
+            raise ValueError(f'"{text}" is not one of {", ".join(choices)}')
+        return begun[0]
+
+    return read
+
+
+def line(text: str) -> str:
+    """Any text on one line."""
+    if not text.strip() or not text.isprintable():
+        raise ValueError("it must be one line of plain text")
+    return text.strip()
+
+
+def title(text: str) -> str:
+    """A text that holds a short name: see `short_name`."""
+    if not short_name(line(text)):
+        raise ValueError(
+            f'"{text}" holds no letter from a to z and no digit, and topics and file names need one: '
+            f"write e.g. pump-3 {text}"
+        )
+    return line(text)
+
+
+def short_name(text: str) -> str:
+    """The name for topics and files that a text holds: without accents, lower case, ``-`` between words."""
+    plain = unicodedata.normalize("NFKD", text.replace("ß", "ss"))
+    ascii_only = plain.encode("ascii", "ignore").decode()
+    return re.sub(r"[^a-z0-9_]+", "-", ascii_only.lower())[:LONGEST_NAME].strip("-")
+
+
+def name(text: str) -> str:
+    """A name of the machine file."""
+    if not re.fullmatch(r"\.*[A-Za-z0-9_-][A-Za-z0-9_.-]*", text) or len(text) > LONGEST_NAME:
+        raise ValueError(
+            f'"{text}" is no name: use up to {LONGEST_NAME} letters from a to z, digits, "_", "." and "-"'
+        )
+    return text
+
+
+def names(text: str) -> tuple[str, ...]:
+    """Names with commas between."""
+    parts = tuple(name(part.strip()) for part in text.split(","))
+    if len(set(parts)) < len(parts):
+        raise ValueError(f'"{text}" has a name twice')
+    return parts
+
+
+def number(text: str) -> float:
+    """A number."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ValueError(f'"{text}" is not a number; write e.g. 0.5 or 1480')
+    return value
+
+
+def rate_hz(text: str) -> float:
+    """A sampling rate."""
+    value = number(text)
+    if value < 1e-4:
+        raise ValueError(f'"{text}" is not a rate: write how many samples there are in a second, e.g. 2560')
+    return value
+
+
+def speed_rpm(text: str) -> float:
+    """The speed of a shaft that turns."""
+    value = number(text)
+    if abs(value) < 1e-3:
+        raise ValueError(f'"{text}" is a shaft that stands still: write its usual speed')
+    return value
+
+
+def whole(text: str) -> int:
+    """A whole number, hexadecimal with ``0x``."""
+    try:
+        return int(text, 0)
+    except ValueError:
+        raise ValueError(f'"{text}" is not a whole number; write e.g. 17 or 0x101') from None
+
+
+def number_or_none(text: str) -> float | None:
+    """A number, or ``none``."""
+    return None if text.lower() == NONE else number(text)
+
+
+def text_or_none(text: str) -> str | None:
+    """A text, or ``none``."""
+    return None if text.lower() == NONE else line(text)
+
+
+YES_NO = {"yes": "", "no": ""}
+
+
+def yes_no(text: str) -> bool:
+    """``yes`` or ``no``."""
+    return one_of(YES_NO)(text) == "yes"

@@ -1,0 +1,371 @@
+"""The sensors, detectors and alarms of a new machine file: questions and tables."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from daqsvc.commands.new import question as q
+from daqsvc.commands.new.buses import BUSES, STREAM
+from daqsvc.commands.new.question import NONE, Answers, Question, sensor_key
+from daqsvc.commands.new.toml_lines import array, behind, entry, toml
+from daqsvc.commands.new.topics import SENSOR_TOPICS, TOPICS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from daqsvc.settings.zones import Boundaries
+
+TYPES = {
+    "proximity": "a proximity probe, which sees the shaft",
+    "accelerometer": "on the housing",
+    "velocity": "a velocity sensor on the housing",
+    "keyphasor": "one pulse a revolution",
+    "trend": "a value that the device measures itself, e.g. velocity RMS, temperature",
+    NONE: "nothing that is of interest",
+}
+_UNITS = {"proximity": ("um", "mm", "mil"), "accelerometer": ("g", "m/s2")}
+_FIXED_UNITS = {"velocity": "mm/s", "keyphasor": "V"}
+_SENSITIVITY = {"um": 7.87, "mm": 7870.0, "mil": 200.0, "g": 100.0, "m/s2": 10.2, "mm/s": 4.0}
+_PREFIX = {"proximity": "probe-", "accelerometer": "accel-", "velocity": "velocity-"}
+_ZERO_V, _OK_V = -10.0, (-18.0, -2.0)
+CLASSES = {
+    "2-rigid": "15 to 300 kW on a stiff foundation",
+    "2-flexible": "15 to 300 kW on a soft one, e.g. on springs or a steel frame",
+    "1-rigid": "above 300 kW on a stiff foundation",
+    "1-flexible": "above 300 kW on a soft one",
+}
+_ISO_RPM = (120.0, 30_000.0)
+"""Speeds that ISO 20816-3 is for."""
+_BEARING_RATE_HZ, _BEARING_RPM, _BEARING_BLOCK_S = 2500.0, 600.0, 1.25
+"""What the bearings' detector needs."""
+_PULSE_SAMPLES, _HARMONIC_SAMPLES = 4.0, 12.0
+"""Samples a revolution that a keyphasor's pulses, and 1X by them, need."""
+_LONGEST_WINDOW_S = 10.0
+_SLOW_RPM, _SLOW_HZ, _BAND_HZ = 600.0, 2.0, (10.0, 1000.0)
+"""The velocity of machines up to this speed counts from a lower frequency on (ISO 20816-3)."""
+
+
+class Sensor(NamedTuple):
+    """A sensor, as it was answered."""
+
+    channel: str
+    name: str
+    type: str
+    unit: str
+    bearing: Any
+
+    @property
+    def housing(self) -> bool:
+        """Whether its velocity RMS is measured here."""
+        return self.type in {"accelerometer", "velocity"}
+
+    @property
+    def measure(self) -> tuple[str, str] | None:
+        """The measure that its limits are for, and the unit of that."""
+        if self.housing:
+            return "velocity_rms", "mm/s"
+        return {"proximity": ("rms", self.unit), "trend": ("value", self.unit)}.get(self.type)
+
+    @property
+    def iso(self) -> str | None:
+        """Which zones of ISO 20816-3 are there for it: ``housing`` or ``shaft``."""
+        if self.type == "proximity":
+            return "shaft"
+        return "housing" if self.housing or (self.type == "trend" and self.unit == "mm/s") else None
+
+
+def sensors(answers: Answers) -> list[Sensor]:
+    """The sensors as far as they have been answered."""
+    found = []
+    for channel in BUSES[answers["bus"]].channels(answers):
+        kind = answers.get(sensor_key(channel, "type"), NONE)
+        if kind != NONE and sensor_key(channel, "name") in answers:
+            unit = _FIXED_UNITS.get(kind) or answers.get(sensor_key(channel, "unit"), "")
+            bearing = answers.get(sensor_key(channel, "bearing"))
+            found.append(Sensor(channel, answers[sensor_key(channel, "name")], kind, unit, bearing))
+    return found
+
+
+def sensor_questions(answers: Answers) -> Iterator[Question]:
+    """What is on each channel."""
+    bus = BUSES[answers["bus"]]
+    for channel in bus.channels(answers):
+        yield from bus.of_channel(answers, channel)
+        yield from _of_channel(answers, channel)
+
+
+def _of_channel(answers: Answers, channel: str) -> Iterator[Question]:
+    bus = BUSES[answers["bus"]]
+    known = {kind: TYPES[kind] for kind in bus.sensor_types(answers)}
+    kind, unit = bus.guess(answers, channel)
+    quiet = answers["bus"] == "virtual"
+
+    def ask(topic: str, read: Any, default: str, **more: Any) -> Question:
+        words = SENSOR_TOPICS[topic]
+        filled = q.Topic(
+            words.text.format(channel=channel, unit=answers.get(sensor_key(channel, "unit"), "mm/s")),
+            words.help.format(channel=channel, unit=answers.get(sensor_key(channel, "unit"), "mm/s")),
+        )
+        return Question(sensor_key(channel, topic), filled, read, default, quiet=quiet, **more)
+
+    yield ask("type", q.one_of(known), kind, choices=known)
+    chosen = answers[sensor_key(channel, "type")]
+    if chosen == NONE:
+        return
+    taken = {one.name for one in sensors(answers)}
+    yield ask("name", q.name, _free_name(f"{_PREFIX.get(chosen, '')}{channel}", taken))
+    if chosen in _UNITS:
+        units = dict.fromkeys(_UNITS[chosen], "")
+        yield ask("unit", q.one_of(units), unit if unit in units else next(iter(units)), choices=units)
+    elif chosen == "trend":
+        yield ask("unit", q.line, unit or "mm/s")
+    if chosen in {"proximity", "accelerometer", "velocity"}:
+        yield from _of_waveform(answers, channel, ask)
+    if chosen == "keyphasor":
+        yield ask("threshold", q.number, "-6")
+
+
+def _of_waveform(answers: Answers, channel: str, ask: Any) -> Iterator[Question]:
+    kind = answers[sensor_key(channel, "type")]
+    unit = _FIXED_UNITS.get(kind) or answers[sensor_key(channel, "unit")]
+    volts = BUSES[answers["bus"]].in_volts(answers)
+    yield ask("sensitivity", q.number_or_none, f"{_SENSITIVITY[unit]:g}" if volts else NONE)
+    if kind == "proximity":
+        probes = [one for one in sensors(answers) if one.type == "proximity"]
+        yield ask("angle", q.number, "0" if len(probes) % 2 else "90")
+    if kind == "accelerometer" and _tells_bearings(answers):
+        yield ask("bearing", _bearing, NONE)
+
+
+def _tells_bearings(answers: Answers) -> bool:
+    """Whether samples and speed are such that the bearings' detector can work."""
+    block_s = answers["samples"] / answers["rate"] if "samples" in answers else math.inf
+    return (
+        answers["rate"] >= _BEARING_RATE_HZ
+        and abs(answers["speed"]) >= _BEARING_RPM
+        and block_s >= _BEARING_BLOCK_S
+    )
+
+
+def _free_name(wanted: str, taken: set[str]) -> str:
+    begin = wanted[: q.LONGEST_NAME]
+    numbered = (f"{wanted[: q.LONGEST_NAME - 5]}-{number}" for number in range(2, 9999))
+    return begin if begin not in taken else next(name for name in numbered if name not in taken)
+
+
+def _bearing(text: str) -> Any:
+    """A designation, or a table of the geometry; None without a bearing."""
+    from daqsvc.bearing.geometry import bearing_orders  # noqa: PLC0415 - only what a verb needs
+
+    if text.lower() == NONE:
+        return None
+    if "," in text:
+        figures = [q.number(part.strip()) for part in text.split(",")]
+        if not 3 <= len(figures) <= 4 or figures[0] != int(figures[0]):
+            raise ValueError(
+                "give a whole number of balls, ball and pitch diameter in mm, and perhaps the contact angle "
+                "in degrees: 9, 7.94, 39.04"
+            )
+        keys = ("ball_diameter_mm", "pitch_diameter_mm", "contact_deg")
+        return {"balls": int(figures[0]), **dict(zip(keys, figures[1:], strict=False))}
+    try:
+        bearing_orders(q.line(text))
+    except KeyError as error:
+        found = f"{error.args[0]}".partition(". ")[0]
+        raise ValueError(f"{found}. Or give balls, ball and pitch diameter in mm: 9, 7.94, 39.04") from None
+    return text.strip()
+
+
+def limit_questions(answers: Answers) -> Iterator[Question]:
+    """Which limits, and of what."""
+    limited = [one for one in sensors(answers) if one.measure is not None]
+    if not limited:
+        return
+    quiet = answers["bus"] == "virtual"
+    in_range = _ISO_RPM[0] <= abs(answers["speed"]) <= _ISO_RPM[1]
+    choices = {"iso": "zones of ISO 20816-3", "own": "two figures of yours", NONE: "write them later"}
+    if not in_range or not any(one.iso for one in limited):
+        del choices["iso"]
+    probes = limited[0].type == "proximity"
+    default = "own" if quiet and probes else "iso" if "iso" in choices else NONE
+    yield Question("limits", TOPICS["limits"], q.one_of(choices), default, choices)
+    if answers["limits"] == "iso" and any(one.iso == "housing" for one in limited):
+        yield Question("class", TOPICS["class"], q.one_of(CLASSES), "2-rigid", CLASSES)
+    if answers["limits"] == "own":
+        unit = limited[0].measure[1] if limited[0].measure else ""
+        alert = (
+            {"um": "35", "mm": "0.035", "mil": "1.4"}.get(unit)
+            if probes
+            else "2.8"
+            if unit == "mm/s"
+            else None
+        )
+        what = f"{limited[0].measure[0]} in {unit}" if limited[0].measure else ""
+        for key, factor in (("alert", 1.0), ("danger", 1.5)):
+            words = q.Topic(f"{TOPICS[key].text} ({what.replace('_', ' ')})", TOPICS[key].help)
+            yield Question(key, words, q.number, alert if factor == 1.0 else _higher(answers["alert"]))
+
+
+def _higher(alert: float) -> str:
+    return f"{alert + max(0.5 * abs(alert), 1e-3):.6g}"
+
+
+def sensor_tables(answers: Answers) -> Iterator[str]:
+    """Lines of ``[[sensors]]``."""
+    for sensor in sensors(answers):
+        get = partial(lambda channel, topic: answers.get(sensor_key(channel, topic)), sensor.channel)
+        yield "[[sensors]]"
+        yield entry("name", sensor.name)
+        yield entry("type", sensor.type)
+        yield entry("stream", STREAM)
+        yield entry("channel", sensor.channel)
+        yield entry("unit", sensor.unit)
+        sensitivity = get("sensitivity")
+        if sensitivity is not None:
+            yield entry("sensitivity_mv_per_unit", sensitivity, "from the sensor's calibration sheet")
+        elif sensor.type in _PREFIX:
+            yield "# no sensitivity_mv_per_unit: the samples are in this unit already"
+        if sensor.type == "proximity":
+            if sensitivity is not None:
+                yield entry("zero_v", _ZERO_V, "gap voltage with the shaft centred: measure it")
+                yield entry("gap_ok_v", _OK_V, "beyond, the probe is not believed; see its manual")
+            yield entry("angle_deg", get("angle"), "0 to the right, 90 upwards, against the clock")
+        if sensor.type == "keyphasor":
+            yield entry("threshold_v", get("threshold"), "half-way up a pulse: look at it on a scope")
+            yield entry("hysteresis_v", 0.5)
+            yield entry("edge", "rising", 'or "falling": the edge that marks angle zero')
+        if sensor.type == "trend":
+            yield "# ok_between = [-40.0, 105.0]    # what it can measure; beyond, it is not believed"
+        yield ""
+
+
+def pipeline_tables(answers: Answers) -> Iterator[str]:
+    """Lines of ``[pipeline]`` and its detectors."""
+    there = sensors(answers)
+    rate_hz, speed_rpm = answers["rate"], abs(answers["speed"])
+    waveforms = [one for one in there if one.type in _PREFIX]
+    keyphasor = next((one.name for one in there if one.type == "keyphasor"), None)
+    per_revolution = 60.0 * rate_hz / speed_rpm
+    housing = any(one.housing for one in there)
+    low_hz = _SLOW_HZ if speed_rpm <= _SLOW_RPM else _BAND_HZ[0]
+    window_s = max(0.5, 16.0 / rate_hz, 2.0 / low_hz if housing else 0.0)
+    by_mark = keyphasor is not None and per_revolution >= _HARMONIC_SAMPLES and bool(waveforms)
+    if by_mark and 120.0 / speed_rpm > window_s:
+        by_mark = 120.0 / speed_rpm <= _LONGEST_WINDOW_S
+        window_s = max(window_s, 120.0 / speed_rpm) if by_mark else window_s
+    window_s = _up(window_s)
+    yield "[pipeline]"
+    yield entry("ring_s", max(30.0, 4.0 * window_s), "how much of the past stays in memory")
+    yield ""
+    yield "[pipeline.levels]"
+    if waveforms:
+        yield entry("window_s", window_s, "RMS, peak and so on are measured over so long")
+    if housing:
+        high_hz = min(_BAND_HZ[1], float(f"{0.4 * rate_hz:.3g}"))
+        band = [low_hz, high_hz]
+        yield entry("velocity_band_hz", band, "of the velocity RMS; ends below half the sampling rate")
+    if by_mark:
+        yield entry("keyphasor", keyphasor, "the mark that phases count from")
+        yield entry("measures", ["1x_amplitude", "1x_phase_lag"], "told for trends, without an alarm")
+    yield ""
+    bearings = [one for one in there if one.bearing is not None]
+    if bearings:
+        yield from _bearing_table(bearings, keyphasor if per_revolution >= _PULSE_SAMPLES else None)
+
+
+def _bearing_table(bearings: list[Sensor], keyphasor: str | None) -> Iterator[str]:
+    yield "[pipeline.bearing]               # tells which part of a rolling bearing is damaged"
+    if keyphasor is not None:
+        yield entry("keyphasor", keyphasor, "the speed is measured")
+    else:
+        yield "# Without a keyphasor machine.speed_rpm must be right to 1 %."
+    yield entry("calibrate_s", 30.0, "the first seconds are the healthy machine; kept over restarts")
+    tables = []
+    for one in bearings:
+        key = "type" if isinstance(one.bearing, str) else "geometry"
+        tables.append({"name": one.name, "sensor": one.name, key: one.bearing})
+    yield from array("bearings", tables)
+    yield ""
+
+
+def _up(seconds: float) -> float:
+    """Rounded up to a tenth of a second."""
+    return math.ceil(round(10.0 * seconds, 6)) / 10.0
+
+
+def alarm_tables(answers: Answers) -> Iterator[str]:
+    """Lines of ``[[alarms]]``; what has no limits yet has them in a comment."""
+    there = sensors(answers)
+    limits = answers.get("limits", NONE)
+    first = next((one.measure for one in there if one.measure is not None), None)
+    for sensor in there:
+        if sensor.measure is None:
+            continue
+        if limits == "iso" and sensor.iso is not None:
+            yield from _iso_alarm(answers, sensor)
+        elif limits == "own" and sensor.measure == first:
+            yield from _own_alarm(answers, sensor)
+        else:
+            yield from _later(sensor)
+        yield ""
+    if any(one.bearing is not None for one in there):
+        yield "[[alarms]]"
+        yield entry("name", _free_name("bearing-damage", {one.name for one in there}))
+        yield entry("detector", "bearing", "level and cause are what it finds")
+        yield entry("latching", value=True, comment="damage does not heal: it stays until it is reset")
+        yield ""
+
+
+def _iso_alarm(answers: Answers, sensor: Sensor) -> Iterator[str]:
+    from daqsvc.settings.zones import Zones, boundaries  # noqa: PLC0415 - brings the settings
+
+    table: dict[str, Any] = {"standard": "iso-20816-3"}
+    if sensor.iso == "shaft":
+        table["shaft"] = True
+    else:
+        group, support = answers["class"].split("-")
+        table |= {"group": int(group), "support": support}
+    at: Boundaries | None = boundaries(
+        Zones(**table), answers["speed"], sensor.unit if sensor.iso == "shaft" else "mm/s"
+    )
+    assert at is not None  # noqa: S101 - for the type checker: the table is complete
+    measure, unit = sensor.measure or ("", "")
+    if sensor.iso == "shaft":
+        measure = "peak_to_peak"
+    yield f"# Alert where zone C begins, {at[1]:g} {unit}, danger where zone D does, {at[2]:g} {unit}."
+    yield from _alarm(sensor.name, measure, {"zones": table}, at[1])
+
+
+def _own_alarm(answers: Answers, sensor: Sensor) -> Iterator[str]:
+    measure, unit = sensor.measure or ("", "")
+    yield f"# Setpoints in {unit}: best from the machine itself, when it is in good order."
+    limits = {"alert": answers["alert"], "danger": answers["danger"]}
+    yield from _alarm(sensor.name, measure, limits, answers["alert"])
+
+
+def _alarm(name: str, measure: str, limits: dict[str, Any], alert: float) -> Iterator[str]:
+    yield "[[alarms]]"
+    yield entry("name", name)
+    yield entry("sensor", name)
+    yield entry("measure", measure)
+    for key, value in limits.items():
+        yield entry(key, value)
+    yield entry("deadband", float(f"{0.05 * abs(alert):.2g}"), "returns this far below a limit")
+    yield entry("on_delay_s", 3.0, "so long at a limit before it counts")
+    yield entry("off_delay_s", 5.0, "so long below before it returns")
+    yield entry("latching", value=False, comment="true: it stays until somebody resets it")
+
+
+def _later(sensor: Sensor) -> Iterator[str]:
+    measure, unit = sensor.measure or ("", "")
+    yield f"# No limits yet. In {unit}; take them from the machine in good order, or ask its maker:"
+    yield "# [[alarms]]"
+    for key, value in (("name", sensor.name), ("sensor", sensor.name), ("measure", measure)):
+        yield f"# {key} = {toml(value)}"
+    yield "# alert = ..."
+    yield behind(
+        "# danger = ...",
+        "and alert_low, danger_low of a value that can be too low" if sensor.type == "trend" else "",
+    )

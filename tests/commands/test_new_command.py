@@ -1,0 +1,334 @@
+"""``daqsvc new``: whatever is answered, the file that it writes can be used; and how it asks."""
+
+from __future__ import annotations
+
+import os
+import pty
+import shutil
+import signal
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+from support.examples import examples
+from support.paths import ROOT
+
+from daqsvc.cli import main
+from daqsvc.commands.new.buses import BUSES
+from daqsvc.commands.new.interview import Given, checked, conduct, refusal, take
+from daqsvc.commands.new.machine_text import machine_text, questions
+from daqsvc.settings import load_machine_file
+
+if TYPE_CHECKING:
+    from daqsvc.commands.new.question import Question
+
+pytestmark = pytest.mark.integration
+DBC = ROOT / "config" / "devices" / "triaxial-accelerometer.dbc"
+NEEDED = {
+    "dbc": f"{DBC}",
+    "host": "192.0.2.10",
+    "port": "/dev/serial/by-id/usb-logger",
+    "alert": "2.5",
+}
+"""Answers to what has no default."""
+PLAIN = st.characters(codec="utf-8", exclude_categories=["C", "Z"])
+WORDS = st.text(st.one_of(PLAIN, st.sampled_from(" \"'\\#[]=,{}")), max_size=40)
+NAMES = st.from_regex(r"[A-Za-z][A-Za-z0-9_-]{0,20}", fullmatch=True)
+NUMBERS = st.floats(-1e6, 1e6).map(repr)
+FREE = {
+    "name": st.builds("{}a{}".format, WORDS, WORDS),
+    "site": NAMES,
+    "box": NAMES,
+    "interface": st.sampled_from(["socketcan", "pcan", "slcan"]),
+    "socket": NAMES.map("/run/{}".format),
+    "channel": st.one_of(NAMES, WORDS),
+    "bitrate": st.sampled_from(["125000", "500000", "1000000"]),
+    "data-bitrate": st.sampled_from(["2000000", "8000000"]),
+    "dbc": st.just(f"{DBC}"),
+    "signals": st.sampled_from(["AccelX", "AccelY, AccelZ", "Status, AccelX, AccelZ"]),
+    "id": st.integers(0, 0x1FFF_FFFF).map(hex),
+    "channels": st.lists(NAMES, min_size=1, max_size=6, unique=True).map(", ".join),
+    "scale": st.one_of(NUMBERS, st.sampled_from(["0.001", "0.0005", "-0.01", "1"])),
+    "samples-per-frame": st.integers(1, 40).map(str),
+    "host": st.sampled_from(["192.0.2.10", "gateway.example", "::1"]),
+    "tcp-port": st.integers(1, 65_535).map(str),
+    "port": WORDS.map("/dev/tty{}".format),
+    "baud": st.sampled_from(["9600", "19200", "115200", "3000000"]),
+    "unit": st.integers(1, 247).map(str),
+    "block-id": st.integers(0, 65_535).map(str),
+    "block-address": st.integers(0, 65_535).map(str),
+    "samples": st.sampled_from(["64", "1024", "8192"]),
+    "columns": st.lists(NAMES, min_size=2, max_size=6, unique=True).map(", ".join),
+    "separator": st.sampled_from([",", ";", " ", r"\t"]),
+    "prefix": st.sampled_from(["none", "$ACC", "LOG"]),
+    "speed": st.one_of(st.sampled_from(["600", "1480", "-3000", "12000", "90"]), NUMBERS),
+    "rate": st.one_of(st.sampled_from(["1", "100", "2560", "12800", "25600"]), NUMBERS),
+    "alert": NUMBERS,
+    "danger": NUMBERS,
+    "broker": st.sampled_from(["none", "mqtt://127.0.0.1:1883", "mqtts://broker.example:8883"]),
+    "username": st.one_of(st.just("none"), WORDS),
+    "password-file": WORDS,
+    "address": st.integers(0, 65_535).map(str),
+    "sensitivity": st.sampled_from(["none", "7.87", "100", "4", "10.2"]),
+    "angle": st.integers(-360, 360).map(str),
+    "threshold": st.sampled_from(["-6", "2.5", "0"]),
+    "bearing": st.sampled_from(["none", "6205-2RS", "6203", "9, 7.94, 39.04", "12, 8, 50, 15"]),
+}
+
+
+def strategy(question: Question) -> st.SearchStrategy[str]:
+    """Answers to a question; most of them can be used, with the answers before."""
+    topic = question.key.rpartition(".")[2]
+    if question.choices:
+        return st.sampled_from(sorted(question.choices))
+    if topic == "unit" and "." in question.key:
+        return st.sampled_from(["mm/s", "degC", "bar", "µm", "%"])
+    return NAMES if topic == "name" and "." in question.key else FREE[topic]
+
+
+@pytest.mark.property
+@settings(
+    max_examples=examples(90),
+    deadline=None,
+    phases=[Phase.explicit, Phase.reuse, Phase.generate],
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
+)
+@given(data=st.data())
+def test_whatever_is_answered_the_file_passes_check(data: st.DataObject) -> None:
+    file = Path("/nowhere/machine.toml")
+    answers: dict = {}
+    for question in questions(answers, file.parent):
+        asked = data.draw(st.booleans()) if question.default is not None else True
+        text = data.draw(strategy(question), label=question.key) if asked else question.default
+        reason = take(question, text, answers, file)
+        if reason is not None:
+            # An answer that is asked again: with a reason, and the default will do.
+            assert len(reason) > 10
+            topic = question.key.rpartition(".")[2]
+            sure = question.default if question.default is not None else NEEDED[topic]
+            assert take(question, sure, answers, file) is None, (question.key, sure)
+    text = machine_text(answers, file.name)
+    machine = checked(text, file)
+    assert machine.machine.description in {answers["name"], ""}
+    assert machine.machine.speed_rpm == answers["speed"]
+
+
+def grid() -> list[dict[str, str]]:
+    """Answers of all kinds of buses and limits, one by one."""
+    cases = [
+        {"bus": bus, "limits": limits, **NEEDED_OF.get(bus, {})}
+        for bus in BUSES
+        for limits in ("none", "iso", "own")
+    ]
+    for case in cases:
+        if case["limits"] == "own":
+            case["alert"] = "2.5"
+    cases += [{"bus": "modbus-tcp", "host": "::1", "way": "waveform", "sensor.x.bearing": "6205-2RS"}]
+    cases += [{"bus": "can", "broker": "mqtts://broker.example", "username": "daq", "home-assistant": "yes"}]
+    return cases
+
+
+NEEDED_OF = {
+    "can-dbc": {"dbc": f"{DBC}"},
+    "modbus-tcp": {"host": "192.0.2.10"},
+    "modbus-rtu": {"port": "/dev/ttyS0"},
+    "serial": {"port": "/dev/ttyS0"},
+}
+
+
+@pytest.mark.parametrize("case", grid(), ids=lambda case: " ".join(case.values()))
+def test_without_a_terminal_options_and_defaults_make_a_file_without_warnings(tmp_path, capsys, case):
+    file = tmp_path / "m.toml"
+    texts = {key: value for key, value in case.items() if not key.startswith("sensor.")}
+    options = [f"--{key}={value}" for key, value in texts.items()]
+    options += [f"--sensor={key[7:]}={value}" for key, value in case.items() if key not in texts]
+    assert main(["new", f"{file}", "--yes", *options]) == 0
+    said = capsys.readouterr().out
+    assert f"{file} is written; daqsvc check finds no error in it." in said
+    machine = load_machine_file(file)
+    assert machine.warnings == ()
+    assert bool(machine.alarms) == (case.get("limits") != "none")
+    # What it says to type next is what there is to type.
+    verbs = [line.split()[1] for line in said.partition("Next:")[2].splitlines() if line.strip()]
+    assert verbs == ["check", "run", "sim" if case["bus"] == "virtual" else "status"]
+    assert main(["check", f"{file}"]) == 0
+
+
+def test_answers_of_a_file_are_those_of_the_options(tmp_path, capsys):
+    answers = tmp_path / "answers.toml"
+    answers.write_text(
+        'bus = "modbus-tcp"\nname = "Lüfter \\"7\\" \'süd\' 泵"\nhost = "::1"\nunit = 3\nspeed = -1480\n'
+        'channels = ["de", "nde"]\nlimits = "iso"\nclass = "1-flexible"\n'
+        'sensor.de.address = 17\nsensor.de.type = "trend"\n[sensor.nde]\naddress = 0x20\nscale = 0.001\n',
+        encoding="utf-8",
+    )
+    file = tmp_path / "fan.toml"
+    assert main(["new", f"{file}", "--answers", f"{answers}", "--yes", "--unit", "4"]) == 0
+    machine = load_machine_file(file)
+    assert machine.machine.description == "Lüfter \"7\" 'süd' 泵"
+    assert machine.machine.name == "lufter-7-sud"
+    assert machine.machine.speed_rpm == -1480.0
+    layout = tomllib.loads(file.read_text(encoding="utf-8"))["streams"]["device"]["layout"]
+    assert layout["unit"] == 4
+    assert [(one["address"], one["scale"]) for one in layout["channels"]] == [(17, 0.01), (32, 0.001)]
+    assert [alarm.alert for alarm in machine.alarms] == [7.1, 7.1]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--bus", "modbus-tcp", "--name", "a"], "Give --host; there is no terminal to ask at"),
+        ([], "Give --bus, or --yes for virtual and all other defaults"),
+        (["--yes", "--bus", "modbus"], '--bus modbus: "modbus" is not one of virtual, can-dbc, '),
+        (["--yes", "--host", "a"], "--host is not asked for with these answers; leave it out"),
+        (["--yes", "--speed", "0"], '--speed 0: "0" is a shaft that stands still'),
+        (["--yes", "--sensor", "x.kind=none"], "--sensor x.kind= is not asked for"),
+        (["--yes", "--sensor", "x"], "write CHANNEL.TOPIC=ANSWER"),
+        (["--yes", "--name", "\u6cf5"], "holds no letter from a to z"),
+        (["--yes", "--bus=can-dbc", "--dbc=no.dbc"], "there is no file"),
+        (["--yes", "--bus=can", "--rate=1e6"], "Remedy: correct the rates of the streams"),
+        (
+            ["--yes", "--bus=can", "--sensor=x.type=accelerometer", "--rate=2560", "--sensor=x.bearing=9999"],
+            "9999",
+        ),
+    ],
+)
+def test_what_is_missing_or_wrong_is_said_in_one_line_and_nothing_is_written(
+    tmp_path, capsys, monkeypatch, options, words
+):
+    monkeypatch.chdir(tmp_path)
+    assert main(["new", *options]) == 2
+    said = capsys.readouterr()
+    assert words in said.err
+    assert said.err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_is_there_is_written_over_only_if_that_is_said(tmp_path, capsys):
+    file = tmp_path / "rig.toml"
+    file.write_text("mine")
+    assert main(["new", f"{file}", "--yes"]) == 2
+    assert "is there already; give another FILE, or --overwrite" in capsys.readouterr().err
+    assert file.read_text() == "mine"
+    assert main(["new", f"{file}", "--yes", "--overwrite"]) == 0
+    assert load_machine_file(file).machine.name == "rig"
+    assert main(["new", f"{tmp_path}", "--yes"]) == 2
+    assert "is a directory; name a file in it" in capsys.readouterr().err
+    assert main(["new", f"{tmp_path / 'no' / 'rig.toml'}", "--yes"]) == 2
+    assert "make it first: mkdir -p" in capsys.readouterr().err
+
+
+def test_a_dbc_file_is_found_from_where_it_was_typed_and_by_the_service_too(tmp_path, monkeypatch):
+    here, there = tmp_path / "here", tmp_path / "there"
+    here.mkdir()
+    there.mkdir()
+    shutil.copy(DBC, here / "my sensor.dbc")
+    monkeypatch.chdir(here)
+    for file in (Path("fan.toml"), there / "fan.toml"):
+        assert main(["new", f"{file}", "--yes", "--bus=can-dbc", "--dbc=my sensor.dbc"]) == 0
+        machine = load_machine_file(file)
+        assert [(one.name, one.type, one.unit) for one in machine.sensors] == [
+            (f"accel-Accel{axis}", "accelerometer", "g") for axis in "XYZ"
+        ]
+    assert 'dbc = "my sensor.dbc"' in Path("fan.toml").read_text(encoding="utf-8")
+
+
+class Terminal:
+    """``daqsvc new`` at a terminal, in a folder."""
+
+    def __init__(self, folder: Path, *options: str) -> None:
+        self._leader, follower = pty.openpty()
+        command = [sys.executable, "-m", "daqsvc", "new", *options]
+        environment = {**os.environ, "PYTHONPATH": f"{ROOT}"}
+        self.process = subprocess.Popen(
+            command, cwd=folder, stdin=follower, stdout=follower, stderr=follower, env=environment,
+            start_new_session=True,
+        )  # fmt: skip
+        os.close(follower)
+
+    def until(self, words: str) -> str:
+        """What has come since the last look, up to some words."""
+        seen = ""
+        while words not in seen:
+            try:
+                seen += os.read(self._leader, 1).decode("utf-8", "replace")
+            except OSError:
+                raise AssertionError(f"it has ended without {words!r}: {seen}") from None
+        return seen
+
+    def type(self, text: str) -> None:
+        os.write(self._leader, f"{text}\n".encode())
+
+    def rest(self) -> str:
+        seen = ""
+        try:
+            while part := os.read(self._leader, 4096):
+                seen += part.decode()
+        except OSError:
+            pass
+        self.process.wait(timeout=60)
+        os.close(self._leader)
+        return seen
+
+
+def test_at_a_terminal_it_explains_asks_again_and_takes_defaults(tmp_path):
+    (tmp_path / "pump-3.toml").write_text("mine")
+    terminal = Terminal(tmp_path)
+    terminal.until("[virtual]: ")
+    terminal.type("?")
+    assert "daqsvc sim then plays a machine" in terminal.until("[virtual]: ")
+    terminal.type("modbus")
+    assert '"modbus" is not one of virtual, can-dbc' in terminal.until("[virtual]: ")
+    terminal.type("")
+    terminal.until("[rig]: ")
+    terminal.type("Pump 3")
+    assert "zones of ISO 20816-3" in terminal.until("[own]: ")
+    terminal.type("")
+    assert "Alert limit (rms in um)" in terminal.until("[35]: ")
+    terminal.type("-5")
+    assert "must be greater than 0" in terminal.until("[35]: ")
+    terminal.type("50")
+    terminal.until("[75]: ")
+    terminal.type("")
+    terminal.until("[none]: ")
+    terminal.type("")
+    terminal.until("pump-3.toml is there already. Another name, or overwrite: ")
+    terminal.type("pump.toml")
+    assert "daqsvc run pump.toml" in terminal.rest()
+    assert terminal.process.returncode == 0
+    machine = load_machine_file(tmp_path / "pump.toml")
+    assert [(alarm.alert, alarm.danger) for alarm in machine.alarms] == [(50.0, 75.0), (50.0, 75.0)]
+    assert (tmp_path / "pump-3.toml").read_text() == "mine"
+
+
+def test_ctrl_c_leaves_nothing_behind(tmp_path):
+    terminal = Terminal(tmp_path, "rig.toml")
+    terminal.until("[virtual]: ")
+    terminal.type("")
+    terminal.until("[rig]: ")
+    terminal.process.send_signal(signal.SIGINT)
+    assert "interrupted" in terminal.rest()
+    assert terminal.process.returncode == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_end_of_the_input_leaves_nothing_behind(tmp_path):
+    terminal = Terminal(tmp_path, "rig.toml")
+    terminal.until("[virtual]: ")
+    terminal.type("\x04")
+    assert "nothing was written" in terminal.rest()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_answers_that_fit_each_other_are_taken_whatever_comes_later():
+    """No answer is refused because of the default of a later question: nobody would know what to change."""
+    for bus in BUSES:
+        answers = conduct(
+            Path("m.toml"), Given({"bus": bus, **NEEDED_OF.get(bus, {})}, defaults=True), None, print
+        )
+        assert refusal(answers, Path("m.toml")) is None
