@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, signals_to_end
 from drivers.can.sniff import CanSniffer
+from drivers.modbus.sniff import ModbusSniffer
 from drivers.serial.sniff import SerialSniffer
 from drivers.sniffing import Sniffer, SniffError
 
@@ -60,7 +61,7 @@ class SniffCommand:
 
 def sniffers() -> dict[str, Sniffer]:
     """Every kind of bus that can be looked at, by the name of its driver."""
-    known: dict[str, Sniffer] = {"can": CanSniffer(), "serial": SerialSniffer()}
+    known: dict[str, Sniffer] = {"can": CanSniffer(), "serial": SerialSniffer(), "modbus": ModbusSniffer()}
     for point in entry_points(group=SNIFFERS):
         try:
             made = point.load()()

@@ -151,6 +151,10 @@ sniff can no-such-interface --seconds 0
 sniff can no-such-interface --bitrate 5
 sniff can no-such-interface --dbc absent.dbc
 sniff can no-such-interface --interface no-such
+sniff modbus
+sniff modbus 127.0.0.1 --units 0-300
+sniff modbus 127.0.0.1 --registers 9-3
+sniff modbus no/such:port
 sniff serial
 sniff serial no/such/port
 sniff serial no/such/port --baud 0

@@ -1,0 +1,219 @@
+"""``daqsvc sniff modbus`` against simulated devices: units, registers, gateways, and that it never writes."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import struct
+import subprocess
+import sys
+import threading
+import tomllib
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from support.ports import free_port
+from support.waiting import PATIENCE_S
+
+from daqsvc.cli import main
+from sim_hw.nodes.modbus_node import ModbusRtuServer, ModbusTcpServer
+from sim_hw.nodes.modbus_unit import ModbusUnit
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+    from pathlib import Path
+
+pytestmark = pytest.mark.integration
+BEGIN = 'schema_version = 1\nsite = "lab"\nbox = "edge-1"\n\n[machine]\nname = "fan"\nspeed_rpm = 1480.0\n\n'
+
+
+class Watched(ModbusUnit):
+    """A unit that notes what it is asked, and whose value at 40 moves."""
+
+    def __init__(self, code: int | None = None) -> None:
+        super().__init__()
+        self.asked: list[bytes] = []
+        self._code = code
+        self._count = 0
+
+    def answer(self, pdu: bytes) -> bytes:
+        self.asked.append(pdu)
+        if self._code is not None:
+            return bytes([pdu[0] | 0x80, self._code])
+        self._count += 1
+        self.put("holding", 40, struct.pack(">f", 23.37 + 1e-5 * self._count))
+        return super().answer(pdu)
+
+
+def pump() -> Watched:
+    """Registers 0 to 3, 40 and 41, 107."""
+    unit = Watched()
+    unit.put("holding", 0, struct.pack(">4H", 7, 65_535, 300, 0))
+    unit.put("holding", 107, struct.pack(">H", 5))
+    return unit
+
+
+@contextmanager
+def serving(start: Callable[[], Any]) -> Iterator[Any]:
+    """A simulated server on an event loop of its own; ``start`` is called there."""
+    loop = asyncio.new_event_loop()
+    thread = threading.Thread(target=loop.run_forever)
+    thread.start()
+
+    async def begun() -> Any:
+        server = start()
+        if asyncio.iscoroutine(waits := server.start()):
+            await waits
+        return server
+
+    async def ended(server: Any) -> None:
+        server.stop()
+        await asyncio.sleep(0.01)
+
+    server = asyncio.run_coroutine_threadsafe(begun(), loop).result(PATIENCE_S)
+    try:
+        yield server
+    finally:
+        asyncio.run_coroutine_threadsafe(ended(server), loop).result(PATIENCE_S)
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join()
+        loop.close()
+
+
+@contextmanager
+def tcp(units: Mapping[int, ModbusUnit]) -> Iterator[str]:
+    with serving(lambda: ModbusTcpServer(units)) as server:
+        yield f"127.0.0.1:{server.port}"
+
+
+def words(target: str, *more: str) -> list[str]:
+    return ["sniff", "modbus", target, "--pause-ms", "0", "--timeout-ms", "60", *more]
+
+
+def figures(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return found
+
+
+def test_units_and_registers_are_found_and_nothing_is_written(capsys: pytest.CaptureFixture[str]) -> None:
+    units = {3: pump(), 5: Watched(10), 6: Watched(11)}
+    with tcp(units) as target:
+        assert main(words(target, "--units", "1-8", "--registers", "0-120", "--json")) == 0
+    found = figures(capsys)
+    assert found["units"] == [3]
+    assert found["units_gateway"] == [5, 6]
+    [table] = found["tables"]
+    assert table["runs"] == [[0, 3], [40, 41], [107, 107]]
+    values = {one["address"]: one for one in table["registers"]}
+    assert [values[k]["uint16"] for k in (0, 1, 2, 3, 107)] == [7, 65_535, 300, 0, 5]
+    assert values[1]["int16"] == -1
+    assert values[40]["later"] == values[40]["uint16"]
+    assert values[41]["later"] != values[41]["uint16"]
+    plausible = {
+        (one["type"], one["order"]): one["value"] for one in values[40]["readings"] if one["plausible"]
+    }
+    assert plausible["float32", "ABCD"] == pytest.approx(23.4, abs=0.1)
+    asked = [pdu for unit in units.values() for pdu in unit.asked]
+    assert {pdu[0] for pdu in asked} == {3}
+    assert found["requests"] == len(asked) + 5  # of addresses that nobody has
+
+
+def test_registers_are_shown_and_what_it_proposes_passes_check(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with tcp({1: pump()}) as target:
+        assert main(words(target, "--units", "1", "--function", "both")) == 0
+        shown = capsys.readouterr()
+        assert main(words(target, "--units", "1", "--json")) == 0
+        fragment = figures(capsys)["machine_file"]
+        assert main(words(target, "--units", "1", "--all-orders")) == 0
+        everything = capsys.readouterr().out
+    assert "1 requests to find units" in shown.err
+    assert "Unit 1, holding registers (function 3): 7 at 0-3, 40-41, 107" in shown.out
+    assert "Unit 1, input registers (function 4): none" in shown.out
+    rows = {line.split()[0]: line for line in shown.out.splitlines() if line[:3].strip().isdecimal()}
+    assert rows["1"].split() == ["1", "ffff", "65535", "-1"]
+    assert "yes" in rows["41"]
+    assert "float32 ABCD 23." in rows["40"]
+    assert "*float32 ABCD 23." in everything
+    assert "float32 DCBA" in everything
+    machine = tmp_path / "machine.toml"
+    machine.write_text(BEGIN + fragment.replace("127.0.0.1", "192.0.2.10"))
+    code = main(["check", f"{machine}"])
+    said = capsys.readouterr()
+    assert (code, said.err) == (0, "")
+    [stream] = tomllib.loads(fragment)["streams"].values()
+    assert stream["layout"]["channels"] == [{"name": "r40", "address": 40, "type": "float32"}]
+
+
+def test_a_server_that_ignores_the_unit_is_one_device(capsys: pytest.CaptureFixture[str]) -> None:
+    unit = pump()
+    with tcp(dict.fromkeys(range(1, 248), unit)) as target:
+        assert main(words(target, "--registers", "0-9")) == 0
+    said = capsys.readouterr().out
+    assert "It answers in the name of every unit" in said
+    assert "units that answer: 1\n" in said
+    assert len(unit.asked) < 60
+
+
+def test_units_on_a_serial_line_are_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    port = tmp_path / "ttyS0"
+    with serving(lambda: ModbusRtuServer({2: pump()}, port)):
+        assert main(words(f"{port}", "--units", "1-3", "--registers", "0-50", "--json")) == 0
+    found = figures(capsys)
+    assert (found["units"], found["tables"][0]["runs"]) == ([2], [[0, 3], [40, 41]])
+    [bus] = tomllib.loads(found["machine_file"])["buses"].values()
+    assert (bus["transport"], bus["serial_port"], bus["baud"]) == ("rtu", f"{port}", 19_200)
+
+
+def test_nobody_and_nothing_are_failures_that_say_what_to_check(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with tcp({9: Watched(11)}) as target:
+        assert main(words(target, "--units", "8-9")) == 1
+    said = capsys.readouterr().err
+    assert "none of units 8 to 9 answers; a gateway says of 1 that they do not answer. Remedy: " in said
+    with tcp({1: Watched(2)}) as target:
+        assert main(words(target, "--units", "1", "--registers", "0-3")) == 1
+    assert "no register could be read. Remedy: " in capsys.readouterr().err
+    assert main(words(f"127.0.0.1:{free_port()}")) == 1
+    assert "nobody listens there; start the server, or correct TARGET" in capsys.readouterr().err
+    assert main(words(f"{tmp_path / 'ttyS9'}")) == 1
+    assert "plug the device in, or correct TARGET" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (("--units", "0-300"), "--units '0-300': write FIRST-LAST from 0 to 255"),
+        (("--registers", "9-3"), "--registers '9-3': write FIRST-LAST"),
+        (("--pause-ms", "-1"), "--pause-ms -1: give 0 to 10000 ms"),
+        (("--timeout-ms", "0"), "--timeout-ms 0.0: "),
+    ],
+)
+def test_wrong_arguments_are_one_line(
+    more: tuple[str, str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["sniff", "modbus", "127.0.0.1", *more]) == 2
+    line = capsys.readouterr().err
+    assert said in line
+    assert len(line.splitlines()) == 1
+
+
+def test_ctrl_c_ends_it_early_and_shows_what_was_found() -> None:
+    with tcp({1: pump()}) as target:
+        command = [sys.executable, "-m", "daqsvc", "sniff", "modbus", target, "--json", "--timeout-ms", "100"]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        try:
+            assert process.stderr is not None
+            assert process.stderr.readline().startswith("asking ")
+            threading.Event().wait(0.5)  # unit 1 answers at once, the next ones never
+            process.send_signal(signal.SIGINT)
+            output, said = process.communicate(timeout=PATIENCE_S)
+        finally:
+            process.kill()
+            process.communicate()
+    assert (process.returncode, said) == (0, "")
+    assert json.loads(output)["units"] == [1]
