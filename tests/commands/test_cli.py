@@ -44,6 +44,7 @@ VERBS = (
     "detectability",
     "example",
     "sniff",
+    "explain",
     "new",
     "record",
     "demo",
