@@ -9,7 +9,7 @@ import pytest
 from support.paths import ROOT
 
 TESTS = ROOT / "tests"
-SUITES = {"conformance", "guard", "hil", "nothing_lost", "plants", "project", "prose", "soak"}
+SUITES = {"conformance", "guard", "hil", "nothing_lost", "plants", "project", "prose", "soak", "tutorials"}
 ROOMS = sorted({str(file.parent.relative_to(TESTS)) for file in TESTS.rglob("test_*.py")})
 
 

@@ -1,0 +1,271 @@
+"""A reader who does what a tutorial says, word for word, and looks whether all is as shown.
+
+A tutorial is Markdown. What the reader does is written in it like this:
+
+- A block ``console``: lines that begin with ``$ `` are typed, the others are what is shown. A line ``...``
+  stands for any lines, ``...`` within a line for any text. ``^C`` means that Ctrl-C is pressed. Where a
+  program asks, what stands behind the prompt is typed.
+- "In a second terminal" (or first, third) in the paragraph before a block says where it is typed. Without
+  such words it is the same as before. A program that does not end goes on running there.
+- "Save this as `NAME`" before a block: the reader writes that file.
+- "In `NAME`, replace" before a block, and "by" before the next one: the reader changes that file.
+
+Ports that other programs may have taken are replaced by free ones.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import pty
+import re
+import select
+import shlex
+import signal
+import struct
+import subprocess
+import sys
+import termios
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from support.paths import ROOT
+from support.ports import free_port
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+PATIENCE_S = 60.0
+"""So long a program may take to show what it must: only one that shows something else takes so long."""
+ANY = "..."
+CTRL_C = "^C"
+PORTS = ("1883", "5020", "8420")
+_FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+_TERMINAL = re.compile(r"\b[Ii]n (?:a|the) (first|second|third) terminal")
+_SAVE = re.compile(r"[Ss]ave this as `([^`]+)`")
+_REPLACE = re.compile(r"[Ii]n `([^`]+)`, replace")
+_COLUMNS = 100
+
+
+class NotAsShownError(AssertionError):
+    """Something else came than the tutorial shows."""
+
+
+@dataclass
+class Step:
+    """A block of the tutorial, and the paragraph before it.
+
+    Attributes:
+        words: the paragraph.
+        language: of the block.
+        text: what is in it.
+    """
+
+    words: str
+    language: str
+    text: str
+
+
+def steps(markdown: str) -> list[Step]:
+    """The blocks of a tutorial, in order."""
+    found, end = [], 0
+    for match in _FENCE.finditer(markdown):
+        between = markdown[end : match.start()].strip()
+        found.append(Step(between.split("\n\n")[-1].replace("\n", " "), match[1], match[2]))
+        end = match.end()
+    return found
+
+
+@dataclass
+class Terminal:
+    """One terminal: a program at a time."""
+
+    folder: Path
+    environment: dict[str, str]
+    process: subprocess.Popen[bytes] | None = None
+    leader: int = -1
+    pending: str = ""
+    whole: bool = True
+    seen: list[str] = field(default_factory=list)
+
+    def start(self, command: str) -> None:
+        """Type a command, when the one before has ended."""
+        self.finish()
+        self.leader, follower = pty.openpty()
+        fcntl.ioctl(follower, termios.TIOCSWINSZ, struct.pack("HHHH", 50, _COLUMNS, 0, 0))
+        self.process = subprocess.Popen(
+            ["bash", "-c", f"exec {command}" if not re.search(r"[;&|<>]", command) else command],
+            cwd=self.folder,
+            env=self.environment,
+            stdin=follower,
+            stdout=follower,
+            stderr=follower,
+            start_new_session=True,
+        )
+        os.close(follower)
+        self.pending, self.whole, self.seen = "", True, [f"$ {command}"]
+
+    def show(self, shown: list[str]) -> None:
+        """Wait for all that is shown, and type what is asked for."""
+        # What went on meanwhile may have shown more, where the block before has said so.
+        skipping = not self.whole
+        self.whole = not (shown and shown[-1] in {ANY, CTRL_C})
+        for expected in shown:
+            if expected == ANY:
+                skipping = True
+            elif expected == CTRL_C:
+                self.interrupt()
+                skipping = True
+            else:
+                self._expect(expected, skipping=skipping)
+                skipping = False
+
+    def interrupt(self) -> None:
+        """Press Ctrl-C."""
+        assert self.process is not None
+        os.killpg(self.process.pid, signal.SIGINT)
+
+    def finish(self) -> None:
+        """Wait until the program has ended, having shown nothing more."""
+        if self.process is None:
+            return
+        rest = []
+        while (line := self._line(None)) is not None:
+            rest.append(line)
+        self.process.wait(timeout=PATIENCE_S)
+        self.process = None
+        os.close(self.leader)
+        if self.whole and any(line.strip() for line in rest):
+            self._fail("nothing more", rest)
+
+    def _expect(self, expected: str, *, skipping: bool) -> None:
+        pattern = re.compile(".*".join(map(re.escape, expected.rstrip().split(ANY))))
+        passed: list[str] = []
+        while True:
+            line = self._line(expected)
+            if line is None:
+                self._fail(expected, passed)
+            elif pattern.fullmatch(line.rstrip()):
+                return
+            elif not skipping and line.strip():
+                self._fail(expected, [line])
+            passed.append(line or "")
+
+    def _line(self, expected: str | None) -> str | None:
+        """The next line, None at the end; at a prompt, what is typed there is in the line that is shown."""
+        until = time.monotonic() + PATIENCE_S
+        while "\n" not in self.pending:
+            if time.monotonic() > until:
+                self._fail(expected or "the end of the program", [self.pending])
+            if select.select([self.leader], [], [], 0.2)[0]:
+                try:
+                    part = os.read(self.leader, 65_536)
+                except OSError:  # the other end is closed
+                    part = b""
+                if not part:
+                    line, self.pending = self.pending, ""
+                    return line or None
+                self.pending += part.decode("utf-8", "replace").replace("\r\n", "\n")
+            elif expected is not None and self.pending.endswith(": "):
+                prompt = self.pending
+                if not expected.startswith(prompt.rstrip()):
+                    self._fail(expected, [prompt])
+                typed = expected[len(prompt) :] if len(expected) > len(prompt) else ""
+                os.write(self.leader, f"{typed}\n".encode())
+        line, _, self.pending = self.pending.partition("\n")
+        self.seen.append(line)
+        return line
+
+    def _fail(self, expected: str, found: list[str]) -> None:
+        before = "\n".join(self.seen[-60:])
+        raise NotAsShownError(
+            f"shown is {expected!r}, and there came {found[-3:]!r}; all that was there:\n{before}"
+        )
+
+
+class Reader:
+    """Follows a tutorial in a fresh folder.
+
+    Args:
+        folder: an empty one; a short path, as sockets lie in it.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder / "here"
+        programs = folder / "bin"
+        for one in (self.folder, programs, folder / "home", folder / "tmp"):
+            one.mkdir()
+        program = programs / "daqsvc"
+        program.write_text(
+            f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -m daqsvc "$@"\n', encoding="utf-8"
+        )
+        program.chmod(0o755)
+        self._environment = {
+            **{key: value for key, value in os.environ.items() if not key.startswith(("XDG_", "STATE_"))},
+            "PATH": f"{programs}:{os.environ['PATH']}:/usr/sbin",
+            "PYTHONPATH": f"{ROOT}",
+            "HOME": f"{folder / 'home'}",
+            "TMPDIR": f"{folder / 'tmp'}",
+            "TERM": "dumb",
+            "USER": "ann",
+        }
+        self._ports = {port: f"{free_port()}" for port in PORTS}
+        self._terminals: dict[str, Terminal] = {}
+        self._at = "first"
+        self._replaced: tuple[Path, str] | None = None
+
+    def follow(self, markdown: str) -> None:
+        """Do all that a tutorial says.
+
+        Raises:
+            NotAsShownError: something else came than it shows.
+        """
+        for port, free in self._ports.items():
+            markdown = re.sub(rf"\b{port}\b", free, markdown)
+        for step in steps(markdown):
+            if step.language == "console":
+                self._type(step)
+            else:
+                self._write(step)
+        for terminal in self._terminals.values():
+            terminal.finish()
+
+    def close(self) -> None:
+        """End what is still running."""
+        for terminal in self._terminals.values():
+            if terminal.process is not None:
+                os.killpg(terminal.process.pid, signal.SIGKILL)
+                terminal.process.wait()
+                os.close(terminal.leader)
+
+    def _type(self, step: Step) -> None:
+        where = _TERMINAL.findall(step.words)
+        name = self._at = where[-1] if where else self._at
+        if name not in self._terminals:
+            self._terminals[name] = Terminal(self.folder, self._environment)
+        terminal = self._terminals[name]
+        shown: list[str] = []
+        started = False
+        for line in step.text.splitlines():
+            if line.startswith("$ "):
+                if started or shown:
+                    terminal.show(shown)
+                terminal.start(line.removeprefix("$ "))
+                shown, started = [], True
+            elif line.strip():
+                shown.append(line)
+        terminal.show(shown)
+
+    def _write(self, step: Step) -> None:
+        if (save := _SAVE.search(step.words)) is not None:
+            (self.folder / save[1]).write_text(step.text, encoding="utf-8")
+        elif (replace := _REPLACE.search(step.words)) is not None:
+            self._replaced = (self.folder / replace[1], step.text)
+        elif self._replaced is not None and step.words.strip(" :") == "by":
+            file, old = self._replaced
+            text = file.read_text(encoding="utf-8")
+            if text.count(old) != 1:
+                raise NotAsShownError(f"{file.name} has {text.count(old)} times:\n{old}")
+            file.write_text(text.replace(old, step.text), encoding="utf-8")
+            self._replaced = None

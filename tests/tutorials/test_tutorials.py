@@ -1,0 +1,70 @@
+"""The tutorials, followed word for word: a text that is no longer true fails here."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from pathlib import Path
+
+import pytest
+from support.paths import ROOT
+from tutorials.reader import NotAsShownError, Reader, steps
+
+pytestmark = pytest.mark.integration
+TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("[0-9]*.md"))
+EVERYDAY = {"01-first-machine.md"}
+
+
+@pytest.fixture
+def reader():
+    # Not below pytest's folders: the paths of sockets have to be short.
+    folder = Path(tempfile.mkdtemp(prefix="tutorial-"))
+    one = Reader(folder)
+    yield one
+    one.close()
+    shutil.rmtree(folder)
+
+
+def followed(path: Path) -> object:
+    return pytest.param(path, id=path.stem, marks=[] if path.name in EVERYDAY else [pytest.mark.long])
+
+
+@pytest.mark.parametrize("path", [followed(path) for path in TUTORIALS])
+def test_a_tutorial_is_true_word_for_word(reader: Reader, path: Path) -> None:
+    reader.follow(path.read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)
+def test_a_tutorial_says_how_long_it_takes_and_where_to_go_next(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert "minutes" in text.partition("##")[0]
+    assert "## What you have now" in text
+    assert "Next: [" in text
+    assert any(step.language == "console" for step in steps(text))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("```console\n$ echo one\ntwo\n```", "'two', and there came ['one']"),
+        ("```console\n$ printf 'a\\nb\\n'\na\n```", "'nothing more', and there came ['b']"),
+        ("```console\n$ true\n...\nnever\n```", "'never', and there came []"),
+        ("```console\n$ read -p 'Name: ' a; echo $a\nName: ann\nbob\n```", "'bob', and there came ['ann']"),
+        ("In `f`, replace\n\n```toml\nold\n```\n\nby\n\n```toml\nnew\n```", "f has 0 times"),
+    ],
+)
+def test_what_is_not_as_shown_is_found(reader: Reader, text: str, words: str) -> None:
+    (reader.folder / "f").write_text("other")
+    with pytest.raises(NotAsShownError) as caught:
+        reader.follow(text)
+    assert words in f"{caught.value}"
+
+
+def test_what_is_as_shown_is_followed_in_all_terminals(reader: Reader) -> None:
+    reader.follow(
+        "Save this as `f`:\n\n```text\nold\n```\n\n"
+        "In `f`, replace\n\n```text\nold\n```\n\nby\n\n```text\nnew\n```\n"
+        "Then:\n\n```console\n$ cat f\nnew\n$ cat\n```\n\nIn a second terminal:\n\n"
+        "```console\n$ read -p 'Name: ' a; echo hello $a, $RANDOM times\nName: ann\nhello ann, ... times\n"
+        "$ seq 3\n...\n3\n```\n\nIn the first terminal, press Ctrl-C:\n\n```console\n^C\n```\n"
+    )
