@@ -169,21 +169,19 @@ def rotors(docs: Path) -> Iterator[Row]:
     """Rotors by finite elements, which nobody modelled."""
     page, again = Page(docs, "plants.md"), 'make bench-diagnosis ARGS="--aside"'
     place = "plants.md#the-half-that-was-set-aside"
-    for kind, title, columns in (
+    calibrated = {
+        "modelled: right": "named right",
+        "told": "truth in the group",
+        "wrong": "wrong",
+        "unmodelled: misnamed": "misnamed",
+        "false alarms / 1000 rev": "false alarms per 1000 revolutions",
+        "refused": "refused",
+    }
+    for table, title, columns in (
+        ("{}", "calibrated rotor", calibrated),
+        ("{}, run-up", "calibrated rotor with a run-up", calibrated),
         (
-            "",
-            "calibrated rotor",
-            {
-                "modelled: right": "named right",
-                "told": "truth in the group",
-                "wrong": "wrong",
-                "unmodelled: misnamed": "misnamed",
-                "false alarms / 1000 rev": "false alarms per 1000 revolutions",
-                "refused": "refused",
-            },
-        ),
-        (
-            "bank, ",
+            "bank, {}",
             "rotor bank from a run-up",
             {
                 "right": "named right",
@@ -195,7 +193,7 @@ def rotors(docs: Path) -> Iterator[Row]:
         ),
     ):
         aside, tuned = (
-            [page.row(snr, after=f"make bench-diagnosis ({kind}{half})") for snr in SNR_DB]
+            [page.row(snr, after=f"make bench-diagnosis ({table.format(half)})") for snr in SNR_DB]
             for half in ("set aside", "tuned")
         )
         for column, name in columns.items():

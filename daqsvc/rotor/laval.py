@@ -1,7 +1,8 @@
 """Steady response of the Laval rotor to unbalance and to a force, with what is not known about it.
 
 In physical units, for the calibrated machine: omega_s and zeta are given with a tolerance, and whatever is
-predicted from them is averaged over that box (`LavalRotor.box`).
+predicted from them is averaged over that box (`LavalRotor.box`). The two modes that a run-up has shown stand
+beside them (`LavalRotor.two_modes`).
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ import numpy as np
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from daqsvc.rotor.model import RotorParameters
 
     Complexes = NDArray[np.complex128]
     Floats = NDArray[np.float64]
@@ -57,6 +60,8 @@ class LavalRotor:
         clearance_um: radial clearance, if known.
         static_sag_um: sag of the shaft under its weight towards -y; that of a horizontal disc on a
             massless shaft, g / omega_s^2, if not given. 0 for a vertical shaft.
+        two_modes: the same rotor with the two modes of its run-up and a clearance of 1 um, so that its orbits
+            are in um; None where no run-up was seen, or two modes do not explain it.
 
     Raises:
         ValueError: a figure that no rotor has.
@@ -68,6 +73,7 @@ class LavalRotor:
     damping_tolerance: float = 0.2
     clearance_um: float | None = None
     static_sag_um: float | None = None
+    two_modes: RotorParameters | None = None
 
     def __post_init__(self) -> None:
         positive = {"natural_frequency_hz": self.natural_frequency_hz, "damping_ratio": self.damping_ratio}

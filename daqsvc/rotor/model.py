@@ -33,7 +33,14 @@ from __future__ import annotations
 import cmath
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Complexes = NDArray[np.complex128]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -215,6 +222,25 @@ class TwoModes:
             gyroscopic=self.gyroscopic + stiffened,
             higher_modes=self.higher_modes,
         )
+
+    def compliance(self, w: float, order: int) -> Complexes:
+        """Deflection that a force makes which turns at a multiple of the shaft speed, over the static one.
+
+        Args:
+            w: normalised speed of the shaft.
+            order: the multiple; 0: a force that rests.
+
+        Returns:
+            complex128 ``[2, 2]``, from and to what turns forward and the conjugate of what turns backward.
+        """
+        speed = order * w
+        forward, to_forward, to_backward, backward = self._stiffness(speed, 1.0, 1.0)
+        inertia, gyroscopic = speed**2, self.gyroscopic * w * speed
+        stiffness = np.array(
+            [[forward - inertia + gyroscopic, to_forward], [to_backward, backward - inertia - gyroscopic]]
+        )
+        higher = self.higher_modes if order else 0j
+        return np.asarray(np.linalg.inv(stiffness) + np.diag([higher, higher.conjugate()]))
 
     def _stiffness(
         self, w: float, damped: float, stiffness_ratio: float

@@ -8,7 +8,6 @@ change comes: the same observers' evidence, summed from that sample on.
 
 from __future__ import annotations
 
-import functools
 import json
 import math
 import zlib
@@ -19,6 +18,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
+from plants.run_ups import identified
 from plants.score import PER_REV, SNR_DB, keyphasor_volts, window_of
 
 from daqsvc.detectors.rotor_bank.detector import RotorBankDetector
@@ -26,14 +26,11 @@ from daqsvc.detectors.rotor_bank.modes import RotorMode, bank_modes
 from daqsvc.dsp.probes import Probe
 from daqsvc.dsp.speed.keyphasor import KeyphasorProbe
 from daqsvc.rotor import coupled_kernels
-from daqsvc.rotor.calibration.run_up import fit_run_up, revolutions_of
-from daqsvc.rotor.calibration.two_modes import TwoModeFit, fit_two_modes
 from daqsvc.rotor.coupled import couple, state_matrix
 from daqsvc.rotor.decision import DecisionRules
 from daqsvc.rotor.discretise import discretise
 from daqsvc.rotor.laval import STANDARD_GRAVITY_M_S2
 from daqsvc.rotor.model import RotorParameters
-from daqsvc.rotor.synchronous.vectors import synchronous_vectors
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -101,23 +98,6 @@ class BankSaid:
         return self.fault in self.group
 
 
-@functools.lru_cache(maxsize=16)
-def identified(folder: Path, geometry: str, seed: int) -> TwoModeFit:
-    """Two modes of a geometry, from its run-up."""
-    with np.load(folder / f"bank-{geometry}-run-up.npz".replace(" ", "-")) as kept:
-        z, angle, rate_hz = kept["z_um"].astype(np.complex128), kept["angle_rad"], float(kept["rate_hz"])
-    rng = np.random.default_rng([seed, zlib.crc32(geometry.encode())])
-    noise = math.sqrt(float(np.var(z)) / 2.0 / 100.0)
-    z = z + noise * (rng.standard_normal(len(z)) + 1j * rng.standard_normal(len(z)))
-    nearest = fit_run_up(np.column_stack((z.real, z.imag)), angle, rate_hz)
-    return fit_two_modes(
-        synchronous_vectors(revolutions_of(z, angle)),
-        rate_hz,
-        natural_frequency_hz=nearest.natural_frequency_hz,
-        damping_ratio=nearest.damping_ratio,
-    )
-
-
 def _modes(rotor: RotorParameters, speed_rpm: float, whirl_um: float) -> list[RotorMode]:
     """Levels of every fault; without those that the machine cannot run in, as it would whirl by itself."""
     damping_ratio = rotor.damping_ratio
@@ -150,7 +130,7 @@ def judge_bank(folder: Path, seed: int, job: tuple[Case, int]) -> BankSaid:
     noise_um = math.sqrt(float(np.var(z[: ONSET_REV * PER_REV])) / 2.0 / 10.0 ** (snr_db / 10.0))
     z = z + noise_um * (rng.standard_normal(len(z)) + 1j * rng.standard_normal(len(z)))
     samples = np.stack((z.real, z.imag, keyphasor_volts(angle, rng)), axis=1).astype(np.float32)
-    fit = identified(folder, str(case["geometry"]), seed)
+    _, fit = identified(folder, str(case["geometry"]), seed)
     speed_rpm = float(case["speed_rpm"])  # type: ignore[arg-type]
     rotor = fit.rotor(
         RotorParameters(

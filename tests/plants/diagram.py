@@ -29,7 +29,7 @@ def draw(halves: Mapping[str, Sequence[tuple[float, bool]]], path: Path) -> None
     """Draw how often names are true over the probability that they were given with.
 
     Args:
-        halves: by what a half is called, probability and truth of every name.
+        halves: by what they are called, probability and truth of every name.
         path: of the SVG.
     """
     with mpl.rc_context({"svg.hashsalt": "plants", "svg.fonttype": "none", "font.size": 9}):

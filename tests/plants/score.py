@@ -15,6 +15,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
+from plants.run_ups import identified
 
 from daqsvc.detectors.rotor_synchronous.detector import RotorSynchronousDetector
 from daqsvc.diagnosis.detector import Window
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.diagnosis.record import Diagnosis
+    from daqsvc.rotor.calibration.run_up import RunUpFit
+    from daqsvc.rotor.calibration.two_modes import TwoModeFit
 
 SNR_DB = (20, 10, 0)
 PER_REV = 64
@@ -164,8 +167,8 @@ def keyphasor_volts(angle: NDArray[np.float64], rng: np.random.Generator) -> NDA
     return np.asarray(edge + 0.02 * rng.standard_normal(len(angle)))
 
 
-def judge(folder: Path, seed: int, job: tuple[dict[str, object], int]) -> Said:
-    """Run the detector over a record."""
+def judge(folder: Path, seed: int, job: tuple[dict[str, object], int], *, run_up: bool = False) -> Said:
+    """Run the detector over a record, with or without what the geometry's run-up shows."""
     case, snr_db = job
     onset = float(case["onset_rev"])
     healthy = case["fault"] == "healthy"
@@ -174,6 +177,11 @@ def judge(folder: Path, seed: int, job: tuple[dict[str, object], int]) -> Said:
     off = 1.0 + _TOLERANCE * rng.uniform(-1.0, 1.0, 2)
     speed_rpm = float(case["speed_rpm"])
     rate_hz = speed_rpm / 60.0 * PER_REV
+    stated = LavalRotor(
+        natural_frequency_hz=float(case["critical_hz"]) * off[0],
+        damping_ratio=float(case["damping_ratio"]) * off[1],
+        clearance_um=float(case["clearance_um"]),
+    )
     detector = RotorSynchronousDetector(
         machine=str(case["geometry"]),
         stream="shaft",
@@ -181,11 +189,7 @@ def judge(folder: Path, seed: int, job: tuple[dict[str, object], int]) -> Said:
         speed_rpm=speed_rpm,
         probes=(Probe("x", 0, 0.0), Probe("y", 1, 90.0)),
         reference=KeyphasorProbe("keyphasor", 2, -6.0),
-        rotor=LavalRotor(
-            natural_frequency_hz=float(case["critical_hz"]) * off[0],
-            damping_ratio=float(case["damping_ratio"]) * off[1],
-            clearance_um=float(case["clearance_um"]),
-        ),
+        rotor=_with_run_up(stated, *identified(folder, str(case["geometry"]), seed)) if run_up else stated,
         rules=WatchRules(probe_drift_um=_DRIFT_UM),
     )
     samples = samples_of(record, snr_db, onset, seed)
@@ -195,6 +199,12 @@ def judge(folder: Path, seed: int, job: tuple[dict[str, object], int]) -> Said:
         said += detector.process(window_of(part, begin, rate_hz))
     last = detector.finish()
     return _summed(case, snr_db, [*said, *([last] if last else [])], detector.refused, onset, healthy=healthy)
+
+
+def _with_run_up(stated: LavalRotor, nearest: RunUpFit, modes: TwoModeFit) -> LavalRotor:
+    """As ``daqsvc calibrate`` has it: a run-up replaces what was stated where one Laval rotor explains it."""
+    known = nearest.rotor(clearance_um=stated.clearance_um) if nearest.laval else stated
+    return modes.beside(known)
 
 
 def window_of(samples: NDArray[np.float32], first_index: int, rate_hz: float) -> Window:
@@ -246,9 +256,11 @@ def _summed(
     )
 
 
-def scored(folder: Path, *, aside: bool, seed: int = 0, snr_db: Sequence[int] = SNR_DB) -> list[Said]:
-    """Judge all records of one half."""
+def scored(
+    folder: Path, *, aside: bool, seed: int = 0, snr_db: Sequence[int] = SNR_DB, run_up: bool = False
+) -> list[Said]:
+    """Judge all records of one half, with or without what the run-ups show."""
     cases = json.loads((folder / "cases.json").read_text())
     jobs = [(case, snr) for case in cases if case["aside"] == aside for snr in snr_db]
     with ProcessPoolExecutor(2) as pool:
-        return list(pool.map(partial(judge, folder, seed), jobs, chunksize=8))
+        return list(pool.map(partial(judge, folder, seed, run_up=run_up), jobs, chunksize=8))

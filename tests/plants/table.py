@@ -103,12 +103,14 @@ def main(arguments: Sequence[str]) -> int:
     half = "set aside" if options.aside else "tuned"
     bank = bank_scored(options.folder, aside=options.aside, seed=options.seed)
     _put(f"bank, {half}", [bank_summary(bank), *(bank_answers(bank, snr) for snr in SNR_DB)], options.seed)
-    said = scored(options.folder, aside=options.aside, seed=options.seed)
-    _put(half, [summary(said), reliability(said), *(answers(said, snr) for snr in SNR_DB)], options.seed)
-    if options.seed:
-        return 0
-    names = [(certain(s), s.decision in s.true_names) for s in first_names(said)]
-    draw({f"{half} half": names}, PAGE.with_name(f"plants-{half.replace(' ', '-')}.svg"))
+    names = {}
+    for run_up, place in ((False, half), (True, f"{half}, run-up")):
+        said = scored(options.folder, aside=options.aside, seed=options.seed, run_up=run_up)
+        _put(place, [summary(said), reliability(said), *(answers(said, snr) for snr in SNR_DB)], options.seed)
+        known = "with a run-up" if run_up else "as stated"
+        names[f"{half} half, {known}"] = [(certain(s), s.decision in s.true_names) for s in first_names(said)]
+    if not options.seed:
+        draw(names, PAGE.with_name(f"plants-{half.replace(' ', '-')}.svg"))
     return 0
 
 

@@ -16,6 +16,7 @@ from daqsvc.rotor.calibration.file import (
     CalibrationFileError,
     CalibrationRecord,
     load_calibration,
+    load_healthy,
     load_record,
     parse_record,
     record_text,
@@ -199,26 +200,57 @@ def test_a_saved_calibration_can_be_loaded(tmp_path: Path) -> None:
     assert len(load_record(path).steady) == 2
 
 
+RUN_UP = RunUpFit(
+    natural_frequency_hz=85.0,
+    damping_ratio=0.18,
+    eccentricity_um=34 + 0j,
+    centre_um=-39j,
+    covariance=np.eye(4) * 1e-6,
+    centre_uncertainty_um=0.1,
+    ellipticity=0.0,
+    noise_um=1.0,
+    fit_error=0.01,
+    speed_range_rpm=(1000.0, 8000.0),
+    revolutions=230,
+)
+
+
 def test_a_run_up_alone_is_no_baseline() -> None:
-    fit = RunUpFit(
-        natural_frequency_hz=85.0,
-        damping_ratio=0.18,
-        eccentricity_um=34 + 0j,
-        centre_um=-39j,
-        covariance=np.eye(4) * 1e-6,
-        centre_uncertainty_um=0.1,
-        ellipticity=0.0,
-        noise_um=1.0,
-        fit_error=0.01,
-        speed_range_rpm=(1000.0, 8000.0),
-        revolutions=230,
-    )
-    alone = CalibrationRecord(rotor=ROTOR, run_up=fit)
+    alone = CalibrationRecord(rotor=ROTOR, run_up=RUN_UP)
     with pytest.raises(ValueError, match="a run-up only and no steady baseline; calibrate again with a rec"):
         alone.at(5110.0)
     text = record_text(alone)
     assert "natural_frequency_hz = 85.0  # +- 0.085" in text
     assert "34 um at 0.0 degrees, +- 0.034 um, 0.057 degrees" in text
+
+
+@pytest.mark.parametrize(
+    ("speed_rpm", "fit_error", "known"),
+    [(5110.0, 0.02, True), (-5110.0, 0.02, True), (None, 0.02, True), (5110.0, 0.2, False)],
+)
+def test_the_two_modes_of_a_run_up_are_known_where_they_hold(
+    tmp_path: Path, speed_rpm: float | None, fit_error: float, *, known: bool
+) -> None:
+    modes = TwoModes(support_share=0.3, support_lag=0.2, anisotropy=0.1 + 0.05j)
+    fit = TwoModeFit(
+        natural_frequency_hz=83.0,
+        damping_ratio=0.05,
+        eccentricity_um=30.0 + 4.0j,
+        modes=modes,
+        fit_error=fit_error,
+        speed_range_rpm=RUN_UP.speed_range_rpm,
+    )
+    path = tmp_path / "rotor.toml"
+    save_record(replace(record(5110.0), run_up=RUN_UP, two_modes=fit), path)
+    rotor, (baseline,) = load_healthy(path, speed_rpm, 250.0)
+    assert baseline.rotor == rotor
+    assert rotor.clearance_um == 250.0
+    assert (rotor.two_modes is not None) == known
+    if rotor.two_modes is not None:
+        assert rotor.two_modes.two_modes == modes
+        assert (rotor.two_modes.natural_frequency_hz, rotor.two_modes.clearance_um) == (83.0, 1.0)
+    beyond, _ = load_healthy(path, 9000.0, 250.0)
+    assert beyond.two_modes is None
 
 
 def test_a_record_has_one_rotor() -> None:

@@ -182,7 +182,7 @@ def test_motion_that_does_not_repeat_is_a_mark_of_contact():
     machine = healthy(0.6, laval=False)
     angle = math.radians(140.0)
     machine.baseline[0] = 0.3 * machine.baseline[1] * np.exp(1j * angle)
-    linear = pulse(angle, wall_at(angle, machine, 6.0), 0.6, width=1.0)
+    linear = pulse(angle, wall_at(angle, machine, 2.0), 0.6, width=1.0)
     linear[3:] = 0.0
     hidden = np.full(5, (0.1 * np.abs(linear).max()) ** 2)
     quiet, loud = (

@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.integrate import solve_ivp
 from scipy.signal import cont2discrete, lfilter
 
 RATE_HZ = 4000.0
@@ -79,3 +80,40 @@ def run_up(machine: Machine, from_hz: float, to_hz: float, seconds: float) -> tu
     t = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
     angle = math.tau * (from_hz * t + 0.5 * (to_hz - from_hz) / seconds * t**2)
     return machine.move(angle), angle
+
+
+def vector_of(machine: Machine, speed_hz: float) -> np.ndarray:
+    """Synchronous vector of the machine, complex128 ``[5]`` um."""
+    return np.array([machine.rest, *machine.orbit(speed_hz), 0.0, 0.0])
+
+
+def touching(machine: Machine, speed_hz: float, wall: complex, stiffness: float) -> np.ndarray:
+    """The same where it touches a flat wall, by its equations of motion.
+
+    Args:
+        machine: the machine.
+        speed_hz: of the shaft.
+        wall: the point of the wall that is nearest to the origin, um; its normal points to the origin.
+        stiffness: of the wall, in that of the unit.
+    """
+    w = speed_hz / UNIT_HZ
+    springs, dampers = np.array(machine.supports), np.array(machine.dampers)
+    normal = np.array([wall.real, wall.imag]) / abs(wall)
+
+    def moved(t: float, state: np.ndarray) -> np.ndarray:
+        place, speed, foot = state[:2], state[2:4], state[4:]
+        bent = machine.shaft * (place - foot)
+        turning = machine.eccentricity_um * w**2 * np.exp(1j * w * t) + machine.load
+        push = stiffness * max(0.0, float(place @ normal) - abs(wall))
+        force = np.array([turning.real, turning.imag]) - bent - push * normal
+        return np.concatenate((speed, force, (bent - springs * foot) / dampers))
+
+    rest = machine.rest
+    feet = [machine.load.real / springs[0], machine.load.imag / springs[1]]
+    begin = np.array([rest.real, rest.imag, 0.0, 0.0, *feet])
+    settled, seen = 60, 40
+    theta = math.tau * np.arange(64 * seen) / 64.0
+    at = (math.tau * settled + theta) / w
+    found = solve_ivp(moved, (0.0, at[-1]), begin, t_eval=at, rtol=1e-7, atol=1e-6, max_step=0.2 / w)
+    z = found.y[0] + 1j * found.y[1]
+    return np.array([np.mean(z * np.exp(-1j * k * theta)) for k in (0, 1, -1, 2, -2)])

@@ -18,9 +18,6 @@ if TYPE_CHECKING:
     from daqsvc.rotor.calibration.two_modes import TwoModeFit
     from daqsvc.settings.models import MachineFile
 
-_BEYOND = 0.1
-"""So far outside of the speeds of its run-up a rotor is still the one that was identified."""
-
 
 def bank_detector(machine: MachineFile, bank: RotorBank) -> RotorBankDetector:
     """The detector that ``[pipeline.rotor_bank]`` asks for.
@@ -122,8 +119,8 @@ def _run_up(path: Path, speed_rpm: float) -> TwoModeFit:
         raise CalibrationFileError(
             f"{path}: {fit.describe()}; watch this machine with [pipeline.rotor_synchronous]"
         )
-    low, high = fit.speed_range_rpm
-    if not low * (1.0 - _BEYOND) <= abs(speed_rpm) <= high * (1.0 + _BEYOND):
+    if not fit.holds_at(speed_rpm):
+        low, high = fit.speed_range_rpm
         raise CalibrationFileError(
             f"{path}: the run-up went from {low:.0f} to {high:.0f} rpm, and machine.speed_rpm is "
             f"{speed_rpm:g}; record one that passes it"

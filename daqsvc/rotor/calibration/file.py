@@ -394,9 +394,9 @@ def load_healthy(
         clearance_um: radial clearance, in place of the file's.
 
     Returns:
-        The rotor, and the baseline of the speed, or of every speed if it is not known. None at all if the
-        file holds a run-up, which is true at any speed, and no baseline of that one: the first revolutions
-        have to be the baseline then.
+        The rotor, with the two modes of a run-up that passed the speed, and the baseline of the speed, or of
+        every speed if it is not known. None at all if the file holds a run-up, which is true at any speed,
+        and no baseline of that one: the first revolutions have to be the baseline then.
 
     Raises:
         CalibrationFileError: the file cannot be read or used, or has neither a run-up nor a baseline of that
@@ -413,8 +413,9 @@ def load_healthy(
             baselines = ()
     if clearance_um is not None:
         rotor = replace(rotor, clearance_um=clearance_um)
-        baselines = tuple(replace(baseline, rotor=rotor) for baseline in baselines)
-    return rotor, baselines
+    if record.two_modes is not None and (speed_rpm is None or record.two_modes.holds_at(speed_rpm)):
+        rotor = record.two_modes.beside(rotor)
+    return rotor, tuple(replace(baseline, rotor=rotor) for baseline in baselines)
 
 
 def load_record(path: Path | str) -> CalibrationRecord:

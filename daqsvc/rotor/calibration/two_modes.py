@@ -23,14 +23,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.optimize import least_squares
 
-from daqsvc.rotor.model import TwoModes, series_stiffness
+from daqsvc.rotor.model import RotorParameters, TwoModes, series_stiffness
 from daqsvc.rotor.synchronous.baseline import LEAST_REVOLUTIONS, NotCalibratableError
 from daqsvc.rotor.synchronous.vectors import BACKWARD, FORWARD
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from daqsvc.rotor.model import RotorParameters
+    from daqsvc.rotor.laval import LavalRotor
     from daqsvc.rotor.synchronous.vectors import SynchronousVectors
 
     Complexes = NDArray[np.complex128]
@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 
 FIT_LIMIT = 0.1
 """Part of the whirl that may be left unexplained for two modes to stand for the machine."""
+_BEYOND = 0.1
+"""Part of a speed by which a machine may run beyond its run-up."""
 
 _USUAL = np.array([1.0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0.5])
 _PRIORS = np.array(
@@ -118,6 +120,28 @@ class TwoModeFit:
             heavy_spot_deg=math.degrees(cmath.phase(eccentricity)),
             two_modes=modes,
         )
+
+    def holds_at(self, speed_rpm: float) -> bool:
+        """Whether the run-up passed this speed of either sign, or nearly did."""
+        low, high = self.speed_range_rpm
+        return low * (1.0 - _BEYOND) <= abs(speed_rpm) <= high * (1.0 + _BEYOND)
+
+    def beside(self, known: LavalRotor) -> LavalRotor:
+        """What is known of a rotor, and its two modes if they explain the run-up.
+
+        Args:
+            known: the Laval rotor that is nearest to it.
+        """
+        if not self.explains:
+            return known
+        modes = RotorParameters(
+            natural_frequency_hz=known.natural_frequency_hz,
+            damping_ratio=known.damping_ratio,
+            eccentricity_um=0.0,
+            clearance_um=1.0,
+            static_sag_um=known.sag_um,
+        )
+        return replace(known, two_modes=self.rotor(modes))
 
     def describe(self) -> str:
         """The verdict in words."""

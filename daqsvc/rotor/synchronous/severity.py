@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.rotor.laval import unbalance_response
-from daqsvc.rotor.synchronous.signatures import likeliest_touch
+from daqsvc.rotor.synchronous.by_two_modes import damping_left, stiffness_left
+from daqsvc.rotor.synchronous.pulses import likeliest_touch
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -34,7 +35,8 @@ def levels(identification: Identification, calibration: Calibration) -> dict[Rot
     * ``unmodelled``, ``small_change``: ``change_um`` of the synchronous vector, and ``nonsynchronous_um``,
       what does not repeat with the shaft, rms of one probe above the healthy one.
 
-    Without a Laval rotor, figures that need its model are left out.
+    Where a run-up has shown two modes, ``left`` and ``stiffness`` are by them. Without these and without a
+    Laval rotor, figures that need a model are left out.
     """
     known: Mapping[RotorFault, Callable[[Identification, Calibration], dict[str, float]]] = {
         "unbalance": _unbalance,
@@ -63,6 +65,10 @@ def _unbalance(identification: Identification, calibration: Calibration) -> dict
 
 
 def _damping_loss(identification: Identification, calibration: Calibration) -> dict[str, float]:
+    modes = calibration.rotor.two_modes
+    if modes is not None:
+        left = damping_left(identification.change, calibration.healthy, modes)
+        return {"damping_ratio": left * modes.damping_ratio, "left": left}
     if not calibration.laval:
         return {}
     omega, zeta = calibration.rotor.box
@@ -74,15 +80,15 @@ def _damping_loss(identification: Identification, calibration: Calibration) -> d
     # Every rotor of the box has its own best figure; those that explain the change as well as any count.
     best = misfit.min(axis=1)
     good = best <= best.min() + 0.05 * abs(calibration.baseline[1] + identification.change[1])
-    left = left_over[misfit.argmin(axis=1)[good]]
-    damping = left * zeta[good]
-    if left.min() <= _DAMPING_LEFT[0] or left.min() >= _DAMPING_LEFT[1]:
+    found = left_over[misfit.argmin(axis=1)[good]]
+    damping = found * zeta[good]
+    if found.min() <= _DAMPING_LEFT[0] or found.min() >= _DAMPING_LEFT[1]:
         return {}
     return {
         "damping_ratio": float(np.median(damping)),
         "least": float(damping.min()),
         "most": float(damping.max()),
-        "left": float(np.median(left)),
+        "left": float(np.median(found)),
     }
 
 
@@ -95,6 +101,9 @@ def _static_load(identification: Identification, calibration: Calibration) -> di
 
 
 def _stiffness_loss(identification: Identification, calibration: Calibration) -> dict[str, float]:
+    modes = calibration.rotor.two_modes
+    if modes is not None:
+        return {"stiffness": stiffness_left(identification.change, calibration.healthy, modes)}
     if not calibration.laval:
         return {}
     rotor, change = calibration.rotor, identification.change

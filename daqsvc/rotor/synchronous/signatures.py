@@ -9,10 +9,14 @@ rotor's parameters are averaged over, so that a flexible hypothesis pays for its
 * stiffness loss: mean position and 1X move together, by one parameter; on a machine that is no Laval rotor
   the shaft sinks, and 1X turns by about what that tells of the natural frequency, or by any amount.
 * rub: a pulse once a revolution, directed inwards where the orbit comes nearest to the wall, passed through
-  the rotor, with marks of contact (`daqsvc.rotor.synchronous.contact`); or an orbit that fills the clearance.
+  the rotor (`daqsvc.rotor.synchronous.pulses`), with marks of contact (`daqsvc.rotor.synchronous.contact`);
+  or an orbit that fills the clearance.
 * unmodelled: any components, each by itself. It pays `UNMODELLED_NATS` for explaining everything.
 
-The pulses of rub and crack, and the name or group of names that the likelihoods come to (`identify`), follow.
+Where a run-up has shown the rotor's two modes, they say how damping loss and stiffness loss move the vector
+(`daqsvc.rotor.synchronous.by_two_modes`), and the free shapes above are for what few machines do beside that.
+
+The name or group of names that the likelihoods come to (`identify`) follows.
 """
 
 from __future__ import annotations
@@ -23,14 +27,16 @@ from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 
 import numpy as np
 
-from daqsvc.rotor.laval import compliance, unbalance_response
+from daqsvc.rotor.laval import unbalance_response
+from daqsvc.rotor.synchronous.by_two_modes import less_damped, softer
 from daqsvc.rotor.synchronous.contact import fills_clearance, has_marks, marks_would_show
+from daqsvc.rotor.synchronous.pulses import crack, rub_pulse
 from daqsvc.rotor.synchronous.vectors import (
     BACKWARD,
     DC,
     FORWARD,
-    HARMONICS,
     SPREADS,
+    TWICE,
     Healthy,
     density,
     log_density,
@@ -38,7 +44,7 @@ from daqsvc.rotor.synchronous.vectors import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
 
     from numpy.typing import NDArray
 
@@ -47,7 +53,6 @@ if TYPE_CHECKING:
 
     Complexes = NDArray[np.complex128]
     Floats = NDArray[np.float64]
-    Flags = NDArray[np.bool_]
 
 
 RotorFault: TypeAlias = Literal[
@@ -87,6 +92,9 @@ _STILL_SHARE = 0.2
 _STIFFNESS_DAMPING = np.array([0.0, 1.8])
 """A softer support also damps more: relative increase per 1 / k - 1, up to `_MOST_DAMPING`."""
 _MOST_DAMPING = 1.6
+
+_BESIDES = 0.02
+"""Probability that a fault moves a rotor in another way than its two modes tell."""
 
 _NO_CONTACT_NATS = 12.0
 """What a rub stays behind all others where its harmonics would be seen and are not."""
@@ -175,7 +183,22 @@ def _unbalance(change: Complexes, variance: Floats, healthy: Healthy) -> float:
     return float(score.sum())
 
 
+def _besides(told: float, free: float) -> float:
+    """Log likelihood of what the two modes tell, and of a shape that leaves open what they do not."""
+    return float(np.logaddexp(told + math.log1p(-_BESIDES), free + math.log(_BESIDES)))
+
+
 def _damping_loss(change: Complexes, variance: Floats, healthy: Healthy) -> float:
+    free = _free_damping_loss(change, variance, healthy)
+    rotor = healthy.rotor.two_modes
+    if rotor is None:
+        return free
+    moved = float(np.abs(change[[FORWARD, BACKWARD]]).max())
+    twice = float(_still(change, variance, moved)[TWICE].sum())
+    return _besides(twice + less_damped(change, variance, healthy, rotor), free)
+
+
+def _free_damping_loss(change: Complexes, variance: Floats, healthy: Healthy) -> float:
     """1X moves as less damping moves it; where the rotor is no Laval rotor, both senses of 1X move anyhow."""
     if healthy.laval:
         return _unbalance(change, variance, healthy) - damping_misfit(change, variance, healthy)
@@ -237,9 +260,10 @@ def _softer(change: Complexes, variance: Floats, healthy: Healthy, *, still: flo
     over the sag), up to the part that the probes see of it, and that how 1X turns. Or 1X does as it likes.
     """
     free = _free(change[FORWARD], variance[FORWARD], healthy.amplitude_um)
-    untied = _sunk(change[DC], variance[DC], healthy) + np.logaddexp(
-        still + math.log(_STILL_SHARE), free + math.log(1.0 - _STILL_SHARE)
-    )
+    if healthy.rotor.two_modes is None:
+        free = np.logaddexp(still + math.log(_STILL_SHARE), free + math.log(1.0 - _STILL_SHARE))
+    # else the modes tell where 1X stays as it is
+    untied = _sunk(change[DC], variance[DC], healthy) + free
     sag_um = healthy.rotor.sag_um
     if sag_um <= 0.0:
         return float(untied)  # an upright shaft: nothing sinks that could tell of 1X
@@ -263,6 +287,16 @@ def _softer(change: Complexes, variance: Floats, healthy: Healthy, *, still: flo
 
 
 def _stiffness_loss(change: Complexes, variance: Floats, healthy: Healthy) -> float:
+    free = _free_stiffness_loss(change, variance, healthy)
+    rotor = healthy.rotor.two_modes
+    if rotor is None:
+        return free
+    moved = float(np.hypot(abs(change[DC]), abs(change[FORWARD])))
+    twice = float(_still(change, variance, moved)[TWICE].sum())
+    return _besides(twice + softer(change, variance, healthy, rotor), free)
+
+
+def _free_stiffness_loss(change: Complexes, variance: Floats, healthy: Healthy) -> float:
     moved = float(np.hypot(abs(change[DC]), abs(change[FORWARD])))
     score = _still(change, variance, moved)
     rest = float(score.sum() - score[DC] - score[FORWARD])
@@ -297,7 +331,7 @@ def _rub(
     change: Complexes, variance: Floats, healthy: Healthy, position: Complexes, *, shaken: bool
 ) -> tuple[float, float]:
     """Likelihood of a rub, and nats that it stays behind all others where no mark of contact shows."""
-    pulse = rub_pulse(change, variance, healthy)
+    pulse = rub_pulse(change, variance, healthy, position)
     if fills_clearance(position, change, variance, healthy):
         # An orbit that fills the clearance touches, whatever shape it has by then.
         return max(pulse, _unmodelled(change, variance, healthy) + UNMODELLED_NATS), 0.0
@@ -306,7 +340,7 @@ def _rub(
     if marks_would_show(change, variance):
         return pulse, _NO_CONTACT_NATS
     # Where the rotor's model holds, it says itself how a pulse moves the mean position and both senses of 1X.
-    return pulse, 0.0 if healthy.laval else _HIDDEN_CONTACT_NATS
+    return pulse, 0.0 if healthy.modelled else _HIDDEN_CONTACT_NATS
 
 
 def _unmodelled(change: Complexes, variance: Floats, healthy: Healthy) -> float:
@@ -316,136 +350,6 @@ def _unmodelled(change: Complexes, variance: Floats, healthy: Healthy) -> float:
     for k in range(len(change)):
         total += np.logaddexp(still[k], _free(change[k], variance[k], healthy.amplitude_um)) - math.log(2.0)
     return float(total)
-
-
-_PULSE_WIDTHS = np.array([0.3, 0.6, 1.0])
-_ANGLES = 2.0 * math.pi * np.arange(24) / 24.0
-"""Angles of the shaft at which it may touch, or at which a crack may lie."""
-_RUB_TOLERANCES = np.array([0.2, 0.4, 0.7])
-_CRACK_TOLERANCES = np.array([0.1, 0.2, 0.4])
-_CRACK_FACING = 0.85
-_RUB_FACING = 0.5
-_RUB_OUTWARDS = 0.2
-
-
-def rub_pulse(change: Complexes, variance: Floats, healthy: Healthy) -> float:
-    """A pulse of force at one angle of the shaft, inwards, through the rotor's compliance."""
-    order = np.array(HARMONICS)
-    turning = np.exp(1j * np.outer(_ANGLES, order))
-    whirl = turning[:, 1:] @ healthy.baseline[1:]
-    place = whirl + healthy.baseline[DC]
-
-    def possible(force: Complexes) -> Flags:
-        # The wall is where the whirl leads to, and not behind the centre: a crack pulls the other way.
-        return (_facing(-force, whirl) > _RUB_FACING) & (_facing(-force, place) > _RUB_OUTWARDS)
-
-    return _shaped(change, variance, healthy, _pulses(healthy), _RUB_TOLERANCES, possible)
-
-
-def likeliest_touch(change: Complexes, healthy: Healthy) -> tuple[float, float]:
-    """Force of a rub over the shaft's stiffness, in um, and the shaft angle where it touches, in rad.
-
-    Of all pulses the one that explains the change best, whichever way it points.
-    """
-    shape = _pulses(healthy)
-    scale = (shape.conj() * change).sum(axis=-1) / (np.abs(shape) ** 2).sum(axis=-1)
-    explained = np.abs(scale) ** 2 * (np.abs(shape) ** 2).sum(axis=-1)
-    best = np.unravel_index(int(explained.argmax()), explained.shape)
-    return float(abs(scale[best])), float(_ANGLES[best[2]])
-
-
-def crack(change: Complexes, variance: Floats, healthy: Healthy) -> float:
-    """A shaft that a crack makes softer once a revolution, when its weight opens it.
-
-    Two shapes, equally likely: the lost restoring force lies along the crack and turns with it (Mayes and
-    Davies 1984; the hinge of Gasch 1976), or it is a pulse along the sag, as a finite-element model of a
-    crack between bearings gives it. A rub pushes the other way.
-    """
-    order = np.array(HARMONICS)
-    theta = 2.0 * math.pi * np.arange(32) / 32.0
-    direction = np.exp(1j * (theta + _ANGLES[:, np.newaxis]))
-    deflection = np.exp(1j * np.outer(theta, order[1:])) @ healthy.baseline[1:] - 1j * healthy.rotor.sag_um
-    down = -direction.imag  # cosine of the angle between crack and gravity
-    breathing = np.stack([(1.0 + down) / 2.0, (1.0 + np.sign(down)) / 2.0])
-    force = breathing * (deflection * direction.conj()).real * direction
-    spectrum = force @ np.exp(-1j * np.outer(theta, order)) / len(theta)
-    turning = _shaped(
-        change,
-        variance,
-        healthy,
-        spectrum[:, np.newaxis] * _passed(healthy),
-        _CRACK_TOLERANCES,
-        lambda loss: loss.real > math.cos(math.pi / 4.0) * np.abs(loss),
-    )
-    along_sag = _shaped(
-        change,
-        variance,
-        healthy,
-        _pulses(healthy),
-        _CRACK_TOLERANCES,
-        lambda loss: -loss.imag > _CRACK_FACING * np.abs(loss),
-    )
-    return float(np.logaddexp(turning, along_sag)) - math.log(2.0)
-
-
-def _pulses(healthy: Healthy) -> Complexes:
-    """Response to a pulse of force in a fixed direction, once a revolution, complex128 ``[W, B, A, 5]``."""
-    order = np.array(HARMONICS)
-    width = np.exp(-((order * _PULSE_WIDTHS[:, np.newaxis]) ** 2) / 2.0)
-    turning = np.exp(1j * np.outer(_ANGLES, order))
-    return np.asarray(width[:, np.newaxis, np.newaxis] * _passed(healthy) * turning.conj())
-
-
-def _passed(healthy: Healthy) -> Complexes:
-    """Compliance to forces at the orders of `HARMONICS`, complex128 ``[B, 1, 5]`` over a coarse box."""
-    omega, zeta = (axis.reshape(5, 5)[::2, ::2].ravel() for axis in healthy.rotor.box)
-    order = np.array(HARMONICS)
-    passed = compliance(order * healthy.speed_rad_s / omega[:, np.newaxis], zeta[:, np.newaxis])
-    return np.asarray(passed[:, np.newaxis])
-
-
-def _shaped(
-    change: Complexes,
-    variance: Floats,
-    healthy: Healthy,
-    shape: Complexes,
-    tolerances: Floats,
-    possible: Callable[[Complexes], Flags],
-) -> float:
-    """Log marginal likelihood of a change of known shape and unknown complex size.
-
-    Args:
-        change: complex128 ``[5]``.
-        variance: float64 ``[5]``.
-        healthy: the machine before.
-        shape: complex128 ``[..., 5]``, shapes, equally likely.
-        tolerances: relative deviations from the shape, equally likely.
-        possible: which of the sizes that fit best can be, complex128 ``[...]`` to bool.
-    """
-    size = np.abs(shape)
-    norm = (size**2).sum(axis=-1)
-    scores = np.full((len(tolerances), len(SPREADS), *norm.shape), -np.inf)
-    for i, tolerance in enumerate(tolerances):
-        spread = variance + (tolerance * np.abs(change)) ** 2
-        for _ in range(2):
-            scale = (shape.conj() * change / spread).sum(axis=-1) / (size**2 / spread).sum(axis=-1)
-            spread = variance + (tolerance * np.abs(scale)[..., np.newaxis] * size) ** 2
-        precision = (size**2 / spread).sum(axis=-1)
-        scale = (shape.conj() * change / spread).sum(axis=-1) / precision
-        residual = change - scale[..., np.newaxis] * shape
-        misfit = (np.abs(residual) ** 2 / spread).sum(axis=-1) + np.log(spread).sum(axis=-1)
-        allowed = possible(scale)
-        for j, part in enumerate(SPREADS):
-            # Integral over the size, normal with this spread: Sherman and Morrison.
-            prior = (part * healthy.amplitude_um) ** 2 / norm
-            occam = np.log1p(prior * precision) + np.abs(scale) ** 2 * precision / (1.0 + prior * precision)
-            scores[i, j] = np.where(allowed, -misfit - occam, -np.inf)
-    return log_mean(scores.ravel())
-
-
-def _facing(force: Complexes, place: Complexes) -> Floats:
-    """Cosine of the angle between two directions."""
-    return np.asarray((force * place.conj()).real / np.maximum(np.abs(force) * np.abs(place), 1e-300))
 
 
 _GENERIC_RUB_MARGIN_NATS = 12.0
@@ -601,14 +505,14 @@ def _group(
     marked: bool,
 ) -> tuple[RotorFault, ...]:
     """All hypotheses within the margin of the best one, the best first; `marked`: by marks of contact."""
-    # Without a Laval rotor any change of both senses of 1X would be a loss of damping.
+    # Without a model any change of both senses of 1X would be a loss of damping.
     alone = best == "damping_loss" and scores[best] - scores["unbalance"] > rules.margin_nats
 
     def margin(name: RotorFault) -> float:
-        if name == "unmodelled" and alone and not healthy.laval:
+        if name == "unmodelled" and alone and not healthy.healthy.modelled:
             return math.inf
         if {name, best} == _RIVALS:
-            return rules.rub_margin_nats if healthy.laval else _GENERIC_RUB_MARGIN_NATS
+            return rules.rub_margin_nats if healthy.healthy.modelled else _GENERIC_RUB_MARGIN_NATS
         return rules.margin_nats
 
     close = [name for name in scores if scores[best] - scores[name] < margin(name)]

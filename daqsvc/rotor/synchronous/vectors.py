@@ -171,6 +171,11 @@ class Healthy:
     laval: bool
 
     @property
+    def modelled(self) -> bool:
+        """Whether a model holds that says how forces move it: one Laval rotor, or two modes of a run-up."""
+        return self.laval or self.rotor.two_modes is not None
+
+    @property
     def amplitude_um(self) -> float:
         """Amplitude A of the healthy whirl, the measure of every change."""
         return float(np.sqrt(np.sum(np.abs(self.baseline[1:]) ** 2)))

@@ -1,0 +1,90 @@
+"""With the two modes of a run-up, faults part that one speed and a stated Laval rotor leave in one group."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from support.two_mode_rotors import RATE_HZ, Machine, run_up, touching, vector_of
+
+from daqsvc.rotor.calibration.run_up import fit_run_up, revolutions_of
+from daqsvc.rotor.calibration.two_modes import TwoModeFit, fit_two_modes
+from daqsvc.rotor.laval import LavalRotor
+from daqsvc.rotor.synchronous.signatures import likelihoods
+from daqsvc.rotor.synchronous.vectors import Healthy, synchronous_vectors
+
+MACHINE = Machine()
+STATED = LavalRotor(natural_frequency_hz=29.0, damping_ratio=0.1, static_sag_um=-MACHINE.rest.imag)
+SPEEDS_HZ = [20.0, 28.0, 38.0]
+
+
+@cache
+def identified() -> TwoModeFit:
+    position, angle = run_up(MACHINE, 8.0, 50.0, 25.0)
+    nearest = fit_run_up(np.column_stack((position.real, position.imag)), angle, RATE_HZ)
+    return fit_two_modes(
+        synchronous_vectors(revolutions_of(position, angle)),
+        RATE_HZ,
+        natural_frequency_hz=nearest.natural_frequency_hz,
+        damping_ratio=nearest.damping_ratio,
+    )
+
+
+def leads(fault: str, after: np.ndarray, speed_hz: float, *, run_up_seen: bool = True) -> dict[str, float]:
+    """How far a fault is ahead of each other one, nats, in noise that leaves 40 dB of the whirl."""
+    before = vector_of(MACHINE, speed_hz)
+    rotor = identified().beside(STATED) if run_up_seen else STATED
+    healthy = Healthy(before, math.tau * speed_hz, rotor, laval=False)
+    variance = np.full(5, (0.01 * healthy.amplitude_um) ** 2)
+    scores = likelihoods(after - before, variance, healthy, after)
+    return {name: scores[fault] - score for name, score in scores.items() if name != fault}
+
+
+@pytest.mark.parametrize("speed_hz", SPEEDS_HZ)
+def test_softer_supports_are_no_load(speed_hz):
+    after = vector_of(MACHINE.softened(0.6), speed_hz)
+    assert min(leads("stiffness_loss", after, speed_hz).values()) > 5.0
+
+
+@pytest.mark.parametrize("speed_hz", SPEEDS_HZ)
+def test_a_load_is_no_softer_support(speed_hz):
+    heavier = replace(MACHINE, load=1.5 * MACHINE.load)
+    after = vector_of(heavier, speed_hz)
+    assert min(leads("static_load", after, speed_hz).values()) > 5.0
+
+
+def test_without_a_run_up_the_two_are_one_group():
+    after = vector_of(replace(MACHINE, load=1.5 * MACHINE.load), 28.0)
+    assert leads("static_load", after, 28.0, run_up_seen=False)["stiffness_loss"] < 5.0
+
+
+@pytest.mark.parametrize("speed_hz", SPEEDS_HZ)
+def test_weaker_dampers_are_no_unbalance(speed_hz):
+    after = vector_of(MACHINE.damped(0.5), speed_hz)
+    ahead = leads("damping_loss", after, speed_hz)
+    assert ahead["unbalance"] > 2.0
+    assert min(lead for name, lead in ahead.items() if name != "unbalance") > 5.0
+
+
+@pytest.mark.parametrize("speed_hz", SPEEDS_HZ)
+def test_unbalance_is_no_loss_of_damping(speed_hz):
+    turned = replace(MACHINE, eccentricity_um=MACHINE.eccentricity_um * (1.0 + 0.5j))
+    after = vector_of(turned, speed_hz)
+    assert min(leads("unbalance", after, speed_hz).values()) > 3.0
+
+
+@pytest.mark.parametrize("direction_deg", [0.0, -60.0, 200.0])
+@pytest.mark.parametrize("speed_hz", SPEEDS_HZ)
+def test_a_wall_that_is_touched_is_a_rub(speed_hz, direction_deg):
+    direction = np.exp(1j * math.radians(direction_deg))
+    theta = math.tau * np.arange(256) / 256.0
+    forward, backward = MACHINE.orbit(speed_hz)
+    orbit = MACHINE.rest + forward * np.exp(1j * theta) + backward * np.exp(-1j * theta)
+    reach = float((orbit * direction.conjugate()).real.max())
+    wall = (reach - 0.3 * abs(forward)) * direction
+    after = touching(MACHINE, speed_hz, wall, 1.0)
+    ahead = leads("rub", after, speed_hz)
+    assert min(ahead.values()) > 3.0
