@@ -188,3 +188,12 @@ BUS_OPTION = Code(
     "Correct the option that the message names, as the manual of the interface has it.",
     _PAGE,
 )
+MANUALS_NUMBER = Code(
+    "B26",
+    "The address looks like the number of a manual",
+    "Manuals often count holding registers from 40001 and input registers from 30001. On the line they "
+    "begin at 0.",
+    "Take 40001 or 30001 off, if the manual counts so. A device that really has such addresses is read as "
+    "it is.",
+    "modbus.md",
+)

@@ -12,6 +12,7 @@ from daqsvc.errors.buses import (
     BITS,
     BUS_TOO_SLOW,
     FORBIDDEN_REGISTERS,
+    MANUALS_NUMBER,
     NO_ROOM_FOR_REGISTERS,
     REGISTERS_OVERLAP,
     UNIT_ADDRESS,
@@ -44,6 +45,10 @@ if TYPE_CHECKING:
 
 
 ADDRESSES = 65_536
+_MANUALS_FIRST = (30_001, 40_001)
+"""What manuals call the first input register and the first holding register ..."""
+_MANUALS_RANGE = 9_999
+"""... and how many of each they can number so."""
 _LAYOUTS = (RegistersLayout, FifoLayout, RingLayout, WaveformLayout)
 _BUSES = (ModbusTcpBus, ModbusRtuBus)
 
@@ -78,6 +83,7 @@ def check_modbus(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[Fi
             code=UNIT_ADDRESS,
         )
     yield from _check_bits(layout, path)
+    yield from _check_counted_from_0(layout, path)
     yield from check_channel_overlaps(layout, path)
     yield from _check_room(layout, path)
     yield from _check_writes(bus, stream.bus, layout, path)
@@ -127,6 +133,23 @@ def _check_bits(layout: ModbusLayout, path: KeyPath) -> Iterator[Finding]:
                 f"are no part of {channel.type}",
                 "write [lowest bit, number of bits] of an unsigned type that holds them, e.g. [0, 4]",
                 code=BITS,
+            )
+
+
+def _check_counted_from_0(layout: ModbusLayout, path: KeyPath) -> Iterator[Finding]:
+    """An address is one of the line, and not the number that a manual gives."""
+    if not isinstance(layout, RegistersLayout):
+        return
+    for index, channel in enumerate(layout.channels):
+        if first := next((n for n in _MANUALS_FIRST if n <= channel.address < n + _MANUALS_RANGE), None):
+            number = channel.address - first
+            yield Finding(
+                (*path, "channels", index, "address"),
+                f"looks like a number of the manual, where registers begin at {first}",
+                f"write address = {number}, as registers begin at 0 here; leave it if the device has such "
+                "addresses",
+                fatal=False,
+                code=MANUALS_NUMBER,
             )
 
 

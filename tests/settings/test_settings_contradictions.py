@@ -412,6 +412,22 @@ def test_numbers_that_share_a_register(channels, fatal, words):
     assert problem.line
 
 
+@pytest.mark.parametrize(("address", "meant"), [(40001, 0), (40018, 17), (49999, 9998), (30002, 1)])
+def test_the_number_of_a_manual_in_place_of_an_address_is_a_warning(address, meant):
+    channels = f'{{ name = "a", address = {address}, type = "int16" }}'
+    problems, warnings = outcome(registers(channels))
+    assert not problems
+    ((key, warning),) = warnings.items()
+    assert key == "streams.s.layout.channels[0].address"
+    assert f"write address = {meant}, as registers begin at 0" in warning.remedy
+    assert f"{warning}".endswith("[B26]")
+
+
+@pytest.mark.parametrize("address", [17, 30000, 40000, 50000])
+def test_other_addresses_are_taken_as_they_are(address):
+    assert outcome(registers(f'{{ name = "a", address = {address}, type = "int16" }}')) == ({}, {})
+
+
 @pytest.mark.parametrize(
     "channels",
     [
