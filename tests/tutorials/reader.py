@@ -8,6 +8,7 @@ A tutorial is Markdown. What the reader does is written in it like this:
 - "In a second terminal" (or first, third) in the paragraph before a block says where it is typed. Without
   such words it is the same as before. A program that does not end goes on running there.
 - "Save this as `NAME`" before a block: the reader writes that file.
+- "Open `URL` in a browser" before a block: the page has the words of each line of it.
 - "In `NAME`, replace" before a block, and "by" before the next one: the reader changes that file.
 
 Ports that other programs may have taken are replaced by free ones.
@@ -16,6 +17,7 @@ Ports that other programs may have taken are replaced by free ones.
 from __future__ import annotations
 
 import fcntl
+import html
 import os
 import pty
 import re
@@ -27,6 +29,7 @@ import subprocess
 import sys
 import termios
 import time
+import urllib.request
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -45,6 +48,7 @@ _FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _TERMINAL = re.compile(r"\b[Ii]n (?:a|the) (first|second|third) terminal")
 _SAVE = re.compile(r"[Ss]ave this as `([^`]+)`")
 _REPLACE = re.compile(r"[Ii]n `([^`]+)`, replace")
+_OPEN = re.compile(r"[Oo]pen `http://([^`]+)` in a browser")
 _COLUMNS = 100
 
 
@@ -226,6 +230,8 @@ class Reader:
         for step in steps(markdown):
             if step.language == "console":
                 self._type(step)
+            elif (address := _OPEN.search(step.words)) is not None:
+                self._look(address[1], step.text)
             else:
                 self._write(step)
         for terminal in self._terminals.values():
@@ -256,6 +262,13 @@ class Reader:
             elif line.strip():
                 shown.append(line)
         terminal.show(shown)
+
+    def _look(self, address: str, words: str) -> None:
+        with urllib.request.urlopen(f"http://{address}", timeout=PATIENCE_S) as answer:
+            page = html.unescape(re.sub(r"<[^>]*>", " ", answer.read().decode()))
+        for line in filter(None, words.splitlines()):
+            if line not in page:
+                raise NotAsShownError(f"{address} does not show {line!r}:\n{page}")
 
     def _write(self, step: Step) -> None:
         if (save := _SAVE.search(step.words)) is not None:

@@ -60,6 +60,16 @@ def test_what_is_not_as_shown_is_found(reader: Reader, text: str, words: str) ->
     assert words in f"{caught.value}"
 
 
+def test_a_page_in_a_browser_has_the_words_that_are_shown(reader: Reader) -> None:
+    text = (
+        "```console\n$ python3 -u -m http.server 8420 --bind 127.0.0.1\nServing HTTP ...\n...\n```\n\n"
+        "Open `http://127.0.0.1:8420/` in a browser:\n\n```text\n{words}\n```\n"
+    )
+    (reader.folder / "index.html").write_text("<p>one &amp; <b>two</b></p>")
+    with pytest.raises(NotAsShownError, match="does not show 'three'"):
+        reader.follow(text.format(words="one & \nthree"))
+
+
 def test_what_is_as_shown_is_followed_in_all_terminals(reader: Reader) -> None:
     reader.follow(
         "Save this as `f`:\n\n```text\nold\n```\n\n"
