@@ -200,11 +200,12 @@ class Reader:
         programs = folder / "bin"
         for one in (self.folder, programs, folder / "home", folder / "tmp"):
             one.mkdir()
-        program = programs / "daqsvc"
-        program.write_text(
-            f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -m daqsvc "$@"\n', encoding="utf-8"
-        )
-        program.chmod(0o755)
+        for name, arguments in (("daqsvc", "-m daqsvc "), ("python3", "")):
+            program = programs / name
+            program.write_text(
+                f'#!/bin/sh\nexec {shlex.quote(sys.executable)} {arguments}"$@"\n', encoding="utf-8"
+            )
+            program.chmod(0o755)
         self._environment = {
             **{key: value for key, value in os.environ.items() if not key.startswith(("XDG_", "STATE_"))},
             "PATH": f"{programs}:{os.environ['PATH']}:/usr/sbin",

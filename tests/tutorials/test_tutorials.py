@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import tempfile
 from pathlib import Path
@@ -29,9 +30,17 @@ def followed(path: Path) -> object:
     return pytest.param(path, id=path.stem, marks=[] if path.name in EVERYDAY else [pytest.mark.long])
 
 
+def goes_on_from(path: Path) -> list[Path]:
+    """The tutorial in whose folder this one goes on, if there is one."""
+    text = " ".join(path.read_text(encoding="utf-8").split())
+    found = re.findall(r"\]\((\S+\.md)\) and go on in its folder", text)
+    return [path.parent / name for name in found]
+
+
 @pytest.mark.parametrize("path", [followed(path) for path in TUTORIALS])
 def test_a_tutorial_is_true_word_for_word(reader: Reader, path: Path) -> None:
-    reader.follow(path.read_text(encoding="utf-8"))
+    for one in (*goes_on_from(path), path):
+        reader.follow(one.read_text(encoding="utf-8"))
 
 
 @pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)
