@@ -11,7 +11,8 @@ A tutorial is Markdown. What the reader does is written in it like this:
 - "Open `URL` in a browser" before a block: the page has the words of each line of it.
 - "In `NAME`, replace" before a block, and "by" before the next one: the reader changes that file.
 
-Ports that other programs may have taken are replaced by free ones.
+Ports that other programs may have taken are replaced by free ones, and ``/tmp`` by a folder of this
+reader's own.
 """
 
 from __future__ import annotations
@@ -44,6 +45,7 @@ PATIENCE_S = 60.0
 ANY = "..."
 CTRL_C = "^C"
 PORTS = ("1883", "5020", "8420")
+SHARED_TMP = "/tmp/"  # noqa: S108 - it is what is replaced
 _FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _TERMINAL = re.compile(r"\b[Ii]n (?:a|the) (first|second|third) terminal")
 _SAVE = re.compile(r"[Ss]ave this as `([^`]+)`")
@@ -216,6 +218,7 @@ class Reader:
             "USER": "ann",
         }
         self._ports = {port: f"{free_port()}" for port in PORTS}
+        self._own_tmp = f"{folder / 'tmp'}/"
         self._terminals: dict[str, Terminal] = {}
         self._at = "first"
         self._replaced: tuple[Path, str] | None = None
@@ -228,6 +231,7 @@ class Reader:
         """
         for port, free in self._ports.items():
             markdown = re.sub(rf"\b{port}\b", free, markdown)
+        markdown = markdown.replace(SHARED_TMP, self._own_tmp)
         for step in steps(markdown):
             if step.language == "console":
                 self._type(step)

@@ -563,7 +563,7 @@ class _Lines:
         del folder
         yield _ask("port", q.line, _only_port())
         yield _ask("baud", q.whole, "115200")
-        yield _ask("prefix", q.text_or_none, NONE, quiet=True)
+        yield _ask("prefix", q.text_or_none, NONE)
         yield _ask("separator", _character, ",", quiet=True)
         yield _choose("checksum", dict.fromkeys(("none", "xor", "crc16"), ""), "none", quiet=True)
         yield _ask("columns", _columns, "t, x, y")
