@@ -26,11 +26,11 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-def mosquitto_program() -> str:
-    """The Mosquitto of this machine; skips the test if there is none, unless it is required."""
-    program = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin:/usr/local/sbin")
+def mosquitto_program(name: str = "mosquitto", package: str = "mosquitto") -> str:
+    """A program of Mosquitto on this machine; skips the test if there is none, unless it is required."""
+    program = shutil.which(name) or shutil.which(name, path="/usr/sbin:/usr/local/sbin")
     if program is None:
-        reason = "no mosquitto on this machine (apt-get install mosquitto)"
+        reason = f"no {name} on this machine (apt-get install {package})"
         if os.environ.get("DAQSVC_REQUIRE_MOSQUITTO") == "1":
             pytest.fail(reason)
         pytest.skip(reason)

@@ -5,8 +5,8 @@ A tutorial is Markdown. What the reader does is written in it like this:
 - A block ``console``: lines that begin with ``$ `` are typed, the others are what is shown. A line ``...``
   stands for any lines, ``...`` within a line for any text. ``^C`` means that Ctrl-C is pressed. Where a
   program asks, what stands behind the prompt is typed.
-- "In a second terminal" (or first, third) in the paragraph before a block says where it is typed. Without
-  such words it is the same as before. A program that does not end goes on running there.
+- "In a second terminal" (or first, third, fourth) in the paragraph before a block says where it is typed.
+  Without such words it is the same as before. A program that does not end goes on running there.
 - "Save this as `NAME`" before a block: the reader writes that file.
 - "Open `URL` in a browser" before a block: the page has the words of each line of it.
 - "In `NAME`, replace" before a block, and "by" before the next one: the reader changes that file.
@@ -44,10 +44,10 @@ PATIENCE_S = 60.0
 """So long a program may take to show what it must: only one that shows something else takes so long."""
 ANY = "..."
 CTRL_C = "^C"
-PORTS = ("1883", "5020", "8420")
+PORTS = ("1883", "1884", "5020", "8420")
 SHARED_TMP = "/tmp/"  # noqa: S108 - it is what is replaced
 _FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-_TERMINAL = re.compile(r"\b[Ii]n (?:a|the) (first|second|third) terminal")
+_TERMINAL = re.compile(r"\b[Ii]n (?:a|the) (first|second|third|fourth) terminal")
 _SAVE = re.compile(r"[Ss]ave this as `([^`]+)`")
 _REPLACE = re.compile(r"[Ii]n `([^`]+)`, replace")
 _OPEN = re.compile(r"[Oo]pen `http://([^`]+)` in a browser")

@@ -8,6 +8,7 @@ import tempfile
 from pathlib import Path
 
 import pytest
+from support.brokers import mosquitto_program
 from support.paths import ROOT
 from tutorials.reader import NotAsShownError, Reader, steps
 
@@ -39,6 +40,9 @@ def goes_on_from(path: Path) -> list[Path]:
 
 @pytest.mark.parametrize("path", [followed(path) for path in TUTORIALS])
 def test_a_tutorial_is_true_word_for_word(reader: Reader, path: Path) -> None:
+    if "mosquitto_sub" in path.read_text(encoding="utf-8"):
+        mosquitto_program()
+        mosquitto_program("mosquitto_sub", "mosquitto-clients")
     for one in (*goes_on_from(path), path):
         reader.follow(one.read_text(encoding="utf-8"))
 
