@@ -246,6 +246,7 @@ def test_the_two_modes_of_a_run_up_are_known_where_they_hold(
     assert baseline.rotor == rotor
     assert rotor.clearance_um == 250.0
     assert (rotor.two_modes is not None) == known
+    assert ("without a run-up" in baseline.describe()) != known
     if rotor.two_modes is not None:
         assert rotor.two_modes.two_modes == modes
         assert (rotor.two_modes.natural_frequency_hz, rotor.two_modes.clearance_um) == (83.0, 1.0)

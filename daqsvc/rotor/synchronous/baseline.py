@@ -171,15 +171,18 @@ class Calibration:
                 if self.implausible
                 else f"backward over forward 1X is {100.0 * self.ellipticity:.0f} %"
             )
-            sentences.append(
-                f"is no Laval rotor ({why}): generic mode, in which rub and unmodelled changes stay one group"
+            told = (
+                "the two modes of its run-up say how faults move it"
+                if self.rotor.two_modes is not None
+                else "generic mode, in which rub and unmodelled changes stay one group"
             )
+            sentences.append(f"is no Laval rotor ({why}): {told}")
         smallest_um = self.smallest_change_um
         sentences.append(
             f"after {self.revolutions} revolutions the smallest change that can be seen is "
             f"{smallest_um:.2g} um, {100.0 * smallest_um / max(self.amplitude_um, 1e-12):.1f} % of 1X"
         )
-        if self.rotor.natural_frequency_tolerance > 0.05 or self.fit_error is None:
+        if self.rotor.two_modes is None and self.rotor.natural_frequency_tolerance > 0.05:
             sentences.append(
                 "without a run-up, unbalance and loss of damping are one group unless the steady orbit "
                 "excludes one of them"
