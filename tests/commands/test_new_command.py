@@ -177,6 +177,13 @@ def test_answers_of_a_file_are_those_of_the_options(tmp_path, capsys):
     assert layout["unit"] == 4
     assert [(one["address"], one["scale"]) for one in layout["channels"]] == [(17, 0.01), (32, 0.001)]
     assert [alarm.alert for alarm in machine.alarms] == [7.1, 7.1]
+    # Of a velocity the range that is offered is not that of a temperature, and can be taken as it is.
+    offered = file.read_text(encoding="utf-8").replace(
+        "# ok_between = [0.0, 65.0]", "ok_between = [0.0, 65.0]"
+    )
+    assert offered.count("\nok_between") == 2
+    file.write_text(offered, encoding="utf-8")
+    assert main(["check", f"{file}"]) == 0
 
 
 @pytest.mark.parametrize(

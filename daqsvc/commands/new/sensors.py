@@ -237,7 +237,8 @@ def sensor_tables(answers: Answers) -> Iterator[str]:
             yield entry("hysteresis_v", 0.5)
             yield entry("edge", "rising", 'or "falling": the edge that marks angle zero')
         if sensor.type == "trend":
-            yield "# ok_between = [-40.0, 105.0]    # what it can measure; beyond, it is not believed"
+            between = "0.0, 65.0" if sensor.unit == "mm/s" else "-40.0, 105.0"
+            yield f"# ok_between = [{between}]    # what it can measure; beyond, it is not believed"
         yield ""
 
 
