@@ -171,6 +171,18 @@ async def test_what_the_service_counts_is_what_prometheus_gets(tmp_path: Path) -
     assert abs(time.time() - spoke_s) < PATIENCE_S
 
 
+def test_refusals_of_a_modbus_unit_are_faults_of_its_bus(tmp_path: Path) -> None:
+    seen = figures(tmp_path)
+    refused = {
+        "exceptions": {"illegal function": 13, "gateway": 2},
+        "unknown_ids": {"0x7": 4},
+        "odd": {"a": "b"},
+    }
+    seen = {**seen, "buses": {"modbus": {"up": 1, **refused}}}
+    found = {fault.cause: fault.times for fault in fault_counts(seen) if fault.kind == "buses"}
+    assert found == {"exceptions": 15}
+
+
 async def test_who_asks_for_some_metrics_gets_these(tmp_path: Path) -> None:
     port = free_port()
     async with serving(tmp_path, port) as output:
