@@ -91,7 +91,6 @@ def strategy(question: Question) -> st.SearchStrategy[str]:
     return NAMES if topic == "name" and "." in question.key else FREE[topic]
 
 
-@pytest.mark.property
 @settings(
     max_examples=examples(90),
     deadline=None,

@@ -106,7 +106,8 @@ def test_what_is_wrong_in_it_is_said_as_of_any_table(installed):
     bounded = the_problem(text('[pipeline.kurtosis]\nsensor = "accel-de"\nmost = -1'))
     assert (bounded.key, bounded.message) == ("pipeline.kurtosis.most", "must be 0 or more")
     missing = the_problem(text("[pipeline.kurtosis]"))
-    assert str(missing).endswith('the accelerometer. Remedy: add sensor = "accel-de" to [pipeline.kurtosis]')
+    remedy = 'the accelerometer. Remedy: add sensor = "accel-de" to [pipeline.kurtosis] [F06]'
+    assert str(missing).endswith(remedy)
     nobody = the_problem(text('[pipeline.kurtosis]\nsensor = "nowhere"'))
     assert (nobody.key, nobody.message) == ("pipeline.kurtosis.sensor", "there is no such sensor")
 

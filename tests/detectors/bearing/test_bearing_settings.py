@@ -118,7 +118,7 @@ def test_what_was_understood_is_told() -> None:
             "too slow",
         ),
         ((("calibrate_s = 30.0", "calibrate_s = 3.0"),), "calibrate_s", "10", ""),
-        ((("bsf = 1.9940, ", ""),), "orders.bsf", "is missing: a ball turns", "bsf = 2.357"),
+        ((("bsf = 1.9940, ", ""),), "orders.bsf", "is missing: how often a ball turns", "bsf = 2.357"),
     ],
 )
 def test_mistakes_are_told_with_key_and_remedy(replacements, key, message, remedy) -> None:
