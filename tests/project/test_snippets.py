@@ -10,6 +10,7 @@ import ast
 import contextlib
 import functools
 import json
+import multiprocessing.process
 import re
 import runpy
 import shlex
@@ -162,6 +163,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
+def work_in(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Change to a folder, for new processes too: they begin where this one began."""
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(multiprocessing.process, "ORIGINAL_DIR", f"{folder}")
+
+
 @of("python")
 def test_python_is_whole(snippet: Snippet) -> None:
     ast.parse(snippet.text)
@@ -174,7 +181,7 @@ def test_python_is_whole(snippet: Snippet) -> None:
     ids=lambda one: one.name,
 )
 def test_python_runs(snippet: Snippet, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(folder)
+    work_in(folder, monkeypatch)
     file = folder / "snippet.py"
     file.write_text(snippet.text)
     # What the text of a page says that there is.
@@ -258,7 +265,7 @@ def can_run(words: list[str], folder: Path) -> bool:
 def test_lines_that_can_run_do(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(folder)
+    work_in(folder, monkeypatch)
     ran = []
     for name, words in OURS:
         line = chosen(words)
