@@ -143,6 +143,7 @@ class ConfinedProcess:
             "arguments": dict(arguments),
             "memory_bytes": memory_bytes,
             "cpu_s": cpu_s,
+            "directory": _directory(),
         }
         with self._lock:
             running = self._running = self._running or _begin(self._name)
@@ -188,6 +189,14 @@ class ConfinedProcess:
         os.close(running.replies)
         if running.requests >= 0:
             os.close(running.requests)
+
+
+def _directory() -> str | None:
+    """Where names of files begin; None if that is gone."""
+    try:
+        return os.getcwd()  # noqa: PTH109 - of this moment, as the process may be older
+    except OSError:
+        return None
 
 
 def _begin(name: str) -> _Running:

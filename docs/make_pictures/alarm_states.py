@@ -88,22 +88,22 @@ def draw(axes: Axes, here: AlarmState, there: AlarmState, stimulus: Stimulus, ki
 
 
 def route(here: tuple[float, float], there: tuple[float, float]) -> Route:
-    """The way from one box to another: each direction has a lane of its own."""
+    """The way from one box to another: the two directions run beside each other."""
     (x1, y1), (x2, y2) = here, there
     half_w, half_h = SIZE[0] / 2, SIZE[1] / 2
     if y1 == y2 and abs(x1 - x2) < 300.0:  # neighbours
         side = 1.0 if x2 > x1 else -1.0
-        lane = y1 + 10.0 * side
-        label = ((x1 + x2) / 2, lane + 9.0 * side)
-        return Route((x1 + side * half_w, lane), (x2 - side * half_w, lane), label)
+        track = y1 + 10.0 * side
+        label = ((x1 + x2) / 2, track + 9.0 * side)
+        return Route((x1 + side * half_w, track), (x2 - side * half_w, track), label)
     if y1 == y2:  # over the one between
         return Route((x1, y1 + half_h), (x2, y2 + half_h), ((x1 + x2) / 2, y1 + half_h + 64.0), bend=0.2)
     down = -1.0 if y2 < y1 else 1.0
     if x1 == x2:
-        lane = x1 - 14.0 * down
+        track = x1 - 14.0 * down
         right = down < 0 or x1 < 2 * half_w  # no room on the left of the first column
-        label = (lane + (5.0 if right else -5.0), (y1 + y2) / 2)
-        begin, end = (lane, y1 + down * half_h), (lane, y2 - down * half_h)
+        label = (track + (5.0 if right else -5.0), (y1 + y2) / 2)
+        begin, end = (track, y1 + down * half_h), (track, y2 - down * half_h)
         return Route(begin, end, label, "left" if right else "right")
     side = 1.0 if x2 > x1 else -1.0
     shift = -7.0 if down < 0 else 7.0

@@ -82,13 +82,13 @@ async def play(folder: Path) -> Course:
 
 
 def picture() -> Figure:
-    """Three lanes: decided, on the disk, at the broker; below how many wait."""
+    """Three rows: decided, on the disk, at the broker; below how many wait."""
     with tempfile.TemporaryDirectory() as folder:
         course = asyncio.run(play(Path(folder)))
     figure = new(4.0)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.0, 1.0))
-    for lane, times, color in ((2, course.decided, FAULTY), (1, course.stored, HEALTHY)):
-        upper.plot(list(times.values()), [lane] * len(times), "o", color=color, markersize=5)
+    for row, times, color in ((2, course.decided, FAULTY), (1, course.stored, HEALTHY)):
+        upper.plot(list(times.values()), [row] * len(times), "o", color=color, markersize=5)
     seen: set[int] = set()
     for number, second in course.arrived:
         again = number in seen

@@ -35,6 +35,20 @@ def test_numbers_come_back_from_one_process_for_many_calls(process):
     assert call(process, "double", numbers=[1.0]).document == first.document != {"pid": os.getpid()}
 
 
+def test_names_of_files_begin_where_the_caller_is_now(process, tmp_path, monkeypatch):
+    first = call(process, "whereabouts").document
+    assert first["directory"] == f"{Path.cwd()}"
+    monkeypatch.chdir(tmp_path)
+    now = call(process, "whereabouts").document
+    assert now == {"directory": f"{tmp_path}", "pid": first["pid"]}
+    # From a directory that is gone whole paths still lead to files.
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    assert call(process, "whereabouts").document == now
+
+
 def test_an_error_there_is_an_error_here(process):
     with pytest.raises(RaisedThereError, match="KeyError: 'no such thing'"):
         call(process, "fail")

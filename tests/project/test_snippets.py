@@ -10,7 +10,6 @@ import ast
 import contextlib
 import functools
 import json
-import multiprocessing.process
 import re
 import runpy
 import shlex
@@ -163,12 +162,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
-def work_in(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Change to a folder, for new processes too: they begin where this one began."""
-    monkeypatch.chdir(folder)
-    monkeypatch.setattr(multiprocessing.process, "ORIGINAL_DIR", f"{folder}")
-
-
 @of("python")
 def test_python_is_whole(snippet: Snippet) -> None:
     ast.parse(snippet.text)
@@ -181,7 +174,7 @@ def test_python_is_whole(snippet: Snippet) -> None:
     ids=lambda one: one.name,
 )
 def test_python_runs(snippet: Snippet, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    work_in(folder, monkeypatch)
+    monkeypatch.chdir(folder)
     file = folder / "snippet.py"
     file.write_text(snippet.text)
     # What the text of a page says that there is.
@@ -265,7 +258,7 @@ def can_run(words: list[str], folder: Path) -> bool:
 def test_lines_that_can_run_do(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    work_in(folder, monkeypatch)
+    monkeypatch.chdir(folder)
     ran = []
     for name, words in OURS:
         line = chosen(words)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
@@ -19,6 +20,10 @@ if TYPE_CHECKING:
 
 def double(numbers: Sequence[float]) -> Answer:
     return {"pid": os.getpid()}, [2.0 * np.asarray(numbers), np.empty((0, 3))]
+
+
+def whereabouts() -> Answer:
+    return {"directory": f"{Path.cwd()}", "pid": os.getpid()}, []
 
 
 def chatter() -> Answer:
