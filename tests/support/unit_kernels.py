@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import shutil
 import subprocess
@@ -24,6 +25,8 @@ from daqsvc import kernel_cache
 def warm() -> None:
     """Compile what the service of the rig needs, where the guest would take minutes."""
     kernel_cache.prepare()
+    # Those of samples are compiled by their modules, and only a bus imports these.
+    importlib.import_module("daqsvc.acquisition.assembler")
     from daqsvc.detectors.make import detectors
     from daqsvc.settings import load_machine_file
 
