@@ -5,6 +5,8 @@ A tutorial is Markdown. What the reader does is written in it like this:
 - A block ``console``: lines that begin with ``$ `` are typed, the others are what is shown. A line ``...``
   stands for any lines, ``...`` within a line for any text. ``^C`` means that Ctrl-C is pressed. Where a
   program asks, what stands behind the prompt is typed.
+- What only looks (``daqsvc status``, ``alarms``, ``trend``) is typed again until it shows what it must, as a
+  person would: what it looks at takes its time.
 - "In a second terminal" (or first, third, fourth) in the paragraph before a block says where it is typed.
   Without such words it is the same as before. A program that does not end goes on running there.
 - "Save this as `NAME`" before a block: the reader writes that file.
@@ -52,6 +54,7 @@ _SAVE = re.compile(r"[Ss]ave this as `([^`]+)`")
 _REPLACE = re.compile(r"[Ii]n `([^`]+)`, replace")
 _OPEN = re.compile(r"[Oo]pen `http://([^`]+)` in a browser")
 _COLUMNS = 100
+_LOOK = re.compile(r"daqsvc (status|alarms|trend)\b(?!.*--watch)")
 
 
 class NotAsShownError(AssertionError):
@@ -190,6 +193,24 @@ class Terminal:
         )
 
 
+def _look_until(terminal: Terminal, command: str, shown: list[str]) -> None:
+    """Type it again until it shows what it must."""
+    until = time.monotonic() + PATIENCE_S
+    while True:
+        terminal.start(command)
+        try:
+            terminal.show(shown)
+            terminal.finish()
+        except NotAsShownError:
+            if time.monotonic() > until:
+                raise
+            terminal.whole = False
+            terminal.finish()
+            time.sleep(0.5)
+        else:
+            return
+
+
 class Reader:
     """Follows a tutorial in a fresh folder.
 
@@ -256,17 +277,15 @@ class Reader:
         if name not in self._terminals:
             self._terminals[name] = Terminal(self.folder, self._environment)
         terminal = self._terminals[name]
-        shown: list[str] = []
-        started = False
-        for line in step.text.splitlines():
-            if line.startswith("$ "):
-                if started or shown:
-                    terminal.show(shown)
-                terminal.start(line.removeprefix("$ "))
-                shown, started = [], True
-            elif line.strip():
-                shown.append(line)
-        terminal.show(shown)
+        goes_on, *typed = re.split(r"^\$ ", step.text, flags=re.MULTILINE)
+        terminal.show(list(filter(str.strip, goes_on.splitlines())))
+        for text in typed:
+            command, *shown = filter(str.strip, text.splitlines())
+            if _LOOK.match(command):
+                _look_until(terminal, command, shown)
+            else:
+                terminal.start(command)
+                terminal.show(shown)
 
     def _look(self, address: str, words: str) -> None:
         with urllib.request.urlopen(f"http://{address}", timeout=PATIENCE_S) as answer:

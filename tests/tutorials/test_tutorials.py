@@ -91,3 +91,11 @@ def test_what_is_as_shown_is_followed_in_all_terminals(reader: Reader) -> None:
         "```console\n$ read -p 'Name: ' a; echo hello $a, $RANDOM times\nName: ann\nhello ann, ... times\n"
         "$ seq 3\n...\n3\n```\n\nIn the first terminal, press Ctrl-C:\n\n```console\n^C\n```\n"
     )
+
+
+def test_what_looks_is_typed_again_until_it_shows_what_it_must(reader: Reader) -> None:
+    program = reader.folder.parent / "bin" / "daqsvc"
+    program.write_text("#!/bin/sh\nrm ready 2>/dev/null && echo well || { touch ready; echo not yet; }\n")
+    reader.follow("```console\n$ daqsvc status\nwell\n```\n")
+    with pytest.raises(NotAsShownError, match="not yet"):
+        reader.follow("```console\n$ daqsvc run\nwell\n```\n")
