@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pty
 import shutil
@@ -270,6 +271,13 @@ class Terminal:
     def type(self, text: str) -> None:
         os.write(self._leader, f"{text}\n".encode())
 
+    def interrupt(self) -> None:
+        """Press Ctrl-C; again where the prompt was shown and nothing was read yet: Python misses that one."""
+        while self.process.poll() is None:
+            self.process.send_signal(signal.SIGINT)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self.process.wait(timeout=1)
+
     def rest(self) -> str:
         seen = ""
         try:
@@ -317,7 +325,7 @@ def test_ctrl_c_leaves_nothing_behind(tmp_path):
     terminal.until("[virtual]: ")
     terminal.type("")
     terminal.until("[rig]: ")
-    terminal.process.send_signal(signal.SIGINT)
+    terminal.interrupt()
     assert "interrupted" in terminal.rest()
     assert terminal.process.returncode == 1
     assert list(tmp_path.iterdir()) == []

@@ -278,7 +278,8 @@ class Reader:
             self._terminals[name] = Terminal(self.folder, self._environment)
         terminal = self._terminals[name]
         goes_on, *typed = re.split(r"^\$ ", step.text, flags=re.MULTILINE)
-        terminal.show(list(filter(str.strip, goes_on.splitlines())))
+        if shown := list(filter(str.strip, goes_on.splitlines())):
+            terminal.show(shown)
         for text in typed:
             command, *shown = filter(str.strip, text.splitlines())
             if _LOOK.match(command):
