@@ -154,14 +154,14 @@ def paper(docs: Path) -> Iterator[Row]:
         )
     prediction = Page(docs, "detectability.md")
     for change in ("F1 to F1L2", "N to unbalance x1.3", "N to stiffness 0.95", "N to rub"):
-        row = prediction.row(change, after="## How far it can be trusted")
+        row = prediction.row(change, after="## How accurate it is")
         delay = row["delay in revolutions, predicted / seen"]
         yield Row(
             f"delay that `daqsvc detectability` predicts, {change}, {row['SNR']}",
             f"{delay} revolutions, predicted / seen",
             "simulated machines with an integrator of their own",
             "pytest tests/rotor/test_detectability_comes_true.py",
-            "detectability.md#how-far-it-can-be-trusted",
+            "detectability.md#how-accurate-it-is",
         )
 
 
@@ -343,7 +343,7 @@ def kept(docs: Path) -> Iterator[Row]:
             f"{row['lost by the broker']} lost by a broker that was killed",
             "random runs: kill -9, broker killed, network cut, disk full; a consumer counts",
             'make nothing-lost ARGS="--runs 60"',
-            "outbox.md#what-was-tried",
+            "outbox.md#what-was-tested",
         )
     samples, events = box.row("samples", after="## Soak"), box.row("alarm events", after="## Soak")
     yield Row(
@@ -382,7 +382,7 @@ def alarms(docs: Path) -> Iterator[Row]:
             "make bench",
             "outbox.md#how-fast",
         )
-    many = page.find(r"among 10,000 sensors ([\d.]+ to [\d.]+) times as much as among 10")
+    many = page.find(r"with 10,000 sensors a diagnosis takes ([\d.]+ to [\d.]+) times as long as with 10")
     yield Row(
         "a diagnosis among 10,000 sensors",
         f"{many[1]} times what it costs among 10",
