@@ -116,7 +116,7 @@ def paper(docs: Path) -> Iterator[Row]:
         f"{verdicts.count('yes')} of {len(verdicts)} agree",
         "each experiment of section V from scratch; the page gives the reasons of the others",
         again,
-        "reproduce.md#what-came-out",
+        "reproduce.md#results",
     )
     rule = r"this service's rule \(CUSUM of log-likelihood ratios\): {}"
     delay = page.find(rule.format(r"median delay .*?; 0 dB: ([\d. /]+); "))
@@ -125,7 +125,7 @@ def paper(docs: Path) -> Iterator[Row]:
         f"{delay[1]} revolutions",
         "damping from 0.18 to 0.10, 0.06 and 0.02; 100 draws of the sensor noise",
         again,
-        "reproduce.md#what-came-out",
+        "reproduce.md#results",
     )
     wrong = page.find(
         rule.format(
@@ -140,7 +140,7 @@ def paper(docs: Path) -> Iterator[Row]:
         f"{', '.join(wrong.groups())} at -5, 0, +5 dB; by the paper's own rule {', '.join(old.groups())}",
         "the same draws",
         again,
-        "reproduce.md#what-came-out",
+        "reproduce.md#results",
     )
     figures, wrong_of = Page(docs, "rotor-figures.md"), "wrong changes in 32,234 revolutions"
     for snr in ("-5 dB", "0 dB", "+5 dB"):
@@ -235,7 +235,7 @@ def bearings(docs: Path) -> Iterator[Row]:
             parts,
             how,
             "make bench-data",
-            "race-test.md#what-it-reaches",
+            "race-test.md#results",
         )
     noise = page.find(r"(\d+) windows of Gaussian noise .*?: (\d+) alarms")
     yield Row(
@@ -243,7 +243,7 @@ def bearings(docs: Path) -> Iterator[Row]:
         f"{noise[2]} in {noise[1]} windows",
         "Gaussian noise, 2.5 s at 12 kHz",
         "make bench-data",
-        "race-test.md#what-it-reaches",
+        "race-test.md#results",
     )
     other = page.find(
         r"Of (\d+) records with a damaged race (\d+) were named right, of (\d+) with a damaged ball (\w+)"
@@ -253,7 +253,7 @@ def bearings(docs: Path) -> Iterator[Row]:
         f"{other[2]} of {other[1]} damaged races named, {other[4]} of {other[3]} balls, no wrong part",
         "fan end and base plate of the CWRU rig",
         "pytest tests/bearing/test_race_other_sensors.py",
-        "race-test.md#what-it-reaches",
+        "race-test.md#results",
     )
     pair, again = (
         Page(docs, "bearing.md"),
