@@ -23,7 +23,7 @@ def test_every_source_is_cited_and_every_citation_has_a_source() -> None:
 
 
 def test_the_day_of_looking_is_stated() -> None:
-    assert re.search(r"read in the sources at the end, on 20\d\d-\d\d-\d\d", BODY)
+    assert re.search(r"come from the sources at the end, read on 20\d\d-\d\d-\d\d", BODY)
 
 
 def test_each_system_has_both_sides_and_a_way_together() -> None:
