@@ -150,4 +150,7 @@ def _odd_link(link: object) -> _Odd | None:
     ):
         if not isinstance(value := getattr(link, name), kind):
             return _Odd(f"{name} of the link", value, wanted)
+    faults = link.faults
+    if not isinstance(faults, Mapping) or not all(isinstance(text, str) for text in faults.values()):
+        return _Odd("faults of the link", faults, "a text by stream")
     return None

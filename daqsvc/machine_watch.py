@@ -39,6 +39,7 @@ class MachineWatch:
         report: takes what the detectors say.
         supervisor: keeps its parts going.
         bus_over: says of a bus why nothing more can come from it; empty if something can.
+        stream_silent: says of a stream what its bus knows of why nothing comes; empty if nothing.
         kernels: threads that its detectors compute in.
         make_reader: makes what hands the samples of a ring to a detector.
 
@@ -65,6 +66,7 @@ class MachineWatch:
         report: Callable[[Diagnosis], None],
         supervisor: Supervisor,
         bus_over: Callable[[str], str],
+        stream_silent: Callable[[str], str],
         kernels: KernelThreads,
         make_reader: Callable[[SampleRing], RingReader] = RingReader,
     ) -> None:
@@ -73,6 +75,7 @@ class MachineWatch:
         self._clock = clock
         self.supervisor = supervisor
         self._bus_over = bus_over
+        self._stream_silent = stream_silent
         watching = detectors(machine, store)
         grids = [*(Grid({name: stream}) for name, stream in machine.streams.items()), *machine.grids]
         self._grids = grids
@@ -97,6 +100,7 @@ class MachineWatch:
             supervisor=supervisor,
             fall_silent=self._fall_silent,
             why_over=self._why_over,
+            why_silent=self._why_silent,
             make_reader=make_reader,
             on_read=self._on_read,
             on_processed=self._on_processed,
@@ -203,6 +207,11 @@ class MachineWatch:
         streams = next(grid.streams for grid in self._grids if grid.name == stream)
         buses = {self.machine.streams[name].bus for name in streams}
         return next(filter(None, (self._bus_over(bus) for bus in sorted(buses))), "")
+
+    def _why_silent(self, stream: str) -> str:
+        """What the bus of a stream or grid knows of why nothing comes; else empty."""
+        streams = next(grid.streams for grid in self._grids if grid.name == stream)
+        return next(filter(None, (self._stream_silent(name) for name in streams)), "")
 
 
 def _ring(machine: MachineFile, grid: Grid, watching: Sequence[Detector]) -> SampleRing:

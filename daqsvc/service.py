@@ -208,6 +208,7 @@ class Service:
             self._report,
             self.supervisor if box.is_single else self.supervisor.within(name),
             self._why_bus_over,
+            partial(self._why_silent, name),
             self._kernels,
         )
 
@@ -558,6 +559,12 @@ class Service:
     def _why_bus_over(self, bus: str) -> str:
         """Why nothing more can come from a bus, e.g. that its recording has ended; else empty."""
         return next((one.link.over for one in self.driver_reports if one.name == bus), "")
+
+    def _why_silent(self, machine: str, stream: str) -> str:
+        """What the bus of a stream of a machine knows of why no samples of it come; else empty."""
+        bus = self.box.machines[machine].streams[stream].bus
+        links = (one.link for one in self.driver_reports if one.name == bus)
+        return next((link.why_silent(self.box.stream_key(machine, stream)) for link in links), "")
 
     def _report(self, diagnosis: Diagnosis) -> None:
         self.reports[diagnosis.machine].remember(diagnosis)

@@ -13,7 +13,7 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.settings.failures import cause_of, in_words
 
 if TYPE_CHECKING:
-    from collections.abc import Hashable
+    from collections.abc import Hashable, Mapping
 
 logger = logging.getLogger(__name__)
 
@@ -129,6 +129,8 @@ class Link:
         over: why nothing more comes over it, in a clause with its name; empty while it is up or tried again.
         turns: how often the thread that reads it has come round, whether there was anything or not; it does
             so several times a second. 0 where the event loop reads.
+        faults: by stream, why no samples of it come while the link is up, in a clause, e.g. that the device
+            refuses what is asked.
     """
 
     name: str
@@ -137,6 +139,7 @@ class Link:
     reason: str = ""
     over: str = ""
     turns: int = 0
+    faults: Mapping[str, str] = field(default_factory=dict)
     _ever_up: bool = field(default=False, repr=False)
     _said_down: bool = field(default=False, repr=False)
     _sparing: Sparing = field(default_factory=Sparing, repr=False)
@@ -189,6 +192,10 @@ class Link:
         ended = f"{self.name} has ended: {reason}"
         logger.info("%s", ended)
         self.state, self.reason, self._said_down, self.over = "down", reason, False, ended
+
+    def why_silent(self, stream: str) -> str:
+        """Why no samples of a stream come, in a clause, as far as that is known; else empty."""
+        return self.reason if self.state == "down" else self.faults.get(stream, "")
 
     def turn(self) -> None:
         """The thread that reads has come round once more; called on it."""

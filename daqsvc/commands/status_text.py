@@ -179,6 +179,8 @@ def _rate(stream: Document) -> str:
 
 def _lost(stream: Document) -> str:
     lost, received = stream["samples_lost"], stream["samples_received"]
+    if not lost + received:
+        return "no samples yet" + (f" [{stream['doubt']}]" if stream["doubt"] else "")
     share = f" ({100 * lost / (lost + received):.2g} %)" if lost else ""
     doubt = f" [{stream['doubt']}]" if stream["doubt"] else ""
     return f"{lost:,} of {lost + received:,} samples{share}{doubt}"

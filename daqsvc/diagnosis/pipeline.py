@@ -272,6 +272,7 @@ class Pipeline:
         fall_silent: called with the name and the standing of a stream in doubt of which nothing comes any
             more; whoever tells the pipeline how streams stand passes it on. None: it is passed on at once.
         why_over: why nothing more can come of a stream, in a clause; empty if something may.
+        why_silent: what the bus of a stream says of why nothing comes, in a clause; empty if nothing.
         make_reader: makes what hands the samples of a ring to a detector.
         on_read: called on the event loop with a detector's name and each window that is read for it.
         on_processed: called, on the thread that computes, with a detector and each window it has processed.
@@ -289,6 +290,7 @@ class Pipeline:
         supervisor: Supervisor | None = None,
         fall_silent: Tell | None = None,
         why_over: Callable[[str], str] = lambda _stream: "",
+        why_silent: Callable[[str], str] = lambda _stream: "",
         make_reader: Callable[[SampleRing], RingReader] = RingReader,
         on_read: Callable[[str, Window], None] = lambda _detector, _window: None,
         on_processed: Callable[[Detector, Window], None] = lambda _detector, _window: None,
@@ -305,6 +307,7 @@ class Pipeline:
         self._standings = dict.fromkeys(rings, StreamState())
         self._fall_silent = fall_silent or self.stand
         self._why_over = why_over
+        self._why_silent = why_silent
         self._doubts_told = dict.fromkeys(rings, 0)
         self._changes = dict.fromkeys(rings, 0)
         self._held: dict[str, deque[Diagnosis]] = {name: deque(maxlen=MOST_HELD) for name in rings}
@@ -415,6 +418,8 @@ class Pipeline:
     async def _listen_for_silence(self) -> None:
         """Have detectors say, once, that their stream has fallen silent: a window never comes to say it.
 
+        It is said once more when only then the bus tells why nothing comes.
+
         Of a stream in doubt samples may not come as far as the ring; that frames come is told with the doubt.
 
         A process that was suspended has not listened: what came meanwhile still waits to be read.
@@ -423,6 +428,7 @@ class Pipeline:
         looked_ns = self._clock.monotonic_ns()
         since_ns = {name: looked_ns + self._settling_ns.get(name, 0) for name in self._rings}
         silent: set[str] = set()
+        unexplained: set[str] = set()
         while True:
             await self._clock.sleep_ns(LOOK_NS)
             now_ns = self._clock.monotonic_ns()
@@ -437,19 +443,25 @@ class Pipeline:
                         self._patience[name].heard_after(now_ns - since_ns[name])
                     heard[name], since_ns[name] = come, now_ns
                     silent.discard(name)
+                    unexplained.discard(name)
                 elif name not in silent and now_ns - since_ns[name] >= self._patience[name].ns:
                     silent.add(name)
+                    why = self._say_nothing_comes(name, now_ns - since_ns[name], now_ns)
+                    unexplained |= set() if why else {name}
+                elif name in unexplained and (self._why_over(name) or self._why_silent(name)):
+                    unexplained.discard(name)
                     self._say_nothing_comes(name, now_ns - since_ns[name], now_ns)
 
-    def _say_nothing_comes(self, stream: str, silence_ns: int, now_ns: int) -> None:
+    def _say_nothing_comes(self, stream: str, silence_ns: int, now_ns: int) -> str:
+        """Have the detectors of a stream say that nothing comes; returns why, if that is known."""
         silence_s = silence_ns / NS_PER_S
         standing = self._standings[stream]
-        over = self._why_over(stream)
-        reason = f"no more samples of {stream}: {over}" if over else silence_reason(stream, silence_s)
+        over, why = self._why_over(stream), self._why_silent(stream)
+        reason = f"no more samples of {stream}: {over}" if over else silence_reason(stream, silence_s, why)
         if standing.doubt:
             # What the stream was doubted for is no longer what is wrong.
             self._fall_silent(stream, StreamState(reason, standing.proven, silent=True))
-            return
+            return over or why
         self._let_go(stream)
         self._silent_until_ns[stream] = now_ns
         if not any(detector.stream == stream for detector in self.detectors):
@@ -460,7 +472,8 @@ class Pipeline:
                     _part(detector), "the other detectors say that nothing comes"
                 ):
                     for diagnosis in said_of_silence(detector, silence_s, now_ns):
-                        self._report(replace(diagnosis, reason=reason) if over else diagnosis)
+                        self._report(replace(diagnosis, reason=reason) if over or why else diagnosis)
+        return over or why
 
     async def _follow(self, detector: Detector) -> None:
         while True:

@@ -80,8 +80,16 @@ class Diagnosis:
         return self.quality == "missing" and bool(self.bounds)
 
 
-def silence_reason(stream: str, silence_s: float) -> str:
-    """Why a statement about a silent stream is not good."""
+def silence_reason(stream: str, silence_s: float, why: str = "") -> str:
+    """Why a statement about a silent stream is not good.
+
+    Args:
+        stream: its name.
+        silence_s: how long nothing has come of it.
+        why: what its bus says of that, in a clause; empty if it says nothing.
+    """
+    if why:
+        return f"no samples of {stream}: {why}"
     return f"no samples of {stream} for {silence_s:.1f} s; check bus and device"
 
 

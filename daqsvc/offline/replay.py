@@ -373,6 +373,7 @@ class Replay:
                 self._report,
                 self._supervisor,
                 lambda _bus: "",
+                lambda _stream: "",
                 KernelThreads(THREADS, kernel_failed(self._supervisor)),
                 GivenWindows,
             )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections import defaultdict
+from collections import ChainMap, defaultdict
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.acquisition.link import Link
@@ -85,6 +85,7 @@ class ModbusDriver:
         parity = "none" if isinstance(bus, ModbusTcpBus) else bus.parity
         self._characters = CharacterFormat(self.link.name, Character(8, parity))
         self._readers = readers_for(bus, port, self.counters)
+        self.link.faults = ChainMap(*(reader.faults for reader in self._readers))
         self._line: ModbusLine | None = None
         self._sparing: SparingByEnquiry = {}
 

@@ -35,6 +35,11 @@ class Reader(Protocol):
         """Counters and clock of each stream, by name."""
         ...
 
+    @property
+    def faults(self) -> dict[str, str]:
+        """By stream, why the last request for it has failed, in a clause."""
+        ...
+
 
 class PollingReader(ABC):
     """A reader that looks again and again, and goes on after a request that failed.
@@ -42,11 +47,16 @@ class PollingReader(ABC):
     Args:
         streams: names of what it reads.
         clock: the service's clock.
+
+    Attributes:
+        faults: by stream, why the last request for it has failed, in a clause; without those that get on.
     """
 
     def __init__(self, streams: Sequence[str], clock: Clock) -> None:
+        self._names = streams
         self._who = streams_in_words(streams)
         self._clock = clock
+        self.faults: dict[str, str] = {}
         self._said: set[str] = set()
 
     async def run(self, line: ModbusLine) -> None:
@@ -57,21 +67,29 @@ class PollingReader(ABC):
             except LineLostError:
                 return
             except (NoReplyError, RequestRefusedError) as error:
+                fault = f"{error}"
                 if isinstance(error, RequestRefusedError):
-                    self._tell(error)
+                    remedy = REMEDIES.get(error.code, OTHER_REMEDY)
+                    self._tell(fault, remedy)
+                    fault = f"{fault}; {remedy}"
+                self._stand(dict.fromkeys(self._concerned(), fault))
                 await self._pause_after_failure()
+            else:
+                self._stand({})
 
-    def _tell(self, error: RequestRefusedError, who: str = "") -> None:
-        """Tell each refusal once; how often there are such, the counters of the bus say.
+    def _stand(self, faults: Mapping[str, str]) -> None:
+        self.faults.clear()
+        self.faults.update(faults)
 
-        Args:
-            error: what is refused.
-            who: gets no sample of it; all streams if left out.
-        """
-        if (message := f"{who or self._who}: {error}") not in self._said:
+    def _tell(self, refusal: str, remedy: str) -> None:
+        """Tell each refusal once; how often there are such, the counters of the bus say."""
+        if (message := f"{streams_in_words(self._concerned())}: {refusal}") not in self._said:
             self._said.add(message)
-            remedy = REMEDIES.get(error.code, OTHER_REMEDY)
             logger.warning("%s, which is counted from now on; %s", message, remedy)
+
+    def _concerned(self) -> Sequence[str]:
+        """The streams that get no sample by the request that has failed."""
+        return self._names
 
     @abstractmethod
     async def _look(self, line: ModbusLine) -> None:

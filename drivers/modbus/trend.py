@@ -19,7 +19,7 @@ from daqsvc.acquisition.assembler import StreamCounters, note_gap, note_received
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.acquisition.timebase import RECENT_DELAYS, TimeBaseState
-from drivers.modbus.reading import PollingReader, streams_in_words
+from drivers.modbus.reading import PollingReader
 from drivers.modbus.registers import RegisterRecord, run_of
 from drivers.modbus.replies import FUNCTIONS, NoReplyError, RequestRefusedError
 
@@ -65,6 +65,13 @@ class _Failure(NamedTuple):
         """Whether the unit may have each stream's registers, and not all that lies between them."""
         refused = isinstance(self.error, RequestRefusedError) and self.error.code in REFUSALS_OF_REGISTERS
         return refused and len(self.takers) > 1
+
+    @property
+    def in_words(self) -> NoReplyError | RequestRefusedError:
+        """The error, with the registers that are refused; whoever is silent is told by the line."""
+        if not isinstance(self.error, RequestRefusedError):
+            return self.error
+        return RequestRefusedError(f"{self.error} ({_words(self.run)})", self.error.code)
 
 
 class _Row(NamedTuple):
@@ -194,6 +201,7 @@ class TrendReader(PollingReader):
         self._start_ns = 0
         self._done = -1
         self._begun = False
+        self._without_sample: Sequence[str] = ()
         self._streams = [_TrendStream(spec, port) for spec in specs]
         self._shared = runs
         self._apart_ns = APART_NS
@@ -225,7 +233,8 @@ class TrendReader(PollingReader):
             readings, failure = await self._ask(line)
         self._append(slot, readings)
         if failure is not None:
-            self._fail(failure)
+            self._without_sample = sorted(stream.name for stream in failure.takers)
+            raise failure.in_words
 
     async def _ask(self, line: ModbusLine) -> tuple[list[RegisterValues | None], _Failure | None]:
         """Read all runs; the last failure that cost some stream its sample, if any."""
@@ -269,12 +278,8 @@ class TrendReader(PollingReader):
                 message,
             )
 
-    def _fail(self, failure: _Failure) -> None:
-        """Tell a refusal with whom it concerns; whoever is silent is told by the line."""
-        if not isinstance(failure.error, RequestRefusedError):
-            raise failure.error
-        refusal = RequestRefusedError(f"{failure.error} ({_words(failure.run)})", failure.error.code)
-        self._tell(refusal, streams_in_words(sorted(stream.name for stream in failure.takers)))
+    def _concerned(self) -> Sequence[str]:
+        return self._without_sample
 
     async def _pause_after_failure(self) -> None:
         """The schedule itself is the pause."""

@@ -355,6 +355,23 @@ async def test_a_silence_is_said_once_and_again_after_the_next() -> None:
     await running
 
 
+async def test_what_the_bus_knows_of_a_silence_is_said_also_when_it_comes_later() -> None:
+    clock, ring = DrivenClock(), SampleRing("s", ("a",), 50)
+    said: list[Diagnosis] = []
+    known = {"s": ""}
+    pipeline = Pipeline(
+        {"s": ring}, [Listener("one", 10)], said.append, clock, why_silent=lambda stream: known[stream]
+    )
+    running = asyncio.create_task(pipeline.run())
+    for quarter in range(1, 41):
+        known["s"] = "unit 1 refuses that" if quarter > 20 else ""
+        await asyncio.sleep(0.005)
+        clock.advance_to(clock.monotonic_ns() + 250_000_000)
+    assert [one.reason for one in said] == ["2 s", "no samples of s: unit 1 refuses that"]
+    ring.close()
+    await running
+
+
 async def test_a_stream_that_is_sampled_once_a_minute_is_silent_after_minutes_only() -> None:
     clock, ring = DrivenClock(), SampleRing("s", ("a",), 50)
     said: list[Diagnosis] = []

@@ -12,6 +12,8 @@ from support.machine_files import MACHINES, problems_of
 from support.waiting import eventually
 
 from daqsvc.acquisition.clock import SystemClock
+from daqsvc.commands.status_text import status_text
+from daqsvc.control import ask_status
 from daqsvc.settings import describe, load_machine_file, parse_machine_file
 from drivers.make import bus_drivers, stream_layout
 from drivers.modbus.driver import ModbusDriver
@@ -62,6 +64,78 @@ async def test_probes_on_an_analogue_module_are_read_by_the_service(tmp_path):
     assert seen[~np.isnan(seen[:, 0])][-1] == pytest.approx([-8.0, -11.5], abs=0.00031)
     polled = seen[~np.isnan(seen[:, 0]), 0]  # a poll that a busy machine came too late for is a row of NaN
     assert (np.diff(polled) >= 0.0).all()
+
+
+async def test_alarm_and_status_say_why_a_stream_has_not_begun(tmp_path):
+    unit = ModbusUnit()
+    unit.map("holding", 100, 2)  # not where the machine file looks
+    server = ModbusTcpServer({1: unit})
+    await server.start()
+    where = f'host = "127.0.0.1"\ntcp_port = {server.port}'
+    machine = parse_machine_file(edited(GAPS, ('host = "192.0.2.20"', where)), GAPS)
+    async with running(machine, tmp_path) as service:
+        alarms = service.alarms.manager.alarms
+        await eventually(lambda: "sensor-ok/probe-x" in alarms, "nothing comes of the stream")
+        message = alarms["sensor-ok/probe-x"].message
+        [status] = await asyncio.to_thread(ask_status, tmp_path, None)
+    server.stop()
+    why = (
+        "no samples of gap: unit 1 refuses function 3: illegal data address (registers 0 to 1); "
+        "compare the register map of the device with the layout"
+    )
+    assert why in message
+    assert "of gap for" not in message
+    text = " ".join(status_text(status, 200).split())
+    assert "gap io - of 10 - no samples yet" in text
+    assert why in text
+
+
+async def test_a_fault_is_told_of_the_streams_that_have_it_and_until_it_is_over(tmp_path):
+    unit = ModbusUnit()
+    unit.map("holding", 0, 1)
+    server = ModbusTcpServer({1: unit})
+    await server.start()
+    other = 'channels = [{ name = "y", address = 40, type = "uint16" }]'
+    streams = f"""[streams.gap]
+bus = "io"
+rate_hz = 20.0
+layout = {{ way = "registers", unit = 1, channels = [{{ name = "x", address = 0, type = "uint16" }}] }}
+[streams.other]
+bus = "io"
+rate_hz = 20.0
+layout = {{ way = "registers", unit = 1, {other} }}
+"""
+    text = f"""schema_version = 1
+site = "s"
+box = "b"
+[machine]
+name = "m"
+speed_rpm = 600.0
+[buses.io]
+driver = "modbus"
+transport = "tcp"
+host = "127.0.0.1"
+tcp_port = {server.port}
+{streams}
+[[sensors]]
+name = "x"
+type = "trend"
+stream = "gap"
+channel = "x"
+unit = "V"
+"""
+    (driver,) = bus_drivers(parse_machine_file(text, tmp_path / "m.toml"), SystemClock(), lambda _block: None)
+    task = asyncio.create_task(driver.run())
+    await eventually(lambda: driver.link.why_silent("other"), "the unit refuses")
+    assert driver.link.state == "up"
+    assert "registers 40 to 40" in driver.link.why_silent("other")
+    assert not driver.link.why_silent("gap")
+    unit.map("holding", 40, 1)
+    await eventually(lambda: not driver.link.why_silent("other"), "the unit answers")
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+    server.stop()
+    assert driver.link.why_silent("gap") == "it was stopped"
 
 
 async def test_a_reply_of_the_vibration_sensor_means_what_its_maker_says(tmp_path):
