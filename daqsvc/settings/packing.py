@@ -164,6 +164,8 @@ class Channel(Section):
 class PackedFields(Layout):
     """Samples side by side in a frame, sample after sample: s0c0 s0c1 s0c2 s1c0 ..."""
 
+    number_keys: ClassVar[str] = "byte_order and type"
+
     byte_order: Literal["little", "big"] = Field(default="little", description="of counter and samples")
     counter: (
         Annotated[

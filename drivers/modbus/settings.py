@@ -227,6 +227,7 @@ class _ModbusLayout(Layout):
     """What all layouts in registers have."""
 
     mark: ClassVar[str] = "way"
+    number_keys: ClassVar[str] = "order and type"
 
     unit: Annotated[UnitAddress, Field(description="address of the unit", examples=[1])]
 

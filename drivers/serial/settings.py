@@ -172,6 +172,7 @@ class SerialLayout(Layout):
 
     kind: ClassVar[str] = "a layout of a binary serial frame"
     mark: ClassVar[str] = "payload_length"
+    number_keys: ClassVar[str] = "byte_order and type"
 
     payload_length: Annotated[
         int,

@@ -142,7 +142,14 @@ def _of_stream(machine: MachineFile, settings: Levels, stream: str) -> Iterator[
             shaft=shaft,
         )
     trends = [
-        TrendChannel(s.name, machine.column(s), s.unit, _limits(machine, s.name), s.ok_between)
+        TrendChannel(
+            s.name,
+            machine.column(s),
+            s.unit,
+            _limits(machine, s.name),
+            s.ok_between,
+            machine.streams[stream].layout.number_keys,
+        )
         for s in sensors
         if isinstance(s, TrendValue)
     ]

@@ -13,6 +13,7 @@ import numpy as np
 
 from daqsvc.detectors.levels.statements import Evidence, LevelStatements
 from daqsvc.diagnosis.record import silence_reason
+from daqsvc.dsp.quality.misread import Misread
 from daqsvc.dsp.quality.missing import BRIDGED, MOST_MISSING, not_judged, nothing_known, partly_missing
 from daqsvc.dsp.quality.unit import RESCALE, beyond_any_value
 
@@ -41,6 +42,8 @@ class TrendChannel:
         unit: its unit.
         limits: its setpoints.
         ok_between: OK limits, in its unit; beyond them the sensor is not believed. None: there are none.
+        number_keys: the keys of its layout that say how bytes become a number, e.g. ``"order and type"``;
+            empty where there are no such keys.
     """
 
     sensor: str
@@ -48,6 +51,14 @@ class TrendChannel:
     unit: str
     limits: Sequence[Limits] = ()
     ok_between: tuple[float, float] | None = None
+    number_keys: str = ""
+
+    @property
+    def remedy(self) -> str:
+        """What to do about values that no sensor measures."""
+        if not self.number_keys:
+            return RESCALE
+        return f"correct {self.number_keys} of its channel in the layout, or its scale or unit"
 
 
 class TrendDetector:
@@ -78,6 +89,7 @@ class TrendDetector:
         self._channels = tuple(channels)
         self._statements = LevelStatements(machine, stream, "trends/1")
         self._missed = dict.fromkeys((channel.sensor for channel in self._channels), 0)
+        self._misread = {channel.sensor: Misread() for channel in self._channels}
         self._next_index = 0
 
     def warm(self) -> None:
@@ -138,8 +150,9 @@ class TrendDetector:
             )
             return self._missing(channel, evidence, reason)
         self._missed[channel.sensor] = 0
-        if wrong := beyond_any_value(known):
-            reason = f"{channel.sensor} {wrong}; {RESCALE}"
+        misread = self._misread[channel.sensor].update(known)
+        if wrong := misread or beyond_any_value(known):
+            reason = f"{channel.sensor} {wrong}; {channel.remedy}"
             share = 1.0 - len(known) / len(samples)
             return self._statements.state(
                 channel.sensor, channel.limits, evidence, {}, {}, "not_ok", reason, share

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -69,6 +71,72 @@ def test_a_value_that_no_sensor_measures_is_not_judged(value, rate_hz):
     assert "in any unit; correct its scale or unit" in said.reason
     after = subject.process(window([0.0] * 10, first=20, period_s=1.0 / rate_hz))[-1]
     assert (after.quality, after.decision) == ("good", "danger")
+
+
+def swapped(values):
+    """What is read of floats in two registers with the words exchanged."""
+    return np.array(values, np.float32).view(np.uint16).reshape(-1, 2)[:, ::-1].copy().view(np.float32)[:, 0]
+
+
+def noisy(mean, n=200):
+    return mean * (1.0 + 0.02 * np.random.default_rng(5).standard_normal(n))
+
+
+@pytest.mark.parametrize("mean", [2.8, -9.4, 25.9, 1480.0])
+def test_floats_in_the_wrong_order_are_told_and_do_not_flap(mean):
+    subject = detector(limits=[], number_keys="order and type")
+    values = swapped(noisy(mean))
+    looks_possible = (np.abs(values) > 1e-12) & (np.abs(values) < 1e12)
+    assert 20 < looks_possible.sum() < 100
+    said = subject.process(window(values))
+    qualities = [one.quality for one in said]
+    changes = sum(now != before for before, now in pairwise(qualities))
+    assert changes <= 3
+    assert set(qualities[10:]) == {"not_ok"}
+    assert all(not one.statistics for one in said[10:])
+    assert "which no sensor measures; correct order and type of its channel in the layout" in said[-1].reason
+
+
+def test_a_value_that_stays_all_but_zero_is_told():
+    subject = detector(number_keys="order and type")
+    said = subject.process(window([-1e-19] * 8))
+    assert said[-1].quality == "not_ok"
+    assert "reads -1e-19, which no sensor measures; correct order and type" in said[-1].reason
+
+
+def test_what_is_told_of_a_wrong_order_is_over_once_all_values_can_be_measured():
+    subject = detector(limits=[])
+    assert subject.process(window(swapped(noisy(2.8, 40))))[-1].quality == "not_ok"
+    said = subject.process(window(noisy(2.8, 20), first=40))
+    assert {one.quality for one in said[:12]} == {"not_ok"}
+    assert said[-1].quality == "good"
+
+
+DYING = [float(0.37**k) for k in range(86)]  # before it is a denormal number
+ROUNDING = np.random.default_rng(3).standard_normal(40) * 1e-17
+SMALL = {
+    "zeros": [0.0] * 40,
+    "zeros and values": [0.0, 1.2] * 20,
+    "small values": [3e-7, -2e-9, 4e-7, 1e-11] * 10,
+    "what dies away": [2.5, *DYING],
+    "what dies away in long steps": [3.0, 1e-4, 1e-8, 1e-13, 1e-18, 1e-24, 1e-30, 0.0, 0.0],
+    "the rounding of a mean at rest": [*ROUNDING],
+    "a machine that starts and stops": [*ROUNDING[:20], *[2.8] * 20, *ROUNDING[:20], 0.0, *[2.8] * 20],
+    "large values": [9e11, 1e3, -9e11] * 10,
+}
+
+
+@pytest.mark.parametrize("what", SMALL)
+def test_zeros_and_small_values_are_believed(what):
+    said = detector(limits=[], number_keys="order and type").process(window(SMALL[what]))
+    assert {one.quality for one in said} == {"good"}
+
+
+def test_a_glitch_now_and_then_is_told_by_itself():
+    values = [2.8] * 60
+    values[20], values[27], values[40] = 3e20, -2e31, 5e15
+    said = detector(limits=[]).process(window(values))
+    assert [k for k, one in enumerate(said) if one.quality != "good"] == [20, 27, 40]
 
 
 def test_a_fast_trend_is_averaged_over_its_window():
