@@ -27,8 +27,8 @@ WELL_S = 60.0
 MOST_LINES = 20
 """Of what one page's process says that go into the log."""
 LONGEST_LINE = 500
-END_S = 1.0
-"""How long it is waited for when it is told to end."""
+END_S = 0.2
+"""How long it is waited for when the service does not say how long it may take; then it is killed."""
 
 
 class PageOutput(Output):
@@ -54,6 +54,9 @@ class PageOutput(Output):
         self._starts = 0
         self._is_up = False
         self._process: asyncio.subprocess.Process | None = None
+        self._stopping = asyncio.Event()
+        self._end_s = END_S
+        self._ended = asyncio.Event()
 
     @property
     def pid(self) -> int | None:
@@ -61,7 +64,23 @@ class PageOutput(Output):
         return None if self._process is None else self._process.pid
 
     async def run(self) -> None:
-        """Keep it going until cancelled."""
+        """Keep it going until `stop`, or until cancelled."""
+        try:
+            await self._keep_going()
+        finally:
+            self._ended.set()
+
+    async def stop(self, deadline_s: float) -> None:
+        """See `Output.stop`: it may take so long to take leave of browsers, then it is killed."""
+        self._end_s = deadline_s
+        self._stopping.set()
+        await self._ended.wait()
+
+    def figures(self) -> dict[str, Any]:
+        """See `Output.figures`."""
+        return {"up": int(self._is_up), "starts": self._starts}
+
+    async def _keep_going(self) -> None:
         backoff, said = Backoff(), ""
         loop = asyncio.get_running_loop()
         while True:
@@ -70,20 +89,18 @@ class PageOutput(Output):
                 why = await self._run_once()
             except OSError as error:
                 why = f"it cannot be started: {error.strerror or error}"
+            if self._stopping.is_set():
+                return
             self.reason = why
             if why != said:
                 log.warning("the page at %s has ended, and is started again: %s", self._listen, why)
                 said = why
             if loop.time() - begun_s > WELL_S:
                 backoff.reset()
-            await asyncio.sleep(backoff.next_ns() / NS_PER_S)
-
-    async def stop(self, deadline_s: float) -> None:
-        """See `Output.stop`: nothing is left to hand over."""
-
-    def figures(self) -> dict[str, Any]:
-        """See `Output.figures`."""
-        return {"up": int(self._is_up), "starts": self._starts}
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(backoff.next_ns() / NS_PER_S):
+                    await self._stopping.wait()
+                return
 
     async def _run_once(self) -> str:
         """Start it, and wait for its end; why it has ended."""
@@ -105,11 +122,17 @@ class PageOutput(Output):
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(self._hear(process.stdout))
                 tasks.create_task(_log_what_it_says(process.stderr, last))
+                ending = tasks.create_task(self._end_if_stopped(process))
                 await process.wait()
+                ending.cancel()
         finally:
             self._is_up, self._process = False, None
-            await _end(process)
+            await _end(process, END_S)
         return last[0] if last else f"exit code {process.returncode}"
+
+    async def _end_if_stopped(self, process: asyncio.subprocess.Process) -> None:
+        await self._stopping.wait()
+        await _end(process, self._end_s)
 
     async def _hear(self, stdout: asyncio.StreamReader) -> None:
         """Its first line says that it listens."""
@@ -144,8 +167,8 @@ async def _lines(stream: asyncio.StreamReader) -> AsyncIterator[str]:
             yield text[:LONGEST_LINE]
 
 
-async def _end(process: asyncio.subprocess.Process) -> None:
-    """Have it end, by force if it does not."""
+async def _end(process: asyncio.subprocess.Process, within_s: float) -> None:
+    """Have it end, by force if it does not within so long: it holds nothing that could be lost."""
     if process.stdin is not None:
         process.stdin.close()
     if process.returncode is not None:
@@ -153,7 +176,7 @@ async def _end(process: asyncio.subprocess.Process) -> None:
     with contextlib.suppress(ProcessLookupError):
         process.terminate()
     try:
-        async with asyncio.timeout(END_S):
+        async with asyncio.timeout(within_s):
             await process.wait()
     except (TimeoutError, asyncio.CancelledError) as error:
         with contextlib.suppress(ProcessLookupError):

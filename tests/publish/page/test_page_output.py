@@ -47,7 +47,9 @@ async def kept(output: PageOutput) -> Any:
         await asyncio.wait({keeping})
 
 
-async def test_the_service_starts_its_page_which_shows_its_machine(tmp_path: Path) -> None:
+async def test_the_service_starts_its_page_which_shows_its_machine(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     port = free_port()
     virtual = ('interface = "socketcan"', 'interface = "virtual"')
     table = f'[page]\nlisten = "127.0.0.1:{port}"\n\n[mqtt]'
@@ -61,6 +63,51 @@ async def test_the_service_starts_its_page_which_shows_its_machine(tmp_path: Pat
                 await asyncio.sleep(0.2)
     with pytest.raises(OSError, match="refused"):
         await asyncio.to_thread(get, port)
+    assert "left behind" not in caplog.text
+
+
+async def test_a_page_has_the_time_of_the_stop_to_end(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    port = free_port()
+    output = PageOutput([f"--listen=127.0.0.1:{port}"], f"127.0.0.1:{port}", tmp_path)
+    running = asyncio.create_task(output.run())
+    await eventually(lambda: output.figures()["up"] == 1, "it listens")
+    await asyncio.to_thread(get, port)
+    process = output._process
+    assert process is not None
+    await output.stop(PATIENCE_S)
+    await running
+    assert process.returncode == 0, "it has ended by itself"
+    assert output.figures() == {"up": 0, "starts": 1}
+    assert "started again" not in caplog.text
+
+
+async def test_a_page_that_does_not_end_is_killed_at_the_deadline(tmp_path: Path) -> None:
+    deaf = (
+        "import signal\n"
+        "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
+        "print('here', flush=True)\n"
+        "while True: signal.pause()\n"
+    )
+    output = PageOutput([], "nowhere", tmp_path)
+    output._command = (sys.executable, "-c", deaf)
+    running = asyncio.create_task(output.run())
+    await eventually(lambda: output.figures()["up"] == 1, "it is there")
+    process = output._process
+    assert process is not None
+    await output.stop(0.05)
+    await running
+    assert process.returncode == -signal.SIGKILL
+
+
+async def test_a_page_that_waits_to_start_again_ends_at_once(tmp_path: Path) -> None:
+    output = PageOutput([], "nowhere", tmp_path)
+    output._command = (str(tmp_path / "absent"),)
+    running = asyncio.create_task(output.run())
+    await eventually(lambda: output.reason, "it says why")
+    await output.stop(PATIENCE_S)
+    await running
 
 
 async def test_a_page_that_is_killed_comes_back(tmp_path: Path) -> None:
