@@ -261,7 +261,7 @@ def _sensor_states(
     for sensor, (state, _) in states.items():
         alarm = alarms.get(f"sensor-ok/{sensor}")
         if state == "ok" and alarm is not None and alarm.own_state.is_active:
-            states[sensor] = ("not_ok", alarm.message)
+            states[sensor] = ("not_ok", alarm.told)
     return states
 
 
@@ -308,7 +308,7 @@ def _standing(alarms: Mapping[str, AlarmStatus], now_ns: int, wall_of_ns: int) -
                 if status.shelved_until_ns is None
                 else status.shelved_until_ns + wall_of_ns,
                 "first_out": status.first_out,
-                "message": status.message,
+                "message": status.told,
             }
             for name, status in standing
         ],

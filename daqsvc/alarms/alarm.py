@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import re
 from collections import deque
 from typing import TYPE_CHECKING
 
@@ -103,9 +104,19 @@ LIMITS_NOW = "; since then its limits are "
 """What follows in a message on what was found by earlier limits."""
 
 FINDINGS = frozenset(
-    {EventKind.RAISED, EventKind.ESCALATED, EventKind.LOWERED, EventKind.CHANGED, EventKind.RECURRED}
+    {
+        EventKind.RAISED,
+        EventKind.ESCALATED,
+        EventKind.LOWERED,
+        EventKind.CHANGED,
+        EventKind.RECURRED,
+        EventKind.LATCHED,
+        EventKind.RETURNED,
+    }
 )
 """Events whose message says what is found."""
+
+_FIGURE = re.compile(r"[-+]?\d[\d.,]*(e[-+]?\d+)?")
 
 
 class Alarm:
@@ -163,6 +174,7 @@ class Alarm:
             strongest_first(self._holds),
             self._shelved_until_ns,
             self._chatter.chattering,
+            found=self._last_message,
         )
 
     def twin(self) -> Alarm:
@@ -278,11 +290,17 @@ class Alarm:
         return (
             self._state.is_active
             and finding.level == self._level
-            and finding.identity != self._finding
+            and self._is_news(finding)
             and [doubt[:3] for doubt in self.doubts] == [doubt[:3] for doubt in self._seen_doubts]
             and self._changed_ns is not None
             and 0 <= at.t_ns - self._changed_ns < CHANGES_NS
         )
+
+    def _is_news(self, finding: RuleFinding) -> bool:
+        """Whether something else is found at the same level."""
+        if finding.identity != self._finding:
+            return True
+        return finding.told_by_words and _wording(finding.sentence) not in _wording(self._last_message)
 
     def _held_back(self, finding: RuleFinding, cause: Diagnosis, at: ClockReading) -> list[AlarmEvent]:
         """A return while the alarm chatters; after a restart somebody must know who still doubts a sensor."""
@@ -314,10 +332,11 @@ class Alarm:
         state = transition(self._state, Stimulus.CLEAR, latching=self._latching)
         if state.is_latched:
             message = f"{self.name} latched at {self._level.label}: {finding.sentence}"
+            self._last_message = message
             return self._change(
                 EventKind.LATCHED, state, self._level, cause, HandlingRequest("", at), message
             )
-        message = f"{self.name} returned to normal: {finding.sentence}"
+        message = self._last_message = f"{self.name} returned to normal: {finding.sentence}"
         return self._change(EventKind.RETURNED, state, Level.NORMAL, cause, HandlingRequest("", at), message)
 
     def _found_bad(self, finding: RuleFinding, cause: Diagnosis, at: ClockReading) -> AlarmEvent | None:
@@ -354,7 +373,7 @@ class Alarm:
             return EventKind.ESCALATED, level
         if level < self._level:
             return EventKind.LOWERED, level
-        return (EventKind.CHANGED if finding.identity != self._finding else None), level
+        return (EventKind.CHANGED if self._is_news(finding) else None), level
 
     def suppress(self, reason: str, cause: Diagnosis, at: ClockReading) -> AlarmEvent:
         """Cover the state because a sensor is not OK."""
@@ -528,6 +547,11 @@ class Alarm:
             finding=self._finding,
             doubts=self.doubts,
         )
+
+
+def _wording(message: str) -> str:
+    """A message without its figures, which are others each time."""
+    return _FIGURE.sub("#", message)
 
 
 def _signed(request: HandlingRequest, lasting: str = "") -> str:

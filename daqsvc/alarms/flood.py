@@ -9,14 +9,14 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.alarms.states import AlarmState
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from daqsvc.alarms.events import AlarmEvent
     from daqsvc.settings.alarms import AlarmHandling
 
 
-MOST_FIRST_OUT = 5
-"""First-out alarms that the message names at most: a sentence with a hundred names is not read."""
+MOST_NAMED = 5
+"""Alarms or streams that the message names at most: a sentence with a hundred names is not read."""
 
 
 class FloodWatch:
@@ -45,12 +45,12 @@ class FloodWatch:
         if self._most:
             self._called_ns.append(now_ns)
 
-    def sentence(self, now_ns: int, first_out: Iterable[str] = ()) -> str | None:
+    def sentence(self, now_ns: int, advice: Callable[[], str] = str) -> str | None:
         """What has changed by ``now_ns``, in words for a person; None if nothing has.
 
         Args:
             now_ns: monotonic time.
-            first_out: the alarms that hold the first-out mark of their group, if any does.
+            advice: where to look first, as `where_to_look` says it; asked for when a flood begins.
         """
         if not self._most:
             return None
@@ -60,13 +60,9 @@ class FloodWatch:
         if not self.flooding and count > self._most:
             self.flooding = True
             self.floods += 1
-            first = list(first_out)
-            more = f" and {len(first) - MOST_FIRST_OUT} more" if len(first) > MOST_FIRST_OUT else ""
-            named = " and ".join(first[:MOST_FIRST_OUT])
-            begin = f"look at {named}{more} first (first out), " if first else ""
             return (
                 f"{count} alarms within {minutes:g} min are more than a person can attend to (limit "
-                f"{self._most}); {begin}shelve what is known"
+                f"{self._most}); {advice()}shelve what is known"
             )
         while len(self._called_ns) > self._most + 1:
             # So many say that it is a flood; a longer list of them would only take memory.
@@ -75,6 +71,28 @@ class FloodWatch:
             self.flooding = False
             return f"only {count} alarms in the last {minutes:g} min"
         return None
+
+
+def where_to_look(first_out: Iterable[str], unjudged_streams: Mapping[str, int]) -> str:
+    """Where to look first in a flood, as the beginning of a sentence; empty if nobody knows.
+
+    Args:
+        first_out: the alarms that hold the first-out mark of their group and stand.
+        unjudged_streams: streams of which nothing comes that could be judged, with how many sensors rest on
+            each: one device that is lost is an alarm for each of them.
+    """
+    lost = {stream: sensors for stream, sensors in unjudged_streams.items() if sensors > 1}
+    first = list(first_out)
+    if lost:
+        streams = _some([f"stream {stream!r}" for stream in lost])
+        then = f"then at {_some(first)} (first out), " if first else ""
+        return f"{sum(lost.values())} sensors rest on {streams}: look at bus and device first, {then}"
+    return f"look at {_some(first)} first (first out), " if first else ""
+
+
+def _some(names: Sequence[str]) -> str:
+    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    return " and ".join(names[:MOST_NAMED]) + more
 
 
 _SET_ASIDE = frozenset({AlarmState.SHELVED, AlarmState.OUT_OF_SERVICE})

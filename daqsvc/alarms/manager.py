@@ -22,7 +22,7 @@ from daqsvc.alarms.conditions import (
 )
 from daqsvc.alarms.events import ANNUNCIATIONS, AlarmEvent, Doubt, EventKind, Identity
 from daqsvc.alarms.expected import Expected
-from daqsvc.alarms.flood import FirstOut, FloodWatch
+from daqsvc.alarms.flood import FirstOut, FloodWatch, where_to_look
 from daqsvc.alarms.handling import CALM, AlarmCounters, ShelvingEnds, shelving_ns
 from daqsvc.alarms.quality import PREFIXES, SensorHealth, in_words
 from daqsvc.alarms.ruled import Ruled, RuledAlarms
@@ -300,12 +300,19 @@ class AlarmManager:
         """Mark and count events as they come about, and say if they are a flood."""
         marked = [self._marked(event) for event in events]
         now = self._now()
-        sentence = self._flood.sentence(now.t_ns, self._first_out.marked())
+        sentence = self._flood.sentence(now.t_ns, self._advice)
         if sentence is not None:
             level = Level.ALERT if self._flood.flooding else Level.NORMAL
             marked += [self._marked(event) for event in self._stand(ALARM_FLOOD, level, sentence, now)]
             self.counters.floods = self._flood.floods
         return marked
+
+    def _advice(self) -> str:
+        """Where a person is to look first in a flood."""
+        # One that has returned keeps its mark until it is acknowledged, and would mislead.
+        marked = self._first_out.marked()
+        first = [name for name in marked if self._alarms[name].status.own_state.is_active]
+        return where_to_look(first, self._doubts.unjudged_streams)
 
     def _marked(self, event: AlarmEvent) -> AlarmEvent:
         self.counters.events += 1

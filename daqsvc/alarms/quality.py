@@ -132,6 +132,8 @@ class SensorHealth:
         self._by_detector: dict[str, tuple[str, Doubt]] = {}
         # Why there are no samples by which to judge, by detector, until it says good.
         self._causes: dict[str, str] = {}
+        # By detector, the stream that it cannot judge by.
+        self._unjudged: dict[str, str] = {}
         self._by_alarm: defaultdict[str, dict[str, Doubt]] = defaultdict(dict)
         # By sensor who blames it by name and why, the latest last; a sensor that nobody blames has no row.
         self._blamed: dict[str, dict[str, str]] = {}
@@ -146,9 +148,19 @@ class SensorHealth:
         """The sensors that somebody blames by name, as it is at any time."""
         return self._blamed.keys()
 
+    @property
+    def unjudged_streams(self) -> dict[str, int]:
+        """Streams without samples to judge by, with how many sensors rest on each."""
+        sensors: defaultdict[str, set[str]] = defaultdict(set)
+        for detector, stream in self._unjudged.items():
+            if (doubted := self._by_detector.get(detector)) is not None:
+                sensors[stream].update(doubted[1].sensors)
+        return {stream: len(those) for stream, those in sorted(sensors.items())}
+
     def update(self, diagnosis: Diagnosis) -> Touched:
         """Take in a statement; returns what it is about."""
         detector = diagnosis.detector
+        self._unjudged.pop(detector, None)
         name = quality_alarm(detector, diagnosis.sensors)
         before = self._forget(detector)
         self._unheard.discard(detector)
@@ -166,6 +178,7 @@ class SensorHealth:
             touched |= _blames(doubt)
             if diagnosis.quality == "missing" and diagnosis.end_index == diagnosis.first_index:
                 self._causes[detector] = f" ({cause_of(diagnosis.reason)})"
+                self._unjudged[detector] = diagnosis.stream
         else:
             self._causes.pop(detector, None)
         # A detector may rest on other sensors than before: then what it had against those is settled, too.
@@ -225,6 +238,7 @@ class SensorHealth:
             self._forget(detector)
             self._lacked_at_restart.pop(detector, None)
             self._causes.pop(detector, None)
+            self._unjudged.pop(detector, None)
             self._unheard.discard(detector)
 
     def not_ok(self) -> list[tuple[str, Doubt]]:
@@ -285,7 +299,9 @@ class SensorHealth:
         parts = "|".join(
             f"{d.detector}={d.quality}{self._cause(d)}{'+not_ok' if d.not_ok else ''}" for d in doubts
         )
-        return RuleFinding(Level.ALERT, parts, lambda: in_words(name, doubts))
+        # What samples lack, and for how long, is other words each time; what a sensor has is not.
+        by_words = _worst(doubts).quality == "not_ok"
+        return RuleFinding(Level.ALERT, parts, lambda: in_words(name, doubts), told_by_words=by_words)
 
     def silences(self, rule: Rule, sensors: frozenset[str]) -> str | None:
         """Why the alarm of ``rule`` is suppressed while it rests on ``sensors``; None if it is not.

@@ -7,6 +7,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
+from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.alarms.setpoints import SetpointMonitor
 from daqsvc.alarms.states import Level
 
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Set as AbstractSet
 
     from daqsvc.alarms.events import AlarmEvent
-    from daqsvc.alarms.setpoints import Setpoint
+    from daqsvc.alarms.setpoints import Limit, Setpoint
     from daqsvc.diagnosis.record import Diagnosis
 
 log = logging.getLogger(__name__)
@@ -61,11 +62,13 @@ class RuleFinding(NamedTuple):
         level: the level by now.
         identity: what is found, where a level can have several causes, e.g. ``"F1L2"``.
         say: puts the finding into words. Few findings become an event; what is not asked for is not made.
+        told_by_words: whether other words, apart from figures, are another finding, too.
     """
 
     level: Level
     identity: str
     say: Callable[[], str]
+    told_by_words: bool = False
 
     @property
     def sentence(self) -> str:
@@ -371,13 +374,25 @@ class MeasureWatch:
         if limit is not None:
             side = "lower " if limit.lower else ""
             multiplied = f" times {self._factor:g} at start-up" if self._factor > 1.0 and not side else ""
-            return f"{measured}, {side}{limit.level.label} limit {limit.at:.4g}{unit}{multiplied}"
+            said = f"{measured}, {side}{limit.level.label} limit {limit.at:.4g}{unit}{multiplied}"
+            return f"{said}{self._until_it_ends(limit, value, unit)}"
         low, high = self.setpoint.highest_low, self.setpoint.lowest
         if low is None:
             return f"{measured}, below its limit of {high:.4g}{unit}"
         if high is None:
             return f"{measured}, above its limit of {low:.4g}{unit}"
         return f"{measured}, between its limits of {low:.4g} and {high:.4g}{unit}"
+
+    def _until_it_ends(self, limit: Limit, value: float, unit: str) -> str:
+        """Why a level stands whose limit the value keeps by now; empty while it does not keep it."""
+        inside = limit.at - value if not limit.lower else value - limit.at
+        if inside <= 0.0 or self._factor > 1.0:
+            return ""
+        end = limit.at + (self.setpoint.deadband if limit.lower else -self.setpoint.deadband)
+        side = "above" if limit.lower else "below"
+        delay_s = self.setpoint.off_delay_ns / NS_PER_S
+        lasting = f" for {delay_s:g} s" if delay_s else ""
+        return f", which ends {side} {end:.4g}{unit}{lasting}"
 
 
 class _LevelWatch:

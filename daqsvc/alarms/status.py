@@ -36,6 +36,8 @@ class AlarmStatus(NamedTuple):
         shelved_until_ns: end of shelving by the monotonic clock; None if not shelved.
         chattering: whether its returns are held back.
         first_out: whether it was the first of its group.
+        found: the sentence that said what was found last; empty if that was before a restart, and something
+            else has been said since.
     """
 
     state: AlarmState
@@ -48,3 +50,11 @@ class AlarmStatus(NamedTuple):
     shelved_until_ns: int | None = None
     chattering: bool = False
     first_out: bool = False
+    found: str = ""
+
+    @property
+    def told(self) -> str:
+        """What was found last, and what has been done about it since."""
+        if not self.found or self.found == self.message:
+            return self.message
+        return f"{self.found}; {self.message}"

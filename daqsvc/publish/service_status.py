@@ -82,7 +82,7 @@ class StandingAlarmPayload(JsonPayload):
     age_s: Number = Field(description="since it changed last")
     shelved_until_wall_ns: int | None = Field(None, description="when shelving ends; null if not shelved")
     first_out: bool = Field(False, description="it was the first of its group to stand")
-    message: str = Field(description="its latest event in a sentence")
+    message: str = Field(description="what was found last, and what has been done about it since")
 
 
 class AlarmsPayload(JsonPayload):

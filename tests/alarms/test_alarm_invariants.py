@@ -277,7 +277,8 @@ class Alarms(RuleBasedStateMachine):
             if status.own_state is AlarmState.NORMAL and not status.holds and name not in GROUPS:
                 continue
             after = self.manager.alarms[name]
-            same = {"since": None, "shelved_until_ns": None}
+            # What was found is in the journal, and here only while nothing else has been said since.
+            same = {"since": None, "shelved_until_ns": None, "found": ""}
             assert after._replace(**same) == status._replace(**same)
             if status.shelved_until_ns is not None:
                 left_ns, left_after_ns = status.shelved_until_ns - then_ns, after.shelved_until_ns - now_ns

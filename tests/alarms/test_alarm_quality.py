@@ -295,3 +295,60 @@ def test_a_reason_that_waits_is_dropped_when_the_sensor_is_good_again():
         silent(rig, reason)
     assert kinds(rig.rms(0.0)) == [("sensor-ok/probe-x", "returned")]
     assert rig.tick(10.0) == []
+
+
+def test_other_words_for_the_same_sensor_are_told_once_other_figures_are_not():
+    rig = AlarmRig(LEVEL)
+
+    def stuck(reason):
+        return kinds(rig.rms(0.0, "not_ok", reason=reason))
+
+    assert ("sensor-ok/probe-x", "raised") in stuck("stood still at 0.431 g for 38 of 200 samples")
+    assert stuck("stood still at 0.432 g for 1e+02 of 200 samples") == []
+    assert stuck("does not move at all (0.431 g)") == [("sensor-ok/probe-x", "changed")]
+    assert rig.status("sensor-ok/probe-x").message.endswith("does not move at all (0.431 g)")
+    for _ in range(20):
+        assert stuck("does not move at all (0.432 g)") == []
+    for reason in ["is clipped", "does not move at all (1 g)"] * 10:
+        stuck(reason)
+    assert len(rig.events) <= 3 + 20 / 5 + 1
+    stuck("is outside its limits")
+    rig.tick(5.0)
+    assert rig.events[-1].message.endswith("is outside its limits")
+    after = rig.restarted(SPEAKERS)
+    assert kinds(after.rms(0.0, "not_ok", reason="is outside its limits")) == []
+
+
+def test_a_flood_of_a_lost_device_names_its_stream_and_no_alarm_that_has_returned():
+    level = LevelRule("vibration-x", "probe-x", "rms", Setpoint(alert=40.0))
+    rig = AlarmRig(level, handling=alarm_handling(flood=(5, 600)))
+    rig.rms(50.0)
+    rig.rms(0.0)
+    assert rig.status("vibration-x").first_out
+    for i in range(5):
+        rig.take(
+            detector=f"levels/p{i}",
+            stream="device",
+            decision="normal",
+            quality="missing",
+            reason="no samples of stream 'device' for 2.0 s",
+            sensors=(f"p{i}",),
+            end_index=0,
+        )
+    flood = rig.status("alarm-flood")
+    assert flood.message.endswith(
+        "5 sensors rest on stream 'device': look at bus and device first, shelve what is known"
+    )
+
+
+def test_a_flood_of_a_lost_device_names_the_alarm_that_came_first_too():
+    level = LevelRule("vibration-x", "probe-x", "rms", Setpoint(alert=40.0))
+    rig = AlarmRig(level, handling=alarm_handling(flood=(5, 600)))
+    rig.rms(50.0)
+    for i in range(5):
+        sensors = (f"p{i}",)
+        rig.take(detector=f"levels/p{i}", decision="normal", quality="missing", sensors=sensors, end_index=0)
+    assert (
+        "at bus and device first, then at vibration-x (first out), shelve"
+        in rig.status("alarm-flood").message
+    )
