@@ -24,7 +24,7 @@ class Fault(NamedTuple):
 
     Attributes:
         name: the same.
-        next_step: what to look at.
+        next_step: what to look at; ``{views}`` stands for what the page can show of its sensors.
     """
 
     name: str
@@ -70,18 +70,16 @@ FAULTS = {
     ),
     "unmodelled": Fault(
         "a change that no fault of the model explains",
-        "Look at spectrum and orbit, and at what was changed on the machine lately.",
+        "Look at {views}, and at what was changed on the machine lately.",
     ),
     "changed": Fault(
         "a change that names no part", "Look at the spectra beside those of the healthy machine."
     ),
     "small_change": Fault("a small change", "Nothing yet: look whether it grows."),
-    "alert": Fault(
-        "a value beyond its alert limit", "Look at its trend, and at the spectrum for what it is."
-    ),
+    "alert": Fault("a value beyond its alert limit", "Look at {views} for what it is."),
     "danger": Fault(
         "a value beyond its danger limit",
-        "Decide now whether the machine may go on; look at the orbit or the spectrum for what it is.",
+        "Decide now whether the machine may go on; look at {views} for what it is.",
     ),
 }
 """By what detectors say, in their words."""
@@ -162,14 +160,28 @@ def _named(live: MachineLive, detector: str, decision: str) -> str:
     return known.name if fault == decision else f"{known.name} ({decision})"
 
 
+def _next_step(live: MachineLive, statement: Document) -> str:
+    """What to look at, of what there is: a value that a device has measured itself has no spectrum."""
+    known = FAULTS.get(live.fault_of(str(statement["detector"]), str(statement["decision"])))
+    if known is None:
+        return "Look at its figures below."
+    about = {*statement.get("sensors", ())} or {*live.vibration_sensors()}
+    views = ["its trend"]
+    if about & {*live.waveform_sensors()}:
+        views.append("its spectrum")
+    if any(about & {*pair} for pair in live.probes()):
+        views.append("the orbit")
+    *others, last = views
+    return known.next_step.format(views=f"{', '.join(others)} and {last}" if others else last)
+
+
 def _row_of(live: MachineLive, statement: Document) -> str:
     detector = str(statement["detector"])
     decided = live.decided[detector]
     since = time_mark(live.wall_ns_at_0 + decided.since_ns)
-    known = FAULTS.get(live.fault_of(detector, str(statement["decision"])))
     return row(
         escape(sentence(live, statement)),
         level_mark(str(statement["severity"])),
         since if decided.is_seen else f"before {since}",
-        escape(known.next_step if known else "Look at its figures below."),
+        escape(_next_step(live, statement)),
     )

@@ -71,6 +71,23 @@ def test_a_value_beyond_its_limit_is_named_with_both() -> None:
     )
 
 
+def test_the_next_step_names_only_what_there_is_to_look_at() -> None:
+    levels = said("danger", detector="levels/probe-x", severity="danger", sensors=["left"])
+    whole = "Decide now whether the machine may go on; look at its trend, its spectrum and the orbit for what"
+    assert whole in finding_rows(looking(levels))
+    temperature = said("alert", detector="levels/oil", sensors=["oil"])
+    assert "<td>Look at its trend for what it is.</td>" in finding_rows(looking(temperature))
+    alone = about() | {"faults": NAMES}
+    alone["values"]["sensors"] = [{"name": "left", "type": "accelerometer", "unit": "g"}]
+    live = MachineLive(alone)
+    live.hear({"statement": levels})
+    live.hear({"statement": said("unmodelled", detector="bearing/left", sensors=["left"])})
+    rows = finding_rows(live)
+    assert "look at its trend and its spectrum for what it is." in rows
+    assert "Look at its trend and its spectrum, and at what was changed on the machine lately." in rows
+    assert "orbit" not in rows
+
+
 def test_a_phase_is_beyond_its_limit_by_how_far_it_is_off_its_reference() -> None:
     levels = said(
         "alert",
