@@ -63,8 +63,8 @@ def _alarms_and_outputs(status: Document, width: int) -> Iterator[str]:
 
 def _standing(alarms: Sequence[Document], width: int) -> str:
     """A line for each alarm, and what it says below."""
-    rows = [[one["level"], _alarm_state(one), one["alarm"], _age(one["age_s"])] for one in alarms]
-    title, *lines = aligned(["LEVEL", "STATE", "ALARM", "SINCE"], rows).splitlines()
+    rows = [[one["level"], _alarm_state(one), one["alarm"], _ago(one["age_s"])] for one in alarms]
+    title, *lines = aligned(["LEVEL", "STATE", "ALARM", "CHANGED"], rows).splitlines()
     told = [title]
     for line, one in zip(lines, alarms, strict=True):
         message = one["message"].removeprefix(f"{one['alarm']} {one['level']}: ")
@@ -194,6 +194,10 @@ def _age(age_s: float | None) -> str:
     if age_s is None:
         return "-"
     return f"{age_s:.1f} s" if age_s < 10 else ago(round(age_s * NS_PER_S))
+
+
+def _ago(age_s: float | None) -> str:
+    return "-" if age_s is None else f"{_age(age_s)} ago"
 
 
 def _filled(text: str, width: int) -> str:

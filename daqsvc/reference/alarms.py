@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from daqsvc.alarms.conditions import ALARM_FLOOD, RESERVED, TRIP_MULTIPLY
 from daqsvc.alarms.events import EventKind
 from daqsvc.alarms.quality import PREFIXES
 from daqsvc.alarms.states import AlarmState
@@ -17,6 +18,9 @@ if TYPE_CHECKING:
 OWN: Mapping[str, str] = {
     "sensor-ok/": "samples of the sensor are missing, or it is not OK",
     "detector-ok/": "samples of the detector are missing, or a sensor that it rests on is not OK",
+    ALARM_FLOOD: "more alarms came within `flood_window_s` than `flood_alarms` of `[alarm_handling]`, and "
+    "not yet fewer than half as many; its message names the alarms that stood first",
+    TRIP_MULTIPLY: "a start-up has multiplied the limits of alarms for longer than it may last",
     "store/disk": "less is free on the disk than `reserve_mb` of `[store]`",
     "store/journal": "alarm events are not written to the disk",
     "store/damage": "a damaged file of the store was set aside in the last minute",
@@ -61,9 +65,26 @@ EVENTS: Mapping[str, str] = {
 }
 
 
+MARKS: Mapping[str, str] = {
+    "first_out": "the alarm stood first of those of its `first_out_group`, which is where to look for the "
+    "cause; `daqsvc alarms` writes `first out` behind its state. It stays until all of the group are normal",
+    "chattering": "the alarm came and went so often that its returns are held back until it is quiet",
+}
+"""What is reported about an alarm beside its state."""
+
+
 def gaps() -> Iterator[str]:
     """Alarms of the service, states and kinds of events that nothing describes."""
-    alarms = (*PREFIXES, *STORE, REFUSED, CERTIFICATE, BUS_OVERRUN, BUS_CONTROLLER, BUS_RECORDING)
+    alarms = (
+        *PREFIXES,
+        *sorted(RESERVED),
+        *STORE,
+        REFUSED,
+        CERTIFICATE,
+        BUS_OVERRUN,
+        BUS_CONTROLLER,
+        BUS_RECORDING,
+    )
     for what, names, known in (
         ("alarm", alarms, OWN),
         ("state", [*AlarmState], STATES),
@@ -86,6 +107,8 @@ def pages() -> dict[str, str]:
             table(("alarm", "stands while"), own),
             "## States",
             table(("state", "what it says"), ((code(name), text) for name, text in STATES.items())),
+            "## Marks",
+            table(("mark", "what it says"), ((code(name), text) for name, text in MARKS.items())),
             "## Kinds of events",
             table(("kind", "why the event was sent"), ((code(name), text) for name, text in EVENTS.items())),
         )
@@ -93,5 +116,6 @@ def pages() -> dict[str, str]:
 
 
 _ABOUT = """Names of alarms, states and events as they stand in messages, in the log and in `daqsvc
-alarms`. When exactly an alarm comes and goes: [alarms.md](../alarms.md); what to do about those of the
-service: [commands.md](../commands.md)."""
+alarms`. In the log each event is a line `alarm NAME KIND: MESSAGE`, e.g. `alarm rotor-fault escalated: ...`.
+KIND is one of the kinds below; the message says how the alarm stands after it. When exactly an alarm comes
+and goes: [alarms.md](../alarms.md); what to do about those of the service: [commands.md](../commands.md)."""

@@ -138,6 +138,8 @@ async def test_until_when_an_alarm_is_shelved_is_told(
         assert 3600 * NS_PER_S <= until_ns - before_ns <= (3600 + PATIENCE_S) * NS_PER_S
         shown = datetime.fromtimestamp(until_ns // NS_PER_S, UTC).astimezone()
         assert f"shelved until {shown:%Y-%m-%d %H:%M:%S}  rotor-fault" in status_text(status, 80)
+        titles = r"LEVEL +STATE +ALARM +CHANGED\n.* rotor-fault +\d+\.\d s ago\n"
+        assert re.search(titles, status_text(status, 80))
         del alarm["shelved_until_wall_ns"]
         assert "shelved  rotor-fault" in status_text(status, 80), "of a service of an earlier version"
 
