@@ -484,8 +484,9 @@ class BearingDetector:
             decision=standing.decision,
             changed=changed,
             severity=self._severity(evaluated.change),
+            # Without a verdict the decision is the one from before, which these would contradict.
             probabilities={str(k): p for k, p in evaluated.finding.probabilities.items()}
-            if evaluated.finding
+            if good and evaluated.finding
             else {},
             group=standing.group,
             statistics=figures,
