@@ -49,8 +49,10 @@ def _tables(status: Document, width: int) -> Iterator[str]:
     if others:
         rows = [[one["detector"], _quality(one), _age(one["age_s"]), _finding(one)] for one in others]
         yield aligned(["DETECTOR", "QUALITY", "AGE", "FINDING"], rows, width)
-    if status["faults"]:
-        yield aligned(["LOST OR FAULTY", "SINCE THE START, BY CAUSE"], list(_faults(status["faults"])), width)
+    if faults := list(_faults(status["faults"])):
+        yield aligned(["LOST OR FAULTY", "SINCE THE START, BY CAUSE"], faults, width)
+    if others := [[name, ids] for name, ids in _other_frames(status["figures"]["buses"])]:
+        yield aligned(["BUS", "FRAMES THAT NO STREAM HAS, BY ID"], others, width)
     if failures := status["figures"]["failures"]:
         yield aligned(["PART", "FAILURES"], [[name, f"{count}"] for name, count in failures.items()], width)
 
@@ -130,7 +132,17 @@ def _faults(faults: Document) -> Iterator[list[str]]:
     for kind, things in faults.items():
         for name, causes in things.items():
             what = name if name == kind else f"{_ONE[kind]} {name}"
-            yield [what, ", ".join(f"{cause} {count:,}" for cause, count in causes.items())]
+            counted = [f"{cause} {count:,}" for cause, count in causes.items() if cause != "frames_unknown"]
+            if counted:
+                yield [what, ", ".join(counted)]
+
+
+def _other_frames(buses: Document) -> Iterator[tuple[str, str]]:
+    """Frames that are no faults, though they help to find one: those that no stream of the file has."""
+    for name, figures in buses.items():
+        ids = figures.get("unknown_ids") or {}
+        if count := figures.get("frames_unknown"):
+            yield name, ", ".join(f"{one} {n:,}" for one, n in ids.items()) or f"{count:,}"
 
 
 _ONE = {"streams": "stream", "buses": "bus", "detectors": "detector"}

@@ -457,7 +457,11 @@ class Pipeline:
         silence_s = silence_ns / NS_PER_S
         standing = self._standings[stream]
         over, why = self._why_over(stream), self._why_silent(stream)
-        reason = f"no more samples of {stream}: {over}" if over else silence_reason(stream, silence_s, why)
+        reason = (
+            f"no more samples of stream {stream!r}: {over}"
+            if over
+            else silence_reason(stream, silence_s, why)
+        )
         if standing.doubt:
             # What the stream was doubted for is no longer what is wrong.
             self._fall_silent(stream, StreamState(reason, standing.proven, silent=True))

@@ -89,8 +89,8 @@ def silence_reason(stream: str, silence_s: float, why: str = "") -> str:
         why: what its bus says of that, in a clause; empty if it says nothing.
     """
     if why:
-        return f"no samples of {stream}: {why}"
-    return f"no samples of {stream} for {silence_s:.1f} s; check bus and device"
+        return f"no samples of stream {stream!r}: {why}"
+    return f"no samples of stream {stream!r} for more than {silence_s:.1f} s; check bus and device"
 
 
 def is_text(value: object, longest: int) -> bool:

@@ -24,6 +24,7 @@ from drivers.can.batches import BusOffError, FrameDemultiplexer
 from drivers.can.errors import BUS_OFF_REASON, EXPLAINED, CanCounters, ErrorCounts
 from drivers.can.record import recorder_of
 from drivers.can.socketcan import open_socketcan
+from drivers.can.stream_faults import StreamFaults
 from drivers.frames import DecodedBatch
 from drivers.reconnect import (
     Attempt,
@@ -201,6 +202,8 @@ class CanDriver:
         self._sorter = FrameDemultiplexer(port.streams)
         self._assemblers = {s.name: assembler_of(s, port) for s in port.streams}
         self._open_source = open_source or self._open_bus
+        self._faults = StreamFaults(port.name, port.streams, port.clock)
+        self.link.faults = self._faults
         self._said: set[str] = set()
         self._is_fresh = False
         """Whether nothing has come since the bus was opened: what its controller was then, nobody knows."""
@@ -298,6 +301,7 @@ class CanDriver:
         for stream, (count, length) in batch.wrong_length.items():
             self._count_wrong_length(stream, count, length)
         for stream, frames in batch.frames.items():
+            self._faults.heard(stream)
             with sparing_others(self.link, stream, self.counters):
                 self._assemblers[stream].accept(*frames)
         if batch.drained_ns is not None:
@@ -333,6 +337,7 @@ class CanDriver:
         )
 
     def _count_unknown(self, name: str, count: int) -> None:
+        self._faults.heard_other(name)
         ids = self.counters.unknown_ids
         if name in ids or len(ids) < REMEMBERED_IDS:
             ids[name] = ids.get(name, 0) + count
@@ -347,6 +352,7 @@ class CanDriver:
     def _count_wrong_length(self, stream: str, count: int, length: int) -> None:
         assembler = self._assemblers[stream]
         assembler.counters.frames_wrong_length += count
+        self._faults.has_wrong_length(stream, length)
         spec = next(s for s in self._port.streams if s.name == stream)
         self._say_once(
             f"length of {stream}",

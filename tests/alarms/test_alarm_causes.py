@@ -5,7 +5,7 @@ from __future__ import annotations
 from daqsvc.alarms.quality import SensorHealth
 from daqsvc.diagnosis.record import Diagnosis
 
-SILENCE = "no samples of s for {} s; check bus and device"
+SILENCE = "no samples of stream 's' for more than {} s; check bus and device"
 RATE = "the device sends {} Hz, the file says 50"
 
 

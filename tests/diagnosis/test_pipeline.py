@@ -326,7 +326,7 @@ async def test_without_detectors_it_lasts_as_long_as_the_rings_and_says_what_fal
         clock.advance_to(clock.monotonic_ns() + 250_000_000)
     assert not running.done(), "it is not started again and again"
     assert [r.message for r in caplog.records] == [
-        "no samples of s for 2.0 s; check bus and device; no detector reads them"
+        "no samples of stream 's' for more than 2.0 s; check bus and device; no detector reads them"
     ]
     ring.close()
     await asyncio.sleep(0.002)
@@ -367,7 +367,7 @@ async def test_what_the_bus_knows_of_a_silence_is_said_also_when_it_comes_later(
         known["s"] = "unit 1 refuses that" if quarter > 20 else ""
         await asyncio.sleep(0.005)
         clock.advance_to(clock.monotonic_ns() + 250_000_000)
-    assert [one.reason for one in said] == ["2 s", "no samples of s: unit 1 refuses that"]
+    assert [one.reason for one in said] == ["2 s", "no samples of stream 's': unit 1 refuses that"]
     ring.close()
     await running
 

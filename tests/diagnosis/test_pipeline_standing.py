@@ -165,7 +165,7 @@ async def test_a_device_that_stops_while_a_doubt_stands_is_silent_and_no_longer_
         return [(event.kind.value, event.message.partition("judged: ")[2]) for event in events[before:]]
 
     other = "the device's counter stands still at 7"
-    silence = "no samples of s for 2.0 s; check bus and device"
+    silence = "no samples of stream 's' for more than 2.0 s; check bus and device"
     assert await live(2, "") == []
     # However long it stands, while frames come.
     assert await live(9, DOUBT) == [("raised", DOUBT)]

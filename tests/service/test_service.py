@@ -140,7 +140,7 @@ async def test_a_bus_that_falls_silent_holds_the_alarm_and_is_told(tmp_path: Pat
             await eventually(lambda: consumer.on("/alarms/sensor-ok/accel"), "the silence is told")
             assert service.alarms.manager.alarms["vibration-accel"].level.label == "alert"
             told = consumer.on("/alarms/sensor-ok/accel")[0].payload
-            assert "no samples of recording for" in told["message"]
+            assert "no samples of stream 'recording' for more than" in told["message"]
             assert told["cause"]["decision"] == "alert"
             # Good again is what has been good for some seconds.
             await shake(service, 8.0)
@@ -184,7 +184,7 @@ async def test_a_recording_that_has_been_played_holds_the_alarm_and_says_so(
     async with running(load_machine_file(path), tmp_path / "store") as service:
         alarms = service.alarms.manager.alarms
         message = (
-            "sensor-ok/accel alert: accel cannot be judged: no more samples of housing: "
+            "sensor-ok/accel alert: accel cannot be judged: no more samples of stream 'housing': "
             f"replayed bus 'tape' ({tmp_path / 'run.npz'}) has ended: end of file"
         )
         # A busy machine may be silent for long before the recording begins, too, and says so.

@@ -242,7 +242,7 @@ async def test_all_is_told_that_the_service_knows(tmp_path: Path) -> None:
         assert status["buses"]["can0"]["reason"] == "cable \x1b[2J?\ngone"
         assert status["streams"]["shaft"]["rate_hz"] is None
         assert channel(status, "probe-x")["state"] == "missing"
-        assert "no samples of shaft" in channel(status, "probe-x")["reason"]
+        assert "no samples of stream 'shaft'" in channel(status, "probe-x")["reason"]
         (levels,) = [one for one in status["statements"] if one["detector"] == "levels/probe-x"]
         assert levels["measures"]["rms"]["value"] == pytest.approx(10.0 / np.sqrt(2.0), rel=0.02), "held"
         assert levels["measures_age_s"] > levels["age_s"]
@@ -267,7 +267,7 @@ async def test_all_is_told_that_the_service_knows(tmp_path: Path) -> None:
             "can0 can down cable",
             "probe-x missing",
             "- of 640",
-            "frames_unknown 3",
+            "can0 3",
             f" s ({away})",
             "alert active unacknowledged sensor-ok/probe-x",
             "for the broker, the oldest for",

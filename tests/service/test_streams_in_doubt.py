@@ -102,7 +102,7 @@ async def be_in_doubt(folder: Path, *, and_recover: bool) -> None:
                 )
             # One that is asked would answer all the same, and its counter stand still.
             nodes["can"].phases = [Phase("stopped", per_s=0.0)]
-            nothing = "no samples of can for "
+            nothing = "no samples of stream 'can' for more than "
             await eventually(lambda: nothing in events.words("sensor-ok/s-can")[-1], "the device has stopped")
             assert service.figures()["streams"]["can"]["doubt"].startswith(nothing)
             for name in STILL:

@@ -175,7 +175,7 @@ def test_what_cannot_be_judged_clears_nothing(learnt, spoil, quality, words) -> 
     assert re.search(words, held[-1].reason)
     (silence,) = watch.silent(3.0, 10**12)
     assert (silence.quality, silence.decision) == ("missing", "outer")
-    assert "no samples of housing for 3.0 s" in silence.reason
+    assert "no samples of stream 'housing' for more than 3.0 s" in silence.reason
 
 
 def test_a_dead_sensor_does_not_hide_the_other_bearing(learnt) -> None:

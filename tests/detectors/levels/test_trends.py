@@ -164,7 +164,7 @@ def test_two_missing_values_are_bridged_and_the_third_is_told_and_clears_nothing
     assert "the last 3 values of oil did not arrive" in missing.reason
     (silence,) = slow.silent(210.0, 99)
     assert (silence.quality, silence.decision, silence.first_index) == ("missing", "alert", 7)
-    assert "no samples of trend for 210.0 s" in silence.reason
+    assert "no samples of stream 'trend' for more than 210.0 s" in silence.reason
 
 
 def test_before_its_first_value_nothing_is_decided():

@@ -223,7 +223,7 @@ def test_silence_holds_the_decision(grown):
     run(subject, grown)
     (said,) = subject.silent(3.0, 123)
     assert (said.decision, said.severity, said.quality, said.t_ns) == ("unbalance", "alert", "missing", 123)
-    assert "no samples of shaft for 3.0 s" in said.reason
+    assert "no samples of stream 'shaft' for more than 3.0 s" in said.reason
     assert not said.changed
 
 

@@ -123,7 +123,7 @@ async def test_a_silent_bus_does_not_clear_the_alarm(tmp_path: Path) -> None:
             )
             alarms = service.alarms.manager.alarms
             assert alarms["detector-ok/rotor-synchronous"].level.label == "alert"
-            assert "no samples of shaft" in alarms["detector-ok/rotor-synchronous"].message
+            assert "no samples of stream 'shaft'" in alarms["detector-ok/rotor-synchronous"].message
             assert alarms["rotor-changed"].level.label == "danger"
             assert alarms["rotor-changed"].state.is_active
         # A restart knows what healthy was: it does not take the faulty machine for it.

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.bus_tables import can_bus
 from support.can_standin import FaultyBus
-from support.clocks import QuickClock
+from support.clocks import QuickClock, SettableClock
 from support.running_drivers import begun
 from support.waiting import eventually
 
@@ -120,6 +120,33 @@ async def test_what_is_no_sample_is_counted_and_said_once(caplog: pytest.LogCapt
     assert sum("CRC does not match" in text for text in said) == 1
     assert len(said) == 3, "every kind is said once, however many there are"
     assert sum("bytes, its layout 64" in text for text in said) == 1
+
+
+async def test_a_silent_stream_says_what_comes_in_its_place() -> None:
+    blocks: list[SampleBlock] = []
+    streams = [StreamSpec("shaft", layout(), 1000.0), StreamSpec("other", layout(0x55), 1000.0)]
+    clock = SettableClock()
+    driver = CanDriver(FAULTY, port(blocks, streams=streams, clock=clock))
+    async with begun(driver):
+        await eventually(lambda: driver.link.state == "up")
+        assert driver.link.why_silent("shaft") == ""
+        for frame_id in (0x320, 0x7A0):
+            FaultyBus.inbox.put(message(0, arbitration_id=frame_id))
+        await eventually(lambda: driver.counters.frames_unknown == 2)
+        assert driver.link.why_silent("shaft") == (
+            "the bus works, as other frames come on can0: 0x320 (11 bit), 0x7a0 (11 bit); "
+            "compare the id 0x101, or check the device"
+        )
+        FaultyBus.inbox.put(message(1, data=message(1).data[:40]))
+        await eventually(lambda: driver.streams["shaft"][0].frames_wrong_length == 1)
+        said = "its frames 0x101 have 40 bytes, the layout 64; correct the layout"
+        assert driver.link.faults["shaft"] == said
+        assert "compare the id 0x55" in driver.link.faults["other"]
+        FaultyBus.inbox.put(message(2))
+        await eventually(lambda: driver.streams["shaft"][0].frames_received == 1)
+        assert "have 40 bytes" not in driver.link.why_silent("shaft")
+        clock.advance(11.0)
+        assert dict(driver.link.faults) == {}, "nothing comes any more"
 
 
 @pytest.mark.parametrize(

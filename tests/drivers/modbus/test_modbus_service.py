@@ -80,7 +80,7 @@ async def test_alarm_and_status_say_why_a_stream_has_not_begun(tmp_path):
         [status] = await asyncio.to_thread(ask_status, tmp_path, None)
     server.stop()
     why = (
-        "no samples of gap: unit 1 refuses function 3: illegal data address (registers 0 to 1); "
+        "no samples of stream 'gap': unit 1 refuses function 3: illegal data address (registers 0 to 1); "
         "compare the register map of the device with the layout"
     )
     assert why in message
