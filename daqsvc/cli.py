@@ -44,6 +44,7 @@ from daqsvc.commands.trend import TrendCommand
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from daqsvc.box import Box
     from daqsvc.settings import MachineFile
 
 COMMANDS = "daqsvc.commands"
@@ -114,11 +115,15 @@ class CheckCommand:
         for number, machine in enumerate(box.machines.values()):
             if number:
                 print()  # noqa: T201 - this is what the verb is for
-            codes.append(self._check(machine, box.own))
+            codes.append(self._check(machine, box))
         return max(codes)
 
-    def _check(self, machine: MachineFile, own: MachineFile) -> int:
-        from daqsvc.commands.store_argument import store_doubts  # noqa: PLC0415
+    def _check(self, machine: MachineFile, box: Box) -> int:
+        from daqsvc.commands.store_argument import (  # noqa: PLC0415
+            doubts_of_owner,
+            store_doubts,
+            store_in_words,
+        )
         from daqsvc.detectors.make import check_files  # noqa: PLC0415
         from daqsvc.publish.make import check_outputs  # noqa: PLC0415
         from daqsvc.settings import describe  # noqa: PLC0415 - each verb imports only what it needs
@@ -128,9 +133,9 @@ class CheckCommand:
 
         check_files(machine)
         check_outputs(machine)
-        doubts = list(store_doubts(machine))
+        doubts = [*store_doubts(machine), *doubts_of_owner(box)]
         with collecting() as failures:
-            print(describe(machine, doubts, own))  # noqa: T201 - this is what the verb is for
+            print(describe(machine, doubts, box.own, store_in_words(box)))  # noqa: T201 - this is what the verb is for
         for failed in failures:
             failed.file, failed.table = machine.path, dotted(failure(machine, failed).path)
             print(failed, file=sys.stderr)  # noqa: T201

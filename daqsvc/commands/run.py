@@ -19,7 +19,7 @@ from daqsvc.commands.machine_files import load_box, read_box
 from daqsvc.commands.process_guard import ProcessGuard
 from daqsvc.commands.service_manager import ServiceManager
 from daqsvc.commands.start_memory import give_back, share_heaps
-from daqsvc.commands.store_argument import StoreNotFoundError, store_directory
+from daqsvc.commands.store_argument import StoreNotFoundError, files_by_identity, store_directory
 from daqsvc.threads import call_in_thread
 
 if TYPE_CHECKING:
@@ -120,6 +120,7 @@ def _run(
 ) -> int:
     from daqsvc.outbox.files import take_possession  # noqa: PLC0415
     from daqsvc.outbox.journal import refuse_store  # noqa: PLC0415
+    from daqsvc.outbox.machine_files import take_store  # noqa: PLC0415
     from daqsvc.outbox.messages import (  # noqa: PLC0415
         NewerOutboxError,
         OutboxAwayError,
@@ -133,6 +134,7 @@ def _run(
     from drivers.frames import LayoutError  # noqa: PLC0415
 
     try:
+        is_named = store is not None
         store = store or store_directory(box)
         # What comes next may compile kernels, on a small box for minutes: meanwhile the store is held, which
         # says to others that a service starts.
@@ -141,6 +143,7 @@ def _run(
             # What the disk cannot do now, it may by the time the journal is opened.
             with contextlib.suppress(OSError):
                 held.enter_context(take_possession(store / LOCK))
+            take_store(store, files_by_identity(box), on_purpose=is_named)
             _run_loop(_run_until_stopped(box, files, store, guard, manager, held.close))
     except (AssemblyError, LayoutError, NewerOutboxError, StoreNotFoundError, StorePathError) as error:
         log.critical("%s", error)
@@ -266,6 +269,7 @@ async def _run_until_stopped(
     Raises:
         AssemblyError, DeviceAbsentError, EssentialLostError, LayoutError, OutboxError: see `Service`.
     """
+    from daqsvc.outbox.machine_files import note_files  # noqa: PLC0415
     from daqsvc.service import Service  # noqa: PLC0415
     from daqsvc.supervision import stop_all  # noqa: PLC0415
 
@@ -296,6 +300,7 @@ async def _run_until_stopped(
             # alarms, would hold up the event loop for some .1 s each time.
             gc.freeze()
             guard.reload_by(reloader.ask)
+            note_files(store, {name: machine.path for name, machine in box.machines.items()})
             log.info("watching %s; the journal is in %s", box.names, store)
             call_in_thread(give_back, name="give back")
         await running

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     import argparse
     from collections.abc import Iterator, Sequence
 
+    from daqsvc.alarms.events import Identity
     from daqsvc.box import Box
     from daqsvc.commands.machine_files import Load
     from daqsvc.settings import MachineFile
@@ -58,6 +59,37 @@ def store_directory(box: Box) -> Path:
     if own.store is not None:
         return own.resolve(own.store.directory)
     return _default_directory(own, f"-{own.machine.name}" if box.is_single else "")
+
+
+def store_in_words(box: Box) -> str:
+    """Where `daqsvc run` keeps the journal of a box, and why there."""
+    try:
+        store = store_directory(box)
+    except StoreNotFoundError:
+        return "none: this user has no home directory; name one in [store]"
+    if box.own.store is not None:
+        return f"{store}"
+    with contextlib.suppress(RuntimeError, ValueError):
+        store = Path("~") / store.relative_to(Path.home())
+    return f"{store}, where [store] names no other; under systemd, the state directory of the unit"
+
+
+def files_by_identity(box: Box) -> dict[Identity, Path]:
+    """The machine files of a box, by the names of their machines."""
+    from daqsvc.alarms.events import Identity  # noqa: PLC0415 - only what a verb needs
+
+    return {Identity(one.site, one.box, name): one.path for name, one in box.machines.items()}
+
+
+def doubts_of_owner(box: Box) -> Iterator[str]:
+    """Why `daqsvc run` would refuse the store of a box: it is that of another file of the same names."""
+    from daqsvc.outbox.machine_files import in_words, other_file  # noqa: PLC0415 - as above
+
+    with contextlib.suppress(StoreNotFoundError):
+        store = store_directory(box)
+        for identity, file in files_by_identity(box).items():
+            if (other := other_file(store, identity, file)) is not None:
+                yield with_code(in_words(store, identity, file, other), UNUSABLE_STORE)
 
 
 def _default_directory(machine: MachineFile, end: str = "") -> Path:

@@ -13,8 +13,9 @@ NEEDS_RESTART = Code(
 UNUSABLE_STORE = Code(
     "S02",
     "The store cannot be used",
-    "Its path is no directory, this user may not write there, or a newer version of daqsvc has written it.",
-    "Correct store.directory, give the user of the service the right to write there, or install the newer"
-    " version.",
+    "Its path is no directory, this user may not write there, a newer version of daqsvc has written it, or "
+    "it is that of another machine file with the same site, box and machine name.",
+    "Correct store.directory, give the user of the service the right to write there, install the newer"
+    " version, or give the machine another name.",
     "outbox.md",
 )

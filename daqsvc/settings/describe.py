@@ -33,13 +33,16 @@ _NO_BREAK = "\N{NO-BREAK SPACE}"
 _HOUR_S = 3600.0
 
 
-def describe(machine: MachineFile, doubts: Iterable[str] = (), own: MachineFile | None = None) -> str:
+def describe(
+    machine: MachineFile, doubts: Iterable[str] = (), own: MachineFile | None = None, store: str = ""
+) -> str:
     """Summary of a machine file: plain text for a terminal of 100 columns, without secrets, warnings last.
 
     Args:
         machine: the machine file.
         doubts: what is to be warned of beside its own warnings.
         own: the box with its outputs and its store (`daqsvc.box.Box.own`), if others share these.
+        store: where the store is, in words; left out, as [store] says.
     """
     blocks = [
         _facts(_identity(machine)),
@@ -48,7 +51,7 @@ def describe(machine: MachineFile, doubts: Iterable[str] = (), own: MachineFile 
         ["Sensors", *_table(_SENSOR_HEADER, [_sensor(sensor) for sensor in machine.sensors])],
         ["Detectors", *_table([], list(_detectors(machine)))],
         ["Alarms", *_table(_ALARM_HEADER, list(_alarms(machine)))],
-        _facts([*_outlets(own or machine), *_recorder(machine)]),
+        _facts([*_outlets(own or machine, store), *_recorder(machine)]),
     ]
     warnings = [
         textwrap.fill(
@@ -217,7 +220,7 @@ def _limits(low: float | None, high: float | None, unit: str) -> str:
     return f"<= {low:g} {unit}" if high is None else f"{low:g}..{high:g} {unit}"
 
 
-def _outlets(machine: MachineFile) -> Iterator[tuple[str, str]]:
+def _outlets(machine: MachineFile, store: str) -> Iterator[tuple[str, str]]:
     lines = [
         (path, _words(partial(plugin.describe, machine, settings)))
         for path, plugin, settings in configured_outputs(machine)
@@ -226,10 +229,10 @@ def _outlets(machine: MachineFile) -> Iterator[tuple[str, str]]:
         below = [words for at, words in lines if f"{at}.".startswith(f"{path}.") and words]
         if "." not in path and (below or plugin.absent):
             yield one_line(plugin.label) or path, "; ".join(below) or one_line(plugin.absent)
-    yield (
-        "Store",
-        "no directory configured" if machine.store is None else str(machine.resolve(machine.store.directory)),
-    )
+    named = "where daqsvc run keeps it, as [store] names no directory"
+    if machine.store is not None:
+        named = f"{machine.resolve(machine.store.directory)}"
+    yield "Store", store or named
 
 
 def _recorder(machine: MachineFile) -> Iterator[tuple[str, str]]:

@@ -215,7 +215,8 @@ class MachineFile(Section):
     )
     store: Store | None = Field(
         default=None,
-        description="where the journal is kept, which survives a power cut; none is kept if absent",
+        description="where the journal is kept, which survives a power cut; below ~/.local/state/daqsvc if "
+        "absent, or in the state directory of the unit under systemd",
     )
 
     _origin: Origin = PrivateAttr(default_factory=Origin)

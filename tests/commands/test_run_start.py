@@ -47,7 +47,7 @@ async def test_what_the_start_has_made_is_not_looked_through_for_garbage_again(m
         expect_turns=lambda _: None,
         reload_by=reloads.append,
     )
-    box = SimpleNamespace(names="rig")
+    box = SimpleNamespace(names="rig", machines={})
     try:
         await asyncio.wait_for(run._run_until_stopped(box, [], tmp_path, guard, ServiceManager()), 10.0)
     finally:
@@ -171,7 +171,7 @@ def test_the_store_is_held_while_the_service_is_made(monkeypatch, tmp_path):
 
     monkeypatch.setattr(daqsvc.service, "Service", Service)
     guard = SimpleNamespace(stopping=None, protect=lambda _: None, stop_by=lambda *_: None)
-    box = SimpleNamespace(names="rig")
+    box = SimpleNamespace(names="rig", machines={})
     assert run._run(box, [], tmp_path / "store", guard, ServiceManager()) == 0
     assert held == [True, False]
 

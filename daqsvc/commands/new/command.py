@@ -203,13 +203,15 @@ def _write(file: Path, text: str) -> None:
 
 def _report(file: Path, text: str, answers: Answers) -> int:
     """Say what was written, and what to type next."""
+    from daqsvc.box import Box  # noqa: PLC0415
     from daqsvc.commands.new.buses import BUSES  # noqa: PLC0415 - slow to import
     from daqsvc.commands.new.interview import checked  # noqa: PLC0415
+    from daqsvc.commands.store_argument import doubts_of_owner  # noqa: PLC0415
 
     machine = checked(text, file)
     quoted = shlex.quote(f"{file}")
     _say(f"\n{file} is written; daqsvc check finds no error in it.")
-    for warning in machine.warnings:
+    for warning in (*machine.warnings, *doubts_of_owner(Box.single(machine))):
         _say(f"{warning}")
     beside, about = BUSES[answers["bus"]].beside(quoted)
     commands = {
