@@ -100,7 +100,15 @@ class Scan:
     lost: str = ""
     _client: ModbusClient | None = None
 
-    async def run(self, units: Sequence[int], functions: Sequence[int], begin: int, end: int) -> None:
+    async def run(
+        self,
+        units: Sequence[int],
+        functions: Sequence[int],
+        begin: int,
+        end: int,
+        *,
+        until_found: bool = False,
+    ) -> None:
         """Find units, read their registers, and read those that are there again.
 
         Args:
@@ -108,6 +116,7 @@ class Scan:
             functions: 3, 4 or both.
             begin: first register.
             end: last one.
+            until_found: whether no further function is tried on a unit that has registers.
 
         Raises:
             LineLostError: the line cannot be opened.
@@ -121,6 +130,8 @@ class Scan:
                     self.tables.append(table)
                     for at in range(begin, end + 1, BLOCK):
                         await self._read(table, at, min(BLOCK, end + 1 - at))
+                    if table.first and until_found:
+                        break
             for table in self.tables:
                 await self._read_again(table)
         except LineLostError as error:

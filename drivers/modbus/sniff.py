@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 TCP_PORT = 502
 UNITS = "1-247"
 REGISTERS = "0-200"
-_FUNCTIONS = {"3": (3,), "4": (4,), "both": (3, 4)}
+_AUTO = "auto"
+_FUNCTIONS = {_AUTO: (3, 4), "3": (3,), "4": (4,), "both": (3, 4)}
 _TABLES = {3: "holding", 4: "input"}
 _MOST_CHANNELS = 64
 _LAST_REGISTER = 65_535
@@ -46,7 +47,10 @@ class ModbusSniffer(Sniffer):
             "--registers", default=REGISTERS, metavar="A-B", help=f"registers to read (default: {REGISTERS})"
         )
         parser.add_argument(
-            "--function", choices=tuple(_FUNCTIONS), default="3", help="which reads them (default: 3)"
+            "--function",
+            choices=tuple(_FUNCTIONS),
+            default=_AUTO,
+            help="which reads them (default: auto, which is 3, and 4 for a unit where 3 reads none)",
         )
         parser.add_argument(
             "--timeout-ms", type=float, default=300.0, metavar="MS", help="for a reply (default: 300)"
@@ -83,12 +87,13 @@ class ModbusSniffer(Sniffer):
         probes, most = most_requests(len(units), len(functions), end + 1 - begin)
         wait_s = probes * (arguments.pause_ms + arguments.timeout_ms) / 1000
         tell(
-            f"asking {bus.where}: {probes} requests to find units, at most {wait_s:.0f} s; then at most "
-            f"{most} for each unit that answers; Ctrl-C ends it early"
+            f"asking {bus.where}: {probes} request{'s' * (probes != 1)} to find units, at most "
+            f"{math.ceil(wait_s)} s; then at most {most} for each unit that answers; Ctrl-C ends it early"
         )
         scan = Scan(bus, SystemClock(), stop, arguments.pause_ms / 1000)
         try:
-            asyncio.run(scan.run(units, functions, begin, end))
+            until_found = arguments.function == _AUTO
+            asyncio.run(scan.run(units, functions, begin, end, until_found=until_found))
         except LineLostError as error:
             said = f"{error}".replace("correct host and tcp_port", "correct TARGET").replace(
                 "correct host", "correct TARGET"
@@ -96,7 +101,7 @@ class ModbusSniffer(Sniffer):
             raise SniffError(
                 f"{bus.where}: {said.replace('correct serial_port', 'correct TARGET')}"
             ) from error
-        return _Report(bus, scan, arguments.all_orders, (first_unit, last_unit)).sniffed()
+        return _Report(bus, scan, arguments.all_orders, (first_unit, last_unit), functions).sniffed()
 
 
 def _range(text: str, option: str, most: int) -> tuple[int, int]:
@@ -149,6 +154,7 @@ class _Report(NamedTuple):
     scan: Scan
     all_orders: bool
     units: tuple[int, int]
+    functions: tuple[int, ...]
 
     def sniffed(self) -> Sniffed:
         """All of it."""
@@ -171,9 +177,13 @@ class _Report(NamedTuple):
                 "slow one needs a longer --timeout-ms"
             )
         if not any(table.first for table in scan.tables) and not scan.stop.is_set():
+            asked = " and ".join(map(str, self.functions))
+            other = ""
+            if len(self.functions) == 1:
+                other = ", and for its tables (--function both)"
             return (
-                f"{where}: no register could be read. Remedy: see the device's manual for its addresses "
-                "(--registers) and tables (--function 4, or both)"
+                f"{where}: no register could be read by function {asked}. Remedy: see the device's manual "
+                f"for its addresses (--registers){other}"
             )
         return ""
 

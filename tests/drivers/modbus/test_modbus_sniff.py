@@ -130,7 +130,7 @@ def test_registers_are_shown_and_what_it_proposes_passes_check(
         fragment = figures(capsys)["machine_file"]
         assert main(words(target, "--units", "1", "--all-orders")) == 0
         everything = capsys.readouterr().out
-    assert "1 requests to find units" in shown.err
+    assert "1 request to find units, at most 1 s; then" in shown.err
     assert "Unit 1, holding registers (function 3): 7 at 0-3, 40-41, 107" in shown.out
     assert "Unit 1, input registers (function 4): none" in shown.out
     rows = {line.split()[0]: line for line in shown.out.splitlines() if line[:3].strip().isdecimal()}
@@ -146,6 +146,21 @@ def test_registers_are_shown_and_what_it_proposes_passes_check(
     assert (code, said.err) == (0, "")
     [stream] = tomllib.loads(fragment)["streams"].values()
     assert stream["layout"]["channels"] == [{"name": "r40", "address": 40, "type": "float32"}]
+
+
+def test_input_registers_are_found_where_there_are_no_holding_registers(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    inputs, both = ModbusUnit(), pump()
+    inputs.put("input", 2, struct.pack(">2H", 11, 12))
+    both.put("input", 2, struct.pack(">2H", 21, 22))
+    with tcp({1: inputs, 2: both}) as target:
+        assert main(words(target, "--units", "1-2", "--registers", "0-9", "--json")) == 0
+    found = figures(capsys)
+    tables = [(one["unit"], one["function"], one["runs"]) for one in found["tables"]]
+    assert tables == [(1, 3, []), (1, 4, [[2, 3]]), (2, 3, [[0, 3]])]
+    streams = tomllib.loads(found["machine_file"])["streams"]
+    assert streams["unit-1-input"]["layout"]["table"] == "input"
 
 
 def test_a_server_that_ignores_the_unit_is_one_device(capsys: pytest.CaptureFixture[str]) -> None:
@@ -177,7 +192,10 @@ def test_nobody_and_nothing_are_failures_that_say_what_to_check(
     assert "none of units 8 to 9 answers; a gateway says of 1 that they do not answer. Remedy: " in said
     with tcp({1: Watched(2)}) as target:
         assert main(words(target, "--units", "1", "--registers", "0-3")) == 1
-    assert "no register could be read. Remedy: " in capsys.readouterr().err
+    assert "no register could be read by function 3 and 4. Remedy: " in capsys.readouterr().err
+    with tcp({1: Watched(2)}) as target:
+        assert main(words(target, "--units", "1", "--registers", "0-3", "--function", "3")) == 1
+    assert "for its addresses (--registers), and for its tables (--function both)" in capsys.readouterr().err
     assert main(words(f"127.0.0.1:{free_port()}")) == 1
     assert "nobody listens there; start the server, or correct TARGET" in capsys.readouterr().err
     assert main(words(f"{tmp_path / 'ttyS9'}")) == 1
