@@ -32,7 +32,11 @@ if TYPE_CHECKING:
     from daqsvc.supervision import Part
 
 log = logging.getLogger(__name__)
+milestones = logging.getLogger(f"{__name__}.milestones")
+"""What is logged without ``-v``, too: a service that says nothing leaves a person in doubt."""
 
+LOOK_S = 0.2
+"""How often is looked whether samples of all streams have come."""
 
 LOG_S = 0.3
 """What the last lines of the log may take to be written."""
@@ -96,6 +100,7 @@ class RunCommand:
         manager = ServiceManager.of_environment()
         handler = LogThread(STDERR)
         self._start_logging(verbose=arguments.verbose, handler=handler)
+        milestones.setLevel(logging.INFO)
         try:
             manager.starting()
             from daqsvc.kernel_compiler import compile_apart  # noqa: PLC0415 - each verb imports only what it needs
@@ -242,6 +247,15 @@ class _Reloader:
                     log.error("SIGHUP is refused, and the service goes on as it is: %s", reason)  # noqa: TRY400
 
 
+async def _await_samples(service: Service) -> None:
+    """Say once when samples of all streams have come."""
+    while True:
+        if all(one.ring.started for one in service.streams.values()):
+            break
+        await asyncio.sleep(LOOK_S)
+    milestones.info("samples come of all streams: %s", ", ".join(service.streams))
+
+
 def _reloading(manager: ServiceManager, begins: bool) -> None:  # noqa: FBT001 - a callback
     manager.reloading(begins=begins)
     if not begins:
@@ -289,7 +303,7 @@ async def _run_until_stopped(
     let_go()
     running = asyncio.create_task(service.run(stop), name="service")
     follow = partial(manager.follow, service)
-    following = service.supervisor.keep("service manager", follow, may_end=lambda: True)
+    parts = [service.supervisor.keep("service manager", follow, may_end=lambda: True)]
     reloader = _Reloader(service)
     ready = asyncio.create_task(service.ready.wait(), name="ready")
     try:
@@ -301,11 +315,13 @@ async def _run_until_stopped(
             gc.freeze()
             guard.reload_by(reloader.ask)
             note_files(store, {name: machine.path for name, machine in box.machines.items()})
-            log.info("watching %s; the journal is in %s", box.names, store)
+            milestones.info("watching %s; the journal is in %s", box.names, store)
+            awaiting = partial(_await_samples, service)
+            parts.append(service.supervisor.keep("first samples", awaiting, may_end=lambda: True))
             call_in_thread(give_back, name="give back")
         await running
     finally:
         ready.cancel()
         reloader.is_over = True
-        await stop_all([following, *([reloader.part] if reloader.part else [])], LOG_S)
+        await stop_all([*parts, *([reloader.part] if reloader.part else [])], LOG_S)
     log.info("stopped")

@@ -10,7 +10,9 @@ import sys
 from types import SimpleNamespace
 
 import pytest
+from support.can_gateway import MACHINE, CanGateway, daqsvc_run
 from support.notify_sockets import NotifySocket
+from support.ports import free_port
 from support.waiting import eventually
 
 import daqsvc.service
@@ -30,6 +32,7 @@ async def test_what_the_start_has_made_is_not_looked_through_for_garbage_again(m
             self.ready = asyncio.Event()
             self.alarms = SimpleNamespace(outbox=SimpleNamespace(close_from_outside=None))
             self.supervisor = Supervisor()
+            self.streams = {}
 
         async def run(self, stop):
             frozen.append(gc.get_freeze_count())
@@ -54,6 +57,24 @@ async def test_what_the_start_has_made_is_not_looked_through_for_garbage_again(m
         gc.unfreeze()
     assert frozen[1] > frozen[0] + 1000
     assert len(reloads) == 1, "SIGHUP is obeyed when the service is ready"
+
+
+@pytest.mark.parametrize("journal", ["", "1:2"])
+async def test_without_v_a_person_sees_that_it_watches_and_that_samples_come(journal, monkeypatch, tmp_path):
+    if journal:
+        monkeypatch.setenv("JOURNAL_STREAM", journal)
+    log = tmp_path / "log"
+    async with CanGateway() as gateway:
+        file = tmp_path / "motor.toml"
+        text = MACHINE.format(gateway=gateway.port, broker=free_port(), alarms="").partition("[mqtt]")[0]
+        file.write_text(text)
+        async with daqsvc_run(file, tmp_path / "store", "--store", f"{tmp_path}/store"):
+            await eventually(lambda: "samples come" in log.read_text(), "samples come")
+    said = [line.partition("INFO ")[2] for line in log.read_text().splitlines()]
+    assert said == [
+        f"watching motor; the journal is in {tmp_path}/store",
+        "samples come of all streams: shaking",
+    ], "and nothing else is said while all is well"
 
 
 async def test_however_often_sighup_comes_meanwhile_the_files_are_read_once_more(caplog):
@@ -164,6 +185,7 @@ def test_the_store_is_held_while_the_service_is_made(monkeypatch, tmp_path):
             self.ready = asyncio.Event()
             self.alarms = SimpleNamespace(outbox=SimpleNamespace(close_from_outside=None))
             self.supervisor = Supervisor()
+            self.streams = {}
 
         async def run(self, stop):
             # It takes possession itself.

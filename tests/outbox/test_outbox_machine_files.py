@@ -128,7 +128,7 @@ def test_run_refuses_check_and_new_warn_and_the_note_is_made_by_a_run(
     )
     assert watching.stderr is not None
     try:
-        assert any("alarm sensor-ok/" in line for line in watching.stderr), "it watches"
+        assert any("alarm sensor-ok/" in line for line in watching.stderr), "the note is made before"
     finally:
         watching.terminate()
         watching.communicate()

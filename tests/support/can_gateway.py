@@ -151,9 +151,15 @@ class CanGateway:
 
 
 @contextlib.asynccontextmanager
-async def daqsvc_run(file: Path, store: Path) -> AsyncIterator[subprocess.Popen[bytes]]:
-    """``daqsvc run`` in a process of its own; it is stopped at the end. Its log is beside the store."""
-    command = [sys.executable, "-m", "daqsvc", "run", str(file), "--store", str(store), "-v"]
+async def daqsvc_run(file: Path, store: Path, *more: str) -> AsyncIterator[subprocess.Popen[bytes]]:
+    """``daqsvc run`` in a process of its own; it is stopped at the end. Its log is beside the store.
+
+    Args:
+        file: the machine file.
+        store: directory of the journal.
+        more: options; ``-v`` if left out.
+    """
+    command = [sys.executable, "-m", "daqsvc", "run", str(file), "--store", str(store), *(more or ["-v"])]
     with (
         (store.parent / "log").open("wb") as log,
         subprocess.Popen(command, stderr=log) as process,  # noqa: ASYNC220 - it takes no time
