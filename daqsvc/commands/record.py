@@ -23,6 +23,10 @@ if TYPE_CHECKING:
 
 
 ENDINGS = (".blf", ".asc", ".log")
+LIVE_S, TOLD_S = 1.0, 10.0
+"""How often is said how it gets on: in a terminal, and elsewhere."""
+WIDTH = 79
+"""Of that line in a terminal."""
 
 
 class RecordCommand:
@@ -86,7 +90,7 @@ class RecordCommand:
         try:
             port = bus_port(machine, name, SystemClock(), lambda _block: None)
             driver = CanDriver(bus, port, logs=OneLog(arguments.out))
-            asyncio.run(_run_until_stopped(driver, arguments.duration))
+            asyncio.run(_run_until_stopped(driver, arguments.duration, _Progress(driver, arguments.out)))
         except (AssemblyError, DeviceAbsentError, LayoutError) as error:
             return _say(error, EXIT_FAILED)
         files = sorted(_logs(arguments.out) - there)
@@ -141,17 +145,57 @@ def _logs(log: Path) -> set[Path]:
     return {path for path in log.parent.iterdir() if names.fullmatch(path.name)}
 
 
-async def _run_until_stopped(driver: Driver, duration_s: float | None) -> None:
+class _Progress:
+    """Says on stderr how the recording gets on: over the same line in a terminal, else now and then.
+
+    Args:
+        driver: of the bus.
+        log: the file.
+    """
+
+    def __init__(self, driver: Driver, log: Path) -> None:
+        self._driver = driver
+        self._log = log
+        self._is_live = sys.stderr.isatty()
+
+    async def tell(self) -> None:
+        """Say it until cancelled."""
+        _tell(f"recording {self._driver.link.name} in {self._log}; Ctrl-C ends it\n")
+        try:
+            while True:
+                await asyncio.sleep(LIVE_S if self._is_live else TOLD_S)
+                # Blanks go over the end of a longer line.
+                _tell(f"{self._words():<{WIDTH}}\r" if self._is_live else f"{self._words()}\n")
+        finally:
+            if self._is_live:
+                _tell("\n")
+
+    def _words(self) -> str:
+        link, counters = self._driver.link, asdict(self._driver.counters)
+        frames = f"{counters['frames_recorded']:,} frames recorded"
+        if counters["frames_unrecorded"]:
+            frames += f", {counters['frames_unrecorded']:,} not"
+        if link.reason:
+            frames += f"; {link.reason}"
+        return frames[:WIDTH] if self._is_live else frames
+
+
+def _tell(words: str) -> None:
+    print(words, end="", file=sys.stderr, flush=True)  # noqa: T201 - stdout has the result
+
+
+async def _run_until_stopped(driver: Driver, duration_s: float | None, progress: _Progress) -> None:
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in signals_to_end():
         loop.add_signal_handler(number, stop.set)
     running = asyncio.create_task(driver.run(), name="record")
     stopped = asyncio.create_task(stop.wait(), name="stop")
+    telling = asyncio.create_task(progress.tell(), name="progress")
     await asyncio.wait({running, stopped}, timeout=duration_s, return_when=asyncio.FIRST_COMPLETED)
-    for task in (stopped, running):
+    for task in (telling, stopped, running):
         task.cancel()
-    ended = await asyncio.gather(running, stopped, return_exceptions=True)
+    ended = await asyncio.gather(running, stopped, telling, return_exceptions=True)
     if isinstance(ended[0], Exception):
         raise ended[0]
 

@@ -257,6 +257,11 @@ class _Sampled(_ModbusLayout):
         return tuple(channel.name for channel in self.channels)
 
     @property
+    def channels_in_words(self) -> str:
+        """How many channels there are."""
+        return f"{len(self.channels)} channel{'s' * (len(self.channels) > 1)}"
+
+    @property
     def sample_registers(self) -> int:
         """Registers of one sample of every channel."""
         return max(channel.place + channel.registers for channel in self.channels)
@@ -394,7 +399,7 @@ class FifoLayout(_Sampled):
     @property
     def summary(self) -> str:
         """What a person should know about it, in a few words."""
-        return f"{len(self.channels)} channels from a FIFO, {self.count.bits} bit count"
+        return f"{self.channels_in_words} from a FIFO, {self.count.bits} bit count"
 
     @property
     def samples_per_read(self) -> int:
@@ -432,7 +437,7 @@ class RingLayout(_Sampled):
     @property
     def summary(self) -> str:
         """What a person should know about it, in a few words."""
-        return f"{len(self.channels)} channels from a ring of {self.depth}, {self.count.bits} bit count"
+        return f"{self.channels_in_words} from a ring of {self.depth}, {self.count.bits} bit count"
 
     @property
     def samples_per_read(self) -> int:
@@ -486,7 +491,7 @@ class WaveformLayout(_Sampled):
     @property
     def summary(self) -> str:
         """What a person should know about it, in a few words."""
-        return f"{len(self.channels)} channels in blocks of {self.samples} samples"
+        return f"{self.channels_in_words} in blocks of {self.samples} samples"
 
     @property
     def room(self) -> int:

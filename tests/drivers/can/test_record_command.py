@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import signal
 import subprocess
 import sys
-from typing import TYPE_CHECKING
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
 
 import can
 import pytest
@@ -15,11 +17,14 @@ from support.can_recordings import numbers
 from support.examples import first_of
 from support.paths import ROOT
 from support.ports import free_port
-from support.waiting import PATIENCE_S, eventually_blocking
+from support.waiting import PATIENCE_S, eventually, eventually_blocking
 
+from daqsvc.acquisition.link import Link
 from daqsvc.cli import main
+from daqsvc.commands import record
 from daqsvc.commands.arguments import signals_to_end
 from daqsvc.commands.record import ENDINGS
+from drivers.can.errors import CanCounters
 from sim_hw.bus_socket import UnixBus
 from sim_hw.bus_socket_hub import Hub
 
@@ -101,6 +106,8 @@ def test_what_is_recorded_is_printed_when_it_is_stopped(
         process.send_signal(signals_to_end()[ENDINGS.index(ending) % len(signals_to_end())])
         output, said = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0, said
+    assert said.startswith("recording CAN bus 'can0' ")
+    assert f" in {log}; Ctrl-C ends it\n" in said
     summary = json.loads(output)
     found = numbers(log)
     assert [number for number in found if number] == list(range(1, FRAMES + 1))
@@ -136,6 +143,33 @@ def _last(log: Path) -> int:
         return numbers(log)[-1]
     except (IndexError, ValueError):
         return -1
+
+
+@pytest.mark.parametrize("where", ["terminal", "pipe"])
+async def test_how_a_recording_gets_on_is_said_meanwhile(
+    where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    is_terminal = where == "terminal"
+    monkeypatch.setattr(record, "LIVE_S" if is_terminal else "TOLD_S", 0.01)
+    monkeypatch.setattr("sys.stderr.isatty", lambda: is_terminal)
+    driver: Any = SimpleNamespace(link=Link("the bus"), counters=CanCounters(frames_recorded=12_345))
+    telling = asyncio.create_task(record._Progress(driver, tmp_path / "run.blf").tell())
+    said = ""
+
+    def has_told() -> bool:
+        nonlocal said
+        said += capsys.readouterr().err
+        return said.count("frames recorded") > 1
+
+    await eventually(has_told, "it tells again")
+    driver.link.down("it is gone")
+    driver.counters.frames_unrecorded = 7
+    await eventually(lambda: has_told() and "7 not; it is gone" in said, "what goes wrong is said")
+    telling.cancel()
+    await asyncio.gather(telling, return_exceptions=True)
+    said += capsys.readouterr().err
+    assert said.startswith(f"recording the bus in {tmp_path}/run.blf; Ctrl-C ends it\n12,345 frames recorded")
+    assert ("\r" in said, said.endswith("\n")) == (is_terminal, True)
 
 
 def test_it_ends_after_the_time_that_is_given(bus: UnixBus, machine: Path, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import struct
+import tomllib
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from drivers.make import bus_drivers, stream_layout
 from drivers.modbus.driver import ModbusDriver
 from drivers.modbus.line import WriteRefusedError
 from drivers.modbus.registers import RegisterRecord
+from drivers.modbus.settings import FifoLayout
 from sim_hw.nodes.modbus_node import ModbusNode, ModbusRtuServer, ModbusTcpServer
 from sim_hw.nodes.modbus_unit import ModbusUnit
 from sim_hw.nodes.pacing import RealTimePacer
@@ -195,6 +197,12 @@ def test_the_examples_say_what_line_they_are_on(path):
     machine = load_machine_file(path)
     assert "Modbus" in describe(machine)
     assert "values polled in holding registers" in describe(machine)
+
+
+def test_one_channel_is_no_channels():
+    one = FIFO.replace(', { name = "y", place = 1, type = "int16" }', "")
+    assert FifoLayout.model_validate(tomllib.loads(one)).summary.startswith("1 channel from a FIFO")
+    assert FifoLayout.model_validate(tomllib.loads(FIFO)).summary.startswith("2 channels from a FIFO")
 
 
 RING = """
