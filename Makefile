@@ -5,20 +5,20 @@
 # make check  formatting, lint, types, layers, spelling and plain English
 # make bench  speed, as ratios measured in one run
 # make dist   what a release consists of, in dist/: wheel, and a CycloneDX list of everything it is installed with
-# make guard  is what users see as before? make guard ARGS=--take takes the golden texts anew
+# make guard  is what users see as before? make guard ARGS=--take updates the golden texts
 # make measure  figures of the source: lines, circles of imports, names that occur twice
 # make nothing-lost  200 randomised runs with kills, outages and full disks: does every alarm arrive?
 # make soak  ten minutes of all that can happen to several machines; make soak SECONDS=86400 a day of it
 # make bench-diagnosis  names given to machines that nobody modelled (finite elements), into docs/plants.md
-# make bench-data  the tables of the documentation, anew from the measured recordings
+# make bench-data  the tables of the documentation, again from the measured recordings
 # make docs   the site of the documentation, in build/docs/html; fails if a link leads nowhere
-# make pictures  docs/pictures, anew from the product; make pictures ARGS=timebase one of them
-# make evaluation  the tables of docs/evaluate.md, anew from the figures on the other pages
+# make pictures  docs/pictures, again from the product; make pictures ARGS=timebase one of them
+# make evaluation  the tables of docs/evaluate.md, again from the figures on the other pages
 # make deb    a Debian package of the service, in dist/; apt install ./dist/daqsvc_*.deb
 # make test-wheel  the everyday tests against the wheel in dist/, installed in a venv of its own
 # make hooks  have git check every commit
-# make reference  the pages of docs/reference, anew from the code, and the schemas of docs/schemas
-# make proto  the module of the Sparkplug payload, anew from its schema
+# make reference  the pages of docs/reference, again from the code, and the schemas of docs/schemas
+# make proto  the module of the Sparkplug payload, again from its schema
 # Each sets up what it needs in .venv; nothing else on the machine is touched.
 
 PYTHON ?= python3.11
@@ -33,7 +33,7 @@ BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 # Compiled kernels are kept here, so that only the first run compiles them.
 # Small linear systems only: threads of the linear algebra library cost more than they save.
-# Python keeps what it has compiled, else each process that a test starts compiles it anew.
+# Python keeps what it has compiled, else each process that a test starts compiles it again.
 unexport PYTHONDONTWRITEBYTECODE
 export OMP_NUM_THREADS ?= 1
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.cache/kernels

@@ -259,7 +259,7 @@ class AlarmService:
 
     def change(
         self,
-        anew: Iterable[AlarmManager],
+        fresh: Iterable[AlarmManager],
         *,
         gone: Collection[str],
         buses: Mapping[str, Collection[str]],
@@ -269,7 +269,7 @@ class AlarmService:
         """Go on with alarms by other rules, which stand as they did: as over a restart, without one.
 
         Args:
-            anew: the alarms of machines that are new, or whose rules are.
+            fresh: the alarms of machines that are new, or whose rules are.
             gone: machines that are no longer watched; their alarms return to normal.
             buses: see `__init__`.
             active_detectors: see `resume`.
@@ -286,7 +286,7 @@ class AlarmService:
             self.outputs.update(outputs.made)
         self._conditions = [*conditions(buses), *self._conditions_of_outputs]
         own = self.manager.identity.machine
-        for manager in anew:
+        for manager in fresh:
             machine = manager.identity.machine
             before = self.managers.get(machine)
             self.managers[machine] = manager
@@ -318,7 +318,7 @@ class AlarmService:
         ]
 
     def _tell_again(self, events: Sequence[AlarmEvent]) -> list[asyncio.Future[int]]:
-        """Say of every alarm how it stands: the broker may show what the journal never got.
+        """Say of every alarm its state: the broker may show what the journal never got.
 
         Args:
             events: what the journal knows, which the alarms have taken over.
@@ -437,7 +437,7 @@ class AlarmService:
     def _tick_by_machine(self) -> Iterator[None]:
         """See `tick`; comes back after each machine, so that others may have a turn."""
         if self._untold and self.outbox.counters.waiting <= self._waiting_max // 2:
-            # Once events are taken again, broker and disk must know how each alarm stands by now.
+            # Once events are taken again, broker and disk must know the state of each alarm by now.
             for event in list(self._untold.values()):
                 self._submit(event)
         if self._falls_out_of_step():
@@ -740,7 +740,7 @@ class AlarmService:
         return committed
 
     def _settled(self, event: AlarmEvent, committed: asyncio.Future[int]) -> None:
-        """Remember what the disk must be told again: how an alarm stands, if its newest event was refused."""
+        """Remember the alarms whose newest event the disk has refused: their states must be written again."""
         self._under_way.discard(committed)
         if committed.cancelled() or (error := committed.exception()) is None:
             return

@@ -165,7 +165,7 @@ class AuditLog:
 
 @dataclass(slots=True)
 class RefusedMany:
-    """Refused commands that have no lines of their own.
+    """Refused commands that have no their own lines.
 
     Attributes:
         since_ns: when the first of them came, wall clock, ns since the Unix epoch.

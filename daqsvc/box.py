@@ -30,7 +30,7 @@ BOX = "box"
 class Box:
     """One or several machine files that are watched by one process.
 
-    A single machine file is a box of its own: every name is as in the file. Of several ones each bus, by its
+    A single machine file is its own box: every name is as in the file. Of several ones each bus, by its
     name, and each table of an output or of the store is one thing of the box; streams and sensors have the
     name of their machine in front. So what is made once for all of them is made of one file, `own`.
 
@@ -77,7 +77,7 @@ class Box:
 
     @property
     def others(self) -> list[MachineFile]:
-        """The machines beside what stands for the service itself, if that is none of them."""
+        """The machines beside what represents the service itself, if that is none of them."""
         return [] if self.is_single else [*self.machines.values()]
 
     @property

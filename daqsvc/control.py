@@ -1,12 +1,12 @@
 """Commands and questions from people on the box: a Unix socket in the store, and the client for it.
 
 A request is one line of JSON, and so is its answer: see `ControlRequest` and `ControlAnswer`; the status is a
-`daqsvc.publish.service_status.ServiceStatusPayload`. The socket is ``control.sock`` in the store's directory,
-or in systemd's ``$RUNTIME_DIRECTORY`` with a link from there, mode 0600: only the service's own user and root
-may open it, and whoever may open it may command the alarms.
-Whatever a client sends or leaves unsent costs the service a counter and a few kilobytes at most, or ten
-megabytes of one who looks on. Clients that hang keep nobody out: each user has connections of their own, and
-the quietest of them makes way for the next; so does the one who has looked on for longest.
+`daqsvc.publish.service_status.ServiceStatusPayload`. The socket is ``control.sock`` in the store's
+directory, or in systemd's ``$RUNTIME_DIRECTORY`` with a link from there, mode 0600. Only the service's own
+user and root may open it, and whoever may open it may handle alarms. Whatever a client sends or leaves
+unsent costs the service a counter and a few kilobytes at most, or ten megabytes of one who looks on.
+Clients that hang keep nobody out: each user has their own connections, and the quietest of them makes way
+for the next; so does the one who has looked on for longest.
 """
 
 from __future__ import annotations
@@ -708,7 +708,7 @@ def ask_snapshot(store: Path, machine: str | None = None) -> SnapshotAnswer:
 
 
 def ask_status(store: Path, machine: str | None = None, timeout_s: float = STATUS_S) -> list[dict[str, Any]]:
-    """How everything stands by the service that runs on a store, as it says; blocks.
+    """The state of everything by the service that runs on a store, as it says; blocks.
 
     Args:
         store: the store's directory.

@@ -36,7 +36,7 @@ def prepare(*, say: bool = True, first: Callable[[], bool] = lambda: True) -> No
     """Choose the directory; call before any kernel is imported. When the first one is compiled, that is said.
 
     It is ``$NUMBA_CACHE_DIR``; else systemd's ``$CACHE_DIRECTORY``; else that of the installed service, if
-    this is its account; else the user's cache directory (XDG); else one in the folder for temporary files
+    this is its account. Else the user's cache directory (XDG); else one in the folder for temporary files
     that only this user may enter. If none of these can be written, kernels are compiled at every start. Both
     of the latter are said.
 

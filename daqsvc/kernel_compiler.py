@@ -1,4 +1,4 @@
-"""Kernels compiled in a process of their own: this one only loads them from where they are kept.
+"""Kernels compiled in a their own process: this one only loads them from where they are kept.
 
 What the compiler takes stays with the process that has called it, some 130 MB; a service runs for months. So
 whoever runs that long asks another process for each kernel that is not kept yet.
@@ -33,7 +33,7 @@ LOOK_S = 0.2
 
 
 class KernelCompiler:
-    """Has kernels compiled, one at a time, by a process of its own.
+    """Has kernels compiled, one at a time, by a separate process.
 
     The process starts with the first kernel and ends when it has no work. It ends with this process,
     however that ends. If it is lost no other is begun.
@@ -146,7 +146,7 @@ _compiler: list[KernelCompiler] = []
 
 
 def compile_apart() -> KernelCompiler:
-    """Have kernels compiled in a process of their own from now on; call before any is imported."""
+    """Have kernels compiled in a their own process from now on; call before any is imported."""
     _compiler[:] = [KernelCompiler()]
     return _compiler[0]
 

@@ -2,7 +2,7 @@
 
 Who looks is told in lines of JSON. The first one is `LiveFeed.about`. Each further one has one key:
 ``samples`` (of a stream, base64 of float32), ``statement``, ``alarm``, ``standing``, ``left_out``: how many
-samples and other things were left out since the last line, as they were not taken fast enough; or ``alive``,
+samples and other things were left out since the last line, as they were not taken fast enough. Or ``alive``,
 where nothing else has passed for a while.
 """
 
@@ -128,7 +128,7 @@ class LiveFeed:
         *,
         of_this_box: bool = True,
     ) -> dict[str, Any]:
-        """Whose machine it is, what comes of it, and how it stands.
+        """Whose machine it is, what comes of it, and its state.
 
         Args:
             statements: what each detector has said last.
@@ -210,7 +210,7 @@ class LiveFeed:
         self._tell(_StreamStands(stream, standing))
 
     def end(self) -> None:
-        """The machine is watched no more, or otherwise: who looks is to look anew."""
+        """The machine is watched no more, or otherwise: who looks is to look again."""
         for looker in self._lookers:
             looker.end()
         self._lookers.clear()

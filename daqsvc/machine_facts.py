@@ -31,7 +31,7 @@ def machine_values(machine: MachineFile) -> dict[str, Any]:
 
 
 def fault_names(machine: MachineFile) -> dict[str, dict[str, str]]:
-    """By detector and decision the fault that it means, of those whose decisions have names of their own."""
+    """By detector and decision the fault that it means, of those whose decisions have their own names."""
     named: dict[str, dict[str, str]] = {}
     for plugin, settings in plugins(machine):
         try:

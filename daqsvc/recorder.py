@@ -367,7 +367,7 @@ class MachineRecorder:
             one.until_ns = min(one.until_ns, now_ns)
 
     def take_over(self, events: Iterable[AlarmEvent]) -> None:
-        """Take in how alarms stand from before the recorder was made."""
+        """Take in the states of alarms from before the recorder was made."""
         for event in events:
             self._kept.alarms.setdefault(event.alarm, event)
 

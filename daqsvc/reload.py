@@ -89,7 +89,7 @@ def changes(before: Box, after: Box) -> Changes:
     old_buses, new_buses = (dict(_buses(box)) for box in (before, after))
     kept = [name for name in new_buses if name in old_buses]
     buses_anew = {name: why for name in kept if (why := _otherwise(old_buses[name], new_buses[name]))}
-    # The driver of a bus that is opened anew counts samples from 0, which no ring takes that has some.
+    # The driver of a bus that is opened again counts samples from 0, which no ring takes that has some.
     anew = {
         name: why
         for name in common
@@ -213,7 +213,7 @@ def _watched_otherwise(old: MachineFile, new: MachineFile) -> list[str]:
     """The keys by which a machine is watched in another way."""
     keys = {*type(old).model_fields} - _OF_BOX - set(_output_tables(old))
     if not any(isinstance(sensor, TrendValue) for sensor in new.sensors):
-        keys -= _OF_ALARMS  # the detector of trend values says which limit will be reached when
+        keys -= _OF_ALARMS  # the detector of trend values predicts when a limit will be reached
     # What a machine is called by people changes nothing of how it is watched.
     described = new.machine.model_copy(update={"description": old.machine.description})
     differ = _differ(old, new.model_copy(update={"machine": described}), frozenset(keys))

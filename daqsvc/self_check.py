@@ -43,7 +43,7 @@ class BusHealth(NamedTuple):
         bus_off: how often its controller took itself off the bus.
         state: state of the controller; None for a bus that has none.
         unrecorded: frames that are missing from its recording.
-        heard: whether anything has come from it since the start: until then nobody knows how it stands.
+        heard: whether anything has come from it since the start: until then nobody knows its state.
     """
 
     overruns: int
@@ -103,7 +103,7 @@ def conditions(buses: Mapping[str, Collection[str]] = MappingProxyType({})) -> l
 
 
 class SelfCheck:
-    """Remembers what was seen before, and says how things stand.
+    """Remembers what was seen before, and says the present state.
 
     What is not known yet is not said to be normal: an alarm that stood before a restart would return, and
     come again. What happens now and then is known once it was watched for `QUIET_NS`.
@@ -141,7 +141,7 @@ class SelfCheck:
         return shutil.disk_usage(self._store).free
 
     def look(self, vitals: Vitals) -> Iterator[Condition]:
-        """How everything stands, as far as it is known, whether that is new or not."""
+        """The state of everything, as far as it is known, whether that is new or not."""
         if vitals.free_bytes is not None:
             yield self._disk(vitals.free_bytes)
         for now_and_then in (self._journal, self._damage, self._dropped, self._audit):
@@ -178,7 +178,7 @@ class SelfCheck:
         yield condition
 
     def _disk(self, free_bytes: int) -> Condition:
-        # No count of what is free: it stands for hours, and would be another sentence with every MiB.
+        # No count of what is free: it represents hours, and would be another sentence with every MiB.
         limit = f"{self._reserve_bytes // MIB} MiB"
         if free_bytes < self._reserve_bytes:
             on = f"on the disk of {self._store}"

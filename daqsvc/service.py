@@ -105,7 +105,7 @@ class LoopLag:
                 )
 
     def forget(self) -> None:
-        """Begin the figures anew."""
+        """Begin the figures again."""
         self._late_s.clear()
 
     def figures_ms(self) -> dict[str, float]:
@@ -262,7 +262,7 @@ class Service:
     async def run(self, stop: asyncio.Event) -> None:
         """Run until ``stop`` is set; then hand over what is under way and end within two seconds.
 
-        Blocking calls get threads of their own from here on; the end of the process waits for none of them.
+        Blocking calls get their own threads from here on; the end of the process waits for none of them.
 
         Raises:
             OutboxError: the journal's directory cannot be used.
@@ -423,7 +423,7 @@ class Service:
                 raise ReloadRefusedError([f"{problem}" for problem in error.problems]) from error
             except (AssemblyError, LayoutError) as error:
                 raise ReloadRefusedError([f"{error}"]) from error
-            # A task of its own: whoever has asked for it may go away, the service may not stay in between.
+            # Its own task: whoever has asked for it may go away, the service may not stay in between.
             going_on = self._parts.reload = asyncio.create_task(
                 self._go_on_with(box, found, made), name="reload"
             )
@@ -743,7 +743,7 @@ class Parts:
 
 
 class Made(NamedTuple):
-    """What a reload has made: of machines and buses that are new, or begin anew."""
+    """What a reload has made: of machines and buses that are new, or begin again."""
 
     watches: dict[str, MachineWatch]
     drivers: dict[str, Driver]

@@ -1,4 +1,4 @@
-"""How everything stands that the service knows: what ``daqsvc status`` asks for.
+"""The state of everything that the service knows: what ``daqsvc status`` asks for.
 
 The event loop gathers references and the newest sample of each stream, and lets others have their turn
 meanwhile. The text is made on a thread, once for all who ask at about the same time.
@@ -71,7 +71,7 @@ class _Seen(NamedTuple):
 
 
 class StatusReport:
-    """Keeps what the detectors have said last, and tells how everything stands.
+    """Keeps what the detectors have said last, and tells the state of everything.
 
     Args:
         watch: of the machine.
@@ -120,7 +120,7 @@ class StatusReport:
             self._measured[diagnosis.detector] = diagnosis
 
     async def line(self) -> bytes:
-        """How everything stands by now, or did `FRESH_S` ago: a `ServiceStatusPayload` as a line of JSON."""
+        """The state of everything, at most `FRESH_S` old: a `ServiceStatusPayload` as a line of JSON."""
         loop = asyncio.get_running_loop()
         async with self._one_at_a_time:
             if loop.time() - self._made_s > FRESH_S:

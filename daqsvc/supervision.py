@@ -264,7 +264,7 @@ class Part:
 
 
 MOST_LOOK_S = 2.0
-"""What counts of the time between two looks at most: a process that was suspended has not stalled."""
+"""Longest time between two checks that counts: a process that was suspended has not stalled."""
 
 
 class Progress(NamedTuple):
@@ -290,8 +290,8 @@ class _Standstill:
 class StallWatch:
     """Finds parts that have something to do and get nowhere, for all who act on that, and says each once.
 
-    Time is counted from look to look, and without what a part's thread has waited for a processor: where the
-    whole process gets on slowly, or not at all for a while, no part of it has stalled.
+    Time is counted from look to look, and without what a part's thread has waited for a processor. Where
+    the whole process gets on slowly, or not at all for a while, no part of it has stalled.
 
     Args:
         progress: by name, how far each part has come.

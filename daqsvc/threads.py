@@ -1,4 +1,4 @@
-"""Blocking calls in threads of their own, which nobody has to wait for.
+"""Blocking calls in their own threads, which nobody has to wait for.
 
 The threads of a common pool are waited for when the process ends, so one call that hangs, such as a look at a
 disk that is gone, would keep the process from ending. And a pool that has lost a thread does not notice.
@@ -25,7 +25,7 @@ class ThreadLostError(Exception):
 
 
 class CallThreads(ThreadPoolExecutor):
-    """An executor for asyncio's `to_thread` that gives each call a thread of its own.
+    """An executor for asyncio's `to_thread` that gives each call its own thread.
 
     The end of the process waits for none of them.
     """

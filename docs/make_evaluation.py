@@ -148,7 +148,7 @@ def paper(docs: Path) -> Iterator[Row]:
         yield Row(
             f"the same by 200 seeds, {snr}",
             f"median {row['median']} revolutions; {row[wrong_of]} {wrong_of}",
-            "beside it on the page: a detector that is told when the machine changes, and to what",
+            "beside it on the page: a detector that knows when the machine changes, and to what",
             "DAQSVC_SEEDS=200 pytest -s tests/rotor/test_rotor_detection.py",
             "rotor-figures.md#the-papers-scenario-200-seeds-a-level",
         )
@@ -159,7 +159,7 @@ def paper(docs: Path) -> Iterator[Row]:
         yield Row(
             f"delay that `daqsvc detectability` predicts, {change}, {row['SNR']}",
             f"{delay} revolutions, predicted / seen",
-            "simulated machines with an integrator of their own",
+            "simulated machines with another integrator",
             "pytest tests/rotor/test_detectability_comes_true.py",
             "detectability.md#how-accurate-it-is",
         )
@@ -386,7 +386,7 @@ def alarms(docs: Path) -> Iterator[Row]:
     yield Row(
         "a diagnosis among 10,000 sensors",
         f"{many[1]} times what it costs among 10",
-        "alarms of the others are not looked at",
+        "alarms of the others are not evaluated",
         "make bench",
         "alarms.md",
     )

@@ -1,7 +1,7 @@
 """What a driver brings to ``daqsvc sniff``: a look at a bus of its kind before there is any machine file.
 
 A sniffer listens or asks, and says what it found: for a person, for a program, and as tables of a machine
-file to begin with. Those of this tree are named in `daqsvc.commands.sniff`; a package of its own registers
+file to begin with. Those of this tree are named in `daqsvc.commands.sniff`; its own package registers
 one by entry point in the group ``daqsvc.sniffers``, under the name of its driver.
 """
 

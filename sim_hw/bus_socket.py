@@ -3,8 +3,8 @@
     can.Bus(interface="unixbus", channel="/tmp/can0", fd=True)
 
 Needs no kernel support, no privileges and no network. The bus lives in a hub; whoever comes first starts
-one in its own process, unless one runs already (``python -m sim_hw.bus_socket /tmp/can0``). When the hub
-ends the bus is lost for all, as when an interface goes down, and whoever opens it next starts it anew.
+one in a separate process, unless one runs already (``python -m sim_hw.bus_socket /tmp/can0``). When the hub
+ends the bus is lost for all, as when an interface goes down, and whoever opens it next starts it again.
 
 Like Linux' vcan it has no bit rate and no arbitration. Unlike vcan it reports every frame that a slow reader
 loses: by an error frame where they are missing, and by their number in `UnixBus.frames_lost`.

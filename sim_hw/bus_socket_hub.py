@@ -302,7 +302,7 @@ class Hub:
             self._close()
 
     def start(self) -> None:
-        """Run in a thread of its own; a process that ends hands on what its hub has taken in."""
+        """Run in a separate thread; a process that ends hands on what its hub has taken in."""
         atexit.register(self.stop)
         self.thread = threading.Thread(
             target=self._run_as_thread, name=f"unixbus-hub {self.path}", daemon=True

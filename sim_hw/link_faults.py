@@ -1,7 +1,7 @@
 """Faults of a link: frames dropped, sent twice, overtaken by later ones, or corrupted on the way.
 
-The faults are planned over the whole schedule of one id's frames before the first is sent, so the
-plan knows whether a later frame can really overtake a held one, and what it counts is what happens.
+The faults are planned over the whole schedule of one id's frames before the first is sent. So the plan
+knows whether a later frame can really overtake a held one, and what it counts is what happens.
 """
 
 from __future__ import annotations

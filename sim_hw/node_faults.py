@@ -155,7 +155,7 @@ class NodePlan:
         fault: uint8 ``[m]``, the `Fault` done to it.
         flips: uint8 ``[m, length]``, bits to flip in the frame.
         late: bool ``[m]``, whether it is sent later than it was due.
-        mark: uint8 ``[m]``, a `CountRestart` at the frame with which the node counts anew.
+        mark: uint8 ``[m]``, a `CountRestart` at the frame with which the node counts again.
         babble_id: int64 ``[m]``, id of a babbling node's frame, else -1.
     """
 

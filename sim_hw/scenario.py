@@ -368,7 +368,7 @@ class Noise(ScenarioTable):
     """Noise of the sensors.
 
     ``snr_db`` is the AC power of a channel in the healthy mode over the noise's variance, in the whole
-    band up to half the sampling rate; the noise stays the same when the machine gets worse.
+    band up to half the sampling rate. The noise stays the same when the machine gets worse.
     """
 
     snr_db: float = Field(default=0.0, allow_inf_nan=False)

@@ -125,7 +125,7 @@ async def node_for(order: NodeOrder) -> SimNode:
 
 
 class CanNodes:
-    """All streams of a CAN bus, each a node of its own."""
+    """All streams of a CAN bus, each its own node."""
 
     def __init__(self, address: str, nodes: dict[str, CanNode]) -> None:
         self.address = address
@@ -349,7 +349,7 @@ def _holds(window: FaultWindow, t_s: float) -> bool:
 
 
 class SerialNodes:
-    """All streams of a serial port, each a device of its own on the same cable."""
+    """All streams of a serial port, each its own device on the same cable."""
 
     def __init__(self, cable: PseudoTerminal, nodes: dict[str, SerialNode]) -> None:
         self.address = str(cable.path)

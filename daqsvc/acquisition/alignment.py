@@ -1,6 +1,6 @@
 """Channels of one machine that come in several streams, put on one grid, with the error of doing so.
 
-Every device samples on a clock of its own. One stream is the **reference**: its samples are the grid, and
+Every device samples on its own clock. One stream is the **reference**: its samples are the grid, and
 pass as they are (the edge of a keyphasor stays an edge). The samples of every other stream are interpolated
 at the instants of the reference's, as the two time bases see them. How far off that may be goes with the
 data; samples that cannot be placed well enough are left out.

@@ -119,7 +119,7 @@ class SourceCounters:
     Attributes:
         rows_missing: rows without its samples: lost, too late, within the filter's reach of such, or silent.
         rows_withheld: rows without its samples because these could not be placed well enough.
-        steps: how often its place was set anew rather than followed, the first time included.
+        steps: how often its place was set again rather than followed, the first time included.
     """
 
     rows_missing: int = 0
@@ -162,7 +162,7 @@ class Follower:
     """Keeps a stream's latest samples and reads them at the instants of the grid.
 
     The place to read at moves smoothly: what the time bases learn is followed with `FOLLOW_S`, so that the
-    signal has no steps. Only where there is no signal anyway is it set anew.
+    signal has no steps. Only where there is no signal anyway is it set again.
 
     Args:
         source: the stream.

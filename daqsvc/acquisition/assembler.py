@@ -219,7 +219,7 @@ class StreamAssembler:
             self._release(everything=True)
 
     def begin_afresh(self) -> None:
-        """What comes next is of a sender that is known to begin anew, such as a recording played again.
+        """What comes next is of a sender that is known to begin again, such as a recording played again.
 
         Its first frame takes the next index, whatever its counter is: nothing is lost. Its times are its own.
         """
@@ -441,8 +441,8 @@ def _joined(parts: list[Frames]) -> Frames:
 def note_received(counters: StreamCounters, stream: str, samples: Samples) -> Samples:
     """Count samples that are handed on, and what in them is absent; the first such is told.
 
-    A value is absent if the device says that it has none (NaN), or if it is infinite: that is what an
-    overflow leaves, on the device or in a number that no float32 holds, and nothing that was measured.
+    A value is absent if the device says that it has none (NaN), or if it is infinite. An overflow on the
+    device, or a number too large for a float32, leaves such a value; it is no measurement.
 
     Args:
         counters: of the stream.

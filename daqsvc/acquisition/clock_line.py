@@ -1,10 +1,10 @@
 """The line from a device's sample count to host time, under arrivals that come late and never early.
 
-Two lines compete. The **support** lies under the earliest arrivals where it fits the window best (the linear
-programme of Moon, Skelly and Towsley, INFOCOM 1999, solved on the lower convex hull): with N arrivals whose
-delay is often close to the least one it errs by some delay / N, and no load of the host moves it. Where a
-small delay is rare the support hangs on two lucky arrivals; there the **mean** line, of least squares through
-all arrivals and lowered until it touches, errs less.
+Two lines compete. The **support** lies under the earliest arrivals where it fits the window best (the
+linear programme of Moon, Skelly and Towsley, INFOCOM 1999, solved on the lower convex hull). With N
+arrivals whose delay is often close to the least one, its error is about delay / N, and no load of the host
+moves it. Where a small delay is rare the support hangs on two lucky arrivals; there the **mean** line, of
+least squares through all arrivals and lowered until it touches, errs less.
 
 How far the line may be off is told by the earliest arrivals of parts of the window. The constants below make
 that a 95th percentile for delays whose least value is not rare (uniform, exponential, in bursts), and about
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 PARTS = 6
-"""Parts of the window that a line is held against: the earliest arrival of each should lie on it."""
+"""Parts of the window that a line is compared with: the earliest arrival of each should lie on it."""
 SOFT = 0.5
 """The mean line is taken if its slope is sure, at the window's end, to so much of the support's gap."""
 _LEAST_GROWTH = 1.3
@@ -38,11 +38,11 @@ _MEAN_ERROR = (1.0, 2.5)
 _CALM = 2.0
 """The latest of six parts may make the mean gap so many times that of the rest; the host was busy then."""
 _HEARD = 0.5
-"""Of its share of the arrivals, what a part must have to be held against the line."""
+"""Of its share of the arrivals, what a part must have to be compared with the line."""
 _STALLED = 10.0
 """Arrivals later by more than so many times the median come from a stall, and bend the mean line."""
 _LEAST_USUAL = 6
-"""Of such means as the mean line is drawn through: one through fewer has nothing that speaks against it."""
+"""Of such means as the mean line is drawn through: one through fewer has no evidence against it."""
 _SIGMAS = 2.0
 _TOUCHES_NS = 1e-3
 

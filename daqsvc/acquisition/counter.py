@@ -244,7 +244,7 @@ class CounterUnwrapper:
     """Follows one device's counter of 4 to 64 bits, which begins again at 0 after all ones.
 
     A frame is taken by its sequence alone while that agrees with the host clock. Where it does not,
-    the number of missed wraps comes from the clock; a counter that no number of wraps can explain is
+    the number of missed wraps comes from the clock. A counter that no number of wraps can explain is
     kept only if the next frame of the batch continues from it: then it is a restart. The last frame of a
     batch may come once more, as the first one of the next.
 
@@ -341,7 +341,7 @@ class CounterUnwrapper:
         return 0
 
     def begin_afresh(self, first: int) -> None:
-        """Take the next frame as the first one of a sender that begins anew, whatever its counter is.
+        """Take the next frame as the first one of a sender that begins again, whatever its counter is.
 
         Args:
             first: the count of that frame.
@@ -361,7 +361,7 @@ class CounterUnwrapper:
 
         Returns:
             int64 ``[n]``, the counter unwrapped; bool ``[n]``, False for frames whose counter fits neither
-            the sequence nor a restart, and whose count is meaningless; places in the batch at which the
+            the sequence nor a restart, and whose count is meaningless. Places in the batch at which the
             device was found to have restarted its counter. The distance to the frame before these is
             estimated from the host clock.
         """

@@ -35,7 +35,7 @@ class Quality(IntFlag):
     """The number of missing samples comes from the host clock: the device has no counter, or restarted it."""
     PLACE_ESTIMATED = 8
     """How far this block lies behind the one before is a guess, which may be off by many samples: the device
-    has begun to count anew, or sends no count and was away for long. What goes by phase begins anew."""
+    has begun to count again, or sends no count and was away for long. What goes by phase begins again."""
 
 
 @dataclass(frozen=True, slots=True)

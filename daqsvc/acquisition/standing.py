@@ -27,7 +27,7 @@ class StreamState(NamedTuple):
     """How a stream stands.
 
     Attributes:
-        doubt: why nothing can be judged by its samples; empty if nothing speaks against them.
+        doubt: why nothing can be judged by its samples; empty if there is no evidence against them.
         proven: whether its rate seems to be the nominal one, or could not be found out in time.
         silent: whether the doubt is that nothing comes at all, since another one stood.
     """

@@ -8,7 +8,7 @@ and the estimate says how far off it may be. The constant part of the delay cann
 stays in.
 
 Where all arrivals contradict the line it was wrong, or the device's clock has stepped, and the line begins
-anew: at once when they are early, for nothing comes before its time; after some seconds when they are late
+again: at once when they are early, for nothing comes before its time; after some seconds when they are late
 and do not catch up, for they may have been delayed.
 
 A device whose clock is off by more than 5 % has another rate than the nominal one. The line then follows the
@@ -199,7 +199,7 @@ class TimeBase:
         return self._unwrapper.sure(counter, arrival_ns)
 
     def begin_afresh(self, first_index: int) -> None:
-        """Take the next frame as the first one of a sender that begins anew, with a clock of its own.
+        """Take the next frame as the first one of a sender that begins again, with its own clock.
 
         Args:
             first_index: the index of its first sample.
@@ -218,8 +218,8 @@ class TimeBase:
 
         Returns:
             int64 ``[n]``, the index of each frame's first sample; bool ``[n]``, False for frames that belong
-            nowhere; places in the batch at which the device restarted its counter; whether the arrivals
-            contradicted the time base, so that it has begun anew.
+            nowhere. Places in the batch at which the device restarted its counter; whether the arrivals
+            contradicted the time base, so that it has begun again.
         """
         counts, kept, restarts = self._unwrapper.place(counter, arrival_ns)
         index = counts * self._samples_per_count
@@ -243,7 +243,7 @@ class TimeBase:
             restarted: whether where they belong is a guess, since the device has restarted its counter.
 
         Returns:
-            Whether the line has begun anew, since the arrivals contradicted it.
+            Whether the line has begun again, since the arrivals contradicted it.
         """
         if restarted:
             self._restarts += 1
@@ -287,7 +287,7 @@ class TimeBase:
         self._settled = False
 
     def _learn(self, index: NDArray[np.int64], arrival_ns: NDArray[np.int64]) -> bool:
-        """Take in arrivals; returns whether the line has begun anew because of them."""
+        """Take in arrivals; returns whether the line has begun again because of them."""
         if not len(index):
             return False
         if self._origin is None:
@@ -320,7 +320,7 @@ class TimeBase:
         return False
 
     def _append(self, bucket: Bucket) -> bool:
-        """Lay the line under a bucket, unless it contradicts the line; returns whether that began anew."""
+        """Lay the line under a bucket, unless it contradicts the line; returns whether that began again."""
         off_ns = self._residual((bucket.x, bucket.y_ns)) - self._offset_ns if self._settled else 0.0
         may_err_ns = 3.0 * self._line_error(bucket.x) if self._settled else 0.0
         if off_ns < -self._contradiction_ns - may_err_ns:
@@ -406,7 +406,7 @@ class TimeBase:
             self._unwrapper.measured(NS_PER_S / self._period_ns / self._samples_per_count, drift)
 
     def _line_of_any_rate(self) -> ClockLine | None:
-        """The line, if the arrivals are those of a device with a rate of its own, whatever that is.
+        """The line, if the arrivals are those of a device with its own rate, whatever that is.
 
         None if they are of a stall, or of frames that were held up: such tell no rate. Where the device has
         had another rate before, the arrivals of that time are forgotten.

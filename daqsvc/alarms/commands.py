@@ -21,7 +21,7 @@ class Verb(StrEnum):
     ACKNOWLEDGE = "acknowledge"
     """Somebody has seen it."""
     RESET = "reset"
-    """Let go of a latched alarm whose condition has gone."""
+    """Return a latched alarm to normal whose condition has gone."""
     SHELVE = "shelve"
     """Cover it for a stated time."""
     UNSHELVE = "unshelve"
@@ -122,7 +122,7 @@ class JsonCommand(BaseModel):
 
         Raises:
             ValidationError: it is none.
-            ValueError: a key stands twice: nobody knows which one is meant.
+            ValueError: a key is there twice: nobody knows which one is meant.
         """
         message = cls.model_validate_json(raw)
         json.loads(raw, object_pairs_hook=_once)

@@ -50,9 +50,9 @@ MOST_NAMED = 20
 class AlarmManager:
     """Turns diagnoses into alarms, exactly one event per change.
 
-    Besides the alarms of the rules there is one quality alarm per sensor, ``sensor-ok/<sensor>``: it is
-    active while a statement about that sensor is missing samples or the sensor is not OK, and it says
-    why. A statement that rests on several sensors cannot blame one of them; its quality alarm is
+    Besides the alarms of the rules there is one quality alarm per sensor, ``sensor-ok/<sensor>``: It is
+    active, with the reason, while a statement about that sensor lacks samples or the sensor is not OK. A
+    statement that rests on several sensors cannot blame one of them; its quality alarm is
     ``detector-ok/<detector>``.
 
     - Not OK suppresses every alarm that rests on the sensor, until a good statement comes.
@@ -217,7 +217,7 @@ class AlarmManager:
         Every alarm takes over its state, level, occurrence and holds, and holds them until a good diagnosis
         comes, which continues the occurrence or returns it. A suppression holds until whoever asked for
         it says good. Shelving goes on by the wall clock, but not for longer than was left. Delays begin
-        anew.
+        again.
 
         Args:
             events: the last event of each alarm, in the order in which they were published.

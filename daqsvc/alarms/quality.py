@@ -119,7 +119,7 @@ class SensorHealth:
     """What each detector has against its sensors, from a statement that is not good to the next good one.
 
     Missing samples do not take back that a sensor was not OK; a partial statement does, which has seen at
-    least half of them. It raises a doubt of its own when such statements prevail, and upholds one that
+    least half of them. It raises its own doubt when such statements prevail, and upholds one that
     samples are missing. A detector that says what share of its samples is missing, and that could not judge
     them, is good again only when that has lasted for some seconds.
     """

@@ -263,9 +263,9 @@ def decision_evidence(diagnosis: Diagnosis) -> float | None:
     """The evidence for the decision, in nats; None if the detector states none.
 
     A detector that follows the lead of its decision over every other mode (``lead.M``) has the evidence of
-    the narrowest lead over a mode outside the group; while it only knows that the mode has been left, what
-    speaks against it (``cusum.M``, the most of the group). Any other states the evidence of each fault over
-    none.
+    the narrowest lead over a mode outside the group. While it only knows that the mode has been left, the
+    evidence against it (``cusum.M``, the most of the group). Any other states the evidence of each fault
+    over none.
     """
     evidence, decision = diagnosis.evidence, diagnosis.decision
     among = {decision, *diagnosis.group}
@@ -504,7 +504,7 @@ def _figures(diagnosis: Diagnosis) -> Iterator[str]:
 
 
 def _identity(decision: str, group: tuple[str, ...]) -> str:
-    """The decision with all that it cannot be told apart from; the name of a change stands for its group."""
+    """The decision with all that it cannot be told apart from; the name of a change represents its group."""
     if decision == DEPARTURE:
         return decision
     return "|".join([decision, *sorted(set(group) - {decision})])

@@ -94,7 +94,7 @@ class Setpoint:
         return tuple(Limit(level, at, lower) for level, at, lower in described if at is not None)
 
     def judged(self, value: float) -> float:
-        """What of a value is held against the limits: itself, or how far it is from the reference."""
+        """What of a value is compared with the limits: itself, or how far it is from the reference."""
         return value if self.reference_deg is None else deviation_deg(value, self.reference_deg)
 
     def zone(self, value: float) -> str:
@@ -120,7 +120,7 @@ class Setpoint:
 
 
 class SetpointMonitor:
-    """Holds values against a `Setpoint`, by the time of the data.
+    """Compares values with a `Setpoint`, by the time of the data.
 
     Both delays count only time between two consecutive values that are known: a gap neither confirms
     that a limit is exceeded nor that it is kept, so the count stands still over it.

@@ -387,7 +387,7 @@ class ResidualChange(NamedTuple):
     Attributes:
         changed: whether one of the levels has risen beyond its limit.
         rise_db: float64 ``[1 + BANDS]``, of all bands together and of each.
-        limit_db: float64 ``[1 + BANDS]``, what they are held against.
+        limit_db: float64 ``[1 + BANDS]``, what they are compared with.
         windows: windows that it is the median of.
         quiet: whether the machine seems to stand still.
         gain: whether all bands have risen alike, so that a gain or a unit is wrong.

@@ -3,7 +3,7 @@
 A race is named by which side the excess is on, and any excess is on some side: a noisier sensor, a changed
 gain and steady forces look like one race or the other, too. But they are stationary, and hits are not. In
 frames as short as a hit, the energies of stationary Gaussian noise scatter in a known way, whatever its level
-and spectrum; those of hits scatter more, for some frames hold one and others do not.
+and spectrum. Those of hits scatter more, for some frames hold one and others do not.
 """
 
 from __future__ import annotations

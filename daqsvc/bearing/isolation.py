@@ -3,11 +3,11 @@
 The residual is cut into frames about as long as one hit. In frame t and line f of its spectrum, the healthy
 machine has the covariance S_0(f); a hit of race i adds a s(f) M_i(f). There a is the size of the hit, s the
 spectrum of a short dip, and M_i the second moment of the race's answer over models that are wrong by the
-stated mismatch: lines in which the two races look alike to such models then say nothing. The logarithm of the
-likelihood, each race at its best a, gives for each frame a ratio d of inner over outer race in nats, of which
-what noise alone does is taken off. Under a fault of one race all frames that decide are of one side; a ball
-hits the races in turn, and they are of both. So the rule is one of ratio again: that of the evidence for
-the inner race to that for either.
+stated mismatch. Lines in which the two races look alike to such models then have no weight. The logarithm
+of the likelihood, each race at its best a, gives for each frame a ratio d of inner over outer race in nats,
+of which what noise alone does is taken off. Under a fault of one race all frames that decide are of one
+side; a ball hits the races in turn, and they are of both. So the rule is one of ratio again: that of the
+evidence for the inner race to that for either.
 
 Against energies of the two components this gains much where the races look nearly alike: the noises of the
 two components are then nearly one, and cancel in d.

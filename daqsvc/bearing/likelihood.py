@@ -13,9 +13,9 @@ their own pace. With p the share of frames that do, the logarithm of the likelih
 
     max over a of  sum over t of  ln(1 - p + p exp L(t, a))
 
-Where hits come in bursts it is larger than that of the mean energy, and in steady noise it is not. The limit
-is the quantile at the stated rate of false alarms, by a seeded simulation of Gaussian frames that are held
-against a healthy machine learnt from as many frames as this one.
+Where hits come in bursts it is larger than that of the mean energy, and in steady noise it is not. The
+limit is the quantile at the stated rate of false alarms, by a seeded simulation of Gaussian frames that are
+compared with a healthy machine learnt from as many frames as this one.
 """
 
 from __future__ import annotations

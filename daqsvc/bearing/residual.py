@@ -6,10 +6,10 @@ Newton's equations give the force of each faulty spring from what the two accele
     D_in u_in = a_r + (k_s / s^2 + c_s / s) (a_r - a_b) / m_r - v / m_r
     D_out u_out = a_h - [(k_c / s^2 + c_c / s) (a_b - a_h) - (k_h / s^2 + c_h / s) a_h] / m_h
 
-These hold four integrations, which no filter may run: they are the invariant zeros of the model at s = 0.
-A high-pass hp(s) = (s / (s + w0))^6 takes them and a sensor's offset out, and what remains is stable with all
-poles at -w0: residual = hp(s) D G(s)^-1 (y - G_v v), and so residual i = hp(s) D_i u_i, whatever the other
-race does.
+These hold four integrations, which no filter may run: they are the invariant zeros of the model at s = 0. A
+high-pass hp(s) = (s / (s + w0))^6 takes them and a sensor's offset out, and what remains is stable with all
+poles at -w0. Then residual = hp(s) D G(s)^-1 (y - G_v v), and so residual i = hp(s) D_i u_i, whatever the
+other race does.
 """
 
 from __future__ import annotations
@@ -59,12 +59,12 @@ def _held(before_last: float, before: float, now: float, after: float, after_nex
 def separate(inputs: Floats, designs: Records, memories: Records, residual: Floats) -> None:
     """Run the residual generator over a block; see the top of this module for what it is made of.
 
-    A row with a missing input gives a missing residual; after it the generator starts anew from rest and is
+    A row with a missing input gives a missing residual; after it the generator starts again from rest and is
     silent until it has settled.
 
     Args:
         inputs: float64 ``[4 + n, 3]``: accelerations of rotor and housing, force of the unbalance, after the
-            four rows of the last block; changed where the generator starts anew.
+            four rows of the last block; changed where the generator starts again.
         designs: ``[1]`` of `GENERATOR`.
         memories: ``[1]`` of `MEMORY`; changed.
         residual: float64 ``[n, 2]``, written; two samples behind the inputs.
@@ -184,7 +184,7 @@ class TwoSensorResidual:
         return residual
 
     def reset(self) -> None:
-        """Forget everything: the next sample starts anew."""
+        """Forget everything: the next sample starts again."""
         self._memory["unsettled"] = -1
 
     def response(self, frequency_hz: Floats) -> Complexes:

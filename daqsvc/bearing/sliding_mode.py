@@ -5,7 +5,7 @@ from there obeys s' = -mu s + n . r - K sgn(s): a leaky sum with a soft threshol
 states each, are in `sim_hw.reproduce.bearing.experiment`.
 
 A fault of the inner race pushes the outer race's unit off its surface and leaves the inner race's unit in
-peace, and the other way round; a ball meets both races and pushes both off. With the model a little wrong the
+peace, and the other way round. A ball meets both races and pushes both off. With the model a little wrong the
 matched unit is not quite in peace, the less so the larger the fault is: absolute limits then call every large
 fault a ball's. The ratio of the two energies does not depend on the size of the fault.
 """

@@ -203,6 +203,6 @@ class TwoSensorMonitor:
         )
 
     def reset(self) -> None:
-        """Forget the samples, not the machine: the next window starts anew."""
+        """Forget the samples, not the machine: the next window starts again."""
         self._total.reset()
         self._drive.reset()

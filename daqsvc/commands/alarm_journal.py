@@ -65,7 +65,7 @@ def machines_of(store: Path) -> set[str]:
 
 
 def standing(store: Path, events: Sequence[EventDocument]) -> list[AlarmView]:
-    """How alarms stand, with what their own past adds to it; blocks.
+    """The states of alarms, with what their own past adds to it; blocks.
 
     Args:
         store: the store's directory.
@@ -140,7 +140,7 @@ ID_LENGTH = 8
 
 
 def current_table(alarms: Sequence[AlarmView], now_ns: int) -> str:
-    """How alarms stand: one line each, the worst first, then the newest.
+    """The states of alarms: one line each, the worst first, then the newest.
 
     Args:
         alarms: one each.

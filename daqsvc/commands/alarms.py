@@ -1,6 +1,6 @@
 """The verbs about alarms.
 
-``daqsvc alarms`` says from the journal how they stand and what has happened. What people do with them goes to
+``daqsvc alarms`` says from the journal their states and what has happened. What people do with them goes to
 the service that runs: ``ack``, ``reset``, ``shelve``, ``bypass``, and their undoing.
 """
 
@@ -145,7 +145,7 @@ def _show(store: Path, events: list[dict[str, Any]], arguments: argparse.Namespa
 
 
 def _doubt(store: Path) -> str:
-    """Why the journal may not be how things stand: what the disk cannot take, the service has in memory."""
+    """Why the journal may not be the present state: what the disk cannot take, the service has in memory."""
     from daqsvc.control import ControlError, UnreachableError, events_waiting  # noqa: PLC0415
     from daqsvc.outbox.files import is_read_only, remedy  # noqa: PLC0415
 

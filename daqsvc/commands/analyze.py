@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     Load: TypeAlias = Callable[[Path], MachineFile | None]
 
 _FEW_PER_PROCESS = 3
-"""A process of its own costs as much as so many short recordings."""
+"""Its own process costs as much as so many short recordings."""
 
 
 class AnalyzeCommand(VerbWithKernels):

@@ -77,7 +77,7 @@ class ExportCommand(VerbWithKernels):
         except RecordingError as error:
             return _fail(error, EXIT_REFUSED)
         except OSError as error:
-            # Libraries put words of their own around the reason.
+            # Libraries put their own words around the reason.
             why = os.strerror(error.errno) if error.errno else error
             return _fail(f"{arguments.to} is not written: {why}", EXIT_FAILED)
         finally:

@@ -24,7 +24,7 @@ def load_box(paths: Sequence[Path], load: Load) -> Box | None:
     """The box of a machine file, or of several, or of all ``*.toml`` of a directory that are not hidden.
 
     Args:
-        paths: as they were given; a directory stands for several machines, also if it holds one file only,
+        paths: as they were given; a directory represents several machines, also if it holds one file only,
             and ``plant.toml`` for the directory ``plant`` where there is no such file.
         load: reads a machine file.
 

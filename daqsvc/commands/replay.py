@@ -40,7 +40,11 @@ class ReplayCommand(VerbWithKernels):
         """See `daqsvc.cli.Command.add_arguments`."""
         parser.add_argument("snapshot", type=Path, metavar="SNAPSHOT", help="the snapshot (.mcap)")
         parser.add_argument(
-            "machine", type=Path, nargs="?", metavar="MACHINE", help="a machine file to judge by instead"
+            "machine",
+            type=Path,
+            nargs="?",
+            metavar="MACHINE",
+            help="a machine file to judge by instead",
         )
         parser.add_argument(
             "--speed",

@@ -28,7 +28,7 @@ US_PER_S = 1_000_000
 LONGEST_US = 20
 """Digits of what systemd counts to."""
 LEAST_WATCH_S = 3.0
-"""What parts are held to at least: sound ones take a second or so now and then."""
+"""The shortest limit of parts: sound ones take a second or so now and then."""
 SEND_S = 0.1
 """What a datagram may take: systemd takes them at once, unless it is being replaced by a new version."""
 

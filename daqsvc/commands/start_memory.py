@@ -30,8 +30,8 @@ _ANY = re.compile(r"[0-9a-f]+-[0-9a-f]+ ")
 def share_heaps() -> None:
     """Have all threads share two heaps; call before any is begun.
 
-    Else the C library makes one after the other, eight for each core, as blocking calls have threads of their
-    own. In each a MB or two stay of what is free again, so that a service would grow for long.
+    Else the C library makes one after the other, eight for each core, as blocking calls have their own
+    threads. In each a MB or two stay of what is free again, so that a service would grow for long.
     """
     with contextlib.suppress(AttributeError):  # another C library than GNU's
         ctypes.CDLL(None).mallopt(_M_ARENA_MAX, _HEAPS)

@@ -17,7 +17,7 @@ STATES = {"ok": "ok", "not_ok": "NOT OK", "missing": "missing", "unknown": "-"}
 
 
 def status_text(status: Document, width: int = 80, *, alarms_first: bool = False) -> str:
-    """How everything stands, from a `ServiceStatusPayload` by its keys in JSON.
+    """The state of everything, from a `ServiceStatusPayload` by its keys in JSON.
 
     Args:
         status: what the service has answered.

@@ -213,7 +213,7 @@ def _refuse_file(store: Path) -> None:
     except StorePathError as error:
         raise StoreNotFoundError(f"{error}") from None
     except OSError:
-        return  # whoever opens the journal says what this account may not do
+        return  # the reader of the journal reports what this account may not do
 
 
 def _of_file(path: Path, load: Load, machine: str | None, *, all_sound: bool) -> ChosenStore:

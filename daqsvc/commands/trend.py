@@ -358,7 +358,7 @@ def _put(path: Path, place: Path, *, force: bool) -> None:
 
 @contextmanager
 def _named(target: Path) -> Iterator[None]:
-    """What goes wrong here is said of the target, as the option names it: libraries have words of their own.
+    """What goes wrong here is said of the target, as the option names it: libraries have their own words.
 
     Raises:
         NoTrendError: instead of an OSError.

@@ -1,1 +1,1 @@
-"""Work on files that may be damaged or hostile, in a process of its own with bounded memory and time."""
+"""Work on files that may be damaged or hostile, in a separate process with bounded memory and time."""

@@ -93,7 +93,7 @@ class _Running:
 
 
 class ConfinedProcess:
-    """Calls functions in a process of its own, one at a time.
+    """Calls functions in a separate process, one at a time.
 
     The process starts with the first call, and again after a loss.
 

@@ -100,7 +100,7 @@ def put(detector: object, memory: DetectorMemory) -> None:
     """Have a detector that was just made of the same machine file remember that.
 
     Raises:
-        MemoryNotFittingError: it cannot; it may then remember some of it, and is to be made anew.
+        MemoryNotFittingError: it cannot; it may then remember some of it, and is to be made again.
     """
     try:
         if _Putter(memory, _packages(detector)).value(memory.tree, detector) is not detector:

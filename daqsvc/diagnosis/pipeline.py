@@ -68,7 +68,7 @@ class KernelThreads:
 
     Args:
         count: so many calls are made at a time, besides those that are set apart.
-        failed: told, on the thread, that one was interrupted by an exception of its own; it goes on.
+        failed: told, on the thread, that one was interrupted by its own exception; it goes on.
     """
 
     def __init__(self, count: int, failed: Callable[[BaseException], None]) -> None:
@@ -547,7 +547,7 @@ class Pipeline:
                 self._supervisor.failed(_part(detector), hangs, "the other detectors go on without it")
 
     def _see_names(self, detector: Detector, said: Sequence[Diagnosis], t_ns: int) -> None:
-        """See that a detector speaks for itself only: what its `silent` speaks for, or its own name.
+        """See that a detector makes statements in its own name only, or in those of its `silent`.
 
         Raises:
             BrokenContractError: it speaks under another name, which an alarm of another detector may follow.
@@ -582,7 +582,8 @@ class Pipeline:
             reason = f"detector {detector.name} has failed: {error_text(error)}"
             with self._supervisor.sparing_others(_part(detector), "nothing is said of that window"):
                 return [
-                    # It blames itself, also where it speaks for each of its sensors: they have done nothing.
+                    # It blames itself, also if it makes statements for each of its sensors: they have done
+                    # nothing.
                     replace(held, quality="missing", reason=reason, sensors=())
                     for held in said_of_silence(detector, 0.0, window.t_end_ns)
                 ]

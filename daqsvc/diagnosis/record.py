@@ -34,7 +34,7 @@ class Diagnosis:
         group: modes that the evidence cannot tell apart, the decision among them.
         statistics: what was measured, by name, e.g. ``{"rms": 0.07}``.
         units: unit of each statistic, by the same names; a pure number has none.
-        thresholds: limits that the statistics were held against, e.g. ``{"rms.alert": 0.11}``.
+        thresholds: limits that the statistics were compared with, e.g. ``{"rms.alert": 0.11}``.
         evidence: log-likelihood ratios in nats, by name.
         revolutions: shaft revolutions since the detector started, where it follows the shaft.
         quality: ``"good"``; ``"missing"`` if too many samples of the window are missing, or nothing can be

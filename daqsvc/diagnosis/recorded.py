@@ -386,7 +386,7 @@ class Statements:
 
 
 def statements_of(detector: Detector, recorded: Recorded) -> tuple[Statements, ...]:
-    """What a new detector says of a recording, apart by whom it speaks for.
+    """What a new detector says of a recording, apart by whom it is about.
 
     Args:
         detector: of ``recorded.machine``.
@@ -397,7 +397,7 @@ def statements_of(detector: Detector, recorded: Recorded) -> tuple[Statements, .
 
 
 def by_name(detector: str, diagnoses: Iterable[Diagnosis], rate_hz: float) -> tuple[Statements, ...]:
-    """What a detector said, apart by whom it speaks for: a level detector speaks for each of its sensors.
+    """What a detector said, apart by whom it is about: a level detector is about each of its sensors.
 
     Args:
         detector: its name.

@@ -39,7 +39,7 @@ class Judgement:
         statistics: what was measured, by name.
         decision: in a word; the severity unless given.
         units: of the statistics that have one.
-        thresholds: what the statistics were held against, by name.
+        thresholds: what the statistics were compared with, by name.
 
     Raises:
         ValueError: there is no such severity, a figure, unit or decision is of another kind, a figure is not

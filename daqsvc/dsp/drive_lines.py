@@ -1,7 +1,7 @@
 """Lines of what drives a machine: the mesh of a gear with its sidebands, and an induction motor's.
 
 Such lines may fall where a bearing's are looked for. A mesh is a strong line at a whole order, the number of
-teeth, well above the orders beside it, and so is its second harmonic; narrow sidebands come in pairs, as far
+teeth, well above the orders beside it, and so is its second harmonic. Narrow sidebands come in pairs, as far
 apart as the mate turns, and the mate has a whole number of teeth, too. A motor has a line at twice the line
 frequency, to within what a grid varies.
 

@@ -123,7 +123,7 @@ def squared_envelope(band: Band, bins: int) -> Envelope:
         bins: how many bins of the envelope's own spectrum will be looked at: those are free of aliasing.
 
     Returns:
-        ``[samples]`` at a rate of its own, over the signal's whole duration.
+        ``[samples]`` at its own rate, over the signal's whole duration.
     """
     least = int(OVERSAMPLING * len(band)) + bins
     # Lengths of small factors only, as of real transforms: those with 7 and 11 take twice as long.

@@ -4,10 +4,10 @@ In a band a filled-in value is wrong twice: what is missing takes its power alon
 spread the power of all frequencies over all others. Integration blows that up at the low ones: one sample in
 fifty lost of an accelerometer that hears a loud bearing makes a velocity that is not there.
 
-The autocovariance has neither fault. Its mean product at lag k needs no sample but the pairs that are there,
-and has the right expectation whatever else is missing, as long as samples are not lost because of their
-value. The power in a band is a sum over lags of it (Wiener and Khinchin), so it is right on average, too:
-negative lags and taper included it is the very sum that a complete window has.
+The autocovariance has neither fault. Its mean product at lag k needs no sample but the pairs that are
+there, and has the right expectation whatever else is missing, as long as samples are not lost because of
+their value. The power in a band is a sum over lags of it (Wiener and Khinchin), so it is right on average,
+too. With negative lags and taper, it is exactly the sum of a complete window.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def band_weights(n: int, rate_hz: float, low_hz: float, high_hz: float, *, integ
     if integrate:
         weight[inside] /= (2 * np.pi * frequency_hz[inside]) ** 2
     taper = np.hanning(n)
-    # One-sided spectrum: every bin but the first and last stands for two.
+    # One-sided spectrum: every bin but the first and last represents two.
     return taper, 2 * weight / (n * np.sum(taper**2))
 
 
@@ -149,7 +149,7 @@ def gapped_band_rms(
     """`band_rms` of a window that lacks samples, with the error that this brings.
 
     The error is that beside the complete window, not beside the machine: of the gaps' own spectrum, by which
-    each frequency's power leaks into all others, only the mean is known and taken off; how far chance may be
+    each frequency's power leaks into all others, only the mean is known and taken off. How far chance may be
     from it follows from the power that leaks.
 
     Args:

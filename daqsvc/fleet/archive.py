@@ -25,7 +25,7 @@ RECORDINGS = "recordings"
 MOST_DESCRIPTION_BYTES = 64_000_000
 """Of the files that describe one machine: more are recordings in the wrong place."""
 _STAMPS = ("mtime", "ETag", "etag", "md5", "content_md5", "LastModified", "last_modified", "created")
-"""What stores call that by which a file that was written anew is known, the first that there is."""
+"""What stores call that by which a file that was written again is known, the first that there is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class ArchivedFile:
         path: in the archive's file system.
         name: below the folder that it was looked for in.
         size_bytes: by the listing.
-        stamp: by which the listing shows that it was written anew.
+        stamp: by which the listing shows that it was written again.
     """
 
     path: str
@@ -228,7 +228,7 @@ class Archive:
         return [
             (PurePosixPath(about["name"]).name, about["type"] == "directory", about)
             for about in self._fs.ls(folder, detail=True)
-            if about["name"].rstrip("/") != prefix  # some stores list a folder as an entry of its own
+            if about["name"].rstrip("/") != prefix  # some stores list a folder as its own entry
         ]
 
 

@@ -48,12 +48,12 @@ def connected(name: str, cores: int) -> Iterator[Any]:
 
 @contextlib.contextmanager
 def _local(workers: int) -> Iterator[Any]:
-    """Processes that only this one can talk to: on loopback, by certificates of their own."""
+    """Processes that only this one can talk to: on loopback, by their own certificates."""
     import dask  # noqa: PLC0415 - of the extra
     from distributed import Client, LocalCluster  # noqa: PLC0415
 
     with (
-        # Who starts a worker anew is itself given up if that takes longer, as on a busy computer.
+        # Who starts a worker again is itself given up if that takes longer, as on a busy computer.
         dask.config.set({"distributed.deploy.lost-worker-timeout": "10 minutes"}),
         tempfile.TemporaryDirectory(prefix="daqsvc-fleet-", ignore_cleanup_errors=True) as folder,
         LocalCluster(

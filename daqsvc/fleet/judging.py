@@ -38,7 +38,7 @@ _PIECE_BYTES = 1 << 22
 _MOST_FILES = 1000
 _LONGEST_REASON = 2000
 _MOST_ENCODED = 4
-"""Text needs so many bytes for each that it says, at the most: a larger file than this cannot be read."""
+"""Text needs so many bytes for each that it says, at most: a larger file than this cannot be read."""
 
 
 class OtherVersionError(Exception):
@@ -80,7 +80,7 @@ class Judged:
 
     Attributes:
         rows: of the recordings that were judged, or could not be.
-        unchanged: by file, size and stamp of those that were written anew and hold what they held.
+        unchanged: by file, size and stamp of those that were written again and hold what they held.
     """
 
     rows: list[Row]

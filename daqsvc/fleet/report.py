@@ -125,7 +125,7 @@ class MachineReport:
         false_alarms: of these, the ones outside of every known fault; empty without known faults.
         false_recordings: alarming recordings outside of every known fault.
         seen: the known faults.
-        years: that the recordings that were judged stand for; None if no time is known.
+        years: that the recordings that were judged represent; None if no time is known.
         reasons: why recordings were not judged, each once.
         cost: of its false alarms; None: nothing is known of it.
     """
@@ -315,7 +315,7 @@ def fleet_report(
         results: the table.
         truth: known faults; all that they do not cover is healthy. None: nothing is known.
         cost: of a false alarm.
-        interval_s: how long each recording stands for; None: until the next one, by the times in their names.
+        interval_s: how long each recording represents; None: until the next one, by the times in their names.
 
     Raises:
         FleetError: the results cannot be read, or there are none.
@@ -397,7 +397,7 @@ def _span(fault: KnownFault, ordered: Sequence[Row]) -> _Span:
 
     Args:
         fault: what is known.
-        ordered: the recordings of its machine, judged or not; empty: its bounds cannot be held against any.
+        ordered: the recordings of its machine, judged or not; empty: its bounds cannot be compared with any.
 
     Raises:
         TruthError: a bound is neither a time nor a recording, or the last one is before the first.

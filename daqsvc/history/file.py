@@ -231,7 +231,7 @@ class HistoryFile(HistoryReader):
             os.close(create(path))
         for suffix in SIDE_FILES:
             restrict(path.with_name(path.name + suffix))
-        # Each call may come from a thread of its own, one after the other.
+        # Each call may come from a separate thread, one after the other.
         self._sql = sqlite3.connect(path, isolation_level=None, timeout=BUSY_S, check_same_thread=False)
         try:
             _check_version(self._sql, path)

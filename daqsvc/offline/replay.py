@@ -2,7 +2,7 @@
 
 The buses are replaced, and the hands that give samples to detectors: these give the windows that were given
 then. So every detector computes the same numbers from the same samples in the same portions. It begins with
-what it remembered then, if the snapshot has that, else anew. That nothing came is heard as it was said then:
+what it remembered then, if the snapshot has that, else again. That nothing came is heard as it was said then:
 no sample tells when.
 """
 
@@ -75,7 +75,7 @@ class ReplayError(Exception):
 
 @dataclass(slots=True)
 class Comparison:
-    """What was said then, held against what is said now.
+    """What was said then, compared with what is said now.
 
     Attributes:
         equal: said then and now, to the last bit.
@@ -98,9 +98,9 @@ class Replayed:
         causes: why the snapshot was made, in words.
         statements: of the detectors, in order.
         alarms: events of alarms, in order.
-        anew: the detectors that began anew, and why.
+        again: the detectors that began again, and why.
         notes: what a person should know of the snapshot, in sentences.
-        said: the statements held against those of the snapshot.
+        said: the statements compared with those of the snapshot.
         alarmed: likewise the events of alarms, but for people's.
     """
 
@@ -540,7 +540,7 @@ class Replay:
 
     def _report(self, diagnosis: Diagnosis) -> None:
         if diagnosis.quality == "missing" and diagnosis.end_index == diagnosis.first_index:
-            return  # it is heard when it was said
+            return  # it is used when it was stated
         self._result.statements.append(diagnosis)
         self._take(self._alarms.take(diagnosis))
 

@@ -1,7 +1,7 @@
 """Ids of commands, on disk before the command is obeyed, so that none is obeyed twice.
 
 A broker that has not seen our acknowledgement sends a command again, after a restart of the service too.
-Each id is a line of a small file, with a checksum; the file is written anew when it has grown to twice what
+Each id is a line of a small file, with a checksum; the file is written again when it has grown to twice what
 is needed. It is there before the journal of a new store is, with one line at least. So beside a journal a
 file that is missing, empty or has a damaged line has lost ids, and commands that were issued before the start
 are refused.

@@ -18,7 +18,7 @@ class TelemetryCounters:
         dropped_disk: messages that a nearly full disk or a broken file cost, as far as they could be counted.
         write_errors: transactions that failed.
         quarantined: corrupt files set aside.
-        restarts: how often the thread that keeps telemetry has begun again after a failure of its own.
+        restarts: how often the thread that keeps telemetry has begun again after its own failure.
         in_memory: 1 while the file cannot be used and telemetry is kept in memory, else 0.
     """
 

@@ -1,7 +1,7 @@
 """Messages that the broker will not take: kept on disk, out of the way of all others, to be tried again.
 
 Once a message on a topic is here, those that follow on the same topic come here too, so that each alarm's
-events stay in their order. Everything happens in a file of its own, which is opened for each of the few
+events stay in their order. Everything happens in a separate file, which is opened for each of the few
 things that are done with it.
 """
 

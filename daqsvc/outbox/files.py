@@ -28,7 +28,7 @@ WAL_PAGES = 1000
 """Pages in the write-ahead log from which on they are moved to the database: about 4 MiB."""
 
 WAL_MAX_BYTES = 8 * 1024 * 1024
-"""The write-ahead log is cut to this when it starts anew."""
+"""The write-ahead log is cut to this when it starts again."""
 
 ASIDE_KEPT = 3
 """Corrupt files that are kept; a failing disk must not fill itself with them."""

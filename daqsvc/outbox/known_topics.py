@@ -49,7 +49,7 @@ class KnownTopics:
 
         Args:
             latest: what the journal knows.
-            is_whole: whether these are all: then the file can be made anew, if it is damaged or missing.
+            is_whole: whether these are all: then the file can be made again, if it is damaged or missing.
         """
         restrict(self._path)
         topics = self._read()

@@ -1,7 +1,7 @@
 """The messages that stand in pages of a write-ahead log or a database, whatever SQLite says of it.
 
 For SQLite a log ends before its first wrong checksum: one flipped bit takes all that was committed behind it.
-But messages have checksums of their own. So the pages in the log are read one by one, and each message that
+But messages have their own checksums. So the pages in the log are read one by one, and each message that
 is whole counts; likewise the pages of a database whose first one, with the tables' definitions, is lost.
 Formats: https://www.sqlite.org/fileformat2.html, "The Write-Ahead Log" and "B-tree Pages".
 """
@@ -102,7 +102,7 @@ def _frames(log: bytes, size: int) -> Iterator[Frame]:
     now: Salts = struct.unpack_from(">II", log, 16)
     first: Salts = struct.unpack_from(">II", log, whole[0] + 8)
     if not _are_alike(now, first):
-        now = first  # the header is damaged, or the log has just begun anew
+        now = first  # the header is damaged, or the log has just begun again
     for at in whole:
         if _are_alike(now, struct.unpack_from(">II", log, at + 8)):
             start = at + _FRAME_HEADER_BYTES

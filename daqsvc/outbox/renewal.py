@@ -5,7 +5,7 @@
 3. The corrupt files become ``<journal>.corrupt-<ms>``.
 4. The saved one becomes the journal.
 
-Until the second step the corrupt journal is as it was, so that a start begins anew; from there on, a start
+Until the second step the corrupt journal is as it was, so that a start begins again; from there on, a start
 goes on. What has happened is kept in ``<journal>.damage`` until an alarm has reported it.
 """
 

@@ -1,7 +1,7 @@
 """A small database that is corrupt gives way to a new one with the rows that can still be read.
 
-As of the journal (see `outbox.renewal`), what can be read is in a new file, synced and under a name of its
-own, before the corrupt one is touched: whatever fails, and wherever a crash comes, nothing readable is lost.
+As of the journal (see `outbox.renewal`), what can be read is in a new file, synced and under its own name,
+before the corrupt one is touched. So nothing readable is lost, whatever fails and wherever a crash comes.
 """
 
 from __future__ import annotations

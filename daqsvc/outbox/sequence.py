@@ -1,7 +1,7 @@
 """Numbers that are never used twice, whatever happens to the journal's file.
 
 Consumers drop a message whose number they have seen, so a number that is used twice loses an alarm. The
-journal itself knows its highest number, but it can forget: a new file takes the place of a corrupt one; a
+journal itself knows its highest number, but it can forget: a new file takes the place of a corrupt one. A
 write-ahead log with a flipped bit ends, for SQLite, before that bit; a disk that lies about its cache loses
 in a power cut what it had confirmed. So two side files of one line each tell, apart from the database:
 
@@ -15,10 +15,10 @@ They are written one after the other, in place, so that a torn or a damaged one 
 disk stops neither. A disk that takes no writes at all stops both: then numbers may be given up to
 `UNRECORDED` above the ceiling, for messages in memory.
 
-Every run begins above all of these and above the wall clock in ms, also one that can write nothing: a run
-gives far fewer than a thousand numbers a second, so the next one begins above it though no disk knows of it.
-After an end that was not a proper one some more are skipped if the clock is not ahead of them; and a run
-begins far ahead when a side file is damaged or missing.
+Every run begins above all of these and above the wall clock in ms, also one that can write nothing. A run
+uses far fewer than a thousand numbers a second, so the next one begins above it without any trace on the
+disk. After an end that was not a proper one some more are skipped if the clock is not ahead of them; and a
+run begins far ahead when a side file is damaged or missing.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The outbox: alarms are on disk before anybody says that they are, and stay until the broker has them.
 
-Telemetry is the lower class: it goes to a file of its own, unsynced, and may be dropped (see
+Telemetry is the lower class: it goes to a separate file, unsynced, and may be dropped (see
 `outbox.telemetry`).
 """
 
@@ -55,12 +55,12 @@ class Outbox:
     All of a file's SQLite happens on one thread. Messages that arrive while a commit is on its way to
     the disk go together with the next one, so a message waits for two syncs at most and a burst shares
     one. If the disk is full or fails, messages wait in memory, can be read from there like all others, and
-    are tried again until it works; on a full one, telemetry gives way first, then messages that the broker
+    are tried again until it works. On a full one, telemetry gives way first, then messages that the broker
     has.
 
     Use it from one event loop; ``open`` before anything else, ``close`` at the end.
 
-    Beside the journal it has, in files of their own, the messages that the broker refuses (`dead_letters`)
+    Beside the journal it has, in their own files, the messages that the broker refuses (`dead_letters`)
     and the ids of the commands that have come (`command_ids`).
 
     Args:
@@ -135,7 +135,7 @@ class Outbox:
     def broker_is_ahead(self) -> bool:
         """Whether an earlier run may have told the broker what the journal never got.
 
-        Until `damage_is_told`, which says that the broker has been told how everything stands by now.
+        Until `damage_is_told`, which says that the broker has been told the state of everything by now.
         """
         return self._journal.was_ahead
 
@@ -146,14 +146,14 @@ class Outbox:
     async def append(self, topic: str, payload_of_sequence: Callable[[int], bytes], *, retain: bool) -> int:
         """Append a message and wait until it is on disk.
 
-        If the disk takes no writes, the broker may have it before; if that goes on for very long, the journal
+        If the disk takes no writes, the broker may have it before. If that goes on for very long, the journal
         gives up messages that the broker has and a later one has overtaken: then this returns, too.
 
         Args:
             topic: MQTT topic.
             payload_of_sequence: builds the payload from the message's sequence number; called on the
                 writer's thread, and once more for each time that a commit has failed.
-            retain: whether the broker shall keep it as the latest of its topic.
+            retain: whether the broker keeps it as the latest of its topic.
 
         Returns:
             The sequence number.

@@ -37,7 +37,7 @@ WAITING_MAX_BYTES = 4 * 1024 * 1024
 
 
 class Telemetry:
-    """The lower class of messages, with a thread and a file of its own.
+    """The lower class of messages, with a thread and its own file.
 
     Args:
         path: the SQLite file.

@@ -250,8 +250,8 @@ class TelemetryFile:
             connection.execute("BEGIN IMMEDIATE")
             if version == 0:
                 _create(connection)
-            # The monotonic clock of an earlier run means nothing now: what was left of a message's time
-            # is told by the wall clock, and a wall clock that was set back gives it no more than it had.
+            # The monotonic clock of an earlier run means nothing now. The wall clock shows how much of a
+            # message's time is left, and never more than before if it was set back.
             connection.execute(
                 "UPDATE telemetry SET expires_ns = ? + max(0, min(lifetime_ns, expires_wall_ns - ?))",
                 (self._clock.monotonic_ns(), self._clock.wall_ns()),

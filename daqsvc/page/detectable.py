@@ -1,4 +1,4 @@
-"""What can be told apart on a machine, computed by a process of its own: that takes seconds, and memory."""
+"""What can be told apart on a machine, computed by a separate process: that takes seconds, and memory."""
 
 from __future__ import annotations
 

@@ -123,7 +123,7 @@ def sentence(live: MachineLive, statement: Document) -> str:
 
 
 def _evidence(statement: Document, group: set[str]) -> str:
-    """What speaks for it: the least lead over what is excluded, or the value that is beyond its limit."""
+    """The evidence for it: the least lead over what is excluded, or the value that is beyond its limit."""
     leads = {
         name.removeprefix("lead."): nats
         for name, nats in statement.get("evidence", {}).items()

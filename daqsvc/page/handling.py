@@ -118,7 +118,7 @@ async def alarms_page(
         events, why = [], "the journal cannot be read by who runs the page"
     alarm = known.get(chosen)
     if chosen and events and (alarm is None or events[0]["wall_ns"] >= alarm["wall_ns"]):
-        alarm = events[0]  # what was done just now may not have been told yet
+        alarm = events[0]  # the last command may not be shown yet
     return {
         "rows": alarm_list(known, machine),
         "asked": asked,

@@ -1,4 +1,4 @@
-"""Listening to one machine, over whatever: what it tells is kept, and asked for anew when that ends."""
+"""Listening to one machine, over whatever: what it tells is kept, and asked for again when that ends."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Listening(ABC):
         self.streams: frozenset[str] = frozenset()
         """Those whose samples are to be asked for."""
         self.anew = asyncio.Event()
-        """Whether it has to be asked for anew, as other streams are wanted."""
+        """Whether it has to be asked for again, as other streams are wanted."""
         self._history = history
         self._wanted: dict[object, frozenset[str]] = {}
         self._has_begun = asyncio.Event()
@@ -80,7 +80,7 @@ class Listening(ABC):
 
     def _ask_anew(self) -> None:
         wanted = frozenset().union(*self._wanted.values())
-        # What is wanted no more goes on coming until something else is: it costs less than asking anew.
+        # What is wanted no more goes on coming until something else is: it costs less than asking again.
         if wanted - self.streams or (self.streams and not wanted):
             self.anew.set()
 

@@ -220,13 +220,13 @@ class MachineLive:
         self.left_out += line.get("left_out", 0)
 
     def go_on_from(self, before: MachineLive) -> None:
-        """Keep what is known of the time before the connection was made anew."""
+        """Keep what is known of the time before the connection was made again."""
         self.said = before.said
         self.probable = before.probable | self.probable
         for detector, now in self.decided.items():
             if (known := before.decided.get(detector)) is not None and known.decision == now.decision:
                 self.decided[detector] = known
-        if self.about["begun_ns"] == before.about["begun_ns"]:  # else samples are counted anew
+        if self.about["begun_ns"] == before.about["begun_ns"]:  # else samples are counted again
             self.rings = before.rings
             self._runs = before._runs
         for event in before.journal:

@@ -98,7 +98,8 @@ class _Statement(JsonPayload):
     model: str = Field(description="name and version of the model that it rests on")
     where: str = Field("", description="the part of the machine that it is about, e.g. a bearing; or empty")
     missing_share: Number = Field(
-        None, description="share of the window's samples that are missing; null if the detector does not say"
+        None,
+        description="share of the window's samples that are missing; null if the detector does not say",
     )
     bounds: dict[str, tuple[Number, Number]] = Field(
         {},

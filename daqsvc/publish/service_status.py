@@ -1,4 +1,4 @@
-"""What ``daqsvc status --json`` prints: how everything stands that the service knows, at one moment."""
+"""What ``daqsvc status --json`` prints: the state of everything that the service knows, at one moment."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class StandingAlarmPayload(JsonPayload):
 
 
 class AlarmsPayload(JsonPayload):
-    """How the alarms stand."""
+    """The states of the alarms."""
 
     by_state: dict[str, int] = Field(description="how many are in each state, normal included")
     standing: tuple[StandingAlarmPayload, ...] = Field(description="those not normal, the worst first")
@@ -114,7 +114,7 @@ class OutputPayload(JsonPayload):
 
 
 class ServiceStatusPayload(Stamped):
-    """How everything stands that the service knows."""
+    """The state of everything that the service knows."""
 
     schema_: Literal["daqsvc.service-status/1"] = Field(SCHEMA, alias="schema", description=SCHEMA_ABOUT)
     machine: str = Field(description="name of the machine")

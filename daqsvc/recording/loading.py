@@ -1,4 +1,4 @@
-"""What is done with a file where it is read: in a process of its own, as it may be damaged or hostile.
+"""What is done with a file where it is read: in a separate process, as it may be damaged or hostile.
 
 `daqsvc.recording.recording` calls these there.
 """

@@ -239,7 +239,7 @@ def _rates(stated: Mapping[str, float], column: _TimeColumn | None) -> str:
 def time_column(contents: Contents, length: int) -> str | None:
     """Name of the evenly spaced column of time that goes with channels of ``length`` samples.
 
-    That is the first which holds dates or is named like a time, samples that are missing aside; in a table
+    That is the first which holds dates or is named like a time, samples that are missing aside. In a table
     without a header it is the first column if it rises by even steps, which no measured signal does. Steps
     of one are left: they number the samples.
     """

@@ -94,10 +94,11 @@ def load_recording(
     """Read channels from a file of one of the kinds of `formats.READERS`.
 
     In the file a channel is named by its variable (``X105_DE_time``), the field of a struct
-    (``bearing.gs``), a column of a matrix (``data[2]``), the header or number from 0 of a table's column,
-    the number from 0 of a WAV file's channel, or the path of an HDF5 file's data set (``run/accel``).
+    (``bearing.gs``) or a column of a matrix (``data[2]``). In a table it is named by its header or its
+    number from 0, in a WAV file by its number from 0, in an HDF5 file by the path of the data set
+    (``run/accel``).
 
-    The file is read in a process of its own, within the limits of `set_limits`: what is damaged or hostile
+    The file is read in a separate process, within the limits of `set_limits`: what is damaged or hostile
     costs that process at most. Samples that are missing by a column of time are NaN.
 
     Integer samples of WAV files are scaled so that full scale is 1; all others stay as they are.
@@ -115,8 +116,8 @@ def load_recording(
             calculates with them in float64 all the same.
 
     Raises:
-        RecordingError: the file cannot be read within the limits, a channel is not there, not numeric, empty
-            or holds what no sensor measures, the channels have different lengths, or the rate is not known,
+        RecordingError: the file cannot be read within the limits. Or a channel is not there, not numeric,
+            empty, or has impossible values. Or the channels have different lengths, or the rate is not known,
             contradicted, or outside of `rate.LEAST_RATE_HZ` to `rate.MOST_RATE_HZ`.
     """
     path = Path(path)

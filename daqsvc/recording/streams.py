@@ -97,7 +97,7 @@ def checked(stream: RecordedStream, recording: str) -> tuple[RecordedStream, lis
 
     Returns:
         The stream, its names unique and its texts without control characters and lone surrogates, without a
-        begin where no count of nanoseconds holds it; and notes on what is not as it was, in sentences.
+        begin where no count of nanoseconds holds it. And notes on what is not as it was, in sentences.
 
     Raises:
         RecordingError: its names, units and samples do not belong together, or its rate is none.

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 VARIANCE_FACTOR = 1.5
-"""How much larger than their own figure the innovations' variance is taken to be after an adaptation: room
-for what orbit and rest do not put right, natural frequency and damping that are off by a few per cent."""
+"""How much larger than their own figure the innovations' variance is taken to be after an adaptation. This
+allows for errors of natural frequency and damping of a few per cent."""
 MODEL_ERROR = 0.1
 """Part of the healthy orbit that a rotor with two modes may be off by after a fault."""
 

@@ -197,7 +197,7 @@ class ModelBank:
         return int(self._memory.header["paper_decision" if self.rules.rule == "paper" else "decision"])
 
     def reseed(self) -> None:
-        """Start every observer anew, for instance after a long gap; the decision is held.
+        """Start every observer again, for instance after a long gap; the decision is held.
 
         The revolution that they need to find the machine is no evidence.
         """
@@ -238,7 +238,7 @@ class ModelBank:
         Args:
             xy: float64 ``[n, 2]``, measured position in clearances. A sample that is NaN, infinite or farther
                 out than any disc can be is missing: predicted through, and no evidence. When samples come
-                back after more than a revolution, the observers start anew.
+                back after more than a revolution, the observers start again.
             cos: float64 ``[n]``, cosine of the shaft angle, from the keyphasor mark. NaN: not known, missing.
             sin: float64 ``[n]``, its sine.
 

@@ -1,7 +1,7 @@
 """Observers of a rotor with two modes: what `discretise` makes for the paper's, with both axes coupled.
 
-Supports that are softer in one direction, oil films and gyroscopic moments couple the axes, so an observer is
-one recursion over (x, x', y, y') instead of the same one twice, and its reference orbit is an ellipse.
+Supports that are softer in one direction, oil films and gyroscopic moments couple the axes. So an observer
+is one recursion over (x, x', y, y') instead of the same one twice, and its reference orbit is an ellipse.
 """
 
 from __future__ import annotations

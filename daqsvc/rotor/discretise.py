@@ -8,8 +8,8 @@ the deviation from its own reference orbit; the forcing needs no integration at 
 stepped by Strang splitting: exact linear flow over half a sub-step, a kick by the contact force,
 flow over the other half.
 
-By their steady orbits some modes look alike: more unbalance and less damping make the same one at resonance;
-only the transient of a few revolutions differs, and the side that it falls on by chance is no diagnosis. Such
+By their steady orbits some modes look alike: more unbalance and less damping make the same one at resonance.
+Only the transient of a few revolutions differs, and the side that it falls on by chance is no diagnosis. Such
 modes are one group (`alike`).
 """
 
@@ -234,8 +234,8 @@ def _set_flow(observer: np.void, prefix: str, flow: Floats) -> None:
 def innovation_gain(observers: Observers, turn_rad: float) -> Complex:
     """What is left of a harmonic deviation in the innovations of each observer, once it is steady.
 
-    A constant-gain observer on its own orbit is x+ = F (x + K (u - C x)) with the deviation u as input;
-    the innovation is e = u - C x, so that e / u = 1 - C (z I - F (I - K C))^-1 F K at z = exp(i turn).
+    A constant-gain observer on its own orbit is x+ = F (x + K (u - C x)) with the deviation u as input.
+    The innovation is e = u - C x, so that e / u = 1 - C (z I - F (I - K C))^-1 F K at z = exp(i turn).
 
     Args:
         observers: ``[M]`` of `discretise.OBSERVER`.

@@ -29,7 +29,7 @@ ESCAPE_RADIUS = 3.0
 """No disc gets this many clearances from the centre: beyond it an observer is lost, or a sample wrong."""
 _ESCAPE_SQUARED = ESCAPE_RADIUS * ESCAPE_RADIUS
 UNDETERMINED = -1
-"""Index that stands for no mode."""
+"""Index that represents no mode."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -148,8 +148,8 @@ def _run_linear(
 ) -> State:
     """A linear observer over a block; its state after it.
 
-    Update and prediction are one step of the closed loop, x+ = F (I - K C) x + F K z: it halves the chain
-    of operations from a state to the next, which is what the time goes into.
+    Update and prediction are one step of the closed loop, x+ = F (I - K C) x + F K z. It halves the chain
+    of operations from a state to the next, which takes most of the time.
     """
     a, b, rest_x, rest_y = observer.a, observer.b, observer.rest_x, observer.rest_y
     xx, xv, vx, vv = observer.xx, observer.xv, observer.vx, observer.vv

@@ -61,7 +61,7 @@ class LavalRotor:
         static_sag_um: sag of the shaft under its weight towards -y; that of a horizontal disc on a
             massless shaft, g / omega_s^2, if not given. 0 for a vertical shaft.
         two_modes: the same rotor with the two modes of its run-up and a clearance of 1 um, so that its orbits
-            are in um; None where no run-up was seen, or two modes do not explain it.
+            are in um. None where no run-up was seen, or two modes do not explain it.
 
     Raises:
         ValueError: a figure that no rotor has.

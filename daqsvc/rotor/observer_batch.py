@@ -1,11 +1,11 @@
 """Memory of a bank for its kernels: eight observers side by side, so that the processor steps them together.
 
-All that a bank knows lies in one piece, `BankMemory`, which is handed over and copied as a whole: a header
-(`HEADER`), groups of observers (`GROUP`), constants of the observers, evidence of pairs of modes (`PAIR`) and
-where the axes are coupled what these observers have besides (`coupled.COUPLED`). A group holds constants,
-estimates and evidence of `WIDTH` modes, one member each; mode m is member m % WIDTH of group m // WIDTH. The
-lengths are part of the type: that is what lets the compiler turn a loop over members into vector
-instructions. Members that no mode needs explain nothing: their likelihood is 0.
+All that a bank knows lies in one piece, `BankMemory`, which is passed on and copied as a whole. It has a
+header (`HEADER`), groups of observers (`GROUP`), constants of the observers, evidence of pairs of modes
+(`PAIR`) and where the axes are coupled what these observers have besides (`coupled.COUPLED`). A group holds
+constants, estimates and evidence of `WIDTH` modes, one member each; mode m is member m % WIDTH of group m
+// WIDTH. The lengths are part of the type: that is what lets the compiler turn a loop over members into
+vector instructions. Members that no mode needs explain nothing: their likelihood is 0.
 """
 
 from __future__ import annotations

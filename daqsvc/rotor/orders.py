@@ -8,11 +8,12 @@ one phi that brings them closest to the present ones. What remains,
     d_hc = p_hc - exp(i h phi) b_hc
 
 is the departure. Each term is -ln of the probability of such a change by chance, so T of an unchanged
-machine is Gamma distributed, and smaller by the choice of phi. u^2 is the variance of the two means, of nu
-degrees of freedom, by the spectra of their own blocks beside each order and by what each order drifted.
+machine is Gamma distributed, and smaller by the choice of phi. Here u^2 is the variance of the two means,
+of nu degrees of freedom, by the spectra of their own blocks beside each order and by what each order
+drifted.
 
 A change must be significant and large. It is then attributed by its spectrum as velocity, the measure of
-ISO 20816: unbalance acts at 1X with the square of the speed, and what its 2X and 3X add comes of the
+ISO 20816. Unbalance acts at 1X with the square of the speed, and what its 2X and 3X add comes of the
 supports being not quite linear. Less damping near a resonance does the same, and without a phase and a
 model nothing tells the two apart: they are always named together.
 """

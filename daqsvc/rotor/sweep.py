@@ -2,7 +2,7 @@
 
 Loops over the members of a group become vector instructions; what is rare or branches (contact, a
 declaration, a lost observer, coupled axes) goes mode by mode. The CUSUM of log-likelihood ratios (Page 1954)
-stands by one mode; every other gathers evidence against that one since an onset of its own. As long as
+stands by one mode; every other gathers evidence against that one since its own onset. As long as
 nothing is declared, all modes are compared with all.
 
 numba's cache on disk looks at the file of a function alone: after a change in `kernels`, `coupled_kernels` or
@@ -139,7 +139,7 @@ def next_verdict(batch: Batch, pairs: Pairs, header: Header) -> tuple[int, int]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def stand_by(mode: int, batch: Batch, pairs: Pairs, header: Header) -> None:
-    """Make a mode the decision: its lead is what it won by, and the evidence starts anew.
+    """Make a mode the decision: its lead is what it won by, and the evidence starts again.
 
     Args:
         mode: index of the mode.
@@ -217,7 +217,7 @@ def _forget(observers: Observers, batch: Batch, pairs: Pairs, header: Header) ->
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def start_anew(memory: Bytes) -> None:
-    """Start every observer of a bank anew with the next sample that is usable, as after a long gap.
+    """Start every observer of a bank again with the next sample that is usable, as after a long gap.
 
     Args:
         memory: uint8 ``[n]``, see `batch.sections`; changed in place.
@@ -300,7 +300,7 @@ def _coast(observers: Observers, batch: Batch, cos: float, sin: float) -> None:
 def _guard_coupled(
     observers: Observers, couplings: Couplings, m: int, cos: float, sin: float, state: State
 ) -> State:
-    """The state of one observer; a rub observer that is lost starts anew."""
+    """The state of one observer; a rub observer that is lost starts again."""
     if observers[m].substeps == 0:
         return state
     return coupled_kernels.guarded(observers[m], couplings[m], observers[0], couplings[0], cos, sin, state)

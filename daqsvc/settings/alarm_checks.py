@@ -271,7 +271,7 @@ def _setpoints(alarm: SetpointAlarm, at: KeyPath) -> Iterator[Finding]:
 
 
 def _phase_alone(alarm: SetpointAlarm, at: KeyPath) -> Iterator[Finding]:
-    """A phase is held against a reference, and nothing else is."""
+    """A phase is compared with a reference, and nothing else is."""
     if alarm.measure not in PHASES:
         if alarm.reference_deg is not None:
             remedy = (

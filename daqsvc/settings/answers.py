@@ -26,7 +26,7 @@ _ACCEPTED: Mapping[Any, type[Any]] = {
 
 
 def meaning(annotation: str | ForwardRef, module: str) -> Any:
-    """The type that an annotation of a module of ours stands for; anything at all if that cannot be known."""
+    """The type that an annotation of a module of ours represents; anything at all if that cannot be known."""
     text = annotation.__forward_arg__ if isinstance(annotation, ForwardRef) else annotation
     try:
         return eval(text, vars(sys.modules[module]), _Imported(module))  # noqa: S307 - our own text

@@ -1,7 +1,7 @@
 """Asking plugins: whatever a hook of one raises is one sentence that names it, and ends nothing else.
 
-A hook is a public method or property of a `contract`, and of whatever is derived from it: each call of one is
-guarded, wherever it is called from, so that a new hook needs no guard of its own.
+A hook is a public method or property of a `contract`, and of whatever is derived from it. Each call of one
+is guarded, wherever it is called from, so a new hook needs no further guard.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What is computed from the samples: what all detectors share; each has a table of its own below it."""
+"""What is computed from the samples: what all detectors share; each has its own table below it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ TableT = TypeVar("TableT", bound=Section)
 
 
 class Alignment(Section):
-    """Lets a rotor detector take its sensors from several streams, with clocks of their own."""
+    """Lets a rotor detector take its sensors from several streams, with their own clocks."""
 
     max_error_us: Annotated[float, Field(ge=0.01, le=1_000_000)] = Field(
         default=200.0, description="samples that may be further off the reference's are left out"

@@ -184,7 +184,7 @@ def _made(point: EntryPoint, what: str, contract: type[Any]) -> Any:
 
 
 def forget() -> None:
-    """Look for plugins anew: for whoever installs one in a running process."""
+    """Look for plugins again: for whoever installs one in a running process."""
     _installed.cache_clear()
     pipeline_model.cache_clear()
     _with_outputs.clear()

@@ -106,7 +106,7 @@ def _homes(root: type[Section]) -> Mapping[str, tuple[str, ...]]:
 
 
 def forget_homes() -> None:
-    """Look anew which tables can hold a key: other plugins bring other tables."""
+    """Look again which tables can hold a key: other plugins bring other tables."""
     _homes.cache_clear()
 
 

@@ -1,4 +1,4 @@
-"""Whether the zones of an alarm are those of what it watches, and the limits that they stand for."""
+"""Whether the zones of an alarm are those of what it watches, and the limits that they represent."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def with_zones(machine: MachineFile) -> MachineFile:
-    """The machine file with the limits that zones stand for; those that it states itself win.
+    """The machine file with the limits that zones represent; those that it states itself win.
 
     Args:
         machine: the machine file, or what is valid of it.

@@ -4,7 +4,7 @@ Zone A is a new machine, B one that may run for long, C one that may run until i
 that takes damage. Limits of the maker, or of experience with the machine, are better where there are any.
 
 The velocities were found alike in two public programs, the law of the shaft is common knowledge; neither was
-held against the text of the standard, which is for sale.
+compared with the text of the standard, which is for sale.
 """
 
 from __future__ import annotations

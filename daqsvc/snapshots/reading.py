@@ -1,4 +1,4 @@
-"""A snapshot is read, in a process of its own: it may be cut, damaged, or made to do harm.
+"""A snapshot is read, in a separate process: it may be cut, damaged, or made to do harm.
 
 `load` is what that process does, `read_snapshot` what calls it.
 """
@@ -86,7 +86,7 @@ def _block(stream: str, data: bytes | memoryview) -> Entry:
 
 
 def load(path: str) -> tuple[Document, list[NDArray[np.float32]]]:
-    """Read a snapshot; called in a process of its own.
+    """Read a snapshot; called in a separate process.
 
     Returns:
         ``about``, ``files`` in base64, ``notes`` and ``entries``: of a block all but its samples, which are
@@ -166,7 +166,7 @@ def notes_of(damage: Damage) -> list[str]:
 
 
 def read_snapshot(path: Path, limits: ResourceLimits, process: ConfinedProcess | None = None) -> Snapshot:
-    """Read a snapshot, in a process of its own.
+    """Read a snapshot, in a separate process.
 
     Args:
         path: the file.

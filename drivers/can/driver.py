@@ -1,10 +1,10 @@
 """The CAN and CAN FD driver: SocketCAN by a reader of ours, anything else through python-can.
 
-python-can's own asyncio reader hangs when the interface goes down and takes one frame per turn of the
-event loop (python-can#1865, #1912), so the bus is read by a thread of ours. It takes batches from a source,
-has them sorted and decoded as arrays, and hands them to the event loop, where the driver opens the bus and
-opens it again, places what the thread has decoded, and counts. When the event loop cannot keep up the
-thread waits: frames then pile up in the interface, and what overflows there shows as a gap in the devices'
+python-can's own asyncio reader hangs when the interface goes down and takes one frame per turn of the event
+loop (python-can#1865, #1912), so the bus is read by a thread of ours. It takes batches from a source, has
+them sorted and decoded as arrays, and passes them to the event loop. There the driver opens the bus, opens
+it again, places the decoded frames in time, and counts. When the event loop cannot keep up the thread
+waits: frames then pile up in the interface, and what overflows there shows as a gap in the devices'
 counters.
 """
 

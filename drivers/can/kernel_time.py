@@ -26,10 +26,10 @@ _HARDWARE_WINDOW_NS = NS_PER_S
 class KernelTime:
     """Converts stamps of CLOCK_REALTIME, and of a controller's own clock, to monotonic time.
 
-    The offset between wall and monotonic time is measured anew at each batch. When the wall clock has
-    stepped since the last one, a stamp of the batch may have been taken before or after the step: the
-    later of the two times that is not in the future is taken. For frames arrive late, never early, as
-    the time base (`daqsvc.acquisition.timebase`) has it.
+    The offset between wall and monotonic time is measured again at each batch. When the wall clock has
+    stepped since the last one, a stamp of the batch may have been taken before or after the step. The later
+    of the two times that is not in the future is taken. For frames arrive late, never early, as the time
+    base (`daqsvc.acquisition.timebase`) has it.
 
     A controller's clock is tied to the kernel's by the earliest kernel stamps of the last second: its stamps
     lack the delay of the interrupt. In that second the two clocks drift apart by 1 us per ppm at most.
@@ -83,7 +83,7 @@ class KernelTime:
         # The window holds rising offsets only: its first one is the least of the last second.
         window = self._hardware_offsets
         if window and abs(offset_ns - window[-1][1]) > NS_PER_S:
-            window.clear()  # the controller's clock began anew, or was set
+            window.clear()  # the controller's clock began again, or was set
         while window and window[0][0] < now_ns - _HARDWARE_WINDOW_NS:
             window.popleft()
         while window and window[-1][1] >= offset_ns:

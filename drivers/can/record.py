@@ -1,6 +1,6 @@
 """The recording of a CAN bus: every frame that the reader receives, in order, into log files.
 
-A thread of its own writes. It is handed frames in batches and never waited for: what it cannot keep up
+Its own thread writes. It is handed frames in batches and never waited for: what it cannot keep up
 with, or the disk refuses, is left out and counted, and the bus is read on.
 """
 

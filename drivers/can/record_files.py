@@ -52,7 +52,7 @@ class LogEncoder(Protocol):
     """A log that is being written."""
 
     flush_ns: int
-    """How long frames may gather before they are taken: a container of BLF has a price of its own."""
+    """How long frames may gather before they are taken: a container of BLF has its own price."""
 
     def add(self, frames: CanBatch, t_us: Sequence[int]) -> None:
         """Add frames, with their times in microseconds since the epoch, which never step back."""

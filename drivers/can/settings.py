@@ -176,7 +176,7 @@ class DbcCounter(Section):
 
 
 class DbcChannel(Section):
-    """One quantity in a DBC message: its consecutive samples are signals of their own."""
+    """One quantity in a DBC message: its consecutive samples are their own signals."""
 
     name: Annotated[Name, Field(description="name of the channel", examples=["x"])]
     signals: Annotated[

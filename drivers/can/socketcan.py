@@ -315,7 +315,7 @@ class Stamps(NamedTuple):
 
     Attributes:
         software_ns: int64 ``[n]``, when the kernel took each in, on CLOCK_REALTIME; 0 where it does not say.
-        hardware_ns: int64 ``[n]``, when the controller took each in, on a clock of its own; 0 where it does
+        hardware_ns: int64 ``[n]``, when the controller took each in, on its own clock; 0 where it does
             not say.
         dropped: how many datagrams the kernel had dropped on this socket before the last one, modulo 2^32;
             None if it does not say, which means none as long as it never said.

@@ -1,9 +1,9 @@
 """One Modbus line and its units: one request at a time, quiet after a failure, silent units set aside.
 
 A reply on a serial line carries no number that tells which request it answers. One that comes after its
-request was given up would be taken for the reply to the next request, so after every failure the line is
-kept quiet, and whatever arrives meanwhile is thrown away and counted. The same goes for a line that has just
-been opened: whoever had it before may have asked for what is still to come.
+request was given up would be taken for the reply to the next request. So after every failure the line is
+kept quiet, and bytes that arrive in this time are thrown away and counted. The same goes for a line that
+has just been opened: whoever had it before may have asked for what is still to come.
 
 A unit that is dead, or one request of a unit that lives, is set aside after a few requests without reply, and
 asked again ever more rarely. A unit is dead when nothing that it is asked is answered any more: a queue that

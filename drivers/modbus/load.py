@@ -1,7 +1,7 @@
 """How much of a serial Modbus line's time its polling takes: an estimate from its characters and silences.
 
 A request of a read has 8 characters and its reply 5 beside two for each register (Modbus Application
-Protocol 1.1b3, 6); each character has 11 bits, or 10 without parity and a second stop bit. Before the reply,
+Protocol 1.1b3, 6). Each character has 11 bits, or 10 without parity and a second stop bit. Before the reply,
 and before the next request, the line is silent for 3.5 characters, 1.75 ms at least (Modbus over serial line
 1.02, 2.5.1.1). How long a unit takes until it answers nobody knows: `USUAL_ANSWER_S` is a usual time.
 """

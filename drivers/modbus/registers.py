@@ -1,10 +1,10 @@
 """Numbers in 16-bit registers: where they lie, in which order of words and bytes, and what they are worth.
 
-A Modbus register travels high byte first, but a number of several registers travels in whatever order
-its device was written for. The four orders that occur are named by the letters of a 32-bit number whose
-bytes are A (highest) to D: ``ABCD`` is big-endian, ``CDAB`` has its words exchanged, ``BADC`` its bytes
-within each word, ``DCBA`` is little-endian. The same two exchanges apply to numbers of 64 bits; a number
-of 16 bits knows only the one of bytes.
+A Modbus register travels high byte first, but a number of several registers travels in whatever order its
+device was written for. The four orders that occur are named by the letters of a 32-bit number whose bytes
+are A (highest) to D. ``ABCD`` is big-endian, ``CDAB`` has its words exchanged, ``BADC`` its bytes within
+each word, ``DCBA`` is little-endian. The same two exchanges apply to numbers of 64 bits; a number of 16
+bits knows only the one of bytes.
 """
 
 from __future__ import annotations

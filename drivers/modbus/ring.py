@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from drivers.modbus.replies import ModbusCounters
 
 REQUESTS_PER_LOOK = 16
-"""Requests for samples between two looks at the counter, at most: if one fails, all are made again."""
+"""Requests for samples between two readings of the counter, at most: if one fails, all are made again."""
 
 
 class _Look(NamedTuple):
@@ -35,19 +35,19 @@ class _Look(NamedTuple):
 class DeviceRingReader(CountedReader[RingLayout]):
     """Follows the write counter of a ring.
 
-    What was written between two looks at the counter is read, and the look after that tells whether any of
-    it may have been overwritten meanwhile. A request that fails is repeated at the next look: only what
-    the device has overwritten is lost, and the counter says how much that is.
+    What was written between two readings of the counter is read, and the reading after that tells
+    whether any of it may have been overwritten meanwhile. A request that fails is repeated at the next
+    reading: only what the device has overwritten is lost, and the counter says how much that is.
 
     No look is believed by itself. A counter does not go back: one that was damaged on its way is above the
-    next one, or below the one before. A counter that has begun again is so at the next look, too, and then
-    only what must have been written since is read.
+    next one, or below the one before. A counter that has begun again is so at the next reading, too, and
+    then only what must have been written since is read.
     """
 
     def __init__(
         self, spec: StreamSpec[RingLayout], port: BusPort, counters: ModbusCounters, *, checked: bool
     ) -> None:
-        """Begin with the next look.
+        """Begin with the next reading.
 
         Args:
             spec: the stream.
@@ -98,7 +98,7 @@ class DeviceRingReader(CountedReader[RingLayout]):
         return first
 
     async def _read_until(self, look: _Look, line: ModbusLine) -> bool:
-        """Read what has been written until a look; returns whether the next look confirms that."""
+        """Read what was written until a reading; returns whether the next reading confirms that."""
         self._place(look)
         assert self._next is not None  # noqa: S101 - `_place` has set it
         layout, start = self._layout, self._next
@@ -124,7 +124,7 @@ class DeviceRingReader(CountedReader[RingLayout]):
         since_look = (after.written - look.written) % self._modulus
         lately = self._sample_clock.most(after.seen_ns - look.asked_ns)
         if since_look <= lately + self._sample_clock.standstill:
-            # Of two looks in order the later one is nearer to the truth, if the first was too low.
+            # Of two readings in order the later one is nearer to the truth, if the first was too low.
             self._known = after, self._index + unread
         if unread >= self._per_read:
             self._seen = after  # there is more already

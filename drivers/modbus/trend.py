@@ -178,7 +178,7 @@ class _TrendStream:
 class TrendReader(PollingReader):
     """Polls registers on a schedule, which begins with the first sample; its count is its place in that.
 
-    A poll that fails is a lost sample of every stream that has registers in it, and of no other; and so is
+    A poll that fails is a lost sample of every stream that has registers in it, and of no other. And so is
     one whose request could not go out before the next was due, because others held the line.
 
     Args:

@@ -117,7 +117,7 @@ class _Lines:
         self._again = self._header.copy()
 
     def __iter__(self) -> _Lines:
-        # A reader takes the header in a loop of its own, which is its first.
+        # A reader takes the header in its own loop, which is its first.
         self._loops += 1
         return self
 

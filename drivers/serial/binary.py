@@ -150,7 +150,8 @@ class BodyCodec:
             batch: where to put frames, unknown ids and wrong lengths.
 
         Returns:
-            bool ``[n]``, False for bodies that are no frame at all: neither length nor CRC speak for them.
+            bool ``[n]``, False for bodies that are no frame at all: neither length nor CRC is evidence for
+            them.
         """
         buffer, starts, lengths, intact, arrival_ns = bodies
         sound = intact & (lengths > 0) if self.checked else np.zeros(len(starts), np.bool_)

@@ -1,6 +1,6 @@
 """The driver of serial ports: framed binary samples, or lines of text, from a device that sends by itself.
 
-pyserial opens the port and sets it up; the bytes are read from its file descriptor by a thread of ours, cut
+pyserial opens the port and sets it up. The bytes are read from its file descriptor by a thread of ours, cut
 into frames and decoded by another, and handed to the event loop in batches. When the event loop cannot keep
 up the threads wait: bytes then pile up in the kernel, and what overflows there shows as a gap in the
 devices' counters. A port that goes away, because it was unplugged, is opened again by its path.
@@ -260,7 +260,7 @@ def _assembler(spec: StreamSpec[Any], port: BusPort) -> StreamAssembler:
 
 
 def _wrap_s(spec: StreamSpec[Any]) -> float:
-    """In what time a stream's counter begins anew; 0 if it has none, and its rate is told by arrivals."""
+    """In what time a stream's counter begins again; 0 if it has none, and its rate is told by arrivals."""
     layout: FrameLayout | LineLayout = spec.layout
     if isinstance(layout, LineLayout):
         return 0.0 if layout.counter is None else 2.0**layout.counter.bits / spec.rate_hz

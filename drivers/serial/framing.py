@@ -29,7 +29,7 @@ SHOWN_BYTES = 16
 
 
 def in_place(ends: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Where frames end stands for when they arrived."""
+    """Where frames end represents when they arrived."""
     return ends
 
 
@@ -93,7 +93,7 @@ class Framing(Protocol):
         ...
 
     def restart(self) -> None:
-        """Forget what is incomplete: the port has been opened anew, in the middle of a frame perhaps."""
+        """Forget what is incomplete: the port has been opened again, in the middle of a frame perhaps."""
         ...
 
 

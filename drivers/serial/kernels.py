@@ -2,7 +2,7 @@
 
 Each goes over a whole batch without the interpreter and without its lock. What they compute is what
 `binascii.crc_hqx` and the library `cobs` compute; those write the frames of the virtual bus, and are what the
-tests hold these against.
+tests compare these with.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def unstuff(buffer: Bytes, starts: Places, stops: Places) -> Places:
     """Take the stuffing out of COBS pieces in place; the body of each then begins at its start + 1.
 
     A code tells how far the next one is, and stands where a zero was, so most codes just become that zero.
-    Only one of 0xFF stands for no byte; what is behind the next code then moves up by one.
+    Only one of 0xFF represents no byte; what is behind the next code then moves up by one.
 
     Args:
         buffer: uint8, with the pieces in it; changed.

@@ -22,7 +22,7 @@ PAUSE_BYTES = 1024
 """What may gather in a pause, of the 4096 bytes that a port of Linux holds until its driver is told to wait
 (N_TTY_BUF_SIZE); a UART without flow control loses what comes then."""
 WRAP_SHARE = 1.0 / 16.0
-"""Of the time in which a counter begins anew: frames are placed by when they come, to a quarter of that."""
+"""Of the time in which a counter begins again: frames are placed by when they come, to a quarter of that."""
 SELDOM_SHARE = 1.0 / 4.0
 """Of a pause: bytes that come less often are read one by one."""
 
@@ -33,7 +33,7 @@ def longest_pause_s(bits_per_character: int, baud: int, wraps_s: Iterable[float]
     Args:
         bits_per_character: on the wire.
         baud: bit/s.
-        wraps_s: by stream, in what time its counter begins anew.
+        wraps_s: by stream, in what time its counter begins again.
     """
     filled_s = PAUSE_BYTES * bits_per_character / baud
     return min(LONGEST_S, filled_s, *(WRAP_SHARE * wrap_s for wrap_s in wraps_s))

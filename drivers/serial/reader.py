@@ -259,7 +259,7 @@ class SerialReader(threading.Thread):
         self._post(self._accept, batch)
 
     def _look_at_line(self, now_ns: int) -> None:
-        """Count what the UART has found wrong since the last look."""
+        """Count what the UART has found wrong since the last poll."""
         if self._line_errors is None or now_ns < self._line_errors_due_ns:
             return
         self._line_errors_due_ns = now_ns + LINE_ERRORS_EVERY_NS

@@ -1,4 +1,4 @@
-"""The page of ``daqsvc page`` beside the demo, in a process of its own as in the field."""
+"""The page of ``daqsvc page`` beside the demo, in a separate process as in the field."""
 
 from __future__ import annotations
 

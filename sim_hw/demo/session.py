@@ -159,7 +159,7 @@ class Script:
         samples_per_rev: to count delays in revolutions; None if the shaft is not known.
         faults: of the node and its link.
         seed: of everything random, to be told in the summary.
-        detector: the one whose decisions are held against ``onsets``.
+        detector: the one whose decisions are compared with ``onsets``.
     """
 
     title: str

@@ -186,7 +186,7 @@ class FifoStore:
         oldest = [self._queue[k] for k in range(min(len(self._queue), self._layout.samples_per_read))]
         if not oldest:
             return b""
-        # One count stands for all: samples behind a gap must wait for the next reply.
+        # One count represents all: samples behind a gap must wait for the next reply.
         first = oldest[0][0]
         together = [row for k, (index, row) in enumerate(oldest) if index == first + k]
         self._handed_out = len(together)

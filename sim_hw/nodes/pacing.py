@@ -60,9 +60,8 @@ class RealTimePacer:
 class DrivenPacer:
     """Drives a `DrivenClock`, at most ``speed`` times as fast as real time, and never past its receiver.
 
-    The clock moves in steps of at most 2 ms simulated, never past the time that some device waits
-    for, and it stands still while the receiver's backlog is over its limit: however fast the playing,
-    nothing is lost by it.
+    The clock moves in steps of at most 2 ms simulated, never past the time that some device waits for, and
+    it stops while the receiver's backlog is over its limit. So nothing is lost at any speed of playing.
 
     The start is the reading of the clock when the pacer is made.
 

@@ -66,7 +66,7 @@ class Rules:
         """All that is to be mended, in the order of the texts."""
         for text in texts:
             most = self.longest.get(text.kind, math.inf)
-            for sentence in sentences(text.words):
+            for sentence in sentences(text.words, text.kind):
                 if (words := length(sentence)) > most:
                     beginning = " ".join(sentence.split()[:8])
                     yield Finding(
@@ -80,9 +80,13 @@ class Rules:
                     )
 
 
-def sentences(words: str) -> list[str]:
-    """The sentences of a text."""
-    return _END.split(words)
+def sentences(words: str, kind: str = "page") -> list[str]:
+    """The sentences of a text; in a message a semicolon ends one, too: what follows is the remedy."""
+    return [
+        sentence
+        for part in _END.split(words)
+        for sentence in (part.split("; ") if kind == "message" else [part])
+    ]
 
 
 def length(sentence: str) -> int:

@@ -27,7 +27,8 @@ CODE = "`x`"
 _LITERAL = re.compile(r"``[^`]+``|`[^`\n]+`")
 _BLANK = re.compile(r"\s*$")
 # A list item is a text by itself, and so is an entry below "Args:", a row of a table and a heading.
-_ITEM = re.compile(r"\s*([-*] |\d+\. |\w+: |\w+\n|[|=:`#])")
+# So is a formula.
+_ITEM = re.compile(r"\s*([-*] |\d+\. |\w+: |\w+\n|[|=:`#]|\w+( \w+)? = )")
 _DIRECTIVE = re.compile(r"#\s*(noqa|type: ignore|pragma).*")
 # What is written in a language for machines, in strings of several lines.
 _PROGRAM = re.compile(

@@ -123,7 +123,7 @@ class Scales:
         self._caution = 1.0 if shaft.seen else rules.unseen_caution
 
     def weigh(self) -> dict[Part, PartEvidence]:
-        """Evidence for all parts; lines that the foremost part explains do not speak for another one."""
+        """Evidence for all parts; lines that the foremost part explains are no evidence for another one."""
         evidence = {part: self._part(part) for part in PARTS}
         significant = [part for part in PARTS if evidence[part].z >= evidence[part].z_limit]
         if len(significant) < 2:
@@ -227,7 +227,7 @@ def refuse_rivals(
 ) -> None:
     """Refuse to name a part that has these lines only at a doubtful speed.
 
-    Harmonics may be too few to confirm the stated speed, and yet more of them may speak for the speed at
+    Harmonics may be too few to confirm the stated speed, and yet more of them may indicate the speed at
     which the same lines are those of another part.
 
     Args:
@@ -269,7 +269,7 @@ RACES: tuple[Part, ...] = ("inner", "outer")
 class Decision:
     """The word, what it cannot be told from, the shares of belief, and how thin it is.
 
-    ``both``: the parts of the group have lines of their own each, and can be told apart: all may be damaged.
+    ``both``: the parts of the group have their own lines each, and can be told apart: all may be damaged.
     """
 
     verdict: RaceWord

@@ -79,7 +79,7 @@ class RaceFeatures:
         levels: mean square in octave bands.
         speed_rpm: of the shaft, as its harmonics show it.
         speed_unconfirmed: why they do not confirm it; empty if they do.
-        rival_rpm: the speed that they speak for instead; None if they do not.
+        rival_rpm: the speed that they indicate instead; None if they do not.
         revolutions: of the shaft in the record.
         notes: what is odd about the samples.
         repairs: what was wrong with them and put right.
@@ -399,7 +399,7 @@ class RaceWatch:
             window_samples: ``[n]``, about `window` samples that follow those before; call `forget` where they
                 do not.
             speed_rpm: the shaft's speed now, if it is measured; a change of more than the tolerance of the
-                test begins anew.
+                test begins again.
 
         Raises:
             UnfitError: no verdict can rest on these samples. They are forgotten.
@@ -415,5 +415,5 @@ class RaceWatch:
         return verdict_of(features, self._rules, self._baseline)
 
     def forget(self) -> None:
-        """Begin anew: samples are missing, or the machine has changed."""
+        """Begin again: samples are missing, or the machine has changed."""
         self._held = np.empty(0)

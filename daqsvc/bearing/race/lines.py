@@ -2,7 +2,7 @@
 
 Evidence is found for a line at every frequency, narrow or smeared by slip. Gaussian noise has no kinematic
 lines, yet the best of many offsets always scores something. The mean of that score grows with the logarithms
-of the revolutions in the record and of the searched slip; it was fitted on 2400 records of white noise of 60
+of the revolutions in the record and of the searched slip. It was fitted on 2400 records of white noise of 60
 to 300 revolutions, sampled at 12 and 25.6 kHz, of four bearings.
 
 The lines of a part together make a comb, which is searched over slip (`best_comb`).
@@ -198,7 +198,7 @@ class ModulationDepth:
 
         Returns:
             About 1 where the harmonic itself is smeared, as speed that wanders smears it to either side;
-            about 0 beside a line of its own.
+            about 0 beside its own line.
         """
         harmonic = round(order)
         gap = float(np.copysign(max(2.0 * abs(order - harmonic), SMEAR * order), order - harmonic))

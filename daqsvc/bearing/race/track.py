@@ -47,8 +47,8 @@ CAP_NATS = 16.0
 RAMP_LEAD_NATS = 0.5
 RAMP_LEAD_PER_BIN = 0.25
 FOLLOWED_LEAD_NATS = 1.75
-"""Leads in votes over an even speed, of a ramp (and per bin that it smears 1X over) and of a followed phase:
-more than they had in measured records of shafts that turn evenly (0.3 and 1.7)."""
+"""Leads in votes over an even speed, of a ramp (and per bin that it smears 1X over) and of a followed
+phase. This is more than they had in measured records of shafts that turn evenly (0.3 and 1.7)."""
 LEAST_WANDER = 5e-4
 LEAST_POWER = 1e-300
 

@@ -31,7 +31,7 @@ PLACES: Mapping[Part, str] = {"inner": "inner race", "outer": "outer race", "bal
 
 @dataclass(frozen=True, slots=True)
 class PartEvidence:
-    """What speaks for damage of one part.
+    """The evidence for damage of one part.
 
     Attributes:
         z: significance of its kinematic lines, in standard deviations of the Gaussian-noise null, search
@@ -108,8 +108,8 @@ class RaceVerdict:
     Attributes:
         verdict: the one word; ``"changed"`` needs a baseline.
         group: parts that the evidence cannot tell apart, the verdict among them; or both races.
-        both: whether the parts of the group have lines of their own each: all of them may be damaged.
-        evidence: what speaks for each part.
+        both: whether the parts of the group have their own lines each: all of them may be damaged.
+        evidence: of each part.
         probability: share of belief per word, summing to one, of the words that were weighed.
         lines: kinematic lines found, strongest first.
         margin: how far the decision is from another, as a factor of severity: 1 is on the fence, 10 the most
@@ -163,7 +163,7 @@ class RaceRules:
         ball_severity_limit: of a ball.
         unseen_caution: factor on a race's limit of severity where no harmonics confirm the speed.
         unseen_ball_caution: the same for a ball: at a wrong speed it is a ball that races are most taken for.
-        elsewhere_ball_caution: the same where harmonics speak for another speed instead.
+        elsewhere_ball_caution: the same where harmonics indicate another speed instead.
         depth_limit: least size of a race's lines.
         ball_depth_limit: least size of a ball's lines.
         steadiness_limit: least steadiness of a race's lines.
@@ -273,7 +273,7 @@ class RaceBaseline:
     """Evidence and level of the same bearing in good order, at about the same speed; see `race_baseline`.
 
     Attributes:
-        evidence: what spoke for each part although it was in good order.
+        evidence: of each part although it was in good order.
         levels: mean square in octave bands.
         speed_rpm: of the shaft.
         orders: of the bearing; None if not known.

@@ -1,4 +1,4 @@
-"""From questions to answers: each is held to what ``daqsvc check`` would say of the file that comes of it."""
+"""From questions to answers: each must give a file that ``daqsvc check`` accepts."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def refusal(answers: Answers, file: Path) -> str | None:
 
 
 def checked(text: str, file: Path) -> MachineFile:
-    """The machine file in a text, held to what ``daqsvc check`` holds it to.
+    """The machine file in a text, checked by what ``daqsvc check`` checks.
 
     Raises:
         MachineFileError: it cannot be used.

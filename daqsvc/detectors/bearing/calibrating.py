@@ -83,7 +83,7 @@ def _learn(
 
 @dataclass(slots=True)
 class HealthyRun:
-    """A recording of the healthy machine, learnt anew for each sampling rate that is compared with it.
+    """A recording of the healthy machine, learnt again for each sampling rate that is compared with it.
 
     Attributes:
         setup: what it is judged by.
@@ -97,7 +97,7 @@ class HealthyRun:
 
     @property
     def against(self) -> tuple[str, str]:
-        """What speaks against it as a healthy run, see `against_healthy_run`."""
+        """The evidence against it as a healthy run, see `against_healthy_run`."""
         if self._against is None:
             self._against = against_healthy_run(self.recording, self.setup)
         return self._against

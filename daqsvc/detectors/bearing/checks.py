@@ -98,8 +98,8 @@ def _kinematics(bearing: WatchedBearing, at: KeyPath) -> Iterator[Finding]:
 def _geometry(orders: FaultOrders, at: KeyPath) -> Iterator[Finding]:
     """What any bearing with a standing outer ring has, whatever its contact angle.
 
-    Of z balls of diameter d on a circle of diameter D, with g = d / D times the cosine of the contact angle:
-    bpfo = z (1 - g) / 2 = z ftf, bpfi = z (1 + g) / 2, bsf = D / (2 d) (1 - g^2).
+    Of z balls of diameter d on a circle of diameter D, with g = d / D times the cosine of the contact
+    angle. Then bpfo = z (1 - g) / 2 = z ftf, bpfi = z (1 + g) / 2, bsf = D / (2 d) (1 - g^2).
     """
     balls = orders.bpfo + orders.bpfi
     if abs(balls - round(balls)) > _OFF * balls:
@@ -311,7 +311,7 @@ def _ring(draft: MachineFile) -> Iterator[Finding]:
 
 
 def _blocks(draft: MachineFile, settings: Bearing) -> Iterator[Finding]:
-    """Blocks that a device takes by themselves are long enough for a look each."""
+    """Blocks that a device takes by themselves are long enough for an evaluation each."""
     first = named(draft).get(settings.bearings[0].sensor)
     stream = None if first is None else draft.streams.get(first.stream)
     block = None if stream is None else stream.layout.block

@@ -76,7 +76,7 @@ class HealthyGathering:
     def add(
         self, samples: NDArray[np.float32], finding: BearingFinding, speed_rpm: float
     ) -> BearingBaseline | None:
-        """Take in a look that follows those before.
+        """Take in an evaluation that follows those before.
 
         Args:
             samples: float32 ``[n, channels]`` of the stream.
@@ -126,7 +126,7 @@ MODEL = "bearing-race/1"
 
 _BLOCKS_PER_LOOK = 5
 _LEAST_LAST = 0.5
-"""Part of a look that is worth a last one."""
+"""Part of an evaluation that is worth a last one."""
 _NO_LONGER_LARGE = 8.0
 """Danger stays until the innovations are less than so many times the healthy ones."""
 SAME_SPEED = 0.05
@@ -145,12 +145,12 @@ class BearingDetector:
     ``inner_or_outer``. Two looks must agree before a fault is raised, eight before it is taken back. Any
     fault is alert; danger from ten times the healthy innovations on.
 
-    A look with missing samples, or at a dead or clipped accelerometer, or at a machine that stands still,
-    clears nothing: the decision is held and the reason said, unless another bearing shows a fault by itself.
+    A look with missing samples, or at a dead or clipped accelerometer, or at a machine at rest, clears
+    nothing. The decision is held and the reason stated, unless another bearing shows a fault.
 
     A bearing with two accelerometers is also watched by direction (`RaceDirection`); `find` says how that
     joins what the lines say. With a keyphasor the lines are looked for at the measured speed. Where that
-    leaves the tolerance of the race test, the evidence begins anew; at another speed than the healthy
+    leaves the tolerance of the race test, the evidence begins again; at another speed than the healthy
     machine's nothing is compared with it. Neither clears anything.
 
     Args:
@@ -241,7 +241,7 @@ class BearingDetector:
         return [self._statement(evaluated, self._end_index, t_ns, changed=False)]
 
     def finish(self, rest: NDArray[np.float32], t_ns: int) -> Diagnosis | None:
-        """A last look, at the end of a recording.
+        """A last evaluation, at the end of a recording.
 
         Args:
             rest: float32 ``[n, channels]``, what did not fill a block.
@@ -300,7 +300,7 @@ class BearingDetector:
         return self._statement(evaluated, first_index, t_ns, changed=changed, missing_share=share)
 
     def _missing_share(self, samples: NDArray[np.float32]) -> float:
-        """Share of the samples that lack a value of any sensor that the look rests on."""
+        """Share of the samples that lack a value of any sensor that the evaluation rests on."""
         columns = [column for bearing in self.bearings for column in bearing.columns]
         if self.keyphasor is not None:
             columns.append(self.keyphasor.column)
@@ -346,7 +346,7 @@ class BearingDetector:
         return Evaluation(races, changes, "good", reason, finding, directions)
 
     def _follow_speed(self, samples: Floats) -> Iterator[tuple[Quality, str]]:
-        """Measure the speed; begin anew where it has changed. Yields what is against the look."""
+        """Measure the speed; begin again where it has changed. Yields what is against the evaluation."""
         self._speed_unknown = False
         if self.keyphasor is None:
             return

@@ -1,4 +1,4 @@
-"""Which race by direction: accelerometers on rotor and housing, held against the healthy machine.
+"""Which race by direction: accelerometers on rotor and housing, compared with the healthy machine.
 
 The monitor of `daqsvc.bearing.two_sensors`, look by look: whether the residual holds more than the healthy
 machine's, which race the hits in it come from, and what the sliding units say to that.
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Direction:
-    """What two accelerometers say of a look.
+    """What two accelerometers say of an evaluation.
 
     Attributes:
         detected: whether the residual is not the healthy machine's.
@@ -97,7 +97,7 @@ class RaceDirection:
         )
 
     def judge(self, pair: Floats, *, suspected: bool = False) -> Direction | None:
-        """Judge a look.
+        """Judge an evaluation.
 
         Args:
             pair: float64 ``[n, 2]``, rotor and housing in their units; NaN where missing.

@@ -24,7 +24,7 @@ LARGE = 10.0
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """What one look has found.
+    """What one evaluation has found.
 
     Attributes:
         races: of each bearing that could be judged, by name.
@@ -90,7 +90,7 @@ def figures_of(evaluated: Evaluation, where: str) -> dict[str, float]:
 
 
 def thresholds_of(evaluated: Evaluation, where: str) -> dict[str, float]:
-    """What the figures are held against."""
+    """What the figures are compared with."""
     thresholds: dict[str, float] = {}
     if evaluated.change is not None:
         thresholds |= {"residual.departure": 1.0, "residual.ratio.danger": LARGE}
@@ -108,7 +108,7 @@ def thresholds_of(evaluated: Evaluation, where: str) -> dict[str, float]:
 def evidence_of(evaluated: Evaluation, where: str) -> dict[str, float]:
     """Log-likelihood ratio of each part in nats: of its lines against noise, or of its hits if that is more.
 
-    A ball's hits are those of both races: the fewer of them speak for it.
+    A ball's hits are those of both races: the fewer of them are evidence for it.
     """
     if where not in evaluated.races:
         return {}

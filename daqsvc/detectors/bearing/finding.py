@@ -163,7 +163,7 @@ class ConfirmedState:
 
     @property
     def sound(self) -> bool:
-        """Whether nothing is held against the machine."""
+        """Whether nothing is compared with the machine."""
         return self.decision in {UNDETERMINED, "normal"}
 
 

@@ -277,7 +277,7 @@ def _concluded(
     diagnoses: list[Diagnosis],
     looks: _Looks,
 ) -> BearingVerdict:
-    """What the detector stands by at the end, with the figures of the look that shows it most."""
+    """What the detector stands by at the end, with the figures of the evaluation that shows it most."""
     columns = [recording.names.index(bearing.sensor) for bearing in detector.bearings]
     in_turn = columns == list(range(columns[0], columns[0] + len(columns)))
     chosen = slice(columns[0], columns[0] + len(columns)) if in_turn else columns  # the former copies nothing

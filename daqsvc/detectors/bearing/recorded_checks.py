@@ -61,7 +61,7 @@ def meant_in_hz(recording: Recording, setup: BearingSetup) -> str:
 
 
 def against_healthy_run(recording: Recording, setup: BearingSetup) -> tuple[str, str]:
-    """What speaks against a recording as the healthy run.
+    """The evidence against a recording as the healthy run.
 
     Args:
         recording: said to be of the machine in good order.
@@ -89,7 +89,7 @@ def ball_order_problem(orders: BearingOrders) -> str:
     """What is odd about a stated BSF; empty if nothing: BPFI and BPFO alone determine it.
 
     Their sum is the number of balls, their difference over it the ratio of ball to pitch diameter, times the
-    cosine of the contact angle, which makes BSF smaller by itself; so only about twice the value is told.
+    cosine of the contact angle, which makes BSF smaller by itself. So only about twice the value is told.
 
     Args:
         orders: as stated.

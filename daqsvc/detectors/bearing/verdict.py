@@ -237,7 +237,7 @@ class BearingVerdict(Verdict):
 
 
 def evidence_json(race: RaceVerdict) -> dict[str, Any]:
-    """What speaks for each part, for the output."""
+    """The evidence for each part, for the output."""
     return {
         part: {
             "z": e.z,

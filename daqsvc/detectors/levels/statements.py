@@ -1,4 +1,4 @@
-"""What is said of a sensor's level: held against its setpoints, and kept while the data is not good."""
+"""What is said of a sensor's level: compared with its setpoints, and kept while the data is not good."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Limits(NamedTuple):
         danger: the same.
         alert_low: lower setpoint.
         danger_low: the same.
-        reference_deg: a phase that the measure is held against: its setpoints are how far it may be from it.
+        reference_deg: a phase that the measure is compared with: its setpoints are how far it may be from it.
         zones: where zones B, C and D of a standard begin, in the unit of the measure.
     """
 

@@ -1,6 +1,6 @@
 """Trend values: levels that a device has measured itself, such as an RMS velocity or a temperature.
 
-What comes is held against the setpoints as it is. A value that stands still is no dead sensor here: the
+What comes is compared with the setpoints as it is. A value that stands still is no dead sensor here: the
 temperature of a steady machine does not move for hours.
 """
 
@@ -137,7 +137,7 @@ class TrendDetector:
     def _judge(
         self, channel: TrendChannel, samples: NDArray[np.float32], evidence: Evidence
     ) -> Diagnosis | None:
-        """What is to be said of the next value; None while the last one still stands for a missing one."""
+        """What is to be said of the next value; None while the last one still represents a missing one."""
         known = samples[np.isfinite(samples)]
         if not len(known):
             self._missed[channel.sensor] += 1

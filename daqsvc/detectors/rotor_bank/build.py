@@ -107,7 +107,7 @@ def _run_up(path: Path, speed_rpm: float) -> TwoModeFit:
     """The rotor's two modes, by a file of ``daqsvc calibrate``.
 
     Raises:
-        CalibrationFileError: there are none, they do not stand for the machine, or not at its speed.
+        CalibrationFileError: there are none, they do not represent the machine, or not at its speed.
     """
     fit = load_record(path).two_modes
     if fit is None:

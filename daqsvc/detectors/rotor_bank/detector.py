@@ -53,18 +53,18 @@ class RotorBankDetector:
 
     Says one `Diagnosis` a revolution, and one at once for every change of the declared mode. The
     probabilities in it are those of the rule that decides: under ``cusum`` the posterior odds of the
-    evidence ``lead_M``; under ``paper``, and while nothing is declared yet, the paper's conditional
+    evidence ``lead_M``. Under ``paper``, and while nothing is declared yet, the paper's conditional
     probabilities, which are always there as statistics ``paper.M`` too. The
     evidence, in nats: ``lead.M``, of the declared mode over mode M, and ``cusum.M``, of M against the
     declared one since the onset of its evidence. Under the paper's rule every severity is normal: a
     posterior of 0.9 is no ground for an alarm.
 
-    When the evidence against the declared mode is past its threshold, but does not yet favour one other
-    mode, the decision is ``departure`` with the candidates as group, at once and until the cause is known;
-    the declared mode has not changed by that.
+    The evidence against the declared mode may be past its threshold before it favours one other mode. The
+    decision is then ``departure`` with the candidates as group, at once and until the cause is known.
+    The declared mode has not changed by that.
 
     A gap of up to a revolution is predicted through; after a longer one, and after one whose length is a
-    guess, the observers start anew. While the quality is not good there is no evidence, and the decision is
+    guess, the observers start again. While the quality is not good there is no evidence, and the decision is
     held.
 
     Args:
@@ -212,7 +212,7 @@ class RotorBankDetector:
 
     @property
     def variance_factor(self) -> float:
-        """Room for what the models miss: of the noise, and of the orbit where two modes stand for many."""
+        """Room for what the models miss: of the noise, and of the orbit where two modes represent many."""
         healthy = self._bank_modes[0].rotor
         if healthy.isotropic:
             return VARIANCE_FACTOR

@@ -1,4 +1,4 @@
-"""The modes of a rotor bank in physical terms, and the models that they stand for."""
+"""The modes of a rotor bank in physical terms, and the models that they represent."""
 
 from __future__ import annotations
 

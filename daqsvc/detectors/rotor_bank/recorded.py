@@ -67,12 +67,12 @@ def _draw(recording: Recording, statements: Statements, modes: tuple[str, ...], 
 def bank_verdict(recording: Recording, statements: Statements, faults: Mapping[str, str]) -> RotorVerdict:
     """What a recording says about a rotor by its bank alone.
 
-    Modes become the faults that they stand for; levels of one fault are one verdict.
+    Modes become the faults that they represent; levels of one fault are one verdict.
 
     Args:
         recording: the recording.
         statements: all that the bank said.
-        faults: the fault that each mode stands for.
+        faults: the fault that each mode represents.
     """
     quality = known_against(recording)
     source = str(recording.source)

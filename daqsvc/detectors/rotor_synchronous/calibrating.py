@@ -1,6 +1,6 @@
 """From recordings of a healthy machine to what a calibration file holds of it.
 
-A recording through which the speed goes up or down tells the rotor; one at steady speed tells the baseline at
+A recording through which the speed goes up or down tells the rotor. One at steady speed tells the baseline at
 that speed, by the detector that watches the machine live (`analyse`), over all of its revolutions.
 """
 

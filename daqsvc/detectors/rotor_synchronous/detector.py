@@ -64,7 +64,7 @@ class RotorSynchronousDetector:
     """Says whether a rotor has changed since it was calibrated, and to what; see `Detector`.
 
     The first revolutions, or a calibration of an earlier time, are the healthy machine. Each later one is
-    held against them: a change is declared at once, as decision ``departure``, and named when the rotor has
+    compared with them: a change is declared at once, as decision ``departure``, and named when the rotor has
     settled (`RotorWatch`). Decisions are ``undetermined`` while calibrating, ``normal``, ``departure``
     between a change and its first name, and then the verdict: ``unbalance``, ``damping_loss``,
     ``static_load``, ``stiffness_loss``, ``rub``, ``unmodelled`` (none of them) or ``small_change`` (below
@@ -75,7 +75,7 @@ class RotorSynchronousDetector:
 
     One `Diagnosis` a revolution at most: when something changes, at each look at a change, and else once a
     second. A revolution with missing samples, a dead or clipped probe, an angle that nobody knows, or a speed
-    farther than 5 % from the calibrated one is not judged; the decision is held and the reason said. A
+    farther than 5 % from the calibrated one is not judged. The decision is held and the reason said. A
     calibration that is refused is a quality that is not good, with the reason, until one succeeds.
 
     A shaft that turns clockwise is looked at from its other end (x mirrored): its whirl is then forward, and
@@ -233,7 +233,7 @@ class RotorSynchronousDetector:
         return [self._stater.silence(self._standing(), verdict, self._turns.end_index, t_ns)]
 
     def finish(self) -> Diagnosis | None:
-        """A last look, at the end of a recording; None if there was no revolution to look at."""
+        """A last evaluation, at the end of a recording; None if there was no revolution to look at."""
         if self._report is None:
             return None
         reports = self._watch.finish()

@@ -259,7 +259,7 @@ def _judge(
 
 
 def _healthy_state(setup: RotorSetup, speed_rpm: float) -> Calibration | None:
-    """The calibration that the recording is held against; None to make one of its first revolutions."""
+    """The calibration that the recording is compared with; None to make one of its first revolutions."""
     if not setup.calibrations:
         return None
     try:
@@ -384,7 +384,7 @@ class _Conclusion:
         return departed
 
     def _last_look(self) -> Identification | None:
-        """The last look; one more at the end of the recording, unless the last revolution had one."""
+        """The last evaluation; one more at the end of the recording, unless the last revolution had one."""
         if not self.reports or self.reports[-1].state != "departed":
             return None
         if self.reports[-1].looked:
@@ -398,7 +398,7 @@ class _Conclusion:
             if report is departed:
                 watched -= report.revolution - (report.onset_revolution or report.revolution)
                 break
-            # What begins anew begins with the revolutions of its calibration.
+            # What begins again begins with the revolutions of its calibration.
             watched = watched + 1 if report.state == before == "watching" else 0
             before = report.state
         return min(_MOST_REFERENCE, calibration.revolutions + max(0, watched))
@@ -420,7 +420,7 @@ class _Conclusion:
 
 
 def history(reports: Sequence[WatchReport], last: Identification | None) -> tuple[ModeStep, ...]:
-    """Every change of what the watch said, and at the end the last look if it said something else."""
+    """Every change of what the watch said, and at the end the last evaluation if it said something else."""
     steps: list[ModeStep] = []
     for report in reports:
         before = steps[-1] if steps else None
@@ -538,7 +538,7 @@ def declared_at(
     Args:
         places: the recording.
         reports: among which to look, in order.
-        last: the look that names it; None if none does.
+        last: the evaluation that names it; None if none does.
     """
     if last is None or not last.named:
         return None
@@ -556,7 +556,7 @@ def declared_at(
 
 def _alarm(places: Places, segment: Sequence[WatchReport], last: Identification | None = None) -> RotorAlarm:
     looks = [report.identification for report in segment if report.looked and report.identification]
-    # A name is kept through one look that sees a healthy machine: such a look says nothing of the fault.
+    # A name is kept through one evaluation that sees a healthy machine: it says nothing of the fault.
     faulty = [look for look in looks if look.verdict != "normal" and "normal" not in look.candidates]
     seen = last or (faulty[-1] if faulty else None)
     return RotorAlarm(

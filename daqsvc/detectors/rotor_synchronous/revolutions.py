@@ -140,7 +140,7 @@ class RevolutionStream:
         """Take in samples; the revolutions that they complete.
 
         A gap of up to a revolution is bridged as missing samples. After a longer one, where the index goes
-        back, and after a break the revolutions begin anew; at a stated speed the angle goes on.
+        back, and after a break the revolutions begin again; at a stated speed the angle goes on.
 
         Args:
             samples: float32 ``[n, channels]`` of the stream; what is not finite is missing.
@@ -189,7 +189,7 @@ class RevolutionStream:
         self._held_index += len(raw)
         since = self._cutter_index - self.origin
         if self._reference == "fixed":
-            # After a gap the cutter begins at angle zero anew; the shaft does not.
+            # After a gap the cutter begins at angle zero again; the shaft does not.
             angle = math.tau * math.fmod(since / self.period, 1.0)
             revolutions = replace(revolutions, angle_rad=revolutions.angle_rad + angle)
         vectors = synchronous_vectors(revolutions)

@@ -125,7 +125,7 @@ class Stater:
         """The statement after a revolution, if there is something to say.
 
         Args:
-            standing: how things stand.
+            standing: the present state.
             verdict: what the last revolutions are worth.
             end_index: absolute index of the sample after the revolution.
             t_ns: monotonic time of the last sample of it.
@@ -168,7 +168,7 @@ class Stater:
         """Decision and group by now."""
         report = standing.report
         if report is None or report.state == "calibrating":
-            # A baseline that is sought anew is no reason to forget what was found.
+            # A baseline that is sought again is no reason to forget what was found.
             return self._decision, self._group
         identification = report.identification
         if report.state == "watching":

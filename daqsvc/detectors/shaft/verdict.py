@@ -49,7 +49,7 @@ class RotorAlarm:
         onset: estimated begin of the change.
         departure: where the alarm was raised.
         declaration: where its last group was first named; None if it never was.
-        verdict: the most likely fault by its last look; None if it was over before there was one.
+        verdict: the most likely fault by its last evaluation; None if it was over before there was one.
         group: all that could not be told apart, the most likely first.
         returned: where the machine was found healthy again; None if it was not.
     """
@@ -95,8 +95,8 @@ class ModeStep:
         revolution: the revolution.
         verdict: most likely; None between a departure and the first look at it.
         group: all that cannot be told apart.
-        named: whether two looks agree.
-        probabilities: of that look.
+        named: whether two evaluations agree.
+        probabilities: of that evaluation.
     """
 
     revolution: int
@@ -135,13 +135,13 @@ class RotorVerdict(Verdict):
     Attributes:
         verdict: the fault, the most likely one of ``group``; None if refused.
         group: all that the evidence cannot tell apart, the most likely first.
-        named: whether two looks in a row agreed, or the machine is normal.
+        named: whether two evaluations in a row agreed, or the machine is normal.
         probabilities: of every verdict.
         evidence: nats of every hypothesis over "normal".
         severity: modulus of the change over the healthy whirl's amplitude.
         level: how large each fault of the group would be, in its own terms
             (`daqsvc.rotor.synchronous.severity`).
-        identification: what the last look saw; None while the machine is healthy.
+        identification: what the last evaluation saw; None while the machine is healthy.
         onset: estimated begin of the change.
         departure: where the alarm is raised.
         declaration: where the final group was first named.

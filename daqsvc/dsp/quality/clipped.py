@@ -1,10 +1,10 @@
 """Whether a signal's peaks are cut off by the range of its sensor or converter.
 
-A coarse converter repeats its values between the extremes as well, and a sine only twice as often at its top
-as elsewhere: a clipped signal repeats its extreme four times as often as any other value (`ends_cut_off`).
-What differs is how much of it spoils the result. A revolution has its peaks in a sixteenth of its samples at
-least, an accelerometer's spectrum tolerates a hundredth, and of a whole recording of probes a few samples are
-worth a remark.
+A coarse converter repeats its values between the extremes as well, and a sine only twice as often at its
+top as elsewhere. A clipped signal repeats its extreme four times as often as any other value
+(`ends_cut_off`). What differs is how much of it spoils the result. A revolution has its peaks in a
+sixteenth of its samples at least, an accelerometer's spectrum tolerates a hundredth, and of a whole
+recording of probes a few samples are worth a remark.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def clipped_at(signal: Floats) -> float | None:
         signal: float64 ``[n]``, without missing samples.
     """
     least = max(CLIPPED_REVOLUTION * len(signal), LEAST_IN_REVOLUTION)
-    # Sorting costs more than this look, which leaves nothing to sort in nearly every revolution.
+    # Sorting costs more than this evaluation, which leaves nothing to sort in nearly every revolution.
     if all(np.count_nonzero(signal == extreme) < least for extreme in (signal.min(), signal.max())):
         return None
     return next(iter(ends_cut_off(signal, least)), None)

@@ -40,7 +40,7 @@ class Misread:
         self._is_misread = False
 
     def update(self, values: Iterable[float]) -> str:
-        """Take in values; returns what speaks for a wrong order or type, in a clause, empty if nothing.
+        """Take in values; returns the evidence for a wrong order or type, in a clause, empty if nothing.
 
         Once that is so, it stays until the last `REMEMBERED` values are all of a size that can be measured.
 

@@ -1,10 +1,10 @@
 """Samples that are missing: how many may be, what is still sure without them, and when a stream is silent.
 
-How many may be missing depends on what the rest is used for, and on nothing else: the spectrum of an
+How many may be missing depends on what the rest is used for, and on nothing else. The spectrum of an
 accelerometer suffers from a hundredth (`ACCELEROMETER_SHARE`), levels are estimates from a twentieth on
-(`MOST_MISSING`), a revolution is fitted with three quarters of its samples (`REVOLUTION_SHARE`), levels and a
-whole recording are used with half of them. What watches a machine and what reads a recording have the same
-limits.
+(`MOST_MISSING`). A revolution is fitted with three quarters of its samples (`REVOLUTION_SHARE`), levels and
+a whole recording are used with half of them. What watches a machine and what reads a recording have the
+same limits.
 """
 
 from __future__ import annotations

@@ -271,7 +271,7 @@ def find_transients(signal: Real, rate_hz: float, revolution: int) -> list[Stret
     """Where somebody knocks.
 
     Strikes of a damaged bearing, and rubs, come back in every revolution or every few of them: they set the
-    level that a knock is held against.
+    level that a knock is compared with.
 
     Args:
         signal: ``[n]``, without mean, of about unit deviation between its events.

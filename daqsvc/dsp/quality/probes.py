@@ -1,6 +1,6 @@
 """What the revolutions of two probes are worth: missing, standing still, dead (for a part too), clipped.
 
-A revolution that is worth nothing must not reach a bank or the synchronous vectors: a dead probe makes a
+A revolution that is worth nothing must not reach a bank or the synchronous vectors. A dead probe makes a
 straight orbit and a clipped one makes harmonics, and both look like a fault of the machine.
 """
 

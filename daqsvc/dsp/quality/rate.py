@@ -36,7 +36,7 @@ LEAST_UNBROKEN = 0.75
 MOST_OFF_GRID = 0.3
 """A gap in a column of time is a whole number of samples to within so much of one, ..."""
 SHORT_GAP = 20
-"""... if it is not longer than so many samples; what was not sampled may have had a clock of its own."""
+"""... if it is not longer than so many samples; what was not sampled may have had its own clock."""
 
 LEAST_IN_ORDER = 0.75
 """Part of the stamps, or of the steps, that go forward where a column of time with stamps that go back still
@@ -45,7 +45,7 @@ tells the rate."""
 _PIECE = 1 << 14
 """Values whose medians are looked for at a time."""
 _NEIGHBOURS = 51
-"""Stamps that the one in their middle is held against."""
+"""Stamps that the one in their middle is compared with."""
 
 FITS = 0.05
 """How far the rate may be off the nominal one; so in the time base (`daqsvc.acquisition.timebase`)."""

@@ -1,7 +1,7 @@
 """Whether a sensor stands still: it repeats one value for longer than it ever does.
 
 A coarse converter repeats its values, a square wave rests on two, and between impacts a quiet sensor stays
-at one. What tells a dead sensor from these is its own habit: how often a sample repeats the one before, and
+at one. A dead sensor differs from these by its habit. This is how often a sample repeats the one before, and
 how long its other runs of one value are, in this window and in the good ones before (`StandstillWatch`).
 
 An accelerometer is searched for drop-outs besides, many short runs, by `dropouts`: the habit is taken from

@@ -38,7 +38,7 @@ M_S2_PER_UNIT: Mapping[str, float] = {"g": 9.80665, "m/s2": 1.0}
 """Of standard gravity (CGPM 1901). Volts are missing: what they mean only the sensor's sensitivity tells."""
 
 _USUAL_G = (1e-3, 50.0)
-"""R.m.s. of a housing on a running machine, at the least and at the most."""
+"""R.m.s. of a housing on a running machine, at the least and at most."""
 _LEAST_M_S2 = 1e-4
 _MOST_M_S2 = 10_000.0
 """No accelerometer on a housing shows less than its own noise, or more r.m.s. than destroys it."""

@@ -34,7 +34,7 @@ MAINS_HZ = (50.0, 60.0)
 MAINS_BINS = 2.0
 """How far the skirt of a line of the mains reaches."""
 HIGHEST_ORDER = 18.0
-"""Highest multiple of the stated rate that is looked at: eight harmonics of the fastest speed held against
+"""Highest multiple of the stated rate that is looked at: eight harmonics of the fastest speed compared with
 it."""
 MEDIAN_ORDERS = 2.0
 """Width of the local noise level, in multiples of the stated rate."""
@@ -159,7 +159,7 @@ NEAR = 0.03
 NEAR_NATS = 6.0
 """Lead in votes that it takes to go beyond the tolerance of the stated speed."""
 SCAN = (0.48, 2.1)
-"""Shares of the stated speed between which other speeds are held against it."""
+"""Shares of the stated speed between which other speeds are compared with it."""
 LEAD_NATS = 4.0
 """Lead in votes that another speed may have by chance, or by lines of the bearing."""
 OTHER_NATS = 10.0
@@ -183,7 +183,7 @@ class ShaftRate:
         seen: whether harmonics of the shaft stand out at that rate, and more so than at any other.
         sharp: whether it is known to a fraction of the search.
         doubt: why they do not confirm it; empty if they do.
-        rival_hz: the rate that they speak for instead; None if they do not.
+        rival_hz: the rate that they indicate instead; None if they do not.
         scan: votes for all speeds about the stated one.
     """
 
@@ -309,13 +309,13 @@ class SpeedScan:
         return cls(harmonics, stated_hz, rates, harmonics.votes(rates), share, others)
 
     def voted(self, tolerance: float) -> float:
-        """The rate about the stated one that most harmonics speak for."""
+        """The rate about the stated one that most harmonics indicate."""
         inside = np.flatnonzero(np.abs(self.share - 1.0) <= tolerance)
         total = self.votes[inside] - 2.0 * ((self.share[inside] - 1.0) / PRIOR_SHARE) ** 2
         return float(self.rates_hz[inside[np.argmax(total)]])
 
     def best(self, among: NDArray[np.bool_]) -> float:
-        """The rate of some that most harmonics speak for."""
+        """The rate of some that most harmonics indicate."""
         return float(self.rates_hz[np.argmax(np.where(among, self.votes, -np.inf))])
 
     def votes_about(self, rate_hz: float, reach: float = SAME) -> float:
@@ -333,7 +333,7 @@ class SpeedScan:
         return ""
 
     def doubt(self, rate_hz: float) -> tuple[str, float | None]:
-        """Why the harmonics do not confirm a rate, empty if they do, and which one they speak for instead."""
+        """Why the harmonics do not confirm a rate, empty if they do, and which one they indicate instead."""
         if unseen := self.unseen(rate_hz):
             return unseen, None
         own = self.votes_about(rate_hz)
@@ -365,7 +365,7 @@ class SpeedScan:
 
 
 def _cage_line(series: Real, rate_hz: float, line_hz: float) -> bool:
-    """Whether the line at 1X less the cage's rate stands out, as a speed of its own."""
+    """Whether the line at 1X less the cage's rate stands out, as its own speed."""
     try:
         line = find_speed(series[:, np.newaxis], rate_hz, line_hz)
     except OtherSpeedError:

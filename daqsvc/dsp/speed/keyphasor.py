@@ -196,7 +196,7 @@ class EdgeLine:
     Attributes:
         counts: what became of the edges.
         marks: the last edges of the line, oldest first.
-        number: counts the lines; it changes when the edges begin to be numbered anew.
+        number: counts the lines; it changes when the edges begin to be numbered again.
         period: samples per revolution at the last edge; the expected ones before there is any line.
     """
 
@@ -316,13 +316,13 @@ class EdgeLine:
         return steady and shortest <= sum(gaps) / len(gaps) <= longest
 
     def _divide(self) -> None:
-        """Start anew if the edges keep step at a part of the period: the line had skipped some."""
+        """Start again if the edges keep step at a part of the period: the line had skipped some."""
         last = list(self._crossings)
         if len(last) > _ALIAS_EDGES and self._in_step(last, _ALIAS_STEP):
             self._start(last)
 
     def _multiply(self) -> None:
-        """Start anew if the edges keep step at a multiple of the period: the line had one too many."""
+        """Start again if the edges keep step at a multiple of the period: the line had one too many."""
         last = list(self.marks)[-(_ALIAS_EDGES // 2) - 1 :]
         turns = {b.revolution - a.revolution for a, b in itertools.pairwise(last)}
         several = len(last) > _ALIAS_EDGES // 2 and len(turns) == 1 and turns != {1}

@@ -1,7 +1,7 @@
 """Speed, sense of rotation and shaft angle from the orbit's own 1X, where no keyphasor tells them.
 
-With two probes at right angles, z = x + i y turns with the shaft: its full spectrum has the 1X line at plus
-the rotational frequency for a forward orbit and at minus it for a backward one; an ellipse has both.
+With two probes at right angles, z = x + i y turns with the shaft. Its full spectrum has the 1X line at plus
+the rotational frequency for a forward orbit and at minus it for a backward one. An ellipse has both.
 """
 
 from __future__ import annotations
@@ -261,7 +261,7 @@ class AngleZero:
     Attributes:
         sample: in samples since the start.
         trusted: whether the revolution that ends there is known.
-        measured: whether that revolution has a phase of its own.
+        measured: whether that revolution has its own phase.
     """
 
     sample: float
@@ -278,7 +278,7 @@ class OrbitPhase:
     when the acceleration changes, and less than half of the variance that it has at its end. A single
     revolution of 64 samples at 0 dB has 5 degrees of noise, the parabola 1.7.
 
-    Phases that make no sense for 16 revolutions start the search anew; until then, and while searching,
+    Phases that make no sense for 16 revolutions start the search again; until then, and while searching,
     the speed is guessed and nothing is trusted.
 
     Args:

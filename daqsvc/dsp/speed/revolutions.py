@@ -4,8 +4,8 @@ What is measured once a revolution needs whole revolutions: the keyphasor says w
 speed, or the orbit itself. A revolution is the half-open interval between two marks of angle zero and may
 last a non-integer number of samples; a sample belongs to the revolution that its time lies in.
 
-A pulse with flanks shorter than the sampling interval says only between which two samples its edge lies;
-half way between them is wrong by up to half a sample, 3 degrees at 64 samples a revolution, and jumps by a
+A pulse with flanks shorter than the sampling interval says only between which two samples its edge lies.
+Half way between them is wrong by up to half a sample, 3 degrees at 64 samples a revolution, and jumps by a
 whole one from one revolution to another. The last edges together say more: of all constant speeds that put
 each of them between its own two samples, the middle one places the newest (`SteadyEdges`).
 """
@@ -85,7 +85,7 @@ class SteadyEdges:
     def place(self, mark: KeyphasorEdge, *, sharp: bool) -> KeyphasorEdge:
         """The mark, moved by up to half a sample if its edge is sharp and the shaft turns evenly.
 
-        The place moves on with the speed and only gently towards the middle of what the edges allow: where
+        The place moves on with the speed and only gently towards the middle of what the edges allow. Where
         they allow a whole sample, any place in it is as good, but none may be left in a jump.
         """
         if not sharp:
@@ -185,7 +185,7 @@ class RevolutionCutter(Protocol):
         ...
 
     def reset(self) -> None:
-        """Start anew after a gap: incomplete revolutions are dropped, the counts go on."""
+        """Start again after a gap: incomplete revolutions are dropped, the counts go on."""
         ...
 
 
@@ -470,7 +470,7 @@ class Between:
             self._cut(self._marks[2])
 
     def restart(self, marks: Iterable[KeyphasorEdge], period_samples: float) -> None:
-        """A new line of marks, numbered anew; see `add`."""
+        """A new line of marks, numbered again; see `add`."""
         self._finish()
         for mark in marks:
             if self._edge is None or mark.index > self._edge.index:

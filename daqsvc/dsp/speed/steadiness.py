@@ -24,15 +24,15 @@ _MOST_ODD = 0.2
 
 
 class SpeedError(ValueError):
-    """The pulses of a look tell no speed; the message says why and what to do."""
+    """The pulses of an evaluation tell no speed; the message says why and what to do."""
 
 
 class ShaftSpeed(NamedTuple):
-    """Of a look.
+    """Of an evaluation.
 
     Attributes:
         rpm: mean.
-        drift: how far the fifths of the look are apart, as a share of it.
+        drift: how far the fifths of the evaluation are apart, as a share of it.
     """
 
     rpm: float

@@ -33,7 +33,7 @@ class SignInError(Exception):
 
 
 class OpenHere:
-    """Anybody on this box may look; who has the operator's key, which is made anew at each start, may act.
+    """Anybody on this box may look; who has the operator's key, which is made again at each start, may act.
 
     Args:
         key: lets whoever has it act; empty for nobody.

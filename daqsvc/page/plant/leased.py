@@ -30,7 +30,7 @@ LOOK_S = 1.0
 PATIENCE_S = 2.0
 """After so long without an answer it is shown what the box publishes for all, until there is one."""
 SILENT_S = 10.0
-"""A feed that has said nothing for so long is asked for anew; it says each second that it is alive."""
+"""A feed that has said nothing for so long is asked for again; it says each second that it is alive."""
 NO_WAVEFORMS = (
     "This box sends alarms and diagnoses but no waveforms: add [mqtt.live] to its machine file, and allow "
     "this page to publish below live/ at the broker."
@@ -127,7 +127,7 @@ class LeasedListening(Listening):
         """Show what there is while nothing comes of the feed.
 
         Raises:
-            ConnectionError: it has to be asked for anew.
+            ConnectionError: it has to be asked for again.
         """
         if away := self._link.why_not or self._box.away:
             raise ConnectionError(away)

@@ -33,7 +33,7 @@ ANSWER_S = 10.0
 """How long the answer to a command is waited for."""
 CLOSE_S = 1.0
 MOST_PIECES = 1000
-"""Pieces of a live feed that wait; of more the feed is begun anew."""
+"""Pieces of a live feed that wait; of more the feed is begun again."""
 
 
 class BrokerAwayError(OSError):
@@ -41,7 +41,7 @@ class BrokerAwayError(OSError):
 
 
 class BrokerLink:
-    """Listens to all boxes of a plant over one connection, which is made anew whenever it is lost.
+    """Listens to all boxes of a plant over one connection, which is made again whenever it is lost.
 
     Args:
         mqtt: the broker.
@@ -173,7 +173,7 @@ class BrokerLink:
     def _take_piece(self, message: Incoming) -> None:
         pieces = self._feeds.get(message.topic)
         if pieces is not None and not pieces.full():
-            pieces.put_nowait(message.payload)  # one that is left out is missed, and asked for anew
+            pieces.put_nowait(message.payload)  # one that is left out is missed, and asked for again
 
     def _take_answer(self, message: Incoming) -> None:
         try:

@@ -67,7 +67,7 @@ class MachineView(Protocol):
         name: in the address.
         title: what a person reads.
         sentence: what it shows.
-        every_s: how often it is made anew while somebody looks.
+        every_s: how often it is made again while somebody looks.
     """
 
     name: str

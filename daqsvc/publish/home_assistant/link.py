@@ -79,7 +79,7 @@ class HomeAssistantLink(MqttLink):
         return any(taken)
 
     async def run(self, connection: Connection) -> None:
-        """Tell what there is to tell over one connection; ends at once if nothing shall be told any more.
+        """Tell what there is to tell over one connection; ends at once if nothing is left to send.
 
         Raises:
             MqttError: the connection is lost.
@@ -206,7 +206,7 @@ class MachineDevice:
                     born = asyncio.create_task(self._born.wait())
                 elif changed.done():
                     await self._summarise(connection)
-                    # A summary tells of all alarms. For each event of a flood anew, it would be the flood.
+                    # A summary tells of all alarms. For each event of a flood again, it would be the flood.
                     await asyncio.wait({born}, timeout=self._pause_s)
                 if changed.done():
                     changed = asyncio.create_task(self._changed.wait())

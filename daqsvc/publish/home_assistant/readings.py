@@ -103,7 +103,7 @@ class Readings:
             shown.latest = diagnosis
 
     def forget(self) -> None:
-        """Nothing counts as told any more: there is a new connection, or Home Assistant has started anew."""
+        """Nothing counts as told any more: there is a new connection, or Home Assistant has started again."""
         for shown in self._shown.values():
             shown.published_ns = None
 

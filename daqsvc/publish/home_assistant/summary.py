@@ -108,13 +108,13 @@ class Summary:
         return True
 
     def to_json(self, clock: Clock) -> bytes:
-        """How the alarms stand now: a `SummaryPayload` as UTF-8 JSON."""
+        """The states of the alarms now: a `SummaryPayload` as UTF-8 JSON."""
         stamp = stamp_now(self._topics.site, self._topics.box, clock)
         empty = SummaryPayload(**stamp, machine=self._machine, alarms={}).to_json()
         return empty.removesuffix(_NO_ALARMS) + b'"alarms":{' + b",".join(self._alarms.values()) + b"}}"
 
     def _put(self, name: str, standing: dict[str, Any]) -> None:
-        """Keep how an alarm stands, as a `StandingPayload` is written."""
+        """Keep the state of an alarm, as a `StandingPayload` is written."""
         self._standings[name] = standing
         if standing["problem"] == "OFF" and self._rests_on.get(name, frozenset()) & self._not_ok:
             standing = standing | {"problem": None}

@@ -85,7 +85,7 @@ def service_metrics(machine: str, figures: Figures, oldest_age_s: float | None) 
     """The metrics of the service itself.
 
     Args:
-        machine: name of the machine, or of what stands for the service if there are several.
+        machine: name of the machine, or of what represents the service if there are several.
         figures: as in `StatusPayload`.
         oldest_age_s: age of the oldest alarm event that waits for the broker; None if none does.
     """

@@ -133,7 +133,7 @@ class IntakeCounters:
         malformed: too large, not JSON, not a command of a known version, or on a topic without a verb.
         unauthorised: for a machine or a verb that the machine file does not allow.
         stale: too old, from the future, retained at the broker, here for the second time, or so many that
-            a second time could not be told; or from before a start that found the ids of commands lost.
+            a second time could not be told. Or from before a start that found the ids of commands lost.
         unwritten: refused because their id could not be written down.
         unanswered: answers that the broker did not take.
     """

@@ -54,7 +54,7 @@ class BrokerVitals:
 
 
 class BrokerCheck:
-    """Remembers which certificates are about to end, and says how things stand with the broker.
+    """Remembers which certificates are about to end, and says the present state with the broker.
 
     What is not known yet is not said to be normal: an alarm that stood before a restart would return, and
     come again.
@@ -64,7 +64,7 @@ class BrokerCheck:
         self._ending: set[str] = set()
 
     def look(self, vitals: BrokerVitals) -> Iterator[Condition]:
-        """How everything stands, as far as it is known, whether that is new or not."""
+        """The state of everything, as far as it is known, whether that is new or not."""
         for name, end_ns in sorted(vitals.certificates_end_ns.items()):
             if not (name == BROKER and vitals.has_expired):
                 yield self._certificate(name, end_ns - vitals.wall_ns, end_ns)

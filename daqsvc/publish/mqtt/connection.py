@@ -80,7 +80,7 @@ class Will:
         topic: MQTT topic.
         payload: the bytes.
         qos: 0 or 1.
-        retain: whether the broker shall keep it as the latest of its topic.
+        retain: whether the broker keeps it as the latest of its topic.
     """
 
     topic: str
@@ -119,10 +119,10 @@ class _Expected(NamedTuple):
 class Connection:
     """One connection to a broker, made once.
 
-    - The blocking part of connecting (name lookup, TCP, TLS) runs on a daemon thread of its own: a broker
-    that
-      does not answer delays neither the stop of the service nor the end of the process. All else, paho's
-      callbacks too, happens on the event loop, so that no callback meets a socket that is closed already.
+    - The blocking part of connecting (name lookup, TCP, TLS) runs on a separate daemon thread. A broker
+      that does not answer delays neither the stop of the service nor the end of the process. All else,
+      paho's callbacks too, happens on the event loop, so that no callback meets a socket that is closed
+      already.
     - A connection that ends before the broker's consent is an error at once, not after a time limit.
     - `deliver` raises on a negative PUBACK and when the connection is lost. It keeps to the in-flight
     window of
@@ -263,8 +263,8 @@ class Connection:
         Args:
             topic: MQTT topic.
             payload: the bytes.
-            retain: whether the broker shall keep it as the latest of its topic.
-            expiry_s: when the broker shall drop it undelivered (MQTT 5 only); None for never.
+            retain: whether the broker keeps it as the latest of its topic.
+            expiry_s: when the broker drops it undelivered (MQTT 5 only); None for never.
             correlation: what the asker wants to see again in the answer (MQTT 5 only).
 
         Raises:
@@ -445,7 +445,7 @@ class Connection:
         return wire if isinstance(wire, Wire) else None
 
     def _reach(self, reached: asyncio.Future[Exception | None]) -> None:
-        """The blocking part, on a thread of its own."""
+        """The blocking part, on a separate thread."""
         properties = (
             _properties(PacketTypes.CONNECT, MaximumPacketSize=LARGEST_PACKET) if self.is_mqtt5 else None
         )

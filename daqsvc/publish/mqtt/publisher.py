@@ -87,7 +87,7 @@ class MqttPublisher(Output):
         self._outbox = port.outbox
         self._clock = port.clock
         names = [*port.machines]
-        # Of several the last one stands for the service alone.
+        # Of several the last one represents the service alone.
         self._machines = names[:-1] if len(names) > 1 else names
         self._links = links
         self._check = BrokerCheck()

@@ -33,7 +33,8 @@ LOOK_S = 10.0
 """How often to look whether a certificate, key or password was replaced."""
 
 LOOK_AGAIN_S = 86_400.0
-"""After so long a connection is made anew to see the broker's certificate, if the one it showed ends soon."""
+"""After so long a connection is made again to see the broker's certificate, if the one it showed ends
+soon."""
 
 EARLIER_S = 3.0
 """How long delivery waits for the broker to say what it has kept of an earlier run."""

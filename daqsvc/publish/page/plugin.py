@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class PagePlugin(OutputPlugin[Page]):
-    """The page in a browser, as a process of its own that the service starts."""
+    """The page in a browser, as a separate process that the service starts."""
 
     settings = Page
     about = "the page in a browser; the service starts none if absent"

@@ -35,7 +35,7 @@ def _header(text: str) -> str:
 
 
 class Page(Section):
-    """The page in a browser, which the service starts as a process of its own."""
+    """The page in a browser, which the service starts as a separate process."""
 
     listen: ListenAddress = Field(default=DEFAULT, description="host and TCP port where the page listens")
     host_names: Annotated[tuple[Text, ...], Field(strict=False, max_length=MOST_NAMES)] = Field(

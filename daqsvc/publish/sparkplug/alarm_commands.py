@@ -1,7 +1,7 @@
 """What hosts may write to alarms: metrics that ask for something when they are set to true.
 
-A written metric becomes a command as it would have come over the box's own topics, and takes the same way:
-what the machine file allows, how old it may be, the audit log, the alarm's own refusal.
+A written metric becomes a command as over the box's own topics. It is checked in the same way: by what the
+machine file allows, by its age, by the audit log, and by the alarm itself.
 """
 
 from __future__ import annotations

@@ -73,8 +73,8 @@ class Metric:
     """One value.
 
     Attributes:
-        name: its name; None where the alias stands for it.
-        alias: number that stands for the name after a birth; None for none.
+        name: its name; None where the alias represents it.
+        alias: number that represents the name after a birth; None for none.
         timestamp_ms: when the value was taken, UTC, ms since 1970.
         datatype: how the value is written; after reading, None where the sender left it out.
         value: None says that there is none now. Read without a datatype, an integer is unsigned.

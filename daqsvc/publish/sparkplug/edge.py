@@ -70,7 +70,7 @@ class SparkplugEdge(Output):
         self.node = EdgeNode(settings.group or topics.site, settings.edge_node or topics.box)
         self._settings = settings
         self._port = port
-        # What stands for the service itself is the node: its figures are no device's.
+        # What represents the service itself is the node: its figures are no device's.
         several = len(port.machines) > 1
         self._devices = {
             name: settings.device or name

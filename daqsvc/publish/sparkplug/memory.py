@@ -31,7 +31,7 @@ class Memory:
         self._failed = False
 
     def load(self) -> None:
-        """Read the file; one that is absent or cannot be read begins anew, which is logged."""
+        """Read the file; one that is absent or cannot be read begins again, which is logged."""
         try:
             self.bd_seq, self.cursor = _understood(self._path.read_bytes())
         except FileNotFoundError:

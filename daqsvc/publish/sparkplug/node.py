@@ -168,7 +168,7 @@ class EdgeNode:
         """What a host has written to metrics of a device, or of the node, each by its name.
 
         Raises:
-            PayloadError: it is no payload, or an alias stands for no metric.
+            PayloadError: it is no payload, or an alias represents no metric.
         """
         metrics = decode(payload)
         return replace(metrics, metrics=tuple(self._by_name(device, metric) for metric in metrics.metrics))
@@ -212,7 +212,7 @@ class EdgeNode:
         return replace(metric, name=None, alias=self._aliases[device, metric.name or ""], properties={})
 
     def _by_name(self, device: str | None, metric: Metric) -> Metric:
-        """A metric as a host has written it, with the name that its alias stands for."""
+        """A metric as a host has written it, with the name that its alias represents."""
         if metric.name is not None or metric.alias is None:
             return metric
         owner, name = self._names.get(metric.alias, (None, None))

@@ -64,7 +64,7 @@ def find(path: Path) -> tuple[Callable[[Path, Budget], Contents], int]:
     Raises:
         RecordingError: there is no such file, or none that can be read.
     """
-    # Asked first, as the readers say it in words of their own.
+    # Asked first, as the readers say it in their own words.
     try:
         status = path.stat()
     except FileNotFoundError:

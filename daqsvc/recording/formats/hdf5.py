@@ -35,7 +35,7 @@ def read_hdf5(path: Path, budget: Budget, wanted: Collection[str] | None = None)
         path: the file.
         budget: of it.
         wanted: the channels whose samples are looked at; None: all. Where others would take too much, zeros
-            stand for the largest, which take no memory.
+            represent the largest, which take no memory.
     """
     # Before the library is loaded: no code is loaded to unpack what a file holds.
     os.environ["HDF5_PLUGIN_PRELOAD"] = "::"
@@ -123,7 +123,7 @@ class _Tree:
         return unread
 
     def _rate_hz(self, data: Any, said: Mapping[str, float | str]) -> float | None:
-        """What a data set, or the groups that it lies in, says of its rate; the root speaks for all."""
+        """What a data set, or the groups that it lies in, says of its rate; the root is valid for all."""
         for attributes in (said, *map(_attributes, self._groups(data))):
             for key, value in attributes.items():
                 if isinstance(value, float) and key.lower() in RATE_NAMES:

@@ -136,7 +136,7 @@ def write_all(
         What the files cannot hold, in sentences.
 
     Raises:
-        ExportUsageError: a file is there, and shall not be replaced.
+        ExportUsageError: a file is there, and must not be replaced.
         RecordingError: the format cannot hold these samples.
         OSError: they cannot be written.
     """

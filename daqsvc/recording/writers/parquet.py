@@ -21,7 +21,7 @@ def write_parquet(path: Path, streams: Sequence[RecordedStream], about: Mapping[
     """Write one stream.
 
     The column ``time`` is UTC with nanoseconds, or ``time_s`` from the first sample on where nobody says when
-    that was; units are metadata of the columns, the rest of the file; a missing sample is NaN.
+    that was. Units are metadata of the columns, the rest of the file; a missing sample is NaN.
 
     Returns:
         Which channels are called otherwise, as the times have their name, in sentences.

@@ -48,7 +48,7 @@ SPELLED = str.maketrans(
 def write_uff(path: Path, streams: Sequence[RecordedStream], about: Mapping[str, str]) -> list[str]:
     """Write all channels, in float64; a missing sample is 0, as pyuff writes no NaN.
 
-    The first header line is the sensor, the second stream and machine, the third the begin to a second; the
+    The first header line is the sensor, the second stream and machine, the third the begin to a second. The
     fourth has it to a nanosecond and the rate, which the abscissa has to six digits only. Texts are ASCII:
     what has a spelling there gets it (um, degC, m/s2).
 
@@ -107,7 +107,7 @@ def write_uff(path: Path, streams: Sequence[RecordedStream], about: Mapping[str,
 
 def _names(names: Sequence[str]) -> list[str]:
     """First lines of the headers: each once, as who reads them knows the channels by no other."""
-    # NONE stands for no line at all; short enough for a number behind.
+    # NONE represents no line at all; short enough for a number behind.
     lines = [_line(name, LONGEST - 6) for name in names]
     return unique(["channel" if line.upper() in {"", "NONE"} else line for line in lines])
 

@@ -1,12 +1,12 @@
 """A rotor from the Bode plot of one probe: 1X vectors against speed.
 
 Each mode of natural frequency omega_i and damping ratio zeta_i contributes its response to unbalance, times
-a complex gain (eccentricity by modal participation); a constant vector is what does not follow the speed, the
+a complex gain (eccentricity by modal participation). A constant vector is what does not follow the speed, the
 shaft's runout and the response of modes far above:
 
     Z(Omega) = r + sum over i of g_i w_i^2 / (1 - w_i^2 + 2 i zeta_i w_i),   w_i = Omega / omega_i
 
-That is the response at steady speeds. A run-up that passes a lightly damped critical speed rings after it; if
+That is the response at steady speeds. A run-up that passes a lightly damped critical speed rings after it. If
 the vectors are those of a sweep with a known acceleration, each mode's response is computed along the sweep
 instead (`daqsvc.rotor.calibration.run_up`), ringing and late peak included.
 """

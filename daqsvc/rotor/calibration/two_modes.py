@@ -10,7 +10,7 @@ late peak, exact while the rate is even. For small rates it leaves 1X behind by 
 response H; the search begins with that, and ends with the former.
 
 Not everything can be told from a run-up: where nothing whirls backward, the gyroscopic moment is as good as
-more inertia. So each figure is held to 0 by a weak prior, and stays there unless the orbits say otherwise.
+more inertia. So each figure is kept near 0 by a weak prior, and stays there unless the orbits say otherwise.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 FIT_LIMIT = 0.1
-"""Part of the whirl that may be left unexplained for two modes to stand for the machine."""
+"""Part of the whirl that may be left unexplained for two modes to represent the machine."""
 _BEYOND = 0.1
 """Part of a speed by which a machine may run beyond its run-up."""
 
@@ -89,7 +89,7 @@ class TwoModeFit:
 
     @property
     def explains(self) -> bool:
-        """Whether two modes stand for the machine."""
+        """Whether two modes represent the machine."""
         return self.fit_error <= FIT_LIMIT
 
     def rotor(self, known: RotorParameters, *, clockwise: bool = False) -> RotorParameters:

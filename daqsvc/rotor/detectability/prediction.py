@@ -4,9 +4,9 @@ Between linear modes every figure is computed, where a mode rubs it is simulated
 marked so (`evidence`). Evidence is counted in nats, natural logarithms of likelihood ratios: 3 nats are
 odds of 20 to 1, 16 nats of nine million to one.
 
-The mean path of the evidence passes a threshold later than half of the real ones do: they climb with noise
-of their own, about five nats at a threshold of 16, and need to touch it only once. So the distribution of
-the CUSUM is carried forward over a grid, reflected at 0 and absorbed at the threshold.
+The mean path of the evidence passes a threshold later than half of the real ones do. They climb with noise,
+about five nats at a threshold of 16, and need to touch it only once. So the distribution of the CUSUM is
+carried forward over a grid, reflected at 0 and absorbed at the threshold.
 """
 
 from __future__ import annotations

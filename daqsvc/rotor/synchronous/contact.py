@@ -4,7 +4,7 @@ A support that gives way, a load, more unbalance, less damping: all of them leav
 linear rotor that turns steadily moves at 0 and 1 times its speed only. Backward 1X is no mark: a support that
 is softer in one direction makes it. Contact pushes for a part of each revolution, so it leaves harmonics.
 Where they do not stand out, a change that the pulse of a rub happens to fit is no rub, unless noise would
-hide them and the rotor's model holds: it tells then how such a pulse moves mean position and 1X together.
+hide them and the rotor's model holds. It then predicts how such a pulse moves mean position and 1X together.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
 """Has the machine changed? A generalised likelihood ratio over windows of the last revolutions.
 
-For every window of m revolutions the mean synchronous vector is held against that of all revolutions
+For every window of m revolutions the mean synchronous vector is compared with that of all revolutions
 before it:
 
     T = max over m of sum over k of |mean_m(Z_k) - mean_ref(Z_k)|^2 / (v_k (1/m + 1/n_ref) + floor)
 
 Under a healthy machine T of one window is Gamma(5, 1): five complex components. The reference is all that
-was seen since it began, so it gets better while the machine stays as it is; what can be seen at all is
+was seen since it began, so it gets better while the machine stays as it is. What can be seen at all is
 limited by its length, not by patience: delta_min = sqrt(threshold / (n_ref N SNR)).
 
 Before that: are the revolutions of a baseline those of one and the same machine (`oddest_stretch`)? Every
@@ -255,7 +255,7 @@ def nonstationarity(
 ) -> Floats:
     """Variance of a sample that does not repeat with the shaft, float64 ``[R]``.
 
-    The residual within the revolution, and the bend of the vector over three revolutions: a whirl at half
+    The residual within the revolution, and the bend of the vector over three revolutions. A whirl at half
     the speed leaves little in the residual, as five harmonics fit half a cycle well, but is another one
     every time. A vector that creeps or settles hardly bends, and what jitter of the marks does to it (all
     components turn together) is left out. For white noise it equals the noise.

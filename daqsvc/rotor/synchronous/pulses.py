@@ -81,7 +81,7 @@ def crack(change: Complexes, variance: Floats, healthy: Healthy) -> float:
     """Log marginal likelihood of a shaft that a crack makes softer once a revolution.
 
     Two shapes, equally likely: the lost restoring force lies along the crack and turns with it (Mayes and
-    Davies 1984; the hinge of Gasch 1976), or it is a pulse along the sag, as a finite-element model of a
+    Davies 1984. The hinge of Gasch 1976), or it is a pulse along the sag, as a finite-element model of a
     crack between bearings gives it. A rub pushes the other way.
     """
     order = np.array(HARMONICS)
@@ -136,7 +136,7 @@ def _pushed(healthy: Healthy, widths: Floats, turns: Floats) -> Complexes:
 def _passed(force: Complexes, healthy: Healthy) -> Complexes:
     """What forces that repeat with the shaft do to its vector.
 
-    Supports that are softer in one direction do not answer a force that is turned by as much: so the answer
+    Supports that are softer in one direction do not answer a force that is turned by as much. So the answer
     is given to the force as it is and to the force turned by a right angle, and between them it is linear.
 
     Args:

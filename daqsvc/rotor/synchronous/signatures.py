@@ -1,12 +1,12 @@
 """What each fault does to the synchronous vector, as a likelihood.
 
 Given the change d of the synchronous vector since the healthy baseline and the variance v of each of its
-components, every hypothesis has a marginal likelihood: its unknown amplitude, direction and the box of the
+components, every hypothesis has a marginal likelihood. Its unknown amplitude, direction and the box of the
 rotor's parameters are averaged over, so that a flexible hypothesis pays for its flexibility. All in nats.
 
 * unbalance: only 1X moves, anyhow; damping loss: only 1X moves, and along what less damping does to it.
 * static load: only the mean position moves; on a machine that is no Laval rotor, 1X may follow it a little.
-* stiffness loss: mean position and 1X move together, by one parameter; on a machine that is no Laval rotor
+* stiffness loss: mean position and 1X move together, by one parameter. On a machine that is no Laval rotor
   the shaft sinks, and 1X turns by about what that tells of the natural frequency, or by any amount.
 * rub: a pulse once a revolution, directed inwards where the orbit comes nearest to the wall, passed through
   the rotor (`daqsvc.rotor.synchronous.pulses`), with marks of contact (`daqsvc.rotor.synchronous.contact`);
@@ -400,13 +400,13 @@ class Identification:
     Attributes:
         verdict: the name, or the most likely member of the group.
         group: all that cannot be told apart, the most likely first; the verdict alone if it stands alone.
-        named: whether two looks in a row agreed on the group.
+        named: whether two evaluations in a row agreed on the group.
         evidence: nats of every hypothesis over "normal".
         probabilities: posterior of every verdict, hypotheses equally likely before.
         change: complex128 ``[5]``, d in um.
         severity: size of the change, its non-harmonic energy included, over the healthy whirl's amplitude.
         excess: variance of a complex sample that does not repeat with the shaft, above the healthy one, um^2.
-        candidates: verdict and group of this look alone.
+        candidates: verdict and group of this evaluation alone.
     """
 
     verdict: RotorFault
@@ -437,7 +437,7 @@ def identify(
         change: complex128 ``[5]``, mean synchronous vector of the present segment less the baseline, um.
         variance: float64 ``[5]``, its variance, um^2.
         healthy: the baseline.
-        previous: the look before; a name takes two that agree.
+        previous: the evaluation before; a name takes two that agree.
         rules: margins.
         may_name: whether the rotor has settled enough for a name.
         comparison: what the transient says of unbalance and loss of damping, if it was abrupt.

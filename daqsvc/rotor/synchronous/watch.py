@@ -1,8 +1,8 @@
 """A calibrated rotor under watch: departure at once, identity after settling, the healthy state again.
 
 The machine's life is a chain of segments, each a stretch in which it does not change. A departure test runs
-on the segment; when it says that the machine has changed, a new segment begins at the estimated onset, and
-the segment's mean is identified against the healthy baseline at growing intervals (`LOOKS`): names within the
+on the segment. When it says that the machine has changed, a new segment begins at the estimated onset, and
+the segment's mean is identified against the healthy baseline at growing intervals (`LOOKS`). Names within the
 first revolutions are those of the transient.
 """
 
@@ -107,7 +107,7 @@ LOOKS = (3, 5, 8, 12, 20, 30, 50, 80, 120, 220)
 _NAMED_FROM = 8
 """Revolutions since the onset before which no look gives a name: the rotor is still on its way."""
 _TRUSTED_FROM = 12
-"""Revolutions since the onset from which on two looks that see nothing end the alarm."""
+"""Revolutions since the onset from which on two evaluations that see nothing end the alarm."""
 _LATER_LOOKS = 110
 _SETTLING = 8
 """Revolutions after an onset before the new segment's own reference begins."""
@@ -156,7 +156,7 @@ class WatchReport:
         evidence: of the departure test; None while calibrating.
         departed: whether a departure was declared on this revolution.
         onset_revolution: first revolution of the present segment, None while the machine is healthy.
-        identification: what the change is; None while the machine is healthy or before the first look.
+        identification: what the change is; None while the machine is healthy or before the first evaluation.
         looked: whether the identification is of this revolution.
         refused: why the last revolutions could not be the baseline; empty if they could.
     """
@@ -380,7 +380,7 @@ class RotorWatch:
         return LOOKS[-1] + _LATER_LOOKS * (self._look - len(LOOKS) + 1)
 
     def finish(self) -> Identification | None:
-        """A last look, at the end of a recording."""
+        """A last evaluation, at the end of a recording."""
         if self._onset is not None:
             self._identify(self.revolutions, may_name=self.revolutions - self._onset + 1 >= _NAMED_FROM)
         return self._identification

@@ -1,18 +1,17 @@
 """The paper's sliding-mode units, free and driven by the residuals of a detection filter.
 
 The residuals are those of the paper's own error equation, e' = (A + LC) e - F u, without the injected term
-L D u that real measurements have; only so do the faults keep the directions (1, 2) and (1, 6). F_i is an
+L D u that real measurements have. Only so do the faults keep the directions (1, 2) and (1, 6). F_i is an
 eigenvector of A + LC, so that the residual of fault i is exactly D_i u + C F_i times a first-order lag.
 
 The units are as printed: two states each, and a limit for each instead of their ratio.
 
-A unit slides on the line of its own fault direction and is pushed off by the other's. With a = 12 and b =
-8 the free dynamics have the poles -2 and -6, and with the sign of one output flipped the paper's
-directions (1, 2) and (1, 6) lie along the eigenvectors (1, -2) and (1, -6). The distance s = n . x from a
-surface then obeys s' = -mu s + n . r - K sgn(s) on its own, with mu = 6 for the inner unit and 2 for the
-outer one: the unit is a leaky sum with a soft threshold, which is what the service runs
-(`daqsvc.bearing.sliding_mode`). A unit with the paper's bare directions has a coupled s, and its matched
-unit may leave before the other does.
+A unit slides on the line of its own fault direction and is pushed off by the other's. With a = 12 and b = 8
+the free dynamics have the poles -2 and -6. With the sign of one output flipped, the paper's directions (1,
+2) and (1, 6) lie along the eigenvectors (1, -2) and (1, -6). The distance s = n . x from a surface then
+obeys s' = -mu s + n . r - K sgn(s) on its own, with mu = 6 for the inner unit and 2 for the outer one. The
+unit is a leaky sum with a soft threshold, as in the service (`daqsvc.bearing.sliding_mode`). A unit with
+the paper's bare directions has a coupled s, and its matched unit may leave before the other does.
 """
 
 from __future__ import annotations

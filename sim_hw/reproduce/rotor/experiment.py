@@ -1,7 +1,7 @@
 """The paper's schedule (section V) on the simulated plant, through observers and bank.
 
 The paper's numbers come first, and those that it leaves open; then one observer's estimates, sample by
-sample, which the bank keeps to itself; then what the bank declares under either rule, how soon and how
+sample, which the bank keeps to itself. Then what the bank declares under either rule, how soon and how
 rightly.
 """
 
