@@ -380,7 +380,7 @@ class AlarmService:
                 with contextlib.suppress(OutboxError):  # it is being closed; then it is told once more
                     self.outbox.damage_is_told()
 
-        self._watch(asyncio.create_task(confirm(), name="damage is told"))
+        self._watch(asyncio.create_task(confirm(), name="damage is reported"))
 
     def _falls_out_of_step(self) -> bool:
         """Whether the journal was opened late, or replaced, and has not been brought into step since."""
@@ -676,7 +676,9 @@ class AlarmService:
         """How things stand with the outputs; what one that is no longer there has said stands no longer."""
         raised = self.manager.conditions
         for path, output in self.outputs.items():
-            with self._supervisor.sparing_others(output_name(path), "it says nothing of itself meanwhile"):
+            with self._supervisor.sparing_others(
+                output_name(path), "it reports nothing about itself until then"
+            ):
                 yield from [*output.conditions(raised)]
         for prefix, sentence in self._outdated.items():
             for name in sorted(raised):
@@ -774,5 +776,5 @@ def _not_on_disk(committed: Sequence[asyncio.Future[int]]) -> str:
         return ""
     errors = [f"{one.exception()}" for one in committed if one.done() and one.exception() is not None]
     return "done, but the journal cannot be written yet, and a restart before it can will undo it: " + (
-        "; ".join(errors) or "the event waits in memory; the alarm store/journal says what helps"
+        "; ".join(errors) or "the event waits in memory; the alarm store/journal has the remedy"
     )

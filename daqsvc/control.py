@@ -737,7 +737,7 @@ def _status_of(store: Path, machine: str | None, timeout_s: float) -> dict[str, 
     Raises:
         ControlError: see `ask_status`.
     """
-    then = "its log says what holds it up"
+    then = "its log has the reason"
     named = b"}" if machine is None else b', "machine": ' + json.dumps(machine).encode() + b"}"
     line = _asked(store, _STATUS_VERB + named + b"\n", timeout_s, LONGEST_STATUS, then)
     try:
@@ -755,7 +755,7 @@ def _status_of(store: Path, machine: str | None, timeout_s: float) -> dict[str, 
 
 
 def _outcome(store: Path, line: bytes, timeout_s: float) -> ControlAnswer:
-    then = "whether it has obeyed, daqsvc alarms tells"
+    then = "whether it has obeyed, see daqsvc alarms"
     try:
         return ControlAnswer.model_validate_json(_asked(store, line, timeout_s, LONGEST_LINE, then))
     except ValidationError as error:

@@ -110,7 +110,7 @@ class Babble:
         if not 0.0 < self.rate_hz <= 1e6:
             raise ValueError(f"a node babbles {self.rate_hz:g} frames a second; give more than 0, up to 1e6")
         if math.isinf(self.window.end_s):
-            raise ValueError("a babbling node must stop some time; say when the fault ends")
+            raise ValueError("a babbling node must stop some time; state when the fault ends")
 
 
 BABBLER = -1

@@ -138,7 +138,7 @@ def _text(summary: CampaignSummary, results: str) -> str:
         *(f"  {verdict}: {number:,}" for verdict, number in summary.verdicts.most_common()),
     ]
     if summary.refused:
-        lines.append(f"  not judged: {summary.refused:,} (column reason says why; --retry tries again)")
+        lines.append(f"  not judged: {summary.refused:,} (column reason has the reason; --retry tries again)")
     if summary.others:
         kinds = "is of another kind" if summary.others == 1 else "are of other kinds"
         lines.append(f"{counted(summary.others, 'file')} among the recordings {kinds}")
@@ -148,7 +148,7 @@ def _text(summary: CampaignSummary, results: str) -> str:
     failed = list(summary.failed.items())
     lines += [f"not looked at: {name}: {why}" for name, why in failed[:5]]
     if len(failed) > 5:
-        lines.append(f"... of {len(failed):,} machines that were not looked at; --json has all")
+        lines.append(f"... of {len(failed):,} machines that were left out; --json has all")
     return "\n".join([*lines, f"results: {results}"])
 
 

@@ -77,7 +77,9 @@ class PageCommand:
         if arguments.snapshot is not None and (arguments.file or arguments.store):
             self._parser.error("--snapshot shows no service: leave the machine file and --store out")
         if arguments.plant is not None and (arguments.file or arguments.store or arguments.snapshot):
-            self._parser.error("--plant shows what a broker tells: leave out what names a box or a snapshot")
+            self._parser.error(
+                "--plant shows the messages of a broker: leave out what names a box or a snapshot"
+            )
         try:
             from daqsvc.page.access.accounts import AccountsError  # noqa: PLC0415 - an extra
             from daqsvc.page.access.choice import UnsafeError  # noqa: PLC0415

@@ -77,4 +77,4 @@ def other_files(named: Path, answer: ReloadAnswer) -> str:
     if not files or mine in files or (answer.lines and mine.parent in files):
         return ""
     started = " ".join(answer.files)
-    return f"the service was started with {started}: it reads that again, whatever is named here"
+    return f"the service was started with {started}: it reads that again, also if another one is named here"

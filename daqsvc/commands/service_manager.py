@@ -91,7 +91,7 @@ class ServiceManager:
             return cls(address)
         watchdog_s = int(watchdog_us) / US_PER_S
         if watchdog_s < LEAST_WATCH_S:
-            short = "WatchdogSec= is %g s, and parts are held to %g s: write that much at least"
+            short = "WatchdogSec= is %g s, and the limit of parts is %g s: write at least that"
             log.warning(short, watchdog_s, LEAST_WATCH_S)
         return cls(address, watchdog_s)
 
@@ -181,7 +181,7 @@ class _Follower:
         self._service = service
         self._stalled: Callable[[float], list[str]] | None = None
         if manager.watchdog_s is not None:
-            then = "the service manager is told nothing more, and starts the service again"
+            then = "the service manager gets no more signs of life, and starts the service again"
             self._stalled = service.stalls.hold_to(max(manager.watchdog_s, LEAST_WATCH_S), then)
         self._begun_s = manager.begun_s
         self._serving_since_s = 0.0

@@ -148,7 +148,7 @@ class ConfinedProcess:
         with self._lock:
             running = self._running = self._running or _begin(self._name)
             if self._aborted:
-                raise ConfinedError("crash", f"{self._name} was told to stop")
+                raise ConfinedError("crash", f"{self._name} was stopped")
             until = time.monotonic() + _WALL_BASE_S + _WALL_PER_CPU * cpu_s
             try:
                 return _ask(running, request, memory_bytes, until, spill=spill)

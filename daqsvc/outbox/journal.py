@@ -370,7 +370,7 @@ class Journal:
             if self._known_topics.topics is None:
                 self._look_up_topics(is_whole=True)
         except OSError as error:
-            log.info("outbox %s: its damage will be told again: %s", self.path, error)
+            log.info("outbox %s: its damage will be reported again: %s", self.path, error)
 
     def _connect(self) -> None:
         is_new = not self.path.exists()
@@ -767,7 +767,7 @@ class Journal:
             except FileError as error:
                 if not may_pass(error) or self._lock is None:
                     raise
-                log.debug("outbox %s is only looked at: %s", self.path, error)
+                log.debug("outbox %s is only read: %s", self.path, error)
         elif not self._may_view:
             raise sqlite3.OperationalError(f"outbox {self.path} is not open yet")
         if self._viewed is None:

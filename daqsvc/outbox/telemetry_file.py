@@ -112,7 +112,7 @@ class TelemetryFile:
                 delete(self._path)
                 log.warning("telemetry in %s is dropped: the disk is nearly full", self._path)
         except OSError as error:
-            log.warning("telemetry in %s cannot be looked at: %s", self._path, error)
+            log.warning("telemetry in %s cannot be read: %s", self._path, error)
 
     def open(self) -> None:
         """Open or create the file; if it cannot be used, the messages are kept in memory."""

@@ -114,7 +114,7 @@ class BoxSnapshots:
                         self._perhaps_end(other)
                 if len(self._open) >= MOST_OPEN:
                     raise NoPictureError(
-                        f"{MOST_OPEN} snapshots are looked at already, and more would take too much memory: "
+                        f"{MOST_OPEN} snapshots are open already, and more would take too much memory: "
                         "close one"
                     )
                 playing = await asyncio.to_thread(self._read, name)

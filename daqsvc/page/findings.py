@@ -70,7 +70,7 @@ FAULTS = {
     ),
     "unmodelled": Fault(
         "a change that no fault of the model explains",
-        "Look at {views}, and at what was changed on the machine lately.",
+        "Look at {views}, and at what was changed on the machine recently.",
     ),
     "changed": Fault(
         "a change that names no part", "Look at the spectra beside those of the healthy machine."

@@ -168,7 +168,7 @@ def _command(fields: Mapping[str, str], machine: str, person: Person) -> AlarmCo
         FormError: it is none.
     """
     if fields.get("verb") not in {*Verb} or not fields.get("alarm"):
-        raise FormError("it says not what is to be done with which alarm")
+        raise FormError("it does not state the command and the alarm")
     verb = Verb(fields["verb"])
     hours = fields.get("hours", "")
     if verb is Verb.SHELVE and hours not in TIMES:

@@ -136,14 +136,14 @@ class Picture:
                 self._has_failed = True
                 log.exception("the page cannot make %s of %s", self._view, self._machine)
             return json.dumps(
-                {"age_s": 0.0, "why": "the page has failed to make it: its log says why"}
+                {"age_s": 0.0, "why": "the page has failed to make it: its log has the reason"}
             ).encode()
 
     def _told(self, listening: Heard) -> bytes:
         """What browsers are told now, as JSON; on a thread."""
         live = listening.live
         silent_s = time.monotonic() - listening.heard_s
-        why = listening.why_not or ("the service says nothing" if silent_s > STALE_S else "")
+        why = listening.why_not or ("the service sends nothing" if silent_s > STALE_S else "")
         told: dict[str, Any] = {"age_s": round(silent_s, 1), "why": why}
         if live is not None:
             told["token"] = live.token

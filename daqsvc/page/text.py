@@ -84,7 +84,7 @@ def alarm_rows(live: MachineLive) -> str:
         )
         for one in standing(live)
     ]
-    return "".join(rows) or '<tr><td colspan="5">No alarm stands.</td></tr>'
+    return "".join(rows) or '<tr><td colspan="5">No alarm is active.</td></tr>'
 
 
 def alarm_list(known: Mapping[str, Document | None], machine: str) -> str:

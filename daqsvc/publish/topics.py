@@ -181,7 +181,6 @@ def is_one_part(name: str) -> bool:
 def _safe(name: str) -> str:
     if not _NAME.fullmatch(name):
         raise ValueError(
-            f"{name!r} cannot stand in an MQTT topic; use letters, digits, '_', '.', '-', "
-            f"and '/' between parts"
+            f"{name!r} cannot be in an MQTT topic; use letters, digits, '_', '.', '-', and '/' between parts"
         )
     return name

@@ -273,7 +273,7 @@ class TrendReader(PollingReader):
             self._said.add(message)
             logger.warning(
                 "%s: %s; each stream is polled by itself, and they are tried together only now and then. A "
-                "smaller max_gap, or forbidden, says so from the start",
+                "smaller max_gap, or forbidden, avoids it from the start",
                 self._who,
                 message,
             )

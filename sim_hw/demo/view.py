@@ -215,7 +215,7 @@ class View:
         """Print the summary, to another console if one is given."""
         console = console or self._console
         if summary["onsets"]:
-            table = Table(title="what happened, and when it was said", title_justify="left")
+            table = Table(title="what happened, and when it was reported", title_justify="left")
             for title in ("mode", "onset (rev)", "declared (rev)", "delay (rev)"):
                 table.add_column(title, justify="left" if title == "mode" else "right")
             for row in summary["onsets"]:

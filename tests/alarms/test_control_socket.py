@@ -482,7 +482,7 @@ async def test_a_service_that_dies_before_its_answer_is_told(answer: bytes, tmp_
         writer.close()
 
     server = await asyncio.start_unix_server(hang_up, tmp_path / "control.sock")
-    with pytest.raises(ControlError, match="whether it has obeyed, daqsvc alarms tells"):
+    with pytest.raises(ControlError, match="whether it has obeyed, see daqsvc alarms"):
         await asyncio.to_thread(ask, tmp_path, RESET)
     server.close()
     await server.wait_closed()

@@ -104,7 +104,7 @@ def test_a_process_that_was_suspended_or_starved_has_not_stalled(monkeypatch: py
 @pytest.mark.parametrize(
     ("told", "watchdog_s", "warning"),
     [
-        ("300000", 0.3, "WatchdogSec= is 0.3 s, and parts are held to 3 s"),
+        ("300000", 0.3, "WatchdogSec= is 0.3 s, and the limit of parts is 3 s"),
         ("3000000", 3.0, ""),
         *[(odd, None, f"WATCHDOG_USEC is '{odd}', not a number") for odd in ("0", "-5", "abc", "1e20")],
     ],

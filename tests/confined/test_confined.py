@@ -121,7 +121,7 @@ def test_a_call_of_another_thread_can_be_aborted(process):
     thread.join(60)
     assert not thread.is_alive()
     assert len(outcome) == 1
-    with pytest.raises(ConfinedError, match="told to stop"):
+    with pytest.raises(ConfinedError, match="was stopped"):
         call(process, "double", numbers=[1.0])
     process.close()
     assert call(process, "double", numbers=[3.0]).arrays[0].tolist() == [6.0]

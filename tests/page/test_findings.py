@@ -84,7 +84,7 @@ def test_the_next_step_names_only_what_there_is_to_look_at() -> None:
     live.hear({"statement": said("unmodelled", detector="bearing/left", sensors=["left"])})
     rows = finding_rows(live)
     assert "look at its trend and its spectrum for what it is." in rows
-    assert "Look at its trend and its spectrum, and at what was changed on the machine lately." in rows
+    assert "Look at its trend and its spectrum, and at what was changed on the machine recently." in rows
     assert "orbit" not in rows
 
 

@@ -125,7 +125,7 @@ async def test_a_box_that_is_offline_or_silent_is_not_normal(monkeypatch: pytest
     monkeypatch.setattr(known_module.time, "monotonic", lambda: now_s + 60.0)
     silent = tile((await source.statuses())[0])
     assert silent["level"] == "unknown"
-    assert "has said nothing since 20" in silent["away"]
+    assert "has sent nothing since 20" in silent["away"]
     heard(plant, "rig/alarms/hot", alarm(1, level="danger"))
     assert tile((await source.statuses())[0])["level"] == "danger"
 

@@ -119,7 +119,7 @@ class KnownBox:
             return f"the box is offline since {self.since[:19]}Z ({self.why})"
         last_s = self.known_s if self.heard_s is None else self.heard_s
         if time.monotonic() - last_s > SAYS_NOTHING_S:
-            return f"the box has said nothing since {self.heard_utc or 'this page listens'}"
+            return f"the box has sent nothing since {self.heard_utc or 'this page listens'}"
         return ""
 
 

@@ -134,7 +134,7 @@ class BrokerLink:
 
     async def _serve(self, connection: Connection) -> None:
         hearing = asyncio.create_task(self._hear_boxes(connection), name="listen to boxes")
-        taking = asyncio.create_task(self._take_all(connection), name="take what boxes say")
+        taking = asyncio.create_task(self._take_all(connection), name="read what boxes send")
         try:
             done, _ = await asyncio.wait({hearing, taking}, return_when=asyncio.FIRST_COMPLETED)
             for task in done:

@@ -101,7 +101,7 @@ class CentrelineView:
         probes = chosen["probes"].split(",")
         t_ns, along = _means(live, (probes[0], probes[1]))
         if not len(t_ns):
-            return Shown(note="no means of these probes have been told yet")
+            return Shown(note="there are no mean values of these probes yet")
         wanted = t_ns >= t_ns[-1] - float(chosen["minutes"]) * 60.0 * NS_PER_S
         sensors = [live.sensors[name] for name in probes]
         angles = (sensors[0].angle_deg or 0.0, sensors[1].angle_deg or 0.0)

@@ -202,7 +202,7 @@ def _watched(path: Path) -> list[Certificate]:
     try:
         return certificates(path)
     except CertificateError as error:
-        log.warning("nobody will be told when the certificates in %s end: %s", path, error)
+        log.warning("nobody will be warned when the certificates in %s end: %s", path, error)
         return []
 
 

@@ -363,7 +363,7 @@ class MqttPublisher(Output):
         try:
             shown = certificate(der)
         except CertificateError as error:
-            log.warning("nobody will be told when the certificate of %s ends: %s", self._name, error)
+            log.warning("nobody will be warned when the certificate of %s ends: %s", self._name, error)
             return
         self._expiry["broker"] = shown.not_after_ns
         authority = issuer_of(shown, credentials.trusted)
@@ -472,9 +472,11 @@ class MqttPublisher(Output):
             async with asyncio.timeout(max(self._left_s(), GOODBYE_S / 2)):
                 await connection.deliver(self.topics.availability, offline, retain=True)
         except TimeoutError:
-            log.warning("MQTT broker %s did not answer to the goodbye; the last will tells", self._name)
+            log.warning("MQTT broker %s did not answer to the goodbye; the last will reports", self._name)
         except MqttError as error:
-            log.warning("MQTT broker %s did not take the goodbye: %s; the last will tells", self._name, error)
+            log.warning(
+                "MQTT broker %s did not accept the goodbye: %s; the last will reports", self._name, error
+            )
         else:
             await connection.close(max(self._left_s(), GOODBYE_S / 2))
 

@@ -267,7 +267,7 @@ class Session:
         except (MqttError, OutboxError):
             raise
         except Exception as error:  # noqa: BLE001  alarms matter more than what others show
-            self._faults.note(f"{link.name} is told nothing more until the next connection", error)
+            self._faults.note(f"{link.name} receives nothing more until the next connection", error)
 
     async def _telemetry(self) -> None:
         delivery = TelemetryDelivery(
@@ -370,6 +370,6 @@ class Session:
             try:
                 await asyncio.to_thread(read_credentials, self._settings)
             except OSError as error:
-                log.warning("%s; the connection stands, but would not come back after a loss", error)
+                log.warning("%s; the connection is up, but would not come back after a loss", error)
                 continue
             raise CredentialsReplacedError

@@ -129,7 +129,7 @@ def encode(payload: Payload, *, datatypes: bool = True) -> bytes:
 def _message(metric: Metric, *, datatypes: bool) -> messages.Metric:
     datatype, value = metric.datatype, metric.value
     if datatype is None:
-        raise PayloadError(f"metric {metric.name!r} has no datatype; say how its value is written")
+        raise PayloadError(f"metric {metric.name!r} has no datatype; state how its value is written")
     message = messages.Metric(
         name=metric.name,
         alias=metric.alias,

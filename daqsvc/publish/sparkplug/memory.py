@@ -65,7 +65,7 @@ class Memory:
         except OSError as error:
             if not self._failed:
                 log.warning(
-                    "Sparkplug memory %s cannot be written: %s; a restart before it can tells alarms again",
+                    "Sparkplug memory %s cannot be written: %s; a restart before it can sends alarms again",
                     self._path,
                     error,
                 )

@@ -192,7 +192,7 @@ class EdgeSession:
                     self._node.die()
                     await self._connection.deliver(death.topic, death.payload, retain=False)
         except (TimeoutError, MqttError) as error:
-            log.info("the node's death was not published (%s); the last will tells it", error)
+            log.info("the node's death was not published (%s); the last will reports it", error)
             return  # dropped without a word, so that the broker publishes the will
         await self._connection.close(timeout_s)
 
@@ -271,9 +271,9 @@ class EdgeSession:
         barred = f" (the broker lets this client not listen to {' and '.join(closed)})" if closed else ""
         hosts = f"hosts at this broker are {there}" if there else "there is no other host at this broker"
         self._reports.missing(
-            f"Sparkplug tells nothing yet: primary host {self._host.host_id} {word} on "
-            f"{' or '.join(wanted)}{barred}; {hosts}. Correct primary_host in [mqtt.sparkplug], or have that "
-            "host connect to this broker"
+            f"Sparkplug sends nothing yet: primary host {self._host.host_id} {word} on "
+            f"{' or '.join(wanted)}{barred}; {hosts}. Correct primary_host in [mqtt.sparkplug], or have "
+            "that host connect to this broker"
         )
 
     async def _execute(self) -> None:

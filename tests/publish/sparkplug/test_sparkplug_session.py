@@ -160,7 +160,7 @@ async def test_a_host_that_never_comes_is_said_with_those_that_are_there(
                 wanted.say_state(online=True, timestamp=3)
                 await born(host, 2)
                 await eventually(lambda: caplog.text.count(IS_THERE) == 2, "and is there again")
-    assert caplog.text.count("Sparkplug tells nothing yet") == 1
+    assert caplog.text.count("Sparkplug sends nothing yet") == 1
 
 
 async def test_a_host_that_is_there_at_once_and_a_broker_that_comes_late_are_said_rightly(
