@@ -472,7 +472,7 @@ async def test_who_names_other_files_than_the_service_reads_is_told(
     await asyncio.wait({serving_})
     await control.close()
     paths = " ".join(map(str, files))
-    told = f"the service was started with {paths}: it reads that again, whatever is named here"
+    told = f"the service was started with {paths}: it reads that again, also if another one is named here"
     assert other_files(tmp_path / named, answer) == (told if is_told else "")
 
 
