@@ -87,7 +87,6 @@ class PageCommand:
             from daqsvc.page.plant.source import PlantSource  # noqa: PLC0415
             from daqsvc.page.recorded import NoPictureError  # noqa: PLC0415
             from daqsvc.page.serving import PortError, serve  # noqa: PLC0415
-            from daqsvc.page.source import BoxSource  # noqa: PLC0415
             from daqsvc.snapshots.reading import SnapshotError  # noqa: PLC0415
         except ModuleNotFoundError as error:
             return _failed(f"{error.name} is missing: install it with pip install 'daqsvc[page]'")
@@ -107,7 +106,7 @@ class PageCommand:
                 serve(PlantSource(mqtt), "the plant", listen.port, choice, with_parent=with_parent)
             else:
                 store = self._store(arguments)
-                serve(BoxSource(store), f"{store}", listen.port, choice, with_parent=with_parent)
+                _serve_box(store, listen, choice, with_parent=with_parent)
         except BadFileError:
             return EXIT_USAGE
         except (UnsafeError, PlantFileError) as error:
@@ -134,6 +133,36 @@ class PageCommand:
                 "service at first"
             )
         return store
+
+
+def _serve_box(store: Path, listen: Address, choice: AccessChoice, *, with_parent: bool) -> None:
+    """Serve the page of the service on a store.
+
+    Raises:
+        PortError: it cannot listen there.
+    """
+    from daqsvc.page.serving import PortError, PortInUseError, serve  # noqa: PLC0415 - an extra
+    from daqsvc.page.source import BoxSource  # noqa: PLC0415
+
+    try:
+        serve(BoxSource(store), f"{store}", listen.port, choice, with_parent=with_parent)
+    except PortInUseError:
+        if with_parent or not _shows_its_page(store):
+            raise
+        raise PortError(
+            f"{listen.host}:{listen.port} is in use, and the service on {store} shows its page itself "
+            "([page] of its machine file): open that address in a browser, or give another --port"
+        ) from None
+
+
+def _shows_its_page(store: Path) -> bool:
+    """Whether the service that runs on a store has a page of its own."""
+    from daqsvc.control import ControlError, ask_status  # noqa: PLC0415 - only what a verb needs
+
+    try:
+        return any("page" in status["outputs"] for status in ask_status(store))
+    except ControlError:
+        return False
 
 
 def _of_snapshots(files: Sequence[Path]) -> SnapshotSource:

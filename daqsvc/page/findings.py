@@ -83,6 +83,8 @@ FAULTS = {
     ),
 }
 """By what detectors say, in their words."""
+MOST_NAMED = 5
+"""Sensors that a sentence names at most."""
 SOUND = {"normal", "undetermined"}
 
 
@@ -96,7 +98,18 @@ def finding_rows(live: MachineLive) -> str:
         return "".join(rows)
     heard = len(live.latest)
     sentence = "No detector finds a fault." if heard else "No detector has said anything yet."
-    return f'<tr><td colspan="4">{sentence}</td></tr>'
+    return f'<tr><td colspan="4">{escape(sentence + _unjudged(live))}</td></tr>'
+
+
+def _unjudged(live: MachineLive) -> str:
+    """What to know besides: that sensors are not OK, by which nothing is found."""
+    bad = {sensor for one in [*live.latest.values()] if one["quality"] != "good" for sensor in one["sensors"]}
+    if not bad:
+        return ""
+    names = sorted(bad)
+    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    verb = "is" if len(names) == 1 else "are"
+    return f" But {', '.join(names[:MOST_NAMED])}{more} {verb} not OK or missing: nothing is found by that."
 
 
 def sentence(live: MachineLive, statement: Document) -> str:

@@ -15,6 +15,7 @@ from daqsvc.page.access.person import peer_of
 from daqsvc.page.access.role import Role
 from daqsvc.page.guard import FormError
 from daqsvc.page.text import alarm_list, event_rows
+from daqsvc.settings.alarms import AlarmHandling
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -51,6 +52,7 @@ DONE = {
     Verb.BYPASS: "bypassed",
     Verb.UNBYPASS: "put back into service",
 }
+HOW_TO_ACT = "On this box, daqsvc page --operator-link prints an address for operators."
 _ONE_LINE = re.compile(r"\s+")
 
 
@@ -126,11 +128,12 @@ async def alarms_page(
         "state": alarm_list({chosen: alarm}, machine) if chosen else "",
         "occurrence": "" if alarm is None else alarm["occurrence"] or "",
         "offers": [(verb, *OFFERS[verb]) for verb in (offered(alarm) if chosen else ())],
-        "times": TIMES,
+        "times": _times(live),
         "events": event_rows(events),
         "why": why,
         "token": forms.token(person),
         "may_act": person.role is Role.OPERATOR,
+        "how_to_act": "" if person.session else HOW_TO_ACT,
         "said": text,
         "is_good": is_good,
     }
@@ -159,6 +162,14 @@ async def handle(source: MachineSource, machine: str, request: Request, forms: F
     else:
         text = f"Nothing was done: {outcome.reason}."
     return _shown(request, machine, command.alarm, said.keep(text, is_good=outcome.accepted))
+
+
+def _times(live: MachineLive) -> Document:
+    """How long an alarm may be shelved for, as far as the machine file lets people do so."""
+    default_s = AlarmHandling.model_fields["shelve_at_most_s"].default
+    most_s = live.values.get("alarm_handling", {}).get("shelve_at_most_s", default_s)
+    times = {hours: label for hours, label in TIMES.items() if float(hours) * 3600.0 <= most_s}
+    return times or dict([next(iter(TIMES.items()))])
 
 
 def _command(fields: Mapping[str, str], machine: str, person: Person) -> AlarmCommand:

@@ -18,6 +18,7 @@ import numpy as np
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.ring import SampleRing
 from daqsvc.acquisition.samples import Quality, SampleBlock
+from daqsvc.alarms.alarm import FINDINGS
 from daqsvc.dsp.speed.keyphasor import EdgeFinder
 from daqsvc.page.runs import Column, Runs
 
@@ -153,6 +154,9 @@ class MachineLive:
         self.said: dict[str, deque[Said]] = {}
         self.alarms: dict[str, Document] = {one["alarm"]: one for one in about["alarms"]}
         self.journal: deque[Document] = deque(sorted(about["alarms"], key=_when), MOST_JOURNAL)
+        self._found = {
+            name: str(one["message"]) for name, one in self.alarms.items() if one.get("kind") in FINDINGS
+        }
         self.standings: dict[str, Document] = dict(about["standings"])
         self.history: Path | None = None
         """The file of the box's history, if there can be one."""
@@ -214,14 +218,22 @@ class MachineLive:
             self._take_statement(statement)
         elif (alarm := line.get("alarm")) is not None:
             self.alarms[alarm["alarm"]] = alarm
+            if alarm.get("kind") in FINDINGS:
+                self._found[alarm["alarm"]] = str(alarm["message"])
             self.journal.append(alarm)
         elif (standing := line.get("standing")) is not None:
             self.standings[standing["stream"]] = standing
         self.left_out += line.get("left_out", 0)
 
+    def told_of(self, alarm: Document) -> str:
+        """What was found last of an alarm, as far as it was told, and what was done about it since."""
+        found, message = self._found.get(alarm["alarm"], ""), str(alarm["message"])
+        return message if not found or found == message else f"{found}; {message}"
+
     def go_on_from(self, before: MachineLive) -> None:
         """Keep what is known of the time before the connection was made again."""
         self.said = before.said
+        self._found = before._found | self._found
         self.probable = before.probable | self.probable
         for detector, now in self.decided.items():
             if (known := before.decided.get(detector)) is not None and known.decision == now.decision:

@@ -36,6 +36,10 @@ class PortError(Exception):
     """The page cannot listen; the text says where, why and the remedy."""
 
 
+class PortInUseError(PortError):
+    """Something listens there already."""
+
+
 class _Server(uvicorn.Server):
     """Ends at once: browsers listen for as long as they are let."""
 
@@ -89,12 +93,17 @@ def serve(
     except OSError as error:
         remedy = REMEDIES.get(error.errno or 0, "give another --listen")
         why = os.strerror(error.errno) if error.errno and error.errno > 0 else error.strerror or f"{error}"
-        raise PortError(f"cannot listen at {_bracketed(choice.host)}:{port}: {why}; {remedy}") from None
+        in_use = error.errno == errno.EADDRINUSE
+        raise (PortInUseError if in_use else PortError)(
+            f"cannot listen at {_bracketed(choice.host)}:{port}: {why}; {remedy}"
+        ) from None
     with listening:
         tls = choice.certificate is not None
         port = listening.getsockname()[1]
         where = f"http{'s' if tls else ''}://{_bracketed(_name(choice))}:{port}/"
-        print(f"the page of {what} is at {where}; Ctrl-C ends it", flush=True)  # noqa: T201 - for a person
+        # Ctrl-C would end the parent, not only the page.
+        how_to_end = "" if with_parent else "; Ctrl-C ends it"
+        print(f"the page of {what} is at {where}{how_to_end}", flush=True)  # noqa: T201 - for a person
         if key:
             print(f"who opens {where}operator?key={key} may handle alarms", flush=True)  # noqa: T201
         hosts = (*choice.names, *(() if choice.is_local else (_bracketed(choice.host),)))

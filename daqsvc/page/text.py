@@ -80,7 +80,7 @@ def alarm_rows(live: MachineLive) -> str:
             escape(one["alarm"]) + (' <span class="first">first</span>' if one["first_out"] else ""),
             escape(STATES.get(str(one["state"]), str(one["state"]))),
             time_mark(one["wall_ns"]),
-            escape(one["message"]),
+            escape(live.told_of(one)),
         )
         for one in standing(live)
     ]

@@ -10,6 +10,7 @@ from test_views import about
 from daqsvc.machine_facts import fault_names
 from daqsvc.page.findings import FAULTS, SOUND, finding_rows, sentence
 from daqsvc.page.machine_live import MachineLive
+from daqsvc.page.text import alarm_rows
 
 if TYPE_CHECKING:
     import pytest
@@ -156,3 +157,28 @@ def test_a_plugin_that_fails_costs_its_names_and_nothing_else(
     monkeypatch.setattr("daqsvc.detectors.rotor_bank.build.faults", failing)
     assert fault_names(parsed(LAVAL)) == {}
     assert "its decisions are shown as they are" in caplog.text
+
+
+def test_no_fault_is_not_the_whole_story_while_a_sensor_is_not_ok() -> None:
+    good = said("N", severity="normal")
+    assert "But" not in finding_rows(looking(good))
+    bad = good | {"detector": "levels/a", "sensors": ["a"], "quality": "not_ok", "reason": "it is dead"}
+    assert "No detector finds a fault. But a is not OK or missing" in finding_rows(looking(good, bad))
+
+
+def test_the_cause_of_an_alarm_is_shown_after_it_was_acknowledged() -> None:
+    live = looking()
+    raised = {
+        "alarm": "v",
+        "kind": "raised",
+        "state": "active_unacknowledged",
+        "level": "alert",
+        "monotonic_ns": 1,
+        "wall_ns": 1,
+        "first_out": False,
+        "message": "v alert: 3 mm/s",
+    }
+    live.hear({"alarm": raised})
+    done = {"kind": "acknowledged", "state": "active_acknowledged", "message": "v acknowledged by ann"}
+    live.hear({"alarm": raised | done})
+    assert "v alert: 3 mm/s; v acknowledged by ann" in alarm_rows(live)

@@ -14,11 +14,13 @@ from support.page_client import PASSWORD, Client, audited
 from support.page_rig import live_rig
 from support.tls_files import self_signed
 from support.waiting import PATIENCE_S, eventually
+from test_views import about
 
 from daqsvc.alarms.states import Level
 from daqsvc.page.access.accounts import account_line, write_account
 from daqsvc.page.access.role import Role
-from daqsvc.page.handling import offered
+from daqsvc.page.handling import _times, offered
+from daqsvc.page.machine_live import MachineLive
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -81,6 +83,8 @@ async def test_an_operator_handles_an_alarm_and_a_viewer_does_not(tmp_path: Path
         assert "samesite=strict" in cookie
         looked = (await client.get(f"{MACHINE}?alarm={ALARM}")).text
         assert "bob may look only" in looked
+        assert "--operator-link" not in looked, "this page has accounts"
+        assert "Open one to see" in (await client.get(MACHINE)).text
         assert "Acknowledge" not in looked
         token = await client.token("/")
         answer = await client.post(MACHINE, wish(token))
@@ -251,3 +255,17 @@ async def test_an_operator_acknowledges_an_alarm_in_the_browser(tmp_path: Path) 
         await page.get_by_role("row", name="active, acknowledged").wait_for(timeout=PATIENCE_MS)
         await page.get_by_role("button", name="Sign out").click()
         await page.get_by_role("button", name="Sign in").wait_for()
+
+
+@pytest.mark.parametrize(
+    ("handling", "times"),
+    [
+        ({}, ["1", "4", "8"]),
+        ({"shelve_at_most_s": 86_400.0}, ["1", "4", "8", "24"]),
+        ({"shelve_at_most_s": 60.0}, ["1"]),
+    ],
+)
+def test_an_alarm_is_shelved_no_longer_than_the_machine_file_allows(handling: Any, times: list[str]) -> None:
+    live = MachineLive(about())
+    live.values = live.values | {"alarm_handling": handling}
+    assert list(_times(live)) == times

@@ -72,6 +72,17 @@ def test_a_port_that_is_taken_is_one_sentence(tmp_path: Path, capsys: pytest.Cap
     assert "'70000' is no port: give a number from 0 to 65535" in capsys.readouterr().err
 
 
+def test_a_port_that_the_page_of_the_service_has_is_said_to_be_its(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("daqsvc.control.ask_status", lambda _store: [{"outputs": {"page": {}}}])
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert main(["page", "--store", f"{tmp_path}", "--port", f"{port}"]) == 1
+    said = capsys.readouterr().err
+    assert f"127.0.0.1:{port} is in use, and the service on {tmp_path} shows its page itself" in said
+
+
 def test_what_is_no_snapshot_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "odd.mcap"
     file.write_bytes(b"nonsense" * 100)

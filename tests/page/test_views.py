@@ -13,6 +13,7 @@ import pytest
 
 from daqsvc.history.file import HistoryFile, Series
 from daqsvc.history.points import RECORD
+from daqsvc.page.charts import LIGHT
 from daqsvc.page.lines import amplitudes
 from daqsvc.page.machine_live import MachineLive
 from daqsvc.page.presence import Picture
@@ -235,14 +236,37 @@ def test_a_trend_is_drawn_from_the_history_and_broken_where_nothing_was_measured
     shown = view.shown(live, {"reading": "levels/left.rms", "hours": "1"})
     drawn = shown.sources["trend"]
     assert len(drawn["t"]) <= MOST_POINTS
-    assert drawn["t"][0] == pytest.approx(-3000 / 3600, abs=0.01)
+    assert drawn["t"][0] == pytest.approx(-3000 / 60, abs=0.6), "minutes"
     assert np.nanmin(drawn["mean"]) == np.nanmax(drawn["mean"]) == 5.0
     hole = drawn["t"][np.isnan(drawn["mean"])]
-    assert (hole.min(), hole.max()) == pytest.approx((-2000 / 3600, -1600 / 3600), abs=0.01)
+    assert (hole.min(), hole.max()) == pytest.approx((-2000 / 60, -1600 / 60), abs=0.6)
     assert {row[0]: row[1] for row in shown.rows}["mean"] == "5"
     by_the_hour = view.shown(live, {"reading": "levels/left.rms", "hours": "8760"})
     assert ("mean", "5", "um") in by_the_hour.rows
     assert len(by_the_hour.sources["trend"]["t"]) <= 2
+
+
+def test_a_trend_begins_with_a_figure_that_has_limits_and_draws_them(tmp_path: Path) -> None:
+    live = MachineLive(about())
+    alarm = {"name": "a", "sensor": "left", "measure": "velocity_rms", "alert": 2.8, "danger": 4.5}
+    live.values = live.values | {"alarms": [alarm]}
+    live.history = tmp_path / "history.sqlite"
+    file = HistoryFile(live.history)
+    second = np.array([(int(time.time()) - 60, 1, 4.0, 5.0, 7.0)], RECORD)
+    for key in ("rms", "velocity_rms", "peak"):
+        file.write({Series("rig", "levels/left", "statistic", key, "mm/s"): second})
+    file.close()
+    view = VIEWS["trend"]
+    reading, *others = view.choices(live)[0].options
+    assert (reading, others) == ("levels/left.velocity_rms", ["levels/left.rms", "levels/left.peak"])
+
+    def drawn(reading: str, hours: str) -> tuple[set[str], str]:
+        [figure] = view.figures(live, {"reading": reading, "hours": hours}, LIGHT)
+        items = {item.label.value for item in figure.made.legend[0].items}
+        return items, figure.made.xaxis[0].axis_label
+
+    assert drawn(reading, "0.25") == ({reading, "alert", "danger"}, "time before now, minutes")
+    assert drawn("levels/left.rms", "8") == ({"levels/left.rms"}, "time before now, hours")
 
 
 def test_the_centreline_follows_the_means_of_both_probes() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from daqsvc.page.earlier import opened_history
 from daqsvc.page.views.view import Choice, Figure, Shown
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
 
     from daqsvc.history.points import TrendPoints
     from daqsvc.page.charts import Theme
@@ -29,6 +29,8 @@ HOURS = {
     "8760": "1 year",
 }
 SECONDS_UP_TO_H, MINUTES_UP_TO_H = 1.0, 200.0
+MINUTES_TO_H = 1.0
+"""What is no longer is shown in minutes."""
 DAYS_FROM_H = 48.0
 """What is longer is shown in days."""
 MOST_POINTS = 1500
@@ -66,7 +68,7 @@ class TrendView:
     def figures(self, live: MachineLive, chosen: Mapping[str, str], theme: Theme) -> list[Figure]:
         """See `daqsvc.page.views.view.MachineView.figures`."""
         reading, hours = chosen["reading"], float(chosen["hours"])
-        per_unit, unit = (24.0, "days") if hours >= DAYS_FROM_H else (1.0, "hours")
+        per_unit, unit = _unit_of(hours)
         figure_unit = _units(live).get(reading, "")
         made = chart(
             ChartAxis(f"time before now, {unit}", -hours / per_unit, 0.0),
@@ -82,6 +84,15 @@ class TrendView:
         told = source("trend", ["t", "low", "mean", "high"])
         made.varea("t", "low", "high", source=told, fill_color=theme.series[0], fill_alpha=0.25)
         made.line("t", "mean", source=told, line_color=theme.series[0], legend_label=reading)
+        for key, limit in _limits(live, reading):
+            colour = theme.series[1] if key.startswith("danger") else theme.quiet
+            made.line(
+                [-hours / per_unit, 0.0],
+                [limit, limit],
+                line_color=colour,
+                line_dash="dashed",
+                legend_label=key.replace("_", " "),
+            )
         legend(made, theme)
         return [Figure("trend", f"{reading} over {HOURS[chosen['hours']]}", made)]
 
@@ -104,7 +115,7 @@ class TrendView:
             ("greatest", f"{points.high.max():.4g}", series.unit),
             ("newest", f"{points.mean[-1]:.4g}", series.unit),
         ]
-        t = t_h / (24.0 if hours >= DAYS_FROM_H else 1.0)
+        t = t_h / _unit_of(hours)[0]
         return Shown({"trend": {"t": t, "low": low, "mean": mean, "high": high}}, rows)
 
 
@@ -137,11 +148,33 @@ def thinned(points: TrendPoints, now_s: float, step: Step) -> tuple[np.ndarray, 
     return t_h, low, mean, high
 
 
+def _unit_of(hours: float) -> tuple[float, str]:
+    """The unit of the time axis, in h, and its name."""
+    if hours >= DAYS_FROM_H:
+        return 24.0, "days"
+    return (1.0, "hours") if hours > MINUTES_TO_H else (1.0 / 60.0, "minutes")
+
+
 def _units(live: MachineLive) -> dict[str, str]:
     with opened_history(live) as reader:
         return {} if reader is None else {one.name: one.unit for one in reader.series(live.name)}
 
 
 def _names(live: MachineLive) -> list[str]:
-    """The figures that there are, r.m.s. values first."""
-    return sorted(_units(live), key=lambda name: (not name.endswith("rms"), name))
+    """The figures that there are: at first those with limits, then r.m.s. values."""
+    alarmed = {_watched(one) for one in live.values.get("alarms", ())}
+    return sorted(_units(live), key=lambda name: (name not in alarmed, not name.endswith("rms"), name))
+
+
+def _watched(alarm: Mapping[str, Any]) -> str:
+    """The figure that an alarm of the machine file watches, by its name here."""
+    return f"levels/{alarm.get('sensor', '')}.{alarm.get('measure', '')}"
+
+
+def _limits(live: MachineLive, reading: str) -> Iterator[tuple[str, float]]:
+    """The limits of a figure by the machine file, each with the key that states it."""
+    for alarm in live.values.get("alarms", ()):
+        if _watched(alarm) == reading:
+            for key in ("alert", "danger", "alert_low", "danger_low"):
+                if isinstance(limit := alarm.get(key), int | float):
+                    yield key, float(limit)

@@ -50,6 +50,7 @@ async def kept(output: PageOutput) -> Any:
 async def test_the_service_starts_its_page_which_shows_its_machine(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
+    caplog.set_level("INFO")
     port = free_port()
     virtual = ('interface = "socketcan"', 'interface = "virtual"')
     table = f'[page]\nlisten = "127.0.0.1:{port}"\n\n[mqtt]'
@@ -64,6 +65,8 @@ async def test_the_service_starts_its_page_which_shows_its_machine(
     with pytest.raises(OSError, match="refused"):
         await asyncio.to_thread(get, port)
     assert "left behind" not in caplog.text
+    assert "the page of" in caplog.text
+    assert "Ctrl-C" not in caplog.text, "that would end the service"
 
 
 async def test_a_page_has_the_time_of_the_stop_to_end(
