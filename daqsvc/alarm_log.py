@@ -10,7 +10,10 @@ import logging
 from typing import TYPE_CHECKING
 
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.alarms.codes import code_of_alarm
 from daqsvc.alarms.states import Level
+from daqsvc.errors.code import coded
+from daqsvc.errors.service import TOO_SLOW
 
 if TYPE_CHECKING:
     from daqsvc.acquisition.clock import Clock
@@ -48,7 +51,8 @@ class AlarmLog:
         is_quiet = event.from_level is event.to_level is Level.NORMAL
         loud = logging.INFO if is_quiet else logging.WARNING
         name = f"{event.alarm} of {event.identity.machine}" if self._of_several else event.alarm
-        logger.log(loud, "alarm %s %s: %s", name, event.kind, event.message)
+        code = code_of_alarm(event.alarm, event.cause.quality) if event.to_level else None
+        logger.log(loud, "alarm %s %s: %s", name, event.kind, event.message, extra=coded(code))
 
     def sum_up(self) -> None:
         """Say how many events were only counted since the last time; about once a second."""
@@ -56,6 +60,7 @@ class AlarmLog:
             logger.warning(
                 "%d alarm events came too fast for this log; daqsvc alarms --history shows them all",
                 self._left_out,
+                extra=coded(TOO_SLOW),
             )
             self._left_out = 0
 

@@ -23,6 +23,9 @@ from daqsvc.alarms.conditions import Condition
 from daqsvc.alarms.states import AlarmState, CommandNotAllowedError, Level
 from daqsvc.audit import AuditError, AuditLog, Refusals
 from daqsvc.control import SnapshotNotMadeError
+from daqsvc.errors.code import coded
+from daqsvc.errors.outputs import COMMAND_NOT_OBEYED
+from daqsvc.errors.service import DISK_REFUSES, NOT_REMEMBERED, PART_FAILED, SNAPSHOT_LOST
 from daqsvc.outbox.limits import OutboxLimits
 from daqsvc.outbox.messages import OutboxError, event_id
 from daqsvc.outbox.store import Outbox
@@ -325,7 +328,8 @@ class AlarmService:
         """
         logger.warning(
             "the service was ended while the disk took no writes: the broker may show what the journal does "
-            "not know, so the state of every alarm is sent again"
+            "not know, so the state of every alarm is sent again",
+            extra=coded(NOT_REMEMBERED),
         )
         again = [event for event in events if self._newest[event.identity.machine, event.alarm] is event]
         return [
@@ -350,7 +354,12 @@ class AlarmService:
             witness = json.loads(payload)
             number, series = int(witness["sequence"]), str(witness["id"])
         except (ValueError, TypeError, KeyError, RecursionError) as error:
-            logger.warning("what the broker keeps on %s cannot be read: %s", self._witness, error)
+            logger.warning(
+                "what the broker keeps on %s cannot be read: %s",
+                self._witness,
+                error,
+                extra=coded(NOT_REMEMBERED),
+            )
             return
         if self._witness_known is None or number <= self._witness_known:
             return
@@ -358,7 +367,8 @@ class AlarmService:
             return
         logger.warning(
             "an earlier run has sent the broker what the disk never got, so the state of every alarm is sent "
-            "again"
+            "again",
+            extra=coded(NOT_REMEMBERED),
         )
         for event in [*self._newest.values()]:
             self._submit(event)
@@ -552,7 +562,7 @@ class AlarmService:
             task.cancel()
         for task in ended:
             if not task.cancelled() and (error := task.exception()) is not None:
-                logger.error("%s has failed: %s", task.get_name(), error)
+                logger.error("%s has failed: %s", task.get_name(), error, extra=coded(PART_FAILED))
 
     async def close(self, timeout_s: float) -> None:
         """Close the journal; see `Outbox.close`."""
@@ -574,7 +584,13 @@ class AlarmService:
                 await self._write_down(entry, command, source, outcome)
                 return outcome
         except AuditError as error:
-            logger.error("a command to %s %s was refused: %s", command.verb, command.alarm, error)  # noqa: TRY400
+            logger.error(  # noqa: TRY400 - the message says it all
+                "a command to %s %s was refused: %s",
+                command.verb,
+                command.alarm,
+                error,
+                extra=coded(COMMAND_NOT_OBEYED),
+            )
             self.commands.unwritten += 1
             return self._refuse(f"{error}")
         finally:
@@ -593,7 +609,9 @@ class AlarmService:
                 self._refusals.written()
             await self._write_down(entry, command, source, outcome)
         except AuditError as error:
-            logger.error("a snapshot of %s was refused: %s", command.machine, error)  # noqa: TRY400
+            logger.error(  # noqa: TRY400 - the message says it all
+                "a snapshot of %s was refused: %s", command.machine, error, extra=coded(SNAPSHOT_LOST)
+            )
             self.commands.unwritten += 1
             return self._refuse(f"{error}")
         else:
@@ -663,14 +681,20 @@ class AlarmService:
             await self.audit.answered(entry, command, source, outcome)
         except AuditError as error:
             self.commands.unanswered_in_log += 1
-            logger.error("what came of command %s is not in the log: %s", entry, error)  # noqa: TRY400
+            logger.error(  # noqa: TRY400 - the message says it all
+                "what came of command %s is not in the log: %s", entry, error, extra=coded(DISK_REFUSES)
+            )
 
     async def _tell_refused(self) -> None:
         """Write down how many commands were refused in a flood of them."""
         try:
             await self.audit.refused(self._refusals)
         except AuditError as error:
-            logger.error("refused commands that were counted are not in the log yet: %s", error)  # noqa: TRY400
+            logger.error(  # noqa: TRY400 - the message says it all
+                "refused commands that were counted are not in the log yet: %s",
+                error,
+                extra=coded(DISK_REFUSES),
+            )
 
     def _of_outputs(self) -> Iterator[Condition]:
         """How things stand with the outputs; what one that is no longer there has said stands no longer."""
@@ -710,7 +734,9 @@ class AlarmService:
             self._free_bytes = await asyncio.to_thread(self._self_check.free_bytes)
         except OSError as error:
             if self._free_bytes is not None:
-                logger.error("nobody knows how full the disk of the journal is: %s", error)  # noqa: TRY400
+                logger.error(  # noqa: TRY400 - the message says it all
+                    "nobody knows how full the disk of the journal is: %s", error, extra=coded(DISK_REFUSES)
+                )
             self._free_bytes = None
 
     def _refuse(self, reason: str) -> CommandOutcome:
@@ -746,7 +772,9 @@ class AlarmService:
         self._under_way.discard(committed)
         if committed.cancelled() or (error := committed.exception()) is None:
             return
-        logger.error("an event of alarm %s never reached the disk: %s", event.alarm, error)
+        logger.error(
+            "an event of alarm %s never reached the disk: %s", event.alarm, error, extra=coded(DISK_REFUSES)
+        )
         alarm = (event.identity.machine, event.alarm)
         if self._newest[alarm] is event:
             self._untold[alarm] = event

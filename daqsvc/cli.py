@@ -24,6 +24,7 @@ from daqsvc.commands.alarms import AlarmsCommand, alarm_verbs
 from daqsvc.commands.analyze import AnalyzeCommand
 from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, ArgumentParser
 from daqsvc.commands.calibrate import CalibrateCommand
+from daqsvc.commands.complaint import complain
 from daqsvc.commands.detectability import DetectabilityCommand
 from daqsvc.commands.example import ExampleCommand
 from daqsvc.commands.explain import ExplainCommand
@@ -40,6 +41,8 @@ from daqsvc.commands.snapshot import SnapshotCommand
 from daqsvc.commands.sniff import SniffCommand
 from daqsvc.commands.status import StatusCommand
 from daqsvc.commands.trend import TrendCommand
+from daqsvc.errors.code import with_code
+from daqsvc.errors.command_line import INTERRUPTED, LEFT_OUT, OUTPUT_CUT
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -160,12 +163,15 @@ def _with_level(text: str, level: int) -> str:
 
 
 class _OneLine(logging.Formatter):
-    """A message on one line, whatever words of plugins and devices are in it; tracebacks have their own."""
+    """A message on one line, whatever words of plugins and devices are in it; tracebacks have their own.
+
+    It ends with the code of its kind, which the record has as a field (`coded`).
+    """
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - of logging
         from daqsvc.settings.failures import one_line  # noqa: PLC0415 - each verb imports only what it needs
 
-        record.message = one_line(record.message)
+        record.message = with_code(one_line(record.message), getattr(record, "code", None))
         return super().formatMessage(record)
 
 
@@ -231,7 +237,7 @@ def commands() -> dict[str, Command]:
             known[point.name] = point.load()()
         except ImportError as error:
             # A broken extra must not keep the service from running.
-            print(f"daqsvc: verb {point.name!r} is left out: {error}", file=sys.stderr)  # noqa: T201
+            complain("daqsvc", f"verb {point.name!r} is left out: {error}", LEFT_OUT)
     return known
 
 
@@ -296,15 +302,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _give_up_stdout()
         return EXIT_OK
     except KeyboardInterrupt:
-        print("daqsvc: interrupted", file=sys.stderr)  # noqa: T201
-        return EXIT_FAILED
+        return complain("daqsvc", "interrupted", INTERRUPTED)
     except OSError as error:
         if error.errno not in {errno.ENOSPC, errno.EIO}:
             raise
         # A full disk, or a terminal that is gone; stderr may be the same one.
         _give_up_stdout()
         with contextlib.suppress(OSError):
-            print(f"daqsvc: {error.strerror}: the output is not complete", file=sys.stderr)  # noqa: T201
+            complain("daqsvc", f"{error.strerror}: the output is not complete", OUTPUT_CUT)
         return EXIT_FAILED
     except Exception as error:
         from daqsvc.settings.failures import one_line  # noqa: PLC0415 - with all that reads machine files

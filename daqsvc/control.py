@@ -37,6 +37,9 @@ from daqsvc.alarms.commands import (
     Verb,
     faults_of,
 )
+from daqsvc.errors.code import coded
+from daqsvc.errors.command_line import NO_SERVICE, NOT_ASKED
+from daqsvc.errors.service import CONTROL_SOCKET, PART_FAILED
 from daqsvc.outbox.files import is_possessed, is_read_only
 from daqsvc.outbox.reading import JOURNAL_NAME
 from daqsvc.publish.looking import Looking
@@ -97,9 +100,13 @@ _ANSWER: Literal["daqsvc.control-answer/1"] = "daqsvc.control-answer/1"
 class ControlError(Exception):
     """The control socket cannot be used; the text names it and the remedy."""
 
+    code = NOT_ASKED
+
 
 class AbsentError(ControlError):
     """Nobody answers at the control socket of a store, for now."""
+
+    code = NO_SERVICE
 
 
 class NotRunningError(AbsentError):
@@ -347,7 +354,11 @@ class ControlServer:
                         await self.open()
                     except ControlError as error:
                         if self._refused != known:
-                            log.error("no commands on this box until this is mended: %s", error)  # noqa: TRY400
+                            log.error(  # noqa: TRY400 - the message says it all
+                                "no commands on this box until this is mended: %s",
+                                error,
+                                extra=coded(CONTROL_SOCKET),
+                            )
                         is_reported = True
                         await asyncio.sleep(backoff.next_ns() / NS_PER_S)
                         continue
@@ -357,7 +368,11 @@ class ControlServer:
                 await asyncio.sleep(LOOK_S)
                 if not await asyncio.to_thread(_is_at, self.path, self._inode):
                     is_reported = True
-                    log.warning("the control socket %s was taken away; another one is made", self.path)
+                    log.warning(
+                        "the control socket %s was taken away; another one is made",
+                        self.path,
+                        extra=coded(CONTROL_SOCKET),
+                    )
                     await self.close()
                 elif self._link is not None and not await asyncio.to_thread(_leads, self._link, self.path):
                     await self._mend_link(self._link)
@@ -377,11 +392,16 @@ class ControlServer:
                     link,
                     why,
                     LOOK_S,
+                    extra=coded(CONTROL_SOCKET),
                 )
             self._refused = why
         else:
             self._refused = ""
-            log.warning("the link %s to the control socket was taken away; it is made again", link)
+            log.warning(
+                "the link %s to the control socket was taken away; it is made again",
+                link,
+                extra=coded(CONTROL_SOCKET),
+            )
 
     async def close(self) -> None:
         """Stop listening, end every connection at once, and take the socket away."""
@@ -400,13 +420,17 @@ class ControlServer:
                 await asyncio.to_thread(_remove, self.path, self._inode)
         except TimeoutError:
             log.warning(
-                "the control socket %s does not close within %g s and is left behind", self.path, CLOSE_S
+                "the control socket %s does not close within %g s and is left behind",
+                self.path,
+                CLOSE_S,
+                extra=coded(CONTROL_SOCKET),
             )
         except OSError as error:
             log.warning(
                 "the control socket %s is left behind, where the next start replaces it: %s",
                 self.path,
                 error.strerror or error,
+                extra=coded(CONTROL_SOCKET),
             )
 
     def _welcome(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -472,7 +496,9 @@ class ControlServer:
             self.counters.clients_failed += 1
             if self.counters.clients_failed == 1:
                 log.exception(
-                    "the service has failed on what %s asked for, and ends the connection", client.source
+                    "the service has failed on what %s asked for, and ends the connection",
+                    client.source,
+                    extra=coded(PART_FAILED),
                 )
         finally:
             if writer.transport.get_write_buffer_size():

@@ -15,6 +15,9 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from daqsvc.errors.code import coded
+from daqsvc.errors.service import KERNELS
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
@@ -68,7 +71,11 @@ def say_not_kept(error: OSError) -> None:
     """A kernel could not be written after all."""
     if not _Compiling.failed:
         _Compiling.failed = True
-        log.warning("compiled kernels cannot be kept, and the next start compiles them again: %s", error)
+        log.warning(
+            "compiled kernels cannot be kept, and the next start compiles them again: %s",
+            error,
+            extra=coded(KERNELS),
+        )
 
 
 def _choose(*, say: bool) -> bool:
@@ -95,7 +102,7 @@ def _choose(*, say: bool) -> bool:
         os.environ[VARIABLE] = str(temporary)
         consequence = f"compiled kernels are kept in {temporary}, where they may be deleted"
     if say:
-        log.warning("%s: %s; %s", consequence, ", and ".join(reasons), REMEDY)
+        log.warning("%s: %s; %s", consequence, ", and ".join(reasons), REMEDY, extra=coded(KERNELS))
     return temporary is not None
 
 

@@ -18,6 +18,8 @@ from threading import Condition, Thread
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.confined.process import ConfinedError, ConfinedProcess, RaisedThereError
+from daqsvc.errors.code import coded
+from daqsvc.errors.service import KERNELS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -93,7 +95,7 @@ class KernelCompiler:
             words = (
                 "the service compiles kernels by itself, and takes some 130 MB more until its next start: %s"
             )
-            log.warning(words, reason)
+            log.warning(words, reason, extra=coded(KERNELS))
 
     def close(self) -> None:
         """End the process, as if there had been nothing to do for long."""

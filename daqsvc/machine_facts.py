@@ -7,6 +7,7 @@ import logging
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.detectors.make import plugins
+from daqsvc.errors.code import coded
 from daqsvc.settings.hooks import PluginFailedError
 from daqsvc.settings.models import MachineFile
 
@@ -38,7 +39,9 @@ def fault_names(machine: MachineFile) -> dict[str, dict[str, str]]:
             told = plugin.faults(machine, settings)
             named |= {str(detector): {**faults} for detector, faults in told.items()}
         except PluginFailedError as failed:
-            log.error("%s", failed.followed_by("; its decisions are shown as they are"))  # noqa: TRY400
+            log.error(  # noqa: TRY400 - the message says it all
+                "%s", failed.followed_by("; its decisions are shown as they are"), extra=coded(failed.code)
+            )
     return named
 
 

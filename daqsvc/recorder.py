@@ -22,6 +22,8 @@ from daqsvc.alarms.conditions import is_condition
 from daqsvc.alarms.events import ANNUNCIATIONS, AlarmEvent, Identity
 from daqsvc.diagnosis.memory import MemoryNotTakenError, taken_memory
 from daqsvc.diagnosis.record import Diagnosis
+from daqsvc.errors.code import coded
+from daqsvc.errors.service import SNAPSHOT_LOST
 from daqsvc.machine_facts import fault_names, machine_values, stream_facts
 from daqsvc.publish.payloads import alarm_document, statement_document
 from daqsvc.settings.registry import configured
@@ -749,7 +751,13 @@ class MachineRecorder:
         outcome = "lost" if path is None else "ended" + (", and another one begun" if is_begun else "")
         if self._is_well:
             self._is_well = False
-            log.error("a snapshot of %s is %s: %s", self._identity.machine, outcome, _in_words(error))
+            log.error(
+                "a snapshot of %s is %s: %s",
+                self._identity.machine,
+                outcome,
+                _in_words(error),
+                extra=coded(SNAPSHOT_LOST),
+            )
         snapshot.answer(path or SnapshotRefusedError(f"the snapshot is lost: {_in_words(error)}"))
         if path is None and snapshot.writer is not None:
             with contextlib.suppress(OSError):

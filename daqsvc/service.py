@@ -19,6 +19,8 @@ from daqsvc.alarms.manager import AlarmManager
 from daqsvc.control import ControlError, ControlServer, ReloadRefusedError, SnapshotNotMadeError
 from daqsvc.diagnosis.pipeline import THREADS, KernelThreads, kernel_failed
 from daqsvc.driver_reports import DriverReports
+from daqsvc.errors.code import coded
+from daqsvc.errors.service import CONTROL_SOCKET, TOO_SLOW
 from daqsvc.machine_watch import MachineWatch
 from daqsvc.outbox.files import make_directory
 from daqsvc.outbox.limits import OutboxLimits
@@ -102,6 +104,7 @@ class LoopLag:
                     "the process stood still for %.1f s (suspended, or starved by the host); samples that no "
                     "buffer could hold meanwhile are counted as lost",
                     late_s,
+                    extra=coded(TOO_SLOW),
                 )
 
     def forget(self) -> None:
@@ -301,7 +304,9 @@ class Service:
             await self.control.open()
         except ControlError as error:
             # Watching the machine matters more than being told what to do.
-            logger.error("no commands on this box until this is mended: %s", error)  # noqa: TRY400
+            logger.error(  # noqa: TRY400 - the message says it all
+                "no commands on this box until this is mended: %s", error, extra=coded(CONTROL_SOCKET)
+            )
 
     async def _prepare(self, watch: MachineWatch) -> None:
         if watch.store != self._store:

@@ -15,8 +15,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from daqsvc import __version__
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.alarms.codes import code_of_alarm, code_of_quality
 from daqsvc.alarms.states import AlarmState
 from daqsvc.diagnosis.snapshots import patience
+from daqsvc.errors.buses import NOT_BELIEVED
 from daqsvc.outbox.messages import OutboxError
 from daqsvc.publish.faults import fault_counts
 from daqsvc.publish.payloads import stamp_now
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
     from daqsvc.alarms.status import AlarmStatus
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.driver_reports import DriverReports
+    from daqsvc.errors.code import Code
     from daqsvc.machine_watch import MachineWatch
     from daqsvc.publish.output import Output
     from daqsvc.publish.service_status import SensorState
@@ -164,6 +167,7 @@ class StatusReport:
                     "driver": self._machine.buses[driver.name].driver,
                     "state": driver.link.state,
                     "reason": driver.link.reason,
+                    "code": _id(driver.link.code),
                 }
                 for driver in self._drivers
             },
@@ -173,7 +177,13 @@ class StatusReport:
                 _statement(seen.latest[name], seen.measured.get(name), seen.now_ns)
                 for name in sorted(seen.latest)
             ],
-            "alarms": _standing(seen.alarms, seen.now_ns, stamp["wall_ns"] - stamp["monotonic_ns"]),
+            "alarms": _standing(
+                seen.alarms,
+                seen.now_ns,
+                stamp["wall_ns"] - stamp["monotonic_ns"],
+                {f"detector-ok/{one.detector}": one.quality for one in seen.latest.values()}
+                | {f"sensor-ok/{name}": state for name, (state, _) in states.items()},
+            ),
             "outbox": {
                 "depth": outbox["depth"],
                 "waiting": outbox["waiting"],
@@ -216,6 +226,7 @@ class StatusReport:
             "configured_rate_hz": stream.rate_hz,
             "age_s": None if sample is None else _age_s(sample[1], seen.now_ns),
             "doubt": counted.get("doubt", ""),
+            "code": _id(NOT_BELIEVED if counted.get("doubt") else None),
             "samples_received": counted.get("samples_received", 0),
             "samples_lost": counted.get("samples_lost", 0),
         }
@@ -235,6 +246,7 @@ class StatusReport:
                         "age_s": None if sample is None else _age_s(sample[1], seen.now_ns),
                         "state": state,
                         "reason": reason,
+                        "code": _id(code_of_quality(state)),
                     }
 
 
@@ -274,6 +286,7 @@ def _statement(latest: Diagnosis, measured: Diagnosis | None, now_ns: int) -> Do
         "severity": latest.severity,
         "quality": latest.quality,
         "reason": latest.reason,
+        "code": _id(code_of_quality(latest.quality)),
         "age_s": _age_s(latest.t_ns, now_ns),
         "measures": {
             name: {"value": value, "unit": measured.units.get(name, "")}
@@ -286,8 +299,17 @@ def _statement(latest: Diagnosis, measured: Diagnosis | None, now_ns: int) -> Do
     }
 
 
-def _standing(alarms: Mapping[str, AlarmStatus], now_ns: int, wall_of_ns: int) -> Document:
-    """The alarms, where ``wall_of_ns`` makes a time of the wall clock of one of the monotonic clock."""
+def _standing(
+    alarms: Mapping[str, AlarmStatus], now_ns: int, wall_of_ns: int, qualities: Mapping[str, str]
+) -> Document:
+    """The alarms.
+
+    Args:
+        alarms: by name.
+        now_ns: monotonic clock.
+        wall_of_ns: makes a time of the wall clock of one of the monotonic clock.
+        qualities: of samples, by the name of the alarm about them.
+    """
     by_state = dict.fromkeys((state.value for state in AlarmState), 0)
     standing = []
     for name, status in alarms.items():
@@ -309,10 +331,15 @@ def _standing(alarms: Mapping[str, AlarmStatus], now_ns: int, wall_of_ns: int) -
                 else status.shelved_until_ns + wall_of_ns,
                 "first_out": status.first_out,
                 "message": status.told,
+                "code": _id(code_of_alarm(name, qualities.get(name, "")) if status.level else None),
             }
             for name, status in standing
         ],
     }
+
+
+def _id(code: Code | None) -> str | None:
+    return None if code is None else code.id
 
 
 def _journal(outbox: Mapping[str, Any]) -> str:
@@ -325,6 +352,7 @@ def _output(path: str, figures: Mapping[str, Any], output: Output) -> Document:
     return {
         "connected": None if connected is None else bool(connected),
         "reason": output.reason,
+        "code": _id(output.code),
         "away_s": None if away_s is None else round(away_s, 3),
     }
 

@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.link import Backoff, SaidOnce
+from daqsvc.errors.code import coded
+from daqsvc.errors.service import ESSENTIAL_LOST, PART_FAILED, PART_STALLED, STOPPED_HARD
 from daqsvc.settings.failures import BrokenContractError, ExitRaisedError, cause_of, error_text, in_words
 from daqsvc.threads import kept_waiting_s, where_is
 
@@ -36,6 +38,8 @@ OTHERS = "event loop"
 
 class EssentialLostError(Exception):
     """Something without which the service is useless is gone for good; the text says what, and why."""
+
+    code = ESSENTIAL_LOST
 
 
 class Supervisor:
@@ -94,7 +98,7 @@ class Supervisor:
                 return
         what = error if isinstance(error, str) else in_words(error)
         times = "" if count == 1 else f" (failure {count} of it)"
-        logger.error("%s: %s; %s%s", name, what, then, times)
+        logger.error("%s: %s; %s%s", name, what, then, times, extra=coded(PART_FAILED))
         if isinstance(error, BaseException) and error.__traceback__ is not None:
             logger.info("traceback of that failure", exc_info=error)
 
@@ -334,7 +338,9 @@ class StallWatch:
                 before.said = True
                 then = "; after ".join(f"{limit:g} s: {then}" for limit, then in self._limits)
                 where = "" if thread is None else f"; its thread is in {where_is(thread.ident)}"
-                logger.critical("%s has stalled, without a step for %s%s", name, then, where)
+                logger.critical(
+                    "%s has stalled, without a step for %s%s", name, then, where, extra=coded(PART_STALLED)
+                )
         return stalled
 
 
@@ -346,7 +352,12 @@ async def stop_all(parts: Iterable[Part], patience_s: float) -> None:
     await over(parts, patience_s)
     for part in parts:
         if not part.over.done():
-            logger.error("%s does not stop within %g s and is left behind", part.name, patience_s)
+            logger.error(
+                "%s does not stop within %g s and is left behind",
+                part.name,
+                patience_s,
+                extra=coded(STOPPED_HARD),
+            )
 
 
 async def over(parts: Iterable[Part], patience_s: float | None = None) -> None:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Generic, Literal, Protocol, TypeVar
 
 from daqsvc.acquisition.standing import tell_nobody
+from daqsvc.errors.buses import DEVICE_ABSENT
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -31,6 +32,8 @@ ControllerState = Literal["error-active", "error-warning", "error-passive", "bus
 
 class DeviceAbsentError(Exception):
     """The device is not there at start, and the machine file says that this is an error."""
+
+    code = DEVICE_ABSENT
 
 
 class BusOptionError(ValueError):

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
+from daqsvc.errors.buses import LAYOUT
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -29,6 +31,8 @@ J1939_WIDTHS = (8, 16, 24, 32)
 
 class LayoutError(ValueError):
     """A layout contradicts itself, its DBC file, or the values it should carry."""
+
+    code = LAYOUT
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeAlias, TypeVar
 from weakref import WeakKeyDictionary
 
 from daqsvc.acquisition.link import Backoff
+from daqsvc.errors.buses import DRIVER_FAILED
+from daqsvc.errors.code import coded
 from daqsvc.settings.failures import BrokenContractError, said_by
 from daqsvc.threads import call_in_thread
 from drivers.base import DeviceAbsentError
@@ -129,7 +131,12 @@ def sparing_others(link: Link, stream: str, counters: BusCounters) -> Iterator[N
     except Exception:
         counters.reader_failures += 1
         if counters.reader_failures == 1:
-            logger.exception("%s: samples of stream %r cannot be taken in and are lost", link.name, stream)
+            logger.exception(
+                "%s: samples of stream %r cannot be taken in and are lost",
+                link.name,
+                stream,
+                extra=coded(DRIVER_FAILED),
+            )
 
 
 async def in_thread(

@@ -13,6 +13,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
+from daqsvc.errors.command_line import NOT_OPENED, WRONG_VALUE
 from daqsvc.settings.units import unit_of
 
 if TYPE_CHECKING:
@@ -36,6 +37,7 @@ class SniffError(Exception):
     def __init__(self, message: str, *, usage: bool = False) -> None:
         super().__init__(message)
         self.usage = usage
+        self.code = WRONG_VALUE if usage else NOT_OPENED
 
 
 class SniffTable(NamedTuple):

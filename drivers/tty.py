@@ -9,6 +9,9 @@ import os
 import stat
 from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
+from daqsvc.errors.buses import LINE_SETTINGS
+from daqsvc.errors.code import coded
+
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -67,6 +70,7 @@ class CharacterFormat:
                 self._link,
                 self._asked.parity,
                 self._asked.data_bits,
+                extra=coded(LINE_SETTINGS),
             )
         return carried
 

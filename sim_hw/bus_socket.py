@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Literal
 import can
 
 from daqsvc.commands.arguments import ArgumentParser
+from daqsvc.commands.complaint import complain
 from sim_hw.bus_socket_hub import (
     LONGEST,
     QUEUE_FRAMES,
@@ -273,8 +274,7 @@ def run_hub(path: str, queue_frames: int = QUEUE_FRAMES) -> int:
     try:
         hub = Hub(path, queue_frames=queue_frames)
     except HubError as error:
-        print(error, file=sys.stderr)  # noqa: T201 - errors of the command line go to stderr
-        return 1
+        return complain("daqsvc sim", error, error.code)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: hub.stop())
     print(f"bus {path} is up", file=sys.stderr, flush=True)  # noqa: T201

@@ -19,6 +19,8 @@ from pathlib import Path
 
 import can
 
+from daqsvc.errors.command_line import SIMULATION
+
 CAN_BYTES = 16
 FD_BYTES = 72
 LONGEST = FD_BYTES
@@ -165,6 +167,8 @@ BACKLOG = 64
 
 class HubError(OSError):
     """A hub cannot be started at a path; says why and what to do."""
+
+    code = SIMULATION
 
 
 class HubTakenError(HubError):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from daqsvc.errors.recordings import NEEDS_MACHINE_FILE
 from daqsvc.recording import RecordingError
 from daqsvc.recording.formats import named_as_can_log
 from daqsvc.recording.recording import load_recording
@@ -39,10 +40,14 @@ def load_played(
         return load_recording(path, channels, rate_hz)
     if machine is None:
         raise RecordingError(
-            f"{path} is a CAN log, which only the layouts of a machine file make sense of: {remedy}"
+            f"{path} is a CAN log, which only the layouts of a machine file make sense of: {remedy}",
+            NEEDS_MACHINE_FILE,
         )
     if channels:
-        raise RecordingError(f"{path} is a CAN log, of which the machine file says channels: leave out --map")
+        raise RecordingError(
+            f"{path} is a CAN log, of which the machine file says channels: leave out --map",
+            NEEDS_MACHINE_FILE,
+        )
     from daqsvc.offline.can_logs import load_can_log  # noqa: PLC0415 - brings python-can and kernels
 
     return load_can_log(machine, str(path), rate_hz)

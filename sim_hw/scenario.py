@@ -19,6 +19,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from daqsvc.confined.small_toml import TomlFileError, parse_toml, read_toml
+from daqsvc.errors.command_line import SIMULATION
 from sim_hw.link_faults import LinkFaults
 from sim_hw.node_faults import EVER, Babble, Drift, FaultWindow, FrameDelay, NodeFaults
 from sim_hw.plants import bearing, rotor
@@ -305,6 +306,8 @@ _Kind = TypeVar("_Kind", bound=ScenarioTable)
 
 class ScenarioError(ValueError):
     """A scenario cannot be found, read or understood."""
+
+    code = SIMULATION
 
 
 class Onset(NamedTuple):

@@ -13,8 +13,10 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, ArgumentParser
+from daqsvc.commands.arguments import EXIT_OK, EXIT_USAGE, ArgumentParser
+from daqsvc.commands.complaint import complain
 from daqsvc.confined.small_toml import TomlFileError, read_toml
+from daqsvc.errors.command_line import SIMULATION
 from sim_hw.arguments import add_random, add_recording, add_speed, misplaced, positive, whole
 
 if TYPE_CHECKING:
@@ -103,7 +105,7 @@ class SimCommand:
         try:
             return asyncio.run(_simulate(arguments))
         except MachineFileError as error:
-            _say(str(error))
+            _say(str(error))  # each problem has its code
             return EXIT_USAGE
         except (
             AssemblyError,
@@ -112,10 +114,10 @@ class SimCommand:
             RecordingError,
             ScenarioError,
             SignalError,
-            TimeoutError,
         ) as error:
-            _say(str(error))
-            return EXIT_FAILED
+            return complain("daqsvc sim", error, error.code)
+        except TimeoutError as error:
+            return complain("daqsvc sim", error, SIMULATION)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -19,6 +19,7 @@ import numpy as np
 from can.interfaces.socketcan import SocketcanBus
 
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
+from daqsvc.errors.command_line import SIMULATION
 from drivers.base import StreamSpec
 from drivers.can.plugin import frame_layout
 from drivers.can.settings import CanBus
@@ -43,6 +44,8 @@ if TYPE_CHECKING:
 
 class NodeError(Exception):
     """A node cannot be put on its bus; says why and what to do."""
+
+    code = SIMULATION
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
 import numpy as np
 
+from daqsvc.errors.command_line import SIMULATION
 from sim_hw.plants.rotor import RotorEscapeError
 from sim_hw.scenario import BearingScenario, Scenario, ScenarioRun
 
@@ -30,6 +31,8 @@ _PER_M_S2 = {"m/s2": 1.0, "g": 1.0 / G_M_S2}
 
 class SignalError(ValueError):
     """What is to be played has nothing for a sensor; says which, and what there is."""
+
+    code = SIMULATION
 
 
 class Signals(Protocol):

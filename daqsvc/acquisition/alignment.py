@@ -24,6 +24,8 @@ import numpy as np
 from daqsvc.acquisition.alignment_source import AlignedSource, Follower, SourceCounters
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import Quality, SampleBlock
+from daqsvc.errors.buses import NOT_ALIGNED
+from daqsvc.errors.code import coded
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -261,6 +263,7 @@ class Aligner:
             self._reference.source.stream,
             error_us,
             follower.max_error_ns / 1e3,
+            extra=coded(NOT_ALIGNED),
         )
 
 

@@ -21,6 +21,8 @@ from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.acquisition.standing import QUIET_NS, StreamStanding, tell_nobody
 from daqsvc.acquisition.timebase import TimeBase, TimeBaseState, rate_in_words
 from daqsvc.dsp.quality.rate import ArrivalRate
+from daqsvc.errors.buses import NO_FRAME, NO_MEASUREMENT, SAMPLES_MISSING, TIME_UNSURE
+from daqsvc.errors.code import coded
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -174,6 +176,7 @@ class StreamAssembler:
                     "stream %r: a frame's CRC does not match; such frames are counted and left out. If it is "
                     "every frame, compare the place of the CRC in the layout with the device's",
                     self.stream,
+                    extra=coded(NO_FRAME),
                 )
             self.counters.frames_corrupt += int((~intact).sum())
             counter, samples, arrival_ns = counter[intact], samples[intact], arrival_ns[intact]
@@ -301,6 +304,7 @@ class StreamAssembler:
                 "stream %r: a frame's counter fits neither the sequence nor a restart; "
                 "such frames are counted and left out",
                 self.stream,
+                extra=coded(NO_FRAME),
             )
         self.counters.frames_rejected += frames
 
@@ -308,7 +312,7 @@ class StreamAssembler:
         """Log what may happen again and again, but not as often."""
         if message not in self._said or now_ns - self._said[message] >= QUIET_NS:
             self._said[message] = now_ns
-            logger.warning(message, self.stream)
+            logger.warning(message, self.stream, extra=coded(TIME_UNSURE))
 
     def _merge(self, index: NDArray[np.int64], samples: Samples, arrival_ns: int) -> None:
         if not len(index):
@@ -464,6 +468,7 @@ def note_received(counters: StreamCounters, stream: str, samples: Samples) -> Sa
             "behind it",
             stream,
             absent,
+            extra=coded(NO_MEASUREMENT),
         )
     counters.values_absent += absent
     return samples if not np.isinf(samples).any() else np.where(there, samples, np.float32(np.nan))
@@ -484,6 +489,7 @@ def note_gap(counters: StreamCounters, stream: str, lost: int, first: int) -> No
             stream,
             lost,
             first,
+            extra=coded(SAMPLES_MISSING),
         )
     counters.gaps += 1
     counters.samples_lost += lost

@@ -10,10 +10,14 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.errors.buses import DRIVER_FAILED, LEFT_OUT_AT_START, LINK_LOST
+from daqsvc.errors.code import coded
 from daqsvc.settings.failures import cause_of, in_words
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Mapping
+
+    from daqsvc.errors.code import Code
 
 logger = logging.getLogger(__name__)
 
@@ -126,6 +130,7 @@ class Link:
         state: up or down.
         losses: how often it went down after it had been up.
         reason: why it is down.
+        code: of the kind of reason; None while it is up, or was stopped.
         over: why nothing more comes over it, in a clause with its name; empty while it is up or tried again.
         turns: how often the thread that reads it has come round, whether there was anything or not; it does
             so several times a second. 0 where the event loop reads.
@@ -137,6 +142,7 @@ class Link:
     state: LinkState = "down"
     losses: int = 0
     reason: str = ""
+    code: Code | None = None
     over: str = ""
     turns: int = 0
     faults: Mapping[str, str] = field(default_factory=dict)
@@ -158,6 +164,7 @@ class Link:
             logger.info("%s is up", self.name)
         self._sparing.may_take_back()
         self.state, self.reason, self._said_down, self._ever_up = "up", "", False, True
+        self.code = None
         self.over = ""
 
     def down(self, reason: str) -> None:
@@ -167,31 +174,37 @@ class Link:
         if not self._said_down and self._sparing.may_say():
             lost = " is lost" if self._ever_up else ""
             often = OFTEN if self._sparing.often else ""
-            logger.warning("%s%s: %s; it is being tried again%s", self.name, lost, reason, often)
+            logger.warning(
+                "%s%s: %s; it is being tried again%s", self.name, lost, reason, often, extra=coded(LINK_LOST)
+            )
             self._said_down = True
-        self.state, self.reason = "down", reason
+        self.state, self.reason, self.code = "down", reason, LINK_LOST
 
     def fail(self, reason: str, error: BaseException) -> None:
         """The driver has failed in a way that nobody has foreseen, and begins again; said once an hour."""
         if self.state == "up":
             self.losses += 1
         if self._failures.may_say(cause_of(error)):
-            logger.error("%s: %s; it is being tried again", self.name, in_words(error))
+            logger.error(
+                "%s: %s; it is being tried again", self.name, in_words(error), extra=coded(DRIVER_FAILED)
+            )
             logger.info("traceback of that failure", exc_info=error)
             self._said_down = True
-        self.state, self.reason = "down", reason
+        self.state, self.reason, self.code = "down", reason, DRIVER_FAILED
 
     def leave_out(self, reason: str) -> None:
         """The link does not work at start, because of ``reason``, and is not tried again."""
         left_out = f"{self.name}: {reason}; it is left out until the service starts again"
-        logger.warning("%s, as start = 'ignore' says", left_out)
+        logger.warning("%s, as start = 'ignore' says", left_out, extra=coded(LEFT_OUT_AT_START))
         self.state, self.reason, self._said_down, self.over = "down", reason, False, left_out
+        self.code = LEFT_OUT_AT_START
 
     def end(self, reason: str) -> None:
         """There is nothing more to come over the link, because of ``reason``; it is not tried again."""
         ended = f"{self.name} has ended: {reason}"
         logger.info("%s", ended)
         self.state, self.reason, self._said_down, self.over = "down", reason, False, ended
+        self.code = None
 
     def why_silent(self, stream: str) -> str:
         """Why no samples of a stream come, in a clause, as far as that is known; else empty."""
@@ -204,4 +217,4 @@ class Link:
     def stop(self) -> None:
         """Nobody keeps the link up any more: its driver was stopped. That is no loss."""
         if self.state == "up":
-            self.state, self.reason = "down", "it was stopped"
+            self.state, self.reason, self.code = "down", "it was stopped", None

@@ -7,6 +7,8 @@ import re
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.errors.buses import NOT_BELIEVED
+from daqsvc.errors.code import coded
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -103,7 +105,12 @@ class StreamStanding:
             if now_ns - self._said_ns.get(cause, now_ns - QUIET_NS) >= QUIET_NS:
                 self._logged = True
                 self._said_ns[cause] = now_ns
-                logger.warning("stream %r: %s. Nothing is judged by it meanwhile", self._stream, doubt)
+                logger.warning(
+                    "stream %r: %s. Nothing is judged by it meanwhile",
+                    self._stream,
+                    doubt,
+                    extra=coded(NOT_BELIEVED),
+                )
         elif self._logged:
             self._logged = False
             logger.warning("stream %r: its samples can be judged by again", self._stream)

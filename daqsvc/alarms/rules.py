@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.alarms.setpoints import SetpointMonitor
 from daqsvc.alarms.states import Level
+from daqsvc.errors.alarms import CANNOT_JUDGE
+from daqsvc.errors.code import coded
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -329,6 +331,7 @@ class MeasureWatch:
                 diagnosis.detector,
                 ", ".join(diagnosis.statistics) or "nothing",
                 self._measure,
+                extra=coded(CANNOT_JUDGE),
             )
         return None
 

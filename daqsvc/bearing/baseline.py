@@ -35,6 +35,7 @@ from daqsvc.bearing.sliding_mode import SlidingGains, UnitEnergies
 from daqsvc.bearing.two_sensors import HealthyPair, learn_pair
 from daqsvc.confined.small_toml import read_toml
 from daqsvc.dsp.quality import UnfitError
+from daqsvc.errors.detectors import CALIBRATION_FILE
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -176,6 +177,8 @@ Positive = Annotated[float, Field(gt=0)]
 
 class BaselineFileError(ValueError):
     """A file with a healthy machine cannot be read, used or written; the message says why and what to do."""
+
+    code = CALIBRATION_FILE
 
 
 class _FileTable(BaseModel):

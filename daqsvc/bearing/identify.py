@@ -22,6 +22,7 @@ from scipy.fft import next_fast_len
 from scipy.special import chdtrc, stdtrit
 
 from daqsvc import heap
+from daqsvc.errors.recordings import NOT_HEALTHY
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -45,6 +46,8 @@ _WHITENESS_LAGS = 40
 
 class NotIdentifiableError(ValueError):
     """Samples from which no healthy machine can be learnt; the message names thing, value and remedy."""
+
+    code = NOT_HEALTHY
 
 
 class Whiteness(NamedTuple):

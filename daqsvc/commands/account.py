@@ -7,7 +7,9 @@ import getpass
 import sys
 from pathlib import Path
 
-from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK
+from daqsvc.commands.arguments import EXIT_OK
+from daqsvc.commands.complaint import complain
+from daqsvc.errors.command_line import NOT_KNOWN, WRONG_VALUE
 
 LEAST_PASSWORD = 10
 
@@ -51,14 +53,15 @@ class AccountCommand:
             password = _password(name)
             if not LEAST_PASSWORD <= len(password) <= LONGEST_PASSWORD:
                 lengths = f"{LEAST_PASSWORD} to {LONGEST_PASSWORD}"
-                return _failed(f"a password has {lengths} characters: choose another one")
+                what = f"a password has {lengths} characters: choose another one"
+                return complain("daqsvc account", what, WRONG_VALUE)
             line = account_line(name, Role(arguments.role), password)
         try:
             was_there = write_account(file, name, line)
         except AccountsError as error:
-            return _failed(f"{error}")
+            return complain("daqsvc account", error, error.code)
         if arguments.remove and not was_there:
-            return _failed(f"{file} has no account {name}")
+            return complain("daqsvc account", f"{file} has no account {name}", NOT_KNOWN)
         done = "is removed" if arguments.remove else f"may sign in as {arguments.role}"
         print(f"{name} {done}")  # noqa: T201 - for a person
         return EXIT_OK
@@ -81,8 +84,3 @@ def _name(text: str) -> str:
     if NAME.fullmatch(text) is None:
         raise argparse.ArgumentTypeError(f"{text!r} is no name of an account: use {NAME_IN_WORDS}")
     return text
-
-
-def _failed(why: str) -> int:
-    print(f"daqsvc account: {why}", file=sys.stderr)  # noqa: T201 - errors go to stderr
-    return EXIT_FAILED

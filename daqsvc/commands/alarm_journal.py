@@ -6,10 +6,11 @@ That is in aligned columns, in local time, with how long ago that was.
 from __future__ import annotations
 
 import json
-import sys
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from daqsvc.commands.complaint import complain
 from daqsvc.commands.tables import ago, aligned, local_time
+from daqsvc.errors.service import JOURNAL_DAMAGED
 from daqsvc.outbox.reading import read_journal, read_pasts
 from daqsvc.outbox.safety import as_owner_of
 
@@ -122,10 +123,8 @@ def _journal(store: Path, history: int = 0) -> JournalView:
 
 def _tell_damage(view: JournalView, store: Path) -> None:
     if view.damaged:
-        print(  # noqa: T201 - what goes wrong goes to stderr
-            f"{view.damaged} messages of the journal in {store} have changed on the disk and are left out",
-            file=sys.stderr,
-        )
+        what = f"{view.damaged} messages of the journal have changed on the disk and are left out"
+        complain(f"{store}", what, JOURNAL_DAMAGED)
 
 
 def _documents(entries: Iterable[JournalEntry]) -> Iterable[EventDocument]:

@@ -10,12 +10,14 @@ import contextlib
 import json
 import os
 import pwd
-import sys
 import time
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, alarm_id, count, duration, one_line
+from daqsvc.commands.complaint import complain
 from daqsvc.commands.store_argument import BadFileError, StoreNotFoundError, add_store, chosen_store
+from daqsvc.errors.command_line import COMMAND_REFUSED, NO_SUCH_ALARM, NO_SUCH_MACHINE
+from daqsvc.errors.service import JOURNAL_BEHIND
 
 if TYPE_CHECKING:
     import argparse
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
 
     from daqsvc.commands.machine_files import Load
     from daqsvc.commands.store_argument import ChosenStore
+    from daqsvc.errors.code import Code
 
 HISTORY = 20
 """Events that ``--history`` shows by default."""
@@ -86,24 +89,25 @@ class AlarmsCommand:
                 _show(store, events, arguments)
             finally:
                 if doubt:
-                    _complain("alarms", doubt)
+                    _complain("alarms", doubt, JOURNAL_BEHIND)
         except BadFileError:
             return EXIT_USAGE
         except (StoreNotFoundError, NoSuchMachineError, OutboxError) as error:
-            _complain("alarms", error)
-            return EXIT_FAILED
+            return _complain("alarms", error, error.code)
         return EXIT_OK
 
 
-def _complain(verb: str, what: object) -> None:
+def _complain(verb: str, what: object, code: Code) -> int:
     """Say what goes wrong, to stderr. Names of a journal or a service could hold anything."""
     from daqsvc.commands.tables import harmless  # noqa: PLC0415 - only what a verb needs
 
-    print(f"daqsvc {verb}: {harmless(f'{what}')}", file=sys.stderr)  # noqa: T201
+    return complain(f"daqsvc {verb}", harmless(f"{what}"), code)
 
 
 class NoSuchMachineError(Exception):
     """The machine that was named is not among those of the store; the text says which are."""
+
+    code = NO_SUCH_MACHINE
 
 
 def _refuse_unknown(chosen: ChosenStore) -> None:
@@ -174,6 +178,8 @@ LEAST_ID = 4
 
 class NoSuchAlarmError(Exception):
     """What was named is not exactly one alarm; the text says what there is."""
+
+    code = NO_SUCH_ALARM
 
 
 class AlarmVerb:
@@ -246,8 +252,7 @@ class AlarmVerb:
         except BadFileError:
             return EXIT_USAGE
         except (StoreNotFoundError, NoSuchAlarmError, OutboxError, ControlError) as error:
-            _complain(name, error)
-            return EXIT_FAILED
+            return _complain(name, error, error.code)
         if arguments.json:
             answer = {"verb": self._verb, "alarm": alarm, "occurrence": occurrence, "by": request.by}
             came = {"accepted": outcome.accepted, "reason": outcome.reason, "events": list(outcome.events)}
@@ -255,7 +260,7 @@ class AlarmVerb:
         elif outcome.accepted:
             print(harmless(f"{alarm}: {outcome.reason or _DONE[self._verb]}"))  # noqa: T201
         else:
-            _complain(name, f"refused: {outcome.reason}")
+            _complain(name, f"refused: {outcome.reason}", COMMAND_REFUSED)
         # Accepted with a reason: the disk has not got it yet.
         return EXIT_OK if outcome.accepted and not outcome.reason else EXIT_FAILED
 

@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 from daqsvc.commands.analyze_fleet import fleet_misuse, run_fleet
-from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_REFUSED, EXIT_USAGE
+from daqsvc.commands.arguments import EXIT_OK, EXIT_REFUSED, EXIT_USAGE
+from daqsvc.commands.complaint import complain
 from daqsvc.commands.recording_options import (
     add_analyze_options,
     analyze_misuse,
@@ -21,10 +22,12 @@ from daqsvc.commands.recording_options import (
     split_files,
 )
 from daqsvc.commands.with_kernels import VerbWithKernels
+from daqsvc.errors.command_line import CANNOT_WRITE, EXTRA_MISSING
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
+    from daqsvc.errors.code import Code
     from daqsvc.offline.runner import Outcome, Runner
     from daqsvc.settings import MachineFile
 
@@ -74,8 +77,9 @@ class AnalyzeCommand(VerbWithKernels):
 
         set_memory(arguments.max_memory)
         self._prepare_kernel_cache()
-        if arguments.plot is not None and (wrong := _cannot_plot(arguments.plot)):
-            return _fail(wrong, EXIT_FAILED)
+        if arguments.plot is not None and (lacking := _cannot_plot(arguments.plot)):
+            what, of_kind = lacking
+            return complain("daqsvc analyze", what, of_kind)
         loaded = None
         if machine is not None:
             loaded = self._load(machine)
@@ -93,7 +97,7 @@ class AnalyzeCommand(VerbWithKernels):
         try:
             return _tell(_outcomes(runner, recordings, figures, processes), as_json=arguments.json)
         except WorkerLostError as error:
-            return _fail(str(error), EXIT_FAILED)
+            return complain("daqsvc analyze", error, error.code)
 
 
 def _by_file(machine: Path, loaded: MachineFile | None, arguments: argparse.Namespace) -> Runner:
@@ -180,16 +184,16 @@ def _processes(jobs: int | None, recordings: int) -> int:
     return max(1, min(os.cpu_count() or 1, recordings // _FEW_PER_PROCESS))
 
 
-def _cannot_plot(directory: Path) -> str:
+def _cannot_plot(directory: Path) -> tuple[str, Code] | None:
     if importlib.util.find_spec("matplotlib") is None:
-        return "--plot needs matplotlib; install it with: pip install 'daqsvc[plot]'"
+        return "--plot needs matplotlib; install it with: pip install 'daqsvc[plot]'", EXTRA_MISSING
     try:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        return f"--plot {directory}: {error.strerror}; name a directory that can be written"
+        return f"--plot {directory}: {error.strerror}; name a directory that can be written", CANNOT_WRITE
     if not os.access(directory, os.W_OK | os.X_OK):
-        return f"--plot {directory}: cannot be written; name another directory"
-    return ""
+        return f"--plot {directory}: cannot be written; name another directory", CANNOT_WRITE
+    return None
 
 
 def _figure_names(recordings: list[str], directory: Path | None) -> list[str | None]:
@@ -203,8 +207,3 @@ def _figure_names(recordings: list[str], directory: Path | None) -> list[str | N
         seen[stem] = seen.get(stem, 0) + 1
         names.append(str(directory / (stem if seen[stem] == 1 else f"{stem}-{seen[stem]}")))
     return names
-
-
-def _fail(message: str, code: int) -> int:
-    print(f"daqsvc analyze: {message}", file=sys.stderr)  # noqa: T201 - errors of the command line go to stderr
-    return code

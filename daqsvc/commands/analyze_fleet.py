@@ -11,7 +11,9 @@ import signal
 import sys
 from typing import TYPE_CHECKING, Any
 
-from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_REFUSED, EXIT_USAGE
+from daqsvc.commands.arguments import EXIT_OK, EXIT_REFUSED, EXIT_USAGE
+from daqsvc.commands.complaint import complain
+from daqsvc.errors.command_line import EXTRA_MISSING
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -89,14 +91,14 @@ def default_results(archive: str) -> str:
 def run_fleet(arguments: argparse.Namespace) -> int:
     """Judge the archive; returns the exit code."""
     if wrong := lacking_extra():
-        return _fail(wrong, EXIT_USAGE)
+        return complain("daqsvc analyze", wrong, EXTRA_MISSING, EXIT_USAGE)
     from daqsvc.fleet import FleetError  # noqa: PLC0415 - each verb imports what it needs
 
     try:
         with _ended_by_signal():
             summary, results = _judged(arguments)
     except FleetError as error:
-        return _fail(f"{error}", EXIT_FAILED)
+        return complain("daqsvc analyze", error, error.code)
     if arguments.json:
         print(json.dumps({**summary.as_json(), "results": results}))  # noqa: T201 - this is what the verb is for
     else:
@@ -168,8 +170,3 @@ def _ended_by_signal() -> Iterator[None]:
 
 def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)  # noqa: T201 - what goes on is no result
-
-
-def _fail(message: str, code: int) -> int:
-    print(f"daqsvc analyze: {message}", file=sys.stderr)  # noqa: T201 - errors of the command line go to stderr
-    return code

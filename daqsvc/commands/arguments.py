@@ -15,6 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from daqsvc.confined.limits import GIGABYTE
+from daqsvc.errors.code import with_code
+from daqsvc.errors.command_line import ARGUMENTS, WRONG_VALUE
 from daqsvc.recording.rate import LEAST_RATE_HZ, MOST_RATE_HZ
 
 if TYPE_CHECKING:
@@ -46,7 +48,9 @@ class ArgumentParser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Say what is wrong and where help is, and exit with 2."""
-        self.exit(EXIT_USAGE, f"{self.prog}: {message}; see {self.prog} --help\n")
+        is_value = message.startswith("argument ") and "not allowed with argument" not in message
+        code = WRONG_VALUE if is_value else ARGUMENTS
+        self.exit(EXIT_USAGE, with_code(f"{self.prog}: {message}; see {self.prog} --help", code) + "\n")
 
 
 def path(text: str) -> Path:

@@ -8,7 +8,8 @@ import sys
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_REFUSED, EXIT_USAGE, signals_to_end
+from daqsvc.commands.arguments import EXIT_OK, EXIT_REFUSED, EXIT_USAGE, signals_to_end
+from daqsvc.commands.complaint import complain
 from daqsvc.commands.recording_options import (
     add_calibrate_options,
     bearing_recording_misuse,
@@ -17,12 +18,14 @@ from daqsvc.commands.recording_options import (
     split_files,
 )
 from daqsvc.commands.with_kernels import VerbWithKernels
+from daqsvc.errors.command_line import INTERRUPTED, WRONG_VALUE
 
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Callable, Sequence
 
     from daqsvc.bearing.baseline import BearingBaseline
+    from daqsvc.errors.code import Code
     from daqsvc.offline.runner import Runner
     from daqsvc.recording.recording import Recording
     from daqsvc.rotor.calibration.file import CalibrationRecord
@@ -79,9 +82,9 @@ class CalibrateCommand(VerbWithKernels):
                 return _keep(_live(machine, arguments), arguments)
             return _keep(self._calibrated_rotor(machine, recordings, arguments), arguments)
         except (RefusedError, RecordingError, NotCalibratableError, NotIdentifiableError) as error:
-            return _refuse(str(error), as_json=arguments.json)
+            return _refuse(str(error), error.code, as_json=arguments.json)
         except _FailedError as error:
-            return _fail(str(error))
+            return complain("daqsvc calibrate", error, error.code)
 
     def _of_bearings(
         self, machine: MachineFile | None, recordings: Sequence[str], arguments: argparse.Namespace
@@ -212,15 +215,19 @@ def _live(machine: MachineFile, arguments: argparse.Namespace) -> CalibrationRec
         with progress_bar(f"{arguments.revolutions} revolutions") as bar:
             made = asyncio.run(listen(bar.update))
     except asyncio.CancelledError:
-        raise _FailedError("interrupted; nothing was written") from None
+        raise _FailedError("interrupted; nothing was written", INTERRUPTED) from None
     except (AssemblyError, DeviceAbsentError, LayoutError) as error:
-        raise _FailedError(str(error)) from None
+        raise _FailedError(str(error), error.code) from None
     source = f"live, {machine.machine.name}"
     return CalibrationRecord(rotor=made.rotor, steady=(made,), steady_sources=(source,))
 
 
 class _FailedError(Exception):
     """Something else than the data or the usage is at fault."""
+
+    def __init__(self, message: str, code: Code | None) -> None:
+        super().__init__(message)
+        self.code = code
 
 
 def _keep(record: CalibrationRecord, arguments: argparse.Namespace) -> int:
@@ -237,12 +244,12 @@ def _keep(record: CalibrationRecord, arguments: argparse.Namespace) -> int:
             else as_text(record, arguments.predict_rpm)
         )
     except ValueError as error:
-        return _refuse(f"--predict-rpm: {error}", as_json=arguments.json)
+        return _refuse(f"--predict-rpm: {error}", WRONG_VALUE, as_json=arguments.json)
     if arguments.out is not None:
         try:
             save_record(record, arguments.out)
         except CalibrationFileError as error:
-            return _fail(str(error))
+            return complain("daqsvc calibrate", error, error.code)
         if not arguments.json:
             sentence += f"\nwritten to {arguments.out}"
     print(sentence, flush=True)  # noqa: T201 - this is what the verb is for
@@ -260,7 +267,7 @@ def _keep_bearings(baseline: BearingBaseline, arguments: argparse.Namespace) -> 
         try:
             save_bearing_baseline(baseline, arguments.out)
         except BaselineFileError as error:
-            return _fail(str(error))
+            return complain("daqsvc calibrate", error, error.code)
     sentence = (
         json.dumps(bearings_as_json(baseline, arguments.out))
         if arguments.json
@@ -270,14 +277,8 @@ def _keep_bearings(baseline: BearingBaseline, arguments: argparse.Namespace) -> 
     return EXIT_OK
 
 
-def _refuse(why: str, *, as_json: bool) -> int:
+def _refuse(why: str, code: Code, *, as_json: bool) -> int:
     if as_json:
-        print(json.dumps({"refused": why}), flush=True)  # noqa: T201
-    else:
-        print(f"not calibrated: {why}", file=sys.stderr)  # noqa: T201
-    return EXIT_REFUSED
-
-
-def _fail(message: str) -> int:
-    print(f"daqsvc calibrate: {message}", file=sys.stderr)  # noqa: T201 - errors go to stderr
-    return EXIT_FAILED
+        print(json.dumps({"refused": why, "code": code.id}), flush=True)  # noqa: T201
+        return EXIT_REFUSED
+    return complain("not calibrated", why, code, EXIT_REFUSED)

@@ -9,8 +9,11 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, positive
+from daqsvc.commands.arguments import EXIT_OK, EXIT_USAGE, positive
+from daqsvc.commands.complaint import complain
 from daqsvc.commands.with_kernels import VerbWithKernels
+from daqsvc.errors.code import with_code
+from daqsvc.errors.command_line import ARGUMENTS
 
 if TYPE_CHECKING:
     from daqsvc.diagnosis.plugin import DetectorPlugin
@@ -82,7 +85,7 @@ class DetectabilityCommand(VerbWithKernels):
         from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415 - likewise
 
         if wrong := _misuse(machine, arguments):
-            return _complain(arguments, wrong, EXIT_USAGE)
+            return complain(f"{arguments.file}", wrong, ARGUMENTS, EXIT_USAGE)
         machine = _varied(machine, arguments.speed_rpm, arguments.false_alarms_per_1000_rev)
         plugin, settings = next(
             (table, settings) for _, table, settings in configured(machine.pipeline) if _is_predictable(table)
@@ -96,9 +99,11 @@ class DetectabilityCommand(VerbWithKernels):
         try:
             prediction = cast("DetectorPlugin[Any]", plugin).detectability(machine, settings, options)
         except UnfitOptionError as error:
-            return _complain(arguments, f"{error}", EXIT_USAGE)
-        except (AssemblyError, ValueError) as error:
-            return _complain(arguments, f"{error}", EXIT_FAILED)
+            return complain(f"{arguments.file}", error, error.code, EXIT_USAGE)
+        except AssemblyError as error:
+            return complain(f"{arguments.file}", error, error.code)
+        except ValueError as error:
+            return complain(f"{arguments.file}", error, ARGUMENTS)
         print(json.dumps(prediction.json) if arguments.json else prediction.text)  # noqa: T201 - this is what the verb is for
         return EXIT_OK
 
@@ -111,7 +116,8 @@ def _of_values(file: Path, folder: Path) -> MachineFile | None:
     try:
         return machine_file_of(json.loads(file.read_text()), folder / "machine.toml")
     except MachineFileError as error:
-        print(f"{error.problems[0].message}", file=sys.stderr)  # noqa: T201 - as `_complain`
+        problem = error.problems[0]
+        print(with_code(problem.message, problem.code), file=sys.stderr)  # noqa: T201 - as `complain`, for the page
         return None
 
 
@@ -157,8 +163,3 @@ def _varied(
         }
         machine = machine.model_copy(update={"pipeline": machine.pipeline.model_copy(update=watching)})
     return machine
-
-
-def _complain(arguments: argparse.Namespace, message: str, code: int) -> int:
-    print(f"{arguments.file}: {message}", file=sys.stderr)  # noqa: T201 - errors of the command line go to stderr
-    return code

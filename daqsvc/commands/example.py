@@ -8,7 +8,9 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE
+from daqsvc.commands.arguments import EXIT_OK, EXIT_USAGE
+from daqsvc.commands.complaint import complain
+from daqsvc.errors.command_line import ARGUMENTS, CANNOT_WRITE, NOT_KNOWN, THERE_ALREADY
 
 if TYPE_CHECKING:
     import argparse
@@ -84,8 +86,7 @@ class ExampleCommand:
         known = examples()
         if arguments.name is None and arguments.out is not None:
             words = "which one is to be written? name it before --out; daqsvc example lists them"
-            print(f"daqsvc example: {words}", file=sys.stderr)  # noqa: T201 - errors go to stderr
-            return EXIT_USAGE
+            return complain("daqsvc example", words, ARGUMENTS, EXIT_USAGE)
         if arguments.name is None:
             for folder, what in _FOLDERS.items():
                 print(f"{what[0].upper()}{what[1:]}")  # noqa: T201 - this is what the verb is for
@@ -98,8 +99,8 @@ class ExampleCommand:
             # Only here: with the settings comes most of what a start of any verb would take.
             from daqsvc.settings.problems import choice  # noqa: PLC0415
 
-            print(f"daqsvc example: there is no {name!r}; {choice(name, known)}", file=sys.stderr)  # noqa: T201
-            return EXIT_USAGE
+            words = f"there is no {name!r}; {choice(name, known)}"
+            return complain("daqsvc example", words, NOT_KNOWN, EXIT_USAGE)
         if arguments.out is None:
             sys.stdout.write(known[name].text)
             return EXIT_OK
@@ -127,11 +128,9 @@ def _copy(example: Example, out: Path) -> int:
     except FileExistsError:
         return _is_there(path)
     except OSError as error:
-        print(f"daqsvc example: {path} cannot be written: {error.strerror}", file=sys.stderr)  # noqa: T201
-        return EXIT_FAILED
+        return complain("daqsvc example", f"{path} cannot be written: {error.strerror}", CANNOT_WRITE)
     return EXIT_OK
 
 
 def _is_there(path: Path) -> int:
-    print(f"daqsvc example: {path} is there already; give another name", file=sys.stderr)  # noqa: T201
-    return EXIT_FAILED
+    return complain("daqsvc example", f"{path} is there already; give another name", THERE_ALREADY)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 import textwrap
 from typing import TYPE_CHECKING
 
 from daqsvc.commands.arguments import EXIT_OK, EXIT_USAGE
+from daqsvc.commands.complaint import complain
+from daqsvc.errors.command_line import NOT_KNOWN
 
 if TYPE_CHECKING:
     import argparse
@@ -37,14 +38,14 @@ class ExplainCommand:
         unknown = [text for text in wanted if text not in CODES]
         if unknown:
             words = f"there is no code {unknown[0]!r}; daqsvc explain lists them"
-            print(f"daqsvc explain: {words}", file=sys.stderr)  # noqa: T201 - errors go to stderr
-            return EXIT_USAGE
+            return complain("daqsvc explain", words, NOT_KNOWN, EXIT_USAGE)
         print("\n\n".join(_told(CODES[text]) for text in wanted) or _listed())  # noqa: T201 - what the verb is for
         return EXIT_OK
 
 
 def _told(code: Code) -> str:
     parts = {
+        **({"Example": code.example} if code.example else {}),
         "Cause": code.cause,
         "Remedy": code.remedy,
         "More": f"docs/{code.page}, docs/reference/errors.md#{code.id.lower()}",

@@ -8,9 +8,12 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_REFUSED, EXIT_USAGE
+from daqsvc.commands.arguments import EXIT_OK, EXIT_REFUSED, EXIT_USAGE
+from daqsvc.commands.complaint import complain
 from daqsvc.commands.recording_options import add_channel_map, split_files
 from daqsvc.commands.with_kernels import VerbWithKernels
+from daqsvc.errors.command_line import CANNOT_WRITE, THERE_ALREADY
+from daqsvc.errors.recordings import NO_SUCH_CHANNEL
 
 if TYPE_CHECKING:
     import argparse
@@ -73,13 +76,13 @@ class ExportCommand(VerbWithKernels):
         try:
             return self._export(arguments, machine, recordings[0])
         except ExportUsageError as error:
-            return _fail(error, EXIT_USAGE)
+            return complain("daqsvc export", error, error.code, EXIT_USAGE)
         except RecordingError as error:
-            return _fail(error, EXIT_REFUSED)
+            return complain("daqsvc export", error, error.code, EXIT_REFUSED)
         except OSError as error:
             # Libraries put their own words around the reason.
             why = os.strerror(error.errno) if error.errno else error
-            return _fail(f"{arguments.to} is not written: {why}", EXIT_FAILED)
+            return complain("daqsvc export", f"{arguments.to} is not written: {why}", CANNOT_WRITE)
         finally:
             stop_reading()
 
@@ -114,12 +117,15 @@ class ExportCommand(VerbWithKernels):
             streams = [one for one in streams if one.name == arguments.stream]
             if not streams:
                 remedy = choice(arguments.stream, [one.name for one in exported.streams])
-                raise ExportUsageError(f"{recording} has no stream {arguments.stream!r}; {remedy}")
+                raise ExportUsageError(
+                    f"{recording} has no stream {arguments.stream!r}; {remedy}", NO_SUCH_CHANNEL
+                )
         files = targets_of(arguments.to, streams)
         for target in files:
             if target.exists() and target.samefile(recording):
                 raise ExportUsageError(
-                    f"{target} is the recording itself, which --force does not replace; give another name"
+                    f"{target} is the recording itself, which --force does not replace; give another name",
+                    THERE_ALREADY,
                 )
         notes = exported.notes + write_all(files, exported.about, force=arguments.force)
         for note in notes:
@@ -165,8 +171,3 @@ def _line(written: dict[str, Any]) -> str:
         + (f", {one['missing']:,} samples missing" if one["missing"] else "")
         for one in written["streams"]
     )
-
-
-def _fail(message: object, code: int) -> int:
-    print(f"daqsvc export: {message}", file=sys.stderr)  # noqa: T201 - errors of the command line go to stderr
-    return code

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daqsvc.commands.analyze_fleet import lacking_extra
-from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, duration, not_negative
+from daqsvc.commands.arguments import EXIT_OK, EXIT_USAGE, duration, not_negative
+from daqsvc.commands.complaint import complain
 from daqsvc.commands.tables import aligned, harmless, wrapped
+from daqsvc.errors.command_line import EXTRA_MISSING
 
 if TYPE_CHECKING:
     import argparse
@@ -60,7 +61,7 @@ class FleetCommand:
     def run(self, arguments: argparse.Namespace) -> int:
         """See `daqsvc.cli.Command.run`."""
         if wrong := lacking_extra():
-            return _fail(wrong, EXIT_USAGE)
+            return complain("daqsvc fleet", wrong, EXTRA_MISSING, EXIT_USAGE)
         from daqsvc.fleet import FleetError  # noqa: PLC0415 - each verb imports what it needs
         from daqsvc.fleet.report import TruthError, fleet_report, read_truth  # noqa: PLC0415
         from daqsvc.fleet.results import Results  # noqa: PLC0415
@@ -74,9 +75,9 @@ class FleetCommand:
                 interval_s=arguments.interval,
             )
         except TruthError as error:
-            return _fail(f"{error}", EXIT_USAGE)
+            return complain("daqsvc fleet", error, error.code, EXIT_USAGE)
         except FleetError as error:
-            return _fail(f"{error}", EXIT_FAILED)
+            return complain("daqsvc fleet", error, error.code)
         print(json.dumps(report.as_json()) if arguments.json else report_text(report))  # noqa: T201
         return EXIT_OK
 
@@ -240,8 +241,3 @@ def _more(number: int, what: str) -> str:
 def _short(text: str, longest: int = _LONGEST_NAME) -> str:
     """A text that leaves room for others; the end of a long name tells more than its beginning."""
     return text if len(text) <= longest else f"...{text[3 - longest :]}"
-
-
-def _fail(message: str, code: int) -> int:
-    print(f"daqsvc fleet: {message}", file=sys.stderr)  # noqa: T201 - errors of the command line go to stderr
-    return code

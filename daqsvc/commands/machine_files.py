@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING
 
+from daqsvc.errors.code import coded
 from daqsvc.errors.machine_file import NO_MACHINE_FILE
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ def load_machines(paths: Sequence[Path], load: Load) -> tuple[Box | None, list[M
         return _box(paths, machines) if len(machines) == len(read) else None, machines
     except MachineFileError as error:
         for problem in error.problems:
-            log.error("%s", problem)  # noqa: TRY400 - the message says it all
+            log.error("%s", problem, extra=coded(problem.code))  # noqa: TRY400 - the message says it all
         return None, machines
 
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 import ipaddress
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_REFUSED, EXIT_USAGE
+from daqsvc.commands.arguments import EXIT_OK, EXIT_REFUSED, EXIT_USAGE
+from daqsvc.commands.complaint import complain
 from daqsvc.commands.store_argument import BadFileError, StoreNotFoundError, add_store, chosen_store
+from daqsvc.errors.command_line import EXTRA_MISSING
 from daqsvc.settings.addresses import MOST_PORT, Address, address_of
 
 if TYPE_CHECKING:
@@ -89,7 +90,8 @@ class PageCommand:
             from daqsvc.page.serving import PortError, serve  # noqa: PLC0415
             from daqsvc.snapshots.reading import SnapshotError  # noqa: PLC0415
         except ModuleNotFoundError as error:
-            return _failed(f"{error.name} is missing: install it with pip install 'daqsvc[page]'")
+            what = f"{error.name} is missing: install it with pip install 'daqsvc[page]'"
+            return complain("daqsvc page", what, EXTRA_MISSING)
         listen = arguments.listen or Address(LOOPBACK, PORT if arguments.port is None else arguments.port)
         try:
             choice, with_parent = _access_choice(arguments, listen.host), arguments.with_parent
@@ -110,13 +112,11 @@ class PageCommand:
         except BadFileError:
             return EXIT_USAGE
         except (UnsafeError, PlantFileError) as error:
-            _failed(f"{error}")
-            return EXIT_USAGE
+            return complain("daqsvc page", error, error.code, EXIT_USAGE)
         except (StoreNotFoundError, PortError, AccountsError) as error:
-            return _failed(f"{error}")
+            return complain("daqsvc page", error, error.code)
         except (SnapshotError, NoPictureError) as error:
-            _failed(f"{error}")
-            return EXIT_REFUSED
+            return complain("daqsvc page", error, error.code, EXIT_REFUSED)
         return EXIT_OK
 
     def _store(self, arguments: argparse.Namespace) -> Path:
@@ -234,11 +234,6 @@ def _access_choice(arguments: argparse.Namespace, host: str) -> AccessChoice:
         operators=tuple(arguments.operator),
         operator_link=arguments.operator_link,
     )
-
-
-def _failed(why: str) -> int:
-    print(f"daqsvc page: {why}", file=sys.stderr)  # noqa: T201 - errors go to stderr
-    return EXIT_FAILED
 
 
 def _listen(text: str) -> Address:

@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Self
 
 from daqsvc.commands import early_signals
 from daqsvc.commands.arguments import EXIT_HUNG, EXIT_STUCK
+from daqsvc.errors.code import coded
+from daqsvc.errors.service import PART_FAILED, PART_STALLED, STOPPED_HARD
 from daqsvc.threads import where_is
 
 if TYPE_CHECKING:
@@ -166,7 +168,7 @@ class ProcessGuard:
             try:
                 self._turn()
             except BaseException:
-                log.exception("the guard of the process has failed; it goes on")
+                log.exception("the guard of the process has failed; it goes on", extra=coded(PART_FAILED))
 
     def _turn(self) -> None:
         heard, _, _ = select.select([self._heard], [], [], TURN_S)
@@ -247,7 +249,8 @@ class ProcessGuard:
 
     def _say(self, sentence: str) -> None:
         # The log's lock may be held by what hangs.
-        saying = threading.Thread(target=log.critical, args=("%s", sentence), daemon=True)
+        kind = {"extra": coded(PART_STALLED)}
+        saying = threading.Thread(target=log.critical, args=("%s", sentence), kwargs=kind, daemon=True)
         saying.start()
         saying.join(SAY_S)
         self._flush(SAY_S)
@@ -265,7 +268,9 @@ class ProcessGuard:
             thread.join(LINGER_S / len(lingering))
         left = [thread.name for thread in lingering if thread.is_alive()]
         if left:
-            log.critical("threads %s do not end; the process is ended", ", ".join(left))
+            log.critical(
+                "threads %s do not end; the process is ended", ", ".join(left), extra=coded(STOPPED_HARD)
+            )
             self._flush(SAY_S)
             self._end_process(EXIT_HUNG)
 

@@ -11,12 +11,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from daqsvc import kernel_cache
-from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, positive, signals_to_end
+from daqsvc.commands.arguments import EXIT_OK, EXIT_USAGE, positive, signals_to_end
+from daqsvc.commands.complaint import complain
+from daqsvc.errors.command_line import ARGUMENTS, CANNOT_WRITE, NOTHING_ON_BUS, THERE_ALREADY, WRONG_VALUE
 
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Callable
 
+    from daqsvc.errors.code import Code
     from daqsvc.settings import MachineFile
     from drivers.base import Driver
     from drivers.can.settings import CanBus
@@ -77,7 +80,7 @@ class RecordCommand:
             name, bus = _bus(machine, arguments.bus)
             _check_new(arguments.out)
         except _MisuseError as error:
-            return _say(error, EXIT_USAGE)
+            return complain("daqsvc", error, error.code, EXIT_USAGE)
         from daqsvc.acquisition.clock import SystemClock  # noqa: PLC0415 - each verb imports what it needs
         from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415
         from drivers.base import DeviceAbsentError  # noqa: PLC0415
@@ -92,25 +95,28 @@ class RecordCommand:
             driver = CanDriver(bus, port, logs=OneLog(arguments.out))
             asyncio.run(_run_until_stopped(driver, arguments.duration, _Progress(driver, arguments.out)))
         except (AssemblyError, DeviceAbsentError, LayoutError) as error:
-            return _say(error, EXIT_FAILED)
+            return complain("daqsvc", error, error.code)
         files = sorted(_logs(arguments.out) - there)
         summary = _summary(name, driver, files)
         print(json.dumps(summary))  # noqa: T201 - this is what the verb is for
         if summary["frames_unrecorded"]:
-            return _say(
-                f"{summary['frames_unrecorded']} frames could not be recorded in {arguments.out}", EXIT_FAILED
-            )
+            what = f"{summary['frames_unrecorded']} frames could not be recorded in {arguments.out}"
+            return complain("daqsvc", what, CANNOT_WRITE)
         if not files:
-            return _say(
+            what = (
                 f"{driver.link.name} has carried no frame, so there is no {arguments.out}; "
-                f"its state at the end: {driver.link.reason or 'up'}",
-                EXIT_FAILED,
+                f"its state at the end: {driver.link.reason or 'up'}"
             )
+            return complain("daqsvc", what, NOTHING_ON_BUS)
         return EXIT_OK
 
 
 class _MisuseError(Exception):
     """The arguments do not fit the machine file or the disk."""
+
+    def __init__(self, message: str, code: Code) -> None:
+        super().__init__(message)
+        self.code = code
 
 
 def _bus(machine: MachineFile, name: str | None) -> tuple[str, CanBus]:
@@ -121,22 +127,23 @@ def _bus(machine: MachineFile, name: str | None) -> tuple[str, CanBus]:
     there = f"CAN buses of {machine.path} are {', '.join(can_buses)}" if can_buses else "there is none"
     if name is None:
         if len(can_buses) != 1:
-            raise _MisuseError(f"--bus: say which CAN bus to record; {there}")
+            raise _MisuseError(f"--bus: say which CAN bus to record; {there}", ARGUMENTS)
         return next(iter(can_buses.items()))
     if name not in can_buses:
-        raise _MisuseError(f"--bus {name}: {machine.path} has no CAN bus of this name; {there}")
+        what = f"--bus {name}: {machine.path} has no CAN bus of this name; {there}"
+        raise _MisuseError(what, WRONG_VALUE)
     return name, can_buses[name]
 
 
 def _check_new(log: Path) -> None:
     if log.suffix.lower() not in ENDINGS:
-        raise _MisuseError(
-            f"--out {log}: ends in none of {', '.join(ENDINGS)}, which say the format; add one"
-        )
+        what = f"--out {log}: ends in none of {', '.join(ENDINGS)}, which say the format; add one"
+        raise _MisuseError(what, WRONG_VALUE)
     if log.exists():
-        raise _MisuseError(f"--out {log}: is there already; give another name, or take it away first")
+        what = f"--out {log}: is there already; give another name, or take it away first"
+        raise _MisuseError(what, THERE_ALREADY)
     if not log.parent.is_dir():
-        raise _MisuseError(f"--out {log}: there is no folder {log.parent}; make it first")
+        raise _MisuseError(f"--out {log}: there is no folder {log.parent}; make it first", CANNOT_WRITE)
 
 
 def _logs(log: Path) -> set[Path]:
@@ -181,7 +188,7 @@ class _Progress:
 
 
 def _tell(words: str) -> None:
-    print(words, end="", file=sys.stderr, flush=True)  # noqa: T201 - stdout has the result
+    print(words, end="", file=sys.stderr, flush=True)  # noqa: T201 - how it gets on is no result
 
 
 async def _run_until_stopped(driver: Driver, duration_s: float | None, progress: _Progress) -> None:
@@ -215,8 +222,3 @@ def _summary(bus: str, driver: Driver, files: list[Path]) -> dict[str, Any]:
             for name, (stream, _) in driver.streams.items()
         },
     }
-
-
-def _say(what: object, code: int) -> int:
-    print(f"daqsvc: {what}", file=sys.stderr)  # noqa: T201 - errors of the command line go to stderr
-    return code

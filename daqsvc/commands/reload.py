@@ -7,8 +7,10 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE
+from daqsvc.commands.arguments import EXIT_OK, EXIT_USAGE
+from daqsvc.commands.complaint import complain
 from daqsvc.commands.store_argument import BadFileError, StoreNotFoundError, add_store, chosen_store
+from daqsvc.errors.command_line import OTHER_FILES
 
 if TYPE_CHECKING:
     import argparse
@@ -55,8 +57,7 @@ class ReloadCommand:
             if arguments.file is not None and isinstance(error, NotRunningError):
                 moved = f"site, box or [store] of {arguments.file}"
                 where = f"; if {moved} were changed, the service must be restarted"
-            print(f"daqsvc reload: {error}{where}", file=sys.stderr)  # noqa: T201 - errors go to stderr
-            return EXIT_FAILED
+            return complain("daqsvc reload", f"{error}{where}", error.code)
         if arguments.json:
             told = {"accepted": answer.accepted, "dry_run": arguments.dry_run, "lines": list(answer.lines)}
             print(json.dumps(told))  # noqa: T201 - this is what the verb is for
@@ -66,7 +67,7 @@ class ReloadCommand:
             for line in answer.lines:
                 print(line, file=sys.stderr)  # noqa: T201 - errors go to stderr
         if arguments.file is not None and (hint := other_files(arguments.file, answer)):
-            print(f"daqsvc reload: {hint}", file=sys.stderr)  # noqa: T201 - beside what the verb is for
+            complain("daqsvc reload", hint, OTHER_FILES)
         return EXIT_OK if answer.accepted else EXIT_USAGE
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import json
-import sys
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_REFUSED, EXIT_USAGE, positive
+from daqsvc.commands.complaint import complain
 from daqsvc.commands.tables import harmless
 from daqsvc.commands.with_kernels import VerbWithKernels
 
@@ -72,11 +72,10 @@ class ReplayCommand(VerbWithKernels):
             with tempfile.TemporaryDirectory(prefix="daqsvc-replay-") as directory:
                 replayed = asyncio.run(replay(snapshot, machine, Path(directory), pace, heard))
         except SnapshotError as error:
-            print(harmless(f"daqsvc replay: {error}"), file=sys.stderr)  # noqa: T201 - errors go to stderr
-            return EXIT_REFUSED
+            return complain("daqsvc replay", harmless(f"{error}"), error.code, EXIT_REFUSED)
         except ReplayError as error:
-            print(harmless(f"daqsvc replay: {arguments.snapshot} {error}"), file=sys.stderr)  # noqa: T201
-            return EXIT_REFUSED
+            what = harmless(f"{arguments.snapshot} {error}")
+            return complain("daqsvc replay", what, error.code, EXIT_REFUSED)
         # A snapshot may be anybody's: what is in it is shown and not obeyed.
         lines = [json.dumps(_document(replayed))] if arguments.json else map(harmless, _lines(replayed))
         print("\n".join(lines))  # noqa: T201 - this is what the verb is for

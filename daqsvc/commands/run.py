@@ -20,6 +20,8 @@ from daqsvc.commands.process_guard import ProcessGuard
 from daqsvc.commands.service_manager import ServiceManager
 from daqsvc.commands.start_memory import give_back, share_heaps
 from daqsvc.commands.store_argument import StoreNotFoundError, files_by_identity, store_directory
+from daqsvc.errors.code import coded
+from daqsvc.errors.service import ESSENTIAL_LOST, RELOAD_REFUSED
 from daqsvc.threads import call_in_thread
 
 if TYPE_CHECKING:
@@ -151,10 +153,10 @@ def _run(
             take_store(store, files_by_identity(box), on_purpose=is_named)
             _run_loop(_run_until_stopped(box, files, store, guard, manager, held.close))
     except (AssemblyError, LayoutError, NewerOutboxError, StoreNotFoundError, StorePathError) as error:
-        log.critical("%s", error)
+        log.critical("%s", error, extra=coded(error.code))
         return EXIT_USAGE
     except StoreInUseError as error:
-        log.critical("%s", error)
+        log.critical("%s", error, extra=coded(error.code))
         # Of other machines, it will always be in use; of these, until the other service ends.
         watched = {*box.machines} if store is None else _watched(store) or {*box.machines}
         return EXIT_USAGE if watched.isdisjoint(box.machines) else EXIT_FAILED
@@ -164,14 +166,22 @@ def _run(
             error, OutboxAwayError
         )
         remedy = "name another in [store] of the machine file, or with --store"
-        log.critical("%s", f"the store {store} cannot be made there: {remedy}" if is_placeless else error)
+        log.critical(
+            "%s",
+            f"the store {store} cannot be made there: {remedy}" if is_placeless else error,
+            extra=coded(error.code),
+        )
         return EXIT_USAGE if is_placeless else EXIT_FAILED
     except EssentialLostError as error:
-        log.critical("%s; the service ends, and must be started again", error)
+        log.critical("%s; the service ends, and must be started again", error, extra=coded(error.code))
         return EXIT_LOST
     except (SystemExit, asyncio.CancelledError) as error:
         how = "ended" if isinstance(error, SystemExit) else "cancelled"
-        log.critical("the service was %s by something in its process, and must be started again", how)
+        log.critical(
+            "the service was %s by something in its process, and must be started again",
+            how,
+            extra=coded(ESSENTIAL_LOST),
+        )
         return EXIT_LOST
     return EXIT_OK
 
@@ -244,7 +254,11 @@ class _Reloader:
                     log.info("SIGHUP is ignored: %s", ENDS)
                     return
                 for reason in refused.reasons:
-                    log.error("SIGHUP is refused, and the service goes on as it is: %s", reason)  # noqa: TRY400
+                    log.error(  # noqa: TRY400 - the message says it all
+                        "SIGHUP is refused, and the service goes on as it is: %s",
+                        reason,
+                        extra=coded(RELOAD_REFUSED),
+                    )
 
 
 async def _await_samples(service: Service) -> None:

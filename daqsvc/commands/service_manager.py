@@ -15,6 +15,9 @@ import time
 from collections import Counter
 from typing import TYPE_CHECKING, Self
 
+from daqsvc.errors.code import coded
+from daqsvc.errors.service import WATCHDOG
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -87,12 +90,12 @@ class ServiceManager:
             return cls(address)
         if not (watchdog_us.isdecimal() and len(watchdog_us) <= LONGEST_US and int(watchdog_us)):
             odd = "WatchdogSec= is ignored: WATCHDOG_USEC is %.40r, not a number of microseconds"
-            log.warning(odd, watchdog_us)
+            log.warning(odd, watchdog_us, extra=coded(WATCHDOG))
             return cls(address)
         watchdog_s = int(watchdog_us) / US_PER_S
         if watchdog_s < LEAST_WATCH_S:
             short = "WatchdogSec= is %g s, and the limit of parts is %g s: write at least that"
-            log.warning(short, watchdog_s, LEAST_WATCH_S)
+            log.warning(short, watchdog_s, LEAST_WATCH_S, extra=coded(WATCHDOG))
         return cls(address, watchdog_s)
 
     def close(self) -> None:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
-import sys
 from typing import TYPE_CHECKING
 
 from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE
+from daqsvc.commands.complaint import complain
 from daqsvc.commands.store_argument import BadFileError, StoreNotFoundError, add_store, chosen_store
+from daqsvc.errors.command_line import COMMAND_REFUSED
 
 if TYPE_CHECKING:
     import argparse
@@ -47,13 +48,12 @@ class SnapshotCommand:
         except BadFileError:
             return EXIT_USAGE
         except (StoreNotFoundError, ControlError) as error:
-            print(f"daqsvc snapshot: {error}", file=sys.stderr)  # noqa: T201 - errors go to stderr
-            return EXIT_FAILED
+            return complain("daqsvc snapshot", error, error.code)
         if arguments.json:
             told = {"accepted": answer.accepted, "reason": answer.reason, "path": answer.path}
             print(json.dumps(told))  # noqa: T201 - this is what the verb is for
         elif answer.accepted:
             print(answer.path)  # noqa: T201 - as above
         else:
-            print(f"daqsvc snapshot: {answer.reason}", file=sys.stderr)  # noqa: T201 - errors go to stderr
+            complain("daqsvc snapshot", answer.reason, COMMAND_REFUSED)
         return EXIT_OK if answer.accepted else EXIT_FAILED

@@ -11,6 +11,8 @@ from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, signals_to_end
+from daqsvc.commands.complaint import complain
+from daqsvc.errors.command_line import LEFT_OUT, NOTHING_ON_BUS
 from drivers.can.sniff import CanSniffer
 from drivers.modbus.sniff import ModbusSniffer
 from drivers.serial.sniff import SerialSniffer
@@ -50,13 +52,12 @@ class SniffCommand:
             with _stopping() as stop:
                 found = sniffer.sniff(arguments, stop, _tell)
         except SniffError as error:
-            _tell(f"daqsvc: {error}")
-            return EXIT_USAGE if error.usage else EXIT_FAILED
+            return complain("daqsvc", error, error.code, EXIT_USAGE if error.usage else EXIT_FAILED)
         print(_as_json(found) if arguments.json else _as_text(found))  # noqa: T201 - what the verb is for
         if found.problem:
             sys.stdout.flush()
-            _tell(f"daqsvc: {found.problem}")
-        return EXIT_FAILED if found.problem else EXIT_OK
+            return complain("daqsvc", found.problem, NOTHING_ON_BUS)
+        return EXIT_OK
 
 
 def sniffers() -> dict[str, Sniffer]:
@@ -66,12 +67,13 @@ def sniffers() -> dict[str, Sniffer]:
         try:
             made = point.load()()
         except Exception as error:  # noqa: BLE001 - whatever a package does must not take the others along
-            _tell(f"daqsvc: sniff {point.name} is left out: {error}")
+            complain("daqsvc", f"sniff {point.name} is left out: {error}", LEFT_OUT)
             continue
         if isinstance(made, Sniffer):
             known[point.name] = made
         else:
-            _tell(f"daqsvc: sniff {point.name} is left out: it is not derived from Sniffer of daqsvc.api")
+            what = f"sniff {point.name} is left out: it is not derived from Sniffer of daqsvc.api"
+            complain("daqsvc", what, LEFT_OUT)
     return known
 
 

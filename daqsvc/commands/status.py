@@ -10,8 +10,10 @@ import sys
 import time
 from typing import TYPE_CHECKING, Any
 
-from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, signals_to_end
+from daqsvc.commands.arguments import EXIT_OK, EXIT_USAGE, signals_to_end
+from daqsvc.commands.complaint import complain
 from daqsvc.commands.store_argument import BadFileError, StoreNotFoundError, add_store, chosen_store
+from daqsvc.errors.command_line import NO_SERVICE
 
 if TYPE_CHECKING:
     import argparse
@@ -67,8 +69,7 @@ class StatusCommand:
         except BadFileError:
             return EXIT_USAGE
         except (StoreNotFoundError, ControlError) as error:
-            print(f"daqsvc status: {error}", file=sys.stderr)  # noqa: T201 - errors go to stderr
-            return EXIT_FAILED
+            return complain("daqsvc status", error, error.code)
         return EXIT_OK
 
 
@@ -146,7 +147,7 @@ class _Picture:
             lines = wrapped(harmless(why), shutil.get_terminal_size().columns)
             self._draw("\n".join([*lines, "", "It stood last:", last]))
         elif not self._waits:
-            print(f"daqsvc status: {why}", file=sys.stderr)  # noqa: T201 - errors go to stderr
+            complain("daqsvc status", why, NO_SERVICE)
         self._waits = True
 
     def _draw(self, text: str) -> None:

@@ -35,7 +35,7 @@ def status_text(status: Document, width: int = 80, *, alarms_first: bool = False
 
 
 def _tables(status: Document, width: int) -> Iterator[str]:
-    buses = [[name, bus["driver"], bus["state"], bus["reason"]] for name, bus in status["buses"].items()]
+    buses = [[name, bus["driver"], bus["state"], _why(bus)] for name, bus in status["buses"].items()]
     yield aligned(["BUS", "DRIVER", "STATE", "WHY"], buses, width)
     streams = [
         [name, one["bus"], _rate(one), _age(one["age_s"]), _lost(one)]
@@ -55,6 +55,12 @@ def _tables(status: Document, width: int) -> Iterator[str]:
         yield aligned(["BUS", "FRAMES THAT NO STREAM HAS, BY ID"], others, width)
     if failures := status["figures"]["failures"]:
         yield aligned(["PART", "FAILURES"], [[name, f"{count}"] for name, count in failures.items()], width)
+
+
+def _why(thing: Document) -> str:
+    """Why a bus or an output is away, with the code of the reason; services of earlier versions give none."""
+    reason, code = thing.get("reason", ""), thing.get("code")
+    return f"{reason} [{code}]" if reason and code else f"{reason}"
 
 
 def _alarms_and_outputs(status: Document, width: int) -> Iterator[str]:
@@ -175,7 +181,7 @@ def _outputs(status: Document) -> Iterator[str]:
     for path, output in status["outputs"].items():
         name = "broker" if path == "mqtt" else path
         # Services of earlier versions give no reason, and say not for how long.
-        reason, away_s = output.get("reason", ""), output.get("away_s")
+        reason, away_s = _why(output), output.get("away_s")
         lasting = "" if away_s is None else f" for {_age(away_s)}"
         if output["connected"]:
             yield f"{name}: connected"

@@ -9,8 +9,10 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from daqsvc.commands.complaint import complain
 from daqsvc.commands.machine_files import load_machines, read_box
 from daqsvc.errors.code import with_code
+from daqsvc.errors.command_line import NO_STORE, OTHER_FILES
 from daqsvc.errors.service import UNUSABLE_STORE
 
 if TYPE_CHECKING:
@@ -27,6 +29,8 @@ JOURNAL = "outbox.sqlite"
 
 class StoreNotFoundError(Exception):
     """No store, or more than one; the text says what to do."""
+
+    code = NO_STORE
 
 
 class BadFileError(Exception):
@@ -254,9 +258,8 @@ def _of_sound(path: Path, sound: Sequence[MachineFile]) -> Path:
     if len(stores) != 1 or not (told or all(map(_is_used, stores))):
         raise BadFileError
     [store] = stores
-    print(  # noqa: T201 - what goes wrong goes to stderr
-        f"{path}: the store is taken from the other machine files: {store}", file=sys.stderr
-    )
+    what = f"the store is taken from the other machine files: {store}"
+    complain(f"{path}", what, OTHER_FILES)
     return store
 
 

@@ -19,14 +19,26 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, duration
+from daqsvc.commands.arguments import EXIT_OK, EXIT_USAGE, duration
+from daqsvc.commands.complaint import complain
 from daqsvc.commands.store_argument import BadFileError, StoreNotFoundError, add_store, chosen_store
+from daqsvc.errors.command_line import (
+    ARGUMENTS,
+    CANNOT_READ,
+    CANNOT_WRITE,
+    EXTRA_MISSING,
+    NO_SUCH_MACHINE,
+    NOTHING_RECORDED,
+    THERE_ALREADY,
+    WRONG_VALUE,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
     from typing import TextIO
 
     from daqsvc.commands.machine_files import Load
+    from daqsvc.errors.code import Code
     from daqsvc.history.file import HistoryReader, Series
     from daqsvc.history.points import Step, TrendPoints
 
@@ -46,6 +58,10 @@ OF_STDOUT = {errno.EPIPE, errno.ENOSPC, errno.EIO}
 
 class NoTrendError(Exception):
     """There is nothing to show, or no place for it; the text says why, and what to do."""
+
+    def __init__(self, message: str, code: Code = NOTHING_RECORDED) -> None:
+        super().__init__(message)
+        self.code = code
 
 
 class _ShownSeries(NamedTuple):
@@ -105,26 +121,23 @@ class TrendCommand:
         now_s = time.time()
         since_s, until_s = arguments.since, arguments.until or now_s
         if (problem := _unusable(arguments, since_s, until_s)) is not None:
-            print(f"daqsvc trend: {problem}", file=sys.stderr)  # noqa: T201 - errors go to stderr
-            return EXIT_USAGE
+            what, code = problem
+            return complain("daqsvc trend", what, code, EXIT_USAGE)
         try:
             store, machine, _ = chosen_store(arguments, self._load)
             _tell(store, machine, arguments, since_s, until_s)
         except BadFileError:
             return EXIT_USAGE
         except (StoreNotFoundError, NoTrendError, NewerHistoryError, EmptyHistoryError) as error:
-            print(f"daqsvc trend: {error}", file=sys.stderr)  # noqa: T201
-            return EXIT_FAILED
+            return complain("daqsvc trend", error, error.code)
         except sqlite3.Error as error:
-            print(f"daqsvc trend: the history in {store} cannot be read: {error}", file=sys.stderr)  # noqa: T201
-            return EXIT_FAILED
+            return complain("daqsvc trend", f"the history in {store} cannot be read: {error}", CANNOT_READ)
         except OSError as error:
             # Of a target all is said already (`_put_whole`): without a name it is standard output.
             if error.filename is None and error.errno in OF_STDOUT:
                 raise
             where = "standard output" if error.filename is None else error.filename
-            print(f"daqsvc trend: {where}: {error.strerror or error}", file=sys.stderr)  # noqa: T201
-            return EXIT_FAILED
+            return complain("daqsvc trend", f"{where}: {error.strerror or error}", CANNOT_WRITE)
         return EXIT_OK
 
 
@@ -142,21 +155,24 @@ def moment(text: str) -> float:
         ) from None
 
 
-def _unusable(arguments: argparse.Namespace, since_s: float, until_s: float) -> str | None:
+def _unusable(arguments: argparse.Namespace, since_s: float, until_s: float) -> tuple[str, Code] | None:
     """What is wrong with the options together; None if nothing is."""
     for option, (library, extra) in EXTRAS.items():
         if getattr(arguments, option) is not None and importlib.util.find_spec(library) is None:
-            return f"--{option} needs {library}; install it with: pip install 'daqsvc[{extra}]'"
+            return (
+                f"--{option} needs {library}; install it with: pip install 'daqsvc[{extra}]'",
+                EXTRA_MISSING,
+            )
     if since_s >= until_s:
-        return "--since is not before --until; write the earlier one as --since"
+        return "--since is not before --until; write the earlier one as --since", ARGUMENTS
     if arguments.plot is not None and arguments.plot.suffix.lower() not in PICTURES:
-        return f"--plot {arguments.plot}: write a name that ends in one of {', '.join(PICTURES)}"
+        return f"--plot {arguments.plot}: write a name that ends in one of {', '.join(PICTURES)}", WRONG_VALUE
     if str(arguments.parquet) == "-":
-        return "--parquet -: write the name of a file; --csv - writes to standard output"
+        return "--parquet -: write the name of a file; --csv - writes to standard output", WRONG_VALUE
     return _taken(arguments)
 
 
-def _taken(arguments: argparse.Namespace) -> str | None:
+def _taken(arguments: argparse.Namespace) -> tuple[str, Code] | None:
     """Why nothing may be written where the options say; None if it may."""
     target: Path | None = arguments.csv or arguments.parquet or arguments.plot
     if target is None or str(target) == "-":
@@ -166,14 +182,16 @@ def _taken(arguments: argparse.Namespace) -> str | None:
     except FileNotFoundError:
         return None
     except OSError as error:
-        return f"{target}: {error.strerror}; give another name"
+        return f"{target}: {error.strerror}; give another name", CANNOT_WRITE
     problem = None
     if stat.S_ISDIR(mode):
-        problem = f"{target} is a folder; name a file in it"
+        problem = f"{target} is a folder; name a file in it", CANNOT_WRITE
     elif not stat.S_ISREG(mode) and arguments.csv is None:  # a pipe or a device takes a table as it comes
-        problem = f"{target} is no regular file; give another name, or write a table to it with --csv"
+        what = f"{target} is no regular file; give another name, or write a table to it with --csv"
+        problem = what, CANNOT_WRITE
     elif stat.S_ISREG(mode) and not arguments.force:
-        problem = f"{target} is there already; give another name, or --force to replace it"
+        what = f"{target} is there already; give another name, or --force to replace it"
+        problem = what, THERE_ALREADY
     return problem
 
 
@@ -233,7 +251,8 @@ def _chosen(reader: HistoryReader, machine: str | None, readings: list[str] | No
     everything = reader.series()
     machines = sorted({one.machine for one in everything})
     if machine is not None and machine not in machines:
-        raise NoTrendError(f"no machine {machine!r} in the history; there is {', '.join(machines) or 'none'}")
+        there = ", ".join(machines) or "none"
+        raise NoTrendError(f"no machine {machine!r} in the history; there is {there}", NO_SUCH_MACHINE)
     of_machine = [one for one in everything if machine in {None, one.machine}]
     if readings is None:
         return of_machine
@@ -370,7 +389,7 @@ def _named(target: Path) -> Iterator[None]:
         raise
     except OSError as error:
         why = os.strerror(error.errno) if error.errno else " ".join(f"{error}".split())
-        raise NoTrendError(f"{target}: {why}") from error
+        raise NoTrendError(f"{target}: {why}", CANNOT_WRITE) from error
 
 
 def _write_csv(path: Path, shown: list[_ShownSeries], *, force: bool) -> None:

@@ -56,7 +56,8 @@ def _answer(request: Mapping[str, Any], replies: BinaryIO) -> None:
     except MemoryError:
         header, arrays = {"raised": "MemoryError", "message": ""}, ()
     except Exception as error:  # noqa: BLE001 - whoever asked decides what it means
-        header, arrays = {"raised": type(error).__name__, "message": f"{error}"}, ()
+        code = f"{getattr(error, 'code', '')}"
+        header, arrays = {"raised": type(error).__name__, "message": f"{error}", "code": code}, ()
     encoded = json.dumps(header).encode()
     replies.write(LENGTH.pack(len(encoded)) + encoded)
     for array in arrays:

@@ -64,12 +64,14 @@ class RaisedThereError(Exception):
     Attributes:
         kind: name of the error's class.
         message: what it says.
+        code: the code of its kind (`daqsvc.errors`); empty if it has none.
     """
 
-    def __init__(self, kind: str, message: str) -> None:
+    def __init__(self, kind: str, message: str, code: str = "") -> None:
         super().__init__(f"{kind}: {message}")
         self.kind = kind
         self.message = message
+        self.code = code
 
 
 class WorkResult(NamedTuple):
@@ -236,7 +238,7 @@ def _ask(
         raise ConfinedError("crash", f"{running.name} answered without sense")
     header = json.loads(bytes(_take(running, bytearray(length), until)))
     if "raised" in header:
-        raise RaisedThereError(header["raised"], header["message"])
+        raise RaisedThereError(header["raised"], header["message"], header.get("code", ""))
     kinds = [(np.dtype(kind), tuple(shape)) for kind, shape in header["arrays"]]
     if sum(kind.itemsize * float(np.prod(shape, dtype=np.float64)) for kind, shape in kinds) > memory_bytes:
         raise ConfinedError("memory", "what it holds takes more memory than it may")

@@ -24,6 +24,9 @@ from daqsvc.acquisition.standing import StreamState
 from daqsvc.diagnosis.record import silence_reason
 from daqsvc.diagnosis.statements import asked, said_of_silence, said_of_window
 from daqsvc.dsp.quality.missing import Patience
+from daqsvc.errors.code import coded
+from daqsvc.errors.detectors import NO_DETECTOR
+from daqsvc.errors.service import TOO_SLOW
 from daqsvc.settings.failures import BrokenContractError, error_text
 from daqsvc.supervision import Progress, Supervisor, over
 from daqsvc.threads import ThreadLostError, call_in_thread
@@ -469,7 +472,7 @@ class Pipeline:
         self._let_go(stream)
         self._silent_until_ns[stream] = now_ns
         if not any(detector.stream == stream for detector in self.detectors):
-            logger.warning("%s; no detector reads them", reason)
+            logger.warning("%s; no detector reads them", reason, extra=coded(NO_DETECTOR))
         for detector in self.detectors:
             if detector.stream == stream:
                 with self._supervisor.sparing_others(
@@ -527,6 +530,7 @@ class Pipeline:
                 missed,
                 detector.stream,
                 window.first_index - window.skipped,
+                extra=coded(TOO_SLOW),
             )
         if not withheld:
             return window

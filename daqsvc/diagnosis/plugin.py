@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
+from daqsvc.errors.command_line import ARGUMENTS
 from daqsvc.settings.hooks import contract, may_raise
 from daqsvc.settings.plugins import PipelineTable
 from daqsvc.settings.problems import AssemblyError
@@ -49,6 +50,8 @@ class Detectability(NamedTuple):
 
 class UnfitOptionError(ValueError):
     """An option has no meaning for this detector; the message says what to do."""
+
+    code = ARGUMENTS
 
 
 @contract

@@ -14,6 +14,8 @@ from daqsvc.confined.spilled import let_go
 from daqsvc.diagnosis.detector import Window
 from daqsvc.diagnosis.statements import said_of_window
 from daqsvc.dsp.quality.unit import UM_PER_UNIT
+from daqsvc.errors.code import with_code
+from daqsvc.errors.recordings import NOT_JUDGED
 from daqsvc.settings.failures import one_line
 from daqsvc.settings.hooks import Hooks, contract, may_raise
 from daqsvc.settings.models import ProximityProbe
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
     from daqsvc.diagnosis.detector import Detector
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.dsp.quality.recorded import DataQuality
+    from daqsvc.errors.code import Code
     from daqsvc.recording.recording import Recording
     from daqsvc.settings.models import MachineFile
 
@@ -143,6 +146,7 @@ class Verdict(ABC):
         recording: name of the recording.
         quality: what is known against its samples.
         refused: why it cannot be judged; None if it can.
+        code: of the kind of reason; None where `NOT_JUDGED` says it, and for one that was judged.
     """
 
     part: ClassVar[str]
@@ -151,6 +155,17 @@ class Verdict(ABC):
     recording: str
     quality: DataQuality
     refused: str | None = None
+    code: Code | None = None
+
+    @property
+    def refusal(self) -> str:
+        """Why it cannot be judged, with the code of the kind of reason."""
+        return with_code(f"{self.refused}", self.code or NOT_JUDGED)
+
+    @property
+    def refusal_code(self) -> str | None:
+        """The code of the kind of reason; None for a recording that was judged."""
+        return None if self.refused is None else (self.code or NOT_JUDGED).id
 
     @abstractmethod
     def as_json(self) -> dict[str, Any]:

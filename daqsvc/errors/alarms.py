@@ -118,3 +118,11 @@ NOT_OF_STANDARD = Code(
     'Write measure = "peak_to_peak", with setpoints from peak to peak.',
     _PAGE,
 )
+CANNOT_JUDGE = Code(
+    "A16",
+    "An alarm cannot be judged",
+    "The detector that the alarm follows does not give its measure.",
+    "Correct the measure of the alarm. The message lists those that there are.",
+    _PAGE,
+    "alarm housing cannot be judged: levels measures rms, peak, not 'crest'; correct the alarm's measure",
+)

@@ -197,3 +197,166 @@ MANUALS_NUMBER = Code(
     "it is.",
     "modbus.md",
 )
+DEVICE_ABSENT = Code(
+    "B27",
+    "The device is not there at the start",
+    'The port or interface of a bus cannot be opened, and start = "error" says that the service needs it.',
+    'Plug the device in, or correct its name. With start = "retry" the service waits for it.',
+    "driver-contract.md",
+    "CAN bus 'can0' (socketcan can0): it cannot be opened: this kernel has no SocketCAN; `modprobe can-"
+    "raw`, or use another interface",
+)
+LAYOUT = Code(
+    "B28",
+    "The layout contradicts itself",
+    "A frame as the machine file or the DBC file describes it cannot exist, or cannot carry the values.",
+    "Correct what the message names, as the device sends it.",
+    _PAGE,
+    "a float field of 24 bits cannot be; use 1 to 64 (float: 32, 64)",
+)
+LINK_LOST = Code(
+    "B29",
+    "The bus or the port cannot be used for now",
+    "Its device is unplugged, switched off or taken, or nobody listens at its address. It is tried again "
+    "until "
+    "it is there.",
+    "Look at power, cable and address. Nothing else is to be done: the service takes it up again by itself.",
+    "driver-contract.md",
+    "serial port 'line' (/dev/ttyUSB0) is lost: the device was unplugged; it is being tried again",
+)
+LEFT_OUT_AT_START = Code(
+    "B30",
+    "A bus is left out until the next start",
+    'Its device was not there when the service started, and start = "ignore" says to go on without it.',
+    'Restart the service when the device is there. With start = "retry" it is tried again.',
+    "driver-contract.md",
+    "serial port 'line' (/dev/ttyUSB0): it cannot be opened; it is left out until the service starts "
+    "again, as "
+    "start = 'ignore' says",
+)
+DRIVER_FAILED = Code(
+    "B31",
+    "A driver has failed",
+    "A mistake in the driver, or in the library or adapter below it. The driver begins again.",
+    "Update the driver of the adapter. If it happens again, report it with the lines of the log before.",
+    "driver-contract.md",
+    "the reader of CAN bus 'can0' (socketcan can0) failed",
+)
+NO_ANSWER = Code(
+    "B32",
+    "A unit does not answer",
+    "A unit of Modbus is switched off, has another address or line settings, or answers too late. It is "
+    "asked "
+    "now and then, so that the others are not held up.",
+    "Look at power, address, baud rate, parity and timeout_ms. daqsvc sniff modbus shows who answers.",
+    "modbus.md",
+    "unit 3 has not answered within 300 ms; the unit is set aside, and asked again in 5 s",
+)
+REGISTER_REFUSED = Code(
+    "B33",
+    "A unit refuses a request",
+    "The unit answers with an exception: it has no such register or function, or cannot read so many at "
+    "once.",
+    "Compare address, table and number of registers with the manual of the unit. See max_gap and forbidden.",
+    "modbus.md",
+    "stream 'housing': unit 3 refuses input registers 100 to 103: illegal data address, which is counted "
+    "from "
+    "now on",
+)
+NO_FRAME = Code(
+    "B34",
+    "What comes is no frame of the stream",
+    "Bytes, lengths or checksums are not as the layout says, or the frame is of no stream of the machine "
+    "file.",
+    "Compare baud rate, framing, length, checksum and ids with the device. daqsvc sniff shows what it sends.",
+    "driver-contract.md",
+    "serial port 'line' (/dev/ttyUSB0) carries bytes that are no frame; they are counted and left out: "
+    "7 columns, the file lists 6",
+)
+SAMPLES_MISSING = Code(
+    "B35",
+    "Samples are missing",
+    "The counter of the device shows a gap: the bus, the device or this computer has lost frames.",
+    "Look at the load of the bus, its cables and this computer. daqsvc status shows how many are missing.",
+    "status.md",
+    "stream 'shaft': 24 samples are missing before index 81920; gaps are counted from now on",
+)
+NO_MEASUREMENT = Code(
+    "B36",
+    "Values of a stream are no measurements",
+    "The device says that it has no value, or sends one that is not finite, e.g. as a sensor is broken.",
+    "Look at the sensors behind the channels, and at their cables.",
+    "status.md",
+    "stream 'housing': 3 of its values are no measurements: the device says that it has none",
+)
+TIME_UNSURE = Code(
+    "B37",
+    "The time of samples is not certain",
+    "The device has restarted, its counter does not go on, or its frames come late or unevenly.",
+    "Nothing, if the device was restarted. Else compare rate_hz and the counter with the device.",
+    "alignment.md",
+    "stream 'shaft': the device has begun to count its blocks again; blocks that it took just before are "
+    "not "
+    "counted as lost",
+)
+NOT_BELIEVED = Code(
+    "B38",
+    "Nothing is judged by a stream for now",
+    "Its samples contradict the machine file: another rate or scale, or samples that are lost all the time.",
+    "Correct what the message names, in the machine file or in the device.",
+    "status.md",
+    "stream 'shaft': it comes at 3950 Hz, and the machine file says 4000 Hz. Nothing is judged by it "
+    "meanwhile",
+)
+NOT_ALIGNED = Code(
+    "B39",
+    "Two streams cannot be put on one time",
+    "Their times are less certain than max_error_us allows, so that their samples are left out.",
+    "Have the device send more often or with less delay, or raise max_error_us.",
+    "alignment.md",
+    "stream 'b' can be put on the grid of 'a' to 900 us only, worse than max_error_us = 200",
+)
+BUS_ERRORS = Code(
+    "B40",
+    "The CAN controller reports errors",
+    "Frames are damaged or lost on the way: bit rate, termination or cable are wrong, or it is alone on "
+    "the bus.",
+    "Compare bit rates, and look at cable and terminating resistors (120 ohm at both ends).",
+    "can.md",
+    "CAN bus 'can0' (socketcan can0) is error-warning: its controller counts more than 95 errors; look at"
+    " wiring, termination and bit rate",
+)
+BUFFER_FULL = Code(
+    "B41",
+    "A receive buffer was full",
+    "Frames came faster than this computer took them, and some are lost.",
+    "Raise receive_buffer_bytes of the bus, or relieve the computer.",
+    "can.md",
+    "CAN bus 'can0' (socketcan can0): the kernel dropped frames because its receive buffer was full",
+)
+FRAMES_UNRECORDED = Code(
+    "B42",
+    "Frames are not recorded",
+    "The disk is full, too slow or gone, or the frames are of a kind that is not recorded. What is read "
+    "from "
+    "the bus goes on.",
+    "See to the disk: room, speed, rights. frames_unrecorded counts what is missing.",
+    "can.md",
+    "CAN bus 'can0' (socketcan can0) cannot be recorded in /var/log/can: No space left on device",
+)
+PLAYED_OTHERWISE = Code(
+    "B43",
+    "A recording is not played as it is",
+    "It has frames of other channels, leaps in time, or parts that cannot be read.",
+    "Correct channel of the replayed bus, or cut the recording.",
+    "replay.md",
+    "replayed bus 'log': its time stamps leap back, or ahead by more than an hour",
+)
+LINE_SETTINGS = Code(
+    "B44",
+    "The port does not take the settings of the line",
+    "A pseudo-terminal passes whole bytes only, without parity and with 8 data bits.",
+    "Nothing, if a simulated device is behind it. Else correct the name of the port.",
+    "serial.md",
+    "/run/line is a pseudo-terminal, which passes whole bytes only: it is opened without parity",
+)

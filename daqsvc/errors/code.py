@@ -15,6 +15,7 @@ class Code:
         cause: what it means, and what usually leads to it.
         remedy: what to do about it.
         page: where to read on, a page of ``docs/``; may name a heading, e.g. ``alarms.md#votes``.
+        example: a message that has it, without the code; empty where the reference shows none.
     """
 
     id: str
@@ -22,11 +23,19 @@ class Code:
     cause: str
     remedy: str
     page: str
+    example: str = ""
 
     def __str__(self) -> str:
         return self.id
 
 
+def coded(code: Code | None) -> dict[str, Code | None]:
+    """What a logger takes as ``extra``: the code is a field of the record, and ends its line."""
+    return {"code": code}
+
+
 def with_code(text: str, code: Code | None) -> str:
-    """A message with its code at the end; as it is without one, e.g. that of a plugin from outside."""
-    return f"{text} [{code}]" if code is not None else text
+    """A message with its code at the end, once; as it is without one, e.g. that of a plugin from outside."""
+    if code is None or text.endswith(f"[{code}]"):
+        return text
+    return f"{text} [{code}]"

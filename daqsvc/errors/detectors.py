@@ -136,3 +136,28 @@ UNFIT_BEARING = Code(
     "Do what the message says at the key that it names.",
     "bearing.md",
 )
+HEALTHY_STATE = Code(
+    "D19",
+    "The healthy state is learnt anew, or will be lost",
+    "The file that keeps what was learnt of the healthy machine cannot be read, used or written.",
+    "Make sure that the machine is in good order now, or calibrate it again. See to the disk.",
+    "calibration.md",
+    "the healthy state of the rotor is measured anew: /var/lib/daqsvc/rotor.toml was made at another speed",
+)
+NO_DETECTOR = Code(
+    "D20",
+    "No detector reads the samples that fail",
+    "A stream has failed that no detector reads. An alarm would not show it.",
+    "Add a detector for the stream, or remove the stream.",
+    _PAGE,
+    "no samples of spare for 5.0 s; check bus and device; no detector reads them",
+)
+SENSOR_NOT_OK = Code(
+    "D21",
+    "A sensor is not OK",
+    "What it sends is not what a sound sensor delivers: it is dead, clipped, outside its OK limits or loose.",
+    "Look at the sensor, its cable and its supply. The message says what is wrong with its signal.",
+    "alarms.md",
+    "alarm sensor-ok/probe-x raised: probe-x is not OK: probe-x does not move at all (0 um): dead or "
+    "disconnected",
+)

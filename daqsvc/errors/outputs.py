@@ -61,3 +61,133 @@ OTHER_ENCRYPTION = Code(
     "Write mqtts:// in all URLs, or mqtt:// in all.",
     "sparkplug.md",
 )
+BROKER_AWAY = Code(
+    "O09",
+    "The broker cannot be reached",
+    "It does not run, its name or address is wrong, or the network is interrupted. Alarms wait on disk.",
+    "Look at mqtt.url, the network and the broker. All that waits is sent when it is back.",
+    "mqtt.md",
+    "MQTT broker 10.0.0.1:8883 is away: nothing listens there; trying again until it is back",
+)
+BROKER_TLS = Code(
+    "O10",
+    "TLS with the broker fails",
+    "Its certificate has expired, is for another host, or is signed by nobody in ca_file; or one side "
+    "lacks a "
+    "certificate or a version of TLS.",
+    "Correct ca_file and the host in mqtt.url, or renew the certificate that the message names.",
+    "mqtt.md",
+    "MQTT broker 10.0.0.1:8883 is away: nobody in ca_file vouches for its certificate: self-signed "
+    "certificate",
+)
+BROKER_REFUSES = Code(
+    "O11",
+    "The broker refuses the connection",
+    "User or password are wrong, this client is not allowed, or the broker has a limit that is reached.",
+    "Correct username and password_file, or allow this client at the broker.",
+    "mqtt.md",
+    "MQTT broker 10.0.0.1:8883 is away: user name or password are wrong",
+)
+TOPIC_REFUSED = Code(
+    "O12",
+    "The broker does not allow a topic",
+    "This client may connect, but not write or read the topic, or the message is too large for the broker.",
+    "Allow the topic to this client in the access list of the broker, or raise its limit of size.",
+    "mqtt.md",
+    "MQTT broker 10.0.0.1:8883 refuses an alarm message on daqsvc/lab/edge-1/pump/alarm/housing: not "
+    "authorized",
+)
+CLIENT_ID_TAKEN = Code(
+    "O13",
+    "Another client has the same client id",
+    "A broker ends a connection when another client comes with the same id. Both end each other in turn.",
+    "Give each box its own box name, or mqtt.client_id.",
+    "mqtt.md",
+    "MQTT broker 10.0.0.1:8883: another client takes over the connection with client_id "
+    "'daqsvc-lab:edge-1'; "
+    "give each box its own box name or mqtt.client_id",
+)
+CERTIFICATE_UNKNOWN = Code(
+    "O14",
+    "The end of a certificate is not known",
+    "The certificate cannot be read as one, so that no alarm can be raised before it ends.",
+    "Look at the file that the message names, and note when the certificate ends.",
+    "mqtt.md",
+    "nobody will be told when the certificates in /etc/daqsvc/ca.pem end: it holds no certificate",
+)
+MESSAGE_DROPPED = Code(
+    "O15",
+    "Messages are dropped",
+    "Telemetry is dropped where there is no room, or the broker does not take it. Alarms are not.",
+    "See to the disk and the broker. Every dropped message is counted: daqsvc status.",
+    "outbox.md",
+    "telemetry in /var/lib/daqsvc/telemetry.bin is dropped: the disk is nearly full",
+)
+OUTPUT_STATE = Code(
+    "O16",
+    "What an output remembers cannot be kept",
+    "A small file of the output in the store cannot be read or written. After a restart it may tell things "
+    "twice, or leave old ones standing.",
+    "See to the disk and the rights of the store.",
+    "outputs.md",
+    "Sparkplug memory /var/lib/daqsvc/sparkplug.json cannot be written: No space left on device",
+)
+OUTPUT_FAILED = Code(
+    "O17",
+    "An output has failed",
+    "A mistake in the output, or in the library below it. The machine is watched, and other outputs go on.",
+    "Do as the message says. If it happens again, report it with the lines of the log before.",
+    "outputs.md",
+    "metrics: a request has failed: ConnectionResetError(); the others are answered",
+)
+HISTORY_DAMAGED = Code(
+    "O18",
+    "The history is damaged",
+    "The file of the history cannot be read any more. It is set aside, and a new one is begun.",
+    "See to the disk. What was set aside may be read with the tools of SQLite.",
+    "history.md",
+    "the history /var/lib/daqsvc/history.sqlite is damaged (database disk image is malformed): it is now "
+    "history.sqlite.corrupt-1, and a new one is begun",
+)
+PAGE_ENDED = Code(
+    "O19",
+    "The page has ended",
+    "The process of the page could not begin, or was ended. It is started again.",
+    "Look at the line of the log before. A port that is taken needs another page.listen.",
+    "page.md",
+    "the page at 127.0.0.1:8420 has ended, and is started again: exit code 1",
+)
+HOST_MISSING = Code(
+    "O20",
+    "The primary host of Sparkplug is not there",
+    "The host that the machine file names is offline, so that nothing is sent to it. Alarms wait.",
+    "Start the host application, or correct primary_host.",
+    "sparkplug.md",
+    "Sparkplug tells nothing yet: primary host scada is offline on 10.0.0.1:8883",
+)
+COMMAND_NOT_OBEYED = Code(
+    "O21",
+    "A command that came over an output is refused",
+    "It is not signed, too old, has no time, is of a person who may not, or the state of the alarm does "
+    "not "
+    "allow it.",
+    "Do as the message says. daqsvc alarms shows the state of each alarm.",
+    "mqtt.md",
+    "spBv1.0/plant/DCMD/edge-1/pump is refused: it does not say when it was sent",
+)
+NOT_SHOWN = Code(
+    "O22",
+    "A viewer does not get what it shows",
+    "The broker does not let this client send or listen to what a page or a dashboard asks for.",
+    "Allow the topics to this client in the access list of the broker.",
+    "page.md",
+    "the MQTT broker does not let this client subscribe to daqsvc/lab/live: no live data is sent over it",
+)
+CERTIFICATE_ENDS = Code(
+    "O23",
+    "A certificate ends soon, or has ended",
+    "With a certificate that has ended, TLS with the broker fails.",
+    "Renew the certificate. The service reads new files by itself.",
+    "mqtt.md",
+    "certificate broker ends at 2026-12-07T09:00:00Z, in less than 14 days: renew it",
+)

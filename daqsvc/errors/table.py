@@ -5,7 +5,7 @@ from __future__ import annotations
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from daqsvc.errors import alarms, buses, detectors, machine_file, outputs, service
+from daqsvc.errors import alarms, buses, command_line, detectors, machine_file, outputs, recordings, service
 from daqsvc.errors.code import Code
 
 if TYPE_CHECKING:
@@ -13,7 +13,16 @@ if TYPE_CHECKING:
     from types import ModuleType
 
 GROUPS: Mapping[str, ModuleType] = MappingProxyType(
-    {"F": machine_file, "B": buses, "D": detectors, "A": alarms, "O": outputs, "S": service}
+    {
+        "C": command_line,
+        "F": machine_file,
+        "R": recordings,
+        "B": buses,
+        "D": detectors,
+        "A": alarms,
+        "O": outputs,
+        "S": service,
+    }
 )
 """The module of each group, by its letter."""
 

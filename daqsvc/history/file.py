@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from daqsvc.errors.command_line import NOTHING_RECORDED
 from daqsvc.history.points import (
     HOUR_S,
     RECORD,
@@ -67,9 +68,13 @@ CREATE INDEX IF NOT EXISTS event_by_machine ON event (machine, wall_ns);
 class NewerHistoryError(Exception):
     """The file was written by a newer version; the text says so."""
 
+    code = NOTHING_RECORDED
+
 
 class EmptyHistoryError(Exception):
     """The file holds no history, not even an empty one; the text says so."""
+
+    code = NOTHING_RECORDED
 
 
 class Series(NamedTuple):

@@ -16,6 +16,7 @@ from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.diagnosis.snapshots import alignment
 from daqsvc.dsp.quality.rate import SAME_RATE
+from daqsvc.errors.recordings import GAPS, NOT_FOUND, NOT_IN_LOG, NOT_TOGETHER, RATE_CONTRADICTED
 from daqsvc.recording import RecordingError
 from daqsvc.recording.formats import CAN_LOGS, named_as_can_log
 from daqsvc.recording.rate import MOST_STRETCHED
@@ -103,7 +104,7 @@ def _played(machine: MachineFile, path: str) -> _Playing:
             else f"give the log of this machine's bus, or correct {_LAYOUTS}"
         )
         raise RecordingError(
-            f"{path} has no frame of a stream of {machine.path}{playing.seen_instead()}; {why}"
+            f"{path} has no frame of a stream of {machine.path}{playing.seen_instead()}; {why}", NOT_IN_LOG
         )
     playing.check_rates()
     return playing
@@ -134,7 +135,8 @@ def load_can_streams(machine: MachineFile, path: str) -> tuple[list[RecordedStre
             samples, t_ns, period_ns = of_blocks(playing.blocks[name], MOST_STRETCHED)
         except LongGapsError as error:
             raise RecordingError(
-                f"{path} {error} of stream {name!r}; give the logs of one time without long gaps between"
+                f"{path} {error} of stream {name!r}; give the logs of one time without long gaps between",
+                GAPS,
             ) from None
         channels = stream.layout.channel_names
         known = [sensors.get((name, channel)) for channel in channels]
@@ -217,7 +219,8 @@ class _Playing:
         if not self._specs:
             raise RecordingError(
                 f"{path} is a CAN log, and no stream of {machine.path} comes in CAN frames; give a table of "
-                "samples, or the machine file with the layout of the frames"
+                "samples, or the machine file with the layout of the frames",
+                NOT_IN_LOG,
             )
         self.assemblers = {
             spec.name: StreamAssembler(
@@ -242,7 +245,8 @@ class _Playing:
             if not files:
                 raise RecordingError(
                     f"{self._path} is a folder without a CAN log ({', '.join(CAN_LOGS)}); give that of "
-                    "the logs"
+                    "the logs",
+                    NOT_FOUND,
                 )
         logs = [_Log(file, self._buses(), self.notes) for file in files]
         for piece in heapq.merge(*(log.pieces() for log in logs), key=_first_ns):
@@ -306,7 +310,8 @@ class _Playing:
             if seen_hz > stated_hz * (1.0 + _MOST_OFF_RATE) or (too_few and not counters.samples_lost):
                 raise RecordingError(
                     f"{self._path}: stream {name!r} comes at {seen_hz:.4g} Hz, and {self._machine.path} says "
-                    f"{stated_hz:g} Hz; correct its rate_hz"
+                    f"{stated_hz:g} Hz; correct its rate_hz",
+                    RATE_CONTRADICTED,
                 )
 
 
@@ -340,7 +345,7 @@ class _Log:
         try:
             log = CanLog(self.path, self._sort)
         except LogError as error:
-            raise RecordingError(f"{error}") from None
+            raise RecordingError(f"{error}", error.code) from None
         malformed = 0
         try:
             while (piece := log.read(_SPAN_NS)) is not None:
@@ -395,7 +400,8 @@ class _Log:
         if len(candidates) > 1:
             raise RecordingError(
                 f"the frames of {self.path} may be of {' or '.join(bus.name for bus in candidates)}; let its "
-                f"name begin with that of the bus, e.g. {candidates[0].name}-{self.path.name}"
+                f"name begin with that of the bus, e.g. {candidates[0].name}-{self.path.name}",
+                NOT_IN_LOG,
             )
         if candidates:
             self._chosen[channel] = candidates[0]
@@ -425,7 +431,8 @@ def _rows(path: str, name: str, blocks: Sequence[SampleBlock]) -> _Rows:
     if end - first > MOST_STRETCHED * there:
         raise RecordingError(
             f"{path} lacks {end - first - there:,} of {end - first:,} samples of stream {name!r}; give the "
-            "logs of one time without long gaps between"
+            "logs of one time without long gaps between",
+            GAPS,
         )
     samples = np.full((end - first, blocks[0].samples.shape[1]), np.nan)
     for block in blocks:
@@ -442,7 +449,8 @@ def _recording(
     if given_hz is not None and abs(given_hz / rate_hz - 1.0) > SAME_RATE:
         raise RecordingError(
             f"the sampling rate of {path} is {rate_hz:g} Hz by {machine.path} and {given_hz:g} Hz as given: "
-            "leave --fs out, or correct it"
+            "leave --fs out, or correct it",
+            RATE_CONTRADICTED,
         )
     names, columns = [], []
     rows = {name: _rows(path, name, playing.blocks[name]) for name in group}
@@ -491,7 +499,8 @@ def _group(
         if not set(grid.streams) - set(playing.spans_ns):
             raise RecordingError(
                 f"the streams {', '.join(grid.streams)} could not be put on one grid: they are too short, or "
-                "of different times; give logs of some 10 s and more, of the same time"
+                "of different times; give logs of some 10 s and more, of the same time",
+                NOT_TOGETHER,
             )
     present = [name for name in machine.streams if name in playing.blocks]
     streams = [machine.sensor(name).stream for name in watched]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from daqsvc import __version__
 from daqsvc.acquisition.samples import SampleBlock
+from daqsvc.errors.recordings import DAMAGED, GAPS, NEEDS_MACHINE_FILE, NO_SUCH_CHANNEL, TOO_SHORT
 from daqsvc.recording import NamesError, RecordingError
 from daqsvc.recording.formats import named_as_can_log
 from daqsvc.recording.rate import MOST_STRETCHED
@@ -90,7 +91,8 @@ def _read(
     if (is_can_log or is_snapshot) and (channels or rate_hz is not None):
         kind, who = ("CAN log", "the machine file") if is_can_log else ("snapshot", "itself")
         raise RecordingError(
-            f"{path} is a {kind}, of which {who} says channels and rate: leave out --map and --fs"
+            f"{path} is a {kind}, of which {who} says channels and rate: leave out --map and --fs",
+            NEEDS_MACHINE_FILE,
         )
     if is_can_log and machine is not None:
         from daqsvc.offline.can_logs import load_can_streams  # noqa: PLC0415 - brings python-can and kernels
@@ -100,13 +102,14 @@ def _read(
     if path.is_dir():
         raise RecordingError(
             f"{path} is a folder, of which only CAN logs are read, by the layouts of a machine file: name "
-            "that first"
+            "that first",
+            NEEDS_MACHINE_FILE,
         )
     if is_snapshot:
         try:
             snapshot = read_snapshot(path, get_limits())
         except SnapshotError as error:
-            raise RecordingError(f"{error}") from None
+            raise RecordingError(f"{error}", error.code) from None
         about = snapshot.about
         said = {key: str(about[key]) for key in ABOUT_MACHINE if key in about}
         return Exported(_of_snapshot(path, snapshot), said, list(snapshot.notes))
@@ -127,11 +130,13 @@ def _of_snapshot(path: Path, snapshot: Snapshot) -> list[RecordedStream]:
             if name in blocks and any(facts["sensors"])
         ]
     except LongGapsError as error:
-        raise RecordingError(f"{path} {error}; give a snapshot of a shorter time") from None
+        raise RecordingError(f"{path} {error}; give a snapshot of a shorter time", GAPS) from None
     except (ArithmeticError, AttributeError, KeyError, TypeError, ValueError) as error:
-        raise RecordingError(f"{path} cannot be read: {error}; it may be damaged: copy it anew") from None
+        raise RecordingError(
+            f"{path} cannot be read: {error}; it may be damaged: copy it anew", DAMAGED
+        ) from None
     if not streams:
-        raise RecordingError(f"{path} holds no samples of any sensor; give another snapshot")
+        raise RecordingError(f"{path} holds no samples of any sensor; give another snapshot", TOO_SHORT)
     return streams
 
 
@@ -162,7 +167,7 @@ def _of_table(
     try:
         streams, notes = load_all(recording, wanted, rate_hz)
     except NamesError as error:
-        raise ExportUsageError(f"{error}") from None
+        raise ExportUsageError(f"{error}", error.code) from None
     in_units = [
         replace(
             one,
@@ -194,7 +199,8 @@ def _add_sensors(wanted: dict[str, str], machine: MachineFile, there: Collection
         if len(rivals) > 1:
             raise ExportUsageError(
                 f"channel {variable} may be {' or '.join(rivals)} of {machine.path}: say which with "
-                f"--map {rivals[0]}={variable}"
+                f"--map {rivals[0]}={variable}",
+                NO_SUCH_CHANNEL,
             )
         wanted.pop(channel, None)
         sensors[rivals[0]] = variable

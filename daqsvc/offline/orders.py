@@ -14,6 +14,7 @@ import numpy as np
 from daqsvc.detectors.shaft.verdict import VERDICTS
 from daqsvc.diagnosis.recorded import Evaluated, RecordedDetector, Verdict, finite
 from daqsvc.dsp.orders import OrderVectors, order_vectors
+from daqsvc.dsp.quality import RefusedError
 from daqsvc.dsp.quality.recorded import DataQuality, known_against, off_stated_speed
 from daqsvc.dsp.quality.unit import M_S2_PER_UNIT
 from daqsvc.dsp.speed.lines import ORDERS
@@ -179,6 +180,7 @@ class OrderVerdict(Verdict):
                 "revolutions": 0 if orders is None else orders.revolutions,
                 "data_quality": self.quality.as_json(),
                 "refused": self.refused,
+                "code": self.refusal_code,
             }
         )
         return document
@@ -213,7 +215,7 @@ class OrderVerdict(Verdict):
     def describe(self) -> str:
         """A few lines for a person."""
         if self.change is None or self.orders is None:
-            return f"{self.recording}: not judged: {self.refused}"
+            return f"{self.recording}: not judged: {self.refusal}"
         change, orders = self.change, self.orders
         changes = " or ".join(name.replace("_", " ") for name in change.group)
         seen = "" if orders.speed_seen else ", guessed: no order stands out of the noise"
@@ -269,6 +271,7 @@ def analyse_orders(
             setup=setup,
             quality=quality,
             refused=str(error),
+            code=error.code if isinstance(error, RefusedError) else None,
             orders=orders,
         )
     if orders.speed_seen and (problem := off_stated_speed(orders.speed_rpm, setup.speed_rpm)):

@@ -29,6 +29,7 @@ from daqsvc.alarms.manager import AlarmManager
 from daqsvc.diagnosis.memory import DetectorMemory, MemoryNotFittingError, put
 from daqsvc.diagnosis.pipeline import THREADS, KernelThreads, kernel_failed
 from daqsvc.diagnosis.statements import said_of_silence
+from daqsvc.errors.recordings import NOT_REPLAYABLE
 from daqsvc.machine_facts import machine_values
 from daqsvc.machine_watch import MachineWatch
 from daqsvc.publish.payloads import (
@@ -65,12 +66,14 @@ _TURNS = 4
 """Of the event loop, after which whoever woke has done what there was to do."""
 _NOT_OURS = (KeyError, ValueError, TypeError, AttributeError, RecursionError, OverflowError)
 """What comes of a document that this program has not written."""
-_NOT_COMPARED = ("time", "wall_ns", "id", "sequence", "occurrence")
-"""Of an alarm event: its label of wall time, and what is new each time."""
+_NOT_COMPARED = ("time", "wall_ns", "id", "sequence", "occurrence", "code")
+"""Of an alarm event: its label of wall time, what is new each time, and what earlier versions did not say."""
 
 
 class ReplayError(Exception):
     """A snapshot that cannot be replayed; the text is to be read after its name."""
+
+    code = NOT_REPLAYABLE
 
 
 @dataclass(slots=True)

@@ -22,6 +22,7 @@ from daqsvc.detectors.shaft.verdict import RotorVerdict
 from daqsvc.diagnosis.recorded import Recorded, worst
 from daqsvc.dsp.quality import RefusedError
 from daqsvc.dsp.quality.recorded import known_against
+from daqsvc.errors.command_line import PROCESS_LOST
 from daqsvc.recording import RecordingError
 from daqsvc.recording.formats import named_as_can_log
 from daqsvc.recording.formats.column_units import unit_in_name
@@ -64,6 +65,8 @@ Detectors: TypeAlias = "dict[str, RecordedDetector[Any]]"
 
 class WorkerLostError(Exception):
     """A process died that was working on a recording."""
+
+    code = PROCESS_LOST
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +162,8 @@ class Runner:
         try:
             loaded = self.load(recording, narrow=True)
         except (RecordingError, RefusedError) as error:
-            return self._outcome(_not_judged(self.detectors, recording, str(error)), {})
+            refused = _not_judged(self.detectors, recording, str(error))
+            return self._outcome(replace(refused, code=error.code), {})
         present, machine = self._as_recorded(loaded)
         left_out = (one.left_out(loaded.names) for one in self.detectors.values())
         notes = [*loaded.notes, *map(one_line, filter(None, left_out))]

@@ -16,6 +16,8 @@ import zlib
 from collections import OrderedDict
 from typing import TYPE_CHECKING, Literal
 
+from daqsvc.errors.code import coded
+from daqsvc.errors.service import DISK_REFUSES, NOT_REMEMBERED
 from daqsvc.outbox.files import NEW_MODE, may_pass, replace_durably
 
 if TYPE_CHECKING:
@@ -68,7 +70,12 @@ class CommandIds:
                 if is_whole is None and is_new:
                     self._rewrite()
             except OSError as error:
-                log.warning("the ids of commands in %s cannot be read or written: %s", self._path, error)
+                log.warning(
+                    "the ids of commands in %s cannot be read or written: %s",
+                    self._path,
+                    error,
+                    extra=coded(NOT_REMEMBERED),
+                )
                 is_whole = None
             lost = not is_whole and not (is_whole is None and is_new)
             if not lost:
@@ -78,11 +85,17 @@ class CommandIds:
                 "the list of commands that have come, %s, is missing or damaged: commands that were issued "
                 "before this start are refused, for they may have been obeyed already",
                 self._path,
+                extra=coded(NOT_REMEMBERED),
             )
             try:
                 self._rewrite()
             except OSError as error:
-                log.warning("the ids of commands in %s cannot be written: %s", self._path, error)
+                log.warning(
+                    "the ids of commands in %s cannot be written: %s",
+                    self._path,
+                    error,
+                    extra=coded(DISK_REFUSES),
+                )
             return True
 
     def begin(self) -> None:
@@ -99,7 +112,12 @@ class CommandIds:
             except OSError as error:
                 if may_pass(error):
                     raise
-                log.warning("the ids of commands in %s cannot be written: %s", self._path, error)
+                log.warning(
+                    "the ids of commands in %s cannot be written: %s",
+                    self._path,
+                    error,
+                    extra=coded(DISK_REFUSES),
+                )
 
     def is_from_before(self, issued_ns: int) -> bool:
         """Whether a command of that time may have come before, with its id lost; wall clock."""

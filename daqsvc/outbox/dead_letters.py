@@ -13,6 +13,9 @@ import logging
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
+from daqsvc.errors.code import coded
+from daqsvc.errors.outputs import TOPIC_REFUSED
+from daqsvc.errors.service import JOURNAL_DAMAGED
 from daqsvc.outbox.files import FileError, NewerFileError, connect, is_corrupt, put_by, refuse_newer
 from daqsvc.outbox.messages import OutboxError, OutboxMessage, checksum, is_sound
 from daqsvc.outbox.rescue import finish, rescue
@@ -187,6 +190,7 @@ class DeadLetters:
             error,
             aside,
             count,
+            extra=coded(JOURNAL_DAMAGED),
         )
 
     def _insert(self, connection: sqlite3.Connection, message: OutboxMessage, reason: str) -> None:
@@ -219,6 +223,7 @@ class DeadLetters:
                     "more than %d messages on %s are refused; the oldest are dropped and counted",
                     MOST_OF_A_TOPIC,
                     m.topic,
+                    extra=coded(TOPIC_REFUSED),
                 )
             self.dropped += dropped
 
@@ -259,7 +264,12 @@ def _oldest(connection: sqlite3.Connection, topic: str) -> OutboxMessage | None:
         sequence, of, payload, retain, check = row
         if is_sound(sequence, of, payload, check):
             return OutboxMessage(sequence, of, payload, bool(retain))
-        log.error("refused message %s on %s has changed on the disk and is dropped", sequence, topic)
+        log.error(
+            "refused message %s on %s has changed on the disk and is dropped",
+            sequence,
+            topic,
+            extra=coded(JOURNAL_DAMAGED),
+        )
         _delete(connection, sequence)
 
 

@@ -11,6 +11,8 @@ import stat
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from daqsvc.errors.code import coded
+from daqsvc.errors.service import UNUSABLE_STORE
 from daqsvc.outbox.messages import StoreInUseError
 
 if TYPE_CHECKING:
@@ -385,6 +387,7 @@ def put_by(path: Path, version: int, wall_ns: int) -> Path:
         path,
         version,
         aside.name,
+        extra=coded(UNUSABLE_STORE),
     )
     return aside
 

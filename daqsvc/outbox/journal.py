@@ -10,6 +10,8 @@ from dataclasses import replace
 from itertools import islice
 from typing import TYPE_CHECKING
 
+from daqsvc.errors.code import coded
+from daqsvc.errors.service import DISK_REFUSES, JOURNAL_DAMAGED
 from daqsvc.outbox.ballast import Ballast
 from daqsvc.outbox.files import (
     FileError,
@@ -270,9 +272,19 @@ class Journal:
                 self._log_copy.discard()
             elif (aside := self._log_copy.keep(self._wall_ns())) is not None:
                 self.set_aside = aside
-                log.warning("outbox %s: the log that is damaged is set aside as %s", self.path, aside)
+                log.warning(
+                    "outbox %s: the log that is damaged is set aside as %s",
+                    self.path,
+                    aside,
+                    extra=coded(JOURNAL_DAMAGED),
+                )
         except OSError as error:
-            log.warning("outbox %s: the copy of its log stays where it is: %s", self.path, error)
+            log.warning(
+                "outbox %s: the copy of its log stays where it is: %s",
+                self.path,
+                error,
+                extra=coded(DISK_REFUSES),
+            )
 
     def _look_up_topics(self, *, is_whole: bool) -> None:
         topics = [row[0] for row in self._open_connection().execute("SELECT topic FROM latest")]
@@ -328,7 +340,9 @@ class Journal:
         except (sqlite3.OperationalError, OSError) as error:
             if not is_full(error):
                 raise
-            log.warning("outbox %s: %s; the journal is not trimmed", self.path, error)
+            log.warning(
+                "outbox %s: %s; the journal is not trimmed", self.path, error, extra=coded(DISK_REFUSES)
+            )
 
     def quarantine(self, error: Exception) -> None:
         """Set a corrupt file aside and go on with a new one that has what can still be read of it.
@@ -357,6 +371,7 @@ class Journal:
             error,
             aside,
             count,
+            extra=coded(JOURNAL_DAMAGED),
         )
         self._connect()
         self._tidy()
@@ -407,6 +422,7 @@ class Journal:
                 "is not there" if is_new else "was empty" if was_emptied else f"ends with message {last}",
                 self._mark.used,
                 gone,
+                extra=coded(JOURNAL_DAMAGED),
             )
         self._next = max(self._next, self._mark.first_free(stored, self._wall_ns()))
         self._mark.begin(self._next, self._unwritten.first)
@@ -440,6 +456,7 @@ class Journal:
                 "outbox %s: its write-ahead log is damaged; %d messages are taken back from it, page by page",
                 self.path,
                 len(rows),
+                extra=coded(JOURNAL_DAMAGED),
             )
         return [row[0] for row in rows]
 
@@ -632,10 +649,18 @@ class Journal:
             sqlite3.Error: not even that is possible.
         """
         if self._ballast.throw_off():
-            log.warning("outbox %s: the disk is full; the room that was held for this is in use", self.path)
+            log.warning(
+                "outbox %s: the disk is full; the room that was held for this is in use",
+                self.path,
+                extra=coded(DISK_REFUSES),
+            )
             return True
         if self._renewal.forget_aside(1):
-            log.warning("outbox %s: the disk is full; older corrupt files are deleted", self.path)
+            log.warning(
+                "outbox %s: the disk is full; older corrupt files are deleted",
+                self.path,
+                extra=coded(DISK_REFUSES),
+            )
             return True
         if not self._is_ready:
             return False
@@ -733,7 +758,12 @@ class Journal:
             try:
                 self._mark.settle(self._next - 1)
             except OSError as error:
-                log.warning("outbox mark of %s cannot be written: %s; numbers will jump", self.path, error)
+                log.warning(
+                    "outbox mark of %s cannot be written: %s; numbers will jump",
+                    self.path,
+                    error,
+                    extra=coded(DISK_REFUSES),
+                )
         self._mark.close()
         if self._lock is not None:
             lock, self._lock = self._lock, None
@@ -821,7 +851,7 @@ class Journal:
                 # A script, for `execute` would end this statement at its first page.
                 connection.executescript(f"PRAGMA incremental_vacuum({SLACK_PAGES // 2})")
         except sqlite3.Error as error:
-            log.warning("outbox %s cannot be made smaller: %s", self.path, error)
+            log.warning("outbox %s cannot be made smaller: %s", self.path, error, extra=coded(DISK_REFUSES))
         self._ballast.allocate()
 
 

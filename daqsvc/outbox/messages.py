@@ -7,6 +7,8 @@ import zlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from daqsvc.errors.service import JOURNAL, STORE_IN_USE, UNUSABLE_STORE
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -14,17 +16,25 @@ if TYPE_CHECKING:
 class OutboxError(Exception):
     """The outbox cannot do what it was asked to; the text names the file and the remedy."""
 
+    code = JOURNAL
+
 
 class NewerOutboxError(OutboxError):
     """A newer version of the program has written the file: starting again does not help."""
+
+    code = UNUSABLE_STORE
 
 
 class StoreInUseError(OutboxError):
     """Another process uses the store."""
 
+    code = STORE_IN_USE
+
 
 class StorePathError(OutboxError):
     """The store cannot be a directory, since a file is in its place: starting again does not help."""
+
+    code = UNUSABLE_STORE
 
 
 class StoreRefusedError(StorePathError):

@@ -21,6 +21,8 @@ from dataclasses import asdict, dataclass
 from itertools import chain
 from typing import TYPE_CHECKING
 
+from daqsvc.errors.code import coded
+from daqsvc.errors.service import JOURNAL_DAMAGED
 from daqsvc.outbox.files import (
     ASIDE_KEPT,
     MODE,
@@ -119,7 +121,12 @@ class Renewal:
         try:
             count = self._write(chain(readable(source, below), others), source, last, wall_ns)
         except (sqlite3.Error, OSError) as error:
-            log.warning("outbox %s: not all can be saved (%s); trying what is needed", self._path, error)
+            log.warning(
+                "outbox %s: not all can be saved (%s); trying what is needed",
+                self._path,
+                error,
+                extra=coded(JOURNAL_DAMAGED),
+            )
             needed = (row for row in others if row[3] or not row[4])
             count = self._write(chain(_needed(source, below), needed), source, last, wall_ns)
         self._draft.rename(self._saved)
@@ -162,7 +169,12 @@ class Renewal:
         try:
             replace_durably(self._note, json.dumps(asdict(damage)).encode())
         except OSError as error:
-            log.warning("outbox %s: a crash will make forget its damage: %s", self._path, error)
+            log.warning(
+                "outbox %s: a crash will make forget its damage: %s",
+                self._path,
+                error,
+                extra=coded(JOURNAL_DAMAGED),
+            )
 
     def untold(self) -> JournalDamage:
         """What an earlier run could not tell any more."""

@@ -30,6 +30,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from daqsvc.errors.code import coded
+from daqsvc.errors.service import DISK_REFUSES, JOURNAL_DAMAGED
 from daqsvc.outbox.files import NS_PER_MS, is_full, overwrite_durably, read_whole, replace_durably, restrict
 
 if TYPE_CHECKING:
@@ -119,6 +121,7 @@ class SequenceMark:
             log.warning(
                 "outbox mark %s or its twin is damaged or missing: sequence numbers jump ahead",
                 self._sides[0].path,
+                extra=coded(JOURNAL_DAMAGED),
             )
         newest = max(sound, key=lambda mark: (mark.ceiling, mark.used), default=_NOTHING)
         self._told = replace(
@@ -250,6 +253,7 @@ class SequenceMark:
                 "may go on showing states that the journal does not know",
                 self._sides[0].path,
                 error,
+                extra=coded(DISK_REFUSES),
             )
 
     def note(self, used: int) -> None:
@@ -269,7 +273,12 @@ class SequenceMark:
         if len(errors) == len(self._sides) and not is_full(errors[0]):
             raise errors[0]
         if errors and self._noted:
-            log.warning("outbox mark %s cannot be written: %s", self._sides[0].path, errors[0])
+            log.warning(
+                "outbox mark %s cannot be written: %s",
+                self._sides[0].path,
+                errors[0],
+                extra=coded(DISK_REFUSES),
+            )
         self._noted = not errors
         self._told = mark
 
@@ -297,7 +306,12 @@ class SequenceMark:
         if errors and (both or len(errors) == len(self._sides)):
             raise errors[0]
         for failure in errors:
-            log.warning("one of the outbox marks %s cannot be written: %s", self._sides[0].path, failure)
+            log.warning(
+                "one of the outbox marks %s cannot be written: %s",
+                self._sides[0].path,
+                failure,
+                extra=coded(DISK_REFUSES),
+            )
         self._told = mark
 
 
@@ -328,7 +342,7 @@ class _Side:
         except FileNotFoundError:
             return None
         except OSError as error:
-            log.warning("outbox mark %s cannot be read: %s", self.path, error)
+            log.warning("outbox mark %s cannot be read: %s", self.path, error, extra=coded(DISK_REFUSES))
             line = b""
         self._size, self.is_there = len(line), True
         return _understood(line)
@@ -358,7 +372,9 @@ class _Side:
             try:
                 os.close(file)
             except OSError as error:
-                log.warning("outbox mark %s cannot be closed: %s", self.path, error)
+                log.warning(
+                    "outbox mark %s cannot be closed: %s", self.path, error, extra=coded(DISK_REFUSES)
+                )
 
 
 def _opened(path: Path) -> int | None:

@@ -13,6 +13,8 @@ import logging
 import os
 from typing import TYPE_CHECKING, TypeVar
 
+from daqsvc.errors.code import coded
+from daqsvc.errors.service import DISK_REFUSES
 from daqsvc.outbox.command_ids import CommandIds
 from daqsvc.outbox.counters import OutboxCounters, TelemetryCounters
 from daqsvc.outbox.dead_letters import DeadLetters
@@ -128,7 +130,7 @@ class Outbox:
         try:
             return await asyncio.to_thread(_latest_of, self._journal.path)
         except (OutboxError, OSError) as error:
-            log.error("what the alarms were cannot be read yet: %s", error)  # noqa: TRY400
+            log.error("what the alarms were cannot be read yet: %s", error, extra=coded(DISK_REFUSES))  # noqa: TRY400
             return None
 
     @property
@@ -297,6 +299,7 @@ class Outbox:
                 self._journal.path,
                 timeout_s,
                 self.counters.waiting,
+                extra=coded(DISK_REFUSES),
             )
 
     async def _read(self, query: Callable[[], _T]) -> _T:
@@ -345,6 +348,7 @@ class _Books:
                 "alarms are being lost: make room on the disk or replace it",
                 self._journal.path,
                 waiting,
+                extra=coded(DISK_REFUSES),
             )
         return OutboxError(
             f"outbox {self._journal.path} cannot be written and {waiting} messages wait already; "

@@ -10,6 +10,8 @@ from collections import deque
 from typing import TYPE_CHECKING, TypeVar
 
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.errors.code import coded
+from daqsvc.errors.service import PART_FAILED
 from daqsvc.outbox.messages import OutboxError
 from daqsvc.outbox.telemetry_file import Arrival, TelemetryFile
 
@@ -160,7 +162,9 @@ class Telemetry:
         except BaseException:
             self.counters.restarts += 1
             if self.counters.restarts == 1:
-                log.exception("the thread that keeps telemetry has failed; it begins again")
+                log.exception(
+                    "the thread that keeps telemetry has failed; it begins again", extra=coded(PART_FAILED)
+                )
             return self._closing
         finally:
             self.file.close()

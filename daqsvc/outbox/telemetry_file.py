@@ -13,6 +13,9 @@ import sqlite3
 import time
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from daqsvc.errors.code import coded
+from daqsvc.errors.outputs import MESSAGE_DROPPED
+from daqsvc.errors.service import DISK_REFUSES, JOURNAL_DAMAGED
 from daqsvc.outbox.files import (
     FileError,
     NewerFileError,
@@ -110,9 +113,13 @@ class TelemetryFile:
         try:
             if free_bytes(self._path.parent) < self._limits.reserve_bytes and self._path.exists():
                 delete(self._path)
-                log.warning("telemetry in %s is dropped: the disk is nearly full", self._path)
+                log.warning(
+                    "telemetry in %s is dropped: the disk is nearly full",
+                    self._path,
+                    extra=coded(MESSAGE_DROPPED),
+                )
         except OSError as error:
-            log.warning("telemetry in %s cannot be read: %s", self._path, error)
+            log.warning("telemetry in %s cannot be read: %s", self._path, error, extra=coded(MESSAGE_DROPPED))
 
     def open(self) -> None:
         """Open or create the file; if it cannot be used, the messages are kept in memory."""
@@ -286,6 +293,7 @@ class TelemetryFile:
             error,
             aside,
             count,
+            extra=coded(JOURNAL_DAMAGED),
         )
 
     def _into_memory(self, error: Exception) -> None:
@@ -309,6 +317,7 @@ class TelemetryFile:
                 self._path,
                 error,
                 MEMORY_BYTES // 2**20,
+                extra=coded(DISK_REFUSES),
             )
 
     def _newest(self) -> list[tuple[object, ...]]:

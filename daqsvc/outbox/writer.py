@@ -16,6 +16,8 @@ from collections import Counter, deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
 
+from daqsvc.errors.code import coded
+from daqsvc.errors.service import DISK_REFUSES, JOURNAL_DAMAGED
 from daqsvc.outbox.files import FileError, is_corrupt
 from daqsvc.outbox.messages import Draft, OutboxAwayError, OutboxError, OutboxMessage
 from daqsvc.supervision import Progress
@@ -320,6 +322,7 @@ class JournalWriter:
                     ("written" if self._journal.is_ready else "opened") if failure.write else "read",
                     error,
                     UNBACKED if failure.write else "messages wait until it can",
+                    extra=coded(DISK_REFUSES),
                 )
             if not self._recover(error, post, give_up=failed_reads >= READ_FAILURES_MAX):
                 if failure.write:
@@ -440,7 +443,12 @@ class JournalWriter:
                 return self._journal.make_room()
         except FileError as again:
             if not self._journal.is_short_of_room(again):
-                log.error("outbox %s cannot be recovered: %s", self._journal.path, again)  # noqa: TRY400
+                log.error(  # noqa: TRY400 - the message says it all
+                    "outbox %s cannot be recovered: %s",
+                    self._journal.path,
+                    again,
+                    extra=coded(JOURNAL_DAMAGED),
+                )
                 return False
             try:
                 return self._journal.make_room()
@@ -470,6 +478,7 @@ class JournalWriter:
                 len(lost),
                 error,
                 _named(topics),
+                extra=coded(JOURNAL_DAMAGED),
             )
         if accepted:
             log.error(
@@ -477,6 +486,7 @@ class JournalWriter:
                 self._journal.path,
                 len(accepted),
                 error,
+                extra=coded(JOURNAL_DAMAGED),
             )
 
 

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from daqsvc.errors.code import coded
+from daqsvc.errors.outputs import OUTPUT_FAILED
 from daqsvc.page.findings import finding_rows
 from daqsvc.page.present import value_rows
 from daqsvc.page.text import alarm_list, alarm_rows, head, journal_rows, machine_rows
@@ -134,7 +136,9 @@ class Picture:
         except Exception:
             if not self._has_failed:
                 self._has_failed = True
-                log.exception("the page cannot make %s of %s", self._view, self._machine)
+                log.exception(
+                    "the page cannot make %s of %s", self._view, self._machine, extra=coded(OUTPUT_FAILED)
+                )
             return json.dumps(
                 {"age_s": 0.0, "why": "the page has failed to make it: its log has the reason"}
             ).encode()

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import SampleBlock
 from daqsvc.alarms.commands import CommandOutcome
+from daqsvc.errors.recordings import NOT_REPLAYABLE
 from daqsvc.page.machine_live import MachineLive
 from daqsvc.page.text import standing
 from daqsvc.snapshots.contents import ALARMS, DIAGNOSES, MACHINE_JSON, STANDING
@@ -37,6 +38,8 @@ PAUSE_S = 3.0
 
 class NoPictureError(Exception):
     """A snapshot that cannot be shown; the text says why."""
+
+    code = NOT_REPLAYABLE
 
 
 class Playing:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import uvicorn
 
+from daqsvc.errors.command_line import CANNOT_LISTEN
 from daqsvc.page.documentation import built_site
 from daqsvc.page.server import application
 
@@ -34,6 +35,8 @@ END_S = 1
 
 class PortError(Exception):
     """The page cannot listen; the text says where, why and the remedy."""
+
+    code = CANNOT_LISTEN
 
 
 class PortInUseError(PortError):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from daqsvc.alarms.expected import handling_conditions
 from daqsvc.detectors.make import plugins
-from daqsvc.errors.code import with_code
+from daqsvc.errors.code import coded, with_code
 from daqsvc.publish.mqtt.settings import Mqtt
 from daqsvc.publish.output import OutputSet, Watched
 from daqsvc.settings.alarms import DiagnosisAlarm
@@ -84,7 +84,7 @@ def _left_out(settings: dict[str, Any], path: str) -> Iterator[None]:
     except PluginFailedError as failed:
         del settings[path]
         words = f"output {path} cannot be made and is left out: {failed.words}"
-        log.error("%s", with_code(words, failed.code))  # noqa: TRY400
+        log.error("%s", with_code(words, failed.code), extra=coded(failed.code))  # noqa: TRY400
 
 
 def check_outputs(machine: MachineFile) -> None:
@@ -144,4 +144,4 @@ def _asked(machine: MachineFile, hook: str, *, spared: bool) -> Iterator[Any]:
         except PluginFailedError as failed:
             if not spared:
                 raise
-            log.error("%s", failed.followed_by("; the service goes on without"))  # noqa: TRY400
+            log.error("%s", failed.followed_by("; the service goes on without"), extra=coded(failed.code))  # noqa: TRY400

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from daqsvc.alarms.conditions import Condition
     from daqsvc.diagnosis.reading import Reading
     from daqsvc.diagnosis.record import Diagnosis
+    from daqsvc.errors.code import Code
     from daqsvc.outbox.store import Outbox
     from daqsvc.publish.looking import Look
     from daqsvc.publish.topics import Topics
@@ -107,6 +108,8 @@ class Output:
     """Tells others what the service finds. Every method is called by the event loop and must not block it."""
 
     _reason = ""
+    code: Code | None = None
+    """Of the kind of `reason`; None where nobody has said it."""
     _away_since_s: float | None = None
 
     @property
@@ -117,7 +120,7 @@ class Output:
     @reason.setter
     def reason(self, reason: str) -> None:
         if not reason:
-            self._away_since_s = None
+            self._away_since_s = self.code = None
         elif not self._reason:
             self._away_since_s = time.monotonic()
         self._reason = reason

@@ -14,10 +14,13 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, RootModel
 from pydantic_core import to_json
 
 from daqsvc.acquisition.clock import iso_utc
+from daqsvc.alarms.codes import code_of_alarm
 from daqsvc.alarms.events import AlarmEvent, Doubt, EventKind, Identity
 from daqsvc.alarms.states import HOLDS, AlarmState, Level
 from daqsvc.diagnosis.record import Diagnosis, Severity
 from daqsvc.dsp.quality import Quality  # noqa: TC001 - pydantic reads it
+from daqsvc.errors.code import coded
+from daqsvc.errors.service import NOT_REMEMBERED
 from daqsvc.outbox.messages import event_id
 
 if TYPE_CHECKING:
@@ -146,6 +149,10 @@ class AlarmPayload(Stamped):
     message: str = Field(description="the event in a sentence")
     by: str = Field(description="the person who asked for it; empty if the data or time did it")
     reason: str = Field("", description="why, in that person's words")
+    code: str | None = Field(
+        None,
+        description="code of what is wrong with data or service; null for other alarms, and when over",
+    )
     holds: tuple[AlarmState, ...] = Field((), description="what covers the alarm, strongest first")
     covered: AlarmState | None = Field(None, description="the state below; null if nothing covers it")
     shelved_until_wall_ns: int | None = Field(None, description="when shelving ends; null if not shelved")
@@ -221,6 +228,7 @@ def _alarm(event: AlarmEvent, sequence: int, series: str) -> dict[str, Any]:
         "message": event.message,
         "by": event.by,
         "reason": event.reason,
+        "code": _code(event),
         "holds": [hold.value for hold in event.holds],
         "covered": event.covered and event.covered.value,
         "shelved_until_wall_ns": event.shelved_until_wall_ns,
@@ -230,6 +238,11 @@ def _alarm(event: AlarmEvent, sequence: int, series: str) -> dict[str, Any]:
         "doubts": [doubt._asdict() for doubt in event.doubts],
         "cause": _statement(event.cause) | {"monotonic_ns": event.cause.t_ns},
     }
+
+
+def _code(event: AlarmEvent) -> str | None:
+    code = code_of_alarm(event.alarm, event.cause.quality) if event.to_level else None
+    return None if code is None else code.id
 
 
 def alarm_event(payload: bytes) -> AlarmEvent:
@@ -447,6 +460,7 @@ def restore_alarms(messages: Iterable[OutboxMessage], topics: Topics) -> list[Al
             "%d alarm states of the journal cannot be read; these alarms start from normal: %s",
             len(unread),
             "; ".join(unread),
+            extra=coded(NOT_REMEMBERED),
         )
     return events
 

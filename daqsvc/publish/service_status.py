@@ -22,6 +22,7 @@ class BusPayload(JsonPayload):
     driver: str = Field(description="name of the driver")
     state: Literal["up", "down"] = Field(description="whether the bus is up")
     reason: str = Field(description="why it is down")
+    code: str | None = Field(None, description="code of that reason; null if there is none")
 
 
 class StreamPayload(JsonPayload):
@@ -32,6 +33,7 @@ class StreamPayload(JsonPayload):
     configured_rate_hz: float = Field(description="rate in the machine file")
     age_s: Number = Field(description="age of the newest sample; null before the first one")
     doubt: str = Field(description="why nothing can be judged by its samples; empty if it can")
+    code: str | None = Field(None, description="code of that doubt; null if there is none")
     samples_received: int = Field(description="samples that came")
     samples_lost: int = Field(description="samples that never came")
 
@@ -47,6 +49,7 @@ class ChannelPayload(JsonPayload):
     age_s: Number = Field(description="age of the newest sample; null before the first one")
     state: SensorState = Field(description="what the detectors say of the sensor")
     reason: str = Field(description="why it is not ok")
+    code: str | None = Field(None, description="code of that reason; null if there is none")
 
 
 class MeasurePayload(JsonPayload):
@@ -66,6 +69,7 @@ class StatementPayload(JsonPayload):
     severity: Severity = Field(description="how bad that is")
     quality: Quality = Field(description="whether the samples and sensors are good")
     reason: str = Field(description="why the quality is not good")
+    code: str | None = Field(None, description="code of that reason; null if there is none")
     age_s: Number = Field(description="age of the last sample that it rests on")
     measures: dict[str, MeasurePayload] = Field(description="of the last statement that had any")
     measures_age_s: Number = Field(description="age of these; null if there are none")
@@ -83,6 +87,9 @@ class StandingAlarmPayload(JsonPayload):
     shelved_until_wall_ns: int | None = Field(None, description="when shelving ends; null if not shelved")
     first_out: bool = Field(False, description="it was the first of its group to stand")
     message: str = Field(description="what was found last, and what has been done about it since")
+    code: str | None = Field(
+        None, description="code of what is wrong with data or service; null for other alarms"
+    )
 
 
 class AlarmsPayload(JsonPayload):
@@ -108,6 +115,7 @@ class OutputPayload(JsonPayload):
 
     connected: bool | None = Field(description="null for one that has no connection")
     reason: str = Field("", description="why it reaches nobody at present; empty if it does")
+    code: str | None = Field(None, description="code of that reason; null if there is none")
     away_s: Number = Field(
         None, description="for how long it has reached nobody; null if it reaches somebody"
     )

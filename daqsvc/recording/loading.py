@@ -14,6 +14,7 @@ import numpy as np
 from daqsvc.confined.limits import ResourceLimits
 from daqsvc.dsp.quality import UnfitError
 from daqsvc.dsp.quality.unit import refuse_beyond_any_unit
+from daqsvc.errors.recordings import NO_SUCH_CHANNEL, NOT_TOGETHER, TOO_SHORT
 from daqsvc.recording import NamesError, RecordingError
 from daqsvc.recording.contents import GROUP_TIME, NUMERIC, STATED_START
 from daqsvc.recording.formats import read
@@ -145,14 +146,17 @@ def _called(path: Path, contents: Contents, channels: Mapping[str, str]) -> dict
         _channel(path, contents, variable)
         one = _variable(contents, variable)
         if one in called:
-            raise NamesError(f"{one} of {path} cannot be both {called[one]} and {name}: map it once")
+            raise NamesError(
+                f"{one} of {path} cannot be both {called[one]} and {name}: map it once", NO_SUCH_CHANNEL
+            )
         called[one] = name
     there = _lengths(contents)
     for one, name in called.items():
         if name in there and name not in called:
             raise NamesError(
                 f"{one} of {path} cannot be called {name}, as another channel of the file is: give it a name "
-                f"of its own, or map that, too: --map {name}={one},OTHER={name}"
+                f"of its own, or map that, too: --map {name}={one},OTHER={name}",
+                NO_SUCH_CHANNEL,
             )
     return called
 
@@ -175,7 +179,7 @@ def _groups(path: Path, contents: Contents) -> dict[str, list[str]]:
         groups[label if label not in groups else f"{label}-{len(groups) + 1}"] = there
     if not groups:
         _longest(path, contents)  # says what there is instead
-        raise RecordingError(f"{path} holds no channel; it holds {contents.listing()}")
+        raise RecordingError(f"{path} holds no channel; it holds {contents.listing()}", NO_SUCH_CHANNEL)
     return groups
 
 
@@ -241,7 +245,8 @@ class _Begins:
         if length < 2:
             raise RecordingError(
                 f"the channels of {path} were not taken at the same time: one begins after another has "
-                "ended; map only channels taken together"
+                "ended; map only channels taken together",
+                NOT_TOGETHER,
             )
         for column, shift in enumerate(self.shifts):
             samples[:length, column] = samples[shift : shift + length, column]
@@ -311,7 +316,7 @@ def _longest(path: Path, contents: Contents) -> tuple[dict[str, str], dict[str, 
         why = "is too short: no channel has two samples" if numeric else "holds no numeric channel"
         if time is not None:
             why = f"holds no channel beside its time column {time!r}"
-        raise RecordingError(f"{path} {why}; it holds {contents.listing()}")
+        raise RecordingError(f"{path} {why}; it holds {contents.listing()}", NO_SUCH_CHANNEL)
     return channels, {name: length for name, length in lengths.items() if length < longest}
 
 
@@ -343,15 +348,15 @@ def _channel(path: Path, contents: Contents, variable: str) -> NDArray[np.generi
     variable = _variable(contents, variable)
     holds = f"it holds {contents.listing()}"
     if variable not in entries and variable in contents.elsewhere:
-        raise RecordingError(f"{variable} of {path} {contents.elsewhere[variable].why}")
+        raise RecordingError(f"{variable} of {path} {contents.elsewhere[variable].why}", NO_SUCH_CHANNEL)
     if variable not in entries:
-        raise RecordingError(f"{path} has no channel {variable!r}; {holds}")
+        raise RecordingError(f"{path} has no channel {variable!r}; {holds}", NO_SUCH_CHANNEL)
     values = entries[variable]
     if values.dtype.kind not in NUMERIC:
-        raise RecordingError(f"{variable!r} of {path} is not numeric; {holds}")
+        raise RecordingError(f"{variable!r} of {path} is not numeric; {holds}", NO_SUCH_CHANNEL)
     if values.ndim != 1 or not len(values):
         what = {0: "a single number", 1: "empty"}.get(values.ndim, f"{values.ndim}-dimensional")
-        raise RecordingError(f"{variable!r} of {path} is {what}, not a channel; {holds}")
+        raise RecordingError(f"{variable!r} of {path} is {what}, not a channel; {holds}", NO_SUCH_CHANNEL)
     return values
 
 
@@ -362,11 +367,14 @@ def _common_length(
     if len(set(lengths.values())) > 1:
         stated = ", ".join(f"{name} ({channels[name]}) {length}" for name, length in lengths.items())
         raise RecordingError(
-            f"the channels of {path} have different lengths: {stated}; map only channels taken together"
+            f"the channels of {path} have different lengths: {stated}; map only channels taken together",
+            NOT_TOGETHER,
         )
     length = next(iter(lengths.values()))
     if length < 2:
-        raise RecordingError(f"{path} is too short: it holds one sample a channel; give a longer recording")
+        raise RecordingError(
+            f"{path} is too short: it holds one sample a channel; give a longer recording", TOO_SHORT
+        )
     return length
 
 
@@ -404,7 +412,7 @@ def _refuse_impossible(path: Path, names: list[str], samples: Samples) -> None:
         try:
             refuse_beyond_any_unit(signal, f"{name} of {path}")
         except UnfitError as error:
-            raise RecordingError(f"{error}") from None
+            raise RecordingError(f"{error}", error.code) from None
 
 
 def _count_bad(samples: Samples) -> tuple[int, int]:

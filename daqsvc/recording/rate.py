@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 import numpy as np
 
 from daqsvc.dsp.quality.rate import SAME_RATE, StampedRate, rate_of_stamps
+from daqsvc.errors.recordings import GAPS, RATE_CONTRADICTED, RATE_UNKNOWN
 from daqsvc.recording import RecordingError
 from daqsvc.recording.contents import RATE_NAMES, last_part
 
@@ -141,12 +142,14 @@ def timing_of(
             else f"does not state one{_why_not(contents, length, channels)}"
         )
         raise RecordingError(
-            f"the sampling rate of {path} is not known: the file {statement}. Give it with --fs, in Hz"
+            f"the sampling rate of {path} is not known: the file {statement}. Give it with --fs, in Hz",
+            RATE_UNKNOWN,
         )
     if not LEAST_RATE_HZ <= rate_hz <= MOST_RATE_HZ:
         raise RecordingError(
             f"the sampling rate of {path} is said to be {rate_hz:g} Hz ({source}); give one from "
-            f"{LEAST_RATE_HZ:g} to {MOST_RATE_HZ:,.0f} Hz with --fs"
+            f"{LEAST_RATE_HZ:g} to {MOST_RATE_HZ:,.0f} Hz with --fs",
+            RATE_UNKNOWN,
         )
     _refuse_contradictions(path, stated, column, given_hz)
     if column is None:
@@ -210,12 +213,14 @@ def _refuse_contradictions(
         if column is not None and any(not column.agrees(hz) for hz in stated.values()):
             raise RecordingError(
                 f"the sampling rate of {path} is {_rates(stated, column)} by the file, which contradicts "
-                "itself: say which with --fs, or correct the file"
+                "itself: say which with --fs, or correct the file",
+                RATE_CONTRADICTED,
             )
     elif other := _other_rates(stated, column, given_hz):
         raise RecordingError(
             f"the sampling rate of {path} is {other} by the file and {given_hz:g} Hz as given: "
-            "leave --fs out, or correct it"
+            "leave --fs out, or correct it",
+            RATE_CONTRADICTED,
         )
 
 
@@ -262,7 +267,8 @@ def _time(path: Path, contents: Contents, length: int, channels: Collection[str]
         longest = int(np.argmax(np.diff(rows)))
         raise RecordingError(
             f"{path} lacks {rows[-1] + 1 - length:,} of {rows[-1] + 1:,} samples by its time "
-            f"column {column.name!r}, the most behind sample {longest + 1:,}; cut the recording there"
+            f"column {column.name!r}, the most behind sample {longest + 1:,}; cut the recording there",
+            GAPS,
         )
     return column
 

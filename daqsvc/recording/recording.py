@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from daqsvc.confined.limits import ResourceLimits
 from daqsvc.confined.process import ConfinedError, RaisedThereError, shared
+from daqsvc.errors.machine_file import TOO_LARGE
+from daqsvc.errors.recordings import DAMAGED, NO_SUCH_CHANNEL
+from daqsvc.errors.table import CODES
 from daqsvc.recording import NamesError, RecordingError
 from daqsvc.recording.formats import find
 from daqsvc.recording.streams import RecordedStream
@@ -256,7 +259,8 @@ def matching(path: Path | str, variable: str, there: Iterable[str]) -> str:
         return variable
     if len(matches) > 1:
         raise RecordingError(
-            f"{path} has several channels that may be {variable!r}: {', '.join(matches)}; name one of them"
+            f"{path} has several channels that may be {variable!r}: {', '.join(matches)}; name one of them",
+            NO_SUCH_CHANNEL,
         )
     return matches[0]
 
@@ -293,9 +297,9 @@ def _there(
     except RaisedThereError as error:
         for known in (RecordingError, NamesError):
             if error.kind == known.__name__:
-                raise known(error.message) from None
+                raise known(error.message, CODES.get(error.code, DAMAGED)) from None
         raise RecordingError(
-            f"{path} cannot be read: {error}; it may be damaged: copy or save it anew"
+            f"{path} cannot be read: {error}; it may be damaged: copy or save it anew", DAMAGED
         ) from None
     except ConfinedError as error:
         remedy = "it is damaged: copy or save it anew"
@@ -306,4 +310,4 @@ def _there(
                 f"allow more (--max-memory, or max_memory_gb of a replayed bus; it is "
                 f"{limits.memory_bytes / 1e9:.3g} GB), or {remedy}"
             )
-        raise RecordingError(f"{path} cannot be read: {error.how}; {remedy}") from None
+        raise RecordingError(f"{path} cannot be read: {error.how}; {remedy}", TOO_LARGE) from None

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
+from daqsvc.errors.recordings import DAMAGED
 from daqsvc.recording import RecordingError
 
 if TYPE_CHECKING:
@@ -106,12 +107,14 @@ def checked(stream: RecordedStream, recording: str) -> tuple[RecordedStream, lis
     if not channels or not len(stream.names) == len(stream.units) == channels:
         raise RecordingError(
             f"{recording} cannot be read: stream {printable(stream.name):.80} has {len(stream.names)} names "
-            f"and {len(stream.units)} units of {channels} channels; it may be damaged: copy it anew"
+            f"and {len(stream.units)} units of {channels} channels; it may be damaged: copy it anew",
+            DAMAGED,
         )
     if not 0.0 < stream.rate_hz < np.inf or len(stream.samples) / stream.rate_hz > LAST_NS / NS_PER_S:
         raise RecordingError(
             f"{recording} cannot be read: stream {printable(stream.name):.80} is said to have "
-            f"{stream.rate_hz!r} samples a second; it may be damaged: copy it anew"
+            f"{stream.rate_hz!r} samples a second; it may be damaged: copy it anew",
+            DAMAGED,
         )
     notes = []
     start_ns, length_ns = stream.start_ns, round(len(stream.samples) / stream.rate_hz * NS_PER_S)

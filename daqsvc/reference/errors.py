@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from daqsvc.errors.table import CODES, GROUPS, group_title
-from daqsvc.reference.markdown import anchored, page
+from daqsvc.reference.markdown import anchored, code, page
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -29,5 +29,10 @@ def pages() -> Mapping[str, str]:
         for one in CODES.values():
             if one.id.startswith(letter):
                 heading = anchored(f"### {one}: {one.title}", one.id.lower())
-                blocks += [heading, one.cause, f"What to do: {one.remedy} See [{one.page}](../{one.page})."]
+                blocks += [heading, one.cause]
+                if one.example:
+                    blocks.append(f"Example: {code(one.example)}")
+                # The pages of the reference lie beside this one.
+                file = f"../{one.page}".replace("../reference/", "")
+                blocks.append(f"What to do: {one.remedy} See [{one.page}]({file}).")
     return {"errors.md": page("Errors and their codes", _ABOUT, *blocks)}

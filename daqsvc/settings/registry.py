@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, TypeVar
 
 from pydantic import Field, create_model
 
+from daqsvc.errors.code import coded
+from daqsvc.errors.machine_file import PLUGIN_FAILED
 from daqsvc.settings.buses import Bus, Layout, UnknownBus, UnknownLayout
 from daqsvc.settings.failures import import_failure, packages
 from daqsvc.settings.hooks import Hooks, PluginFailedError, brought_by, contract, see_declared
@@ -301,7 +303,12 @@ def _made_with_outputs(base: type[SettingsT], path: str) -> type[SettingsT]:
         if above != path:
             continue
         if name in base.model_fields:
-            log.warning("output %s is left out: [%s] is a table of daqsvc itself; rename it", key, key)
+            log.warning(
+                "output %s is left out: [%s] is a table of daqsvc itself; rename it",
+                key,
+                key,
+                extra=coded(PLUGIN_FAILED),
+            )
             continue
         table: Any = with_outputs(plugin.settings, key)
         fields[name] = (table | None, Field(default=None, description=plugin.about))

@@ -17,6 +17,7 @@ from google.protobuf.message import DecodeError
 
 from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.confined.process import ConfinedError, ConfinedProcess, RaisedThereError
+from daqsvc.errors.recordings import SNAPSHOT
 from daqsvc.snapshots import samples_pb2
 from daqsvc.snapshots.contents import ABOUT, CAUSES, SAMPLES, SCHEMA, Entry, Noted, Snapshot
 from daqsvc.snapshots.mcap import Attachment, Damage, McapError, Message, read
@@ -36,6 +37,8 @@ _REMEDY = "it may be damaged: copy it anew, or give another one"
 
 class SnapshotError(Exception):
     """A snapshot that cannot be read; says the file, the reason and the remedy."""
+
+    code = SNAPSHOT
 
 
 def entries_of(data: memoryview, damage: Damage) -> Iterator[Entry | Attachment]:

@@ -19,6 +19,9 @@ from typing import TYPE_CHECKING, Any
 import can
 
 from daqsvc.acquisition.link import Link
+from daqsvc.errors.buses import BUFFER_FULL, BUS_ERRORS, DRIVER_FAILED, NO_FRAME
+from daqsvc.errors.code import coded
+from daqsvc.errors.service import STOPPED_HARD
 from drivers.can.adapter import open_adapter
 from drivers.can.batches import BusOffError, FrameDemultiplexer
 from drivers.can.errors import BUS_OFF_REASON, EXPLAINED, CanCounters, ErrorCounts
@@ -43,6 +46,7 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.assembler import StreamCounters
     from daqsvc.acquisition.timebase import TimeBaseState
+    from daqsvc.errors.code import Code
     from drivers.base import BusPort
     from drivers.can.batches import CanBatch, CanSource
     from drivers.can.record import CanRecorder
@@ -104,7 +108,7 @@ class CanReader(threading.Thread):
         except (can.CanError, OSError, ValueError) as error:
             reason = words(error)
         except BaseException as error:
-            logger.exception("the reader of %s failed", self._link_name)
+            logger.exception("the reader of %s failed", self._link_name, extra=coded(DRIVER_FAILED))
             self._post(self._accept, DecodedBatch(notes=Counter(reader_failures=1)))
             reason = f"its reader failed: {words(error)}"
         self._post(self._end, reason)
@@ -114,7 +118,11 @@ class CanReader(threading.Thread):
         self._stopping.set()
         self.join(SHUTDOWN_S)
         if self.is_alive():
-            logger.warning("%s: its reader hangs in the adapter and is left behind", self._link_name)
+            logger.warning(
+                "%s: its reader hangs in the adapter and is left behind",
+                self._link_name,
+                extra=coded(STOPPED_HARD),
+            )
         close_quietly(self._source)
 
     def finish(self) -> None:
@@ -283,6 +291,7 @@ class CanDriver:
         if "frames_overrun" in batch.notes:
             self._say_once(
                 "overrun",
+                BUFFER_FULL,
                 "%s: the kernel dropped frames because its receive buffer was full; they are counted from "
                 "now on. Raise receive_buffer_bytes of the bus, or relieve the machine",
                 self.link.name,
@@ -317,6 +326,7 @@ class CanDriver:
         if errors.counts.get("rx_overflows"):
             self._say_once(
                 "rx overflow",
+                BUFFER_FULL,
                 "%s: the controller's receive buffer overflowed: frames are lost, and counted from now on",
                 self.link.name,
             )
@@ -325,7 +335,8 @@ class CanDriver:
         if state != "bus-off" and (errors.bus_off or before == "bus-off"):
             self.link.up()
         elif state not in {before, "bus-off"}:
-            self._say_once(state, "%s is %s: %s", self.link.name, state, EXPLAINED[state])
+            kind = None if state == "error-active" else BUS_ERRORS
+            self._say_once(state, kind, "%s is %s: %s", self.link.name, state, EXPLAINED[state])
 
     @property
     def _bus_off_reason(self) -> str:
@@ -343,6 +354,7 @@ class CanDriver:
             ids[name] = ids.get(name, 0) + count
         self._say_once(
             "unknown id",
+            NO_FRAME,
             "%s carries frames that no stream of the machine file has, id %s the first of them; "
             "they are counted by id",
             self.link.name,
@@ -356,6 +368,7 @@ class CanDriver:
         spec = next(s for s in self._port.streams if s.name == stream)
         self._say_once(
             f"length of {stream}",
+            NO_FRAME,
             "%s: a frame %#x of stream %r has %d bytes, its layout %d; such frames are counted and left out",
             self.link.name,
             spec.layout.frame_id,
@@ -364,7 +377,7 @@ class CanDriver:
             spec.layout.length,
         )
 
-    def _say_once(self, key: str, message: str, *arguments: object) -> None:
+    def _say_once(self, key: str, code: Code | None, message: str, *arguments: object) -> None:
         if key not in self._said:
             self._said.add(key)
-            logger.warning(message, *arguments)
+            logger.warning(message, *arguments, extra=coded(code))

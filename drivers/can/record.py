@@ -13,6 +13,8 @@ import threading
 from typing import TYPE_CHECKING
 
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.errors.buses import FRAMES_UNRECORDED
+from daqsvc.errors.code import coded
 from drivers.can.kernel_time import monotonic_minus_wall_ns
 from drivers.can.record_files import LogFile, LogFolder, encoder_for
 from drivers.reconnect import words
@@ -106,6 +108,7 @@ class CanRecorder:
                 "frames_unrecorded from now on. Take a faster disk, or have the bus filtered",
                 self._link_name,
                 self._logs.place,
+                extra=coded(FRAMES_UNRECORDED),
             )
 
     def close(self) -> None:
@@ -125,6 +128,7 @@ class CanRecorder:
                 left,
                 self._logs.place,
                 PATIENCE_S,
+                extra=coded(FRAMES_UNRECORDED),
             )
 
     def _new_thread(self) -> threading.Thread:
@@ -146,6 +150,7 @@ class CanRecorder:
             self._link_name,
             self._logs.place,
             lost,
+            extra=coded(FRAMES_UNRECORDED),
         )
         self._thread = self._new_thread()
         self._thread.start()
@@ -154,7 +159,9 @@ class CanRecorder:
         try:
             self._write_all()
         except BaseException:
-            logger.exception("the thread that records %s has failed", self._link_name)
+            logger.exception(
+                "the thread that records %s has failed", self._link_name, extra=coded(FRAMES_UNRECORDED)
+            )
             self._end_log()
 
     def _write_all(self) -> None:
@@ -216,6 +223,7 @@ class CanRecorder:
                 self._link_name,
                 log.path,
                 self._missing,
+                extra=coded(FRAMES_UNRECORDED),
             )
             self._failed_ns, self._missing = None, 0
 
@@ -228,6 +236,7 @@ class CanRecorder:
                 self._link_name,
                 self._logs.place,
                 words(error),
+                extra=coded(FRAMES_UNRECORDED),
             )
         self._failed_ns, self._well_since_ns = self._clock.monotonic_ns(), None
         self._settle(unrecorded=self._pending)
@@ -280,6 +289,7 @@ def recorder_of(
             "%s: CAN FD frames are neither read nor recorded, and not counted as unrecorded: the machine "
             "file says fd = false. Set fd = true if the bus carries any",
             link_name,
+            extra=coded(FRAMES_UNRECORDED),
         )
     # Virtual buses are called by a path, which is no word of a log.
     interface = bus.channel if _INTERFACE.fullmatch(bus.channel) else port.name

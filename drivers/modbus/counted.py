@@ -13,6 +13,8 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.acquisition.standing import QUIET_NS, StreamStanding
 from daqsvc.acquisition.timebase import TimeBase
+from daqsvc.errors.buses import TIME_UNSURE
+from daqsvc.errors.code import coded
 from drivers.modbus.reading import PollingReader
 from drivers.modbus.registers import RegisterRecord
 from drivers.modbus.settings import FifoLayout, RingLayout
@@ -145,6 +147,7 @@ class CountedRows:
             logger.warning(
                 "stream %r: its samples do not arrive when its clock has told; its time base begins anew",
                 self._name,
+                extra=coded(TIME_UNSURE),
             )
         lost = 0 if self._next is None else first - self._next
         self._next = first + len(samples)
@@ -214,6 +217,7 @@ class CountedReader(PollingReader, Generic[CountedT]):
                 "stream %r: the device has restarted its count, or has not counted for a while; how many "
                 "samples are missing is estimated from the clock",
                 self._name,
+                extra=coded(TIME_UNSURE),
             )
         self._index = max(self._index, index)
         self._restarted = True

@@ -12,6 +12,8 @@ from collections import ChainMap, defaultdict
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.acquisition.link import Link
+from daqsvc.errors.buses import DRIVER_FAILED
+from daqsvc.errors.code import coded
 from drivers.modbus.client import ModbusClient
 from drivers.modbus.fifo import FifoReader
 from drivers.modbus.line import ModbusLine, RetryPolicy, SparingByEnquiry
@@ -174,7 +176,13 @@ class ModbusDriver:
             if task.cancelled():
                 return f"its {task.get_name()} was cancelled"
             if (error := task.exception()) is not None:
-                logger.error("%s: %s failed", self.link.name, task.get_name(), exc_info=error)
+                logger.error(
+                    "%s: %s failed",
+                    self.link.name,
+                    task.get_name(),
+                    exc_info=error,
+                    extra=coded(DRIVER_FAILED),
+                )
                 self.counters.reader_failures += 1
                 return f"its reader failed: {error}"
         return "its reader has ended"

@@ -20,6 +20,8 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias, TypeVar
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.link import OFTEN, Sparing
+from daqsvc.errors.buses import NO_ANSWER
+from daqsvc.errors.code import coded
 from drivers.modbus.replies import (
     GATEWAY_CODES,
     READ_FIFO,
@@ -258,7 +260,7 @@ class UnitSilence:
     def _say(self, silence: Silence, message: str, *arguments: object) -> None:
         sparing = self._sparing.setdefault((self._unit, silence.enquiry), Sparing())
         if sparing.may_say():
-            logger.warning(message, *arguments, OFTEN if sparing.often else "")
+            logger.warning(message, *arguments, OFTEN if sparing.often else "", extra=coded(NO_ANSWER))
 
     def _say_end(self, silence: Silence, message: str, *arguments: object) -> bool:
         sparing = self._sparing.get((self._unit, silence.enquiry))

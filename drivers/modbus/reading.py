@@ -6,6 +6,8 @@ import logging
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Protocol
 
+from daqsvc.errors.buses import REGISTER_REFUSED
+from daqsvc.errors.code import coded
 from drivers.modbus.replies import OTHER_REMEDY, REMEDIES, LineLostError, NoReplyError, RequestRefusedError
 
 if TYPE_CHECKING:
@@ -85,7 +87,9 @@ class PollingReader(ABC):
         """Tell each refusal once; how often there are such, the counters of the bus say."""
         if (message := f"{streams_in_words(self._concerned())}: {refusal}") not in self._said:
             self._said.add(message)
-            logger.warning("%s, which is counted from now on; %s", message, remedy)
+            logger.warning(
+                "%s, which is counted from now on; %s", message, remedy, extra=coded(REGISTER_REFUSED)
+            )
 
     def _concerned(self) -> Sequence[str]:
         """The streams that get no sample by the request that has failed."""

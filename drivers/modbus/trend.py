@@ -19,6 +19,8 @@ from daqsvc.acquisition.assembler import StreamCounters, note_gap, note_received
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.acquisition.timebase import RECENT_DELAYS, TimeBaseState
+from daqsvc.errors.buses import REGISTER_REFUSED
+from daqsvc.errors.code import coded
 from drivers.modbus.reading import PollingReader
 from drivers.modbus.registers import RegisterRecord, run_of
 from drivers.modbus.replies import FUNCTIONS, NoReplyError, RequestRefusedError
@@ -276,6 +278,7 @@ class TrendReader(PollingReader):
                 "smaller max_gap, or forbidden, avoids it from the start",
                 self._who,
                 message,
+                extra=coded(REGISTER_REFUSED),
             )
 
     def _concerned(self) -> Sequence[str]:

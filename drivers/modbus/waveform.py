@@ -12,6 +12,8 @@ from daqsvc.acquisition.assembler import StreamCounters, note_received
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.acquisition.timebase import TimeBaseState
+from daqsvc.errors.buses import TIME_UNSURE
+from daqsvc.errors.code import coded
 from drivers.modbus.counted import SURE, SampleClock
 from drivers.modbus.reading import PollingReader
 from drivers.modbus.registers import RegisterRecord, RegisterRun
@@ -224,6 +226,7 @@ class WaveformReader(PollingReader):
             "stream %r: the device has begun to count its blocks again; blocks that it took just before are "
             "not counted as lost",
             self._name,
+            extra=coded(TIME_UNSURE),
         )
         self._restarts += 1
 

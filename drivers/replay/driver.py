@@ -19,6 +19,8 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.link import Link
 from daqsvc.confined.limits import GIGABYTE, ResourceLimits
 from daqsvc.confined.process import ConfinedProcess
+from daqsvc.errors.buses import DRIVER_FAILED, PLAYED_OTHERWISE
+from daqsvc.errors.code import coded
 from drivers.base import BusCounters, BusPort
 from drivers.can.adapter import batch_of
 from drivers.can.batches import FrameDemultiplexer
@@ -104,6 +106,7 @@ class ChannelChoice:
             name,
             self._chosen,
             name,
+            extra=coded(PLAYED_OTHERWISE),
         )
 
 
@@ -282,7 +285,7 @@ class ReplayDriver:
                 self._say_once(f"{error}")
             return Ending(f"{error}", readable=True)
         except Exception as error:
-            logger.exception("the reader of %s failed", self.link.name)
+            logger.exception("the reader of %s failed", self.link.name, extra=coded(DRIVER_FAILED))
             self.counters.reader_failures += 1
             return Ending(f"its reader failed: {words(error)}", readable=False)
         finally:
@@ -291,7 +294,7 @@ class ReplayDriver:
     def _say_once(self, what: str) -> None:
         if what not in self._said:
             self._said.add(what)
-            logger.warning("replayed bus %r: %s", self.name, what)
+            logger.warning("replayed bus %r: %s", self.name, what, extra=coded(PLAYED_OTHERWISE))
 
     def _begin_anew(self, recording: RecordedLog) -> None:
         """The recording is played from its beginning: nothing is missing between this and what was before."""

@@ -13,6 +13,7 @@ import numpy as np
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.confined.limits import ResourceLimits
 from daqsvc.confined.process import ConfinedProcess
+from daqsvc.errors.buses import NOT_PLAYABLE
 from daqsvc.recording import RecordingError
 from daqsvc.recording.recording import load_streams
 from drivers.frames import DecodedBatch, DecodedFrames
@@ -32,6 +33,8 @@ TABLE_COUNTER_BITS = 32
 
 class RecordedLogError(Exception):
     """A recording cannot be read, or no longer; says the file, the reason and the remedy."""
+
+    code = NOT_PLAYABLE
 
 
 class RecordedLog(Protocol):

@@ -19,6 +19,8 @@ import serial
 
 from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.link import Link
+from daqsvc.errors.buses import NO_FRAME
+from daqsvc.errors.code import coded
 from drivers.base import BusCounters, BusPort
 from drivers.reconnect import Attempt, CannotOpenError, ended, in_thread, run_with_reconnect, sparing_others
 from drivers.serial.binary import BodyCodec, CobsFraming, SyncFraming
@@ -34,6 +36,7 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.assembler import StreamCounters
     from daqsvc.acquisition.timebase import TimeBaseState
+    from daqsvc.errors.code import Code
     from drivers.base import StreamSpec
     from drivers.frames import DecodedBatch, FrameLayout
     from drivers.serial.framing import Framing
@@ -164,6 +167,7 @@ class SerialDriver:
         if "frames_malformed" in batch.notes:
             self._say_once(
                 "malformed",
+                NO_FRAME,
                 "%s carries bytes that are no frame; they are counted and left out%s. If it is all of them, "
                 "compare baud, parity, framing and checksum with the device's",
                 self.link.name,
@@ -175,6 +179,7 @@ class SerialDriver:
             self._assemblers[stream].counters.frames_wrong_length += count
             self._say_once(
                 f"length of {stream}",
+                NO_FRAME,
                 "%s: a frame of stream %r has %d bytes, id and CRC included, and its layout another length; "
                 "such frames are counted and left out",
                 self.link.name,
@@ -202,16 +207,17 @@ class SerialDriver:
             ids[name] = ids.get(name, 0) + count
         self._say_once(
             "unknown id",
+            NO_FRAME,
             "%s carries frames that no stream of the machine file has, id %s the first of them; "
             "they are counted by id",
             self.link.name,
             name,
         )
 
-    def _say_once(self, key: str, message: str, *arguments: object) -> None:
+    def _say_once(self, key: str, code: Code, message: str, *arguments: object) -> None:
         if key not in self._said:
             self._said.add(key)
-            logger.warning(message, *arguments)
+            logger.warning(message, *arguments, extra=coded(code))
 
 
 def framing_of(bus: SerialBus, streams: Sequence[StreamSpec[Any]]) -> Framing:

@@ -22,6 +22,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
+from daqsvc.errors.buses import DRIVER_FAILED
+from daqsvc.errors.code import coded
+from daqsvc.errors.service import STOPPED_HARD
 from drivers.reconnect import HandOver
 from drivers.serial.pauses import Pauses
 
@@ -149,7 +152,7 @@ class SerialReader(threading.Thread):
         except _HungUpError as error:
             reason = f"{error}"
         except BaseException as error:
-            logger.exception("the %s failed", self.name)
+            logger.exception("the %s failed", self.name, extra=coded(DRIVER_FAILED))
             reason = self._failed(error)
         self._jobs.put(partial(self._post, self._end, reason))
         self._jobs.put(None)
@@ -159,7 +162,9 @@ class SerialReader(threading.Thread):
         self._stopping.set()
         self.join(SHUTDOWN_S)
         if self.is_alive():
-            logger.warning("the %s hangs in the port and is left behind", self.name)
+            logger.warning(
+                "the %s hangs in the port and is left behind", self.name, extra=coded(STOPPED_HARD)
+            )
             self._jobs.put(None)
         self.cutter.join(SHUTDOWN_S)
         close_port(self._device)
@@ -174,7 +179,7 @@ class SerialReader(threading.Thread):
             while (job := self._jobs.get()) is not None:
                 job()
         except BaseException as error:
-            logger.exception("the %s failed", self.cutter.name)
+            logger.exception("the %s failed", self.cutter.name, extra=coded(DRIVER_FAILED))
             self._stopping.set()
             self._post(self._end, self._failed(error))
 

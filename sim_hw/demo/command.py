@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from daqsvc.commands.arguments import EXIT_FAILED, channel_map, sampling_rate_hz
+from daqsvc.commands.arguments import channel_map, sampling_rate_hz
+from daqsvc.commands.complaint import complain
+from daqsvc.errors.command_line import EXTRA_MISSING, INTERRUPTED, SIMULATION
 from sim_hw.arguments import add_random, add_recording, add_speed, first_option, misplaced, positive
 from sim_hw.demo.machines import DemoError
 
@@ -121,7 +123,7 @@ class DemoCommand:
             try:
                 return _run(arguments)
             except KeyboardInterrupt:
-                return _fail("interrupted")
+                return complain("daqsvc demo", "interrupted", INTERRUPTED)
 
 
 def _run(arguments: argparse.Namespace) -> int:
@@ -140,15 +142,19 @@ def _run(arguments: argparse.Namespace) -> int:
         from daqsvc.settings import MachineFileError  # noqa: PLC0415
         from sim_hw.scenario import ScenarioError  # noqa: PLC0415
     except ModuleNotFoundError as error:
-        return _fail(f"the demo needs {error.name}; install it with: pip install 'daqsvc[demo]'")
+        what = f"the demo needs {error.name}; install it with: pip install 'daqsvc[demo]'"
+        return complain("daqsvc demo", what, EXTRA_MISSING)
     try:
         script = script_of(arguments)
         summary = _play(script, arguments)
-    except (DemoError, MachineFileError, RecordingError, ScenarioError) as error:
-        return _fail(str(error))
-    return (
-        0 if summary["complete"] else _fail("the service's last messages did not come back from the broker")
-    )
+    except MachineFileError as error:
+        return complain("daqsvc demo", error, error.problems[-1].code)
+    except (DemoError, RecordingError, ScenarioError) as error:
+        return complain("daqsvc demo", error, error.code)
+    if not summary["complete"]:
+        what = "the service's last messages did not come back from the broker"
+        return complain("daqsvc demo", what, SIMULATION)
+    return 0
 
 
 async def _interruptible(session: DemoSession) -> DemoOutcome:
@@ -195,15 +201,6 @@ def _sigterm_interrupts() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _fail(message: str) -> int:
-    _say(message)
-    return EXIT_FAILED
-
-
-def _say(message: str) -> None:
-    print(f"daqsvc demo: {message}", file=sys.stderr)  # noqa: T201 - errors of the command line go to stderr
 
 
 def _play(script: Script, arguments: argparse.Namespace) -> dict[str, Any]:
@@ -424,3 +421,7 @@ def broker_url(text: str) -> str:
     if parts.path not in {"", "/"} or parts.query or parts.fragment:
         raise argparse.ArgumentTypeError(f"{text!r} has something after host and port; {form}")
     return text
+
+
+def _say(message: str) -> None:
+    print(f"daqsvc demo: {message}", file=sys.stderr)  # noqa: T201 - stdout is for what is played

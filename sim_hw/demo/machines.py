@@ -18,6 +18,7 @@ import numpy as np
 
 from daqsvc.bearing.geometry import bearing_orders
 from daqsvc.detectors.rotor_bank.settings import RotorBank
+from daqsvc.errors.command_line import SIMULATION
 from daqsvc.publish.mqtt.settings import Mqtt
 from daqsvc.settings import MachineFile, MachineFileError, parse_machine_file
 
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
 
 class DemoError(Exception):
     """The demo cannot run; the message says why and what to do."""
+
+    code = SIMULATION
 
 
 CHANNEL = "daqsvc-demo"

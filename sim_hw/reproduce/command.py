@@ -12,7 +12,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK
+from daqsvc.commands.arguments import EXIT_OK
+from daqsvc.commands.complaint import complain
+from daqsvc.errors.command_line import CANNOT_WRITE, EXTRA_MISSING
 from sim_hw import arguments as arguments_of
 
 if TYPE_CHECKING:
@@ -68,17 +70,18 @@ class ReproduceCommand:
 
         start_logging(verbose=False)
         if importlib.util.find_spec("matplotlib") is None:
-            return _fail("the figures need matplotlib; install it with: pip install 'daqsvc[plot]'")
+            what = "the figures need matplotlib; install it with: pip install 'daqsvc[plot]'"
+            return complain("daqsvc reproduce", what, EXTRA_MISSING)
         out: Path = arguments.out
         if problem := _cannot_write_into(out):
-            return _fail(problem)
+            return complain("daqsvc reproduce", problem, CANNOT_WRITE)
         kernel_cache.prepare()
         try:
             rows = _reproduce(out, arguments.seed, arguments.snr_db)
         except OSError as error:
-            return _fail(
-                f"{error.filename or out} cannot be written: {error.strerror}; free it, or name another --out"
-            )
+            where = error.filename or out
+            what = f"{where} cannot be written: {error.strerror}; free it, or name another --out"
+            return complain("daqsvc reproduce", what, CANNOT_WRITE)
         _print(rows, as_json=arguments.json)
         _note(f"figures and tables are in {out}")
         return EXIT_OK
@@ -153,11 +156,6 @@ def snr_db(text: str) -> float:
     if abs(value) > MOST_DB:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number from -{MOST_DB:g} to {MOST_DB:g} dB")
     return value
-
-
-def _fail(message: str) -> int:
-    print(f"daqsvc reproduce: {message}", file=sys.stderr)  # noqa: T201 - errors of the command line go to stderr
-    return EXIT_FAILED
 
 
 def _cannot_write_into(out: Path) -> str | None:

@@ -409,6 +409,7 @@ async def test_nobody_but_its_own_user_may_command_the_service() -> None:
                 with pytest.raises(ControlError, match="try again with sudo") as refused:
                     ask_status(store)
                 assert not isinstance(refused.value, AbsentError), "asking again would not help"
+                assert refused.value.code.id == "C07"
             finally:
                 os.seteuid(0)
             assert (server.counters.clients, desk.told) == (0, [])

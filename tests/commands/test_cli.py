@@ -163,7 +163,7 @@ def test_output_that_cannot_be_written_is_said_in_one_line() -> None:
             command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60, check=False
         )
     assert done.returncode == 1
-    assert done.stderr == "daqsvc: No space left on device: the output is not complete\n"
+    assert done.stderr == "daqsvc: No space left on device: the output is not complete [C16]\n"
 
 
 def test_a_reader_that_has_had_enough_is_no_error() -> None:

@@ -119,6 +119,7 @@ async def test_a_day_in_the_life_of_a_latching_alarm(tmp_path: Path) -> None:
             assert (code, out) == (1, "")
             assert err.startswith("daqsvc reset: refused: ")
             assert "condition still stands" in err
+            assert err.endswith("[C08]\n")
             assert (await stands(store, "shaking", "active_acknowledged"))["id"] == acknowledged["id"]
 
             # Shelved, in JSON, and taken back.
@@ -271,6 +272,7 @@ async def test_the_beginning_of_an_id_must_be_one_alarms(tmp_path: Path) -> None
     code, _, err = await daqsvc("ack", "0d8c", "--store", tmp_path)
     assert code == 1
     assert "'0d8c' begins the ids of shaking, rotor-fault: write more of the id" in err
+    assert err.endswith("[C05]\n")
     code, _, err = await daqsvc("ack", "0d8c1", "--store", tmp_path)
     assert "no daqsvc runs on the store" in err, "that was one, but nobody is there to obey"
 
@@ -281,6 +283,7 @@ async def test_a_store_that_is_not_there_is_told_with_the_remedy(tmp_path: Path)
         code, out, err = await daqsvc(*verb, "--store", tmp_path / "none")
         assert (code, out) == (1, "")
         assert err.startswith(f"daqsvc {verb[0]}: there is no journal {tmp_path / 'none'}")
+        assert err.endswith("[S04]\n")
         assert len(err.splitlines()) == 1
     bad = tmp_path / "bad.toml"
     bad.write_text("schema_version = 1")
@@ -368,6 +371,7 @@ async def test_what_the_disk_has_not_got_is_told(tmp_path: Path) -> None:
         code, _, err = await daqsvc("alarms", "--store", tmp_path)
         assert code == 0
         assert "3 events wait in the service's memory" in err
+        assert err.endswith("[S06]\n")
         code, out, _ = await daqsvc("ack", "shaking", "--store", tmp_path)
         assert "cannot be written yet" in out
         assert code == 1, "0 says that it is on disk"

@@ -77,11 +77,11 @@ def test_what_is_wrong_goes_to_stderr_and_fails(capsys: pytest.CaptureFixture[st
     assert main(["sniff", "profibus", "silent"]) == 1
     said = capsys.readouterr()
     assert said.out.startswith("2 stations")
-    assert said.err.endswith("daqsvc: nobody is there\n")
+    assert said.err.endswith("daqsvc: nobody is there [C20]\n")
     assert main(["sniff", "profibus", "absent"]) == 1
     said = capsys.readouterr()
     assert said.out == ""
-    assert said.err.endswith("daqsvc: there is no absent. Remedy: plug it in\n")
+    assert said.err.endswith("daqsvc: there is no absent. Remedy: plug it in [C21]\n")
 
 
 def test_without_a_kind_those_there_are_can_be_seen(capsys: pytest.CaptureFixture[str]) -> None:

@@ -107,7 +107,7 @@ async def test_a_machine_that_is_none_of_the_store_is_refused(tmp_path: Path, ca
     for named, known in ((plant, "box, fan, gone, pump"), (plant / "pump.toml", "gone, pump")):
         code, out, err = verb(capsys, "alarms", "--machine", "pmup", named)
         assert (code, out) == (1, "")
-        assert err == f"daqsvc alarms: the store {store} has alarms of {known}, not of pmup\n"
+        assert err == f"daqsvc alarms: the store {store} has alarms of {known}, not of pmup [C04]\n"
     code, out, err = await Service(store, "new").asked(capsys, "alarms", "--store", store, "--machine", "new")
     assert (code, out) == (0, "every alarm is normal\n")
     assert (
@@ -132,7 +132,7 @@ def test_a_reload_without_a_service_says_when_it_must_be_restarted(tmp_path: Pat
     code, _, err = verb(capsys, "reload", plant)
     assert code == 1
     assert f"no daqsvc runs on the store {plant / 'store'}: " in err
-    assert err.endswith(f"{remedy}\n")
+    assert err.endswith(f"{remedy} [C06]\n")
     code, _, err = verb(capsys, "reload", "--store", plant / "store")
     assert code == 1
     assert "were changed" not in err
@@ -183,7 +183,7 @@ async def test_verbs_go_on_by_the_sound_files_if_these_tell_one_store(
     assert got == code
     assert ("fan.toml" in err) == (BROKEN in files.values() and list(files)[-1] == "fan")
     assert out.count("\n") == (code == 0)
-    assert (f"{plant}: the store is taken from the other machine files: {plant / 'store'}" in err) == (
+    assert (f"{plant}: the store is taken from the other machine files: {plant / 'store'} [C27]" in err) == (
         not code
     )
     assert verb(capsys, "reload", plant)[0] == 2, "which is about all files"
@@ -234,7 +234,7 @@ def test_a_store_that_is_a_file_is_said_in_a_sentence(
     assert code == 1
     assert err == (
         f"daqsvc {words[0]}: the store {tmp_path}/file is no directory, but a file: name a directory in "
-        "[store] of the machine file, or with --store\n"
+        "[store] of the machine file, or with --store [C03]\n"
     )
 
 

@@ -222,7 +222,7 @@ def test_a_full_disk_leaves_no_cut_file_and_keeps_what_was_there(store, capsys, 
     command = ["trend", "--store", str(store), "--since", "1h", option, str(target), *["--force"] * force]
     with files_of_at_most(34_000):
         assert main(command) == 1
-    assert capsys.readouterr().err == f"daqsvc trend: {target}: File too large\n"
+    assert capsys.readouterr().err == f"daqsvc trend: {target}: File too large [C09]\n"
     assert (target.read_text() if force else target.exists()) == ("dear to me" if force else False)
     assert not list(store.glob(".daqsvc*"))
 
@@ -257,7 +257,7 @@ def test_what_is_no_regular_file_stays_and_takes_a_table_only(store, capsys, for
 def test_a_device_that_is_full_and_a_pipe_whose_reader_is_gone(store, capsys) -> None:
     common = ["trend", "--store", str(store), "--since", "1h", "--csv"]
     assert main([*common, "/dev/full"]) == 1
-    assert capsys.readouterr().err == "daqsvc trend: /dev/full: No space left on device\n"
+    assert capsys.readouterr().err == "daqsvc trend: /dev/full: No space left on device [C09]\n"
     file = os.open(store / "out", os.O_CREAT | os.O_WRONLY)  # standard output is given up then
     reader, writer = os.pipe()
     os.close(reader)

@@ -135,8 +135,9 @@ def test_dbc_problems_name_the_file_and_what_it_has(tmp_path: Path) -> None:
     path.write_text(dbc("SG_ Seq : 0|8@1+"))
     with pytest.raises(LayoutError, match=r"no signal 'A0'; it has \['Seq'\]"):
         layout_from_dbc(path, "M", counter="Seq", counts="frames", channels={"a": ["A0"]})
-    with pytest.raises(LayoutError, match="message 'N'"):
+    with pytest.raises(LayoutError, match="message 'N'") as refused:
         layout_from_dbc(path, "N", counter="Seq", counts="frames", channels={})
+    assert refused.value.code.id == "B28"
 
 
 @pytest.mark.parametrize("value", [20_000.0, float("nan"), float("inf")])

@@ -122,8 +122,9 @@ async def test_a_reader_whose_thread_is_gone_has_ended(monkeypatch: pytest.Monke
 
 
 async def test_an_absent_device_is_an_error_only_at_the_start_and_only_where_that_is_asked_for() -> None:
-    with pytest.raises(DeviceAbsentError, match=r"^CAN bus 'can0': nobody is there$"):
+    with pytest.raises(DeviceAbsentError, match=r"^CAN bus 'can0': nobody is there$") as absent:
         await _kept([ABSENT], start="error")
+    assert absent.value.code.id == "B27"
     for there_once in (USEFUL, USELESS):
         _, waits_ns, _ = await _kept([there_once, ABSENT, None], start="error")
         assert len(waits_ns) == 2

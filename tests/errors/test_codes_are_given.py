@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from typing import TYPE_CHECKING
 
 import pytest
+from errors.test_codes import named
+from errors.test_logs_name_codes import SERVICE, lines
 from support.machine_files import LAVAL, MACHINES, changed
 from support.paths import ROOT
 
+from daqsvc.alarms.codes import OF_SERVICE
+from daqsvc.cli import main
 from daqsvc.detectors.make import check_files
 from daqsvc.errors.table import CODES
 from daqsvc.settings import MachineFileError, parse_machine_file
 from daqsvc.settings.problems import AssemblyError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
 SPECIMENS = ROOT / "tests" / "guard" / "specimens"
@@ -60,13 +66,108 @@ ELSEWHERE = {
     "F26": "service/test_several_machines.py",
     "B14": "settings/test_settings_contradictions.py",
     "B25": "settings/test_failing_plugins.py",
+    "B27": "drivers/test_reconnect.py",
+    "B28": "drivers/test_frames.py",
+    "C04": "commands/test_store_argument.py",
+    "C05": "commands/test_cli_alarms.py",
+    "C07": "alarms/test_control_socket.py",
+    "C08": "commands/test_cli_alarms.py",
+    "C12": "offline/test_export.py",
+    "C15": "sim_hw/test_demo_manners.py",
+    "C16": "commands/test_cli.py",
+    "C17": "page/test_page_server.py",
+    "C20": "drivers/can/test_record_command.py",
+    "C25": "offline/test_analyze_parts.py",
+    "C26": "service/test_assembly.py",
+    "C27": "commands/test_store_argument.py",
     "D14": "detectors/rotor_bank/test_bank_of_a_run_up.py",
     "O02": "publish/mqtt/test_mqtt_settings.py",
+    "O10": "errors/test_logs_name_codes.py",
+    "O11": "errors/test_logs_name_codes.py",
     "O06": "service/test_several_machines.py",
+    "R04": "recording/test_recording_bombs.py",
+    "R10": "recording/test_recording_files.py",
+    "R13": "offline/test_analyze_can_logs.py",
+    "R14": "offline/test_analyze_bearing.py",
+    "R16": "rotor/test_run_up.py",
+    "R18": "offline/test_replay_refused.py",
     "S01": "service/test_reload.py",
     "S02": "commands/test_check_store.py",
+    "S03": "outbox/test_outbox.py",
+    "S04": "commands/test_cli_alarms.py",
+    "S05": "service/test_killed_parts.py",
+    "S06": "commands/test_cli_alarms.py",
+    "S07": "commands/test_alarm_damage.py",
 }
 """What takes more than a text of a machine file: the test that asserts the code."""
+
+COMMANDS: list[tuple[str, list[str]]] = [
+    ("C01", ["trend", "--since", "1h", "--until", "2h"]),
+    ("C02", ["shelve", "housing", "--for", "5 min"]),
+    ("C03", ["alarms"]),
+    ("C06", ["status", "--store", "."]),
+    ("C09", ["example", "laval-rig", "--out", "nowhere/pump.toml"]),
+    ("C10", ["trend", "--store", "broken"]),
+    ("C11", ["example", "laval-rig", "--out", "words.csv"]),
+    ("C13", ["trend", "--store", "."]),
+    ("C14", ["explain", "Z99"]),
+    ("C18", ["page", "--listen", "192.0.2.7:8420", "--store", "."]),
+    ("C19", ["account", "accounts", "ann", "--remove"]),
+    ("C21", ["sniff", "serial", "ttyUSB9"]),
+    ("C22", ["new", "--answers", "nowhere.toml"]),
+    ("C23", ["sim", "--scenario", "unbalnce", f"{LAVAL}"]),
+    ("C24", ["fleet", "report", "."]),
+    ("R01", ["export", "nowhere.csv", "--to", "new.csv"]),
+    ("R02", ["export", "notes.wav", "--to", "new.csv"]),
+    ("R03", ["export", "cut.wav", "--to", "new.csv"]),
+    ("R05", ["export", "norate.csv", "--fs", "100", "--map", "y=y", "--to", "new.csv"]),
+    ("R06", ["export", "words.csv", "--to", "new.csv"]),
+    ("R07", ["export", "norate.csv", "--to", "new.csv"]),
+    ("R08", ["export", "timed.csv", "--fs", "500", "--to", "new.csv"]),
+    ("R09", ["export", "gap.csv", "--to", "new.csv"]),
+    ("R11", ["export", "header.csv", "--to", "new.csv"]),
+    ("R12", ["export", "plant.blf", "--to", "new.csv"]),
+    ("R15", ["analyze", f"{LAVAL}", "norate.csv", "--fs", "100"]),
+    ("R17", ["replay", "notes.mcap"]),
+    ("R19", ["export", "norate.csv", "--fs", "99.5", "--to", "new.wav"]),
+]
+"""The code, and what is asked of daqsvc where `RECORDINGS` are."""
+
+RECORDINGS = {
+    "words.csv": "a,b\n1,2\nfoo,5\n3,4\n",
+    "norate.csv": "x\n1\n2\n3\n",
+    "timed.csv": "t (s),x\n" + "".join(f"{i / 1000},{i % 7}\n" for i in range(50)),
+    "header.csv": "x,y\n",
+    "gap.csv": "t (s),x\n" + "".join(f"{i / 1000},{i % 7}\n" for i in (*range(50), *range(5000, 5050))),
+    "cut.wav": "RIFF\0\0\0\0WAVEfmt \x10\0\0\0\1\0\1\0\x40\x1f\0\0\x40\x1f\0\0\1\0\x08\0data\x40\x1f\0\0ab",
+    "broken/history.sqlite": "no database at all, but long enough to be one",
+    "notes.wav": "no sound",
+    "notes.mcap": "no snapshot",
+    "plant.blf": "no log",
+}
+
+
+@pytest.mark.parametrize(("code", "arguments"), COMMANDS, ids=[one[0] for one in COMMANDS])
+def test_the_command_is_answered_with_the_code(
+    code: str,
+    arguments: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for name, text in RECORDINGS.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_STATE_HOME", f"{tmp_path}")
+    monkeypatch.delenv("STATE_DIRECTORY", raising=False)
+    try:
+        exit_code = main(arguments)
+    except SystemExit as error:  # of the parser
+        exit_code = error.code
+    assert exit_code != 0
+    out, err = capsys.readouterr()
+    assert re.search(rf"\[{code}\]$", (err or out).rstrip(), re.MULTILINE), (out, err)
 
 
 @pytest.mark.parametrize(("code", "path", "edits"), GIVEN, ids=[one[0] for one in GIVEN])
@@ -87,7 +188,17 @@ def test_the_broken_machine_file_is_answered_with_the_code(
 
 @pytest.mark.parametrize(("code", "place"), ELSEWHERE.items())
 def test_the_test_elsewhere_asserts_the_code(code: str, place: str) -> None:
-    assert f"[{code}]" in (ROOT / "tests" / place).read_text(encoding="utf-8")
+    text = (ROOT / "tests" / place).read_text(encoding="utf-8")
+    assert f"[{code}]" in text or f'"{code}"' in text
+
+
+def logged() -> Iterator[str]:
+    """The codes that lines of the log name, as `test_logs_name_codes` holds them to."""
+    names = {name: code for code, name in named()}
+    for call in (call for file in SERVICE for call in lines(file)):
+        for node in ast.walk(call):
+            if isinstance(node, ast.Name) and node.id in names:
+                yield names[node.id]
 
 
 def test_every_code_is_given_by_something() -> None:
@@ -95,4 +206,7 @@ def test_every_code_is_given_by_something() -> None:
     shown = {
         code for file in golden for code in re.findall(r"\[([A-Z]\d\d)\]", file.read_text(encoding="utf-8"))
     }
-    assert [code for code in CODES if code not in shown | {one[0] for one in GIVEN} | set(ELSEWHERE)] == []
+    given = (
+        {one[0] for one in [*GIVEN, *COMMANDS]} | set(ELSEWHERE) | {*logged(), *map(str, OF_SERVICE.values())}
+    )
+    assert [code for code in CODES if code not in shown | given] == []

@@ -20,17 +20,40 @@ CODE_AT = {
     "UnreadableFileError": 2,
     "AssemblyError": 1,
     "PydanticCustomError": 2,
+    "complain": 2,
+    "_complain": 2,
+    "RecordingError": 1,
+    "NamesError": 1,
+    "ExportUsageError": 1,
 }
 """What users are shown, with the position of the code; of pydantic's, that of the context that has it."""
 FILES = [
     file
-    for package in ("daqsvc", "drivers")
+    for package in ("daqsvc", "drivers", "sim_hw")
     for file in sorted((ROOT / package).rglob("*.py"))
     if file.parent != ROOT / "daqsvc" / "errors"
 ]
 EXEMPT = {
     ("daqsvc/rotor/calibration/file.py", "PydanticCustomError"): "put into the words of one AssemblyError",
 }
+NO_FAULT = {
+    "daqsvc/cli.py": {"_check", "load", "main"},  # what they print has its codes
+    "daqsvc/commands/account.py": {"_password"},  # asks again
+    "daqsvc/commands/analyze_fleet.py": {"_say"},  # progress
+    "daqsvc/commands/calibrate.py": {"_with_notes_said"},  # warnings, and all goes on
+    "daqsvc/commands/export.py": {"_export"},  # likewise
+    "daqsvc/commands/complaint.py": {"complain"},
+    "daqsvc/commands/detectability.py": {"_of_values"},  # has its code
+    "daqsvc/commands/record.py": {"_tell"},  # progress
+    "daqsvc/commands/reload.py": {"run"},  # lines of the service, which have their codes
+    "daqsvc/commands/sniff.py": {"_tell"},  # progress
+    "daqsvc/commands/store_argument.py": {"_of_file"},  # goes on with what was said before
+    "sim_hw/bus_socket.py": {"run_hub"},  # progress
+    "sim_hw/demo/command.py": {"_say"},  # warnings, and all goes on
+    "sim_hw/reproduce/command.py": {"_note"},  # progress
+    "sim_hw/sim_command.py": {"_say"},  # progress, and problems of a machine file, which have their codes
+}
+"""Functions that print to stderr what ends no command."""
 
 
 def raised(tree: ast.AST) -> Iterator[tuple[ast.Call, str]]:
@@ -63,6 +86,29 @@ def test_what_users_are_shown_has_a_code(file: Path) -> None:
         if code_of(call, kind) is None and (place, kind) not in EXEMPT
     ]
     assert not without, "name a code of daqsvc.errors"
+
+
+def prints_to_stderr(node: ast.AST) -> bool:
+    """Whether a call is ``print(..., file=sys.stderr)``."""
+    return (
+        isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Name)
+        and node.func.id == "print"
+        and any(one.arg == "file" and ast.unparse(one.value) == "sys.stderr" for one in node.keywords)
+    )
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(ROOT)))
+def test_what_goes_to_stderr_has_a_code(file: Path) -> None:
+    """A command says what went wrong with `complain`, which asks for the code."""
+    place = str(file.relative_to(ROOT))
+    printing = {
+        function.name
+        for function in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef)
+        and any(map(prints_to_stderr, ast.walk(function)))
+    }
+    assert printing == NO_FAULT.get(place, set())
 
 
 def test_every_code_is_raised_somewhere() -> None:

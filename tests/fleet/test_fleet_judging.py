@@ -16,6 +16,7 @@ import daqsvc
 from daqsvc.confined import process
 from daqsvc.confined.limits import ResourceLimits
 from daqsvc.diagnosis.recorded import RecordingOptions
+from daqsvc.errors.recordings import DAMAGED
 from daqsvc.fleet import FleetError, judging
 from daqsvc.fleet.archive import Archive
 from daqsvc.fleet.campaign import Campaign, Wanted
@@ -183,7 +184,7 @@ def raised(cause: Exception) -> Exception:
         try:
             fail()
         except Exception:  # noqa: BLE001 - it is what is looked at
-            raise RecordingError("cannot be read") from None
+            raise RecordingError("cannot be read", DAMAGED) from None
 
     with pytest.raises(RecordingError) as error:
         read()

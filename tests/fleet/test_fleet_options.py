@@ -52,7 +52,7 @@ def test_a_missing_extra_is_named(
     code, _, err = verb(*arguments)
     assert code == 2
     assert err.endswith(
-        "the archive of a fleet needs distributed; install them with: pip install 'daqsvc[fleet]'\n"
+        "the archive of a fleet needs distributed; install them with: pip install 'daqsvc[fleet]' [C12]\n"
     )
 
 
@@ -115,7 +115,7 @@ def test_a_scheduler_that_is_not_there_is_named_in_time(tmp_path: Path) -> None:
     code, _, err = ended(run)
     assert code == 1
     assert err.startswith("daqsvc analyze: no Dask scheduler answers at tcp://127.0.0.1:9 (")
-    assert err.endswith("start one there (dask scheduler), or use --cluster local\n")
+    assert err.endswith("start one there (dask scheduler), or use --cluster local [C24]\n")
     assert err.count("\n") == 1
     assert [one.name for one in tmp_path.iterdir()] == ["archive"], "no folder for results is left"
 

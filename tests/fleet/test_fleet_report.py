@@ -275,7 +275,7 @@ def test_a_table_of_faults_that_cannot_be_read_is_named(
 def test_a_folder_without_results_is_named(verb: Callable[..., Any], tmp_path: Path) -> None:
     code, _, err = verb("fleet", "report", tmp_path / "none")
     assert code == 1
-    assert "holds no results; give the folder that daqsvc analyze --cluster wrote" in err
+    assert "holds no results; give the folder that daqsvc analyze --cluster wrote [C24]" in err
 
 
 def test_numbers_in_names_count() -> None:

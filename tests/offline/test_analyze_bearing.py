@@ -245,6 +245,7 @@ def test_what_cannot_be_judged_is_refused_by_name(verb: Run, tmp_path: Path, kin
     assert (found["verdict"], found["group"], found["lines"]) == (None, [], [])
     assert found["refused"].startswith("de: ")
     assert said in found["refused"]
+    assert found["code"] == "R14"
     assert found["data_quality"]["samples"] == len(damaged(kind))
 
 

@@ -238,6 +238,7 @@ def test_logs_without_samples_of_the_machine_are_refused(analyze, machine, tmp_p
     code, found, err = analyze(machine, *logs, "--jobs", 1)
     assert (code, err) == (3, "")
     refused = [one["refused"] for one in found]
+    assert [one["code"] for one in found][:2] == ["R13", "R01"]
     assert "has no frame of a stream of" in refused[0]
     assert "but frames of 0x123 (29 bit)" in refused[0]
     assert "is a folder without a CAN log" in refused[1]

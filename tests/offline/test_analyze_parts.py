@@ -195,8 +195,9 @@ def test_recordings_go_to_processes_and_come_back_in_order() -> None:
 
 
 def test_a_process_that_is_killed_is_told() -> None:
-    with pytest.raises(WorkerLostError, match="fewer --jobs"):
+    with pytest.raises(WorkerLostError, match="fewer --jobs") as lost:
         list(judge_all(Sleepless("1"), ["0", "1", "2"], [None] * 3, processes=2))
+    assert lost.value.code.id == "C25"
 
 
 def test_each_sensor_of_a_level_detector_has_a_statement_of_its_own_and_the_worst_is_told() -> None:

@@ -311,7 +311,7 @@ def test_nothing_is_written_over(snapshot, tmp_path, capsys):
     target.write_text("mine")
     assert export(snapshot, "--to", target) == 2
     assert capsys.readouterr().err == (
-        f"daqsvc export: {target} is there already; give another name, or --force to replace it\n"
+        f"daqsvc export: {target} is there already; give another name, or --force to replace it [C11]\n"
     )
     assert target.read_text() == "mine"
     assert export(snapshot, "--to", target, "--force") == 0
@@ -326,7 +326,7 @@ def test_force_does_not_replace_the_recording_itself(tmp_path, capsys):
         assert export(source, "--to", target, "--force") == 2
         assert capsys.readouterr().err == (
             f"daqsvc export: {target} is the recording itself, which --force does not replace; give another "
-            "name\n"
+            "name [C11]\n"
         )
     assert source.read_text() == "# fs = 100\nx\n1\n2\n"
     assert link.is_symlink()
@@ -355,7 +355,8 @@ def test_a_library_that_is_missing_is_named(snapshot, tmp_path, capsys, monkeypa
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == library else real(name))
     assert export(snapshot, "--to", tmp_path / f"a{suffix}") == 2
     assert capsys.readouterr().err == (
-        f"daqsvc export: {suffix} files need {library}; install it with: pip install 'daqsvc[{extra}]'\n"
+        f"daqsvc export: {suffix} files need {library}; install it with: pip install 'daqsvc[{extra}]' "
+        "[C12]\n"
     )
 
 
@@ -385,7 +386,10 @@ def test_a_full_disk_leaves_nothing_half(snapshot, tmp_path, capsys, suffix):
         disk.fill()
         target = disk.directory / f"a{suffix}"
         assert export(snapshot, "--to", target) == 1
-        assert capsys.readouterr().err == f"daqsvc export: {target} is not written: No space left on device\n"
+        assert (
+            capsys.readouterr().err
+            == f"daqsvc export: {target} is not written: No space left on device [C09]\n"
+        )
         assert [path.name for path in disk.directory.iterdir()] == ["somebody-else"]
 
 

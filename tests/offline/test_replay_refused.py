@@ -121,7 +121,9 @@ def test_what_is_refused_is_shown_and_not_obeyed(tmp_path: Path, capsys: pytest.
     about = {**ABOUT, "standings": {"shaft": {"a \x1b[31mmood": 1}}}
     SnapshotWriter(path, about, {MACHINE_JSON: machine_json()}, 10**18).finish()
     assert main(["replay", f"{path}"]) == 3
-    assert "a \N{REPLACEMENT CHARACTER}[31mmood" in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert "a \N{REPLACEMENT CHARACTER}[31mmood" in err
+    assert err.endswith("[R18]\n")
 
 
 def test_what_is_no_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -366,8 +366,11 @@ async def test_a_store_belongs_to_one_service_at_a_time(tmp_path):
     first = Outbox(tmp_path / "outbox.sqlite", SystemClock())
     await first.open()
     second = Outbox(tmp_path / "outbox.sqlite", SystemClock())
-    with pytest.raises(OutboxError, match=r"another daqsvc uses the store .*, or have one service watch all"):
+    with pytest.raises(
+        OutboxError, match=r"another daqsvc uses the store .*, or have one service watch all"
+    ) as refused:
         await second.open()
+    assert refused.value.code.id == "S03"
     await second.close()
     await first.close()
     third = Outbox(tmp_path / "outbox.sqlite", SystemClock())

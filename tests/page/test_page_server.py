@@ -65,7 +65,7 @@ def test_a_port_that_is_taken_is_one_sentence(tmp_path: Path, capsys: pytest.Cap
         assert main(["page", "--store", f"{tmp_path}", "--port", f"{port}"]) == 1
     assert capsys.readouterr().err == (
         f"daqsvc page: cannot listen at 127.0.0.1:{port}: Address already in use; end what listens there, or "
-        "give another --port\n"
+        "give another --port [C17]\n"
     )
     with pytest.raises(SystemExit):
         main(["page", "--store", f"{tmp_path}", "--port", "70000"])

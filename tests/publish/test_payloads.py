@@ -85,6 +85,7 @@ def test_an_alarm_says_everything_that_the_event_knows():
         "message": "rotor-fault alert: rotor-bank finds F1",
         "by": "",
         "reason": "",
+        "code": None,
         "holds": [],
         "covered": None,
         "shelved_until_wall_ns": None,

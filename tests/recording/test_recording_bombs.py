@@ -137,8 +137,10 @@ def test_a_replayed_table_may_take_what_the_bus_says(tmp_path):
     path = tmp_path / "a.npz"
     np.savez(path, x=np.zeros(10_000_000))
     spec = [StreamSpec("s", COLUMNS, 1000.0)]
-    with pytest.raises(ReplayError, match="may be read; allow more memory"):
+    with pytest.raises(ReplayError, match="may be read; allow more memory") as refused:
         SampleTable(path, spec, {}, ResourceLimits(100_000_000))
+    assert isinstance(refused.value.__cause__, RecordingError)
+    assert refused.value.__cause__.code.id == "R04"
     SampleTable(path, spec, {}, ResourceLimits(400_000_000)).close()
 
 

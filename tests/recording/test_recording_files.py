@@ -143,19 +143,24 @@ def test_npz(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("channels", "message"),
+    ("channels", "message", "code"),
     [
-        ({"a": "XE"}, r"no channel 'XE'; it holds DE \(500\), FE \(500\), short \(20\), RPM, note, empty"),
-        ({"a": "RPM"}, "'RPM' .* is a single number"),
-        ({"a": "empty"}, "'empty' .* is empty"),
-        ({"a": "note"}, "'note' .* is not numeric"),
-        ({"a": "0"}, "no channel '0'"),
-        ({"a": "DE", "b": "short"}, r"different lengths: a \(DE\) 500, b \(short\) 20"),
+        (
+            {"a": "XE"},
+            r"no channel 'XE'; it holds DE \(500\), FE \(500\), short \(20\), RPM, note",
+            "R05",
+        ),
+        ({"a": "RPM"}, "'RPM' .* is a single number", "R05"),
+        ({"a": "empty"}, "'empty' .* is empty", "R05"),
+        ({"a": "note"}, "'note' .* is not numeric", "R05"),
+        ({"a": "0"}, "no channel '0'", "R05"),
+        ({"a": "DE", "b": "short"}, r"different lengths: a \(DE\) 500, b \(short\) 20", "R10"),
     ],
 )
-def test_channels_that_cannot_be_played(mat, channels, message):
-    with pytest.raises(RecordingError, match=message):
+def test_channels_that_cannot_be_played(mat, channels, message, code):
+    with pytest.raises(RecordingError, match=message) as refused:
         load_recording(mat, channels, 100)
+    assert refused.value.code.id == code
 
 
 @pytest.mark.parametrize("rate_hz", [0, -1, 0.9, 1.1e7, float("nan"), float("inf")])

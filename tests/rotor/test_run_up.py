@@ -105,8 +105,9 @@ def test_refuses_a_run_up_below_the_critical_speed() -> None:
 
 def test_refuses_a_steady_speed() -> None:
     xy, angle = record(speeds_hz=(30.0, 30.5))
-    with pytest.raises(NotCalibratableError, match=r"the speed goes from 1800 to 183. rpm only"):
+    with pytest.raises(NotCalibratableError, match=r"the speed goes from 1800 to 183. rpm only") as refused:
         fit_run_up(xy, angle, RATE_HZ)
+    assert refused.value.code.id == "R16"
 
 
 def test_refuses_a_handful_of_revolutions() -> None:

@@ -75,4 +75,4 @@ def test_a_verb_that_cannot_be_loaded_is_left_out(
     known = cli.commands()
     assert "orbit" not in known
     assert {"analyze", "calibrate", "check", "detectability", "run"} <= set(known)
-    assert "verb 'orbit' is left out: No module named 'no_such_module'" in capsys.readouterr().err
+    assert "verb 'orbit' is left out: No module named 'no_such_module' [C26]" in capsys.readouterr().err

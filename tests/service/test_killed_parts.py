@@ -256,5 +256,6 @@ async def test_without_the_writer_of_its_journal_the_service_ends(
     async with victim(tmp_path, mosquitto, "writer") as there:
         kill_thread(there.threads()[WRITER], KilledError)
         async with asyncio.timeout(20):
-            with pytest.raises(EssentialLostError, match="no alarm can reach the disk any more"):
+            with pytest.raises(EssentialLostError, match="no alarm can reach the disk any more") as lost:
                 await there.running
+            assert lost.value.code.id == "S05"

@@ -225,7 +225,7 @@ async def test_all_is_told_that_the_service_knows(tmp_path: Path) -> None:
             store, lambda now: now["outputs"]["mqtt"]["reason"], "why the broker is away"
         )
         away_s = status["outputs"]["mqtt"].pop("away_s")
-        assert status["outputs"] == {"mqtt": {"connected": False, "reason": away}}
+        assert status["outputs"] == {"mqtt": {"connected": False, "reason": away, "code": "O09"}}
         later = await told_when(
             store, lambda now: now["outputs"]["mqtt"]["away_s"] > away_s + 0.3, "it is away for longer"
         )
@@ -268,7 +268,7 @@ async def test_all_is_told_that_the_service_knows(tmp_path: Path) -> None:
             "probe-x missing",
             "- of 640",
             "can0 3",
-            f" s ({away})",
+            f" s ({away} [O09])",
             "alert active unacknowledged sensor-ok/probe-x",
             "for the broker, the oldest for",
         ):
@@ -419,7 +419,7 @@ def test_in_a_pipe_each_status_follows_the_last(
     away = AbsentError("it is away")
     answers = [{"text": "one"}, away, away, {"text": "two"}]
     assert watched(monkeypatch, tmp_path, *answers, is_live=False) == (0, "one\n\ntwo\n\n")
-    assert capsys.readouterr().err == "daqsvc status: it is away; it is asked again every second\n"
+    assert capsys.readouterr().err == "daqsvc status: it is away; it is asked again every second [C06]\n"
     _, text = watched(monkeypatch, tmp_path, *answers, arguments="--json")
     assert [json.loads(line) for line in text.splitlines()] == [{"text": "one"}, {"text": "two"}]
 

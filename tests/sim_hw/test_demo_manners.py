@@ -316,7 +316,7 @@ def test_an_interrupt_during_the_imports_is_no_traceback(
     command.add_arguments(parser)
     before = signal.getsignal(signal.SIGTERM)
     assert command.run(parser.parse_args([])) == 1
-    assert capsys.readouterr().err == "daqsvc demo: interrupted\n"
+    assert capsys.readouterr().err == "daqsvc demo: interrupted [C15]\n"
     assert signal.getsignal(signal.SIGTERM) == before
 
 

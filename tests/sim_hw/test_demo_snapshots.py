@@ -93,4 +93,4 @@ def test_a_folder_that_cannot_be_made_ends_the_demo_in_a_sentence(
     assert main(["demo", "--speed", "1000", "--json", "--snapshots", str(tmp_path / "file" / "in")]) == 1
     said = capsys.readouterr().err.strip().splitlines()[-1]
     assert said.startswith("daqsvc demo: --snapshots: the folder")
-    assert said.endswith("Not a directory; name another")
+    assert said.endswith("Not a directory; name another [C23]")

@@ -10,9 +10,11 @@ import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE
+from daqsvc.commands.arguments import EXIT_OK, EXIT_USAGE
+from daqsvc.commands.complaint import complain
 from daqsvc.commands.new.question import SENSOR, short_name
 from daqsvc.commands.new.topics import TOPICS
+from daqsvc.errors.command_line import CANNOT_WRITE, INTERRUPTED
 
 if TYPE_CHECKING:
     import argparse
@@ -77,11 +79,12 @@ class NewCommand:
                 text = machine_text(answers, shlex.quote(file.name))
             _write(file, text)
         except AnswerError as error:
-            return _failed(f"{error}", EXIT_USAGE)
+            return complain("daqsvc new", error, error.code, EXIT_USAGE)
         except EOFError:
-            return _failed("the input has ended; nothing was written", EXIT_FAILED)
+            return complain("daqsvc new", "the input has ended; nothing was written", INTERRUPTED)
         except OSError as error:
-            return _failed(f"{error.filename} cannot be written: {error.strerror}", EXIT_FAILED)
+            what = f"{error.filename} cannot be written: {error.strerror}"
+            return complain("daqsvc new", what, CANNOT_WRITE)
         return _report(file, text, answers)
 
 
@@ -228,8 +231,3 @@ def _report(file: Path, text: str, answers: Answers) -> int:
 
 def _say(text: str) -> None:
     print(text)  # noqa: T201 - this is what the verb is for
-
-
-def _failed(why: str, code: int) -> int:
-    print(f"daqsvc new: {why}", file=sys.stderr)  # noqa: T201 - errors go to stderr
-    return code

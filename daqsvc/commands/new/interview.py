@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from daqsvc.commands.new.machine_text import machine_text, questions
 from daqsvc.commands.new.question import SENSOR, Answers, Question
+from daqsvc.errors.command_line import ANSWER
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 
 class AnswerError(Exception):
     """An answer that was given beforehand cannot be used, or is missing; says which option it is."""
+
+    code = ANSWER
 
 
 @dataclass(frozen=True, slots=True)

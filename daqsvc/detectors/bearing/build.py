@@ -19,6 +19,8 @@ from daqsvc.detectors.bearing.kinematics import orders_of
 from daqsvc.detectors.bearing.settings import BEARING
 from daqsvc.dsp.quality.unit import M_S2_PER_UNIT
 from daqsvc.dsp.speed.keyphasor import KeyphasorProbe
+from daqsvc.errors.code import coded
+from daqsvc.errors.detectors import HEALTHY_STATE
 from daqsvc.settings.models import Keyphasor
 from daqsvc.settings.rounding import rounded_up
 
@@ -230,6 +232,7 @@ def _refuse_other_units(path: Path, baseline: BearingBaseline, bearings: list[Ho
             "%s: does not say in which unit it was learnt at %s; calibrate again, and that is checked",
             path,
             ", ".join(unknown),
+            extra=coded(HEALTHY_STATE),
         )
     for name, unit in units.items():
         learnt = baseline.units.get(name, unit)
@@ -252,6 +255,7 @@ def _refuse_other_bearing(path: Path, baseline: BearingBaseline, bearing: Housed
             "%s: does not say of which bearing it was learnt at %s; calibrate again, and that is checked",
             path,
             bearing.sensor,
+            extra=coded(HEALTHY_STATE),
         )
     elif not learnt.same_as(bearing.orders):
         raise BaselineFileError(
@@ -284,7 +288,7 @@ def _kept(
     try:
         return _fitting(path, bearings, rate_hz, speed_rpm)
     except BaselineFileError as error:
-        log.warning("the healthy state of the bearings is learnt anew: %s", error)
+        log.warning("the healthy state of the bearings is learnt anew: %s", error, extra=coded(HEALTHY_STATE))
         return None
 
 
@@ -293,4 +297,8 @@ def _keep(path: Path, baseline: BearingBaseline) -> None:
     try:
         save_bearing_baseline(baseline, path)
     except BaselineFileError as error:
-        log.error("the healthy state of the bearings will be lost at the next restart: %s", error)  # noqa: TRY400
+        log.error(  # noqa: TRY400 - the message says it all
+            "the healthy state of the bearings will be lost at the next restart: %s",
+            error,
+            extra=coded(HEALTHY_STATE),
+        )

@@ -37,6 +37,7 @@ from daqsvc.dsp.quality import UnfitError
 from daqsvc.dsp.quality.clipped import ClippedError, refuse_clipped
 from daqsvc.dsp.quality.recorded import DataQuality
 from daqsvc.dsp.quality.unit import accelerometer_quality, refuse_no_machine, unit_problems
+from daqsvc.errors.recordings import UNFIT_SAMPLES
 from daqsvc.recording import RecordingError
 from daqsvc.recording.recording import load_matching
 
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.diagnosis.recorded import Blocks, Progress, Recorded, RecordingOptions
     from daqsvc.dsp.quality.unit import AccelerationUnit
+    from daqsvc.errors.code import Code
     from daqsvc.recording.recording import Recording
     from daqsvc.settings.models import MachineFile
 
@@ -391,20 +393,21 @@ def analyse_bearings(
         else:
             races[name] = race
 
-    def refuse(why: str) -> BearingVerdict:
+    def refuse(why: str, code: Code | None = None) -> BearingVerdict:
         return BearingVerdict(
             recording=str(recording.source),
             baseline=source,
             setup=setup,
             quality=quality,
             refused=why,
+            code=code,
             unfit=unfit,
         )
 
     if not any(race.speed_seen for race in races.values()) and (wrong := meant_in_hz(recording, setup)):
         return refuse(wrong)
     if not races:
-        return refuse("; ".join(f"{name}: {why}" for name, why in unfit.items()))
+        return refuse("; ".join(f"{name}: {why}" for name, why in unfit.items()), UNFIT_SAMPLES)
     healthy = None if baseline is None else baseline.residuals[tuple(races)]
     change: ResidualChange | None = None
     if healthy is not None:

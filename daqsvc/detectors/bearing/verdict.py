@@ -109,6 +109,7 @@ class BearingVerdict(Verdict):
                 "drives": [] if race is None else [drive_json(drive) for drive in race.drives],
                 "data_quality": self.quality.as_json(),
                 "refused": self.refused,
+                "code": self.refusal_code,
             }
         )
         return document
@@ -178,7 +179,7 @@ class BearingVerdict(Verdict):
         """A few lines for a person."""
         finding, race = self.finding, self.leading
         if finding is None or race is None:
-            return f"{self.recording}: not judged: {self.refused}"
+            return f"{self.recording}: not judged: {self.refusal}"
         lines = [f"{self.recording}: {self._headline(finding, race)}"]
         lines.append(
             ", ".join(

@@ -12,6 +12,8 @@ from daqsvc.detectors.rotor_synchronous.detector import RotorSynchronousDetector
 from daqsvc.detectors.rotor_synchronous.settings import ROTOR_SYNCHRONOUS
 from daqsvc.detectors.shaft.build import keyphasor, probes
 from daqsvc.diagnosis.recorded import known
+from daqsvc.errors.code import coded
+from daqsvc.errors.detectors import HEALTHY_STATE
 from daqsvc.rotor.calibration.file import (
     CalibrationFileError,
     load_calibration,
@@ -118,7 +120,7 @@ def _kept_calibration(path: Path, speed_rpm: float, rotor: LavalRotor) -> Calibr
     try:
         return replace(load_calibration(path, speed_rpm), rotor=rotor)
     except CalibrationFileError as error:
-        log.warning("the healthy state of the rotor is measured anew: %s", error)
+        log.warning("the healthy state of the rotor is measured anew: %s", error, extra=coded(HEALTHY_STATE))
         return None
 
 
@@ -127,4 +129,8 @@ def _keep_calibration(path: Path, calibration: Calibration) -> None:
     try:
         save_calibration(calibration, path, source="the running service")
     except CalibrationFileError as error:
-        log.error("the healthy state of the rotor will be lost at the next restart: %s", error)  # noqa: TRY400
+        log.error(  # noqa: TRY400 - the message says it all
+            "the healthy state of the rotor will be lost at the next restart: %s",
+            error,
+            extra=coded(HEALTHY_STATE),
+        )

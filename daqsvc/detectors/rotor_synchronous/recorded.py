@@ -192,6 +192,7 @@ def analyse(recording: Recording, setup: RotorSetup, progress: Progress | None =
             recording=str(recording.source),
             quality=quality,
             refused=str(error),
+            code=error.code,
             false_alarms_per_1000_rev=setup.rules.false_alarms_per_1000_rev,
             threshold_nats=threshold_for(setup.rules.false_alarms_per_1000_rev),
             speed_rpm=setup.speed_rpm,

@@ -218,6 +218,7 @@ class RotorVerdict(Verdict):
                 "revolutions": self.revolutions,
                 "data_quality": self.quality.as_json(),
                 "refused": self.refused,
+                "code": self.refusal_code,
                 "history": [step.as_json() for step in self.history],
             }
         )
@@ -260,7 +261,7 @@ class RotorVerdict(Verdict):
 
     def _headline(self) -> str:
         if self.refused is not None:
-            return f"not judged: {self.refused}"
+            return f"not judged: {self.refusal}"
         if self.verdict is None and self.departure is None:
             return "no detector of a rotor fault in the machine file"
         if self.verdict is None:

@@ -8,12 +8,16 @@ from __future__ import annotations
 
 from typing import Literal
 
+from daqsvc.errors.recordings import NOT_JUDGED, UNFIT_SAMPLES
+
 Quality = Literal["good", "missing", "not_ok"]
 """Of what a statement rests on: good, too little of it there, or not what a sound sensor delivers."""
 
 
 class RefusedError(ValueError):
     """What was measured cannot be judged; the message names the thing, its value and the remedy."""
+
+    code = NOT_JUDGED
 
 
 class UnfitError(RefusedError):
@@ -24,6 +28,8 @@ class UnfitError(RefusedError):
         value: what was found.
         remedy: what to do about it.
     """
+
+    code = UNFIT_SAMPLES
 
     def __init__(self, thing: str, value: str, remedy: str) -> None:
         super().__init__(f"{thing} {value}; {remedy}")

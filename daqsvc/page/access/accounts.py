@@ -17,6 +17,8 @@ import stat
 import tempfile
 from typing import TYPE_CHECKING, NamedTuple
 
+from daqsvc.errors.code import coded
+from daqsvc.errors.command_line import ACCOUNTS
 from daqsvc.page.access.role import Role
 
 if TYPE_CHECKING:
@@ -41,6 +43,8 @@ _LINE = re.compile(
 
 class AccountsError(Exception):
     """The file of the accounts cannot be used; the text names it, what is wrong and the remedy."""
+
+    code = ACCOUNTS
 
 
 class Account(NamedTuple):
@@ -93,7 +97,7 @@ class AccountsFile:
             self._stamp = ()
             if self._why != f"{error}":
                 self._why = f"{error}"
-                log.error("nobody can sign in until this is mended: %s", error)  # noqa: TRY400
+                log.error("nobody can sign in until this is mended: %s", error, extra=coded(error.code))  # noqa: TRY400
         return self._accounts.get(name)
 
     def _read(self) -> None:

@@ -6,6 +6,7 @@ import ssl
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from daqsvc.errors.command_line import UNSAFE_PAGE
 from daqsvc.page.access.accounts import AccountsFile
 from daqsvc.page.access.ways import ByAccounts, ByProxy, OpenHere, new_key
 from daqsvc.settings.addresses import is_everywhere, is_loopback
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 
 class UnsafeError(Exception):
     """The page would be open to whom it must not be, or cannot be kept secret; the text has the remedy."""
+
+    code = UNSAFE_PAGE
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.link import Backoff
+from daqsvc.errors.code import coded
+from daqsvc.errors.outputs import NOT_SHOWN
 from daqsvc.publish.mqtt.connection import Connection
 from daqsvc.publish.mqtt.credentials import read_credentials
 from daqsvc.publish.mqtt.errors import MqttError, NoConsentError, Outage, in_words
@@ -122,7 +124,9 @@ class BrokerLink:
             f"{root}/+/+/+/commands/+/response",
         )
         for topic in refused:
-            log.warning("MQTT broker %s does not let the page listen to %s", self.name, topic)
+            log.warning(
+                "MQTT broker %s does not let the page listen to %s", self.name, topic, extra=coded(NOT_SHOWN)
+            )
         self._connection = connection
         self.connections += 1
         self._heard_boxes.clear()

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from pydantic import ValidationError
 
+from daqsvc.errors.command_line import CANNOT_READ
 from daqsvc.publish.mqtt.settings import FILES, Mqtt
 from daqsvc.settings.files import UnreadableFileError, read_bounded
 from daqsvc.settings.toml_text import MOST_BYTES, TomlTextError, decoded, parse
@@ -21,6 +22,8 @@ OTHERS = {"commands", "home_assistant", "sparkplug", "live", "telemetry_expiry_s
 
 class PlantFileError(Exception):
     """A plant file that cannot be used; the text names it and the remedy."""
+
+    code = CANNOT_READ
 
 
 def read_plant_file(path: Path) -> Mqtt:

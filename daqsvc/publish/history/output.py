@@ -19,6 +19,9 @@ import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.link import Backoff, Link
+from daqsvc.errors.code import coded
+from daqsvc.errors.outputs import HISTORY_DAMAGED
+from daqsvc.errors.service import DISK_REFUSES
 from daqsvc.history.file import NAME, SETTLED_S, HistoryFile, Keeping, NewerHistoryError, Series, events_of
 from daqsvc.history.points import DAY_S, HOUR_S, MOST, RECORD, Step
 from daqsvc.outbox.files import FileError, free_bytes, is_corrupt, remedy, set_aside
@@ -284,13 +287,14 @@ class HistoryOutput(Output):
                     self._path,
                     error,
                     aside.name,
+                    extra=coded(HISTORY_DAMAGED),
                 )
             except OSError as second:
                 error = second
         elif isinstance(error, NewerHistoryError):
             self._waiting.clear()
         hint = "" if isinstance(error, NewerHistoryError) else f"; {remedy(self._path.parent)}"
-        self.reason = f"{error}{hint}"
+        self.reason, self.code = f"{error}{hint}", DISK_REFUSES
         self._link.down(self.reason)
 
     async def _close(self) -> None:

@@ -11,6 +11,8 @@ import json
 import logging
 from typing import TYPE_CHECKING, Final
 
+from daqsvc.errors.code import coded
+from daqsvc.errors.outputs import OUTPUT_STATE, TOPIC_REFUSED
 from daqsvc.outbox.files import replace_durably
 from daqsvc.publish.mqtt.errors import PublishRefusedError
 from daqsvc.publish.mqtt.link import MqttLink
@@ -73,6 +75,7 @@ class LeftOver(MqttLink):
                     "message away from %s at the broker, or allow this client to",
                     error,
                     topic,
+                    extra=coded(TOPIC_REFUSED),
                 )
         self._is_remembered = await asyncio.to_thread(self.remember, self._refused)
 
@@ -104,6 +107,7 @@ class LeftOver(MqttLink):
                     "machine file no longer has it",
                     self._path,
                     error,
+                    extra=coded(OUTPUT_STATE),
                 )
             self._is_unwritable = True
             return False
@@ -120,5 +124,5 @@ class LeftOver(MqttLink):
         except FileNotFoundError:
             return frozenset()
         except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
-            log.warning("%s is of no use: %s", self._path, error)
+            log.warning("%s is of no use: %s", self._path, error, extra=coded(OUTPUT_STATE))
             return frozenset()

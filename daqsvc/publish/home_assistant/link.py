@@ -9,6 +9,8 @@ import logging
 import random
 from typing import TYPE_CHECKING
 
+from daqsvc.errors.code import coded
+from daqsvc.errors.outputs import OUTPUT_FAILED, TOPIC_REFUSED
 from daqsvc.publish.home_assistant.discovery import Discovery
 from daqsvc.publish.home_assistant.left_over import LeftOver
 from daqsvc.publish.home_assistant.readings import Readings
@@ -141,7 +143,8 @@ class MachineDevice:
                 message.sequence,
                 message.topic,
                 self._machine,
-                " ".join(str(error).split())[:_SHOWN],  # of pydantic: several lines
+                " ".join(str(error).split())[:_SHOWN],
+                extra=coded(OUTPUT_FAILED),  # of pydantic: several lines
             )
 
     def report(self, diagnosis: Diagnosis) -> None:
@@ -177,6 +180,7 @@ class MachineDevice:
                 error,
                 self._discovery.topic,
                 self._topics.summary(self._machine),
+                extra=coded(TOPIC_REFUSED),
             )
 
     async def _run(self, connection: Connection) -> None:

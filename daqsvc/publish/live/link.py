@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 from pydantic import ValidationError
 
 from daqsvc.alarms.commands import faults_of
+from daqsvc.errors.code import coded
+from daqsvc.errors.outputs import NOT_SHOWN
 from daqsvc.publish.live.pieces import Packer
 from daqsvc.publish.live.request import MOST_BYTES, LiveRequestPayload
 from daqsvc.publish.looking import Looking
@@ -102,6 +104,7 @@ class LiveLink(MqttLink):
             log.warning(
                 "the MQTT broker does not let this client subscribe to %s: no live data is sent over it",
                 self._topics.live_requests,
+                extra=coded(NOT_SHOWN),
             )
         asking = asyncio.ensure_future(self._asked.get())
         try:
@@ -178,7 +181,12 @@ class LiveLink(MqttLink):
             else:
                 await self._tell(connection, topic, request)
         except PublishRefusedError as error:
-            log.warning("live data of %s is no longer sent to a viewer: %s", topic.machine, error)
+            log.warning(
+                "live data of %s is no longer sent to a viewer: %s",
+                topic.machine,
+                error,
+                extra=coded(NOT_SHOWN),
+            )
 
     async def _refuse(self, connection: Connection, topic: LiveTopic, feed: int, why: str) -> None:
         line = json.dumps({"accepted": False, "reason": why}).encode() + b"\n"

@@ -91,7 +91,7 @@ class MetricsOutput(Output, Collector):
                 except OSError as error:
                     remedy = REMEDIES.get(error.errno or 0, "write another listen in [metrics]")
                     self._link.down(f"{error.strerror or error}: {remedy}")
-                    self.reason = self._link.reason
+                    self.reason, self.code = self._link.reason, self._link.code
                     await asyncio.sleep(backoff.next_ns() / NS_PER_S)
                     continue
                 backoff.reset()

@@ -21,6 +21,8 @@ from typing import TYPE_CHECKING, Any
 from prometheus_client import MetricsHandler
 
 from daqsvc.acquisition.link import SaidOnce
+from daqsvc.errors.code import coded
+from daqsvc.errors.outputs import OUTPUT_FAILED
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -110,7 +112,11 @@ class MetricsServer(ThreadingHTTPServer):
         if isinstance(error, OSError) or error is None:
             return
         if self._said.may_say(f"{error!r}"):
-            log.error("metrics: a request has failed: %r; the others are answered", error)
+            log.error(
+                "metrics: a request has failed: %r; the others are answered",
+                error,
+                extra=coded(OUTPUT_FAILED),
+            )
 
 
 def _handler(registry: Collector, unhealthy: Callable[[], Sequence[str]]) -> type[MetricsHandler]:

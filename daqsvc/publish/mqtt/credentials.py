@@ -20,6 +20,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.errors.code import coded
+from daqsvc.errors.outputs import CERTIFICATE_UNKNOWN
 from daqsvc.publish.mqtt.settings import LONGEST_PASSWORD, first_line
 
 if TYPE_CHECKING:
@@ -202,7 +204,12 @@ def _watched(path: Path) -> list[Certificate]:
     try:
         return certificates(path)
     except CertificateError as error:
-        log.warning("nobody will be warned when the certificates in %s end: %s", path, error)
+        log.warning(
+            "nobody will be warned when the certificates in %s end: %s",
+            path,
+            error,
+            extra=coded(CERTIFICATE_UNKNOWN),
+        )
         return []
 
 

@@ -8,6 +8,8 @@ from collections import deque
 from typing import TYPE_CHECKING, Any, Literal
 
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.errors.code import coded
+from daqsvc.errors.outputs import MESSAGE_DROPPED, TOPIC_REFUSED
 from daqsvc.outbox.messages import OutboxError
 from daqsvc.publish.mqtt.errors import PublishRefusedError
 
@@ -117,7 +119,7 @@ class Delivery:
                 try:
                     await self._try_topic(topic)
                 except OutboxError as error:
-                    log.error("%s; tried again in %g s", error, TRY_AGAIN_S)  # noqa: TRY400  the message says it
+                    log.error("%s; tried again in %g s", error, TRY_AGAIN_S, extra=coded(TOPIC_REFUSED))  # noqa: TRY400  the message says it
             self._read_again()
             await asyncio.sleep(TRY_AGAIN_S)
 
@@ -165,7 +167,9 @@ class Delivery:
                 return "kept"
             await self._letters.overtake(message)
         except OutboxError as error:
-            log.error("%s; the message on %s waits in the journal", error, message.topic)  # noqa: TRY400
+            log.error(  # noqa: TRY400 - the message says it all
+                "%s; the message on %s waits in the journal", error, message.topic, extra=coded(TOPIC_REFUSED)
+            )
             return self._leave(message)
         return "taken"
 
@@ -279,7 +283,12 @@ class TelemetryDelivery:
                 self._on_refused()
                 if not self._said_refused:
                     self._said_refused = True
-                    log.warning("telemetry on %s is dropped and counted: %s", message.topic, error)
+                    log.warning(
+                        "telemetry on %s is dropped and counted: %s",
+                        message.topic,
+                        error,
+                        extra=coded(MESSAGE_DROPPED),
+                    )
             else:
                 self._on_sent()
             self._outbox.mark_telemetry_sent(message.number)

@@ -11,10 +11,22 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from paho.mqtt.client import error_string
 
+from daqsvc.errors.code import coded
+from daqsvc.errors.outputs import (
+    BROKER_AWAY,
+    BROKER_REFUSES,
+    BROKER_TLS,
+    CLIENT_ID_TAKEN,
+    CREDENTIAL_FILE,
+    OUTPUT_FAILED,
+)
+
 if TYPE_CHECKING:
     from collections.abc import Coroutine
 
     from paho.mqtt.reasoncodes import ReasonCode
+
+    from daqsvc.errors.code import Code
 
 log = logging.getLogger(__name__)
 
@@ -105,13 +117,15 @@ class Outage:
         reason = in_words(error)
         still = "still " if any(sentence == broker for sentence, _ in self._told) else ""
         if self.note(broker, reason):
-            self._log.warning("%s is %saway: %s; %s", broker, still, reason, until)
+            self._log.warning(
+                "%s is %saway: %s; %s", broker, still, reason, until, extra=coded(kind_of(error))
+            )
 
     def tell_lost(self, broker: str, error: Exception) -> None:
         """Say why a connection has ended, unless that has been said; the broker may be there all the same."""
         reason = in_words(error)
         if self.note(broker, reason):
-            self._log.warning("%s: %s; connecting again", broker, reason)
+            self._log.warning("%s: %s; connecting again", broker, reason, extra=coded(kind_of(error)))
 
     def note(self, broker: str, reason: str) -> bool:
         """Take a reason as told; whether it is a new one that may be said."""
@@ -151,6 +165,20 @@ def in_words(error: Exception | None) -> str:
         case OSError() if error.strerror is not None:
             words = error.strerror if error.filename is None else f"{error.filename}: {error.strerror}"
     return words
+
+
+def kind_of(error: Exception | None) -> Code:
+    """The code of a failure to connect, or of the end of a connection."""
+    match error:
+        case ssl.SSLError():
+            return BROKER_TLS
+        case TakenOverError():
+            return CLIENT_ID_TAKEN
+        case MqttCodeError() if not isinstance(error.rc, int):
+            return BROKER_REFUSES
+        case FileNotFoundError() if error.filename is not None:
+            return CREDENTIAL_FILE
+    return BROKER_AWAY
 
 
 def _unverified(error: ssl.SSLCertVerificationError) -> str:
@@ -193,7 +221,13 @@ class Faults:
         if cause in self._said or len(self._said) >= MOST_CAUSES:
             return
         self._said.add(cause)
-        log.error("%s: %s (%.200s); please report this", what, cause[1], ascii(str(error)))
+        log.error(
+            "%s: %s (%.200s); please report this",
+            what,
+            cause[1],
+            ascii(str(error)),
+            extra=coded(OUTPUT_FAILED),
+        )
 
 
 async def unless(stopping: asyncio.Event, work: Coroutine[Any, Any, _T]) -> _T | None:

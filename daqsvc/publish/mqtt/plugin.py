@@ -6,7 +6,7 @@ import logging
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from daqsvc.errors.code import with_code
+from daqsvc.errors.code import coded, with_code
 from daqsvc.publish.mqtt.checks import checks
 from daqsvc.publish.mqtt.conditions import BROKER, CERTIFICATE, REFUSED, UNUSED
 from daqsvc.publish.mqtt.link import MqttLinkPlugin
@@ -67,7 +67,7 @@ class MqttPlugin(OutputPlugin[Mqtt]):
                     links.append(plugin.link(table_at(machine, path), mqtt, port))
                 except PluginFailedError as failed:
                     words = f"output {path} cannot be made and is left out: {failed.words}"
-                    log.error("%s", with_code(words, failed.code))  # noqa: TRY400
+                    log.error("%s", with_code(words, failed.code), extra=coded(failed.code))  # noqa: TRY400
         return MqttPublisher(mqtt, port, [link for link in links if link is not None])
 
 

@@ -12,6 +12,14 @@ from typing import TYPE_CHECKING, Any, Literal
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.link import Backoff
 from daqsvc.alarms.events import Identity
+from daqsvc.errors.code import coded
+from daqsvc.errors.outputs import (
+    BROKER_AWAY,
+    CERTIFICATE_UNKNOWN,
+    CLIENT_ID_TAKEN,
+    CREDENTIAL_OPEN,
+    TOPIC_REFUSED,
+)
 from daqsvc.outbox.messages import OutboxError
 from daqsvc.publish.mqtt.commands import CommandIntake
 from daqsvc.publish.mqtt.conditions import NS_PER_DAY, BrokerCheck, BrokerVitals
@@ -27,6 +35,7 @@ from daqsvc.publish.mqtt.errors import (
     TakenOverError,
     has_expired,
     in_words,
+    kind_of,
     unless,
 )
 from daqsvc.publish.mqtt.session import CredentialsReplacedError, PublishCounters, Session
@@ -297,11 +306,15 @@ class MqttPublisher(Output):
     def _away(self, error: Exception) -> None:
         """Note why there is no connection."""
         self.counters.connected = False
-        self.reason = f"{self._name}: {in_words(error)}"
+        self.reason, self.code = f"{self._name}: {in_words(error)}", kind_of(error)
 
     def _warn_of(self, exposed: tuple[Path, ...]) -> None:
         for path in sorted(set(exposed) - self._exposed):
-            log.warning("%s can be read by every user of this machine: chmod o-rwx it, and replace it", path)
+            log.warning(
+                "%s can be read by every user of this machine: chmod o-rwx it, and replace it",
+                path,
+                extra=coded(CREDENTIAL_OPEN),
+            )
         self._exposed = set(exposed)
 
     async def _prepare(self) -> None:
@@ -312,7 +325,9 @@ class MqttPublisher(Output):
         except OutboxError as error:
             # Of the store, not of the broker: it makes no outage.
             if f"{error}" != self._not_loaded:
-                log.warning("%s; what was refused before waits until it can", error)
+                log.warning(
+                    "%s; what was refused before waits until it can", error, extra=coded(TOPIC_REFUSED)
+                )
             self._not_loaded = f"{error}"
         else:
             self._not_loaded = ""
@@ -329,6 +344,7 @@ class MqttPublisher(Output):
                     self._name,
                     self.topics.availability,
                     error,
+                    extra=coded(TOPIC_REFUSED),
                 )
             self._not_available = str(error)
         else:
@@ -363,7 +379,12 @@ class MqttPublisher(Output):
         try:
             shown = certificate(der)
         except CertificateError as error:
-            log.warning("nobody will be warned when the certificate of %s ends: %s", self._name, error)
+            log.warning(
+                "nobody will be warned when the certificate of %s ends: %s",
+                self._name,
+                error,
+                extra=coded(CERTIFICATE_UNKNOWN),
+            )
             return
         self._expiry["broker"] = shown.not_after_ns
         authority = issuer_of(shown, credentials.trusted)
@@ -443,6 +464,7 @@ class MqttPublisher(Output):
             self._name,
             topic,
             FIRST_BAR_S / 60,
+            extra=coded(TOPIC_REFUSED),
         )
 
     def _judge(self, of_use_s: float, error: Exception) -> None:
@@ -472,10 +494,17 @@ class MqttPublisher(Output):
             async with asyncio.timeout(max(self._left_s(), GOODBYE_S / 2)):
                 await connection.deliver(self.topics.availability, offline, retain=True)
         except TimeoutError:
-            log.warning("MQTT broker %s did not answer to the goodbye; the last will reports", self._name)
+            log.warning(
+                "MQTT broker %s did not answer to the goodbye; the last will reports",
+                self._name,
+                extra=coded(BROKER_AWAY),
+            )
         except MqttError as error:
             log.warning(
-                "MQTT broker %s did not accept the goodbye: %s; the last will reports", self._name, error
+                "MQTT broker %s did not accept the goodbye: %s; the last will reports",
+                self._name,
+                error,
+                extra=coded(BROKER_AWAY),
             )
         else:
             await connection.close(max(self._left_s(), GOODBYE_S / 2))
@@ -503,4 +532,5 @@ class MqttPublisher(Output):
             self._name,
             how,
             self._settings.client_id,
+            extra=coded(CLIENT_ID_TAKEN),
         )

@@ -7,6 +7,8 @@ import logging
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from daqsvc.errors.code import coded
+from daqsvc.errors.outputs import CREDENTIAL_FILE, TOPIC_REFUSED
 from daqsvc.outbox.messages import OutboxError
 from daqsvc.publish.mqtt.credentials import read_credentials, stamp_of
 from daqsvc.publish.mqtt.delivery import Delivery, TelemetryDelivery
@@ -259,6 +261,7 @@ class Session:
                 self._settings.port,
                 topic,
                 reason,
+                extra=coded(TOPIC_REFUSED),
             )
 
     async def _run_link(self, link: MqttLink) -> None:
@@ -288,6 +291,7 @@ class Session:
                 self._settings.host,
                 self._settings.port,
                 self._topics.commands,
+                extra=coded(TOPIC_REFUSED),
             )
         if self._intake is not None:
             # A broker that does not grant this only leaves mistakes unanswered.
@@ -345,7 +349,9 @@ class Session:
             )
         except PublishRefusedError as error:
             intake.counters.unanswered += 1
-            log.warning("an answer on %.200r is not taken: %s", answer.topic, error)
+            log.warning(
+                "an answer on %.200r is not taken: %s", answer.topic, error, extra=coded(TOPIC_REFUSED)
+            )
 
     async def _look_after_credentials(self) -> None:
         """Ask for a new connection when files were replaced by others that can be used.
@@ -370,6 +376,10 @@ class Session:
             try:
                 await asyncio.to_thread(read_credentials, self._settings)
             except OSError as error:
-                log.warning("%s; the connection is up, but would not come back after a loss", error)
+                log.warning(
+                    "%s; the connection is up, but would not come back after a loss",
+                    error,
+                    extra=coded(CREDENTIAL_FILE),
+                )
                 continue
             raise CredentialsReplacedError

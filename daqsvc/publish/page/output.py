@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.link import Backoff
+from daqsvc.errors.code import coded
+from daqsvc.errors.outputs import PAGE_ENDED
 from daqsvc.publish.output import Output
 
 if TYPE_CHECKING:
@@ -91,9 +93,14 @@ class PageOutput(Output):
                 why = f"it cannot be started: {error.strerror or error}"
             if self._stopping.is_set():
                 return
-            self.reason = why
+            self.reason, self.code = why, PAGE_ENDED
             if why != said:
-                log.warning("the page at %s has ended, and is started again: %s", self._listen, why)
+                log.warning(
+                    "the page at %s has ended, and is started again: %s",
+                    self._listen,
+                    why,
+                    extra=coded(PAGE_ENDED),
+                )
                 said = why
             if loop.time() - begun_s > WELL_S:
                 backoff.reset()

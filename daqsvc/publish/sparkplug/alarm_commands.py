@@ -13,6 +13,8 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, NamedTuple
 
 from daqsvc.alarms.commands import Verb
+from daqsvc.errors.code import coded
+from daqsvc.errors.outputs import COMMAND_NOT_OBEYED
 from daqsvc.publish.mqtt.commands import CommandIntake
 from daqsvc.publish.mqtt.connection import Incoming
 from daqsvc.publish.sparkplug.codec import DataType, Metric
@@ -99,12 +101,19 @@ class AlarmCommands:
     async def carry_out(self, wish: HostCommand) -> bool:
         """Have a wish carried out, one at a time; whether it was."""
         if wish.sent_ms is None:
-            log.warning("%s is refused: it does not say when it was sent", wish.topic)
+            log.warning(
+                "%s is refused: it does not say when it was sent", wish.topic, extra=coded(COMMAND_NOT_OBEYED)
+            )
             return False
         try:
             issued_at = datetime.fromtimestamp(wish.sent_ms / 1000.0, UTC).isoformat()
         except (ValueError, OverflowError, OSError):
-            log.warning("%s is refused: it was sent at %d ms, which is no time", wish.topic, wish.sent_ms)
+            log.warning(
+                "%s is refused: it was sent at %d ms, which is no time",
+                wish.topic,
+                wish.sent_ms,
+                extra=coded(COMMAND_NOT_OBEYED),
+            )
             return False
         written = f"{wish.topic} {wish.verb} {wish.alarm} {wish.sent_ms}".encode(errors="replace")
         asked = {

@@ -6,6 +6,8 @@ import json
 import logging
 from dataclasses import dataclass
 
+from daqsvc.errors.code import coded
+from daqsvc.errors.outputs import HOST_MISSING
 from daqsvc.publish.sparkplug.codec import PayloadError
 from daqsvc.publish.sparkplug.node import NAMESPACE
 
@@ -83,7 +85,7 @@ class HostReports:
         """Say that the host is missing, each sentence once until it is there."""
         if sentence not in self._said:
             self._said.add(sentence)
-            log.warning("%s", sentence)
+            log.warning("%s", sentence, extra=coded(HOST_MISSING))
 
     def there(self, host_id: str) -> None:
         """Say that the host is there, if it was said to be missing."""

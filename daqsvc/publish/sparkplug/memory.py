@@ -6,6 +6,8 @@ import json
 import logging
 from typing import TYPE_CHECKING
 
+from daqsvc.errors.code import coded
+from daqsvc.errors.outputs import OUTPUT_STATE
 from daqsvc.outbox.files import replace_durably
 from daqsvc.publish.sparkplug.node import NUMBERS
 
@@ -42,6 +44,7 @@ class Memory:
                 "the time before are not told to Sparkplug hosts; it is replaced at the next connection",
                 self._path,
                 error,
+                extra=coded(OUTPUT_STATE),
             )
 
     def begin_session(self, cursor: int) -> None:
@@ -68,6 +71,7 @@ class Memory:
                     "Sparkplug memory %s cannot be written: %s; a restart before it can sends alarms again",
                     self._path,
                     error,
+                    extra=coded(OUTPUT_STATE),
                 )
             self._failed = True
         else:

@@ -6,6 +6,8 @@ import stat
 from typing import TYPE_CHECKING
 
 from daqsvc.confined.limits import Budget, TooLargeError
+from daqsvc.errors.machine_file import TOO_LARGE
+from daqsvc.errors.recordings import DAMAGED, NEEDS_MACHINE_FILE, NOT_FOUND, UNKNOWN_FORMAT
 from daqsvc.recording import RecordingError
 from daqsvc.recording.formats.delimited import read_csv
 from daqsvc.recording.formats.hdf5 import read_hdf5
@@ -68,20 +70,27 @@ def find(path: Path) -> tuple[Callable[[Path, Budget], Contents], int]:
     try:
         status = path.stat()
     except FileNotFoundError:
-        raise RecordingError(f"{path} cannot be read: there is no such file; correct the path") from None
+        raise RecordingError(
+            f"{path} cannot be read: there is no such file; correct the path", NOT_FOUND
+        ) from None
     except (OSError, ValueError) as error:
-        raise RecordingError(f"{path!s:.200} cannot be read: {_one_line(error)}; correct the path") from None
+        raise RecordingError(
+            f"{path!s:.200} cannot be read: {_one_line(error)}; correct the path", NOT_FOUND
+        ) from None
     name = path.name.lower()
     reader = next((reader for suffix, reader in READERS.items() if name.endswith(suffix)), None)
     if reader is None and named_as_can_log(path):
         raise RecordingError(
-            f"{path} is a CAN log, which only the layouts of a machine file make sense of: name that first"
+            f"{path} is a CAN log, which only the layouts of a machine file make sense of: name that first",
+            NEEDS_MACHINE_FILE,
         )
     if reader is None:
-        raise RecordingError(f"{path} is not a kind of file that can be read; use {', '.join(READERS)}")
+        raise RecordingError(
+            f"{path} is not a kind of file that can be read; use {', '.join(READERS)}", UNKNOWN_FORMAT
+        )
     if not stat.S_ISREG(status.st_mode):
         raise RecordingError(
-            f"{path} cannot be read: it is no file but a folder, pipe or device; give a file"
+            f"{path} cannot be read: it is no file but a folder, pipe or device; give a file", NOT_FOUND
         )
     return reader, status.st_size
 
@@ -106,20 +115,20 @@ def read(path: Path, limits: ResourceLimits, wanted: Collection[str] | None = No
     except (RecordingError, MemoryError):
         raise
     except TooLargeError as error:
-        raise RecordingError(f"{path} is too large: {error}") from None
+        raise RecordingError(f"{path} is too large: {error}", TOO_LARGE) from None
     except OSError as error:
         reason = error.strerror or _one_line(error)
         raise RecordingError(
-            f"{path} cannot be read: {reason}; copy it anew, or give another file"
+            f"{path} cannot be read: {reason}; copy it anew, or give another file", NOT_FOUND
         ) from error
     except RecursionError as error:
         raise RecordingError(
-            f"{path} cannot be read: what it holds is nested too deep; save the channels themselves"
+            f"{path} cannot be read: what it holds is nested too deep; save the channels themselves", DAMAGED
         ) from error
     except Exception as error:
         # On damaged bytes the libraries behind the readers raise almost anything.
         raise RecordingError(
-            f"{path} cannot be read: {_one_line(error)}; it may be damaged: copy or save it anew"
+            f"{path} cannot be read: {_one_line(error)}; it may be damaged: copy or save it anew", DAMAGED
         ) from error
 
 

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, TypeAlias, cast
 import numpy as np
 
 from daqsvc.confined.limits import CountedFile, TooLargeError
+from daqsvc.errors.recordings import NOT_NUMBERS, TOO_SHORT
 from daqsvc.recording import RecordingError
 from daqsvc.recording.contents import LONGEST_NAME, LONGEST_TEXT, STATED_START, Contents, Elsewhere
 from daqsvc.recording.formats.column_units import is_time_name, spelt_alike, time_unit, unit_in_name
@@ -97,7 +98,8 @@ class _DelimitedTable:
             first = self._first_lines()[0]
             raise RecordingError(
                 f"{self._path} holds no numeric channel: its first line is {first[:LONGEST_NAME]!r}, and no "
-                "line behind it has a number; give a table with a column of numbers for each channel"
+                "line behind it has a number; give a table with a column of numbers for each channel",
+                NOT_NUMBERS,
             )
         numbers = self._numbers()
         entries: dict[str, NDArray[np.generic]] = {
@@ -144,7 +146,8 @@ class _DelimitedTable:
                     raise RecordingError(
                         f"column {i + 1} ({name:.{LONGEST_NAME}}) of {self._path} is in "
                         f"{first[1]:.{LONGEST_NAME}} by {first[0]} and in {unit:.{LONGEST_NAME}} by {where}; "
-                        "correct the one that is wrong"
+                        "correct the one that is wrong",
+                        NOT_NUMBERS,
                     )
             units[name] = first[1][:LONGEST_NAME]
         return units
@@ -222,7 +225,8 @@ class _DelimitedTable:
         except EitherDateError:
             raise RecordingError(
                 f"the dates in column {i + 1} ({self._layout.names[i]:.{LONGEST_NAME}}) of {self._path} "
-                "may have the day first or the month, and the rows leap either way; write them as 2026-01-31"
+                "may have the day first or the month, and the rows leap either way; write them as 2026-01-31",
+                NOT_NUMBERS,
             ) from None
 
     def _first_lines(self) -> list[str]:
@@ -238,7 +242,7 @@ class _DelimitedTable:
                 if len(first) == SNIFFED_LINES:
                     break
         if not first:
-            raise RecordingError(f"{self._path} is empty; give a file with samples")
+            raise RecordingError(f"{self._path} is empty; give a file with samples", TOO_SHORT)
         return first
 
     def _numbers(self) -> Floats:
@@ -247,7 +251,9 @@ class _DelimitedTable:
         with contextlib.closing(self._rows(fill=False)) as rows:
             # Asked here, as NumPy would only warn.
             if next(rows, None) is None:
-                raise RecordingError(f"{self._path} has a header but no samples; give a file with samples")
+                raise RecordingError(
+                    f"{self._path} has a header but no samples; give a file with samples", TOO_SHORT
+                )
         if not layout.numeric:
             return np.empty((1, 0))
         try:
@@ -262,7 +268,9 @@ class _DelimitedTable:
             raise
         except ValueError as error:
             self._find_fault()
-            raise RecordingError(f"{self._path} cannot be read: {error}; correct the file") from error
+            raise RecordingError(
+                f"{self._path} cannot be read: {error}; correct the file", NOT_NUMBERS
+            ) from error
 
     def _parsed(self, *, fill: bool) -> Floats:
         return np.loadtxt(
@@ -316,14 +324,17 @@ class _DelimitedTable:
             where = f"{self._path}, line {i}"
             if len(cells) < layout.width:
                 raise RecordingError(
-                    f"{where} has {len(cells)} columns where the others have {layout.width}; correct the file"
+                    f"{where} has {len(cells)} columns where the others have {layout.width}; "
+                    "correct the file",
+                    NOT_NUMBERS,
                 )
             for column in layout.numeric:
                 if cells[column] and not layout.is_number(cells[column]):
                     named = f" ({layout.names[column]:.{LONGEST_NAME}})" if layout.has_header else ""
                     cell = f"{cells[column]!r:.{LONGEST_NAME}}"
                     raise RecordingError(
-                        f"{where}, column {column + 1}{named}: {cell} is not a number; correct the file"
+                        f"{where}, column {column + 1}{named}: {cell} is not a number; correct the file",
+                        NOT_NUMBERS,
                     )
 
 
@@ -424,7 +435,8 @@ class TextFile:
                         raise
                     raise RecordingError(
                         f"{self._path} cannot be read: it is no text in UTF-16, as its first two bytes say "
-                        f"({error}); save it as CSV in UTF-8"
+                        f"({error}); save it as CSV in UTF-8",
+                        NOT_NUMBERS,
                     ) from None
 
     @contextmanager

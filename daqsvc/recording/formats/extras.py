@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from daqsvc.errors.command_line import EXTRA_MISSING
 from daqsvc.recording import RecordingError
 
 if TYPE_CHECKING:
@@ -28,5 +29,5 @@ def needed(path: Path, library: str, package: str) -> Any:
         if error.name != library.partition(".")[0]:
             raise
         raise RecordingError(
-            f"{path} needs {package}; install it with: pip install 'daqsvc[formats]'"
+            f"{path} needs {package}; install it with: pip install 'daqsvc[formats]'", EXTRA_MISSING
         ) from error

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from daqsvc.errors.recordings import DAMAGED, UNKNOWN_FORMAT
 from daqsvc.recording import RecordingError
 from daqsvc.recording.contents import (
     STATED_RATE,
@@ -49,7 +50,8 @@ def read_mat(path: Path, budget: Budget) -> Contents:
         variables = loadmat(path, squeeze_me=True, struct_as_record=False)
     except NotImplementedError:
         raise RecordingError(
-            f"{path} is a MATLAB v7.3 file, which cannot be read; save it in MATLAB with save(..., '-v7')"
+            f"{path} is a MATLAB v7.3 file, which cannot be read; save it in MATLAB with save(..., '-v7')",
+            UNKNOWN_FORMAT,
         ) from None
     variables = {name: variable for name, variable in variables.items() if not name.startswith("__")}
     streams = {name: one for name, variable in variables.items() if (one := _stream(variable)) is not None}
@@ -165,7 +167,7 @@ def check_mat_structure(path: Path, budget: Budget) -> None:
             for variable in variables:
                 _check_array(variable, order)
     except _DamageError as damage:
-        raise RecordingError(f"{path} cannot be read: {damage}; copy or save it anew") from None
+        raise RecordingError(f"{path} cannot be read: {damage}; copy or save it anew", DAMAGED) from None
 
 
 def _unpacked(body: memoryview, budget: Budget) -> bytes:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from daqsvc.errors.recordings import DAMAGED, UNKNOWN_FORMAT
 from daqsvc.recording import RecordingError
 from daqsvc.recording.contents import GROUP_TIME, STATED_START, Contents, check_columns, names_of_groups
 from daqsvc.recording.formats.extras import needed
@@ -38,12 +39,14 @@ def read_mdf(path: Path, budget: Budget) -> Contents:
         magic = file.read(len(FINISHED))
     if magic.startswith(UNFINISHED):
         raise RecordingError(
-            f"{path} cannot be read: the logger has not finished it; finish it with the logger's software"
+            f"{path} cannot be read: the logger has not finished it; finish it with the logger's software",
+            DAMAGED,
         )
     if magic != FINISHED:
         raise RecordingError(
             f"{path} is not an MDF 4 file: it begins with {magic!r}; save it as MDF 4, or give it the suffix "
-            "of what it is"
+            "of what it is",
+            UNKNOWN_FORMAT,
         )
     asammdf = needed(path, "asammdf", "asammdf")
     check_mdf_structure(path, budget)

@@ -11,6 +11,7 @@ import mmap
 import struct
 from typing import TYPE_CHECKING, NamedTuple
 
+from daqsvc.errors.recordings import DAMAGED
 from daqsvc.recording import RecordingError
 from daqsvc.recording.contents import MOST_COLUMNS, check_columns
 
@@ -68,7 +69,7 @@ def check_mdf_structure(path: Path, budget: Budget) -> None:
         _File(content, budget).check()
     except (_DamageError, struct.error) as damage:
         raise RecordingError(
-            f"{path} cannot be read: {damage}; it is damaged or cut short: copy or save it anew"
+            f"{path} cannot be read: {damage}; it is damaged or cut short: copy or save it anew", DAMAGED
         ) from None
 
 

@@ -6,6 +6,7 @@ import zipfile
 from typing import TYPE_CHECKING
 
 from daqsvc.confined.archives import load_array
+from daqsvc.errors.recordings import DAMAGED, UNKNOWN_FORMAT
 from daqsvc.recording import RecordingError
 from daqsvc.recording.contents import Contents, check_columns, flattened
 
@@ -28,11 +29,13 @@ def read_npz(path: Path, budget: Budget) -> Contents:
             if file.read(len(ZIP_BEGIN)) == ZIP_BEGIN:
                 raise RecordingError(
                     f"{path} cannot be read: it is cut short, as the directory at its end is missing; copy "
-                    "it anew, or give another file"
+                    "it anew, or give another file",
+                    DAMAGED,
                 )
             raise RecordingError(
                 f"{path} cannot be read: it is not a zip archive, as numpy.savez writes; "
-                "save it anew, or give it the suffix of what it is"
+                "save it anew, or give it the suffix of what it is",
+                UNKNOWN_FORMAT,
             )
         with zipfile.ZipFile(file) as archive:
             members = archive.infolist()

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from daqsvc.errors.command_line import EXTRA_MISSING
 from daqsvc.recording import RecordingError
 from daqsvc.recording.contents import STATED_UNIT, Contents, check_columns, column_names
 
@@ -31,7 +32,8 @@ def read_parquet(path: Path, budget: Budget) -> Contents:
     except ModuleNotFoundError as error:
         raise RecordingError(
             f"{path} is a Parquet file, and reading it needs pyarrow; "
-            "install it with: pip install 'daqsvc[parquet]'"
+            "install it with: pip install 'daqsvc[parquet]'",
+            EXTRA_MISSING,
         ) from error
     # More threads would take more memory, and no file is read by several.
     pa.set_cpu_count(1)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from daqsvc.acquisition.samples import SampleBlock
+from daqsvc.errors.recordings import SNAPSHOT, TOO_SHORT
 from daqsvc.recording import RecordingError
 from daqsvc.recording.contents import STATED_START, Contents, Elsewhere, check_columns
 from daqsvc.recording.streams import FIRST_NS, LAST_NS, iso_ns
@@ -45,13 +46,13 @@ def read_snapshot_channels(path: Path, budget: Budget) -> Contents:
     budget.spend(path.stat().st_size)
     about, blocks, damage = _read(path)
     if damage.ends_early and not blocks:
-        raise RecordingError(f"{path} {WAS_CUT}")
+        raise RecordingError(f"{path} {WAS_CUT}", SNAPSHOT)
     if about.get("schema") != SCHEMA:
-        raise RecordingError(f"{path} is no snapshot of daqsvc: its first message is not {SCHEMA}")
+        raise RecordingError(f"{path} is no snapshot of daqsvc: its first message is not {SCHEMA}", SNAPSHOT)
     streams = _Streams(about, blocks, budget, tuple(notes_of(damage)))
     groups = streams.groups()
     if not groups:
-        raise RecordingError(f"{path} holds no samples of any sensor; give another snapshot")
+        raise RecordingError(f"{path} holds no samples of any sensor; give another snapshot", TOO_SHORT)
     contents = streams.read(groups[0])
     elsewhere: dict[str, Elsewhere] = {}
     for group in groups[1:]:
@@ -85,7 +86,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, list[SampleBlock]], Dam
                 about = about or one.what.document
     except McapError as error:
         raise RecordingError(
-            f"{path} cannot be read: it {error}; copy it anew, or give another one"
+            f"{path} cannot be read: it {error}; copy it anew, or give another one", SNAPSHOT
         ) from None
     return about, blocks, damage
 

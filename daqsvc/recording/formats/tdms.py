@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from daqsvc.errors.recordings import DAMAGED
 from daqsvc.recording import RecordingError
 from daqsvc.recording.contents import Contents, check_columns, names_of_groups
 from daqsvc.recording.formats.extras import needed
@@ -78,14 +79,16 @@ def _check_segments(path: Path, file_bytes: int) -> None:
             if len(head) < LEAD.size or head[:4] != TAG:
                 raise RecordingError(
                     f"{path} cannot be read: {head[:4]!r} stands at byte {at:,}, where a segment (TDSm) "
-                    "belongs; copy or save it anew"
+                    "belongs; copy or save it anew",
+                    DAMAGED,
                 )
             _, _, _, after, metadata = LEAD.unpack(head)
             at += LEAD.size + after
             if after == UNFINISHED or at > file_bytes or metadata > after:
                 raise RecordingError(
                     f"{path} cannot be read: a segment has not the length that it says; it is cut short, or "
-                    "was not finished: copy or save it anew"
+                    "was not finished: copy or save it anew",
+                    DAMAGED,
                 )
 
 

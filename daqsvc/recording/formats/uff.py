@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from daqsvc.errors.recordings import DAMAGED, TOO_SHORT
 from daqsvc.recording import RecordingError
 from daqsvc.recording.contents import STATED_RATE, STATED_START, Contents, check_columns, column_names
 from daqsvc.recording.formats.extras import needed
@@ -61,7 +62,9 @@ def read_uff(path: Path, budget: Budget) -> Contents:
     file = pyuff.UFF(str(path))
     numbers = [i for i, kind in enumerate(file.get_set_types()) if int(kind) == FUNCTION]
     if not numbers:
-        raise RecordingError(f"{path} holds no function; save the time signals in it as data sets 58")
+        raise RecordingError(
+            f"{path} holds no function; save the time signals in it as data sets 58", TOO_SHORT
+        )
     check_columns(len(numbers))
     entries: dict[str, NDArray[np.generic]] = {}
     rates_hz, times, units, starts_ns = {}, {}, {}, {}
@@ -75,7 +78,8 @@ def read_uff(path: Path, budget: Budget) -> Contents:
         if len(samples) != one["num_pts"]:
             raise RecordingError(
                 f"{path} cannot be read: {name!r} should have {one['num_pts']} samples and has "
-                f"{len(samples)}; copy or save it anew"
+                f"{len(samples)}; copy or save it anew",
+                DAMAGED,
             )
         entries[name] = samples
         if int(one["abscissa_spacing"]) == 1:
@@ -108,7 +112,8 @@ def _check_ends(path: Path) -> None:
     if marks % 2:
         raise RecordingError(
             f"{path} cannot be read: data set {marks // 2 + 1} of it begins and does not end; it is cut: "
-            "copy or save it anew"
+            "copy or save it anew",
+            DAMAGED,
         )
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
+from daqsvc.errors.recordings import DAMAGED, UNKNOWN_FORMAT
 from daqsvc.recording import RecordingError
 from daqsvc.recording.contents import (
     LONGEST_NAME,
@@ -48,7 +49,8 @@ def read_wav(path: Path, budget: Budget) -> Contents:
     if missing:
         raise RecordingError(
             f"{path} cannot be read: it has no {missing[0].strip()!r} chunk; it is cut short or empty, "
-            "and has to be copied or saved anew"
+            "and has to be copied or saved anew",
+            DAMAGED,
         )
     encoding, bits, channels, rate_hz = _format(path, chunks["fmt "])
     data = chunks["data"]
@@ -56,7 +58,8 @@ def read_wav(path: Path, budget: Budget) -> Contents:
     if len(data) % frame_bytes:
         raise RecordingError(
             f"{path} cannot be read: its {len(data)} bytes of samples are no whole number of frames of "
-            f"{frame_bytes} bytes; copy or save it anew"
+            f"{frame_bytes} bytes; copy or save it anew",
+            DAMAGED,
         )
     check_columns(channels)
     budget.check_declared(len(data) * 64.0 / bits)
@@ -92,7 +95,8 @@ def _chunks(path: Path, content: bytes) -> dict[str, memoryview]:
         kind = repr(content[:4]) if content else "nothing"
         raise RecordingError(
             f"{path} is not a WAV file: it begins with {kind}, not with RIFF; "
-            "save it as WAV (not RF64 or RIFX)"
+            "save it as WAV (not RF64 or RIFX)",
+            UNKNOWN_FORMAT,
         )
     chunks: dict[str, memoryview] = {}
     view, at = memoryview(content), 12
@@ -102,7 +106,8 @@ def _chunks(path: Path, content: bytes) -> dict[str, memoryview]:
         if len(body) < size:
             raise RecordingError(
                 f"{path} is cut short: its {tag.decode('latin-1').strip()!r} chunk should have {size} bytes "
-                f"and has {len(body)}; copy or save it anew"
+                f"and has {len(body)}; copy or save it anew",
+                DAMAGED,
             )
         chunks.setdefault(tag.decode("latin-1"), body)
         at += 8 + size + size % 2
@@ -117,12 +122,14 @@ def _format(path: Path, chunk: memoryview) -> tuple[int, int, int, int]:
     if bits not in ENCODINGS.get(encoding, ()):
         raise RecordingError(
             f"{path} has {bits}-bit samples of WAV format {encoding}; save it as PCM of 8, 16, 24 or 32 "
-            "bits, or as float of 32 or 64 bits"
+            "bits, or as float of 32 or 64 bits",
+            UNKNOWN_FORMAT,
         )
     if frame_bytes != channels * bits // 8 or not channels:
         raise RecordingError(
             f"{path} cannot be read: {channels} channels of {bits} bits do not make frames of {frame_bytes} "
-            "bytes; copy or save it anew"
+            "bytes; copy or save it anew",
+            DAMAGED,
         )
     return encoding, bits, channels, rate_hz
 

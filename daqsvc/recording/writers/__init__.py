@@ -12,6 +12,8 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from daqsvc.errors.command_line import CANNOT_WRITE, EXTRA_MISSING, THERE_ALREADY, WRONG_VALUE
+from daqsvc.errors.recordings import NOT_HELD
 from daqsvc.recording import RecordingError
 from daqsvc.recording.streams import unique
 from daqsvc.recording.writers.delimited import write_csv
@@ -24,6 +26,7 @@ from daqsvc.recording.writers.wav import write_wav
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
+    from daqsvc.errors.code import Code
     from daqsvc.recording.streams import RecordedStream
 
 LONGEST_PART = 120
@@ -33,6 +36,10 @@ LONGEST_REASON = 300
 
 class ExportUsageError(Exception):
     """Nothing can be written there, or not in this format; says why, and what to do."""
+
+    def __init__(self, message: str, code: Code) -> None:
+        super().__init__(message)
+        self.code = code
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,11 +83,12 @@ def writer_of(target: Path) -> Writer:
         meant = f"did you mean {close[0]}? There are" if close else "take one of"
         ends = f"ends in {target.suffix}" if suffix else "has no suffix"
         raise ExportUsageError(
-            f"{target} {ends}, and that says no format to write: {meant} {', '.join(WRITERS)}"
+            f"{target} {ends}, and that says no format to write: {meant} {', '.join(WRITERS)}", WRONG_VALUE
         )
     if writer.library and importlib.util.find_spec(writer.library) is None:
         raise ExportUsageError(
-            f"{suffix} files need {writer.library}; install it with: pip install 'daqsvc[{writer.extra}]'"
+            f"{suffix} files need {writer.library}; install it with: pip install 'daqsvc[{writer.extra}]'",
+            EXTRA_MISSING,
         )
     return writer
 
@@ -117,9 +125,13 @@ def refuse_existing(targets: Sequence[Path]) -> None:
     """
     for target in targets:
         if not target.parent.is_dir():
-            raise ExportUsageError(f"{target}: there is no folder {target.parent}; make it first")
+            raise ExportUsageError(
+                f"{target}: there is no folder {target.parent}; make it first", CANNOT_WRITE
+            )
         if target.exists():
-            raise ExportUsageError(f"{target} is there already; give another name, or --force to replace it")
+            raise ExportUsageError(
+                f"{target} is there already; give another name, or --force to replace it", THERE_ALREADY
+            )
 
 
 def write_all(
@@ -169,13 +181,14 @@ def _write(
     except MemoryError:
         raise RecordingError(
             f"{target.name} takes more memory than there is; write .parquet or .csv, or one stream "
-            "alone with --stream"
+            "alone with --stream",
+            NOT_HELD,
         ) from None
     except Exception as error:
         # What names, rates and times a format cannot hold its library says in words of its own.
         why = " ".join(str(error).split())[:LONGEST_REASON] or type(error).__name__
         raise RecordingError(
-            f"{target.name} cannot hold this recording: {why}; write another format"
+            f"{target.name} cannot hold this recording: {why}; write another format", NOT_HELD
         ) from error
 
 
@@ -195,7 +208,8 @@ def _put(written: Path, target: Path, *, force: bool) -> None:
             target.hardlink_to(written)
         except FileExistsError:
             raise ExportUsageError(
-                f"{target} has been written by somebody else meanwhile; give another name, or --force"
+                f"{target} has been written by somebody else meanwhile; give another name, or --force",
+                THERE_ALREADY,
             ) from None
         except OSError:
             pass  # a file system without hard links

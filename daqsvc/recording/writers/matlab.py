@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from daqsvc.errors.recordings import NOT_HELD
 from daqsvc.recording import RecordingError
 from daqsvc.recording.contents import MEASURED_RATE, STATED_RATE, STATED_START
 
@@ -41,7 +42,8 @@ def write_mat(path: Path, streams: Sequence[RecordedStream], about: Mapping[str,
         if stream.samples.nbytes > MOST_BYTES:
             raise RecordingError(
                 f"stream {stream.name} has {stream.samples.nbytes / 1e9:.3g} GB of samples, and a variable "
-                "of a MATLAB file of version 7 holds 2; write .parquet or .mf4"
+                "of a MATLAB file of version 7 holds 2; write .parquet or .mf4",
+                NOT_HELD,
             )
         fields = _identifiers(stream.names, OTHERS)
         variables[variable] = {

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daqsvc.errors.recordings import NOT_HELD
 from daqsvc.recording import RecordingError
 from daqsvc.recording.contents import WAV_SCHEMA
 from daqsvc.recording.writers.gaps import filled, notes_on_gaps
@@ -44,12 +45,14 @@ def write_wav(path: Path, streams: Sequence[RecordedStream], about: Mapping[str,
     if rate_hz < 1 or abs(stream.rate_hz / rate_hz - 1.0) > _WHOLE:
         raise RecordingError(
             f"stream {stream.name} has {stream.rate_hz!r} samples a second, and a WAV file says whole "
-            "numbers only; write .parquet, .mf4 or .mat, or another stream alone with --stream"
+            "numbers only; write .parquet, .mf4 or .mat, or another stream alone with --stream",
+            NOT_HELD,
         )
     if 4 * channels * rate_hz > MOST_RATE_BYTES:
         raise RecordingError(
             f"stream {stream.name} has {stream.rate_hz:g} samples a second of {channels} channels, and a WAV "
-            "file says 4.29 GB a second at most; write .parquet, .mf4 or .mat"
+            "file says 4.29 GB a second at most; write .parquet, .mf4 or .mat",
+            NOT_HELD,
         )
     data_bytes = 4 * channels * len(stream.samples)
     comment = _comment(stream, about)
@@ -57,7 +60,8 @@ def write_wav(path: Path, streams: Sequence[RecordedStream], about: Mapping[str,
     if len(head) + data_bytes > MOST_BYTES or channels > MOST_CHANNELS:
         raise RecordingError(
             f"stream {stream.name} has {data_bytes / 1e9:.3g} GB of samples, and a WAV file holds 4.29; "
-            "write .parquet or .mf4"
+            "write .parquet or .mf4",
+            NOT_HELD,
         )
     infinite = 0
     with path.open("wb") as file:

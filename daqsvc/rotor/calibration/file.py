@@ -17,6 +17,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Val
 from pydantic_core import PydanticCustomError
 
 from daqsvc.confined.small_toml import TomlFileError, parse_toml, read_toml
+from daqsvc.errors.detectors import CALIBRATION_FILE
 from daqsvc.rotor.calibration.run_up import RunUpFit
 from daqsvc.rotor.calibration.two_modes import TwoModeFit
 from daqsvc.rotor.laval import LavalRotor
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
 
 class CalibrationFileError(ValueError):
     """A calibration file cannot be read, used or written; the message says why and what to do."""
+
+    code = CALIBRATION_FILE
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

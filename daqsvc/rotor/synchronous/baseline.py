@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daqsvc.errors.recordings import NOT_HEALTHY
 from daqsvc.rotor.laval import LavalRotor, unbalance_response
 from daqsvc.rotor.synchronous.departure import (
     NONSTATIONARITY_NATS,
@@ -54,6 +55,8 @@ _LEAST_WHIRL = 3.0
 
 class NotCalibratableError(ValueError):
     """The data cannot be the healthy baseline; the message says why and what to do."""
+
+    code = NOT_HEALTHY
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -177,6 +177,7 @@ def test_it_ends_after_the_time_that_is_given(bus: UnixBus, machine: Path, tmp_p
         output, said = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 1
     assert "has carried no frame" in said
+    assert said.endswith("[C20]\n")
     assert json.loads(output)["files"] == []
     assert not (tmp_path / "run.log").exists()
     assert bus.recv(0) is None

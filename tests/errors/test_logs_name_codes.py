@@ -1,0 +1,142 @@
+"""Every line of the log about a fault has a code, as a field of its record and at its end."""
+
+from __future__ import annotations
+
+import ast
+import io
+import logging
+import ssl
+from typing import TYPE_CHECKING
+
+import pytest
+from errors.test_errors_name_codes import FILES
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.reasoncodes import ReasonCode
+from support.paths import ROOT
+
+from daqsvc.acquisition.link import Link
+from daqsvc.alarms.codes import OF_SERVICE, code_of_alarm
+from daqsvc.cli import start_logging
+from daqsvc.errors.buses import LINK_LOST
+from daqsvc.errors.code import coded
+from daqsvc.publish.mqtt.errors import MqttCodeError, Outage, TakenOverError
+from daqsvc.reference.alarms import OWN
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+LEVELS = {"warning", "error", "exception", "critical"}
+LOGGERS = {"log", "logger", "self._log"}
+
+NO_FAULT = {
+    "daqsvc/acquisition/link.py": {"'%s is back' if self._ever_up else '%s is there now'"},
+    "daqsvc/acquisition/standing.py": {"'stream %r: its samples can be judged by again'"},
+    "daqsvc/commands/process_guard.py": {
+        "'%s is ignored: it means nothing to the service'",
+        "'SIGHUP: the service starts; it reads its machine files again when it is ready'",
+        "'%s'",  # why it was asked to stop
+    },
+    "daqsvc/commands/run.py": {"'SIGHUP: the machine files say nothing different'"},
+    "daqsvc/control.py": {"'commands are taken at %s now'"},
+    "daqsvc/kernel_cache.py": {"'compiling kernels for this processor (%stakes up to a minute)'"},
+    "daqsvc/outbox/journal.py": {
+        "'outbox %s: %d messages were saved from %s'",
+        "'outbox %s: the saving of what was left of %s is finished'",
+    },
+    "daqsvc/outbox/machine_files.py": {"'the store %s was that of %s; now it is that of %s'"},  # on purpose
+    "daqsvc/outbox/telemetry_file.py": {"'telemetry file %s can be used again'"},
+    "daqsvc/outbox/writer.py": {"'outbox %s can be used again'"},
+    "daqsvc/page/plant/link.py": {"'MQTT broker %s is back'"},
+    "daqsvc/publish/mqtt/publisher.py": {"'MQTT broker %s is back'"},
+    "daqsvc/publish/page/output.py": {"'page: %s'"},  # what another process says, with its codes
+    "daqsvc/publish/sparkplug/edge.py": {"'Sparkplug is connected to broker %s:%d'"},
+    "daqsvc/publish/sparkplug/host.py": {
+        "'Sparkplug: primary host %s is online; births, alarms and figures go out'"
+    },
+    "daqsvc/recorder.py": {"'snapshots of %s are written again'"},
+    "daqsvc/service.py": {"'reloaded: %s'"},
+    "daqsvc/supervision.py": {"'%s gets on again'"},
+    "drivers/modbus/line.py": {"message"},  # that a unit is back
+}
+"""The lines about no fault: something is back, or was asked for."""
+
+
+def lines(file: Path) -> Iterator[ast.Call]:
+    """The calls that write a line of the log from WARNING on."""
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if (
+            isinstance(node, ast.Call)
+            and isinstance(node.func, ast.Attribute)
+            and node.func.attr in LEVELS
+            and ast.unparse(node.func.value) in LOGGERS
+        ):
+            yield node
+
+
+def names_a_code(call: ast.Call) -> bool:
+    """Whether a call hands over a code as a field of the record."""
+    fields = next((ast.unparse(one.value) for one in call.keywords if one.arg == "extra"), "")
+    return fields.startswith("coded(") and fields != "coded(None)"
+
+
+SERVICE = [file for file in FILES if file.relative_to(ROOT).parts[0] != "sim_hw"]
+
+
+@pytest.mark.parametrize("file", SERVICE, ids=lambda file: str(file.relative_to(ROOT)))
+def test_a_line_about_a_fault_names_a_code(file: Path) -> None:
+    place = str(file.relative_to(ROOT))
+    without = {ast.unparse(call.args[0]) for call in lines(file) if not names_a_code(call)}
+    assert without == NO_FAULT.get(place, set())
+
+
+def test_the_code_is_a_field_of_the_record_and_ends_the_line(caplog: pytest.LogCaptureFixture) -> None:
+    handler = logging.StreamHandler(io.StringIO())
+    start_logging(verbose=False, handler=handler)
+    logging.getLogger("test").warning("%s is away", "can0", extra=coded(LINK_LOST))
+    logging.getLogger("test").warning("all is well")
+    coded_one, plain = caplog.records
+    assert coded_one.__dict__["code"] is LINK_LOST
+    assert handler.format(coded_one).endswith("WARNING can0 is away [B29]")
+    assert handler.format(plain).endswith("WARNING all is well")
+
+
+def codes_of_faults(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [f"{record.__dict__['code']}" for record in caplog.records if "code" in record.__dict__]
+
+
+def test_a_link_has_the_code_of_why_it_is_down(caplog: pytest.LogCaptureFixture) -> None:
+    link = Link("can0")
+    link.down("nobody is there")
+    assert link.code is LINK_LOST
+    link.up()
+    assert link.code is None
+    link.fail("its reader failed", ValueError("odd"))
+    assert f"{link.code}" == "B31"
+    link.leave_out("nobody is there")
+    assert f"{link.code}" == "B30"
+    link.end("all was played")
+    assert link.code is None
+    assert codes_of_faults(caplog) == ["B29", "B31", "B30"]
+
+
+def test_what_keeps_a_broker_away_has_a_code(caplog: pytest.LogCaptureFixture) -> None:
+    refused = ReasonCode(PacketTypes.CONNACK, "Not authorized")
+    for error in (
+        ConnectionRefusedError(),
+        ssl.SSLError(1, "no shared cipher"),
+        MqttCodeError(refused),
+        TakenOverError(),
+        FileNotFoundError(2, "No such file", "password"),
+    ):
+        Outage(logging.getLogger("test")).tell("the broker", error, "it is tried again")
+    assert codes_of_faults(caplog) == ["O09", "O10", "O11", "O13", "O01"]
+
+
+def test_every_alarm_of_the_service_has_a_code() -> None:
+    of_handling = {"alarm-flood", "trip-multiply"}  # nothing is wrong with data or service
+    assert OF_SERVICE.keys() == OWN.keys() - of_handling
+    assert f"{code_of_alarm('sensor-ok/probe-x', 'missing')}" == "B35"
+    assert f"{code_of_alarm('sensor-ok/probe-x', 'not_ok')}" == "D21"
+    assert f"{code_of_alarm('certificate/broker', 'good')}" == "O23"
+    assert code_of_alarm("housing", "good") is None
