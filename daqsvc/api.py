@@ -28,9 +28,12 @@ from daqsvc.settings.packing import PackedLayout
 from daqsvc.settings.plugins import StreamWords
 from daqsvc.settings.problems import AssemblyError, Finding, choice
 from daqsvc.settings.section import Name, Section, Text
+from drivers import questions, toml_lines
 from drivers.base import BusCounters, BusOptionError, BusPort, DeviceAbsentError, Driver, StreamSpec
+from drivers.bus_questions import BusQuestions, Heard
 from drivers.frames import FrameLayout, LayoutError
 from drivers.plugin import DriverPlugin
+from drivers.questions import Question, Topic
 from drivers.reconnect import Attempt, CannotOpenError, in_thread, run_with_reconnect
 from drivers.sniffing import Sniffed, Sniffer, SniffError, SniffTable
 from drivers.stream_driver import StreamDriver, assembler_of
@@ -42,6 +45,7 @@ __all__ = [
     "BusCounters",
     "BusOptionError",
     "BusPort",
+    "BusQuestions",
     "CannotOpenError",
     "Clock",
     "Condition",
@@ -57,6 +61,7 @@ __all__ = [
     "Evaluated",
     "Finding",
     "FrameLayout",
+    "Heard",
     "Judgement",
     "Layout",
     "LayoutError",
@@ -69,6 +74,7 @@ __all__ = [
     "OutputPlugin",
     "OutputPort",
     "PackedLayout",
+    "Question",
     "Reading",
     "Recorded",
     "RecordedDetector",
@@ -87,6 +93,7 @@ __all__ = [
     "StreamSpec",
     "StreamWords",
     "Text",
+    "Topic",
     "UnfitOptionError",
     "Watched",
     "Window",
@@ -94,6 +101,8 @@ __all__ = [
     "assembler_of",
     "choice",
     "in_thread",
+    "questions",
     "run_with_reconnect",
     "statements_of",
+    "toml_lines",
 ]

@@ -7,7 +7,9 @@ one by entry point in the group ``daqsvc.sniffers``, under the name of its drive
 
 from __future__ import annotations
 
+import argparse
 import json
+import math
 import re
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -17,9 +19,9 @@ from daqsvc.errors.command_line import NOT_OPENED, WRONG_VALUE
 from daqsvc.settings.units import unit_of
 
 if TYPE_CHECKING:
-    import argparse
     import threading
     from collections.abc import Callable, Mapping, Sequence
+    from typing import NoReturn
 
 
 LONGEST_UNIT = 16
@@ -38,6 +40,10 @@ class SniffError(Exception):
         super().__init__(message)
         self.usage = usage
         self.code = WRONG_VALUE if usage else NOT_OPENED
+
+
+class NothingFoundError(SniffError):
+    """The bus was looked at, and nothing of use was on it."""
 
 
 class SniffTable(NamedTuple):
@@ -146,3 +152,45 @@ def unused(name: str, taken: set[str]) -> str:
 def rounded_rate(rate_hz: float) -> float:
     """A rate that was measured, to three digits."""
     return float(f"{rate_hz:.3g}")
+
+
+_USUAL = (1.0, 1.25, 1.28, 1.6, 2.0, 2.4, 2.5, 2.56, 3.2, 4.0, 4.8, 5.0, 5.12, 6.4, 8.0, 9.6, 10.0)
+"""First digits of the rates that makers of devices choose, beside powers of 2."""
+_NEAR = 0.005
+
+
+def usual_rate(rate_hz: float) -> float:
+    """The usual rate that a measured one is within 0.5 % of; else that one to three digits."""
+    decade = 10.0 ** math.floor(math.log10(rate_hz))
+    usual = [digits * decade for digits in _USUAL] + [2.0 ** round(math.log2(rate_hz))]
+    nearest = min(usual, key=lambda one: abs(one - rate_hz))
+    return round(nearest, 6) if abs(nearest - rate_hz) <= _NEAR * rate_hz else rounded_rate(rate_hz)
+
+
+class _Words(argparse.ArgumentParser):
+    """Arguments that a program has written."""
+
+    def error(self, message: str) -> NoReturn:
+        """See `argparse.ArgumentParser.error`.
+
+        Raises:
+            SniffError: always.
+        """
+        raise SniffError(message, usage=True)
+
+
+def sniffed(
+    sniffer: Sniffer, words: Sequence[str], stop: threading.Event, tell: Callable[[str], None]
+) -> Mapping[str, Any]:
+    """The figures of what a sniffer finds, with arguments as they would be typed.
+
+    Raises:
+        SniffError: nothing can be seen; says what to do.
+        NothingFoundError: nothing was there; likewise.
+    """
+    parser = _Words(add_help=False)
+    sniffer.add_arguments(parser)
+    found = sniffer.sniff(parser.parse_args(words), stop, tell)
+    if found.problem:
+        raise NothingFoundError(found.problem)
+    return found.figures

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import json
-import signal
 import sys
-import threading
-from contextlib import contextmanager
-from importlib.metadata import entry_points
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, signals_to_end
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE
 from daqsvc.commands.complaint import complain
-from daqsvc.errors.command_line import LEFT_OUT, NOTHING_ON_BUS
+from daqsvc.commands.plugged import plugged
+from daqsvc.commands.stopping import stopping
+from daqsvc.errors.command_line import NOTHING_ON_BUS
 from drivers.can.sniff import CanSniffer
 from drivers.modbus.sniff import ModbusSniffer
 from drivers.serial.sniff import SerialSniffer
@@ -20,7 +18,6 @@ from drivers.sniffing import Sniffer, SniffError
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Iterator
 
     from drivers.sniffing import Sniffed, SniffTable
 
@@ -49,7 +46,7 @@ class SniffCommand:
         """See `daqsvc.cli.Command.run`."""
         sniffer: Sniffer = arguments.sniffer
         try:
-            with _stopping() as stop:
+            with stopping() as stop:
                 found = sniffer.sniff(arguments, stop, _tell)
         except SniffError as error:
             return complain("daqsvc", error, error.code, EXIT_USAGE if error.usage else EXIT_FAILED)
@@ -62,35 +59,8 @@ class SniffCommand:
 
 def sniffers() -> dict[str, Sniffer]:
     """Every kind of bus that can be looked at, by the name of its driver."""
-    known: dict[str, Sniffer] = {"can": CanSniffer(), "serial": SerialSniffer(), "modbus": ModbusSniffer()}
-    for point in entry_points(group=SNIFFERS):
-        try:
-            made = point.load()()
-        except Exception as error:  # noqa: BLE001 - whatever a package does must not take the others along
-            complain("daqsvc", f"sniff {point.name} is left out: {error}", LEFT_OUT)
-            continue
-        if isinstance(made, Sniffer):
-            known[point.name] = made
-        else:
-            what = f"sniff {point.name} is left out: it is not derived from Sniffer of daqsvc.api"
-            complain("daqsvc", what, LEFT_OUT)
-    return known
-
-
-@contextmanager
-def _stopping() -> Iterator[threading.Event]:
-    """What is set by Ctrl-C and by the signals that end a program."""
-    stop = threading.Event()
-
-    def handle(_number: int, _frame: Any) -> None:
-        stop.set()
-
-    before = {number: signal.signal(number, handle) for number in signals_to_end()}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    ours: dict[str, Sniffer] = {"can": CanSniffer(), "serial": SerialSniffer(), "modbus": ModbusSniffer()}
+    return ours | plugged(SNIFFERS, Sniffer, "sniff")  # type: ignore[type-abstract]
 
 
 def _as_json(found: Sniffed) -> str:

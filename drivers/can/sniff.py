@@ -415,6 +415,7 @@ class _Report(NamedTuple):
             "errors": self.traffic.errors.counts,
             "controller_state": self.traffic.errors.state,
             "bitrate": self.bus.bitrate,
+            "data_bitrate": self.bus.data_bitrate,
             "load": None if load is None else {"least": load[0], "most": load[1]},
             "ids": [self._id_figures(one) for one in self._ids],
             **({} if self.dbc is None else {"dbc": self._dbc_figures(self.dbc)}),

@@ -136,12 +136,17 @@ def _check_bits(layout: ModbusLayout, path: KeyPath) -> Iterator[Finding]:
             )
 
 
+def manuals_first(address: int) -> int | None:
+    """The number that manuals give the first register, if an address looks like one of theirs."""
+    return next((first for first in _MANUALS_FIRST if first <= address < first + _MANUALS_RANGE), None)
+
+
 def _check_counted_from_0(layout: ModbusLayout, path: KeyPath) -> Iterator[Finding]:
     """An address is one of the line, and not the number that a manual gives."""
     if not isinstance(layout, RegistersLayout):
         return
     for index, channel in enumerate(layout.channels):
-        if first := next((n for n in _MANUALS_FIRST if n <= channel.address < n + _MANUALS_RANGE), None):
+        if first := manuals_first(channel.address):
             number = channel.address - first
             yield Finding(
                 (*path, "channels", index, "address"),

@@ -248,6 +248,8 @@ class _Report(NamedTuple):
                     "runs": [list(run) for run in table.runs],
                     "refused": [[address, code] for address, code in table.refused.items()],
                     "silent": table.silent,
+                    "moved": sorted(table.moved),
+                    "channels": [one._asdict() for one in _channels(table)],
                     "registers": [
                         {
                             "address": address,
@@ -291,7 +293,7 @@ class _Report(NamedTuple):
         return "\n".join(lines)
 
     def _stream(self, table: FoundTable, sensors: set[str]) -> Iterator[str]:
-        channels = dict(_channels(table))
+        channels = list(_channels(table))
         name = f"unit-{table.unit}" + ("" if table.function == 3 else "-input")
         yield f"[streams.{name}]"
         yield 'bus = "modbus"'
@@ -304,13 +306,28 @@ class _Report(NamedTuple):
             yield 'table = "input"'
         yield "max_gap = 0    # registers between them may not be there"
         yield "channels = ["
-        yield from (f"  {line}," for line in channels.values())
+        yield from (f"  {{ {one.keys} }}," for one in channels)
         yield "]"
-        yield from sensor_lines(name, dict.fromkeys(channels, "1"), sensors)
+        yield from sensor_lines(name, dict.fromkeys((one.name for one in channels), "1"), sensors)
 
 
-def _channels(table: FoundTable) -> Iterator[tuple[str, str]]:
-    """Name and table of each channel: numbers that are likely, else registers that move, else those not 0."""
+class _Channel(NamedTuple):
+    """A number that is worth reading."""
+
+    name: str
+    address: int
+    type: str
+    order: str
+
+    @property
+    def keys(self) -> str:
+        """As in a machine file."""
+        order = "" if self.order == "ABCD" else f", order = {quoted(self.order)}"
+        return f"name = {quoted(self.name)}, address = {self.address}, type = {quoted(self.type)}{order}"
+
+
+def _channels(table: FoundTable) -> Iterator[_Channel]:
+    """What to read: numbers that are likely, else registers that move, else those that are not 0."""
     from drivers.modbus.readings import chosen  # noqa: PLC0415 - only for who scans
 
     wide: dict[int, Reading] = {one.address: one for one in chosen(table.first, table.second)}
@@ -322,10 +339,8 @@ def _channels(table: FoundTable) -> Iterator[tuple[str, str]]:
     )
     for address in sorted({*wide, *singles})[:_MOST_CHANNELS]:
         one = wide.get(address)
-        kind = "uint16" if one is None else one.type
-        order = "" if one is None or one.order == "ABCD" else f", order = {quoted(one.order)}"
-        name = f"r{address}"
-        yield name, f"{{ name = {quoted(name)}, address = {address}, type = {quoted(kind)}{order} }}"
+        kind, order = ("uint16", "ABCD") if one is None else (one.type, one.order)
+        yield _Channel(f"r{address}", address, kind, order)
 
 
 def _words(one: Reading, *, mark: bool) -> str:

@@ -382,6 +382,7 @@ class _Report(NamedTuple):
             "framing": None,
         }
         if isinstance(what, TextLines):
+            counter, time_column = _counter(what), self._time(what)
             figures |= {
                 "framing": "lines",
                 "delimiter": what.delimiter,
@@ -390,7 +391,14 @@ class _Report(NamedTuple):
                 "checksum": what.checksum,
                 "header": what.header,
                 "columns": [
-                    {"name": one.name, "numeric": one.numeric, "min": one.least, "max": one.most}
+                    {
+                        "name": one.name,
+                        "numeric": one.numeric,
+                        "min": one.least,
+                        "max": one.most,
+                        "counts": one is counter,
+                        "time_unit": self._time_unit(what, one) if one is time_column else None,
+                    }
                     for one in what.columns
                 ],
                 "lines": list(what.lines[:_SHOWN_LINES]),
@@ -404,7 +412,10 @@ class _Report(NamedTuple):
                 "payload_length": what.payload_length,
                 "crc": what.crc,
                 "crc_order": what.crc_order,
+                "crc_bytes": what.crc_bytes,
+                "crc_from": what.crc_from,
                 "counter": None if what.counter is None else what.counter._asdict(),
+                "counter_bits": None if (packed := _packed(what)) is None else packed.counter_bits,
             }
         return figures
 

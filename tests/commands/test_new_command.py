@@ -20,13 +20,16 @@ from support.examples import examples
 from support.paths import ROOT
 
 from daqsvc.cli import main
-from daqsvc.commands.new.buses import BUSES
+from daqsvc.commands.new.buses import buses
 from daqsvc.commands.new.interview import Given, checked, conduct, refusal, take
 from daqsvc.commands.new.machine_text import machine_text, questions
+from daqsvc.commands.new.topics import all_topics
 from daqsvc.settings import load_machine_file
+from drivers.bus_questions import Heard
 
 if TYPE_CHECKING:
-    from daqsvc.commands.new.question import Question
+    from drivers.bus_questions import BusQuestions
+    from drivers.questions import Answers, Question
 
 pytestmark = pytest.mark.integration
 DBC = ROOT / "config" / "devices" / "triaxial-accelerometer.dbc"
@@ -65,6 +68,16 @@ FREE = {
     "block-address": st.integers(0, 65_535).map(str),
     "samples": st.sampled_from(["64", "1024", "8192"]),
     "columns": st.lists(NAMES, min_size=2, max_size=6, unique=True).map(", ".join),
+    "count-address": st.integers(0, 65_535).map(str),
+    "ring-address": st.integers(0, 65_535).map(str),
+    "fifo-address": st.integers(0, 65_535).map(str),
+    "acknowledge": st.one_of(st.just("none"), st.integers(0, 65_535).map(str)),
+    "depth": st.sampled_from(["2", "256", "1000", "1024", "32768"]),
+    "sync-word": st.sampled_from(["a55a", "0xFF 00", "zz", "00112233445566"]),
+    "payload-length": st.integers(0, 4096).map(str),
+    "counter-byte": st.one_of(st.just("none"), st.integers(0, 64).map(str)),
+    "first-byte": st.integers(0, 64).map(str),
+    "length": st.sampled_from(["6", "8", "12", "13", "64"]),
     "separator": st.sampled_from([",", ";", " ", r"\t"]),
     "prefix": st.sampled_from(["none", "$ACC", "LOG"]),
     "speed": st.one_of(st.sampled_from(["600", "1480", "-3000", "12000", "90"]), NUMBERS),
@@ -118,17 +131,52 @@ def test_whatever_is_answered_the_file_passes_check(data: st.DataObject) -> None
     assert machine.machine.speed_rpm == answers["speed"]
 
 
+@settings(
+    max_examples=examples(30),
+    deadline=None,
+    phases=[Phase.explicit, Phase.reuse, Phase.generate],
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
+)
+@given(data=st.data())
+def test_whatever_is_heard_the_file_passes_check(data: st.DataObject) -> None:
+    file = Path("/nowhere/machine.toml")
+    bus = data.draw(st.sampled_from(sorted(name for name, one in buses().items() if one.listens_behind)))
+    keys = [*all_topics(), *(f"sensor.{channel}.{topic}" for channel in "xy" for topic in SENSOR_ONES)]
+    proposed = {
+        key: data.draw(st.one_of(FREE.get(key.rpartition(".")[2], WORDS), WORDS, NUMBERS), label=key)
+        for key in data.draw(st.sets(st.sampled_from(keys)))
+    }
+    heard: list[str] = []
+
+    def listen(kind: BusQuestions, answers: Answers) -> Heard:
+        heard.append(kind.listens_behind)
+        assert kind.listens_behind in answers
+        return Heard([], lambda _answers: proposed)
+
+    beforehand = Given({"bus": bus, **NEEDED_OF.get(bus, {})}, defaults=True)
+    answers = conduct(file, beforehand, None, print, listen)
+    assert len(heard) == 1
+    checked(machine_text(answers, file.name), file)
+
+
+SENSOR_ONES = ("type", "name", "unit", "angle", "address", "register-type", "order")
+
+
 def grid() -> list[dict[str, str]]:
     """Answers of all kinds of buses and limits, one by one."""
     cases = [
         {"bus": bus, "limits": limits, **NEEDED_OF.get(bus, {})}
-        for bus in BUSES
+        for bus in buses()
         for limits in ("none", "iso", "own")
     ]
     for case in cases:
         if case["limits"] == "own":
             case["alert"] = "2.5"
     cases += [{"bus": "modbus-tcp", "host": "::1", "way": "waveform", "sensor.x.bearing": "6205-2RS"}]
+    cases += [{"bus": "serial", "port": "/dev/ttyS0", "framing": framing} for framing in ("cobs", "sync")]
+    cases += [{"bus": "modbus-tcp", "host": "::1", "way": way} for way in ("ring", "fifo")]
+    cases += [{"bus": "modbus-rtu", "port": "/dev/ttyS0", "way": way} for way in ("ring", "fifo")]
+    cases += [{"bus": "modbus-tcp", "host": "::1", "way": "fifo", "acknowledge": "700"}]
     cases += [{"bus": "can", "broker": "mqtts://broker.example", "username": "daq", "home-assistant": "yes"}]
     return cases
 
@@ -341,8 +389,40 @@ def test_the_end_of_the_input_leaves_nothing_behind(tmp_path):
 
 def test_answers_that_fit_each_other_are_taken_whatever_comes_later():
     """No answer is refused because of the default of a later question: nobody would know what to change."""
-    for bus in BUSES:
+    for bus in buses():
         answers = conduct(
             Path("m.toml"), Given({"bus": bus, **NEEDED_OF.get(bus, {})}, defaults=True), None, print
         )
         assert refusal(answers, Path("m.toml")) is None
+
+
+def asked(texts: list[str], bus: str, **given: str) -> tuple[Answers, list[str], list[str | None]]:
+    """Answers of somebody who types these texts at the registers, reasons given, and defaults shown there."""
+    said: list[str] = []
+    shown: list[str | None] = []
+
+    def ask(question: Question) -> str:
+        if question.key != "sensor.a.address":
+            assert question.default is not None, question.key
+            return question.default
+        shown.append(question.default)
+        return texts.pop(0) or f"{question.default}"
+
+    beforehand = Given({"bus": bus, "host": "::1", "channels": "a", **given}, defaults=False)
+    return conduct(Path("m.toml"), beforehand, ask, said.append), said, shown
+
+
+def test_a_number_of_the_manual_is_asked_again_with_the_address_that_it_means():
+    answers, said, shown = asked(["40017", ""], "modbus-tcp")
+    assert answers["sensor.a.address"] == 16
+    assert shown == ["0", "16"]
+    assert "looks like a number of the manual, where registers begin at 40001: that is 16 here" in said[0]
+    answers, said, _ = asked(["30001", "30001"], "modbus-tcp")
+    assert answers["sensor.a.address"] == 30_001
+    assert len(said) == 1
+    assert asked(["30000"], "modbus-tcp")[1] == []
+
+
+def test_names_without_commas_are_told_of(capsys):
+    assert main(["new", "--yes", "--bus=modbus-tcp", "--host=::1", "--channels=vibration temp"]) == 2
+    assert '"vibration temp" has no commas: write vibration, temp' in capsys.readouterr().err

@@ -10,6 +10,7 @@ NAMES = {
     *("Driver", "DriverPlugin", "StreamDriver", "BusPort", "BusCounters", "StreamSpec", "Link", "Clock"),
     *("StreamAssembler", "assembler_of", "SampleBlock", "FrameLayout", "LayoutError"),
     *("Device", "DeviceAbsentError", "BusOptionError", "Severity"),
+    *("BusQuestions", "Heard", "Question", "Topic", "questions", "toml_lines"),
     *("Sniffer", "Sniffed", "SniffTable", "SniffError"),
     *("Attempt", "CannotOpenError", "in_thread", "run_with_reconnect"),
     *("Detector", "DetectorPlugin", "WindowDetector", "Judgement", "Window", "Diagnosis", "Reading"),

@@ -7,20 +7,23 @@ import shlex
 import sys
 import tempfile
 import tomllib
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.commands.arguments import EXIT_OK, EXIT_USAGE
 from daqsvc.commands.complaint import complain
-from daqsvc.commands.new.question import SENSOR, short_name
-from daqsvc.commands.new.topics import TOPICS
+from daqsvc.commands.new.buses import bus_of
+from daqsvc.commands.new.topics import all_topics
 from daqsvc.errors.command_line import CANNOT_WRITE, INTERRUPTED
+from drivers.questions import SENSOR, short_name
 
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Iterator, Mapping
 
-    from daqsvc.commands.new.question import Answers, Question
+    from drivers.bus_questions import BusQuestions, Heard
+    from drivers.questions import Answers, Question
 
 
 class NewCommand:
@@ -38,6 +41,11 @@ class NewCommand:
         parser.add_argument(
             "file", type=Path, nargs="?", metavar="FILE", help="to write (default: the machine's name .toml)"
         )
+        parser.add_argument(
+            "--listen",
+            action="store_true",
+            help="look at the bus as soon as it is known where it is, and propose what is found there",
+        )
         parser.add_argument("--yes", action="store_true", help="take the default of whatever is not answered")
         parser.add_argument("--overwrite", action="store_true", help="write over a file that is there")
         parser.add_argument(
@@ -52,7 +60,7 @@ class NewCommand:
             help="of one channel, e.g. x.type=accelerometer; TOPIC is type, name, unit, sensitivity, angle, "
             "threshold, bearing; with Modbus values address, register-type, order, scale, too",
         )
-        for key, topic in TOPICS.items():
+        for key, topic in all_topics().items():
             group.add_argument(
                 f"--{key}", dest=f"answer {key}", metavar="ANSWER", help=topic.text.replace("%", "%%")
             )
@@ -71,7 +79,8 @@ class NewCommand:
                 _say("Enter takes what is in brackets, ? explains, Ctrl-C ends and writes nothing.\n")
             folder = arguments.file or Path("machine.toml")
             ask = _ask if person and not arguments.yes else None
-            answers = conduct(folder, given, ask, lambda reason: _say(f"  {reason}"))
+            listen = partial(_heard, folder.parent) if arguments.listen else None
+            answers = conduct(folder, given, ask, lambda reason: _say(f"  {reason}"), listen)
             file = arguments.file or Path(f"{short_name(answers['name'])}.toml")
             text = machine_text(answers, shlex.quote(file.name))
             if file.exists() and not arguments.overwrite:
@@ -93,7 +102,7 @@ def _given(arguments: argparse.Namespace) -> dict[str, str]:
     from daqsvc.commands.new.interview import AnswerError  # noqa: PLC0415 - slow to import
 
     given = {} if arguments.answers is None else _of_file(arguments.answers)
-    for key in TOPICS:
+    for key in all_topics():
         answer = getattr(arguments, f"answer {key}")
         if answer is not None:
             given[key] = answer
@@ -114,12 +123,12 @@ def _of_file(path: Path) -> dict[str, str]:
         raise AnswerError(f"--answers {path}: {error.strerror}") from None
     except ValueError as error:  # of TOML, or of UTF-8
         raise AnswerError(f"--answers {path} is no TOML: {error}") from None
-    answers = dict(_flat(document))
+    answers, known = dict(_flat(document)), all_topics()
     for key in answers:
-        if key not in TOPICS and not key.startswith(f"{SENSOR}."):
+        if key not in known and not key.startswith(f"{SENSOR}."):
             from daqsvc.settings.problems import choice  # noqa: PLC0415 - slow to import
 
-            raise AnswerError(f"--answers {path}: there is no question {key!r}; {choice(key, TOPICS)}")
+            raise AnswerError(f"--answers {path}: there is no question {key!r}; {choice(key, known)}")
     return answers
 
 
@@ -170,6 +179,23 @@ def _ask(question: Question) -> str:
             _say("  there is no default: type an answer, or ? for help")
 
 
+def _heard(folder: Path, bus: BusQuestions, answers: Answers) -> Heard | None:
+    """What is on the bus, which a person is told, too; None if nothing was found."""
+    from daqsvc.commands.stopping import stopping  # noqa: PLC0415 - only for who listens
+    from drivers.sniffing import SniffError  # noqa: PLC0415
+
+    try:
+        with stopping() as stop:
+            heard = bus.listen(answers, folder, stop, lambda line: _say(f"  {line}"))
+    except SniffError as error:
+        _say(f"  Nothing was found: {error}")
+        return None
+    _say("  Found, and proposed below:")
+    for line in heard.lines:
+        _say(f"    {line}")
+    return heard
+
+
 def _other_file(file: Path, ask: Any) -> Path:
     """What to do about a file that is there already: write over it, or take another name.
 
@@ -206,8 +232,7 @@ def _write(file: Path, text: str) -> None:
 
 def _report(file: Path, text: str, answers: Answers) -> int:
     """Say what was written, and what to type next."""
-    from daqsvc.box import Box  # noqa: PLC0415
-    from daqsvc.commands.new.buses import BUSES  # noqa: PLC0415 - slow to import
+    from daqsvc.box import Box  # noqa: PLC0415 - slow to import
     from daqsvc.commands.new.interview import checked  # noqa: PLC0415
     from daqsvc.commands.store_argument import doubts_of_owner  # noqa: PLC0415
 
@@ -216,7 +241,7 @@ def _report(file: Path, text: str, answers: Answers) -> int:
     _say(f"\n{file} is written; daqsvc check finds no error in it.")
     for warning in (*machine.warnings, *doubts_of_owner(Box.single(machine))):
         _say(f"{warning}")
-    beside, about = BUSES[answers["bus"]].beside(quoted)
+    beside, about = bus_of(answers).beside(quoted)
     commands = {
         f"daqsvc check {quoted}": "what was understood",
         f"daqsvc run {quoted}": "watches the machine, until Ctrl-C",

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import difflib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from daqsvc.commands.new.buses import bus_of
 from daqsvc.commands.new.machine_text import machine_text, questions
-from daqsvc.commands.new.question import SENSOR, Answers, Question
 from daqsvc.errors.command_line import ANSWER
+from drivers.questions import SENSOR, Answers, Question
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
     from daqsvc.settings import MachineFile
+    from drivers.bus_questions import BusQuestions, Heard
 
 
 class AnswerError(Exception):
@@ -37,7 +39,11 @@ class Given:
 
 
 def conduct(
-    file: Path, given: Given, ask: Callable[[Question], str] | None, say: Callable[[str], None]
+    file: Path,
+    given: Given,
+    ask: Callable[[Question], str] | None,
+    say: Callable[[str], None],
+    listen: Callable[[BusQuestions, Answers], Heard | None] | None = None,
 ) -> Answers:
     """All answers.
 
@@ -46,13 +52,16 @@ def conduct(
         given: what was answered beforehand.
         ask: asks a person; None where there is nobody.
         say: tells that person why an answer is asked for again.
+        listen: looks at the bus as soon as it is known where it is; None if nobody wants that.
 
     Raises:
         AnswerError: what was given cannot be used, or something is missing.
     """
     answers: Answers = {}
     asked: list[str] = []
-    for question in questions(answers, file.parent):
+    heard: Heard | None = None
+    for plain in questions(answers, file.parent):
+        question = plain if heard is None else _offered(plain, heard, answers, file)
         asked.append(question.key)
         if question.key in given.texts:
             reason = take(question, given.texts[question.key], answers, file)
@@ -67,10 +76,43 @@ def conduct(
         elif ask is None:
             raise AnswerError(_missing(question))
         else:
-            while (reason := take(question, ask(question), answers, file)) is not None:
-                say(reason)
+            _answer(question, ask, say, answers, file)
+        if listen is not None and question.key == bus_of(answers).listens_behind:
+            heard = listen(bus_of(answers), answers)
     _refuse_others(given, asked)
     return answers
+
+
+def _answer(
+    question: Question,
+    ask: Callable[[Question], str],
+    say: Callable[[str], None],
+    answers: Answers,
+    file: Path,
+) -> None:
+    """Ask a person until there is an answer that can be used, and that is not most likely a mistake."""
+    before = None
+    while True:
+        text = ask(question)
+        reason = take(question, text, answers, file)
+        if reason is None and question.doubt is not None and text != before:
+            doubt = question.doubt(answers[question.key])
+            if doubt is not None:
+                reason, instead = doubt
+                del answers[question.key]
+                question = replace(question, default=instead)
+        if reason is None:
+            return
+        say(reason)
+        before = text
+
+
+def _offered(question: Question, heard: Heard, answers: Answers, file: Path) -> Question:
+    """The question with what was heard as its default, where that can be used; then it is never quiet."""
+    text = heard.proposals(answers).get(question.key)
+    if text is None or text == question.default or take(question, text, dict(answers), file) is not None:
+        return question
+    return replace(question, default=text, quiet=False)
 
 
 def take(question: Question, text: str, answers: Answers, file: Path) -> str | None:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from daqsvc.commands.new import question as q
-from daqsvc.commands.new.buses import BUSES
-from daqsvc.commands.new.question import NONE, Answers, Question
+from daqsvc.commands.new.buses import bus_of, buses
 from daqsvc.commands.new.sensors import (
     alarm_tables,
     limit_questions,
@@ -14,8 +12,10 @@ from daqsvc.commands.new.sensors import (
     sensor_questions,
     sensor_tables,
 )
-from daqsvc.commands.new.toml_lines import entry
 from daqsvc.commands.new.topics import TOPICS
+from drivers import questions as q
+from drivers.questions import NONE, Answers, Question
+from drivers.toml_lines import entry
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -29,10 +29,10 @@ def questions(answers: Answers, folder: Path) -> Iterator[Question]:
         answers: those before; whoever takes a question puts its answer there before the next one.
         folder: of the machine file, where relative paths start.
     """
-    choices = {word: bus.about for word, bus in BUSES.items()}
+    choices = {word: bus.about for word, bus in buses().items()}
     yield Question("bus", TOPICS["bus"], q.one_of(choices), "virtual", choices)
-    bus = BUSES[answers["bus"]]
-    virtual = answers["bus"] == "virtual"
+    bus = bus_of(answers)
+    virtual = bus.simulated
     yield Question("name", TOPICS["name"], q.title, "rig" if virtual else "machine")
     yield Question("site", TOPICS["site"], q.name, "plant", quiet=True)
     yield Question("box", TOPICS["box"], q.name, "edge-1", quiet=True)
@@ -62,7 +62,7 @@ def machine_text(answers: Answers, file: str) -> str:
         answers: to all `questions`.
         file: its name, for the commands that its first comment shows.
     """
-    lines = [*_head(answers, file), *_machine(answers), *BUSES[answers["bus"]].tables(answers), ""]
+    lines = [*_head(answers, file), *_machine(answers), *bus_of(answers).tables(answers), ""]
     lines += [*sensor_tables(answers), *pipeline_tables(answers), *alarm_tables(answers), *_broker(answers)]
     return "\n".join(line.rstrip() for line in lines).rstrip() + "\n"
 

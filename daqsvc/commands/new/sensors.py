@@ -6,11 +6,12 @@ import math
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from daqsvc.commands.new import question as q
-from daqsvc.commands.new.buses import BUSES, STREAM
-from daqsvc.commands.new.question import NONE, Answers, Question, sensor_key
-from daqsvc.commands.new.toml_lines import array, behind, entry, toml
+from daqsvc.commands.new.buses import bus_of
 from daqsvc.commands.new.topics import SENSOR_TOPICS, TOPICS
+from drivers import questions as q
+from drivers.bus_questions import STREAM
+from drivers.questions import NONE, Answers, Question, sensor_key
+from drivers.toml_lines import array, behind, entry, toml
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -79,7 +80,7 @@ class Sensor(NamedTuple):
 def sensors(answers: Answers) -> list[Sensor]:
     """The sensors as far as they have been answered."""
     found = []
-    for channel in BUSES[answers["bus"]].channels(answers):
+    for channel in bus_of(answers).channels(answers):
         kind = answers.get(sensor_key(channel, "type"), NONE)
         if kind != NONE and sensor_key(channel, "name") in answers:
             unit = _FIXED_UNITS.get(kind) or answers.get(sensor_key(channel, "unit"), "")
@@ -90,17 +91,17 @@ def sensors(answers: Answers) -> list[Sensor]:
 
 def sensor_questions(answers: Answers) -> Iterator[Question]:
     """What is on each channel."""
-    bus = BUSES[answers["bus"]]
+    bus = bus_of(answers)
     for channel in bus.channels(answers):
         yield from bus.of_channel(answers, channel)
         yield from _of_channel(answers, channel)
 
 
 def _of_channel(answers: Answers, channel: str) -> Iterator[Question]:
-    bus = BUSES[answers["bus"]]
+    bus = bus_of(answers)
     known = {kind: TYPES[kind] for kind in bus.sensor_types(answers)}
     kind, unit = bus.guess(answers, channel)
-    quiet = answers["bus"] == "virtual"
+    quiet = bus_of(answers).simulated
 
     def ask(topic: str, read: Any, default: str, **more: Any) -> Question:
         words = SENSOR_TOPICS[topic]
@@ -130,7 +131,7 @@ def _of_channel(answers: Answers, channel: str) -> Iterator[Question]:
 def _of_waveform(answers: Answers, channel: str, ask: Any) -> Iterator[Question]:
     kind = answers[sensor_key(channel, "type")]
     unit = _FIXED_UNITS.get(kind) or answers[sensor_key(channel, "unit")]
-    volts = BUSES[answers["bus"]].in_volts(answers)
+    volts = bus_of(answers).in_volts(answers)
     yield ask("sensitivity", q.number_or_none, f"{_SENSITIVITY[unit]:g}" if volts else NONE)
     if kind == "proximity":
         probes = [one for one in sensors(answers) if one.type == "proximity"]
@@ -183,7 +184,7 @@ def limit_questions(answers: Answers) -> Iterator[Question]:
     limited = [one for one in sensors(answers) if one.measure is not None]
     if not limited:
         return
-    quiet = answers["bus"] == "virtual"
+    quiet = bus_of(answers).simulated
     in_range = _ISO_RPM[0] <= abs(answers["speed"]) <= _ISO_RPM[1]
     choices = {"iso": "zones of ISO 20816-3", "own": "two figures of yours", NONE: "write them later"}
     if not in_range or not any(one.iso for one in limited):

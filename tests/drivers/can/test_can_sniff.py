@@ -19,7 +19,7 @@ from support.paths import ROOT
 from support.waiting import PATIENCE_S
 
 from daqsvc.cli import main
-from drivers.can import sniff, socketcan
+from drivers.can import questions, sniff, socketcan
 from sim_hw.bus_socket import UnixBus
 from sim_hw.bus_socket_hub import Hub
 
@@ -272,3 +272,64 @@ def test_wrong_arguments_are_one_line(
     said = capsys.readouterr().err
     assert words in said
     assert len(said.splitlines()) == 1
+
+
+def packed(bus: UnixBus, number: int) -> None:
+    """Two samples of two channels, behind a counter of samples."""
+    payload = (2 * number % 65_536).to_bytes(2, "big") + bytes(range(8)) + bytes([number % 251, 0])
+    bus.send(can.Message(arbitration_id=0x2A1, is_extended_id=False, data=payload, is_fd=True))
+    if number % 3 == 0:
+        bus.send(can.Message(arbitration_id=0x80, is_extended_id=False, data=b"\x01"))
+
+
+def new(tmp_path: Path, *more: str) -> dict[str, Any]:
+    """The machine file of `daqsvc new --listen`, which check has accepted."""
+    file = tmp_path / "new.toml"
+    words = ["--listen", "--interface=unixbus", f"--channel={tmp_path / 'bus'}", "--overwrite", *more]
+    assert main(["new", f"{file}", "--yes", *words]) == 0
+    return tomllib.loads(file.read_text("utf-8"))
+
+
+@pytest.mark.usefixtures("hub")
+def test_new_proposes_the_frames_that_it_hears(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 3.0)
+    with talking(tmp_path / "bus", packed):
+        tables = new(tmp_path, "--bus=can")
+        other = new(tmp_path, "--bus=can", "--id=0x80", "--channels=state", "--raw-type=uint8")
+    said = capsys.readouterr().out
+    assert "0x2a1: 12 bytes" in said
+    assert tables["buses"]["main"]["fd"] is True
+    layout = tables["streams"]["device"]["layout"]
+    assert (layout["id"], layout["length"], layout["samples_per_frame"]) == (0x2A1, 12, 2)
+    assert layout["counter"] == {"byte": 0, "bits": 16, "counts": "samples"}
+    assert (layout["byte_order"], layout["first_byte"]) == ("big", 2)
+    assert len(layout["channels"]) == 2
+    # Of another id than the one that is proposed, what was heard of that.
+    layout = other["streams"]["device"]["layout"]
+    assert (layout["length"], layout["no_counter"], layout["samples_per_frame"]) == (1, True, 1)
+    assert other["streams"]["device"]["rate_hz"] < tables["streams"]["device"]["rate_hz"] / 2
+
+
+@pytest.mark.usefixtures("hub")
+def test_new_proposes_the_message_that_comes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 0.5)
+    with talking(tmp_path / "bus", accelerations):
+        tables = new(tmp_path, "--bus=can-dbc", f"--dbc={DBC}")
+    layout = tables["streams"]["device"]["layout"]
+    assert layout["message"] == "Acceleration"
+    assert layout["counter"] == {"signal": "Sequence", "counts": "frames"}
+    assert 50 < tables["streams"]["device"]["rate_hz"] < 300
+
+
+@pytest.mark.usefixtures("hub")
+def test_new_says_what_to_do_when_no_frame_comes_and_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 0.2)
+    tables = new(tmp_path, "--bus=can")
+    said = capsys.readouterr().out
+    assert "Nothing was found: " in said
+    assert "Remedy: see that the devices are powered" in said
+    assert tables["streams"]["device"]["layout"]["id"] == 0x101

@@ -18,6 +18,7 @@ from support.ports import free_port
 from support.waiting import PATIENCE_S
 
 from daqsvc.cli import main
+from drivers.modbus import questions, sniff
 from sim_hw.nodes.modbus_node import ModbusRtuServer, ModbusTcpServer
 from sim_hw.nodes.modbus_unit import ModbusUnit
 
@@ -235,3 +236,64 @@ def test_ctrl_c_ends_it_early_and_shows_what_was_found() -> None:
             process.communicate()
     assert (process.returncode, said) == (0, "")
     assert json.loads(output)["units"] == [1]
+
+
+@pytest.fixture
+def _few_registers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sniff, "REGISTERS", "0-45")
+
+
+def new(tmp_path: Path, target: str, *more: str) -> dict[str, Any]:
+    """The machine file of `daqsvc new --listen`, which check has accepted."""
+    file = tmp_path / "new.toml"
+    host, _, port = target.rpartition(":")
+    words = ["--bus=modbus-tcp", f"--host={host}", f"--tcp-port={port}", "--listen", "--overwrite", *more]
+    assert main(["new", f"{file}", "--yes", *words]) == 0
+    return tomllib.loads(file.read_text("utf-8"))
+
+
+@pytest.mark.usefixtures("_few_registers")
+def test_new_proposes_the_registers_that_it_finds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    unit = pump()
+    with tcp({3: unit}) as target:
+        tables = new(tmp_path, target)
+        named = new(tmp_path, target, "--channels=speed, level, flow")
+    said = capsys.readouterr().out
+    assert "units that answer: 3" in said
+    assert "  40: 23.37" in said
+    assert "as float32 ABCD, moves" in said
+    layout = tables["streams"]["device"]["layout"]
+    assert (layout["unit"], layout["table"]) == (3, "holding")
+    assert [(one["name"], one["address"], one["type"]) for one in layout["channels"]] == [
+        ("r40", 40, "float32")
+    ]
+    # Names of one's own: registers in a row as far as they are there.
+    channels = named["streams"]["device"]["layout"]["channels"]
+    assert [(one["address"], one["type"]) for one in channels] == [(0, "uint16"), (1, "int16"), (2, "uint16")]
+    assert all(pdu[0] in {3, 4} for pdu in unit.asked)
+
+
+@pytest.mark.usefixtures("_few_registers")
+def test_new_asks_the_other_units_where_none_of_the_first_answers(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(questions, "_UNITS", ("1-2", "3-4"))
+    with tcp({4: pump()}) as target:
+        assert new(tmp_path, target)["streams"]["device"]["layout"]["unit"] == 4
+    assert "units that answer: 4" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("_few_registers")
+def test_new_says_what_to_do_when_nobody_answers_and_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(questions, "_UNITS", ("1-1", "2-2"))
+    tables = new(tmp_path, f"127.0.0.1:{free_port()}")
+    assert "nobody listens there; start the server, or correct its address" in capsys.readouterr().out
+    with tcp({9: pump()}) as target:
+        new(tmp_path, target)
+    assert "none of units 2 to 2 answers. Remedy: see that the device is powered" in capsys.readouterr().out
+    assert [one["name"] for one in tables["streams"]["device"]["layout"]["channels"]] == [
+        "vibration",
+        "temperature",
+    ]

@@ -18,7 +18,7 @@ import serial
 from support.waiting import PATIENCE_S
 
 from daqsvc.cli import main
-from drivers.serial import sniff
+from drivers.serial import questions, sniff
 from drivers.serial.recognise import CHECKS
 from sim_hw.nodes.serial_node import PseudoTerminal
 
@@ -232,3 +232,75 @@ def test_ctrl_c_ends_it_early_and_shows_what_came(cable: PseudoTerminal) -> None
             process.communicate()
     assert (process.returncode, said) == (0, "")
     assert len(json.loads(output)["columns"]) == 4
+
+
+def new(cable: PseudoTerminal, file: Path, *more: str) -> dict[str, Any]:
+    """The machine file of `daqsvc new --listen`, which check has accepted."""
+    assert main(["new", f"{file}", "--yes", "--listen", "--bus=serial", f"--port={cable.path}", *more]) == 0
+    return tomllib.loads(file.read_text("utf-8"))
+
+
+def test_new_proposes_the_lines_that_it_hears(
+    cable: PseudoTerminal,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 0.6)
+    with talking(cable, line):
+        heard = new(cable, tmp_path / "heard.toml")
+        named = new(cable, tmp_path / "named.toml", "--columns=n, vib, temp, load")
+    said = capsys.readouterr().out
+    assert "115200 bit/s, 8N1: lines of text" in said
+    assert "4 columns\n" in said
+    layout = heard["streams"]["device"]["layout"]
+    assert layout["line"] == ["c1", "c2", "c3", "c4"]
+    assert layout["counter"] == {"column": "c1"}
+    # What is known of a column is known by its place, whatever it is called.
+    assert named["streams"]["device"]["layout"]["counter"] == {"column": "n"}
+    assert 50 < heard["streams"]["device"]["rate_hz"] < 400
+
+
+def test_new_leaves_out_the_columns_that_are_no_numbers(
+    cable: PseudoTerminal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 0.6)
+    with talking(cable, lambda number: b"$LOG;%d;ok;%d.5\r\n" % (number, number % 9)):
+        layout = new(cable, tmp_path / "log.toml")["streams"]["device"]["layout"]
+    assert (layout["prefix"], layout["separator"]) == ("$LOG", ";")
+    assert layout["line"] == ["c1", "c2", "c3"]
+    assert layout["channels"] == [{"name": "c3"}]
+
+
+def test_new_says_what_to_do_when_it_hears_nothing_and_goes_on(
+    cable: PseudoTerminal,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(sniff, "TRY_S", 0.01)
+    layout = new(cable, tmp_path / "silent.toml")["streams"]["device"]["layout"]
+    said = capsys.readouterr().out
+    assert "Nothing was found: " in said
+    assert "no byte came. Remedy: see that the device is powered" in said
+    assert layout["line"] == ["t", "x", "y"]
+
+
+def test_new_proposes_the_frames_that_it_hears(
+    cable: PseudoTerminal,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 2.0)
+    with talking(cable, frame):
+        tables = new(cable, tmp_path / "frames.toml")
+    assert "frames behind a55a of 12 bytes" in capsys.readouterr().out
+    bus, stream = tables["buses"]["main"], tables["streams"]["device"]
+    assert (bus["framing"], bus["sync_word"], bus["crc"]) == ("sync", "a55a", "ibm-3740")
+    layout = stream["layout"]
+    assert layout["payload_length"] == 8
+    assert layout["counter"]["byte"] == 0
+    assert layout["samples_per_frame"] == 1
+    assert len(layout["channels"]) == (8 - layout["first_byte"]) // 2
+    assert 50 < stream["rate_hz"] < 400

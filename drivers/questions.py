@@ -1,4 +1,7 @@
-"""A question of ``daqsvc new``, and how what is typed becomes a value."""
+"""A question of ``daqsvc new``, and how what is typed becomes a value.
+
+Those about a bus are in the folder of its driver: see `drivers.bus_questions`.
+"""
 
 from __future__ import annotations
 
@@ -43,6 +46,8 @@ class Question:
         read: makes a value of the text, or raises `ValueError` with the reason.
         default: text that is taken for an empty answer; None where there must be one.
         choices: what may be answered, with what each means; empty if it is free.
+        doubt: why a value is most likely a mistake, and what to offer instead; None if it is none. Whoever
+            types it again means it.
         quiet: whether the default is taken without asking, unless an option says something else.
     """
 
@@ -52,6 +57,7 @@ class Question:
     default: str | None = None
     choices: Mapping[str, str] | None = None
     quiet: bool = False
+    doubt: Callable[[Any], tuple[str, str] | None] | None = None
 
 
 def sensor_key(channel: str, topic: str) -> str:
@@ -70,6 +76,17 @@ def one_of(choices: Mapping[str, str]) -> Callable[[str], str]:
         if len(begun) != 1:
             raise ValueError(f'"{text}" is not one of {", ".join(choices)}')
         return begun[0]
+
+    return read
+
+
+def exactly(choices: Mapping[str, str]) -> Callable[[str], str | None]:
+    """One of some words as they are written; None for `NONE`."""
+
+    def read(text: str) -> str | None:
+        if text not in choices:
+            raise ValueError(f'"{text}" is not one of {", ".join(choices)}')
+        return None if text == NONE else text
 
     return read
 
@@ -109,6 +126,9 @@ def name(text: str) -> str:
 
 def names(text: str) -> tuple[str, ...]:
     """Names with commas between."""
+    words = text.split()
+    if len(words) > 1 and "," not in text:
+        raise ValueError(f'"{text}" has no commas: write {", ".join(words)}')
     parts = tuple(name(part.strip()) for part in text.split(","))
     if len(set(parts)) < len(parts):
         raise ValueError(f'"{text}" has a name twice')
@@ -148,6 +168,11 @@ def whole(text: str) -> int:
         return int(text, 0)
     except ValueError:
         raise ValueError(f'"{text}" is not a whole number; write e.g. 17 or 0x101') from None
+
+
+def whole_or_none(text: str) -> int | None:
+    """A whole number, or ``none``."""
+    return None if text.lower() == NONE else whole(text)
 
 
 def number_or_none(text: str) -> float | None:

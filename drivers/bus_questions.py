@@ -1,0 +1,199 @@
+"""What a driver brings to ``daqsvc new``: questions about a bus of its kind, and the tables made of them.
+
+Those of this tree are named in `daqsvc.commands.new.buses`; a package of its own registers one by entry point
+in the group ``daqsvc.questions``, under the word that ``--bus`` takes.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from drivers import questions as q
+from drivers.questions import NONE, Answers, Question, Topic, sensor_key
+from drivers.toml_lines import entry
+
+if TYPE_CHECKING:
+    import threading
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+
+BUS, STREAM = "main", "device"
+"""Names of the only bus and the only stream of the file."""
+WAVEFORM_HZ = 100.0
+"""What comes at least so often is a waveform, as a rule; else a value that the device measures itself."""
+_BY_ID = Path("/dev/serial/by-id")
+
+SHARED = {
+    "channels": Topic(
+        "What are the channels called?",
+        "Names with commas between, in the order in which the device sends them: x, y, kph",
+    ),
+    "raw-type": Topic("Type of a sample in the frame", "The device's manual says so."),
+    "scale": Topic(
+        "What is one count of a sample worth?",
+        "In volts if the device digitises a sensor, else in the unit of the sensor. See the device's manual.",
+    ),
+    "port": Topic(
+        "Which serial port?",
+        "Best the path below /dev/serial/by-id, which stays the same: ls -l /dev/serial/by-id shows it.",
+    ),
+    "baud": Topic("Baud rate, in bit/s", "As the device is set; its manual says so."),
+    "counter": Topic(
+        "Which signal or column counts the frames or lines, or tells the time?",
+        "By it lost samples are found. none if there is no such signal (CAN only).",
+    ),
+}
+"""What is asked about buses of several kinds."""
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """What was found on a bus.
+
+    Attributes:
+        lines: what it is, for a person; a few lines.
+        proposals: answers by the key of their question, as they would be typed, that fit the answers so far;
+            one that cannot be used is not offered.
+    """
+
+    lines: Sequence[str]
+    proposals: Callable[[Answers], Mapping[str, str]]
+
+
+class BusQuestions(ABC):
+    """A kind of bus for ``daqsvc new``; importing its module must be cheap.
+
+    Attributes:
+        about: what it is, beside its word in the list of buses.
+        topics: what is asked about it beyond `SHARED`, by the key of the question, which is an option of
+            ``daqsvc new``, too.
+        channel_topics: what is asked about one channel; ``{channel}`` is filled in.
+        listens_behind: key of the question behind which it is known where the device is, so that `listen` can
+            look at it; empty if nothing can.
+        simulated: whether ``daqsvc sim`` plays the device, so that most defaults need no question.
+    """
+
+    about: ClassVar[str]
+    topics: ClassVar[Mapping[str, Topic]] = {}
+    channel_topics: ClassVar[Mapping[str, Topic]] = {}
+    listens_behind: ClassVar[str] = ""
+    simulated: ClassVar[bool] = False
+
+    @abstractmethod
+    def questions(self, answers: Answers, folder: Path) -> Iterator[Question]:
+        """What is asked before the speed: where the device is and how its samples lie.
+
+        Args:
+            answers: those before; whoever takes a question puts its answer there before the next one.
+            folder: of the machine file, where relative paths start.
+        """
+
+    @abstractmethod
+    def tables(self, answers: Answers) -> Iterator[str]:
+        """Lines of ``[buses]`` and ``[streams]``."""
+
+    @abstractmethod
+    def rate_hz(self, answers: Answers) -> float:
+        """The sampling rate unless something else is answered."""
+
+    def listen(
+        self, answers: Answers, folder: Path, stop: threading.Event, tell: Callable[[str], None]
+    ) -> Heard:
+        """Look at the bus, for ``daqsvc new --listen``. Nothing is changed there.
+
+        Args:
+            answers: as far as `listens_behind`.
+            folder: of the machine file, where relative paths start.
+            stop: set when the person has waited enough; look at it every 0.2 s or so.
+            tell: says one line while it goes on.
+
+        Raises:
+            SniffError: nothing was found; says what to do.
+        """
+        raise NotImplementedError
+
+    def channels(self, answers: Answers) -> tuple[str, ...]:
+        """Names of the channels."""
+        named: tuple[str, ...] = answers["channels"]
+        return named
+
+    def of_channel(self, answers: Answers, channel: str) -> Iterator[Question]:
+        """What is asked about a channel before its sensor."""
+        del answers, channel
+        yield from ()
+
+    def sensor_types(self, answers: Answers) -> tuple[str, ...]:
+        """Types of sensors that the samples can be of."""
+        del answers
+        return ("proximity", "accelerometer", "velocity", "keyphasor", "trend", NONE)
+
+    def guess(self, answers: Answers, channel: str) -> tuple[str, str | None]:
+        """Type and, where it is known, unit of the sensor on a channel."""
+        waveform = answers["rate"] >= WAVEFORM_HZ
+        unit = "degC" if "temp" in channel.lower() else None
+        return by_name(channel) or ("accelerometer" if waveform else "trend"), unit
+
+    def in_volts(self, answers: Answers) -> bool:
+        """Whether the samples of a sensor are volts, as a rule."""
+        del answers
+        return False
+
+    def beside(self, file: str) -> tuple[str, str]:
+        """What to type beside the service, and what that does."""
+        return f"daqsvc status {file}", "in a second terminal: values, losses, alarms"
+
+    def ask(self, key: str, read: Callable[[str], Any], default: str | None = None, **more: Any) -> Question:
+        """A question about one of its topics."""
+        return Question(key, self._topic(key), read, default, **more)
+
+    def choose(self, key: str, choices: Mapping[str, str], default: str | None, **more: Any) -> Question:
+        """A question that is answered by one of some words."""
+        return self.ask(key, q.one_of(choices), default, choices=choices, **more)
+
+    def yes(self, key: str, *, default: bool) -> Question:
+        """A question that is answered by yes or no."""
+        return self.ask(key, q.yes_no, "yes" if default else "no", choices=q.YES_NO)
+
+    def ask_of(
+        self, channel: str, topic: str, read: Callable[[str], Any], default: str, **more: Any
+    ) -> Question:
+        """A question about a channel."""
+        words = self.channel_topics[topic]
+        filled = Topic(words.text.format(channel=channel), words.help)
+        return Question(sensor_key(channel, topic), filled, read, default, **more)
+
+    def stream(self, answers: Answers, comment: str = "samples a second of each channel") -> Iterator[str]:
+        """Lines of ``[streams]``, up to the keys of the layout."""
+        yield f"[streams.{STREAM}]"
+        yield entry("bus", BUS)
+        yield entry("rate_hz", answers["rate"], comment)
+        yield ""
+        yield f"[streams.{STREAM}.layout]"
+
+    def _topic(self, key: str) -> Topic:
+        return self.topics[key] if key in self.topics else SHARED[key]
+
+
+def by_name(channel: str) -> str | None:
+    """The type of sensor that the name of a channel speaks of; None if it speaks of none."""
+    low = channel.lower()
+    if any(part in low for part in ("kph", "key", "phas", "tacho")):
+        return "keyphasor"
+    if low.startswith(("acc", "a_")) or low == "a":
+        return "accelerometer"
+    if any(part in low for part in ("temp", "press", "speed", "rpm", "rms")):
+        return "trend"
+    return None
+
+
+def is_count(name: str) -> bool:
+    """Whether the name of a signal or column speaks of a counter."""
+    return any(part in name.lower() for part in ("seq", "count", "cnt", "index"))
+
+
+def only_port() -> str | None:
+    """The serial port that was plugged in, if it is the only one."""
+    ports = sorted(_BY_ID.glob("*"))
+    return f"{ports[0]}" if len(ports) == 1 else None

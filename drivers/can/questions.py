@@ -1,0 +1,412 @@
+"""What ``daqsvc new`` asks about CAN: frames packed with samples, described by a DBC file, or simulated."""
+
+from __future__ import annotations
+
+import tempfile
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from drivers import packed_questions as packed
+from drivers import questions as q
+from drivers.bus_questions import BUS, WAVEFORM_HZ, BusQuestions, Heard, by_name, is_count
+from drivers.can.sniff import CanSniffer
+from drivers.questions import NONE, Answers, Question, Topic
+from drivers.sniffing import NothingFoundError, SniffError, sniffed, usual_rate
+from drivers.toml_lines import Hexadecimal, array, behind, entry, toml
+
+if TYPE_CHECKING:
+    import threading
+    from collections.abc import Callable, Iterator, Mapping
+
+    from cantools.database.can import Message
+
+_RATES_HZ = (2560.0, 1280.0, 640.0, 100.0, 10.0)
+_MOST_FRAMES_HZ = 500.0
+"""Of a default: a CAN bus of 500 kbit/s has time for some 4000 short frames a second."""
+_LAST_SHORT_ID = 0x7FF
+"""Of 11 bits; a higher id has 29."""
+_LISTEN_S = 5.0
+_SHOWN = 8
+_SURE_FRAMES = 20
+"""So many frames of a message without a signal that counts: it has none."""
+
+
+class _CanQuestions(BusQuestions):
+    """What all CAN buses have."""
+
+    topics: ClassVar[Mapping[str, Topic]] = {
+        "interface": Topic(
+            "Kind of CAN adapter",
+            "socketcan for adapters that Linux shows as can0; or another interface of python-can, e.g. pcan.",
+        ),
+        "channel": Topic(
+            "Which CAN interface?",
+            "The name that `ip link` shows, e.g. can0; with other adapters their channel.",
+        ),
+        "fd": Topic(
+            "Are CAN FD frames on the bus?",
+            "CAN FD frames carry up to 64 bytes. The device's manual says so.",
+        ),
+        "bitrate": Topic(
+            "Bit rate of the bus, in bit/s", "As all devices on it are set: often 250000 or 500000."
+        ),
+        "data-bitrate": Topic("Bit rate of the data of CAN FD frames, in bit/s", "As all devices are set."),
+    }
+
+    listens_behind = "channel"
+
+    def listen(
+        self, answers: Answers, folder: Path, stop: threading.Event, tell: Callable[[str], None]
+    ) -> Heard:
+        """See `BusQuestions.listen`."""
+        words = ["--interface", answers["interface"], "--seconds", f"{_LISTEN_S:g}"]
+        if "dbc" in answers:
+            words += ["--dbc", f"{folder / answers['dbc']}"]
+        line = ["--", answers["channel"]]
+        try:
+            # An interface of the kernel takes CAN FD frames anyway.
+            fd = ["--fd"] if answers["interface"] != "socketcan" else []
+            found = sniffed(CanSniffer(), [*words, *fd, *line], stop, tell)
+        except NothingFoundError:
+            raise
+        except SniffError:
+            if answers["interface"] == "socketcan":
+                raise
+            found = sniffed(CanSniffer(), [*words, *line], stop, tell)
+        return Heard(list(_in_words(found)), lambda so_far: self._proposals(found, so_far))
+
+    def _proposals(self, found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
+        fd = any(one["fd"] for one in found["ids"])
+        proposed = {"fd": "yes" if fd else "no", **self.proposals(found, answers)}
+        rates = {"bitrate": found["bitrate"], "data-bitrate": found["data_bitrate"]}
+        return proposed | {key: f"{rate}" for key, rate in rates.items() if rate is not None}
+
+    def proposals(self, found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
+        """Those that are about frames; see `Heard.proposals`."""
+        raise NotImplementedError
+
+    def _interface(self) -> Iterator[Question]:
+        yield self.ask("interface", q.line, "socketcan", quiet=True)
+        yield self.ask("channel", q.line, "can0")
+
+    def _bit_rates(self, answers: Answers, *, fd: bool) -> Iterator[Question]:
+        yield self.ask("bitrate", q.whole, "500000")
+        if fd:
+            yield self.ask("data-bitrate", q.whole, f"{max(2_000_000, answers['bitrate'])}")
+
+    def _bus(self, answers: Answers) -> Iterator[str]:
+        rate, channel = answers["bitrate"], answers["channel"]
+        fd = f" dbitrate {answers['data-bitrate']} fd on" if answers["fd"] else ""
+        if answers["interface"] == "socketcan":
+            yield "# Bring the interface up before the service starts, with the bit rates of the bus:"
+            yield f"#   ip link set {channel} up type can bitrate {rate}{fd}"
+        yield f"[buses.{BUS}]"
+        yield entry("driver", "can")
+        yield entry("interface", answers["interface"], "any interface that python-can knows")
+        yield entry("channel", channel)
+        yield entry("fd", answers["fd"], "whether CAN FD frames are on the bus")
+        yield entry("bitrate", rate, "bit/s; it sets nothing, and tells whether the bus has time enough")
+        if answers["fd"]:
+            yield entry("data_bitrate", answers["data-bitrate"], "bit/s of the data of CAN FD frames")
+        yield ""
+
+
+class PackedQuestions(_CanQuestions):
+    """Samples side by side in CAN frames."""
+
+    about = "CAN or CAN FD, samples packed side by side in a frame"
+    topics: ClassVar[Mapping[str, Topic]] = {
+        **_CanQuestions.topics,
+        "id": Topic("CAN id of the frames", "Decimal, or hexadecimal with 0x. candump shows ids."),
+        "length": Topic("Bytes of a frame", "candump shows them, and daqsvc sniff can."),
+        **packed.TOPICS,
+    }
+
+    def questions(self, answers: Answers, folder: Path) -> Iterator[Question]:
+        """See `BusQuestions.questions`."""
+        del folder
+        yield from self._interface()
+        yield self.yes("fd", default=True)
+        yield from self._bit_rates(answers, fd=answers["fd"])
+        yield from self._frame(answers)
+
+    def _frame(self, answers: Answers, **more: Any) -> Iterator[Question]:
+        yield self.ask("id", q.whole, "0x101", **more)
+        yield from packed.sample_questions(self, answers, 64 if answers["fd"] else 8, **more)
+        yield self.ask("length", q.whole, f"{self._length(answers)}", quiet=True)
+
+    def _length(self, answers: Answers) -> int:
+        """The shortest frame that holds counter and samples; one that does not exist if none does."""
+        from drivers.can.settings import CAN_FD_LENGTHS  # noqa: PLC0415 - brings the settings
+
+        needed = packed.end_byte(answers)
+        return next((length for length in CAN_FD_LENGTHS if length >= needed), needed)
+
+    def rate_hz(self, answers: Answers) -> float:
+        """See `BusQuestions.rate_hz`."""
+        most = _MOST_FRAMES_HZ * answers["samples-per-frame"]
+        return next((rate for rate in _RATES_HZ if rate <= most), _RATES_HZ[-1])
+
+    def guess(self, answers: Answers, channel: str) -> tuple[str, str | None]:
+        """See `BusQuestions.guess`."""
+        return packed.guess(answers, channel)
+
+    def in_volts(self, answers: Answers) -> bool:
+        """See `BusQuestions.in_volts`."""
+        return packed.in_volts(answers)
+
+    def proposals(self, found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
+        """See `Heard.proposals`."""
+        ids = [
+            one
+            for one in found["ids"]
+            if one["rate_hz"] and not one["remote"] and one["extended"] == (one["id"] > _LAST_SHORT_ID)
+        ]
+        if not ids:
+            return {}
+        best = max(ids, key=lambda one: (one["counter"] is not None, one["rate_hz"]))
+        proposed = {"id": f"{best['id']:#x}"}
+        chosen = next((one for one in ids if one["id"] == answers.get("id", best["id"])), None)
+        if chosen is None:
+            return proposed
+        length = max(chosen["lengths"])
+        proposed |= packed.frame_proposals(length, chosen["counter"], answers) | {"length": f"{length}"}
+        if "samples-per-frame" in answers:
+            proposed["rate"] = f"{usual_rate(chosen['rate_hz'] * answers['samples-per-frame']):g}"
+        return proposed
+
+    def tables(self, answers: Answers) -> Iterator[str]:
+        """See `BusQuestions.tables`."""
+        yield from self._bus(answers)
+        yield from self.stream(answers)
+        yield entry("id", Hexadecimal(answers["id"]), "CAN id of the frames; candump shows those on the bus")
+        if answers["id"] > _LAST_SHORT_ID:
+            yield entry("extended", value=True, comment="an id of 29 bits")
+        yield entry("length", answers["length"], "bytes of a frame")
+        yield from packed.layout_lines(answers)
+
+
+class VirtualQuestions(PackedQuestions):
+    """A bus between processes, with a simulated machine on it."""
+
+    about = "a virtual bus with a simulated machine: to try daqsvc, no hardware needed"
+    topics: ClassVar[Mapping[str, Topic]] = {
+        "socket": Topic("Path of the virtual bus", "A socket file that daqsvc run and daqsvc sim share."),
+        **PackedQuestions.topics,
+    }
+    simulated = True
+    listens_behind = ""
+
+    def questions(self, answers: Answers, folder: Path) -> Iterator[Question]:
+        """See `BusQuestions.questions`."""
+        del folder
+        yield self.ask("socket", q.line, f"{Path(tempfile.gettempdir()) / 'daqsvc-can0'}", quiet=True)
+        answers["fd"] = True
+        yield from self._frame(answers, quiet=True)
+
+    def rate_hz(self, answers: Answers) -> float:
+        """See `BusQuestions.rate_hz`: 64 samples a revolution."""
+        per_second: float = 64.0 * abs(answers["speed"]) / 60.0
+        return min(max(round(per_second), 640), 12_800)
+
+    def beside(self, file: str) -> tuple[str, str]:
+        """See `BusQuestions.beside`."""
+        return f"daqsvc sim {file}", "in a second terminal: plays the machine, which gets worse and worse"
+
+    def _bus(self, answers: Answers) -> Iterator[str]:
+        yield "# No hardware: `daqsvc sim` plays the devices. For a real bus, daqsvc new asks for it."
+        yield f"[buses.{BUS}]"
+        yield entry("driver", "can")
+        yield entry("interface", "unixbus", "a CAN bus between programs of this computer")
+        yield entry("channel", answers["socket"], "path of its socket")
+        yield entry("fd", value=True)
+        yield ""
+
+
+class DbcQuestions(_CanQuestions):
+    """Samples as signals of a DBC message."""
+
+    about = "CAN, frames described by a DBC file"
+    topics: ClassVar[Mapping[str, Topic]] = {
+        **_CanQuestions.topics,
+        "dbc": Topic(
+            "Which DBC file describes the frames?", "The maker of the device has it. A path from this folder."
+        ),
+        "message": Topic(
+            "Which message of it carries the samples?", "The frame that comes at the sampling rate."
+        ),
+        "signals": Topic(
+            "Which of its signals are measured?",
+            "Names with commas between, e.g. AccelX, AccelY; each becomes a channel. Leave out counters and "
+            "states.",
+        ),
+    }
+
+    def questions(self, answers: Answers, folder: Path) -> Iterator[Question]:
+        """See `BusQuestions.questions`."""
+        yield from self._interface()
+        answers["dbc-folder"] = folder
+        yield self.ask("dbc", partial(_dbc_file, folder))
+        messages = self._messages(answers)
+        choices = {name: _about(one) for name, one in messages.items()}
+        yield self.ask("message", q.exactly(choices), _likely(messages), choices=choices)
+        message = messages[answers["message"]]
+        answers["fd"] = message.length > 8
+        yield from self._bit_rates(answers, fd=answers["fd"])
+        signals = {one.name: one for one in message.signals}
+        counters = {
+            name: f"{one.length} bits" for name, one in signals.items() if _may_count(one, len(signals))
+        }
+        likely = next((name for name in counters if is_count(name)), NONE)
+        choices = {**counters, NONE: "losses are then told by the times of arrival"}
+        yield self.ask("counter", q.exactly(choices), likely, choices=choices)
+        measured = [one.name for one in message.signals if _is_measured(one, answers["counter"])]
+        rest = [name for name in signals if name != answers["counter"]]
+        yield self.ask("signals", partial(_signals, tuple(rest)), ", ".join(measured or rest[:1]))
+
+    listens_behind = "dbc"
+
+    def proposals(self, found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
+        """See `Heard.proposals`."""
+        heard = [one for one in found["dbc"]["messages"] if one["signals"]]
+        if not heard:
+            return {}
+
+        def score(message: Mapping[str, Any]) -> tuple[bool, bool, int]:
+            signals = message["signals"]
+            counted = any(one["counts_frames"] for one in signals)
+            return counted, any(one["unit"] for one in signals), message["frames"]
+
+        best = max(heard, key=score)
+        proposed = {"message": best["message"]}
+        chosen = next((m for m in heard if m["message"] == answers.get("message", best["message"])), None)
+        if chosen is None:
+            return proposed
+        counter = next((one["signal"] for one in chosen["signals"] if one["counts_frames"]), None)
+        if counter is not None or chosen["frames"] >= _SURE_FRAMES:
+            proposed["counter"] = counter or NONE
+        rates = [one["rate_hz"] for one in found["ids"] if one["message"] == chosen["message"]]
+        if len(rates) == 1 and rates[0]:
+            proposed["rate"] = f"{usual_rate(rates[0]):g}"
+        return proposed
+
+    def _messages(self, answers: Answers) -> dict[str, Message]:
+        return _with_signals(answers["dbc-folder"] / answers["dbc"])
+
+    def channels(self, answers: Answers) -> tuple[str, ...]:
+        """See `BusQuestions.channels`."""
+        return tuple(signal[: q.LONGEST_NAME] for signal in answers["signals"])
+
+    def rate_hz(self, answers: Answers) -> float:
+        """See `BusQuestions.rate_hz`."""
+        message = self._messages(answers)[answers["message"]]
+        cycle_ms: float | None = message.cycle_time
+        return 1000.0 if not cycle_ms else round(1000.0 / cycle_ms, 6)
+
+    def guess(self, answers: Answers, channel: str) -> tuple[str, str | None]:
+        """See `BusQuestions.guess`."""
+        unit = self._units(answers).get(channel)
+        kind = {"g": "accelerometer", "m/s2": "accelerometer", "mm/s": "velocity"}.get(unit or "")
+        kind = "proximity" if unit in {"um", "mm", "mil"} else kind
+        if answers["rate"] < WAVEFORM_HZ:
+            kind = "trend"
+        return kind or by_name(channel) or "trend", unit
+
+    def in_volts(self, answers: Answers) -> bool:
+        """See `BusQuestions.in_volts`."""
+        return "V" in self._units(answers).values()
+
+    def _units(self, answers: Answers) -> dict[str, str]:
+        from daqsvc.settings.units import unit_of  # noqa: PLC0415 - brings the settings
+
+        message = self._messages(answers)[answers["message"]]
+        known = {one.name[: q.LONGEST_NAME]: unit_of(one.unit or "") for one in message.signals}
+        return {name: unit.name for name, unit in known.items() if unit is not None}
+
+    def tables(self, answers: Answers) -> Iterator[str]:
+        """See `BusQuestions.tables`."""
+        yield from self._bus(answers)
+        yield from self.stream(answers, "frames a second: the DBC file or candump says so")
+        yield entry("dbc", answers["dbc"], "relative to this file; where signals lie, scale, unit")
+        yield entry("message", answers["message"])
+        if answers["counter"] is None:
+            yield entry("no_counter", value=True, comment="losses are told by the times of arrival")
+        else:
+            counter = toml({"signal": answers["counter"], "counts": "frames"})
+            yield behind(f"counter = {counter}", "grows by 1 with each frame: losses are counted by it")
+        named = zip(self.channels(answers), answers["signals"], strict=True)
+        yield from array("channels", [{"name": name, "signals": [signal]} for name, signal in named])
+
+
+def _dbc_file(folder: Path, text: str) -> str:
+    from drivers.frames import LayoutError  # noqa: PLC0415 - only what a bus needs
+
+    path = Path(q.line(text)).expanduser()
+    if not (folder / path).exists() and path.exists():
+        path = path.absolute()  # typed from another folder than that of the machine file
+    try:
+        messages = _with_signals(folder / path)
+    except LayoutError as error:
+        raise ValueError(f"{error}") from None
+    if not messages:
+        raise ValueError(f"{text} describes no message with signals; give another DBC file")
+    return f"{path}"
+
+
+def _with_signals(file: Path) -> dict[str, Message]:
+    """The messages of a DBC file that hold signals, by name.
+
+    Raises:
+        LayoutError: the file cannot be read, or cantools is not installed.
+    """
+    from drivers.can.dbc import messages_of  # noqa: PLC0415 - cantools is slow to import
+
+    return {message.name: message for message in messages_of(file.absolute()) if message.signals}
+
+
+def _about(message: Message) -> str:
+    return f"id {message.frame_id:#x}: {', '.join(one.name for one in message.signals[:6])}"
+
+
+def _likely(messages: Mapping[str, Message]) -> str:
+    """The message that most likely carries samples: with a counter, and with numbers that have units."""
+
+    def score(message: Message) -> tuple[bool, int]:
+        counted = any(is_count(one.name) for one in message.signals)
+        return counted, sum(bool(one.unit) for one in message.signals)
+
+    return max(messages, key=lambda name: score(messages[name]))
+
+
+def _may_count(signal: Any, signals: int) -> bool:
+    plain = not signal.is_signed and not signal.is_float and signal.scale == 1 and signal.length >= 4
+    return bool(plain) and signals > 1
+
+
+def _is_measured(signal: Any, counter: str | None) -> bool:
+    return signal.name != counter and bool(signal.unit) and signal.multiplexer_ids is None
+
+
+def _signals(known: tuple[str, ...], text: str) -> tuple[str, ...]:
+    chosen = tuple(part.strip() for part in text.split(","))
+    for one in chosen:
+        if one not in known:
+            raise ValueError(f'there is no signal "{one}"; there are {", ".join(known)}')
+    if len({one[: q.LONGEST_NAME] for one in chosen}) < len(chosen):
+        raise ValueError(f'"{text}" has a signal twice')
+    return chosen
+
+
+def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
+    """What was heard, in a few lines: the ids that come most often."""
+    ids = sorted(found["ids"], key=lambda one: -(one["rate_hz"] or 0.0))
+    yield f"{found['frames']} frames of {len(ids)} {'id' if len(ids) == 1 else 'ids'}:"
+    for one in ids[:_SHOWN]:
+        lengths = ", ".join(map(str, one["lengths"]))
+        rate = "once" if one["rate_hz"] is None else f"{one['rate_hz']:.4g} a second"
+        counter, message = one["counter"], one["message"]
+        counts = f", byte {counter['byte']} counts" if counter else ""
+        yield f"  {one['id']:#x}: {lengths} bytes, {rate}{counts}{f', {message}' if message else ''}"
+    if len(ids) > _SHOWN:
+        yield f"  ... and {len(ids) - _SHOWN} more: daqsvc sniff can shows them"

@@ -1,0 +1,412 @@
+"""What ``daqsvc new`` asks about the registers of a Modbus unit."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from drivers import questions as q
+from drivers.bus_questions import BUS, WAVEFORM_HZ, BusQuestions, Heard, only_port
+from drivers.modbus.sniff import ModbusSniffer
+from drivers.questions import NONE, Answers, Question, Topic, sensor_key
+from drivers.sniffing import NothingFoundError, SniffError, sniffed
+from drivers.toml_lines import array, entry
+
+if TYPE_CHECKING:
+    import threading
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from pathlib import Path
+
+REGISTERS = ("uint16", "int16", "uint32", "int32", "float32")
+_WAYS = {
+    "values": "levels that the device measures itself",
+    "waveform": "blocks of samples",
+    "ring": "the last samples in a ring, with a count of all",
+    "fifo": "a queue of samples, emptied by function 24",
+}
+_COUNT_BITS = {"16": "", "32": ""}
+ADDRESSES = 65_536
+_READ_REGISTERS, _FIFO_REGISTERS = 125, 31
+"""Of one reply."""
+_UNITS = ("1-10", "11-247")
+"""Most devices have one of the first addresses; to ask for all takes a minute."""
+_TABLES = {3: "holding", 4: "input"}
+_SHOWN = 12
+
+
+class _ModbusQuestions(BusQuestions):
+    """Registers of a unit."""
+
+    topics: ClassVar[Mapping[str, Topic]] = {
+        "unit": Topic(
+            "Address of the unit (slave id)", "1 to 247; set in the device, by switches or software."
+        ),
+        "way": Topic(
+            "What does the device give?",
+            "values: it measures levels itself, e.g. velocity RMS. waveform: it takes a block of samples now "
+            "and then. ring, fifo: it samples all the time, and keeps the last samples until they are read.",
+        ),
+        "table": Topic(
+            "Which registers are they?",
+            "Manuals call holding registers 40001 and on, input registers 30001 and on.",
+        ),
+        "block-id": Topic("Register that changes with every block", "As on the wire, from 0: 40001 is 0."),
+        "block-address": Topic("First register of the block", "As on the wire, from 0: 40001 is 0."),
+        "samples": Topic("Samples of each channel in a block", "The device's manual says so."),
+        "count-address": Topic(
+            "Register that counts the samples in the ring", "As on the wire, from 0: 40001 is 0."
+        ),
+        "count-bits": Topic("Width of the count of samples, in bits", "16: one register. 32: two of them."),
+        "ring-address": Topic("First register of the ring", "As on the wire, from 0: 40001 is 0."),
+        "depth": Topic("Samples of each channel that the ring holds", "A power of two, e.g. 1024."),
+        "fifo-address": Topic("Pointer of the queue", "The address that function 24 is given, from 0."),
+        "acknowledge": Topic(
+            "Register that is told how far the queue was read",
+            "As on the wire, from 0. none if the device drops what it has handed out.",
+        ),
+    }
+    channel_topics: ClassVar[Mapping[str, Topic]] = {
+        "address": Topic("Register of {channel}", "As on the wire, from 0: what a manual calls 40001 is 0."),
+        "register-type": Topic("What do the registers of {channel} hold?", "The register map says so."),
+        "order": Topic("Byte order of {channel}", "ABCD is the usual one; CDAB has its words exchanged."),
+        "scale": Topic("What is one count of {channel} worth?", "In the unit of the value, e.g. 0.01 mm/s."),
+    }
+
+    def listen(
+        self, answers: Answers, folder: Path, stop: threading.Event, tell: Callable[[str], None]
+    ) -> Heard:
+        """See `BusQuestions.listen`: units are asked for their registers, and nothing is written."""
+        del folder
+        words = self._sniffed_as(answers)
+        try:
+            found = sniffed(ModbusSniffer(), ["--units", _UNITS[0], *words], stop, tell)
+        except NothingFoundError:
+            if stop.is_set():
+                raise
+            found = sniffed(ModbusSniffer(), ["--units", _UNITS[1], *words], stop, tell)
+        except SniffError as error:
+            raise SniffError(f"{error}".replace("TARGET", "its address")) from error
+        return Heard(list(_in_words(found)), lambda so_far: self._proposals(found, so_far))
+
+    def _sniffed_as(self, answers: Answers) -> Sequence[str]:
+        """Arguments of the sniffer that say where the units are."""
+        raise NotImplementedError
+
+    def _proposals(self, found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
+        """See `Heard.proposals`."""
+        tables = [one for one in found["tables"] if one["registers"]]
+        proposed = {"unit": f"{tables[0]['unit']}"}
+        tables = [one for one in tables if one["unit"] == answers.get("unit", tables[0]["unit"])]
+        if tables:
+            proposed["table"] = _TABLES[tables[0]["function"]]
+        tables = [one for one in tables if _TABLES[one["function"]] == answers.get("table")]
+        if not tables or answers.get("way") != "values":
+            return proposed
+        found_channels = {one["address"]: one for one in tables[0]["channels"]}
+        values = {one["address"]: one["int16"] for one in tables[0]["registers"]}
+        proposed["channels"] = ", ".join(one["name"] for one in found_channels.values())
+        for channel in answers.get("channels", ()):
+            if sensor_key(channel, "register-type") not in answers:
+                address = answers.get(sensor_key(channel, "address"))
+                if address is None:
+                    address = self._heard_address(answers, channel, found_channels, values)
+                    proposed[sensor_key(channel, "address")] = f"{address}"
+                kind = found_channels.get(address, {"type": "uint16", "order": "ABCD"})
+                negative = kind["type"] == "uint16" and values.get(address, 0) < 0
+                if kind["type"] != "uint16" or negative:
+                    proposed[sensor_key(channel, "register-type")] = "int16" if negative else kind["type"]
+                proposed[sensor_key(channel, "order")] = kind["order"]
+                break
+            address = answers[sensor_key(channel, "address")]
+            if address in found_channels:
+                proposed[sensor_key(channel, "order")] = found_channels[address]["order"]
+        return proposed
+
+    def _heard_address(
+        self, answers: Answers, channel: str, channels: Mapping[int, Any], values: Mapping[int, int]
+    ) -> int:
+        """The register that a channel is named after, the one behind the last, or the next that was found."""
+        by_name = next((address for address, one in channels.items() if one["name"] == channel), None)
+        following = self._next_address(answers, channel)
+        if by_name is not None or following in values:
+            return following if by_name is None else by_name
+        return next((address for address in sorted(values) if address > following), following)
+
+    def questions(self, answers: Answers, folder: Path) -> Iterator[Question]:
+        """See `BusQuestions.questions`."""
+        del folder
+        yield from self._line()
+        yield self.ask("unit", q.whole, "1")
+        yield self.choose("way", _WAYS, "values")
+        way = answers["way"]
+        if way != "fifo":
+            yield self.choose("table", dict.fromkeys(("holding", "input"), ""), "holding")
+        yield self.ask("channels", q.names, "vibration, temperature" if way == "values" else "x")
+        if way == "values":
+            return
+        yield self.choose("raw-type", dict.fromkeys(REGISTERS, ""), "int16")
+        yield self.ask("scale", q.number, "0.001")
+        ways = {"waveform": self._ask_waveform, "ring": self._ask_ring, "fifo": self._ask_fifo}
+        yield from ways[way](answers)
+
+    def _ask_waveform(self, answers: Answers) -> Iterator[Question]:
+        yield self.ask("block-id", q.whole, "0", doubt=_doubt)
+        yield self.ask("block-address", q.whole, "100", doubt=_doubt)
+        yield self.ask("samples", q.whole, f"{max(min(4096, 60_000 // _sample_registers(answers)), 1)}")
+
+    def _ask_ring(self, answers: Answers) -> Iterator[Question]:
+        yield self.ask("count-address", q.whole, "0", doubt=_doubt)
+        yield self.choose("count-bits", _COUNT_BITS, "32")
+        count = answers["count-address"]
+        behind = count + 2 if count < ADDRESSES // 2 else 0
+        yield self.ask("ring-address", q.whole, f"{16 if count + 2 <= 16 else behind}", doubt=_doubt)
+        begin = answers["ring-address"]
+        room = (count if begin < count else ADDRESSES) - begin
+        places = max(min(1024, room // _sample_registers(answers)), 2)
+        yield self.ask("depth", q.whole, f"{2 ** (places.bit_length() - 1)}")
+
+    def _ask_fifo(self, answers: Answers) -> Iterator[Question]:
+        del answers
+        yield self.ask("fifo-address", q.whole, "0", doubt=_doubt)
+        yield self.choose("count-bits", _COUNT_BITS, "16")
+        yield self.ask("acknowledge", q.whole_or_none, NONE, doubt=_doubt)
+
+    def rate_hz(self, answers: Answers) -> float:
+        """See `BusQuestions.rate_hz`."""
+        if answers["way"] in {"values", "waveform"}:
+            return 2560.0 if answers["way"] == "waveform" else 1.0
+        most = self._most_hz(answers)
+        return next((rate for rate in (2560.0, 1280.0, 640.0, 100.0, 10.0, 1.0, 0.1) if rate <= most), 0.01)
+
+    def _most_hz(self, answers: Answers) -> float:
+        """Samples a second that the line has time for, with room to spare."""
+        del answers
+        return math.inf
+
+    def of_channel(self, answers: Answers, channel: str) -> Iterator[Question]:
+        """See `BusQuestions.of_channel`."""
+        if answers["way"] != "values":
+            return
+
+        types, orders = dict.fromkeys(REGISTERS, ""), dict.fromkeys(("ABCD", "CDAB", "BADC", "DCBA"), "")
+        following = f"{self._next_address(answers, channel)}"
+        yield self.ask_of(channel, "address", q.whole, following, doubt=_doubt)
+        temperature = "temp" in channel.lower()
+        default = "int16" if temperature else "uint16"
+        yield self.ask_of(channel, "register-type", q.one_of(types), default, choices=types)
+        wide = answers[sensor_key(channel, "register-type")].endswith("32")
+        yield self.ask_of(channel, "order", q.exactly(orders), "ABCD", choices=orders, quiet=not wide)
+        is_float = answers[sensor_key(channel, "register-type")].startswith("float")
+        yield self.ask_of(channel, "scale", q.number, "1" if is_float else "0.1" if temperature else "0.01")
+
+    def _next_address(self, answers: Answers, channel: str) -> int:
+        """Behind the registers of all channels before."""
+        end = 0
+        for before in answers["channels"]:
+            if before == channel:
+                break
+            width = _width(answers[sensor_key(before, "register-type")])
+            end = max(end, answers[sensor_key(before, "address")] + width)
+        return end if end < 65_535 else 0
+
+    def sensor_types(self, answers: Answers) -> tuple[str, ...]:
+        """See `BusQuestions.sensor_types`: what is polled is no waveform."""
+        if answers["way"] != "values":
+            return ("accelerometer", "velocity", "proximity", "trend", NONE)
+        return ("trend", NONE)
+
+    def guess(self, answers: Answers, channel: str) -> tuple[str, str | None]:
+        """See `BusQuestions.guess`."""
+        if answers["way"] != "values":
+            return ("accelerometer" if answers["rate"] >= WAVEFORM_HZ else "trend"), None
+        return "trend", "degC" if "temp" in channel.lower() else "mm/s"
+
+    def tables(self, answers: Answers) -> Iterator[str]:
+        """See `BusQuestions.tables`."""
+        yield f"[buses.{BUS}]"
+        yield entry("driver", "modbus")
+        yield from self._line_keys(answers)
+        yield entry("timeout_ms", 500.0, "how long the unit may take to answer")
+        written = answers.get("acknowledge")
+        if written is not None:
+            count = int(answers["count-bits"]) // 16
+            writes = [{"unit": answers["unit"], "address": written, "count": count}]
+            yield entry("writes", writes, "nothing else is ever written")
+        yield ""
+        way = answers["way"]
+        comments = {"values": "how often the values are read", "waveform": "within a block"}
+        yield from self.stream(answers, comments.get(way, "samples a second of each channel"))
+        yield "# Addresses count from 0, as on the wire: what a manual calls 40001 (or 30001) is address 0."
+        yield entry("way", "registers" if way == "values" else way)
+        yield entry("unit", answers["unit"], "address of the unit, its slave id")
+        if way != "fifo":
+            yield entry("table", answers["table"], '"holding" (40001 ...) or "input" (30001 ...)')
+        if way == "values":
+            yield from self._registers(answers)
+            return
+        ways = {"waveform": self._waveform, "ring": self._ring, "fifo": self._fifo}
+        yield from ways[way](answers)
+        yield "# place is the first register of a channel within a sample; value = raw * scale"
+        kind, scale, width = answers["raw-type"], answers["scale"], _width(answers["raw-type"])
+        channels = enumerate(answers["channels"])
+        yield from array(
+            "channels",
+            [{"name": name, "place": n * width, "type": kind, "scale": scale} for n, name in channels],
+        )
+
+    def _waveform(self, answers: Answers) -> Iterator[str]:
+        yield entry("block_id", answers["block-id"], "register that changes with every block")
+        yield entry("address", answers["block-address"], "first register of the block")
+        yield entry("samples", answers["samples"], "of each channel in a block")
+        yield "# If the device takes blocks on demand, add trigger = { address = .., every_s = .. }."
+
+    def _ring(self, answers: Answers) -> Iterator[str]:
+        count = {"address": answers["count-address"], "bits": int(answers["count-bits"])}
+        yield entry("count", count, "counts all samples: sample i is at place i % depth")
+        yield entry("address", answers["ring-address"], "first register of the ring")
+        yield entry("depth", answers["depth"], "samples of each channel that it holds")
+
+    def _fifo(self, answers: Answers) -> Iterator[str]:
+        yield entry("address", answers["fifo-address"], "pointer of the queue, read by function 24")
+        yield entry("count", {"bits": int(answers["count-bits"])}, "at the head of each reply")
+        if answers["acknowledge"] is None:
+            yield "# acknowledge = 700 if the device keeps samples until it is told how far they were read"
+        else:
+            yield entry("acknowledge", answers["acknowledge"], "is told how far the queue was read")
+
+    def _registers(self, answers: Answers) -> Iterator[str]:
+        yield "# value = raw * scale, in the unit of the sensor below"
+        tables = []
+        for name in answers["channels"]:
+            keys = {"address": "address", "type": "register-type", "order": "order", "scale": "scale"}
+            tables.append({"name": name} | {k: answers[sensor_key(name, t)] for k, t in keys.items()})
+        yield from array("channels", tables)
+
+    def _line(self) -> Iterator[Question]:
+        """What is asked about the line that the unit is on."""
+        raise NotImplementedError
+
+    def _line_keys(self, answers: Answers) -> Iterator[str]:
+        """Lines of the table of the bus that say where that is."""
+        raise NotImplementedError
+
+
+class TcpQuestions(_ModbusQuestions):
+    """Units behind a Modbus TCP server."""
+
+    about = "Modbus TCP"
+    listens_behind = "tcp-port"
+    topics: ClassVar[Mapping[str, Topic]] = {
+        "host": Topic("Address of the Modbus device", "An IP address or a host name, without http://."),
+        "tcp-port": Topic("TCP port of the Modbus device", "Nearly always 502."),
+        **_ModbusQuestions.topics,
+    }
+
+    def _line(self) -> Iterator[Question]:
+        yield self.ask("host", q.line)
+        yield self.ask("tcp-port", q.whole, "502", quiet=True)
+
+    def _sniffed_as(self, answers: Answers) -> Sequence[str]:
+        host = f"[{answers['host']}]" if ":" in answers["host"] else answers["host"]
+        return ["--function", "both", "--", f"{host}:{answers['tcp-port']}"]
+
+    def _line_keys(self, answers: Answers) -> Iterator[str]:
+        yield entry("transport", "tcp")
+        yield entry("host", answers["host"])
+        yield entry("tcp_port", answers["tcp-port"])
+
+
+class RtuQuestions(_ModbusQuestions):
+    """Units on a serial line."""
+
+    about = "Modbus RTU on a serial line (RS-485)"
+    listens_behind = "parity"
+    topics: ClassVar[Mapping[str, Topic]] = {
+        "parity": Topic("Parity of the line", "As the device is set: none, even or odd."),
+        **_ModbusQuestions.topics,
+    }
+
+    def _line(self) -> Iterator[Question]:
+        yield self.ask("port", q.line, only_port())
+        yield self.ask("baud", q.whole, "19200")
+        yield self.choose("parity", dict.fromkeys(("none", "even", "odd"), ""), "even")
+
+    def _sniffed_as(self, answers: Answers) -> Sequence[str]:
+        line = ["--baud", f"{answers['baud']}", "--parity", answers["parity"]]
+        return ["--function", "both", *line, "--", answers["port"]]
+
+    def _most_hz(self, answers: Answers) -> float:
+        registers = _FIFO_REGISTERS if answers["way"] == "fifo" else _READ_REGISTERS
+        samples = max((registers - 2) // _sample_registers(answers), 1)
+        # Twice the characters of a reply, for the count and requests, of 11 bits each; units take some ms.
+        baud: int = answers["baud"]
+        return 0.5 * samples / (2 * (2 * registers + 40) * 11 / baud + 0.05)
+
+    def _line_keys(self, answers: Answers) -> Iterator[str]:
+        yield entry("transport", "rtu")
+        yield entry("serial_port", answers["port"], "best its path below /dev/serial/by-id")
+        yield entry("baud", answers["baud"], "bit/s, as the device is set")
+        yield entry("parity", answers["parity"])
+        yield entry("stop_bits", 1)
+
+
+def _width(raw_type: str) -> int:
+    """Registers of a number."""
+    return 2 if raw_type.endswith("32") else 1
+
+
+def _sample_registers(answers: Answers) -> int:
+    """Registers of one sample of every channel."""
+    channels: int = len(answers["channels"])
+    return channels * _width(answers["raw-type"])
+
+
+def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
+    """What was found, in a few lines: which units answer, and the registers that are worth reading."""
+    yield f"units that answer: {', '.join(map(str, found['units']))}"
+    for table in found["tables"]:
+        if not table["registers"]:
+            continue
+        runs = ", ".join(f"{low}" if low == high else f"{low} to {high}" for low, high in table["runs"])
+        yield f"unit {table['unit']} has {_TABLES[table['function']]} registers {runs}:"
+        by_address = {one["address"]: one for one in table["registers"]}
+        wide = {one["address"]: one for one in table["channels"] if one["type"] != "uint16"}
+        behind = {
+            address + number
+            for address, one in wide.items()
+            for number in range(1, 4 if one["type"].endswith("64") else 2)
+        }
+        shown = [address for address in by_address if address not in behind]
+        if len(shown) > _SHOWN:
+            shown = [address for address in shown if address in wide or address in table["moved"]]
+        for address in shown[:_SHOWN]:
+            numbers = 1 + sum(address + number in behind for number in range(1, 4)) if address in wide else 1
+            moved = any(address + number in table["moved"] for number in range(numbers))
+            moves = ", moves" if moved else ""
+            value, meant = f"{by_address[address]['int16']}", ""
+            if address in wide:
+                one = wide[address]
+                same = [
+                    reading
+                    for reading in by_address[address]["readings"]
+                    if (reading["type"], reading["order"]) == (one["type"], one["order"])
+                ]
+                value, meant = f"{same[0]['value']:.6g}", f" as {one['type']} {one['order']}"
+            yield f"  {address}: {value}{meant}{moves}"
+        if len(shown) > _SHOWN:
+            yield f"  ... and {len(shown) - _SHOWN} more: daqsvc sniff modbus shows them"
+
+
+def _doubt(address: int | None) -> tuple[str, str] | None:
+    """See `Question.doubt`: manuals count registers from 30001 or 40001, the line from 0."""
+    from drivers.modbus.checks import manuals_first  # noqa: PLC0415 - brings the settings
+
+    first = None if address is None else manuals_first(address)
+    if address is None or first is None:
+        return None
+    meant = address - first
+    reason = (
+        f"{address} looks like a number of the manual, where registers begin at {first}: that is {meant} "
+        f"here. Enter takes it; type {address} again if the device has such addresses"
+    )
+    return reason, f"{meant}"

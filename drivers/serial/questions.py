@@ -1,0 +1,269 @@
+"""What ``daqsvc new`` asks about lines of text, or binary frames, on a serial port."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from drivers import packed_questions as packed
+from drivers import questions as q
+from drivers.bus_questions import BUS, BusQuestions, Heard, is_count, only_port
+from drivers.questions import NONE, Answers, Question, Topic, sensor_key
+from drivers.serial.sniff import SerialSniffer
+from drivers.sniffing import sniffed, table_name, unused, usual_rate
+from drivers.toml_lines import array, entry
+
+if TYPE_CHECKING:
+    import threading
+    from collections.abc import Callable, Iterator, Mapping
+    from pathlib import Path
+
+_CHARACTERS = {
+    "8N1": (8, "none"),
+    "8E1": (8, "even"),
+    "8O1": (8, "odd"),
+    "7E1": (7, "even"),
+    "7O1": (7, "odd"),
+}
+_FRAMINGS = {
+    "lines": "lines of text",
+    "cobs": "binary frames, encoded by COBS, with a zero byte behind each",
+    "sync": "binary frames of one length, each behind a sync word",
+}
+_CRCS = {"ibm-3740": "begins with 0xffff", "xmodem": "begins with 0", "none": "frames have none"}
+_RATES_HZ = (12_800.0, 2560.0, 1280.0, 640.0, 100.0, 10.0, 1.0, 0.1)
+_LONGEST_PAYLOAD = 4096
+_LONGEST_SYNC_WORD = 8
+_KINDS = dict.fromkeys(_CHARACTERS, "")
+_LISTEN_S = 3.0
+"""Behind the search of the baud rate, which takes some seconds itself."""
+_SHOWN_LINES = 2
+
+
+class SerialQuestions(BusQuestions):
+    """Lines of text or binary frames."""
+
+    about = "lines of text or binary frames on a serial port"
+    topics: ClassVar[Mapping[str, Topic]] = {
+        "character": Topic(
+            "Data bits, parity and stop bits", "8N1 is the usual one: 8 bits, no parity, 1 stop bit."
+        ),
+        "framing": Topic(
+            "What does the device send?", "daqsvc sniff serial shows it, and daqsvc new --listen finds it."
+        ),
+        "sync-word": Topic(
+            "Bytes that each frame begins with", "In hexadecimal, as the device's manual has them, e.g. a55a."
+        ),
+        "crc": Topic("Which CRC is at the end of a frame?", "ibm-3740 is often called CRC-16/CCITT-FALSE."),
+        "crc-order": Topic("Which byte of the CRC comes first?", "The device's manual says so."),
+        "payload-length": Topic(
+            "Bytes of a frame without sync word and CRC", "Counter and samples, and whatever is behind them."
+        ),
+        **packed.TOPICS,
+        "prefix": Topic(
+            "Word that each line begins with", "e.g. $ACC; none if the first column is a number."
+        ),
+        "separator": Topic("Character between columns", "A comma, semicolon, blank or tab."),
+        "checksum": Topic(
+            "Checksum at the end of a line", "Behind a *: xor as in NMEA 0183, crc16, or none."
+        ),
+        "columns": Topic(
+            "What are the columns of a line, in order?",
+            "Names with commas between, e.g. t, x, y; give those that nobody needs a name, too.",
+        ),
+        "counts": Topic(
+            "What does it hold?", "count grows by one with each frame or line; s, ms and us are times."
+        ),
+    }
+
+    listens_behind = "port"
+
+    def listen(
+        self, answers: Answers, folder: Path, stop: threading.Event, tell: Callable[[str], None]
+    ) -> Heard:
+        """See `BusQuestions.listen`."""
+        del folder
+        found = sniffed(SerialSniffer(), ["--seconds", f"{_LISTEN_S:g}", "--", answers["port"]], stop, tell)
+        return Heard(list(_in_words(found)), lambda so_far: _proposals(found, so_far))
+
+    def questions(self, answers: Answers, folder: Path) -> Iterator[Question]:
+        """See `BusQuestions.questions`."""
+        del folder
+        yield self.ask("port", q.line, only_port())
+        yield self.ask("baud", q.whole, "115200")
+        yield self.ask("character", q.exactly(_KINDS), "8N1", choices=_KINDS, quiet=True)
+        yield self.choose("framing", _FRAMINGS, "lines")
+        yield from (self._ask_lines if answers["framing"] == "lines" else self._ask_frames)(answers)
+
+    def _ask_frames(self, answers: Answers) -> Iterator[Question]:
+        if answers["framing"] == "sync":
+            yield self.ask("sync-word", _sync_word, "a55a")
+        yield self.choose("crc", _CRCS, "ibm-3740")
+        orders = {"big": "its high byte comes first", "little": "its low byte does"}
+        yield self.choose("crc-order", orders, "big", quiet=True)
+        yield from packed.sample_questions(self, answers, _LONGEST_PAYLOAD, must_count=True)
+        yield self.ask("payload-length", q.whole, f"{packed.end_byte(answers)}", quiet=True)
+
+    def _ask_lines(self, answers: Answers) -> Iterator[Question]:
+        yield self.ask("prefix", q.text_or_none, NONE)
+        yield self.ask("separator", _character, ",", quiet=True)
+        yield self.choose("checksum", dict.fromkeys(("none", "xor", "crc16"), ""), "none", quiet=True)
+        yield self.ask("columns", _columns, "t, x, y")
+        columns = dict.fromkeys(answers["columns"], "")
+        first = answers["columns"][0]
+        yield self.ask("counter", q.exactly(columns), first, choices=columns)
+        counted = is_count(answers["counter"])
+        kinds = {"count": "it counts lines", "s": "time in s", "ms": "time in ms", "us": "time in us"}
+        yield self.choose("counts", kinds, "count" if counted else "ms")
+
+    def channels(self, answers: Answers) -> tuple[str, ...]:
+        """See `BusQuestions.channels`."""
+        if answers["framing"] != "lines":
+            return super().channels(answers)
+        return tuple(name for name in answers["columns"] if name != answers["counter"])
+
+    def guess(self, answers: Answers, channel: str) -> tuple[str, str | None]:
+        """See `BusQuestions.guess`."""
+        lines = answers["framing"] == "lines"
+        return super().guess(answers, channel) if lines else packed.guess(answers, channel)
+
+    def in_volts(self, answers: Answers) -> bool:
+        """See `BusQuestions.in_volts`."""
+        return answers["framing"] != "lines" and packed.in_volts(answers)
+
+    def rate_hz(self, answers: Answers) -> float:
+        """See `BusQuestions.rate_hz`."""
+        if answers["framing"] != "lines":
+            # Of a frame with all that is around the payload; a character has 12 bits at most.
+            frame_bits = 12 * (1.01 * answers["payload-length"] + 16)
+            most = 0.5 * answers["baud"] / frame_bits * answers["samples-per-frame"]
+            return next((rate for rate in _RATES_HZ if rate <= most), 0.01)
+        bits = 20 * len(answers["columns"]) + 200
+        return next((rate for rate in (100.0, 10.0, 1.0) if 2 * rate * bits <= answers["baud"]), 0.1)
+
+    def tables(self, answers: Answers) -> Iterator[str]:
+        """See `BusQuestions.tables`."""
+        yield f"[buses.{BUS}]"
+        yield entry("driver", "serial")
+        yield entry("port", answers["port"], "best its path below /dev/serial/by-id")
+        yield entry("baud", answers["baud"], "bit/s, as the device is set")
+        data_bits, parity = _CHARACTERS[answers["character"]]
+        if answers["character"] != "8N1":
+            yield entry("data_bits", data_bits)
+            yield entry("parity", parity)
+        yield entry("framing", answers["framing"], '"lines" of text, "cobs" or "sync"')
+        yield from (self._lines if answers["framing"] == "lines" else self._frames)(answers)
+
+    def _frames(self, answers: Answers) -> Iterator[str]:
+        if answers["framing"] == "sync":
+            yield entry("sync_word", answers["sync-word"], "the bytes that each frame begins with")
+        yield entry("crc", answers["crc"], 'the CRC-16 at the end of a frame: "ibm-3740", "xmodem", "none"')
+        if answers["crc"] != "none":
+            yield entry("crc_order", answers["crc-order"], '"little" if its low byte comes first')
+        yield ""
+        yield from self.stream(answers)
+        yield entry("payload_length", answers["payload-length"], "bytes without sync word and CRC")
+        yield from packed.layout_lines(answers)
+
+    def _lines(self, answers: Answers) -> Iterator[str]:
+        checks = 'behind a * at the end of a line: "none", "xor", "crc16"'
+        yield entry("checksum", answers["checksum"], checks)
+        yield ""
+        yield from self.stream(answers, "lines a second")
+        if answers["prefix"] is not None:
+            yield entry("prefix", answers["prefix"], "what each line begins with")
+        yield entry("line", answers["columns"], "the columns, in order")
+        yield entry("separator", answers["separator"])
+        if answers["counts"] == "count":
+            yield entry("counter", {"column": answers["counter"]}, "losses are counted by it")
+        else:
+            time = {"column": answers["counter"], "unit": answers["counts"]}
+            yield entry("time", time, "the device's own clock: it places the lines in time")
+        yield "# scale = 0.01 behind a name if the device sends hundredths"
+        yield from array("channels", [{"name": name} for name in self._measured(answers)])
+
+    def _measured(self, answers: Answers) -> tuple[str, ...]:
+        """The columns that become channels: those with a sensor, as others may be no numbers."""
+        named = self.channels(answers)
+        kept = tuple(name for name in named if answers.get(sensor_key(name, "type")) != NONE)
+        return kept or named
+
+
+def _sync_word(text: str) -> str:
+    word = text.lower().removeprefix("0x").replace(" ", "")
+    try:
+        length = len(bytes.fromhex(word))
+    except ValueError:
+        length = 0
+    if not 1 <= length <= _LONGEST_SYNC_WORD:
+        raise ValueError(f'"{text}" is not 1 to {_LONGEST_SYNC_WORD} bytes in hexadecimal; write e.g. a55a')
+    return word
+
+
+def _character(text: str) -> str:
+    return "\t" if text == r"\t" else q.line(text) if text != " " else text
+
+
+def _columns(text: str) -> tuple[str, ...]:
+    columns = q.names(text)
+    if len(columns) < 2:
+        raise ValueError("a line needs a column that counts or tells the time, and one that is measured")
+    return columns
+
+
+def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
+    """What was heard, in a few lines."""
+    rate = "" if found["rate_hz"] is None else f", {found['rate_hz']:.4g} a second"
+    line = f"{found['baud']} bit/s, {found['character']}"
+    if found["framing"] != "lines":
+        kind = "COBS frames" if found["framing"] == "cobs" else f"frames behind {found['sync_word']}"
+        counter = found["counter"]
+        counts = f"byte {counter['byte']} of the payload counts" if counter else "nothing counts"
+        check = f"CRC {found['crc'] or 'unknown'}"
+        yield f"{line}: {kind} of {found['frame_length']} bytes{rate}, {check}, {counts}"
+        return
+    prefix = f", each begins with {found['prefix']}" if found["prefix"] else ""
+    yield f"{line}: lines of text{rate}, {len(found['columns'])} columns{prefix}"
+    yield from (f"  {one}" for one in found["lines"][:_SHOWN_LINES])
+
+
+def _proposals(found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
+    """See `Heard.proposals`."""
+    proposed = {"baud": f"{found['baud']}", "character": found["character"]}
+    proposed["framing"] = found["framing"]
+    if found["framing"] != "lines":
+        return proposed | _frame_proposals(found, answers)
+    taken: set[str] = set()
+    named = {unused(table_name(one["name"], "column"), taken): one for one in found["columns"]}
+    proposed |= {
+        "prefix": found["prefix"] or NONE,
+        "separator": {"\t": r"\t"}.get(found["separator"], found["separator"] or ","),
+        "checksum": found["checksum"],
+        "columns": ", ".join(named),
+    }
+    if found["rate_hz"] is not None:
+        proposed["rate"] = f"{usual_rate(found['rate_hz']):g}"
+    # Most engineers name the columns themselves: what is known of each is known by its place.
+    for name, one in zip(answers.get("columns", named), named.values(), strict=False):
+        if one["counts"] or one["time_unit"]:
+            proposed |= {"counter": name, "counts": one["time_unit"] or "count"}
+        elif not one["numeric"]:
+            proposed[sensor_key(name, "type")] = NONE
+    return proposed
+
+
+def _frame_proposals(found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
+    """Those of binary frames; see `Heard.proposals`."""
+    # The driver knows two CRCs, which leave out the sync word; another check is a part of the payload for it.
+    known = found["crc"] in _CRCS and found["crc_from"] == len(found["sync_word"]) // 2
+    length = found["payload_length"] + (0 if known else found["crc_bytes"])
+    proposed = {"crc": found["crc"] if known else "none", "payload-length": f"{length}"}
+    if found["sync_word"]:
+        proposed["sync-word"] = found["sync_word"]
+    if known:
+        proposed["crc-order"] = found["crc_order"]
+    if found["counter"] is not None:
+        counter = {**found["counter"], "bits": found["counter_bits"] or found["counter"]["bits"]}
+        proposed |= packed.frame_proposals(found["payload_length"], counter, answers)
+    if "samples-per-frame" in answers and found["rate_hz"] is not None:
+        proposed["rate"] = f"{usual_rate(found['rate_hz'] * answers['samples-per-frame']):g}"
+    return proposed
