@@ -27,10 +27,11 @@ def _below(above: argparse.ArgumentParser) -> Iterator[tuple[argparse.ArgumentPa
 
 
 def options(verb: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.Action]]:
-    """The title of its group and each argument of a verb, but for ``--help``."""
+    """The title of its group and each argument of a verb, but for ``--help`` and those that are not shown."""
     for group in verb._action_groups:  # noqa: SLF001
         for action in group._group_actions:  # noqa: SLF001
-            if not isinstance(action, argparse._HelpAction | argparse._SubParsersAction):  # noqa: SLF001
+            hidden = isinstance(action, argparse._HelpAction | argparse._SubParsersAction)  # noqa: SLF001
+            if not hidden and action.help != argparse.SUPPRESS:
                 yield group.title or "", action
 
 

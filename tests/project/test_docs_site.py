@@ -42,7 +42,7 @@ def test_links_of_the_readme_lead_to_pages_and_copies_of_files(site: Path) -> No
     [copy] = re.findall(r'href="(_downloads/\w+/serial-probes.toml)"', text)
     assert (site / copy).read_bytes() == (ROOT / "config/machines/serial-probes.toml").read_bytes()
     # A folder has no page: its name stays.
-    assert re.search(r"<code[^>]*><span[^>]*>config/machines/</span></code> has some", text)
+    assert re.search(r"<code[^>]*><span[^>]*>config/machines/</span></code> has examples", text)
 
 
 def test_the_side_has_the_lists_of_the_index(site: Path) -> None:

@@ -42,6 +42,10 @@ def test_nothing_lacks_words():
     assert pages.gaps() == []
 
 
+def test_options_that_help_does_not_show_are_not_there(made):
+    assert "SUPPRESS" not in made["verbs.md"]
+
+
 def test_no_page_has_two_anchors_of_one_name(made):
     for name, text in made.items():
         anchors = re.findall(r'<a id="([^"]+)">', text)
