@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from daqsvc.confined.limits import ResourceLimits
 from daqsvc.confined.process import ConfinedError, RaisedThereError, shared
-from daqsvc.errors.machine_file import TOO_LARGE
-from daqsvc.errors.recordings import DAMAGED, NO_SUCH_CHANNEL
+from daqsvc.errors.recordings import DAMAGED, NO_SUCH_CHANNEL, TOO_LARGE
 from daqsvc.errors.table import CODES
 from daqsvc.recording import NamesError, RecordingError
 from daqsvc.recording.formats import find

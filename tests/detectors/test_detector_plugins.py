@@ -270,7 +270,7 @@ class Predictable(KurtosisPlugin):
         if options.process_noise is not None:
             raise UnfitOptionError("--process-noise: knocks have none; leave it out")
         if options.noise_um is not None:
-            raise ValueError("accelerometers measure no um")
+            raise ValueError("accelerometers measure no um [C01]")
         return Detectability({"sensor": given.sensor, "most": given.most}, f"{given.sensor} sees all")
 
 
@@ -287,8 +287,8 @@ def test_what_it_can_see_is_said_by_daqsvc_detectability(installed, tmp_path, ca
     installed(kurtosis=f"{__name__}:Predictable")
     assert verb() == (0, "accel-de sees all")
     assert json.loads(verb("--json")[1]) == {"sensor": "accel-de", "most": 6.0}
-    assert verb("--process-noise", "1") == (2, "--process-noise: knocks have none; leave it out")
-    assert verb("--noise-um", "1") == (1, "accelerometers measure no um")
+    assert verb("--process-noise", "1") == (2, "--process-noise: knocks have none; leave it out [C01]")
+    assert verb("--noise-um", "1") == (1, "accelerometers measure no um [C01]")
     path.write_text(text())
     code, said = verb()
     assert code == 2

@@ -267,7 +267,7 @@ def test_what_cannot_be_started_again_ends_the_process_with_its_own_code(why: st
     with service(tmp_path, LOSSES[why]) as process:
         said = rest_of(process)
         assert process.wait(PATIENCE_S) == 3, said
-    assert said.splitlines()[-1].endswith(why)
+    assert re.search(rf"{re.escape(why)} \[S\d\d\]$", said), said
 
 
 def test_a_task_of_a_plugin_that_exits_ends_nothing(tmp_path: Path) -> None:
@@ -422,6 +422,6 @@ def test_a_store_that_fails_does_not_spoil_the_end(failure: str, tmp_path: Path)
     assert "Traceback" not in said
     (left,) = [line for line in said.splitlines() if "control.sock" in line]
     # A disk that takes long to say so, as on a busy machine, is not waited for.
-    late = left.endswith("s and is left behind")
-    assert late or left.endswith(f"is left behind, where the next start replaces it: {failure}"), left
+    late = left.endswith("s and is left behind [S12]")
+    assert late or left.endswith(f"is left behind, where the next start replaces it: {failure} [S12]"), left
     assert said.splitlines()[-1].endswith("stopped")

@@ -275,7 +275,7 @@ def test_missing_matplotlib_is_told_before_anything_is_done(
     assert cli.main(["reproduce", "--out", str(tmp_path / "out")]) == 1
     errors = capsys.readouterr().err
     assert errors.splitlines() == [
-        "daqsvc reproduce: the figures need matplotlib; install it with: pip install 'daqsvc[plot]'"
+        "daqsvc reproduce: the figures need matplotlib; install it with: pip install 'daqsvc[plot]' [C12]"
     ]
     assert not (tmp_path / "out").exists()
 

@@ -6,8 +6,7 @@ import stat
 from typing import TYPE_CHECKING
 
 from daqsvc.confined.limits import Budget, TooLargeError
-from daqsvc.errors.machine_file import TOO_LARGE
-from daqsvc.errors.recordings import DAMAGED, NEEDS_MACHINE_FILE, NOT_FOUND, UNKNOWN_FORMAT
+from daqsvc.errors.recordings import DAMAGED, NEEDS_MACHINE_FILE, NOT_FOUND, TOO_LARGE, UNKNOWN_FORMAT
 from daqsvc.recording import RecordingError
 from daqsvc.recording.formats.delimited import read_csv
 from daqsvc.recording.formats.hdf5 import read_hdf5

@@ -268,7 +268,7 @@ async def test_a_port_in_use_is_said_once_and_taken_when_it_is_free(
             [status] = await asyncio.to_thread(ask_status, tmp_path / "store")
             reason = f"Address already in use: {FREE}"
             assert status["outputs"]["metrics"].pop("away_s") >= 0.0
-            assert status["outputs"]["metrics"] == {"connected": None, "reason": reason}
+            assert status["outputs"]["metrics"] == {"connected": None, "reason": reason, "code": "B29"}
             assert f"metrics: {reason}" in status_text(status, 200)
             assert service.control._server is not None
             other.close()
