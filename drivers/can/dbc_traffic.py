@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from drivers.fields import Payloads
 
 
+_LEAST_CLOCK_BITS = 12
+
+
 class SignalTraffic:
     """What came of one signal.
 
@@ -65,6 +68,7 @@ class SignalTraffic:
         self.multiplexed = bool(self._selectors)
         self._may_count = cell.kind == "unsigned" and self._scale == 1 and cell.bits >= LEAST_COUNTER_BITS
         self._may_count &= not self.multiplexed
+        self._may_rise = cell.kind == "unsigned" and cell.bits >= _LEAST_CLOCK_BITS and not self.multiplexed
         self._mask = np.uint64(2**cell.bits - 1)
         self._before = np.empty(0, np.uint64)
 
@@ -72,6 +76,16 @@ class SignalTraffic:
     def counts(self) -> bool:
         """Whether it grew by 1 from frame to frame."""
         return self._may_count and self.frames > LEAST_COUNTS
+
+    @property
+    def rises(self) -> bool:
+        """Whether it grew from frame to frame, as a time or an hour meter does, until it began again at 0."""
+        return self._may_rise and self.frames > LEAST_COUNTS and self.most > self.least
+
+    @property
+    def named(self) -> bool:
+        """Whether the DBC file has names for its values, as for those of a state."""
+        return bool(self._choices)
 
     @property
     def choice(self) -> str:
@@ -85,9 +99,11 @@ class SignalTraffic:
         if not len(payloads):
             return
         raw = self._group.read(payloads)[:, 0]
-        if self._may_count:
+        if self._may_count or self._may_rise:
             counts = np.concatenate((self._before, raw.astype(np.uint64)))
-            self._may_count = bool(((np.diff(counts) & self._mask) == 1).all())
+            steps = np.diff(counts) & self._mask
+            self._may_count = self._may_count and bool((steps == 1).all())
+            self._may_rise = self._may_rise and bool(((steps > 0) & (steps < self._mask // 2)).all())
             self._before = counts[-1:]
         self._note(raw.astype(np.float64))
         self._last_raw = None if raw.dtype.kind == "f" else int(raw[-1])

@@ -17,7 +17,7 @@ from drivers.toml_lines import Hexadecimal, array, behind, entry, toml
 
 if TYPE_CHECKING:
     import threading
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from cantools.database.can import Message
 
@@ -261,8 +261,8 @@ class DbcQuestions(_CanQuestions):
         likely = next((name for name in counters if is_count(name)), NONE)
         choices = {**counters, NONE: "losses are then told by the times of arrival"}
         yield self.ask("counter", q.exactly(choices), likely, choices=choices)
-        measured = [one.name for one in message.signals if _is_measured(one, answers["counter"])]
         rest = [name for name in signals if name != answers["counter"]]
+        measured = _likely_measured([signals[name] for name in rest])
         yield self.ask("signals", partial(_signals, tuple(rest)), ", ".join(measured or rest[:1]))
 
     listens_behind = "dbc"
@@ -327,7 +327,7 @@ class DbcQuestions(_CanQuestions):
     def tables(self, answers: Answers) -> Iterator[str]:
         """See `BusQuestions.tables`."""
         yield from self._bus(answers)
-        yield from self.stream(answers, "frames a second: the DBC file or candump says so")
+        yield from self.stream(answers, "samples a second of each channel, here one a frame")
         yield entry("dbc", answers["dbc"], "relative to this file; where signals lie, scale, unit")
         yield entry("message", answers["message"])
         if answers["counter"] is None:
@@ -384,8 +384,16 @@ def _may_count(signal: Any, signals: int) -> bool:
     return bool(plain) and signals > 1
 
 
-def _is_measured(signal: Any, counter: str | None) -> bool:
-    return signal.name != counter and bool(signal.unit) and signal.multiplexer_ids is None
+def _likely_measured(signals: Sequence[Any]) -> list[str]:
+    """Names of what one stream measures: no states, no selectors, one page of a multiplexed message."""
+    numbers = [one for one in signals if not one.is_multiplexer and not one.choices]
+    always = [one for one in numbers if one.multiplexer_ids is None]
+    first = min((min(one.multiplexer_ids) for one in numbers if one.multiplexer_ids), default=None)
+    page = [one for one in numbers if one.multiplexer_ids and first in one.multiplexer_ids]
+    for likely in (always, page):
+        if found := [one.name for one in likely if one.unit]:
+            return found
+    return [one.name for one in (always or page)[:1]]
 
 
 def _signals(known: tuple[str, ...], text: str) -> tuple[str, ...]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import json
+import logging
+import re
 import subprocess
 import time
 from pathlib import Path
@@ -27,7 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from drivers.can.batches import CanSource
-    from drivers.can.dbc_traffic import DbcTraffic, MessageTraffic
+    from drivers.can.dbc_traffic import DbcTraffic, MessageTraffic, SignalTraffic
     from drivers.can.settings import CanBus
     from drivers.can.traffic import IdTraffic, Traffic
 
@@ -163,6 +165,8 @@ def _dbc(file: Path) -> DbcTraffic:
     from drivers.can.dbc_traffic import DbcTraffic  # noqa: PLC0415
     from drivers.fields import LayoutError  # noqa: PLC0415
 
+    if not file.exists():
+        raise SniffError(f"--dbc: there is no file {file}; correct the path", usage=True)
     try:
         return DbcTraffic(messages_of(file))
     except LayoutError as error:
@@ -193,6 +197,8 @@ def _opened(bus: CanBus, clock: Any) -> CanSource:
         raise SniffError(
             f"--interface {bus.interface}: python-can knows no such interface. Remedy: {remedy}", usage=True
         )
+    # python-can logs which optional parts are missing, beside the error that says what is wrong.
+    logging.getLogger("can").addHandler(logging.NullHandler())
     try:
         return open_adapter(bus, clock)
     except Exception as error:
@@ -299,10 +305,23 @@ class _Report(NamedTuple):
 
     def _problem(self) -> str:
         name = self.bus.channel
+        of_kernel = self.bus.interface == "socketcan"
         if self.lost:
-            return f"{name} was lost after {self.seconds:.1f} s: {self.lost}. Remedy: {_set_up(name)}"
+            remedy = _set_up(name) if of_kernel else "see whether it is still plugged in, or still runs"
+            return f"{name} was lost after {self.seconds:.1f} s: {self.lost}. Remedy: {remedy}"
         if self.traffic.ids:
             return ""
+        if "/" in name and not of_kernel:
+            return (
+                f"{name}: no frame in {self.seconds:.1f} s. Remedy: start the program that sends there, and "
+                "see that it has the same path"
+            )
+        if not of_kernel and not self.traffic.error_frames:
+            return (
+                f"{name}: no frame in {self.seconds:.1f} s. Remedy: see that the devices are powered and "
+                "send without being asked, and that CAN_H and CAN_L are not swapped; give the bit rate with "
+                "--bitrate"
+            )
         if self.traffic.error_frames:
             return (
                 f"{name}: no frame in {self.seconds:.1f} s, but {self.traffic.error_frames} error frames: "
@@ -501,7 +520,8 @@ class _Report(NamedTuple):
     def _stream(self, message: MessageTraffic, bus: str, taken: set[str], sensors: set[str]) -> Sequence[str]:
         """A stream of a message, as far as one can be made of what is known."""
         of_ids = [one for key in sorted(message.ids) if (one := self.traffic.ids[key]).rate_hz is not None]
-        channels = [s for s in message.signals if s.frames and not s.counts and not s.multiplexed]
+        measured = [s for s in message.signals if s.frames and not s.counts and not s.multiplexed]
+        channels = [s for s in measured if not s.named and not s.rises]
         if any(signal.multiplexed for signal in message.signals):
             return [f"# {message.name} is multiplexed: make a stream for each page (docs/can.md)"]
         if len(of_ids) != 1 or not channels or message.short:
@@ -524,6 +544,8 @@ class _Report(NamedTuple):
             "channels = [",
             *(f"  {{ name = {quoted(s.name)}, signals = [{quoted(s.name)}] }}," for s in channels),
             "]",
+            *(f"# {s.name} is left out: {_why_left_out(s)}" for s in measured if s not in channels),
+            *_of_one_channel(channels),
             *sensor_lines(
                 name,
                 {s.name: s.unit for s in channels if s.unit}
@@ -531,6 +553,25 @@ class _Report(NamedTuple):
                 sensors,
             ),
         ]
+
+
+def _why_left_out(signal: SignalTraffic) -> str:
+    return (
+        "its values have names, as states have" if signal.named else "it rises all the time, as a clock does"
+    )
+
+
+def _of_one_channel(signals: Sequence[SignalTraffic]) -> Iterator[str]:
+    """Signals that may be the samples of one channel in a frame: names that end in 0, 1 and so on."""
+    stems: dict[str, list[SignalTraffic]] = {}
+    for signal in signals:
+        if match := re.fullmatch(r"(.*[^0-9_])_?(\d+)", signal.name):
+            stems.setdefault(match[1], []).append(signal)
+    for stem, of_one in stems.items():
+        first, *_ = numbers = [int(re.sub(r".*[^0-9]", "", signal.name)) for signal in of_one]
+        if len(of_one) > 1 and first < 2 and numbers == list(range(first, first + len(numbers))):
+            channel = f"{{ name = {quoted(stem)}, signals = [{', '.join(quoted(s.name) for s in of_one)}] }}"
+            yield f"# If these are samples of one channel: {channel}, and {len(of_one)} times the rate."
 
 
 def _id(frame_id: int, *, extended: bool) -> str:

@@ -33,6 +33,16 @@ def test_a_layout_of_the_can_page_fits_its_bus(place, stream, channel):
     assert machine(text, stream, channel).buses["can0"].record.keep_mb == 2048
 
 
+def test_the_pages_of_a_multiplexed_message_are_streams(tmp_path):
+    dbc = tmp_path / "transmitter.dbc"
+    signals = 'SG_ Page M : 0|8@1+ (1,0) [0|0] "" A\n SG_ Temperature m0 : 8|16@1- (0.1,0) [0|0] "degC" A\n'
+    signals += ' SG_ Supply m1 : 8|16@1+ (0.01,0) [0|0] "" A\n'
+    dbc.write_text(f'VERSION ""\nBU_: A\nBO_ 801 Slow: 8 A\n {signals}')
+    bus, _, _, pages, _ = blocks("can.md")
+    text = f"{bus}\n{pages}\n".replace("../devices/transmitter.dbc", f"{dbc}")
+    assert list(machine(text, "supply", "supply").streams) == ["temperature", "supply"]
+
+
 def test_the_keys_of_a_serial_port_are_all_shown_with_their_defaults():
     bus, lines, _ = blocks("serial.md")
     shown = machine(bus + lines[lines.index("[streams") :], "casing", "v").buses["casing"]

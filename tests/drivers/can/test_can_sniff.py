@@ -133,6 +133,58 @@ def test_what_it_proposes_passes_check_in_a_whole_file(
     ]
 
 
+FAN = """VERSION ""
+BU_: A
+BO_ 800 Vibration: 8 A
+ SG_ VibDE_0 : 0|12@1- (0.01,0) [0|0] "g" A
+ SG_ VibDE_1 : 12|12@1- (0.01,0) [0|0] "g" A
+ SG_ TimeMs : 24|24@1+ (1,0) [0|0] "ms" A
+ SG_ State : 48|4@1+ (1,0) [0|0] "" A
+ SG_ Count : 56|8@1+ (1,0) [0|0] "" A
+VAL_ 800 State 0 "off" 1 "on" ;
+"""
+
+
+def fan(bus: UnixBus, number: int) -> None:
+    payload = bytes([number % 7, 0x10, 0x01]) + (3 * number).to_bytes(3, "little") + bytes([1, number % 256])
+    bus.send(can.Message(arbitration_id=800, is_extended_id=False, data=payload))
+
+
+@pytest.mark.usefixtures("hub")
+def test_clocks_and_states_are_no_channels_and_samples_of_one_channel_are_pointed_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dbc = tmp_path / "fan.dbc"
+    dbc.write_text(FAN)
+    with talking(tmp_path / "bus", fan):
+        assert main(words(tmp_path, "--seconds", "0.5", "--json", "--dbc", f"{dbc}")) == 0
+    fragment = figures(capsys.readouterr().out)["machine_file"]
+    [stream] = tomllib.loads(fragment)["streams"].values()
+    assert [channel["name"] for channel in stream["layout"]["channels"]] == ["VibDE_0", "VibDE_1"]
+    assert stream["layout"]["counter"]["signal"] == "Count"
+    assert "# TimeMs is left out: it rises all the time" in fragment
+    assert "# State is left out: its values have names" in fragment
+    assert '{ name = "VibDE", signals = ["VibDE_0", "VibDE_1"] }, and 2 times the rate' in fragment
+
+
+MULTIPLEXED = """VERSION ""
+BU_: A
+BO_ 801 Slow: 8 A
+ SG_ Page M : 0|8@1+ (1,0) [0|0] "" A
+ SG_ Temperature m0 : 8|16@1- (0.1,0) [0|0] "degC" A
+ SG_ Supply m1 : 8|16@1+ (0.01,0) [0|0] "V" A
+"""
+
+
+def test_new_offers_a_page_of_a_multiplexed_message_and_never_its_selector(tmp_path: Path) -> None:
+    dbc = tmp_path / "slow.dbc"
+    dbc.write_text(MULTIPLEXED)
+    file = tmp_path / "new.toml"
+    assert main(["new", f"{file}", "--yes", "--bus=can-dbc", f"--dbc={dbc}", "--rate=1"]) == 0
+    [stream] = tomllib.loads(file.read_text("utf-8"))["streams"].values()
+    assert [channel["signals"] for channel in stream["layout"]["channels"]] == [["Temperature"]]
+
+
 @pytest.mark.usefixtures("hub")
 def test_without_a_dbc_file_the_proposal_has_the_bus_and_says_what_is_missing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -170,8 +222,8 @@ def test_a_silent_bus_is_a_failure_that_says_what_to_check(
     said = capsys.readouterr()
     assert "0 frames in 0.1 s" in said.out
     assert "To begin a machine file" not in said.out
-    assert "no frame in 0.1 s. Remedy: see that the devices are powered" in said.err
-    assert "up type can bitrate 500000" in said.err
+    assert "no frame in 0.1 s. Remedy: start the program that sends there" in said.err
+    assert "ip link" not in said.err
 
 
 def test_a_bus_that_is_lost_ends_it_and_what_was_heard_is_shown(
@@ -331,5 +383,5 @@ def test_new_says_what_to_do_when_no_frame_comes_and_goes_on(
     tables = new(tmp_path, "--bus=can")
     said = capsys.readouterr().out
     assert "Nothing was found: " in said
-    assert "Remedy: see that the devices are powered" in said
+    assert "Remedy: start the program that sends there" in said
     assert tables["streams"]["device"]["layout"]["id"] == 0x101
