@@ -18,7 +18,7 @@ from daqsvc.rotor.synchronous.signatures import (
     identify,
     likelihoods,
 )
-from daqsvc.rotor.synchronous.vectors import HARMONICS, Healthy
+from daqsvc.rotor.synchronous.vectors import HARMONICS, WITH_THRICE, Healthy
 
 ORDER = np.array(HARMONICS)
 VARIANCE = np.full(5, (0.004 * abs(HEALTHY[1])) ** 2)
@@ -131,6 +131,21 @@ def test_a_push_along_the_sag_is_not_called_a_rub():
     change = pulse(math.radians(180.0), -1.0j, speed=0.5)
     best, scores = judged(change, machine)
     assert best == "unmodelled"
+    assert scores["unmodelled"] - scores["rub"] > 5.0
+
+
+@pytest.mark.parametrize("speed", [0.5, 0.7, 1.3])
+def test_a_crack_that_opens_once_a_revolution_is_no_rub(speed):
+    """It pulls along itself and turns with the shaft (Mayes and Davies 1984): backward 3X is hardly there."""
+    machine = healthy(speed)
+    theta = 2.0 * math.pi * np.arange(256) / 256.0
+    along = np.exp(1j * (theta + 0.7))
+    bent = machine.baseline[1] * np.exp(1j * theta) - 1j * machine.rotor.sag_um
+    force = 0.3 * (1.0 - along.imag) / 2.0 * (bent * along.conj()).real * along
+    order = np.array(WITH_THRICE)
+    change = compliance(order * speed, 0.18) * (force @ np.exp(-1j * np.outer(theta, order))) / len(theta)
+    variance = np.full(7, VARIANCE[0])
+    scores = likelihoods(change, variance, machine, machine.baseline + change[:5])
     assert scores["unmodelled"] - scores["rub"] > 5.0
 
 

@@ -47,6 +47,22 @@ def test_revolutions_of_a_broken_number_of_samples_are_recovered_exactly(period)
     assert fitted.end_index[-1] == 100 + keep.sum()
 
 
+def test_3x_in_both_senses_is_kept_besides_and_moves_nothing_else():
+    vectors = np.hstack((VECTORS, [[0.3, -0.2j], [0.0, 0.1], [1.0, 1j]]))
+    cut = orbits(vectors)
+    cut.xy[5:8] = np.nan
+    fitted = synchronous_vectors(cut)
+    np.testing.assert_allclose(fitted.thrice[1:], vectors[1:, 5:], atol=1e-9)
+    np.testing.assert_allclose(fitted.thrice[0], vectors[0, 5:], atol=0.05)
+    np.testing.assert_allclose(fitted.vectors[1:], VECTORS[1:], atol=1e-9)
+
+
+def test_too_few_samples_in_a_revolution_have_no_3x():
+    fitted = synchronous_vectors(orbits(VECTORS, per_rev=12))
+    assert fitted.usable.all()
+    assert np.isnan(fitted.thrice).all()
+
+
 def test_missing_samples_change_nothing_but_the_count():
     cut = orbits(VECTORS)
     cut.xy[64 + 5 : 64 + 12] = np.nan

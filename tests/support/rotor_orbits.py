@@ -9,7 +9,7 @@ import numpy as np
 
 from daqsvc.dsp.speed.revolutions import Revolutions
 from daqsvc.rotor.laval import LavalRotor, unbalance_response
-from daqsvc.rotor.synchronous.vectors import HARMONICS
+from daqsvc.rotor.synchronous.vectors import WITH_THRICE
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -29,10 +29,10 @@ def orbits(
     per_rev: int = PER_REV,
     deviation: NDArray[np.float64] | None = None,
 ) -> Revolutions:
-    """Revolutions with the given synchronous vectors, ``[R, 5]``, in white noise on each probe."""
+    """Revolutions with the given synchronous vectors, ``[R, 5]`` or ``[R, 7]``, in white noise."""
     rows: NDArray[Any] = np.atleast_2d(vectors)
     theta = 2.0 * math.pi * np.arange(per_rev) / per_rev
-    z = rows @ np.exp(1j * np.outer(HARMONICS, theta))
+    z = rows @ np.exp(1j * np.outer(WITH_THRICE[: rows.shape[1]], theta))
     rng = np.random.default_rng(seed)
     z = z.ravel() + noise_um * (rng.standard_normal(z.size) + 1j * rng.standard_normal(z.size))
     count = len(rows)

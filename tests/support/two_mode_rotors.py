@@ -12,6 +12,8 @@ import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.signal import cont2discrete, lfilter
 
+from daqsvc.rotor.synchronous.vectors import WITH_THRICE
+
 RATE_HZ = 4000.0
 UNIT_HZ = 30.0
 
@@ -84,7 +86,7 @@ def run_up(machine: Machine, from_hz: float, to_hz: float, seconds: float) -> tu
 
 def vector_of(machine: Machine, speed_hz: float) -> np.ndarray:
     """Synchronous vector of the machine, complex128 ``[5]`` um."""
-    return np.array([machine.rest, *machine.orbit(speed_hz), 0.0, 0.0])
+    return np.array([machine.rest, *machine.orbit(speed_hz), 0.0, 0.0, 0.0, 0.0])
 
 
 def touching(machine: Machine, speed_hz: float, wall: complex, stiffness: float) -> np.ndarray:
@@ -116,4 +118,4 @@ def touching(machine: Machine, speed_hz: float, wall: complex, stiffness: float)
     at = (math.tau * settled + theta) / w
     found = solve_ivp(moved, (0.0, at[-1]), begin, t_eval=at, rtol=1e-7, atol=1e-6, max_step=0.2 / w)
     z = found.y[0] + 1j * found.y[1]
-    return np.array([np.mean(z * np.exp(-1j * k * theta)) for k in (0, 1, -1, 2, -2)])
+    return np.array([np.mean(z * np.exp(-1j * k * theta)) for k in WITH_THRICE])

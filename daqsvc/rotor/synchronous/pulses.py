@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.rotor.laval import compliance
-from daqsvc.rotor.synchronous.vectors import DC, HARMONICS, SPREADS, Healthy, log_mean
+from daqsvc.rotor.synchronous.vectors import DC, HARMONICS, SPREADS, WITH_THRICE, Healthy, log_mean
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -40,16 +40,16 @@ _CRACK_TOLERANCES = np.array([0.1, 0.2, 0.4])
 _CRACK_FACING = 0.85
 _RUB_FACING = 0.5
 _RUB_OUTWARDS = 0.2
-_PLACES = ((0, 0), (1, 2), (3, 4))
-"""Where the forward and the backward component of orders 0, 1 and 2 stand in `HARMONICS`."""
+_PLACES = ((0, 0), (1, 2), (3, 4), (5, 6))
+"""Where the forward and the backward component of orders 0 to 3 stand in `WITH_THRICE`."""
 
 
 def rub_pulse(change: Complexes, variance: Floats, healthy: Healthy, position: Complexes) -> float:
     """Log marginal likelihood of a push once a revolution, inwards.
 
     Args:
-        change: complex128 ``[5]``, um.
-        variance: float64 ``[5]``, um^2.
+        change: complex128 ``[5]`` or, with 3X, ``[7]``, um.
+        variance: float64, as many, um^2.
         healthy: the machine before.
         position: complex128 ``[5]``, the present synchronous vector, um: it is this orbit that touches.
     """
@@ -59,11 +59,13 @@ def rub_pulse(change: Complexes, variance: Floats, healthy: Healthy, position: C
     place = whirl + position[DC]
 
     def possible(force: Complexes) -> Flags:
-        # The wall is where the whirl leads to, and not behind the centre: a crack pulls the other way.
-        return (_facing(-force, whirl) > _RUB_FACING) & (_facing(-force, place) > _RUB_OUTWARDS)
+        # The wall is where the whirl leads to, and not behind the centre, as a crack pulls. But only a
+        # drawing says where that centre is, and 3X tells a crack better.
+        towards = _facing(-force, whirl) > _RUB_FACING
+        return towards if len(change) > len(HARMONICS) else towards & (_facing(-force, place) > _RUB_OUTWARDS)
 
     tolerances = _RUB_TOLERANCES if healthy.rotor.two_modes is not None else _RUB_TOLERANCES[1:]
-    return _shaped(change, variance, healthy, _rubs(healthy), tolerances, possible)
+    return _shaped(change, variance, healthy, _rubs(healthy, len(change)), tolerances, possible)
 
 
 def likeliest_touch(change: Complexes, healthy: Healthy) -> tuple[float, float]:
@@ -71,7 +73,7 @@ def likeliest_touch(change: Complexes, healthy: Healthy) -> tuple[float, float]:
 
     Of all pulses the one that explains the change best, whichever way it points.
     """
-    shape = _rubs(healthy)
+    shape = _rubs(healthy, len(change))
     force, left = _fitted(change, np.ones(len(change)), shape)
     best = np.unravel_index(int(left.argmin()), left.shape)
     return float(np.hypot(*force[best])), float(_ANGLES[best[-1]])
@@ -80,14 +82,17 @@ def likeliest_touch(change: Complexes, healthy: Healthy) -> tuple[float, float]:
 def crack(change: Complexes, variance: Floats, healthy: Healthy) -> float:
     """Log marginal likelihood of a shaft that a crack makes softer once a revolution.
 
-    Two shapes, equally likely: the lost restoring force lies along the crack and turns with it (Mayes and
-    Davies 1984. The hinge of Gasch 1976), or it is a pulse along the sag, as a finite-element model of a
-    crack between bearings gives it. A rub pushes the other way.
+    The lost restoring force lies along the crack and turns with it (Mayes and Davies 1984, and the hinge of
+    Gasch 1976). Where 3X is not known, it may as likely be a pulse along the sag. Up to 2X,
+    a finite-element model of a crack between bearings looks like one. But it makes next to no backward 3X,
+    and a pulse does.
     """
-    order = np.array(HARMONICS)
+    order = np.array(WITH_THRICE[: len(change)])
     theta = 2.0 * math.pi * np.arange(32) / 32.0
     direction = np.exp(1j * (theta + _ANGLES[:, np.newaxis]))
-    deflection = np.exp(1j * np.outer(theta, order[1:])) @ healthy.baseline[1:] - 1j * healthy.rotor.sag_um
+    deflection = (
+        np.exp(1j * np.outer(theta, HARMONICS[1:])) @ healthy.baseline[1:] - 1j * healthy.rotor.sag_um
+    )
     down = -direction.imag  # cosine of the angle between crack and gravity
     breathing = np.stack([(1.0 + down) / 2.0, (1.0 + np.sign(down)) / 2.0])
     force = breathing * (deflection * direction.conj()).real * direction
@@ -102,33 +107,35 @@ def crack(change: Complexes, variance: Floats, healthy: Healthy) -> float:
         _CRACK_TOLERANCES,
         lambda loss: loss.real > math.cos(math.pi / 4.0) * np.abs(loss),
     )
+    if len(change) > len(HARMONICS):
+        return turning
     along_sag = _shaped(
         change,
         variance,
         healthy,
-        _pushed(healthy, _FEW_WIDTHS, _TURNS[:1]),
+        _pushed(healthy, _FEW_WIDTHS, _TURNS[:1], len(change)),
         _CRACK_TOLERANCES,
         lambda loss: -loss.imag > _CRACK_FACING * np.abs(loss),
     )
     return float(np.logaddexp(turning, along_sag)) - math.log(2.0)
 
 
-def _rubs(healthy: Healthy) -> Complexes:
-    """Response to every push of a wall, complex128 ``[B, W, T, A, 5, 2]``.
+def _rubs(healthy: Healthy, count: int) -> Complexes:
+    """Response to every push of a wall, complex128 ``[B, W, T, A, count, 2]``.
 
     Without the two modes, how the push turns is not asked: it would fit what a wrong rotor leaves over.
     """
     if healthy.rotor.two_modes is not None:
-        return _pushed(healthy, _WIDTHS, _TURNS)
-    return _pushed(healthy, _FEW_WIDTHS, _TURNS[:1])
+        return _pushed(healthy, _WIDTHS, _TURNS, count)
+    return _pushed(healthy, _FEW_WIDTHS, _TURNS[:1], count)
 
 
-def _pushed(healthy: Healthy, widths: Floats, turns: Floats) -> Complexes:
-    """Response to a push once a revolution, complex128 ``[B, W, T, A, 5, 2]``; see `_passed`."""
-    order = np.array(HARMONICS)
+def _pushed(healthy: Healthy, widths: Floats, turns: Floats, count: int) -> Complexes:
+    """Response to a push once a revolution, complex128 ``[B, W, T, A, count, 2]``; see `_passed`."""
+    order = np.array(WITH_THRICE[:count])
     spread = np.exp(
         -(((order - turns[:, np.newaxis]) * widths[:, np.newaxis, np.newaxis]) ** 2) / 2.0
-    )  # [W, T, 5]
+    )  # [W, T, count]
     at = np.exp(-1j * np.outer(_ANGLES, order))
     return _passed(np.asarray(spread[:, :, np.newaxis] * at, dtype=np.complex128), healthy)
 
@@ -140,17 +147,19 @@ def _passed(force: Complexes, healthy: Healthy) -> Complexes:
     is given to the force as it is and to the force turned by a right angle, and between them it is linear.
 
     Args:
-        force: complex128 ``[..., 5]``, forces at the orders of `HARMONICS`, over the static stiffness.
+        force: complex128 ``[..., n]``, forces at the first n orders of `WITH_THRICE`, over the static
+            stiffness.
         healthy: the machine.
 
     Returns:
-        complex128 ``[B, ..., 5, 2]``; B are the rotors that it may be.
+        complex128 ``[B, ..., n, 2]``; B are the rotors that it may be.
     """
-    through = _compliances(healthy)
-    through = through.reshape(len(through), *(1,) * (force.ndim - 1), len(_PLACES), 2, 2)
+    places = _PLACES[: (force.shape[-1] + 1) // 2]
+    through = _compliances(healthy, len(places))
+    through = through.reshape(len(through), *(1,) * (force.ndim - 1), len(places), 2, 2)
     passed = np.empty((len(through), *force.shape, 2), dtype=np.complex128)
     for k, turned in enumerate((1.0, 1j)):
-        for order, (forward, backward) in enumerate(_PLACES):
+        for order, (forward, backward) in enumerate(places):
             there, back = turned * force[..., forward], (turned * force[..., backward]).conj()
             matrix = through[..., order, :, :]
             passed[..., backward, k] = (matrix[..., 1, 0] * there + matrix[..., 1, 1] * back).conj()
@@ -158,15 +167,14 @@ def _passed(force: Complexes, healthy: Healthy) -> Complexes:
     return passed
 
 
-def _compliances(healthy: Healthy) -> Complexes:
-    """Deflection by forces of orders 0, 1 and 2, complex128 ``[B, 3, 2, 2]``; see `TwoModes.compliance`."""
+def _compliances(healthy: Healthy, count: int) -> Complexes:
+    """Deflection by forces of the first orders, complex128 ``[B, count, 2, 2]``: `TwoModes.compliance`."""
     rotor = healthy.rotor.two_modes
     if rotor is not None and rotor.two_modes is not None:
         w = healthy.speed_rad_s / rotor.natural_frequency_rad_s
-        orders = range(len(_PLACES))
-        return np.array([[rotor.two_modes.compliance(w, order) for order in orders]])
+        return np.array([[rotor.two_modes.compliance(w, order) for order in range(count)]])
     omega, zeta = (axis.reshape(5, 5)[::2, ::2].ravel() for axis in healthy.rotor.box)
-    order = np.arange(len(_PLACES))
+    order = np.arange(count)
     through = compliance(order * healthy.speed_rad_s / omega[:, np.newaxis], zeta[:, np.newaxis])
     return np.asarray(through[..., np.newaxis, np.newaxis] * np.eye(2))
 
@@ -184,7 +192,7 @@ def _fitted(change: Complexes, variance: Floats, shape: Complexes) -> tuple[Floa
 
 
 def _of_size(shape: Complexes, size: Floats) -> Complexes:
-    """Shapes times their sizes, complex128 ``[..., 5]``."""
+    """Shapes times their sizes, complex128 ``[..., n]``."""
     return np.asarray(shape[..., 0] * size[..., :1] + shape[..., 1] * size[..., 1:], dtype=np.complex128)
 
 
@@ -209,10 +217,10 @@ def _shaped(
     """Log marginal likelihood of a change of known shape and unknown size and direction.
 
     Args:
-        change: complex128 ``[5]``.
-        variance: float64 ``[5]``.
+        change: complex128 ``[n]``.
+        variance: float64 ``[n]``.
         healthy: the machine before.
-        shape: complex128 ``[..., 5, 2]``, shapes, equally likely; see `_passed`.
+        shape: complex128 ``[..., n, 2]``, shapes, equally likely; see `_passed`.
         tolerances: relative deviations from the shape, equally likely.
         possible: which of the sizes that fit best can be, complex128 ``[...]`` to bool.
     """

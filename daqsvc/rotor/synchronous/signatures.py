@@ -33,10 +33,10 @@ from daqsvc.rotor.synchronous.contact import fills_clearance, has_marks, marks_w
 from daqsvc.rotor.synchronous.pulses import crack, rub_pulse
 from daqsvc.rotor.synchronous.vectors import (
     BACKWARD,
+    BEYOND_1X,
     DC,
     FORWARD,
     SPREADS,
-    TWICE,
     Healthy,
     density,
     log_density,
@@ -114,8 +114,8 @@ def likelihoods(
     """Log marginal likelihood ratio of every hypothesis against "normal", in nats.
 
     Args:
-        change: complex128 ``[5]``, d in um, in the order of `HARMONICS`.
-        variance: float64 ``[5]``, complex variance of each component of it, um^2.
+        change: complex128 ``[5]`` or, with 3X, ``[7]``, d in um, in the order of `WITH_THRICE`.
+        variance: float64, as many, complex variance of each component of it, um^2.
         healthy: the machine before.
         position: complex128 ``[5]``, the present synchronous vector in um, for the clearance.
         shaken: whether motion came with the change that does not repeat with the shaft.
@@ -194,8 +194,8 @@ def _damping_loss(change: Complexes, variance: Floats, healthy: Healthy) -> floa
     if rotor is None:
         return free
     moved = float(np.abs(change[[FORWARD, BACKWARD]]).max())
-    twice = float(_still(change, variance, moved)[TWICE].sum())
-    return _besides(twice + less_damped(change, variance, healthy, rotor), free)
+    rest = float(_still(change, variance, moved)[BEYOND_1X].sum())
+    return _besides(rest + less_damped(change, variance, healthy, rotor), free)
 
 
 def _free_damping_loss(change: Complexes, variance: Floats, healthy: Healthy) -> float:
@@ -292,8 +292,8 @@ def _stiffness_loss(change: Complexes, variance: Floats, healthy: Healthy) -> fl
     if rotor is None:
         return free
     moved = float(np.hypot(abs(change[DC]), abs(change[FORWARD])))
-    twice = float(_still(change, variance, moved)[TWICE].sum())
-    return _besides(twice + softer(change, variance, healthy, rotor), free)
+    rest = float(_still(change, variance, moved)[BEYOND_1X].sum())
+    return _besides(rest + softer(change, variance, healthy, rotor), free)
 
 
 def _free_stiffness_loss(change: Complexes, variance: Floats, healthy: Healthy) -> float:
@@ -434,8 +434,9 @@ def identify(
     """Weigh the hypotheses.
 
     Args:
-        change: complex128 ``[5]``, mean synchronous vector of the present segment less the baseline, um.
-        variance: float64 ``[5]``, its variance, um^2.
+        change: complex128 ``[5]`` or, with 3X, ``[7]``, mean synchronous vector of the present segment less
+            the baseline, um.
+        variance: float64, as many, its variance, um^2.
         healthy: the baseline.
         previous: the evaluation before; a name takes two that agree.
         rules: margins.
@@ -447,7 +448,10 @@ def identify(
     amplitude = healthy.healthy.amplitude_um
     least = (rules.least_severity * amplitude) ** 2
     shaken = energy is not None and energy.nats > _ENERGY_NATS and energy.excess > least
-    scores = likelihoods(change, variance, healthy.healthy, healthy.baseline + change, shaken=shaken)
+    position = healthy.baseline + change[: len(healthy.baseline)]
+    scores = likelihoods(change, variance, healthy.healthy, position, shaken=shaken)
+    # 3X says what a change is, not how large it is.
+    change, variance = change[: len(healthy.baseline)], variance[: len(healthy.baseline)]
     model_holds = comparison is not None and comparison.holds(complex(change[1]))
     if comparison is not None and model_holds:
         scores["damping_loss"] += min(0.0, comparison.damping_nats)

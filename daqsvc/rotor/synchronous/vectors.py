@@ -6,7 +6,8 @@ With z = x + iy and the shaft angle theta, the orbit of a revolution is fitted b
 
 Z_0 is where the shaft runs (gap voltage), Z_1 its forward 1X whirl, Z_-1 the backward part that makes the
 orbit an ellipse, Z_2 and Z_-2 what misalignment, cracks and rub add. What the five leave over is the
-non-harmonic energy: noise, and all that does not repeat with the shaft.
+non-harmonic energy: noise, and all that does not repeat with the shaft. Of that, 3X in both senses is kept
+besides: it says little of whether a machine has changed, and much of what a change is.
 
 The vector of the healthy machine (`Healthy`) and the densities by which hypotheses about its faults are
 compared stand here too.
@@ -35,9 +36,13 @@ if TYPE_CHECKING:
 
 HARMONICS = (0, 1, -1, 2, -2)
 """Orders of the components of a synchronous vector, in this order."""
+WITH_THRICE = (*HARMONICS, 3, -3)
+"""The same with 3X, where a change is named."""
 
 _LEAST_SHARE = 0.75
 """Part of a revolution's samples that must be there."""
+_LEAST_SAMPLES_OF_3X = 16.0
+"""Samples in a revolution with which 3X stands well apart from the other components."""
 _WORST_CONDITION = 2.5
 """Largest spread of the normal equations' eigenvalues: missing samples must not lie in one piece too long.
 
@@ -57,6 +62,8 @@ class SynchronousVectors:
         samples: float64 ``[R]``, usable samples in the revolution.
         period_samples: float64 ``[R]``, length of the revolution in samples.
         end_index: int64 ``[R]``, samples since the start up to the end of the revolution.
+        thrice: complex128 ``[R, 2]``, 3X forward and backward in what the vectors leave over; NaN where a
+            revolution cannot be fitted or has too few samples for it.
     """
 
     vectors: Complexes
@@ -64,6 +71,7 @@ class SynchronousVectors:
     samples: Floats
     period_samples: Floats
     end_index: NDArray[np.int64]
+    thrice: Complexes
 
     def __len__(self) -> int:
         return len(self.noise)
@@ -80,6 +88,7 @@ class SynchronousVectors:
             self.samples[part],
             self.period_samples[part],
             self.end_index[part],
+            self.thrice[part],
         )
 
     @staticmethod
@@ -91,6 +100,7 @@ class SynchronousVectors:
             np.concatenate([part.samples for part in parts]),
             np.concatenate([part.period_samples for part in parts]),
             np.concatenate([part.end_index for part in parts]),
+            np.concatenate([part.thrice for part in parts]),
         )
 
 
@@ -108,7 +118,14 @@ def synchronous_vectors(revolutions: Revolutions) -> SynchronousVectors:
     end_index = revolutions.first_index + ends
     if not count:
         empty = np.empty(0)
-        return SynchronousVectors(np.empty((0, 5), np.complex128), empty, empty, empty, end_index[:0])
+        return SynchronousVectors(
+            np.empty((0, 5), np.complex128),
+            empty,
+            empty,
+            empty,
+            end_index[:0],
+            np.empty((0, 2), np.complex128),
+        )
     z = revolutions.xy[:, 0] + 1j * revolutions.xy[:, 1]
     there = np.isfinite(z) & np.isfinite(revolutions.angle_rad)
     z = np.where(there, z, 0.0)
@@ -119,13 +136,13 @@ def synchronous_vectors(revolutions: Revolutions) -> SynchronousVectors:
         sums = np.add.reduceat(np.append(values, 0.0), revolutions.starts)
         return np.where(ends > revolutions.starts, sums, 0.0)
 
-    powers = [there.astype(np.complex128), turn, turn**2, turn**3, turn**4]
+    powers = [there.astype(np.complex128), turn, turn**2, turn**3, turn**4, turn**5]
     sums = [total(power) for power in powers]
     samples = sums[0].real
     order = np.array(HARMONICS)
     difference = order[np.newaxis, :] - order[:, np.newaxis]
-    spectrum = np.stack([*(np.conj(s) for s in sums[:0:-1]), *sums], axis=-1)  # orders -4 to 4
-    normal = spectrum[:, difference + 4]
+    spectrum = np.stack([*(np.conj(s) for s in sums[:0:-1]), *sums], axis=-1)  # orders -5 to 5
+    normal = spectrum[:, difference + 5]
     projected = np.stack([total(z * np.conj(_power(powers, k))) for k in HARMONICS], axis=-1)
 
     eigenvalues = np.linalg.eigvalsh(normal)
@@ -137,8 +154,18 @@ def synchronous_vectors(revolutions: Revolutions) -> SynchronousVectors:
     noise = np.maximum(residual, 0.0) / np.maximum(samples - 5.0, 1.0)
     vectors[~usable] = np.nan
     noise[~usable] = np.nan
+    beyond = np.array((3, -3))
+    explained = spectrum[:, order[np.newaxis, :] - beyond[:, np.newaxis] + 5]
+    thrice = np.stack([total(z * np.conj(_power(powers, k))) for k in (3, -3)], axis=-1)
+    thrice = (thrice - np.einsum("rjk,rk->rj", explained, vectors)) / np.maximum(samples, 1.0)[:, np.newaxis]
+    thrice[~usable | (samples < _LEAST_SAMPLES_OF_3X)] = np.nan
     return SynchronousVectors(
-        vectors, noise, samples, np.asarray(revolutions.period_samples, dtype=np.float64), end_index
+        vectors,
+        noise,
+        samples,
+        np.asarray(revolutions.period_samples, dtype=np.float64),
+        end_index,
+        np.asarray(thrice, dtype=np.complex128),
     )
 
 
@@ -148,6 +175,8 @@ def _power(powers: Sequence[Complexes], k: int) -> Complexes:
 
 DC, FORWARD, BACKWARD = (HARMONICS.index(k) for k in (0, 1, -1))
 TWICE = [HARMONICS.index(k) for k in (2, -2)]
+BEYOND_1X = slice(TWICE[0], None)
+"""2X and, where it is there, 3X."""
 
 SPREADS = np.array([0.1, 0.3, 1.0, 3.0])
 """Sizes that a change may have, in parts of the healthy orbit."""

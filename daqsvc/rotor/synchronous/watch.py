@@ -46,6 +46,8 @@ if TYPE_CHECKING:
 
 
 _LEAST_ROWS = 8
+_THRICE_FLOOR = 0.001
+"""Part of the healthy whirl by which 3X may change where nothing touches."""
 _LASTING = 0.7
 """Part of the earlier energy that must be left in the later half: a settling rotor shakes less and less."""
 
@@ -59,12 +61,14 @@ class JudgedRevolution:
         vector: complex128 ``[5]``, synchronous vector less the baseline of the calibration, um.
         noise: variance of a sample that does not repeat with the shaft, um^2.
         speed: relative deviation from the speed of the calibration.
+        thrice: complex128 ``[2]``, 3X forward and backward, um; NaN if not known.
     """
 
     revolution: int
     vector: Complexes
     noise: float
     speed: float
+    thrice: Complexes
 
 
 def scatter(rows: Sequence[JudgedRevolution]) -> Floats:
@@ -74,6 +78,37 @@ def scatter(rows: Sequence[JudgedRevolution]) -> Floats:
     vectors = np.array([row.vector for row in rows])
     squares = np.abs(vectors - vectors.mean(axis=0)) ** 2
     return np.asarray(squares.sum(axis=0) / (len(rows) - 1))
+
+
+@dataclass(frozen=True, slots=True)
+class Thrice:
+    """3X over a stretch of revolutions.
+
+    Attributes:
+        mean: complex128 ``[2]``, forward and backward, um.
+        variance: float64 ``[2]``, of one revolution's, um^2.
+        revolutions: in the mean.
+    """
+
+    mean: Complexes
+    variance: Floats
+    revolutions: int
+
+    def apart_from(self, before: Thrice, amplitude_um: float) -> Floats:
+        """Variance of the difference of both means, float64 ``[2]``, um^2."""
+        share = 1.0 / self.revolutions + 1.0 / before.revolutions
+        one = np.maximum(self.variance, before.variance)
+        return np.asarray(one * share + (_THRICE_FLOOR * amplitude_um) ** 2)
+
+
+def thrice_of(rows: Sequence[JudgedRevolution]) -> Thrice | None:
+    """3X of revolutions; None where too few of them have it."""
+    known = np.array([row.thrice for row in rows if np.isfinite(row.thrice).all()])
+    if len(known) < _LEAST_ROWS:
+        return None
+    mean = known.mean(axis=0)
+    scatter_um2 = (np.abs(known - mean) ** 2).sum(axis=0) / (len(known) - 1)
+    return Thrice(mean, np.asarray(scatter_um2), len(known))
 
 
 def noise_scatter(rows: Sequence[JudgedRevolution]) -> float:
@@ -209,6 +244,7 @@ class RotorWatch:
         self._orbits = LastOrbits(_ABRUPT)
         self._alarm: tuple[int, int] | None = None
         self._comparison: Comparison | None = None
+        self._thrice: Thrice | None = None
         if calibration is not None:
             self._begin(calibration)
 
@@ -251,7 +287,11 @@ class RotorWatch:
         )
         self._previous = np.vstack((self._previous[-1:], moved))
         row = JudgedRevolution(
-            self.revolutions, moved[0] - self.calibration.baseline, nonstationary, float(speed[0])
+            self.revolutions,
+            moved[0] - self.calibration.baseline,
+            nonstationary,
+            float(speed[0]),
+            one.thrice[0],
         )
         self._rows.append(row)
         assert self._test is not None  # noqa: S101 - made with the calibration
@@ -348,6 +388,7 @@ class RotorWatch:
             mean, count = self._test.reference_before(window)
             self._healthy = with_more(self.calibration, self.calibration.baseline + mean, count)
             self._middle = self._begun + count / 2.0
+            self._thrice = thrice_of([row for row in self._rows if row.revolution < onset])
         self._onset = onset
         self._look = 0
         self._segment.clear()
@@ -402,6 +443,11 @@ class RotorWatch:
         spread = replace(spread, variance=np.maximum(spread.variance, scatter(rows)))
         apart = float(np.mean([row.revolution for row in rows])) - self._middle
         variance = spread.of_means(float(len(rows)), float(self._healthy.revolutions), speed, apart)
+        # Only the two modes of a run-up say how a force passes through the rotor at three times its speed.
+        now = thrice_of(rows) if self._healthy.rotor.two_modes is not None else None
+        if now is not None and self._thrice is not None:
+            change = np.append(change, now.mean - self._thrice.mean)
+            variance = np.append(variance, now.apart_from(self._thrice, self._healthy.amplitude_um))
         self._identification = identify(
             change,
             variance,
