@@ -279,7 +279,7 @@ def test_signals_end_it_in_order(number: int, tmp_path: Path) -> None:
         assert left_behind(tmp_path)
         running.send_signal(number)
         _, errors = running.communicate()
-        assert without_delays(errors) == ["daqsvc demo: interrupted"]
+        assert without_delays(errors) == ["daqsvc demo: interrupted [C15]"]
         assert running.returncode == 1
     assert left_behind(tmp_path) == []
 
@@ -300,7 +300,7 @@ def test_a_background_job_that_ignores_ctrl_c_ends_in_order_on_sigterm(tmp_path:
         running.stdout.readline()
         running.send_signal(signal.SIGTERM)
         _, errors = running.communicate()
-    assert (without_delays(errors), running.returncode) == (["daqsvc demo: interrupted"], 1)
+    assert (without_delays(errors), running.returncode) == (["daqsvc demo: interrupted [C15]"], 1)
     assert left_behind(tmp_path) == []
 
 
