@@ -75,7 +75,7 @@ def install() -> None:
         f'exec {python} {INSTALLED}/tree/tests/hil/unit_main.py "$@"\n'
     )
     program.chmod(0o755)
-    [[*guide, _check, _start]] = shell_blocks("edge-box.md")["The service under systemd"]
+    [[*guide, _check, _start]] = shell_blocks("edge-box.md")["Run under systemd"]
     for command in guide:
         sh("/bin/sh", "-ec", command, cwd=ROOT)
     for unit in (UNIT, LATE, "daqsvc@broken"):

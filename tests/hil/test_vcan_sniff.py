@@ -117,7 +117,7 @@ def test_vcan_missing_and_down_are_told_apart(vcan: VcanLink) -> None:
     assert code == 1
     assert "no frame in 0.2 s. Remedy: " in words
     vcan.down()
-    assert said() == (1, f"daqsvc: {vcan.name} is down. Remedy: ip link set {vcan.name} up\n")
+    assert said() == (1, f"daqsvc: {vcan.name} is down. Remedy: ip link set {vcan.name} up [C21]\n")
     vcan.remove()
     code, words = said()
     assert code == 1
