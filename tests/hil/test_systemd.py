@@ -198,7 +198,7 @@ def test_whatever_ends_it_it_is_started_again_and_its_alarms_stand_as_they_did(u
         "it knows why no broker is there",
     )
     assert status["outputs"]["mqtt"].pop("away_s") >= 0.0
-    away = {"connected": False, "reason": "127.0.0.1:8883: nothing listens there"}
+    away = {"connected": False, "reason": "127.0.0.1:8883: nothing listens there", "code": "O09"}
     assert (status["buses"]["can0"]["state"], status["outputs"]) == ("up", {"mqtt": away})
     away = "WARNING MQTT broker"
     assert away in journal(least="warning")
