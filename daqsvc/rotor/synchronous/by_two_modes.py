@@ -26,7 +26,7 @@ _LOSSES = np.geomspace(0.01, 1.5, 32)
 _SEEN = np.array([0.5, 0.7, 1.0, 1.4, 2.0])
 """What the probes see the shaft sink by, over what the modes say: they need not stand where it sinks most."""
 _FILM = 0.05
-"""Above this stiffness across the deflection, over the static one, an oil film bears the shaft ..."""
+"""Above this stiffness across the deflection, over the static one, an oil film carries the shaft ..."""
 _ASIDE = np.exp(1j * np.radians([-40.0, -20.0, 0.0, 20.0, 40.0]))
 """... so that its way down need not be the one that the modes say."""
 _LEFT = np.linspace(0.05, 0.97, 32)
