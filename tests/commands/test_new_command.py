@@ -349,6 +349,8 @@ def test_at_a_terminal_it_explains_asks_again_and_takes_defaults(tmp_path):
     terminal.type("")
     terminal.until("[rig]: ")
     terminal.type("Pump 3")
+    terminal.until("pump-3.toml is there already. Another name, or overwrite: ")  # not behind all questions
+    terminal.type("pump.toml")
     assert "zones of ISO 20816-3" in terminal.until("[own]: ")
     terminal.type("")
     assert "Alert limit (rms in um)" in terminal.until("[35]: ")
@@ -359,13 +361,24 @@ def test_at_a_terminal_it_explains_asks_again_and_takes_defaults(tmp_path):
     terminal.type("")
     terminal.until("[none]: ")
     terminal.type("")
-    terminal.until("pump-3.toml is there already. Another name, or overwrite: ")
-    terminal.type("pump.toml")
     assert "daqsvc run pump.toml" in terminal.rest()
     assert terminal.process.returncode == 0
     machine = load_machine_file(tmp_path / "pump.toml")
     assert [(alarm.alert, alarm.danger) for alarm in machine.alarms] == [(50.0, 75.0), (50.0, 75.0)]
     assert (tmp_path / "pump-3.toml").read_text() == "mine"
+
+
+def test_a_file_of_the_command_line_that_is_there_is_asked_about_first(tmp_path):
+    (tmp_path / "rig.toml").write_text("mine")
+    terminal = Terminal(tmp_path, "rig.toml")
+    terminal.until("rig.toml is there already. Another name, or overwrite: ")
+    terminal.type("overwrite")
+    for _ in range(6):
+        terminal.until("]: ")
+        terminal.type("")
+    terminal.rest()
+    assert terminal.process.returncode == 0
+    assert load_machine_file(tmp_path / "rig.toml").machine.name == "rig"
 
 
 def test_ctrl_c_leaves_nothing_behind(tmp_path):

@@ -20,7 +20,7 @@ from drivers.questions import SENSOR, short_name
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from drivers.bus_questions import BusQuestions, Heard
     from drivers.questions import Answers, Question
@@ -71,21 +71,24 @@ class NewCommand:
         from daqsvc.commands.new.machine_text import machine_text  # noqa: PLC0415
 
         person = sys.stdin.isatty() and sys.stdout.isatty()
+        ask = _ask if person and not arguments.yes else None
+        target = _Target(arguments.file, arguments.overwrite, ask)
         try:
             given = Given(_given(arguments), arguments.yes)
-            if arguments.file is not None:
-                _see_place(arguments.file)
-            if person and not arguments.yes:
+            target.see()
+            if ask is not None:
                 _say("Enter takes what is in brackets, ? explains, Ctrl-C ends and writes nothing.\n")
-            folder = arguments.file or Path("machine.toml")
-            ask = _ask if person and not arguments.yes else None
-            listen = partial(_heard, folder.parent) if arguments.listen else None
-            answers = conduct(folder, given, ask, lambda reason: _say(f"  {reason}"), listen)
-            file = arguments.file or Path(f"{short_name(answers['name'])}.toml")
+            listen = partial(_heard, target.folder) if arguments.listen else None
+            answers = conduct(
+                target.folder / "machine.toml",
+                given,
+                ask,
+                lambda reason: _say(f"  {reason}"),
+                listen,
+                target.named,
+            )
+            file = target.file
             text = machine_text(answers, shlex.quote(file.name))
-            if file.exists() and not arguments.overwrite:
-                file = _other_file(file, ask)
-                text = machine_text(answers, shlex.quote(file.name))
             _write(file, text)
         except AnswerError as error:
             return complain("daqsvc new", error, error.code, EXIT_USAGE)
@@ -95,6 +98,71 @@ class NewCommand:
             what = f"{error.filename} cannot be written: {error.strerror}"
             return complain("daqsvc new", what, CANNOT_WRITE)
         return _report(file, text, answers)
+
+
+class _Target:
+    """The file that will be written: that of the command line, or one that is called like the machine.
+
+    A file that is there already is asked about as soon as its name is known, not behind all questions.
+    """
+
+    def __init__(self, file: Path | None, overwrite: bool, ask: Callable[[Question], str] | None) -> None:
+        self._given = file
+        self._file = file
+        self._overwrite = overwrite
+        self._person = ask is not None
+
+    @property
+    def folder(self) -> Path:
+        return Path() if self._given is None else self._given.parent
+
+    @property
+    def file(self) -> Path:
+        assert self._file is not None, "the name of the machine was asked"
+        return self._file
+
+    def see(self) -> None:
+        """Say before all questions that the file of the command line cannot be written.
+
+        Raises:
+            AnswerError: it cannot, or it is there already and nobody can be asked.
+        """
+        from daqsvc.commands.new.interview import AnswerError  # noqa: PLC0415 - slow to import
+
+        if self._given is None:
+            return
+        if self._given.is_dir():
+            raise AnswerError(
+                f"{self._given} is a directory; name a file in it, e.g. {self._given / 'pump.toml'}"
+            )
+        if not self.folder.is_dir():
+            raise AnswerError(f"there is no directory {self.folder}; make it first: mkdir -p {self.folder}")
+        self._file = self._free(self._given)
+
+    def named(self, question: Question, answers: Answers) -> None:
+        """Take the name of the machine for the file, where the command line names none.
+
+        Raises:
+            AnswerError: that file is there already, and nobody can be asked.
+        """
+        if question.key == "name" and self._given is None:
+            self._file = self._free(Path(f"{short_name(answers['name'])}.toml"))
+
+    def _free(self, file: Path) -> Path:
+        """The file, or another one if it is there already and shall stay."""
+        from daqsvc.commands.new.interview import AnswerError  # noqa: PLC0415 - slow to import
+
+        if self._overwrite:
+            return file
+        if file.exists() and not self._person:
+            raise AnswerError(f"{file} is there already; give another FILE, or --overwrite")
+        while file.exists():
+            text = input(f"{file} is there already. Another name, or overwrite: ").strip()
+            if text == "overwrite":
+                break
+            if text:
+                file = file.with_name(text) if "/" not in text else Path(text)
+        return file
 
 
 def _given(arguments: argparse.Namespace) -> dict[str, str]:
@@ -147,16 +215,6 @@ def _typed(value: Any) -> str:
     return ", ".join(map(_typed, value)) if isinstance(value, list) else f"{value}"
 
 
-def _see_place(file: Path) -> None:
-    """Say before all questions that a file could not be written."""
-    from daqsvc.commands.new.interview import AnswerError  # noqa: PLC0415 - slow to import
-
-    if file.is_dir():
-        raise AnswerError(f"{file} is a directory; name a file in it, e.g. {file / 'pump.toml'}")
-    if not file.parent.is_dir():
-        raise AnswerError(f"there is no directory {file.parent}; make it first: mkdir -p {file.parent}")
-
-
 def _ask(question: Question) -> str:
     """What a person types; ``?`` is answered with help."""
     bracket = "" if question.default is None else f" [{question.default}]"
@@ -194,25 +252,6 @@ def _heard(folder: Path, bus: BusQuestions, answers: Answers) -> Heard | None:
     for line in heard.lines:
         _say(f"    {line}")
     return heard
-
-
-def _other_file(file: Path, ask: Any) -> Path:
-    """What to do about a file that is there already: write over it, or take another name.
-
-    Raises:
-        AnswerError: nobody is there to say.
-    """
-    from daqsvc.commands.new.interview import AnswerError  # noqa: PLC0415 - slow to import
-
-    if ask is None:
-        raise AnswerError(f"{file} is there already; give another FILE, or --overwrite")
-    while file.exists():
-        text = input(f"{file} is there already. Another name, or overwrite: ").strip()
-        if text == "overwrite":
-            break
-        if text:
-            file = file.with_name(text) if "/" not in text else Path(text)
-    return file
 
 
 def _write(file: Path, text: str) -> None:

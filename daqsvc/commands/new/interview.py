@@ -44,6 +44,7 @@ def conduct(
     ask: Callable[[Question], str] | None,
     say: Callable[[str], None],
     listen: Callable[[BusQuestions, Answers], Heard | None] | None = None,
+    answered: Callable[[Question, Answers], None] | None = None,
 ) -> Answers:
     """All answers.
 
@@ -53,6 +54,7 @@ def conduct(
         ask: asks a person; None where there is nobody.
         say: tells that person why an answer is asked for again.
         listen: looks at the bus as soon as it is known where it is; None if nobody wants that.
+        answered: is told of each question behind its answer, and may raise `AnswerError`.
 
     Raises:
         AnswerError: what was given cannot be used, or something is missing.
@@ -77,6 +79,8 @@ def conduct(
             raise AnswerError(_missing(question))
         else:
             _answer(question, ask, say, answers, file)
+        if answered is not None:
+            answered(question, answers)
         if listen is not None and question.key == bus_of(answers).listens_behind:
             heard = listen(bus_of(answers), answers)
     _refuse_others(given, asked)
