@@ -10,9 +10,14 @@ import sys
 import tempfile
 from collections import OrderedDict
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, cast
+
+from daqsvc.settings.plugins import detector_tables
 
 if TYPE_CHECKING:
+    from typing import Any
+
+    from daqsvc.diagnosis.plugin import DetectorPlugin
     from daqsvc.page.machine_live import MachineLive
 
 _PATH = re.compile(r"(?<!\w)/(?:[^/\s:'\"]+/)+")
@@ -32,6 +37,15 @@ class Detectable(NamedTuple):
 
     text: str
     why_not: str
+
+
+def why_no_detector(live: MachineLive) -> str:
+    """Why nothing can be told apart on a machine, as far as its tables show; "" if something can be."""
+    tables = detector_tables()
+    known = [key for key, table in tables.items() if cast("DetectorPlugin[Any]", table).predictable]
+    if any(key in live.values.get("pipeline", {}) for key in known):
+        return ""
+    return f"this machine has none of the detectors that can say it: {', '.join(known)}"
 
 
 class Detectabilities:

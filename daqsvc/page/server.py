@@ -41,7 +41,7 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.page.access.person import peer_of
 from daqsvc.page.access.ways import COOKIE, ByAccounts, OpenHere, SignInError
 from daqsvc.page.charts import THEMES
-from daqsvc.page.detectable import Detectabilities
+from daqsvc.page.detectable import Detectabilities, why_no_detector
 from daqsvc.page.documentation import WHY_NOT, Documentation
 from daqsvc.page.guard import FRAMING, Admitted, FormError, Forms, Guarded
 from daqsvc.page.handling import MOST_EVENTS, Said, alarms_page, handle
@@ -376,6 +376,7 @@ class _Page:
         views = VIEWS.values()
         return {
             "machine": name,
+            "no_detectability": why_no_detector(live),
             "views": [{"name": one.name, "title": one.title, "absent": one.why_not(live)} for one in views],
         }
 

@@ -7,11 +7,12 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from jinja2 import Environment, PackageLoader
 from support.waiting import eventually
 from test_views import about
 
 from daqsvc.page import detectable
-from daqsvc.page.detectable import NOT_HERE, Detectabilities, Detectable
+from daqsvc.page.detectable import NOT_HERE, Detectabilities, Detectable, why_no_detector
 from daqsvc.page.machine_live import MachineLive
 
 if TYPE_CHECKING:
@@ -83,3 +84,18 @@ async def test_what_takes_too_long_is_ended(monkeypatch: pytest.MonkeyPatch, tmp
     assert "longer than 0.2 s" in (await computed(made, MachineLive(about()))).why_not
     await made.close()
     await asyncio.sleep(0)
+
+
+def test_a_machine_without_such_a_detector_says_so_where_one_would_look() -> None:
+    known: dict[str, Any] = about()
+    known["values"]["pipeline"] = {"levels": [{"name": "a"}]}
+    why = why_no_detector(MachineLive(known))
+    assert "none of the detectors that can say it: rotor_bank, rotor_synchronous" in why
+    known["values"]["pipeline"]["rotor_synchronous"] = {}
+    assert not why_no_detector(MachineLive(known))
+    navigation = Environment(loader=PackageLoader("daqsvc.page"), autoescape=True).get_template(
+        "navigation.html"
+    )
+    link = 'class="absent" title="no such detector">Detectability'
+    assert link in navigation.render(machine="m", views=[], no_detectability="no such detector")
+    assert "absent" not in navigation.render(machine="m", views=[], no_detectability="")

@@ -70,9 +70,7 @@ def test_what_was_written_before_a_kill_is_read_and_a_new_start_goes_on(
     assert "are as they were, to the last bit" in capsys.readouterr().out
 
     (first / "store").rename(second / "store")
-    shutil.rmtree(
-        first / "plant"
-    )  # a store takes no second file for the same machine
+    shutil.rmtree(first / "plant")  # a store takes no second file for the same machine
     folder = second / "store" / "rotor-00" / "snapshots"
     with watched(second, 1, more=RECORDER) as plant:
         until(lambda: len(files()) >= len(whole) + 3, "two further files are begun")

@@ -72,7 +72,7 @@ class NewCommand:
 
         person = sys.stdin.isatty() and sys.stdout.isatty()
         ask = _ask if person and not arguments.yes else None
-        target = _Target(arguments.file, arguments.overwrite, ask)
+        target = _Target(arguments.file, ask, overwrite=arguments.overwrite)
         try:
             given = Given(_given(arguments), arguments.yes)
             target.see()
@@ -80,16 +80,10 @@ class NewCommand:
                 _say("Enter takes what is in brackets, ? explains, Ctrl-C ends and writes nothing.\n")
             listen = partial(_heard, target.folder) if arguments.listen else None
             answers = conduct(
-                target.folder / "machine.toml",
-                given,
-                ask,
-                lambda reason: _say(f"  {reason}"),
-                listen,
-                target.named,
+                target.file, given, ask, lambda reason: _say(f"  {reason}"), listen, target.named
             )
-            file = target.file
-            text = machine_text(answers, shlex.quote(file.name))
-            _write(file, text)
+            text = machine_text(answers, shlex.quote(target.file.name))
+            _write(target.file, text)
         except AnswerError as error:
             return complain("daqsvc new", error, error.code, EXIT_USAGE)
         except EOFError:
@@ -97,7 +91,7 @@ class NewCommand:
         except OSError as error:
             what = f"{error.filename} cannot be written: {error.strerror}"
             return complain("daqsvc new", what, CANNOT_WRITE)
-        return _report(file, text, answers)
+        return _report(target.file, text, answers)
 
 
 class _Target:
@@ -106,20 +100,16 @@ class _Target:
     A file that is there already is asked about as soon as its name is known, not behind all questions.
     """
 
-    def __init__(self, file: Path | None, overwrite: bool, ask: Callable[[Question], str] | None) -> None:
+    def __init__(self, file: Path | None, ask: Callable[[Question], str] | None, *, overwrite: bool) -> None:
         self._given = file
-        self._file = file
+        self.file = file or Path("machine.toml")
         self._overwrite = overwrite
         self._person = ask is not None
 
     @property
     def folder(self) -> Path:
-        return Path() if self._given is None else self._given.parent
-
-    @property
-    def file(self) -> Path:
-        assert self._file is not None, "the name of the machine was asked"
-        return self._file
+        """Where it will lie."""
+        return self.file.parent
 
     def see(self) -> None:
         """Say before all questions that the file of the command line cannot be written.
@@ -137,7 +127,7 @@ class _Target:
             )
         if not self.folder.is_dir():
             raise AnswerError(f"there is no directory {self.folder}; make it first: mkdir -p {self.folder}")
-        self._file = self._free(self._given)
+        self.file = self._free(self._given)
 
     def named(self, question: Question, answers: Answers) -> None:
         """Take the name of the machine for the file, where the command line names none.
@@ -146,7 +136,7 @@ class _Target:
             AnswerError: that file is there already, and nobody can be asked.
         """
         if question.key == "name" and self._given is None:
-            self._file = self._free(Path(f"{short_name(answers['name'])}.toml"))
+            self.file = self._free(Path(f"{short_name(answers['name'])}.toml"))
 
     def _free(self, file: Path) -> Path:
         """The file, or another one if it is there already and shall stay."""
