@@ -139,7 +139,7 @@ class _Target:
             self.file = self._free(Path(f"{short_name(answers['name'])}.toml"))
 
     def _free(self, file: Path) -> Path:
-        """The file, or another one if it is there already and shall stay."""
+        """The file, or another one where it is there already and must stay."""
         from daqsvc.commands.new.interview import AnswerError  # noqa: PLC0415 - slow to import
 
         if self._overwrite:

@@ -54,7 +54,7 @@ def conduct(
         ask: asks a person; None where there is nobody.
         say: tells that person why an answer is asked for again.
         listen: looks at the bus as soon as it is known where it is; None if nobody wants that.
-        answered: is told of each question behind its answer, and may raise `AnswerError`.
+        answered: called with each question after its answer; may raise `AnswerError`.
 
     Raises:
         AnswerError: what was given cannot be used, or something is missing.

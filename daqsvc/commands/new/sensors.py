@@ -267,7 +267,9 @@ def pipeline_tables(answers: Answers) -> Iterator[str]:
     if housing:
         high_hz = min(_BAND_HZ[1], float(f"{0.4 * rate_hz:.3g}"))
         band = [low_hz, high_hz]
-        yield entry("velocity_band_hz", band, "of the velocity RMS; ends below half the sampling rate")
+        early = f"; the standard goes to {_BAND_HZ[1]:g} Hz, half the sampling rate does not"
+        about = "of the velocity RMS" + (early if high_hz < _BAND_HZ[1] else "")
+        yield entry("velocity_band_hz", band, about)
     if by_mark:
         yield entry("keyphasor", keyphasor, "the mark that phases count from")
         yield entry("measures", ["1x_amplitude", "1x_phase_lag"], "told for trends, without an alarm")
