@@ -86,11 +86,11 @@ class _SchemaAction(argparse.Action):
 class CheckCommand:
     """``daqsvc check FILE ...``."""
 
-    help = "read a machine file and say what was understood, or every error at once"
+    help = "read a machine file and print what was understood, or all of its errors"
     description = (
-        "Read a machine file and print what was understood. If it cannot be used, print every error with "
-        "file, line, key, value and remedy, and exit with 2. Of several files, or a directory of them, it "
-        "also says whether one service can watch all of them."
+        "Read a machine file and print what was understood. If it has errors, print all of them, each "
+        "with file, line, key, value and remedy, and exit with 2. With several files, or a directory of "
+        "them, also print whether one service can watch all of them."
     )
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
@@ -100,12 +100,12 @@ class CheckCommand:
             type=Path,
             nargs="+",
             metavar="FILE",
-            help="the machine file (TOML); or several of one box",
+            help="machine file (TOML), the machine files of several machines on one box, or their directory",
         )
         parser.add_argument(
             "--schema",
             action=_SchemaAction,
-            help="print the JSON Schema of machine files, for editors, and exit: docs/machine-file.md",
+            help="print the JSON Schema of machine files, for editors, and exit (docs/machine-file.md)",
         )
 
     def run(self, arguments: argparse.Namespace) -> int:
@@ -246,7 +246,7 @@ def parser(known: dict[str, Command]) -> argparse.ArgumentParser:
     root = ArgumentParser(
         prog="daqsvc",
         description="Real-time data acquisition and model-based fault diagnosis for rotating machines.",
-        epilog="daqsvc VERB --help tells about one verb.",
+        epilog="daqsvc VERB --help explains one verb.",
     )
     root.add_argument("--version", action="version", version=f"daqsvc {daqsvc.__version__}")
     verbs = root.add_subparsers(dest="verb", metavar="VERB", required=True, title="verbs")

@@ -21,13 +21,13 @@ MOST_DB = 200.0
 def add_random(group: Group) -> None:
     """Options of a scenario's chance: ``--seed`` and ``--snr-db``."""
     group.add_argument(
-        "--seed", type=whole, metavar="N", help="seed of everything random (default: the scenario's)"
+        "--seed", type=whole, metavar="N", help="seed of all random numbers (default: that of the scenario)"
     )
     group.add_argument(
         "--snr-db",
         type=decibels,
         metavar="DB",
-        help="signal to noise of the sensors (default: the scenario's)",
+        help="signal-to-noise ratio of the sensors, in dB (default: that of the scenario)",
     )
 
 
@@ -37,16 +37,22 @@ def add_recording(group: Group) -> None:
         "--recording",
         type=Path,
         metavar="FILE",
-        help="play a measured recording instead of a scenario: whatever daqsvc analyze reads, CAN logs and "
-        "snapshots too",
+        help="play a measured recording instead of a scenario: all that daqsvc analyze reads, also CAN logs "
+        "and snapshots",
     )
     group.add_argument(
         "--map",
         type=channel_map,
         metavar="SENSOR=VARIABLE,...",
-        help="which variables of the recording to play, and as which sensors (default: by their names)",
+        help="which variables of the recording to play, and as which sensors, e.g. x=X097_DE_time (default: "
+        "those with the names of sensors)",
     )
-    group.add_argument("--fs", type=sampling_rate_hz, metavar="HZ", help="sampling rate of the recording")
+    group.add_argument(
+        "--fs",
+        type=sampling_rate_hz,
+        metavar="HZ",
+        help="sampling rate in Hz, if the recordings do not state it",
+    )
     add_max_memory(group.add_argument)
 
 

@@ -41,10 +41,10 @@ class SimCommand:
 
     help = "put simulated devices on a bus, for the service or any other client"
     description = (
-        "Put the devices of a machine file on their buses and play a scenario or a measured recording. A "
-        "device is CAN frames over a virtual bus between processes or SocketCAN, a Modbus server, or a "
-        "serial port behind a pseudo-terminal. At the end, or when stopped, print as JSON what was sent "
-        "and what was done to it."
+        "Put the devices of a machine file on their buses and play a scenario or a measured recording. "
+        "A device is CAN frames over a virtual bus between processes or SocketCAN, a Modbus server, or "
+        "a serial port behind a pseudo-terminal. At the end, or when stopped, print as JSON what was "
+        "sent and which faults were put in."
     )
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
@@ -54,7 +54,7 @@ class SimCommand:
             "what",
             nargs="?",
             metavar="FILE|SCENARIO",
-            help="a machine file, the same as for daqsvc run; or a scenario, played by the rig of the demo",
+            help="machine file (TOML), as for daqsvc run; or a scenario, played by the rig of the demo",
         )
         play = parser.add_argument_group("what to play")
         play.add_argument(
@@ -62,22 +62,29 @@ class SimCommand:
         )
         add_random(play)
         add_recording(play)
-        play.add_argument("--duration", type=positive, metavar="S", help="seconds to play, instead of all")
+        play.add_argument("--duration", type=positive, metavar="S", help="time to play, in s (default: all)")
         play.add_argument(
-            "--stream", action="append", metavar="NAME", help="play only this stream (may be repeated)"
+            "--stream",
+            action="append",
+            metavar="NAME",
+            help="play only this stream; may be repeated (default: all)",
         )
         where = parser.add_argument_group("where to play it")
         where.add_argument(
             "--bus",
             type=Path,
             metavar="PATH",
-            help="virtual CAN bus instead of the machine file's interface; alone: run that bus for others",
+            help="virtual CAN bus to use instead of the interface in the machine file; without FILE, run "
+            "that bus for other processes",
         )
         where.add_argument(
-            "--link", type=Path, metavar="PATH", help="link to the pseudo-terminal of a serial port"
+            "--link",
+            type=Path,
+            metavar="PATH",
+            help="path of a link to the pseudo-terminal that is the serial port",
         )
-        where.add_argument("--port", type=_port, metavar="N", help="TCP port of a Modbus server")
-        add_speed(where, "; daqsvc run knows the sampling rate, and needs 1")
+        where.add_argument("--port", type=_port, metavar="N", help="TCP port of the Modbus server")
+        add_speed(where, "; daqsvc run needs 1, as it knows the sampling rate")
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `daqsvc.cli.Command.run`."""

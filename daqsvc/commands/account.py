@@ -17,23 +17,25 @@ LEAST_PASSWORD = 10
 class AccountCommand:
     """``daqsvc account FILE NAME [--role ROLE | --remove]``."""
 
-    help = "make an account for the page, or remove one"
+    help = "make, change or remove an account for the page"
     description = (
-        "Make an account for daqsvc page --accounts FILE, give one another password or role, or remove it. "
-        "The password is asked for, or read from standard input if that is no terminal; the file holds only "
-        "its hash. A page that runs takes it over at once."
+        "Make an account for daqsvc page --accounts FILE, change its password or role, or remove it. "
+        "The password is asked for; if standard input is not a terminal, it is read from there. The "
+        "file contains only its hash. A running page uses the changed file at once."
     )
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `daqsvc.cli.Command.add_arguments`."""
-        parser.add_argument("file", type=Path, metavar="FILE", help="the accounts; made if it does not exist")
-        parser.add_argument("name", type=_name, metavar="NAME", help="of the account")
+        parser.add_argument(
+            "file", type=Path, metavar="FILE", help="file of accounts; it is made if it does not exist"
+        )
+        parser.add_argument("name", type=_name, metavar="NAME", help="name of the account")
         either = parser.add_mutually_exclusive_group()
         either.add_argument(
             "--role",
             choices=["viewer", "operator"],
             default="viewer",
-            help="viewer looks only, operator handles alarms, too (default: viewer)",
+            help="a viewer only sees the page, an operator also handles alarms (default: viewer)",
         )
         either.add_argument("--remove", action="store_true", help="remove the account")
 

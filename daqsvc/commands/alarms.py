@@ -40,10 +40,11 @@ class AlarmsCommand:
         load: reads a machine file; None after its errors have been printed.
     """
 
-    help = "how the alarms stand, and what has happened, from the journal"
+    help = "show the alarms and their events, from the journal"
     description = (
-        "Show the alarms that are not normal, as they stand in the journal, whether the service runs or not. "
-        "An ID is what daqsvc ack, shelve, reset and the like take, as well as an alarm's name."
+        "Show the alarms that are not normal, from the journal, with and without a running service. "
+        "daqsvc ack, reset, shelve, unshelve, bypass and unbypass take the ID shown here, or the name "
+        "of the alarm."
     )
 
     def __init__(self, load: Load) -> None:
@@ -51,19 +52,21 @@ class AlarmsCommand:
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `daqsvc.cli.Command.add_arguments`."""
-        parser.add_argument("--all", action="store_true", help="those that are normal, too")
+        parser.add_argument(
+            "--all", action="store_true", help="also show alarms that are normal, if they were ever raised"
+        )
         parser.add_argument(
             "--history",
             type=count,
             nargs="?",
             const=HISTORY,
             metavar="N",
-            help=f"the last N events instead, newest last (default: {HISTORY})",
+            help=f"show the last N events instead, the newest last (default: {HISTORY})",
         )
         parser.add_argument(
             "--json",
             action="store_true",
-            help="one JSON object a line: the alarm messages as they go over MQTT",
+            help="print one JSON object per line: the alarm messages as they are sent over MQTT",
         )
         add_store(parser)
 
@@ -195,8 +198,8 @@ class AlarmVerb:
     def __init__(self, verb: str, help_line: str, description: str, load: Load) -> None:
         self.help = help_line
         self.description = (
-            f"{description} The service that runs on the store carries it out and writes it to its audit "
-            "log. The exit code is 0 once that is on disk, and 1 if it is refused or no service runs."
+            f"{description} The running service does this and writes it to its audit log. Exit code: 0 if "
+            "that is on disk, 1 if it is refused or no service runs."
         )
         self._verb = verb
         self._load = load
@@ -207,7 +210,7 @@ class AlarmVerb:
             "alarm",
             type=alarm_id,
             metavar="ID",
-            help="name of the alarm, or how its id begins in daqsvc alarms",
+            help="name of the alarm, or the first four or more characters of its ID in daqsvc alarms",
         )
         if self._verb == "shelve":
             parser.add_argument(
@@ -216,13 +219,22 @@ class AlarmVerb:
                 type=duration,
                 required=True,
                 metavar="TIME",
-                help="how long, e.g. 90s, 30m, 8h, 2d or 1h30m",
+                help="for how long, e.g. 90s, 30m, 8h, 2d or 1h30m",
             )
         parser.add_argument(
-            "--by", type=one_line, metavar="NAME", help="who asks (default: the user who is logged in)"
+            "--by",
+            type=one_line,
+            metavar="NAME",
+            help="name of the person who does this (default: the user who is logged in)",
         )
-        parser.add_argument("--reason", type=one_line, default="", metavar="TEXT", help="why")
-        parser.add_argument("--json", action="store_true", help="one JSON object instead of text")
+        parser.add_argument(
+            "--reason",
+            type=one_line,
+            default="",
+            metavar="TEXT",
+            help="the reason, for the audit log and the alarm's event",
+        )
+        parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
         add_store(parser)
 
     def run(self, arguments: argparse.Namespace) -> int:
@@ -279,25 +291,25 @@ def alarm_verbs(load: Load) -> dict[str, AlarmVerb]:
             (
                 "reset",
                 "reset",
-                "let go of a latched alarm whose condition has gone",
-                "Let go of a latched alarm. It is refused while the condition stands.",
+                "reset a latched alarm whose condition is no longer present",
+                "Reset a latched alarm to normal. It is refused while the condition is still present.",
             ),
             (
                 "shelve",
                 "shelve",
-                "put an alarm aside for a stated time",
-                "Put an alarm aside for a stated time, after which it shows again how it stands.",
+                "suppress an alarm for a stated time",
+                "Suppress an alarm for a stated time. After that it shows its present state again.",
             ),
             (
                 "unshelve",
                 "unshelve",
-                "take a shelved alarm back at once",
-                "Take a shelved alarm back at once.",
+                "end the shelving of an alarm at once",
+                "End the shelving of an alarm at once.",
             ),
             (
                 "bypass",
                 "bypass",
-                "take an alarm out of service",
+                "take an alarm out of service until daqsvc unbypass",
                 "Take an alarm out of service until it is put back with daqsvc unbypass.",
             ),
             (

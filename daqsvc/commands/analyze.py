@@ -40,19 +40,20 @@ _FEW_PER_PROCESS = 3
 class AnalyzeCommand(VerbWithKernels):
     """``daqsvc analyze [MACHINE] RECORDING...``."""
 
-    help = "say what a machine's recordings show: which fault, how sure, since when"
+    help = "judge recordings of a machine: which fault, how sure, since when"
     description = (
-        "Run the detectors of the service over recordings, faster than real time: .npz, .mat, .csv[.gz], "
-        ".wav, .parquet, .tdms, .mf4, .uff, .h5, snapshots. With a machine file CAN logs too: .blf, .asc, "
-        ".log, .trc, or a folder of them. Say which fault the rotor has, what else it might be, since when, "
-        "and how large it is. Either the first file is a machine file (.toml), or options name probes, "
-        "speed and rotor; the first revolutions of a recording are then the healthy machine. Accelerometers "
-        "without a keyphasor are compared with a recording of the healthy machine (--channels, --baseline); "
-        "with --bearing or --orders they say which part of a rolling bearing is damaged. Verdicts: normal, "
-        "unbalance, damping_loss, static_load, stiffness_loss, rub, unmodelled (changed, but none of "
-        "these), small_change (too small for a name); of a bearing: normal, changed, inner, outer, ball, "
-        "inner_or_outer. With --cluster FILE is the archive of a fleet: a folder or a URL with a folder for "
-        "each machine, which is judged on Dask into a table of Parquet files."
+        "Run the detectors of the service over recordings, faster than real time: .npz, .mat, "
+        ".csv[.gz], .wav, .parquet, .tdms, .mf4, .uff, .h5, snapshots. With a machine file also CAN "
+        "logs: .blf, .asc, .log, .trc, or a folder of them. Print which fault the rotor has, what else "
+        "it might be, since when, and how large it is. Either the first file is a machine file (.toml), "
+        "or options describe probes, speed and rotor. Then the first revolutions of a recording must be "
+        "those of the healthy machine. Accelerometers without a keyphasor are compared with a recording "
+        "of the healthy machine (--channels, --baseline). With --bearing or --orders, analyze finds "
+        "which part of a rolling bearing is damaged. Verdicts: normal, unbalance, damping_loss, "
+        "static_load, stiffness_loss, rub, unmodelled (changed, but none of these), small_change (too "
+        "small for a name); of a bearing: normal, changed, inner, outer, ball, inner_or_outer. With "
+        "--cluster, FILE is the archive of a fleet: a folder or a URL with a folder for each machine. "
+        "Dask judges it, and the results are a table of Parquet files."
     )
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:

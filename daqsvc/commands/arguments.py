@@ -232,7 +232,7 @@ def add_max_memory(add: Callable[..., argparse.Action]) -> None:
         "--max-memory",
         type=memory_limit,
         metavar="GB",
-        help="memory that reading one recording may take (default: half of the machine's, at most 4)",
+        help="memory for reading one recording, in GB (default: half of this computer's, at most 4)",
     )
 
 

@@ -38,11 +38,12 @@ class CalibrateCommand(VerbWithKernels):
 
     help = "learn the healthy machine from recordings or the live bus, and write it to a file"
     description = (
-        "Learn what the healthy machine looks like, with uncertainties, and what its model can and cannot "
-        "tell apart. A recording through which the speed goes up or down by more than 10 % is a run-up and "
-        "tells natural frequency, damping and unbalance; one at steady speed tells the baseline there. With "
-        "--channels, or a machine file with [pipeline.bearing], the healthy state of rolling bearings. Data "
-        "that cannot be a healthy machine are refused, and nothing is written."
+        "Learn what the healthy machine looks like, with uncertainties, and which faults its model can "
+        "tell apart. A recording in which the speed changes by more than 10 % is a run-up or "
+        "coast-down: from it come natural frequency, damping and unbalance. From a recording at steady "
+        "speed comes the baseline at that speed. With --channels, or a machine file with "
+        "[pipeline.bearing], learn the healthy state of rolling bearings. Data that cannot be those of "
+        "a healthy machine are refused, and nothing is written."
     )
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:

@@ -27,52 +27,53 @@ MOST_FALSE_ALARMS = 10.0
 class DetectabilityCommand(VerbWithKernels):
     """``daqsvc detectability MACHINE``."""
 
-    help = "say what can be told apart on a machine's rotor, how soon, and from which change on"
+    help = "compute which faults of a rotor can be told apart, how soon, and from which size on"
     description = (
-        "Say, before any fault happens, what the rotor bank of a machine file can tell apart: the evidence "
-        "between every two modes in nats a revolution, and the expected delay of its alarms. It also says "
-        "the smallest visible change of every kind, and which modes look the same at this speed. Without a "
-        "rotor bank, what the synchronous vector of [pipeline.rotor_synchronous] can see: by its "
-        "calibration, or by --noise-um."
+        "Compute, before any fault happens, what the rotor bank of a machine file can tell apart: the "
+        "evidence between every two modes in nats per revolution, and the expected delay of its alarms. "
+        "Also the smallest visible change of every kind, and the modes that look the same at this "
+        "speed. Without a rotor bank, compute what [pipeline.rotor_synchronous] can see: from its "
+        "calibration, or from --noise-um."
     )
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `Command.add_arguments`."""
-        parser.add_argument("file", type=Path, metavar="MACHINE", help="the machine file (TOML)")
+        parser.add_argument("file", type=Path, metavar="MACHINE", help="machine file (TOML)")
         parser.add_argument(
             "--speed-rpm",
             type=positive,
             metavar="N",
-            help="another speed than the machine file's, in the same direction",
+            help="speed of the shaft (default: that of the machine file); the direction is that of the file",
         )
         parser.add_argument(
             "--false-alarms-per-1000-rev",
             type=positive,
             metavar="R",
-            help="set the threshold by the false alarms to accept on a healthy machine, not by the file",
+            help="false alarms to accept in 1000 revolutions, which set the threshold (default: that of "
+            "the file)",
         )
         parser.add_argument(
             "--process-noise",
             type=positive,
             metavar="Q",
-            help="how much the machine itself shakes at random: power spectral density of the acceleration, "
-            "normalised (default: process_noise of the file, mostly more than a machine has)",
+            help="random motion of the machine itself: normalised power spectral density of its acceleration "
+            "(default: process_noise of the file, which is mostly more than a machine has)",
         )
         parser.add_argument(
             "--noise-um",
             type=positive,
             metavar="N",
-            help="without a rotor bank: noise of one probe, where no calibration tells it",
+            help="without a rotor bank: noise of one probe, in um, if there is no calibration",
         )
         parser.add_argument(
             "--eccentricity-um",
             type=positive,
             metavar="E",
-            help="without a rotor bank: mass eccentricity, where neither calibration nor file tells it",
+            help="without a rotor bank: mass eccentricity, in um, if it is neither in calibration nor file",
         )
         # For the page, which knows what is in force, and where the files that it names are.
         parser.add_argument("--values-in", type=Path, metavar="FOLDER", help=argparse.SUPPRESS)
-        parser.add_argument("--json", action="store_true", help="print one JSON object")
+        parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `Command.run`."""

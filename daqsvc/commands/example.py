@@ -70,16 +70,18 @@ def examples() -> dict[str, Example]:
 class ExampleCommand:
     """``daqsvc example [NAME] [--out PATH]``."""
 
-    help = "machine files to start from: list, print or copy them"
+    help = "list, print or copy machine files to start from"
     description = (
-        "List the examples that come with daqsvc, print one, or copy one with the DBC files that it needs: "
-        "daqsvc example laval-rig --out machine.toml"
+        "List the examples that come with daqsvc, print one, or copy one with the DBC files that it "
+        "needs: daqsvc example laval-rig --out machine.toml"
     )
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `daqsvc.cli.Command.add_arguments`."""
-        parser.add_argument("name", nargs="?", metavar="NAME", help="which one (default: list them)")
-        parser.add_argument("--out", type=Path, metavar="PATH", help="file or directory to write it to")
+        parser.add_argument("name", nargs="?", metavar="NAME", help="name of the example (default: list all)")
+        parser.add_argument(
+            "--out", type=Path, metavar="PATH", help="file or directory to copy it to (default: print it)"
+        )
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `daqsvc.cli.Command.run`."""

@@ -20,15 +20,17 @@ _COLUMNS = 100
 class ExplainCommand:
     """``daqsvc explain [CODE ...]``."""
 
-    help = "what the code at the end of a message means, and what to do about it"
+    help = "explain the code at the end of a message, and what to do"
     description = (
-        "Print what the code at the end of a message means, what leads to it, and what to do about it: "
-        "daqsvc explain F01. Without a code, list all of them."
+        "Print what the code at the end of a message means, what causes it, and what to do, e.g. daqsvc "
+        "explain F01. Without a code, list all codes."
     )
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `daqsvc.cli.Command.add_arguments`."""
-        parser.add_argument("codes", nargs="*", metavar="CODE", help="e.g. F01 (default: list them)")
+        parser.add_argument(
+            "codes", nargs="*", metavar="CODE", help="code of a message, e.g. F01 (default: list all)"
+        )
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `daqsvc.cli.Command.run`."""

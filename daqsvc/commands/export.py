@@ -27,36 +27,38 @@ class ExportCommand(VerbWithKernels):
 
     help = "write a recording, CAN log or snapshot as Parquet, CSV, WAV, MATLAB, UFF58 or MDF4"
     description = (
-        "Write the samples of a recording, or of a snapshot of the service, as a file of another tool: "
-        "Parquet, CSV, WAV, MATLAB, universal file (data sets 58) or MDF 4, by the suffix of FILE. It reads "
-        "whatever daqsvc analyze reads; a CAN log needs the machine file (.toml) in front of it. Names, "
-        "units, rate, begin and gaps go with the samples. Of several streams .mat, .uff and .mf4 hold all; "
-        "of the others a file is written for each, with the stream's name behind that of FILE."
+        "Write the samples of a recording, or of a snapshot of the service, as a file for another tool: "
+        "Parquet, CSV, WAV, MATLAB, universal file (data sets 58) or MDF 4. The suffix of --to selects "
+        "the format. It reads all files that daqsvc analyze reads; a CAN log needs its machine file "
+        "(.toml) before it. Names, units, rate, begin and gaps are written with the samples. If there "
+        "are several streams, .mat, .uff and .mf4 contain all of them; with the other formats each "
+        "stream gets its own file, whose name ends with the name of the stream."
     )
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `daqsvc.cli.Command.add_arguments`."""
         self._parser = parser
         parser.epilog = (
-            "Exit code: 0 if it was written, 3 if the recording cannot be read or the format cannot hold it, "
-            "2 for wrong usage or a file that is there, 1 if it cannot be written."
+            "Exit code: 0 if it was written, 3 if the recording cannot be read or the format cannot "
+            "contain it; 2 for wrong usage or a file that exists already, 1 if the file cannot be "
+            "written."
         )
         parser.add_argument(
             "files",
             nargs="+",
             metavar="FILE",
-            help="a machine file (.toml) if there is one, then a recording",
+            help="machine file (.toml) if there is one, then a recording",
         )
         parser.add_argument(
             "--to",
             type=Path,
             required=True,
             metavar="FILE",
-            help="the new file: .parquet, .csv, .wav, .mat, .uff or .mf4",
+            help="file to write: .parquet, .csv, .wav, .mat, .uff or .mf4",
         )
-        parser.add_argument("--stream", metavar="NAME", help="this stream only (default: all)")
-        parser.add_argument("--force", action="store_true", help="replace a file that is there")
-        parser.add_argument("--json", action="store_true", help="say what was written as one JSON object")
+        parser.add_argument("--stream", metavar="NAME", help="write only this stream (default: all)")
+        parser.add_argument("--force", action="store_true", help="replace the file if it exists")
+        parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
         add_channel_map(parser.add_argument)
 
     def run(self, arguments: argparse.Namespace) -> int:

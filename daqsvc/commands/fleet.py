@@ -30,33 +30,36 @@ _MOST_NAMES = 5
 class FleetCommand:
     """``daqsvc fleet report RESULTS``."""
 
-    help = "what the archive of a fleet shows: changes, missed faults, false alarms and their cost"
+    help = "report on the archive of a fleet: changes, missed faults, false alarms and their cost"
     description = (
-        "Report on the results that daqsvc analyze ARCHIVE --cluster wrote: of each machine where its "
-        "verdict changed. Against a CSV table of known faults it also says what was missed, what false "
-        "alarms there were and what they cost (docs/fleet.md)."
+        "Report on the results that daqsvc analyze ARCHIVE --cluster has written: for each machine, "
+        "where its verdict changed. With a CSV table of known faults, also report which faults were "
+        "missed, which alarms were false, and what those cost (docs/fleet.md)."
     )
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `daqsvc.cli.Command.add_arguments`."""
-        parser.add_argument("what", choices=("report",), metavar="report", help="what is wanted")
-        parser.add_argument("results", metavar="RESULTS", help="the folder of the results, or its URL")
+        parser.add_argument("what", choices=("report",), metavar="report", help="the word report")
+        parser.add_argument("results", metavar="RESULTS", help="folder or URL of the results")
         parser.add_argument(
             "--truth",
             type=Path,
             metavar="FILE",
-            help="known faults: a CSV table of machine, fault, first and last (recordings or times)",
+            help="CSV table of known faults: machine, fault, first and last (recordings or times)",
         )
         parser.add_argument(
-            "--false-alarm-cost", type=not_negative, metavar="N", help="of one false alarm, in any currency"
+            "--false-alarm-cost",
+            type=not_negative,
+            metavar="N",
+            help="cost of one false alarm, in any currency",
         )
         parser.add_argument(
             "--interval",
             type=duration,
             metavar="TIME",
-            help="how long each recording stands for, e.g. 1d (default: by the dates in their names)",
+            help="time that each recording represents, e.g. 1d (default: by the dates in their names)",
         )
-        parser.add_argument("--json", action="store_true", help="one JSON object")
+        parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `daqsvc.cli.Command.run`."""

@@ -31,12 +31,12 @@ class PageCommand:
         load: reads a machine file; None after its errors have been printed.
     """
 
-    help = "the machines of this box, in a browser"
+    help = "show the machines of this box in a browser"
     description = (
-        "Show the machines that the service on this box watches in a web page: what they do, what is wrong "
-        "with them and how sure that is; orbit, waveform and spectra. The page is a process of its own: the "
-        "service does not wait for it. It is open to this box "
-        "only, unless it is asked to be open to others, too. Needs the extra 'page'."
+        "Show the machines that the service on this box watches in a web page: their state, what is "
+        "wrong with them and how sure that is; orbit, waveform and spectra. The page is a separate "
+        "process, and the service does not wait for it. Only this box can open it, unless options below "
+        "open it to others. Needs the extra 'page'."
     )
 
     def __init__(self, load: Load) -> None:
@@ -50,27 +50,29 @@ class PageCommand:
             type=Path,
             action="append",
             metavar="FILE",
-            help="show a snapshot of the recorder in place of a service, played again and again; may be "
-            "repeated, e.g. for a healthy one beside it",
+            help="show a snapshot of the recorder instead of a service, played in a loop; may be repeated, "
+            "e.g. to compare it with a healthy one",
         )
         parser.add_argument(
             "--plant",
             type=Path,
             metavar="FILE",
-            help="show all boxes that publish to a broker in place of the service on this box; the file has "
-            "a table [mqtt], as a machine file has it",
+            help="show all boxes that publish to a broker instead of the service on this box; FILE has a "
+            "table [mqtt], as in a machine file",
         )
         where = parser.add_mutually_exclusive_group()
-        where.add_argument("--port", type=_port, help=f"where it listens on {LOOPBACK} (default: {PORT})")
+        where.add_argument("--port", type=_port, help=f"TCP port on {LOOPBACK} (default: {PORT})")
         where.add_argument(
             "--listen",
             type=_listen,
             metavar="HOST:PORT",
-            help="where it listens; beyond this box it needs TLS and accounts, or a reverse proxy",
+            help="address to listen at; beyond this box it needs TLS and accounts, or a reverse proxy",
         )
         # For a program that starts the page: it ends with that program, however that ends.
         parser.add_argument("--with-parent", action="store_true", help=argparse.SUPPRESS)
-        _add_access(parser.add_argument_group("who may look, and who may act (docs/page.md)"))
+        _add_access(
+            parser.add_argument_group("who may see the page, and who may handle alarms (docs/page.md)")
+        )
         add_store(parser, of_a_machine=False)
 
     def run(self, arguments: argparse.Namespace) -> int:
@@ -183,25 +185,30 @@ def _add_access(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--operator-link",
         action="store_true",
-        help="print an address, made anew at each start: who opens it on this box may handle alarms",
+        help="print an address, a new one at each start; whoever opens it on this box may handle alarms",
     )
     group.add_argument(
         "--accounts",
         type=Path,
         metavar="FILE",
-        help="accounts to sign in with, as daqsvc account makes them",
+        help="accounts to sign in with, from daqsvc account",
     )
-    group.add_argument("--certificate", type=Path, metavar="FILE", help="certificate of TLS, in PEM")
-    group.add_argument("--private-key", type=Path, metavar="FILE", help="its private key, in PEM")
+    group.add_argument("--certificate", type=Path, metavar="FILE", help="TLS certificate of the page (PEM)")
+    group.add_argument(
+        "--private-key", type=Path, metavar="FILE", help="private key of that certificate (PEM)"
+    )
     group.add_argument(
         "--host-name",
         action="append",
         default=[],
         metavar="NAME",
-        help="name of the page in addresses, beyond this box; may be repeated",
+        help="host name under which other computers open the page; may be repeated",
     )
     group.add_argument(
-        "--user-header", default="", metavar="NAME", help="header in which a reverse proxy says who asks"
+        "--user-header",
+        default="",
+        metavar="NAME",
+        help="HTTP header in which a reverse proxy names the user",
     )
     group.add_argument(
         "--proxy",

@@ -40,12 +40,12 @@ class RecordCommand:
         start_logging: of the service.
     """
 
-    help = "record what comes over a CAN bus in a log file, until Ctrl-C"
+    help = "record all frames of a CAN bus in a log file, until Ctrl-C"
     description = (
-        "Record every frame that comes over a CAN bus in one log file, without the rest of the service. "
-        "SIGINT (Ctrl-C) or SIGTERM end it. At the end print as JSON what was recorded, and what the streams "
-        'of the machine file do with it. The file can be replayed (driver = "replay") or opened by any tool '
-        "that reads CAN logs."
+        "Record all frames of a CAN bus in one log file, without the rest of the service. SIGINT "
+        "(Ctrl-C) or SIGTERM end it. At the end, print as JSON what was recorded, and what the streams "
+        'of the machine file do with it. The file can be replayed (driver = "replay") or opened by any '
+        "tool that reads CAN logs."
     )
 
     def __init__(
@@ -56,17 +56,19 @@ class RecordCommand:
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `daqsvc.cli.Command.add_arguments`."""
-        parser.add_argument("file", type=Path, metavar="FILE", help="the machine file (TOML)")
-        parser.add_argument("--bus", metavar="NAME", help="the bus (default: the only CAN bus of the file)")
+        parser.add_argument("file", type=Path, metavar="FILE", help="machine file (TOML)")
+        parser.add_argument(
+            "--bus", metavar="NAME", help="name of the bus (default: the only CAN bus of the file)"
+        )
         parser.add_argument(
             "--out",
             type=Path,
             required=True,
             metavar="LOG",
-            help="the new log file; its ending says the format: .blf, .asc, or .log of candump",
+            help="log file to write; its suffix is the format: .blf, .asc, or .log of candump",
         )
         parser.add_argument(
-            "--duration", type=positive, metavar="S", help="seconds to record for (default: until stopped)"
+            "--duration", type=positive, metavar="S", help="time to record, in s (default: until stopped)"
         )
 
     def run(self, arguments: argparse.Namespace) -> int:

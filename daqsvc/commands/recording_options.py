@@ -74,41 +74,44 @@ def add_analyze_options(parser: argparse.ArgumentParser) -> None:
 def add_calibrate_options(parser: argparse.ArgumentParser) -> None:
     """All of ``daqsvc calibrate``."""
     _add_files(parser)
-    parser.add_argument("--out", type=Path, metavar="FILE", help="where the calibration is written (.toml)")
-    parser.add_argument("--json", action="store_true", help="say what was found as one JSON object")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="file for the calibration (.toml)")
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
     parser.add_argument(
         "--predict-rpm",
         type=_speeds,
         metavar="N,N,...",
-        help="speeds at which to predict 1X from a run-up (default: 0.5, 0.7, 0.95 and 1 of the critical)",
+        help="speeds in rpm at which to predict 1X from a run-up (default: 0.5, 0.7, 0.95 and 1 times the "
+        "critical speed)",
     )
     live = parser.add_argument_group("from the live bus")
-    live.add_argument("--live", action="store_true", help="listen to the machine instead of recordings")
+    live.add_argument(
+        "--live", action="store_true", help="read the buses of the machine file instead of recordings"
+    )
     live.add_argument(
         "--revolutions",
         type=calibration_length,
         default=LIVE_REVOLUTIONS,
         metavar="N",
-        help=f"usable revolutions to wait for (default: {LIVE_REVOLUTIONS})",
+        help=f"number of usable revolutions (default: {LIVE_REVOLUTIONS})",
     )
     live.add_argument(
         "--timeout-s",
         type=positive,
         metavar="S",
-        help="how long to wait for them (default: three times what they take, and 10 s)",
+        help="longest wait for them, in s (default: three times what they take, and 10 s)",
     )
     _add_about_healthy_recordings(parser)
     _add_rotor(
         parser.add_argument_group("without a machine file").add_argument,
         speed_help="speed of the steady recordings, negative if clockwise; exact if there is no keyphasor",
-        help_more="; a run-up tells it",
+        help_more="; not needed with a run-up",
     )
     _add_bearing_of_calibrate(parser)
 
 
 def _add_files(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "files", nargs="+", metavar="FILE", help="a machine file (.toml) if there is one, then recordings"
+        "files", nargs="+", metavar="FILE", help="machine file (.toml) if there is one, then recordings"
     )
 
 
@@ -245,8 +248,8 @@ def _add_rotor_of_analyze(parser: argparse.ArgumentParser) -> None:
     rotor = parser.add_argument_group("without a machine file")
     _add_rotor(
         rotor.add_argument,
-        speed_help="shaft speed, negative if clockwise: nominal with a keyphasor, else exact to half of its "
-        "last digit",
+        speed_help="speed of the shaft, negative if clockwise; nominal with a keyphasor, else exact to half "
+        "of its last digit",
     )
     rotor.add_argument("--follow-orbit", action="store_true", help="the same as --speed-rpm orbit:N")
     rotor.add_argument(
@@ -261,25 +264,29 @@ def _add_rotor_of_analyze(parser: argparse.ArgumentParser) -> None:
         type=positive,
         default=FALSE_ALARMS_PER_1000_REV,
         metavar="R",
-        help=f"rate of false alarms to accept (default: {FALSE_ALARMS_PER_1000_REV:g})",
+        help=f"false alarms to accept in 1000 revolutions (default: {FALSE_ALARMS_PER_1000_REV:g})",
     )
 
 
 def _add_orders(parser: argparse.ArgumentParser) -> None:
     """Options of accelerometers, in place of those of probes."""
-    orders = parser.add_argument_group("accelerometers, in place of probes")
+    orders = parser.add_argument_group("accelerometers, instead of probes")
     orders.add_argument(
-        "--channels", type=channel_names, metavar="NAME,...", help="channels of one unit, e.g. the three axes"
+        "--channels",
+        type=channel_names,
+        metavar="NAME,...",
+        help="channels that have one unit, e.g. three axes x,y,z",
     )
     orders.add_argument(
-        "--baseline", metavar="HEALTHY_REC", help="a recording of the healthy machine at the same speed"
+        "--baseline", metavar="HEALTHY_REC", help="recording of the healthy machine at the same speed"
     )
     orders.add_argument(
         "--false-alarm-probability",
         type=probability,
         default=FALSE_ALARM_PROBABILITY,
         metavar="P",
-        help=f"of a recording of the unchanged machine, at most (default: {FALSE_ALARM_PROBABILITY:g})",
+        help="highest probability of an alarm on a recording of the unchanged machine "
+        f"(default: {FALSE_ALARM_PROBABILITY:g})",
     )
 
 
@@ -292,10 +299,13 @@ def _add_bearings(parser: argparse.ArgumentParser) -> None:
         type=channel_map,
         default={},
         metavar="NAME=VARIABLE,...",
-        help="which variable of the healthy run is which channel, where that is not as in the recordings",
+        help="like --map, for the recording of the healthy machine (default: --map)",
     )
     bearings.add_argument(
-        "--baseline-fs", type=sampling_rate_hz, metavar="HZ", help="its sampling rate (default: --fs)"
+        "--baseline-fs",
+        type=sampling_rate_hz,
+        metavar="HZ",
+        help="like --fs, for the recording of the healthy machine (default: --fs)",
     )
 
 
@@ -306,14 +316,13 @@ def _add_about_recordings(parser: argparse.ArgumentParser) -> None:
     both.add_argument(
         "--unit",
         choices=(*LENGTH_UNITS, *ACCELERATION_UNITS),
-        help="unit of the samples (default: um, or the machine file's; of accelerometers: g)",
+        help="unit of the samples (default: that of the machine file, else um, for accelerometers g)",
     )
     both.add_argument(
         "--calibration",
         type=Path,
         metavar="FILE",
-        help="the healthy machine as daqsvc calibrate wrote it, in place of the first revolutions or of "
-        "--baseline",
+        help="file of daqsvc calibrate, used instead of the first revolutions or of --baseline",
     )
 
 
@@ -321,19 +330,21 @@ def _add_output(parser: argparse.ArgumentParser) -> None:
     """What comes out, and how."""
     output = parser.add_argument_group("output")
     output.add_argument(
-        "--json", action="store_true", help="one JSON object a line for each recording, in the order given"
+        "--json",
+        action="store_true",
+        help="print one JSON object per line, one for each recording, in the order given",
     )
     output.add_argument(
         "--plot",
         type=Path,
         metavar="DIR",
-        help="write figures there: orbit, Poincare map, phase plane, probabilities, innovations, polar plot",
+        help="folder for figures: orbit, Poincare map, phase plane, probabilities, innovations, polar plot",
     )
     output.add_argument(
         "--jobs",
         type=count,
         metavar="N",
-        help="processes at a time (default: as many as there are cores, fewer for a few recordings)",
+        help="number of processes (default: one for each core, fewer for few recordings)",
     )
 
 
@@ -344,43 +355,50 @@ def _add_fleet(parser: argparse.ArgumentParser) -> None:
         "--cluster",
         type=cluster_address,
         metavar="ADDRESS",
-        help="judge an archive on Dask: local (processes of this computer, as many as it has cores), "
-        "local:N, or the scheduler tcp://HOST:8786",
+        help="judge an archive on Dask: local (one process for each core of this computer), local:N "
+        "(N processes), or the address of a scheduler, tcp://HOST:8786",
     )
     fleet.add_argument(
         "--results",
         metavar="PLACE",
-        help="folder or URL of the table; what it holds is not judged again (default: ARCHIVE-results)",
+        help="folder or URL of the results; recordings that it contains are not judged again "
+        "(default: ARCHIVE-results)",
     )
     fleet.add_argument(
         "--verify",
         action="store_true",
-        help="read all files to see whether they hold what they held, whatever their sizes and times say",
+        help="read all files to find changed contents, even if size and time have not changed",
     )
-    fleet.add_argument("--retry", action="store_true", help="try again what could not be judged")
+    fleet.add_argument(
+        "--retry", action="store_true", help="judge again the recordings that could not be judged"
+    )
 
 
 def _add_about_healthy_recordings(parser: argparse.ArgumentParser) -> None:
     about = parser.add_argument_group("about the recordings")
     add_channel_map(about.add_argument)
-    about.add_argument("--unit", choices=LENGTH_UNITS, help="unit of the probes' samples (default: um)")
+    about.add_argument(
+        "--unit",
+        choices=LENGTH_UNITS,
+        help="unit of the samples (default: that of the machine file, else um)",
+    )
     about.add_argument(
         "--sweep-rpm",
         type=_sweep,
         metavar="FROM,TO",
-        help="the first recording is a run-up without a keyphasor: the speed goes evenly from FROM at its "
-        "first sample to TO at its last, angle zero at the first",
+        help="the first recording is a run-up without a keyphasor: the speed in rpm changes linearly from "
+        "FROM at its first sample to TO at its last, e.g. 600,3000; the angle is zero at the first sample",
     )
 
 
 def _add_bearing_of_calibrate(parser: argparse.ArgumentParser) -> None:
     """Options of bearings, in place of those of the rotor."""
-    bearings = parser.add_argument_group("bearings, with --speed-rpm, in place of the rotor")
+    bearings = parser.add_argument_group("bearings, with --speed-rpm, instead of the rotor")
     bearings.add_argument(
         "--channels",
         type=channel_names,
         metavar="NAME[,NAME]",
-        help="accelerometers on the housings; name them as the sensors of the machine file are",
+        help="accelerometers on the bearing housings, with the names of sensors in the machine file",
     )
     _add_bearing(bearings.add_argument)
 
@@ -416,9 +434,15 @@ def add_channel_map(add: Callable[..., argparse.Action]) -> None:
         action=_MergedMap,
         default={},
         metavar="NAME=VARIABLE,...",
-        help="which variable of the recordings is which channel or sensor (default: the one of its name)",
+        help="which variable of the recordings is which channel or sensor, e.g. x=X097_DE_time (default: the "
+        "one with its name)",
     )
-    add("--fs", type=sampling_rate_hz, metavar="HZ", help="sampling rate, if the files do not state it")
+    add(
+        "--fs",
+        type=sampling_rate_hz,
+        metavar="HZ",
+        help="sampling rate in Hz, if the recordings do not state it",
+    )
     add_max_memory(add)
 
 
@@ -433,20 +457,25 @@ def _add_bearing(add: Callable[..., argparse.Action]) -> None:
         "--orders",
         type=fault_orders,
         metavar="BPFI=F,BPFO=F,BSF=F,FTF=F",
-        help="fault orders per revolution of the shaft, in place of --bearing",
+        help="fault orders per revolution of the shaft, instead of --bearing",
     )
     add(
         "--balls",
         type=count,
         metavar="N",
-        help="its dimensions in place of --bearing: balls or rollers of a row",
+        help="its dimensions instead of --bearing: number of balls or rollers in a row",
     )
     for name, about in (
         ("ball-diameter-mm", "of a ball, or of a roller at its middle"),
         ("pitch-diameter-mm", "of the circle through their centres"),
     ):
-        add(f"--{name}", type=positive, metavar="D", help=f"with --balls: diameter {about}")
-    add("--contact-deg", type=not_negative, metavar="A", help="with --balls: contact angle (default: 0)")
+        add(f"--{name}", type=positive, metavar="D", help=f"with --balls: diameter {about}, in mm")
+    add(
+        "--contact-deg",
+        type=not_negative,
+        metavar="A",
+        help="with --balls: contact angle in degrees (default: 0)",
+    )
 
 
 def _add_rotor(add: Callable[..., argparse.Action], *, speed_help: str, help_more: str = "") -> None:
@@ -457,23 +486,25 @@ def _add_rotor(add: Callable[..., argparse.Action], *, speed_help: str, help_mor
         speed_help: what the speed is.
         help_more: what is said beside the rotor's figures, where something else can tell them.
     """
-    add("--probes", type=probe_pair, metavar="X,Y", help="channels of the two probes, y 90 degrees after x")
+    add(
+        "--probes", type=probe_pair, metavar="X,Y", help="channels of the two probes; y is 90 degrees after x"
+    )
     add(
         "--speed-rpm",
         type=speed,
         metavar="N",
-        help=f"{speed_help}; orbit:N follows the orbit's own 1X about N",
+        help=f"{speed_help}; orbit:N finds it from the 1X of the orbit, near N",
     )
-    add("--keyphasor", metavar="CH", help="channel of the keyphasor, one pulse a revolution")
+    add("--keyphasor", metavar="CH", help="channel of the keyphasor, one pulse per revolution")
     add(
         "--keyphasor-threshold",
         type=number,
         metavar="V",
-        help="level that marks its edge, in the channel's unit (default: half way from low to high)",
+        help="level of its edge, in the unit of the channel (default: half way from low to high)",
     )
     for name, unit, metavar, about in (
-        ("natural-frequency", "hz", "F", "natural frequency of the healthy shaft"),
-        ("damping", "ratio", "Z", "its damping ratio"),
+        ("natural-frequency", "hz", "F", "natural frequency of the healthy shaft, in Hz"),
+        ("damping", "ratio", "Z", "damping ratio of the healthy shaft"),
     ):
         add(f"--{name}-{unit}", type=positive, metavar=metavar, help=f"{about}{help_more}")
         add(
@@ -481,16 +512,16 @@ def _add_rotor(add: Callable[..., argparse.Action], *, speed_help: str, help_mor
             type=percent,
             default=TOLERANCE_PERCENT,
             metavar="PERCENT",
-            help=f"how far that may be off (default: {TOLERANCE_PERCENT:g})",
+            help=f"how wrong that may be, in %% (default: {TOLERANCE_PERCENT:g})",
         )
-    add("--clearance-um", type=positive, metavar="C", help="radial clearance to the stator")
+    add("--clearance-um", type=positive, metavar="C", help="radial clearance to the stator, in um")
     add(
         "--static-sag-um",
         type=not_negative,
         metavar="S",
-        help="sag of the shaft under its weight (default: g / omega^2; 0 if it stands upright)",
+        help="sag of the shaft under its weight, in um (default: g / omega^2); 0 if the shaft is vertical",
     )
-    add("--ac-coupled", action="store_true", help="the probes have no mean position: do not look at it")
+    add("--ac-coupled", action="store_true", help="the probes are AC-coupled: do not use their mean position")
 
 
 def _given(arguments: argparse.Namespace, options: Iterable[str]) -> list[str]:

@@ -26,12 +26,12 @@ class ReloadCommand:
         load: reads a machine file; None after its errors have been printed.
     """
 
-    help = "have the service that runs read its machine files again"
+    help = "make the running service read its machine files again"
     description = (
-        "Have the service that runs on the store read its machine files again, and go on by what differs. "
-        "Buses, detectors and outputs that are as before go on without a break; alarms stand as they did. "
-        "Files with errors are refused as a whole, and the service goes on as it is. SIGHUP and systemctl "
-        "reload do the same. Exit code 2 if the files are refused, 1 if no service runs."
+        "Make the running service read its machine files again and take over what has changed. Buses, "
+        "detectors and outputs that have not changed go on without a break, and alarms keep their "
+        "state. If a file has errors, all files are refused, and the service goes on as before. SIGHUP "
+        "and systemctl reload do the same. Exit code 2 if the files are refused, 1 if no service runs."
     )
 
     def __init__(self, load: Load) -> None:
@@ -39,8 +39,10 @@ class ReloadCommand:
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `daqsvc.cli.Command.add_arguments`."""
-        parser.add_argument("--dry-run", action="store_true", help="only say what would be different")
-        parser.add_argument("--json", action="store_true", help="one JSON object instead of text")
+        parser.add_argument(
+            "--dry-run", action="store_true", help="change nothing, only print what would change"
+        )
+        parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
         add_store(parser, of_a_machine=False)
 
     def run(self, arguments: argparse.Namespace) -> int:

@@ -27,33 +27,34 @@ _SHOWN = 5
 class ReplayCommand(VerbWithKernels):
     """``daqsvc replay SNAPSHOT [MACHINE]``."""
 
-    help = "judge a snapshot again: the same detectors and alarms over the same samples"
+    help = "run detectors and alarms again over the samples of a snapshot"
     description = (
-        "Play the samples of a snapshot into the rings, detectors and alarms of the service, as fast as it "
-        "goes or at a speed. Print the alarms that come of it, and compare them and every statement of the "
-        "detectors with what the service said then, to the last bit. With a machine file that judges "
-        "instead of the one in the snapshot. Exit code: 0 if it was judged, with --check 1 if anything "
-        "differs or nothing could be compared, 3 if it cannot be read or judged, 2 for wrong usage."
+        "Play the samples of a snapshot into the rings, detectors and alarms of the service, as fast as "
+        "possible or at a stated speed. Print the alarms that follow. Compare them, and every statement "
+        "of the detectors, bit by bit with those of the service. With MACHINE, use that machine file "
+        "instead of the one in the snapshot. Exit code: 0 if it was replayed, with --check 1 if "
+        "anything differs or nothing could be compared, 3 if it cannot be read or replayed, 2 for wrong "
+        "usage."
     )
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `daqsvc.cli.Command.add_arguments`."""
-        parser.add_argument("snapshot", type=Path, metavar="SNAPSHOT", help="the snapshot (.mcap)")
+        parser.add_argument("snapshot", type=Path, metavar="SNAPSHOT", help="snapshot file (.mcap)")
         parser.add_argument(
             "machine",
             type=Path,
             nargs="?",
             metavar="MACHINE",
-            help="a machine file to judge by instead",
+            help="machine file (TOML) to use instead of the one in the snapshot",
         )
         parser.add_argument(
             "--speed",
             type=positive,
             metavar="X",
-            help="X times as fast as it was; 1 in real time (default: as fast as it goes)",
+            help="X times as fast as real time, e.g. 1 (default: as fast as possible)",
         )
         parser.add_argument("--check", action="store_true", help="exit with 1 if anything differs")
-        parser.add_argument("--json", action="store_true", help="one JSON object instead of text")
+        parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `daqsvc.cli.Command.run`."""

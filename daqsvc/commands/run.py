@@ -62,14 +62,14 @@ class RunCommand:
 
     help = "run the service until SIGTERM or SIGINT"
     description = (
-        "Run the service for one machine file, or for several machines that share their buses, one journal "
-        "and one connection to the broker: acquire, diagnose, and publish alarms. SIGTERM, SIGINT "
-        "(Ctrl-C) or the loss of its terminal stop it within two seconds; alarms that the broker has not "
-        "acknowledged stay in the journal and go out at the next start. Exit code 0: it was stopped. Exit "
-        "code 1: it could not start. Exit code 2: the machine file has errors. Exit code 3: something "
-        "without which it is useless was lost, such as the writer of the journal. Exit code "
-        f"{EXIT_HUNG}: something hung while it stopped, and it was ended by force. Exit code {EXIT_STUCK}: "
-        "its event loop stood still, and it was ended by force."
+        "Run the service for one machine file, or for several machines that share their buses, one "
+        "journal and one connection to the broker. It acquires samples, diagnoses the machines and "
+        "publishes alarms. SIGTERM, SIGINT (Ctrl-C) or the loss of its terminal stop it within two "
+        "seconds. Alarms that the broker has not acknowledged stay in the journal and are sent at the "
+        "next start. Exit code 0: it was stopped. Exit code 1: it could not start. Exit code 2: the "
+        "machine file has errors. Exit code 3: it lost something that it cannot work without, such as "
+        f"the writer of the journal. Exit code {EXIT_HUNG}: it hung while it stopped, and was killed. "
+        f"Exit code {EXIT_STUCK}: its event loop stood still, and it was killed."
     )
 
     def __init__(
@@ -85,16 +85,21 @@ class RunCommand:
             type=Path,
             nargs="+",
             metavar="FILE",
-            help="the machine file (TOML); or several of one box, or a directory of them",
+            help="machine file (TOML), the machine files of several machines on one box, or their directory",
         )
         parser.add_argument(
             "--store",
             type=Path,
             metavar="DIR",
-            help="directory of the alarm journal (default: as in the file, else $STATE_DIRECTORY, "
-            "else ~/.local/state/daqsvc)",
+            help="directory of the alarm journal (default: store.directory of the machine file, else "
+            "$STATE_DIRECTORY, else ~/.local/state/daqsvc)",
         )
-        parser.add_argument("-v", "--verbose", action="store_true", help="log what goes well, too")
+        parser.add_argument(
+            "-v",
+            "--verbose",
+            action="store_true",
+            help="also log what goes well, not only warnings and errors",
+        )
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `daqsvc.cli.Command.run`."""

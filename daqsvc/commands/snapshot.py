@@ -23,11 +23,12 @@ class SnapshotCommand:
         load: reads a machine file; None after its errors have been printed.
     """
 
-    help = "have the service write a snapshot of a machine: samples, statements, alarms"
+    help = "make the running service write a snapshot of a machine: samples, statements, alarms"
     description = (
-        "Have the service that runs on the store write a snapshot: the samples of all channels of a machine "
-        "from before_s before until after_s after now, and what was said by them. Waits until it is complete "
-        "and prints its file. The machine file needs a table [recorder]. Exit code 1 if none was made."
+        "Make the running service write a snapshot: the samples of all channels of a machine from "
+        "before_s before now until after_s after it, with the statements of its detectors and its "
+        "alarms. Waits until the file is complete and prints its path. The machine file needs a table "
+        "[recorder]. Exit code 1 if no snapshot was written."
     )
 
     def __init__(self, load: Load) -> None:
@@ -35,7 +36,7 @@ class SnapshotCommand:
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `daqsvc.cli.Command.add_arguments`."""
-        parser.add_argument("--json", action="store_true", help="one JSON object instead of text")
+        parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
         add_store(parser)
 
     def run(self, arguments: argparse.Namespace) -> int:

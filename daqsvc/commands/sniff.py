@@ -27,10 +27,10 @@ SNIFFERS = "daqsvc.sniffers"
 class SniffCommand:
     """``daqsvc sniff KIND ...``; other packages register kinds by entry point in ``daqsvc.sniffers``."""
 
-    help = "what is on a bus, before there is a machine file; ends with tables to begin one with"
+    help = "show what is on a bus, without a machine file, and print tables to begin one with"
     description = (
-        "Look at a bus without a machine file, and print what is on it. At the end come tables of a machine "
-        "file to begin with. Ctrl-C ends it early; what was found until then is printed (docs/sniff.md)."
+        "Show what is on a bus, without a machine file. The output ends with tables to begin a machine "
+        "file with. Ctrl-C ends it early, and what was found until then is printed (docs/sniff.md)."
     )
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
@@ -39,7 +39,7 @@ class SniffCommand:
         for name, sniffer in sniffers().items():
             kind = kinds.add_parser(name, help=sniffer.help, description=sniffer.description)
             sniffer.add_arguments(kind)
-            kind.add_argument("--json", action="store_true", help="one JSON object")
+            kind.add_argument("--json", action="store_true", help="print one JSON object instead of text")
             kind.set_defaults(sniffer=sniffer)
 
     def run(self, arguments: argparse.Namespace) -> int:

@@ -35,11 +35,11 @@ class StatusCommand:
         load: reads a machine file; None after its errors have been printed.
     """
 
-    help = "how everything stands, by the service that runs"
+    help = "show the state of sensors, buses, alarms, outbox and broker, from the running service"
     description = (
-        "Show present values of every channel and measure, whether sensors are OK, rates, losses by cause, "
-        "alarms, outbox and broker, as the service that runs on the store knows them. Exit code 1 if none "
-        "runs, or it may not be asked. daqsvc alarms shows the alarms without a service, too."
+        "Show the present values of every channel and measure, whether sensors are OK, rates, losses by "
+        "cause, alarms, outbox and broker, as the running service knows them. Exit code 1 if no service "
+        "runs, or it may not be asked. Without a service, daqsvc alarms still shows the alarms."
     )
 
     def __init__(self, load: Load) -> None:
@@ -47,12 +47,12 @@ class StatusCommand:
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `daqsvc.cli.Command.add_arguments`."""
-        parser.add_argument("--json", action="store_true", help="one JSON object instead of text")
+        parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
         parser.add_argument(
             "--watch",
             action="store_true",
-            help="again every second until Ctrl-C, also over a restart of the service; with --json one "
-            "object a line",
+            help="print it every second until Ctrl-C, also while the service restarts; with --json one "
+            "object per line",
         )
         add_store(parser)
 

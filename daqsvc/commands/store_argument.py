@@ -162,18 +162,18 @@ def add_store(parser: argparse.ArgumentParser, *, of_a_machine: bool = True) -> 
         type=Path,
         nargs="?",
         metavar="FILE",
-        help="the machine file that the service runs (TOML), or the directory of them",
+        help="machine file (TOML) that the service runs, or the directory of its machine files",
     )
     either.add_argument(
         "--store",
         type=Path,
         metavar="DIR",
-        help="directory of its alarm journal (default: $STATE_DIRECTORY, else the one there is in "
+        help="directory of the alarm journal (default: $STATE_DIRECTORY, else the only store in "
         "~/.local/state/daqsvc)",
     )
     if of_a_machine:
         parser.add_argument(
-            "--machine", metavar="NAME", help="which machine, where the service watches several"
+            "--machine", metavar="NAME", help="name of the machine, if the service watches several"
         )
     # argparse shows each for itself, as if both could be given.
     usage = re.sub(r"\[--store DIR\]\s+", "", parser.format_usage())

@@ -76,11 +76,12 @@ class TrendCommand:
         load: reads a machine file; None after its errors have been printed.
     """
 
-    help = "what figures were over hours or months, from the history on the box"
+    help = "show levels and other figures over hours or months, from the history on this box"
     description = (
-        "Show what levels, probabilities and other figures were, from the history that the service keeps "
-        "where the machine file has [history], whether it runs or not. TIME is how long ago (90m, 8h, 30d), "
-        "or a date and time (2026-11-23, 2026-11-23T14:30; local unless it says otherwise)."
+        "Show levels, probabilities and other figures of the past, from the history on this box. The "
+        "service keeps it if the machine file has a table [history]; it can be read with and without a "
+        "running service. TIME is a time before now (90m, 8h, 30d), or a date and time (2026-11-23, "
+        "2026-11-23T14:30), which is local unless it has an offset."
     )
 
     def __init__(self, load: Load) -> None:
@@ -89,27 +90,37 @@ class TrendCommand:
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `daqsvc.cli.Command.add_arguments`."""
         parser.add_argument(
-            "--since", type=moment, default=SINCE, metavar="TIME", help=f"begin (default: {SINCE})"
+            "--since",
+            type=moment,
+            default=SINCE,
+            metavar="TIME",
+            help=f"begin of the time shown (default: {SINCE})",
         )
-        parser.add_argument("--until", type=moment, default=None, metavar="TIME", help="end (default: now)")
+        parser.add_argument(
+            "--until", type=moment, default=None, metavar="TIME", help="end of the time shown (default: now)"
+        )
         parser.add_argument(
             "--step",
             choices=("second", "minute", "hour"),
-            help="from point to point (default: by the time that is shown)",
+            help="time from point to point (default: it fits the time shown)",
         )
         parser.add_argument(
             "--reading",
             action="append",
             metavar="NAME",
-            help="this figure only, e.g. levels/shaft-x.rms, or all like '*.rms'; may be repeated",
+            help="show only this figure, e.g. levels/shaft-x.rms, or all that match '*.rms'; may be repeated",
         )
         form = parser.add_mutually_exclusive_group()
-        form.add_argument("--json", action="store_true", help="one JSON object a figure and line")
-        form.add_argument("--csv", type=Path, metavar="FILE", help="write a table; - for standard output")
+        form.add_argument(
+            "--json", action="store_true", help="print one JSON object per line, one for each figure"
+        )
+        form.add_argument("--csv", type=Path, metavar="FILE", help="write a CSV table; - is standard output")
         form.add_argument("--parquet", type=Path, metavar="FILE", help="write a Parquet table")
         form.add_argument("--plot", type=Path, metavar="FILE", help="draw a picture (.png, .svg, .pdf)")
-        form.add_argument("--events", action="store_true", help="the alarm events instead, one JSON a line")
-        parser.add_argument("--force", action="store_true", help="replace a file that is there")
+        form.add_argument(
+            "--events", action="store_true", help="print the alarm events instead, one JSON object per line"
+        )
+        parser.add_argument("--force", action="store_true", help="replace the file if it exists")
         add_store(parser)
 
     def run(self, arguments: argparse.Namespace) -> int:

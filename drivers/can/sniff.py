@@ -47,40 +47,46 @@ _IP_S = 2.0
 class CanSniffer(Sniffer):
     """See `drivers.sniffing.Sniffer`."""
 
-    help = "listen to a CAN bus: ids, rates, bytes that change, and values by a DBC file"
+    help = "listen to a CAN bus: ids, rates, bytes that change, values with a DBC file"
     description = (
-        "Listen to a CAN or CAN FD bus and print each id that comes, how often and how evenly, how long its "
-        "frames are and which bytes change. With a DBC file also print the values of its signals. Nothing is "
-        "sent."
+        "Listen to a CAN or CAN FD bus. Print each id, how often and how evenly it comes, how long its "
+        "frames are and which bytes change. With a DBC file also print the values of its signals. "
+        "Nothing is sent."
     )
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `drivers.sniffing.Sniffer.add_arguments`."""
-        parser.add_argument("channel", metavar="INTERFACE", help="the CAN interface, e.g. can0")
-        parser.add_argument("--dbc", type=Path, metavar="FILE", help="describes messages and signals")
+        parser.add_argument("channel", metavar="INTERFACE", help="CAN interface, e.g. can0")
+        parser.add_argument("--dbc", type=Path, metavar="FILE", help="DBC file of the messages and signals")
         parser.add_argument(
             "--seconds",
             type=float,
             default=SECONDS,
             metavar="S",
-            help=f"how long to listen (default: {SECONDS:g})",
+            help=f"time to listen, in s (default: {SECONDS:g})",
         )
         parser.add_argument(
             "--fd",
             action="store_true",
-            help="CAN FD frames are on the bus; interfaces of the kernel take them anyway",
+            help="also receive CAN FD frames; interfaces of the kernel always do",
         )
         parser.add_argument(
-            "--bitrate", type=int, metavar="BIT/S", help="of the bus, for its load (default: ask the kernel)"
+            "--bitrate",
+            type=int,
+            metavar="BIT/S",
+            help="bit rate of the bus, from which its load is computed (default: ask the kernel)",
         )
         parser.add_argument(
-            "--data-bitrate", type=int, metavar="BIT/S", help="of the data of CAN FD frames, likewise"
+            "--data-bitrate",
+            type=int,
+            metavar="BIT/S",
+            help="bit rate of the data of CAN FD frames (default: ask the kernel)",
         )
         parser.add_argument(
             "--interface",
             default="socketcan",
             metavar="NAME",
-            help="kind of interface, as python-can names it (default: socketcan, those of the kernel)",
+            help="interface as python-can names it, e.g. pcan (default: socketcan, those of the kernel)",
         )
 
     def sniff(

@@ -61,7 +61,7 @@ class _ModbusQuestions(BusQuestions):
         "depth": Topic("Samples of each channel that the ring holds", "A power of two, e.g. 1024."),
         "fifo-address": Topic("Pointer of the queue", "The address that function 24 is given, from 0."),
         "acknowledge": Topic(
-            "Register that is told how far the queue was read",
+            "Register to which the read position of the queue is written",
             "As on the wire, from 0. none if the device drops what it has handed out.",
         ),
     }

@@ -30,44 +30,67 @@ _LAST_REGISTER = 65_535
 class ModbusSniffer(Sniffer):
     """See `drivers.sniffing.Sniffer`."""
 
-    help = "ask a Modbus server or line: units that answer, their registers, and what those may mean"
+    help = "scan a Modbus server or line: units that answer, their registers, what those may mean"
     description = (
-        "Ask a Modbus TCP server, or the units on a serial line, for their registers, twice, and print those "
-        "that are there, which of them move, and which numbers they may be. One request at a time, with a "
-        "pause before each. Nothing is ever written."
+        "Read the registers of a Modbus TCP server, or of the units on a serial line, twice. Print "
+        "which registers exist, which of them change, and which numbers they may be. It sends one "
+        "request at a time, with a pause before each. Nothing is written to a device."
     )
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `drivers.sniffing.Sniffer.add_arguments`."""
-        parser.add_argument("target", metavar="TARGET", help="HOST[:PORT], or the path of a serial port")
         parser.add_argument(
-            "--units", default=UNITS, metavar="A-B", help=f"addresses to try, e.g. 1-10 (default: {UNITS})"
+            "target", metavar="TARGET", help="HOST[:PORT], or the path of a serial port, e.g. /dev/ttyUSB0"
         )
         parser.add_argument(
-            "--registers", default=REGISTERS, metavar="A-B", help=f"registers to read (default: {REGISTERS})"
+            "--units",
+            default=UNITS,
+            metavar="A-B",
+            help=f"addresses of units to try, e.g. 1-10 (default: {UNITS})",
+        )
+        parser.add_argument(
+            "--registers",
+            default=REGISTERS,
+            metavar="A-B",
+            help=f"addresses of registers to read, e.g. 0-99 (default: {REGISTERS})",
         )
         parser.add_argument(
             "--function",
             choices=tuple(_FUNCTIONS),
             default=_AUTO,
-            help="which reads them (default: auto, which is 3, and 4 for a unit where 3 reads none)",
+            help="function code: 3 reads holding registers, 4 input registers (default: auto: 3, and 4 for "
+            "a unit without holding registers)",
         )
         parser.add_argument(
-            "--timeout-ms", type=float, default=300.0, metavar="MS", help="for a reply (default: 300)"
+            "--timeout-ms",
+            type=float,
+            default=300.0,
+            metavar="MS",
+            help="longest wait for a reply, in ms (default: 300)",
         )
         parser.add_argument(
-            "--pause-ms", type=float, default=20.0, metavar="MS", help="before each request (default: 20)"
+            "--pause-ms",
+            type=float,
+            default=20.0,
+            metavar="MS",
+            help="pause before each request, in ms (default: 20)",
         )
         parser.add_argument(
-            "--baud", type=int, default=19_200, metavar="BIT/S", help="of a serial port (default: 19200)"
+            "--baud",
+            type=int,
+            default=19_200,
+            metavar="BIT/S",
+            help="baud rate of a serial port (default: 19200)",
         )
         parser.add_argument(
             "--parity",
             choices=("none", "even", "odd"),
             default="even",
-            help="of a serial port (default: even)",
+            help="parity of a serial port (default: even)",
         )
-        parser.add_argument("--all-orders", action="store_true", help="show all byte and word orders")
+        parser.add_argument(
+            "--all-orders", action="store_true", help="print the values in all byte and word orders"
+        )
 
     def sniff(
         self, arguments: argparse.Namespace, stop: threading.Event, tell: Callable[[str], None]

@@ -80,22 +80,23 @@ class SerialSniffer(Sniffer):
 
     help = "listen to a serial port: baud rate, first bytes, columns of lines or frames"
     description = (
-        "Listen to a serial port: try the usual baud rates, show the first bytes, and say whether they are "
-        "lines of text or binary frames, with columns, sync word, length, CRC and counter. Nothing is sent."
+        "Listen to a serial port: try the usual baud rates, print the first bytes, and find whether "
+        "they are lines of text or binary frames. Also print columns, sync word, length, CRC and "
+        "counter. Nothing is sent."
     )
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `drivers.sniffing.Sniffer.add_arguments`."""
         parser.add_argument("port", metavar="PORT", help="path of the port, e.g. /dev/ttyUSB0")
         parser.add_argument(
-            "--baud", type=int, metavar="BIT/S", help="the baud rate (default: try the usual ones)"
+            "--baud", type=int, metavar="BIT/S", help="baud rate of the port (default: try the usual ones)"
         )
         parser.add_argument(
             "--seconds",
             type=float,
             default=SECONDS,
             metavar="S",
-            help=f"how long to listen, once the rate is found (default: {SECONDS:g})",
+            help=f"time to listen, in s, after the baud rate is found (default: {SECONDS:g})",
         )
 
     def sniff(

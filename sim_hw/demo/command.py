@@ -44,9 +44,9 @@ class DemoCommand:
 
     help = "run the whole service against a simulated machine or a recording"
     description = (
-        "Run the whole service - virtual CAN bus, driver, ring, detectors, alarms, journal, MQTT - against a "
-        "simulated machine or a measured recording. It needs no broker, no root and no network: a broker "
-        "starts inside the process, and what you see has come back from it."
+        "Run the whole service - virtual CAN bus, driver, ring, detectors, alarms, journal, MQTT - "
+        "against a simulated machine or a measured recording. It needs no broker, no root and no "
+        "network: a broker starts inside the process, and what you see has passed through it."
     )
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
@@ -64,29 +64,37 @@ class DemoCommand:
             "--machine",
             type=Path,
             metavar="FILE",
-            help="the machine file that knows the layout of the frames, where the recording is a CAN log",
+            help="machine file (TOML) with the layout of the frames, if the recording is a CAN log",
         )
-        what.add_argument("--unit", choices=UNITS, help="unit of the recording's channels (default: g)")
+        what.add_argument("--unit", choices=UNITS, help="unit of the samples (default: g)")
         what.add_argument(
             "--baseline",
             type=Path,
             metavar="FILE",
-            help="recording of the healthy machine: alarm setpoints become 1.5 and 3 times its RMS",
+            help="recording of the healthy machine; the alarm setpoints are 1.5 and 3 times its RMS",
         )
-        what.add_argument("--baseline-map", type=channel_map, metavar="NAME=VARIABLE,...", help="as --map")
         what.add_argument(
-            "--baseline-fs", type=sampling_rate_hz, metavar="HZ", help="as --fs (default: the same)"
+            "--baseline-map",
+            type=channel_map,
+            metavar="NAME=VARIABLE,...",
+            help="like --map, for the recording of the healthy machine (default: --map)",
+        )
+        what.add_argument(
+            "--baseline-fs",
+            type=sampling_rate_hz,
+            metavar="HZ",
+            help="like --fs, for the recording of the healthy machine (default: --fs)",
         )
         what.add_argument(
             "--bearing",
             metavar="NAME",
-            help="watch this bearing at every channel of the recording (catalogue name, e.g. 6205-2RS)",
+            help="designation in the catalogue, e.g. 6205-2RS: watch this bearing with every channel",
         )
         what.add_argument(
             "--speed-rpm",
             type=positive,
             metavar="N",
-            help="speed of the shaft in the recording, right to 1 %%; with --bearing",
+            help="with --bearing: speed of the shaft in the recording, exact to 1 %%",
         )
         how = parser.add_argument_group("how to play it")
         add_speed(how)
@@ -94,25 +102,25 @@ class DemoCommand:
             "--broker",
             type=broker_url,
             metavar="URL",
-            help="publish to this broker, mqtt://HOST[:PORT], without TLS (default: one in the process)",
+            help="publish to this broker, mqtt://HOST[:PORT], without TLS (default: one inside the process)",
         )
         how.add_argument(
             "--snapshots",
             type=Path,
             metavar="DIR",
-            help="keep the snapshots that alarms leave in this folder, for daqsvc replay "
-            "(default: they go with the demo)",
+            help="folder for the snapshots that alarms request, for daqsvc replay (default: they are removed "
+            "with the demo)",
         )
         how.add_argument(
             "--page",
             action="store_true",
-            help="show it in a browser, too, at the address that is said (daqsvc page)",
+            help="also serve daqsvc page, at the address that is printed",
         )
-        how.add_argument("--again", action="store_true", help="play it again and again, until Ctrl-C")
+        how.add_argument("--again", action="store_true", help="play it in a loop, until Ctrl-C")
         how.add_argument(
             "--json",
             action="store_true",
-            help='print one JSON object a line: type "diagnosis", "alarm", "status", at the end "summary"',
+            help='print one JSON object per line: type "diagnosis", "alarm", "status", at the end "summary"',
         )
 
     def run(self, arguments: argparse.Namespace) -> int:

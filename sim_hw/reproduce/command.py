@@ -33,11 +33,11 @@ _METADATA: Mapping[str, str | None] = {"Software": None}
 class ReproduceCommand:
     """The verb ``reproduce`` (entry-point group ``daqsvc.commands``)."""
 
-    help = "run the paper's experiments: figures, and what it states against what comes out"
+    help = "run the paper's experiments: its figures, and its values beside those obtained"
     description = (
-        "Run the paper's experiments from scratch, in less than two minutes. Writes its figures (fig4.png to "
-        "fig10.png) and a table of what the paper states against what was obtained (results.md, "
-        "results.csv), and prints the table."
+        "Run the paper's experiments from scratch, in less than two minutes. Write its figures "
+        "(fig4.png to fig10.png) and a table of the paper's values beside those obtained (results.md, "
+        "results.csv), and print the table."
     )
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
@@ -47,20 +47,27 @@ class ReproduceCommand:
             type=Path,
             required=True,
             metavar="DIR",
-            help="directory for figures and tables; made if new",
+            help="directory for figures and tables; it is made if it does not exist",
         )
         parser.add_argument(
-            "--seed", type=arguments_of.whole, default=SEED, metavar="N", help=f"of the sensor noise ({SEED})"
+            "--seed",
+            type=arguments_of.whole,
+            default=SEED,
+            metavar="N",
+            help=f"seed of the sensor noise (default: {SEED})",
         )
         parser.add_argument(
             "--snr-db",
             type=snr_db,
             default=SNR_DB,
             metavar="DB",
-            help=f"signal to noise of the probes in the figures; the paper has -5 to 5 dB ({SNR_DB:g})",
+            help="signal-to-noise ratio of the probes in the figures, in dB; the paper has -5 to 5 dB "
+            f"(default: {SNR_DB:g})",
         )
         parser.add_argument(
-            "--json", action="store_true", help="print one JSON object for each row of the table"
+            "--json",
+            action="store_true",
+            help="print one JSON object per line, one for each row of the table",
         )
 
     def run(self, arguments: argparse.Namespace) -> int:

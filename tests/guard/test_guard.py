@@ -119,8 +119,8 @@ def test_a_changed_word_of_the_code_is_caught(monkeypatch):
         return compare("help.txt", said + golden[len(said) :], FOLDER)
 
     word, other = (
-        "read a machine file and say what was understood",
-        "read a machine file and tell what it holds",
+        "read a machine file and print what was understood",
+        "read a machine file and print what it holds",
     )
     assert whole(word, other) == ""
     monkeypatch.setattr(CheckCommand, "help", other)

@@ -39,17 +39,25 @@ class NewCommand:
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `daqsvc.cli.Command.add_arguments`."""
         parser.add_argument(
-            "file", type=Path, nargs="?", metavar="FILE", help="to write (default: the machine's name .toml)"
+            "file",
+            type=Path,
+            nargs="?",
+            metavar="FILE",
+            help="machine file to write (default: the machine's name with .toml)",
         )
         parser.add_argument(
             "--listen",
             action="store_true",
-            help="look at the bus as soon as it is known where it is, and propose what is found there",
+            help="listen to the bus as soon as its port or address is known, and propose what is found there",
         )
-        parser.add_argument("--yes", action="store_true", help="take the default of whatever is not answered")
-        parser.add_argument("--overwrite", action="store_true", help="write over a file that is there")
         parser.add_argument(
-            "--answers", type=Path, metavar="TOML", help="file with answers: the options below as its keys"
+            "--yes",
+            action="store_true",
+            help="ask nothing: take the default of each question that has no answer",
+        )
+        parser.add_argument("--overwrite", action="store_true", help="replace the file if it exists")
+        parser.add_argument(
+            "--answers", type=Path, metavar="TOML", help="file with answers: its keys are the options below"
         )
         group = parser.add_argument_group("answers")
         group.add_argument(
@@ -57,8 +65,8 @@ class NewCommand:
             action="append",
             default=[],
             metavar="CHANNEL.TOPIC=ANSWER",
-            help="of one channel, e.g. x.type=accelerometer; TOPIC is type, name, unit, sensitivity, angle, "
-            "threshold, bearing; with Modbus values address, register-type, order, scale, too",
+            help="answer for one channel, e.g. x.type=accelerometer; TOPIC is type, name, unit, sensitivity, "
+            "angle, threshold or bearing, with Modbus values also address, register-type, order or scale",
         )
         for key, topic in all_topics().items():
             group.add_argument(

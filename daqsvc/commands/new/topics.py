@@ -47,7 +47,7 @@ _TOPICS_BEHIND = {
     "password-file": Topic(
         "File whose first line is the password", "The password itself is in no machine file."
     ),
-    "home-assistant": Topic("Shall the machine show up in Home Assistant?", "By its MQTT discovery."),
+    "home-assistant": Topic("Show the machine in Home Assistant?", "By its MQTT discovery."),
 }
 """Behind it."""
 
