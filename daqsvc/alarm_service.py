@@ -20,12 +20,18 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.alarm_log import AlarmLog
 from daqsvc.alarms.commands import CommandOutcome
 from daqsvc.alarms.conditions import Condition
-from daqsvc.alarms.states import AlarmState, CommandNotAllowedError, Level
+from daqsvc.alarms.states import (
+    AlarmState,
+    CommandNotAllowedError,
+    Level,
+    UnknownAlarmError,
+    UnknownMachineError,
+)
 from daqsvc.audit import AuditError, AuditLog, Refusals
 from daqsvc.control import SnapshotNotMadeError
 from daqsvc.errors.code import coded
-from daqsvc.errors.outputs import COMMAND_NOT_OBEYED
-from daqsvc.errors.service import DISK_REFUSES, NOT_REMEMBERED, PART_FAILED, SNAPSHOT_LOST
+from daqsvc.errors.command_line import COMMAND_REFUSED, NOT_ASKED
+from daqsvc.errors.service import DISK_REFUSES, JOURNAL_BEHIND, NOT_REMEMBERED, PART_FAILED
 from daqsvc.outbox.limits import OutboxLimits
 from daqsvc.outbox.messages import OutboxError, event_id
 from daqsvc.outbox.store import Outbox
@@ -45,6 +51,7 @@ if TYPE_CHECKING:
     from daqsvc.alarms.manager import AlarmManager
     from daqsvc.control import TakeSnapshot
     from daqsvc.diagnosis.record import Diagnosis
+    from daqsvc.errors.code import Code
     from daqsvc.outbox.messages import OutboxMessage
     from daqsvc.publish.looking import Look
     from daqsvc.publish.output import Output
@@ -485,9 +492,11 @@ class AlarmService:
             What came of it; if it was obeyed, its events are on disk.
         """
         if self._stopping:
-            return self._refuse(STOPPING)
+            return self._refuse(STOPPING, NOT_ASKED)
         if self._commands_waiting >= MOST_COMMANDS:
-            return self._refuse(f"{MOST_COMMANDS} commands wait for the disk already; ask again later")
+            return self._refuse(
+                f"{MOST_COMMANDS} commands wait for the disk already; ask again later", NOT_ASKED
+            )
         self._commands_waiting += 1
         work = asyncio.create_task(self._carry_out(command, source), name=f"command {command.verb}")
         self._watch(work)
@@ -503,7 +512,7 @@ class AlarmService:
             source: the way it came, for the audit log.
         """
         if self._stopping:
-            return self._refuse(STOPPING)
+            return self._refuse(STOPPING, NOT_ASKED)
         now_ns = self._clock.monotonic_ns()
         lately = self._snapshots.setdefault(command.machine, deque(maxlen=MOST_SNAPSHOTS))
         if len(lately) == MOST_SNAPSHOTS and now_ns - lately[0] < SNAPSHOTS_NS:
@@ -513,7 +522,7 @@ class AlarmService:
                 f"{SNAPSHOTS_NS // NS_PER_S} s; ask again later, or at the box"
             )
             self._refusals.count(command, source, refusal)
-            return self._refuse(refusal)
+            return self._refuse(refusal, NOT_ASKED)
         lately.append(now_ns)
         work = asyncio.create_task(self._made_snapshot(command, source), name="command snapshot")
         self._watch(work)
@@ -572,11 +581,11 @@ class AlarmService:
         try:
             async with self._one_at_a_time:
                 if self._stopping:
-                    return self._refuse(STOPPING)
-                refusal = self._refusal(command) if self._refusals.flooding else None
+                    return self._refuse(STOPPING, NOT_ASKED)
+                refusal = self._refused(command) if self._refusals.flooding else None
                 if refusal is not None:
-                    self._refusals.count(command, source, refusal)
-                    return self._refuse(refusal)
+                    self._refusals.count(command, source, refusal.reason)
+                    return refusal
                 entry = await self.audit.asked(command, source)
                 outcome = await self._outcome(command)
                 if not outcome.accepted:
@@ -589,10 +598,10 @@ class AlarmService:
                 command.verb,
                 command.alarm,
                 error,
-                extra=coded(COMMAND_NOT_OBEYED),
+                extra=coded(DISK_REFUSES),
             )
             self.commands.unwritten += 1
-            return self._refuse(f"{error}")
+            return self._refuse(f"{error}", DISK_REFUSES)
         finally:
             self._commands_waiting -= 1
 
@@ -602,7 +611,7 @@ class AlarmService:
                 # What has not been written down is not done, and a flood is not written down.
                 refusal = "too many commands were refused lately; ask again in a minute, or at the box"
                 self._refusals.count(command, source, refusal)
-                return self._refuse(refusal)
+                return self._refuse(refusal, NOT_ASKED)
             entry = await self.audit.asked(command, source)
             outcome = await self._snapshot_outcome(command, source)
             if not outcome.accepted:
@@ -610,21 +619,21 @@ class AlarmService:
             await self._write_down(entry, command, source, outcome)
         except AuditError as error:
             logger.error(  # noqa: TRY400 - the message says it all
-                "a snapshot of %s was refused: %s", command.machine, error, extra=coded(SNAPSHOT_LOST)
+                "a snapshot of %s was refused: %s", command.machine, error, extra=coded(DISK_REFUSES)
             )
             self.commands.unwritten += 1
-            return self._refuse(f"{error}")
+            return self._refuse(f"{error}", DISK_REFUSES)
         else:
             return outcome
 
     async def _snapshot_outcome(self, command: SnapshotRequest, source: str) -> CommandOutcome:
         if self._snapshot is None:
-            return self._refuse("nobody makes snapshots here")
+            return self._refuse("nobody makes snapshots here", COMMAND_REFUSED)
         why = f": {command.reason}" if command.reason else ""
         try:
             path = await self._snapshot(command.machine, f"asked for by {command.by} ({source}){why}")
         except SnapshotNotMadeError as refused:
-            return self._refuse(f"{refused}")
+            return self._refuse(f"{refused}", refused.code)
         self.commands.accepted += 1
         return CommandOutcome(accepted=True, path=path)
 
@@ -638,38 +647,41 @@ class AlarmService:
             if (manager := self.managers.get(command.machine)) is not None:
                 return manager
             there_are = ", ".join(sorted(self.managers))
-            raise CommandNotAllowedError(f"no machine is named {command.machine!r}; there are: {there_are}")
+            raise UnknownMachineError(f"no machine is named {command.machine!r}; there are: {there_are}")
         having = [one for one in self.managers.values() if one.knows(command.alarm)]
         if len(having) > 1:
             names = ", ".join(one.identity.machine for one in having)
-            raise CommandNotAllowedError(
+            raise UnknownAlarmError(
                 f"{names} each have an alarm {command.alarm!r}: name the machine as well (--machine)"
             )
         return having[0] if having else self.manager
 
-    def _refusal(self, command: AlarmCommand) -> str | None:
-        """Why a command would be refused now; None if it would not."""
+    def _refused(self, command: AlarmCommand) -> CommandOutcome | None:
+        """What comes of a command that would be refused now; None if it would not."""
         if command.denied:
-            return command.denied
+            return self._refuse(command.denied, COMMAND_REFUSED)
         try:
-            return self._manager_of(command).refusal(command)
-        except CommandNotAllowedError as refusal:
-            return f"{refusal}"
+            refusal = self._manager_of(command).refusal(command)
+        except CommandNotAllowedError as error:
+            refusal = error
+        return None if refusal is None else self._refuse(f"{refusal}", refusal.code)
 
     async def _outcome(self, command: AlarmCommand) -> CommandOutcome:
         if command.denied:
-            return self._refuse(command.denied)
+            return self._refuse(command.denied, COMMAND_REFUSED)
         try:
             events = self._manager_of(command).execute(command)
         except CommandNotAllowedError as refusal:
-            return self._refuse(f"{refusal}")
+            return self._refuse(f"{refusal}", refusal.code)
         self.commands.accepted += 1
         committed = [self._post(event) for event in events]
         if committed:
             await asyncio.wait(committed, timeout=COMMIT_S)
+        reason = _not_on_disk(committed)
         return CommandOutcome(
             accepted=True,
-            reason=_not_on_disk(committed),
+            reason=reason,
+            code=JOURNAL_BEHIND.id if reason else None,
             events=tuple(event_id(self.outbox.series, number) for number in _sequences(committed)),
         )
 
@@ -739,9 +751,9 @@ class AlarmService:
                 )
             self._free_bytes = None
 
-    def _refuse(self, reason: str) -> CommandOutcome:
+    def _refuse(self, reason: str, code: Code) -> CommandOutcome:
         self.commands.refused += 1
-        return CommandOutcome(accepted=False, reason=reason)
+        return CommandOutcome(accepted=False, reason=reason, code=code.id)
 
     def _post(self, event: AlarmEvent) -> asyncio.Future[int]:
         self._log.say(event)

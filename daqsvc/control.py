@@ -37,9 +37,9 @@ from daqsvc.alarms.commands import (
     Verb,
     faults_of,
 )
-from daqsvc.errors.code import coded
-from daqsvc.errors.command_line import NO_SERVICE, NOT_ASKED
-from daqsvc.errors.service import CONTROL_SOCKET, PART_FAILED
+from daqsvc.errors.code import coded, with_code
+from daqsvc.errors.command_line import NO_SERVICE, NO_SUCH_MACHINE, NOT_ASKED
+from daqsvc.errors.service import CONTROL_SOCKET, PART_FAILED, RELOAD_REFUSED
 from daqsvc.outbox.files import is_possessed, is_read_only
 from daqsvc.outbox.reading import JOURNAL_NAME
 from daqsvc.publish.looking import Looking
@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daqsvc.alarms.commands import AlarmCommand, CommandHandler
+    from daqsvc.errors.code import Code
     from daqsvc.publish.looking import Look
 
 log = logging.getLogger(__name__)
@@ -109,6 +110,12 @@ class AbsentError(ControlError):
     code = NO_SERVICE
 
 
+class NotAmongThemError(ControlError):
+    """The service watches other machines."""
+
+    code = NO_SUCH_MACHINE
+
+
 class NotRunningError(AbsentError):
     """No service runs on the store."""
 
@@ -150,7 +157,7 @@ class LiveRequest(JsonCommand):
 
 
 class ControlAnswer(BaseModel):
-    """What came of it.
+    """What came of it; ``code`` is that of the reason, None if there is none.
 
     ``waiting`` counts the alarm events that are in the service's memory only.
     """
@@ -160,6 +167,7 @@ class ControlAnswer(BaseModel):
     schema_: Literal["daqsvc.control-answer/1"] = Field(_ANSWER, alias="schema")
     accepted: bool
     reason: str
+    code: str | None = None
     events: Annotated[tuple[str, ...], Field(strict=False)] = ()
     waiting: int = 0
 
@@ -211,19 +219,38 @@ class TakeSnapshot(Protocol):
 
 
 class SnapshotNotMadeError(Exception):
-    """No snapshot was made; the text says why."""
+    """No snapshot was made; the text says why.
+
+    Attributes:
+        code: of that.
+    """
+
+    def __init__(self, why: str, code: Code) -> None:
+        super().__init__(why)
+        self.code = code
 
 
 class ReloadRefusedError(Exception):
     """The service goes on as it is.
 
     Attributes:
-        reasons: why, a sentence each.
+        reasons: why, a sentence each, with its code at the end.
     """
 
+    code = RELOAD_REFUSED
+
     def __init__(self, reasons: list[str]) -> None:
-        super().__init__("; ".join(reasons))
-        self.reasons = reasons
+        self.reasons = [with_code(reason, self.code) for reason in reasons]
+        super().__init__("; ".join(self.reasons))
+
+
+class ReloadTooLateError(ReloadRefusedError):
+    """The service ends."""
+
+    code = NOT_ASKED
+
+    def __init__(self) -> None:
+        super().__init__(["the service ends"])
 
 
 @dataclass(slots=True)
@@ -529,8 +556,7 @@ class ControlServer:
         if isinstance(told, bytes):
             return told
         self.counters.malformed += asked is not None
-        reason = "name a machine" if asked is None else f"this service does not watch {asked!r:.200}"
-        return _json_line(WhichMachineAnswer(accepted=False, reason=reason, machines=told))
+        return _json_line(_which_machine(asked, told))
 
     async def _tell_live(
         self,
@@ -574,31 +600,39 @@ class ControlServer:
             asked = LiveRequest.read(line)
         except (ValueError, RecursionError) as error:
             fault = faults_of(error, "it")[0] if isinstance(error, ValidationError) else f"{error}"
-            return ControlAnswer(accepted=False, reason=f"the request is not valid, {fault}"[:500])
+            return _refused(f"the request is not valid, {fault}"[:500], NOT_ASKED)
         machine = asked.machine
         looking = look(machine, asked.streams)
         if isinstance(looking, Looking):
             if self._make_room_to_look(client.uid):
                 return looking
             looking.leave()
-            return ControlAnswer(
-                accepted=False, reason=f"{MOST_LOOKING} others look already; end one of them"
-            )
-        reason = "name a machine" if machine is None else f"this service does not watch {machine!r:.200}"
-        return WhichMachineAnswer(accepted=False, reason=reason, machines=looking)
+            return _refused(f"{MOST_LOOKING} others look already; end one of them", NOT_ASKED)
+        return _which_machine(machine, looking)
 
     async def _answer(self, line: bytes, source: str) -> ControlAnswer:
         if line.strip() == _QUESTION:
             return ControlAnswer(accepted=True, reason="", waiting=self._waiting())
         try:
             request = parse_request(line, self._machines)
-        except ValueError as error:
+        except RequestError as error:
             self.counters.malformed += 1
-            return ControlAnswer(accepted=False, reason=f"{error}")
+            return _refused(f"{error}", error.code)
         self.counters.requests += 1
         command = replace(request.command(request.verb, request.machine), denied=request.denied)
         outcome = await self._execute(command, f"{source} {request.via}".rstrip())
-        return ControlAnswer(accepted=outcome.accepted, reason=outcome.reason, events=outcome.events)
+        return ControlAnswer(
+            accepted=outcome.accepted, reason=outcome.reason, code=outcome.code, events=outcome.events
+        )
+
+
+def _refused(reason: str, code: Code) -> ControlAnswer:
+    return ControlAnswer(accepted=False, reason=reason, code=code.id)
+
+
+def _which_machine(asked: object, machines: tuple[str, ...]) -> WhichMachineAnswer:
+    reason = "name a machine" if asked is None else f"this service does not watch {asked!r:.200}"
+    return WhichMachineAnswer(accepted=False, reason=reason, code=NO_SUCH_MACHINE.id, machines=machines)
 
 
 async def _reloaded(reload: Reload, *, dry_run: bool) -> ReloadAnswer:
@@ -606,7 +640,10 @@ async def _reloaded(reload: Reload, *, dry_run: bool) -> ReloadAnswer:
         return ReloadAnswer(accepted=True, reason="", lines=tuple(await reload(dry_run=dry_run)))
     except ReloadRefusedError as refused:
         return ReloadAnswer(
-            accepted=False, reason="the machine files are refused", lines=tuple(refused.reasons)
+            accepted=False,
+            reason="the machine files are refused",
+            code=refused.code.id,
+            lines=tuple(refused.reasons),
         )
 
 
@@ -615,30 +652,44 @@ async def _snapshot_answer(snapshot: TakeSnapshot, line: bytes, source: str) -> 
         machine = json.loads(line).get("machine")
         path = await snapshot(machine if isinstance(machine, str) else None, f"asked for by {source}")
     except (ValueError, RecursionError):
-        return SnapshotAnswer(accepted=False, reason="the request is not valid JSON")
+        return SnapshotAnswer(accepted=False, reason="the request is not valid JSON", code=NOT_ASKED.id)
     except SnapshotNotMadeError as refused:
-        return SnapshotAnswer(accepted=False, reason=f"{refused}")
+        return SnapshotAnswer(accepted=False, reason=f"{refused}", code=refused.code.id)
     return SnapshotAnswer(accepted=True, reason="", path=path)
+
+
+class RequestError(ValueError):
+    """A line is no request; the text is one sentence that says why."""
+
+    code = NOT_ASKED
+
+
+class NotWatchedError(RequestError):
+    """It is one for another machine."""
+
+    code = NO_SUCH_MACHINE
 
 
 def parse_request(line: bytes, machines: Collection[str]) -> ControlRequest:
     """The request in a line to the service that watches ``machines``.
 
     Raises:
-        ValueError: it is none; the text is one sentence that says why.
+        RequestError: it is none; the text is one sentence that says why.
     """
     if len(line) > LONGEST_LINE:
-        raise ValueError(f"the request is longer than {LONGEST_LINE} bytes")
+        raise RequestError(f"the request is longer than {LONGEST_LINE} bytes")
     try:
         request = ControlRequest.read(line)
     except ValidationError as error:
         fault = faults_of(error, "it")[0]
         if fault.startswith("verb: must be "):
             fault += f"; or a question, as it is documented to the letter: {_QUESTIONS}"
-        raise ValueError(f"the request is not valid, {fault}") from None
+        raise RequestError(f"the request is not valid, {fault}") from None
+    except ValueError as error:
+        raise RequestError(f"{error}") from None
     if request.machine is not None and request.machine not in machines:
         watched = ", ".join(repr(machine) for machine in machines)
-        raise ValueError(f"this service watches {watched}, not {request.machine!r}")
+        raise NotWatchedError(f"this service watches {watched}, not {request.machine!r}")
     return request
 
 
@@ -691,7 +742,9 @@ def ask(store: Path, request: ControlRequest, timeout_s: float = ANSWER_S) -> Co
         ControlError: there is no service, it is somebody else's, or it does not answer.
     """
     answer = _outcome(store, _json_line(request), timeout_s)
-    return CommandOutcome(accepted=answer.accepted, reason=answer.reason, events=answer.events)
+    return CommandOutcome(
+        accepted=answer.accepted, reason=answer.reason, code=answer.code, events=answer.events
+    )
 
 
 def ask_reload(store: Path, *, dry_run: bool = False) -> ReloadAnswer:
@@ -752,7 +805,7 @@ def ask_status(store: Path, machine: str | None = None, timeout_s: float = STATU
         return [status]
     told = [_status_of(store, one, timeout_s) for one in status if machine is None]
     if machine is not None or not told:
-        raise ControlError(f"the daqsvc of {store} watches {', '.join(status)}, not {machine}")
+        raise NotAmongThemError(f"the daqsvc of {store} watches {', '.join(status)}, not {machine}")
     # One that was taken out in between is left out.
     return [one for one in told if isinstance(one, dict)]
 

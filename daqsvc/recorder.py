@@ -23,6 +23,7 @@ from daqsvc.alarms.events import ANNUNCIATIONS, AlarmEvent, Identity
 from daqsvc.diagnosis.memory import MemoryNotTakenError, taken_memory
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.errors.code import coded
+from daqsvc.errors.command_line import NOT_ASKED
 from daqsvc.errors.service import SNAPSHOT_LOST
 from daqsvc.machine_facts import fault_names, machine_values, stream_facts
 from daqsvc.publish.payloads import alarm_document, statement_document
@@ -107,6 +108,14 @@ ENDS = "nothing more is recorded: the service ends, or goes on by another machin
 
 class SnapshotRefusedError(Exception):
     """A snapshot that was asked for is not made; the text says why."""
+
+    code = NOT_ASKED
+
+
+class SnapshotLostError(SnapshotRefusedError):
+    """A snapshot was begun, and the disk has not taken it."""
+
+    code = SNAPSHOT_LOST
 
 
 @dataclass(slots=True)
@@ -758,7 +767,7 @@ class MachineRecorder:
                 _in_words(error),
                 extra=coded(SNAPSHOT_LOST),
             )
-        snapshot.answer(path or SnapshotRefusedError(f"the snapshot is lost: {_in_words(error)}"))
+        snapshot.answer(path or SnapshotLostError(f"the snapshot is lost: {_in_words(error)}"))
         if path is None and snapshot.writer is not None:
             with contextlib.suppress(OSError):
                 await asyncio.to_thread(snapshot.writer.abandon)

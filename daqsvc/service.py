@@ -16,10 +16,17 @@ from daqsvc.alarm_service import AlarmService
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.make import alarm_rule
 from daqsvc.alarms.manager import AlarmManager
-from daqsvc.control import ControlError, ControlServer, ReloadRefusedError, SnapshotNotMadeError
+from daqsvc.control import (
+    ControlError,
+    ControlServer,
+    ReloadRefusedError,
+    ReloadTooLateError,
+    SnapshotNotMadeError,
+)
 from daqsvc.diagnosis.pipeline import THREADS, KernelThreads, kernel_failed
 from daqsvc.driver_reports import DriverReports
 from daqsvc.errors.code import coded
+from daqsvc.errors.command_line import COMMAND_REFUSED, NO_SUCH_MACHINE
 from daqsvc.errors.service import CONTROL_SOCKET, TOO_SLOW
 from daqsvc.machine_watch import MachineWatch
 from daqsvc.outbox.files import make_directory
@@ -73,10 +80,6 @@ STOP_S = 1.3
 """What all of these may take together, ..."""
 CLOSE_S = 0.3
 """... and then the journal to close: within the two seconds in which the service promises to stop."""
-
-
-ENDS = "the service ends"
-"""Why nothing is reloaded any more."""
 
 
 class LoopLag:
@@ -390,13 +393,15 @@ class Service:
         watch = None if name is None else self.watches.get(name)
         if watch is None:
             why = "name a machine" if name is None else f"this service does not watch {name!r:.80}"
-            raise SnapshotNotMadeError(f"{why}; it watches {', '.join(self.watches)}")
+            raise SnapshotNotMadeError(f"{why}; it watches {', '.join(self.watches)}", NO_SUCH_MACHINE)
         if watch.recorder is None:
-            raise SnapshotNotMadeError(f"{watch.machine.path} has no table [recorder]; write one")
+            raise SnapshotNotMadeError(
+                f"{watch.machine.path} has no table [recorder]; write one", COMMAND_REFUSED
+            )
         try:
             return str(await watch.recorder.snapshot(reason))
         except SnapshotRefusedError as refused:
-            raise SnapshotNotMadeError(f"{refused}") from None
+            raise SnapshotNotMadeError(f"{refused}", refused.code) from None
 
     async def reload(self, *, dry_run: bool = False) -> list[str]:
         """Read the machine files again and go on with them, by what is different.
@@ -423,7 +428,7 @@ class Service:
                     return found.lines()
                 made = await self._make(box, found)
                 if self._is_ending:
-                    raise ReloadRefusedError([ENDS])
+                    raise ReloadTooLateError
             except MachineFileError as error:
                 raise ReloadRefusedError([f"{problem}" for problem in error.problems]) from error
             except (AssemblyError, LayoutError) as error:
@@ -438,7 +443,7 @@ class Service:
             finally:
                 self._on_reload(False)
             if going_on.cancelled():
-                raise ReloadRefusedError([ENDS])
+                raise ReloadTooLateError
             going_on.result()
             for line in found.lines():
                 logger.warning("reloaded: %s", line)

@@ -202,13 +202,15 @@ class CommandOutcome:
 
     Attributes:
         accepted: whether it was carried out.
-        reason: why it was refused; empty if it was not.
+        reason: why it was refused; if it was accepted, empty, or why a restart may undo it.
+        code: the id of the code of that reason; None if there is none.
         events: ids of the alarm events that followed (`AlarmPayload.id`).
         path: file of the snapshot that was made, on the box.
     """
 
     accepted: bool
     reason: str = ""
+    code: str | None = None
     events: tuple[str, ...] = ()
     path: str = ""
 

@@ -28,7 +28,7 @@ from daqsvc.alarms.quality import PREFIXES, SensorHealth, in_words
 from daqsvc.alarms.ruled import Ruled, RuledAlarms
 from daqsvc.alarms.rules import Circumstances, DiagnosisRule, LevelRule, RuleFinding
 from daqsvc.alarms.start_up import StartUpSignal
-from daqsvc.alarms.states import AlarmState, CommandNotAllowedError, Hold, Level
+from daqsvc.alarms.states import AlarmState, CommandNotAllowedError, Hold, Level, UnknownAlarmError
 from daqsvc.alarms.status import ClockReading, HandlingRequest
 
 if TYPE_CHECKING:
@@ -196,12 +196,12 @@ class AlarmManager:
         self.counters.commands += 1
         return self._tell([event])
 
-    def refusal(self, command: AlarmCommand) -> str | None:
+    def refusal(self, command: AlarmCommand) -> CommandNotAllowedError | None:
         """Why `execute` would refuse a command now; None if it would not. Nothing changes by asking."""
         try:
             self._obeyed(command, self._named(command.alarm).twin())
         except CommandNotAllowedError as refusal:
-            return f"{refusal}"
+            return refusal
         return None
 
     def resume(
@@ -453,7 +453,7 @@ class AlarmManager:
         there_are = f"there are: {', '.join(sorted(known)) or 'none'}"
         if len(known) > MOST_NAMED:
             there_are = f"there are {len(known)} others; daqsvc check lists those of the machine file"
-        raise CommandNotAllowedError(f"no alarm is named {name!r}; {there_are}")
+        raise UnknownAlarmError(f"no alarm is named {name!r}; {there_are}")
 
     def _resumed(self, event: AlarmEvent, active_detectors: Mapping[str, Sequence[str]]) -> bool:
         """Resume the alarm of ``event``; False if it is active and no rule judges it any more."""

@@ -12,6 +12,8 @@ from enum import Enum, IntEnum, StrEnum
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
+from daqsvc.errors.command_line import COMMAND_REFUSED, NO_SUCH_ALARM, NO_SUCH_MACHINE
+
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
@@ -108,6 +110,20 @@ class Stimulus(StrEnum):
 
 class CommandNotAllowedError(Exception):
     """A person asked for something that the alarm's state does not allow; the text is the reason."""
+
+    code = COMMAND_REFUSED
+
+
+class UnknownAlarmError(CommandNotAllowedError):
+    """There is no alarm of that name, or there are several."""
+
+    code = NO_SUCH_ALARM
+
+
+class UnknownMachineError(CommandNotAllowedError):
+    """There is no machine of that name."""
+
+    code = NO_SUCH_MACHINE
 
 
 _Moves = dict[tuple[AlarmState, Stimulus], AlarmState]

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, alarm_id, count, duration, one_line
 from daqsvc.commands.complaint import complain
 from daqsvc.commands.store_argument import BadFileError, StoreNotFoundError, add_store, chosen_store
+from daqsvc.errors.code import with_code
 from daqsvc.errors.command_line import COMMAND_REFUSED, NO_SUCH_ALARM, NO_SUCH_MACHINE
 from daqsvc.errors.service import JOURNAL_BEHIND
 
@@ -100,7 +101,7 @@ class AlarmsCommand:
         return EXIT_OK
 
 
-def _complain(verb: str, what: object, code: Code) -> int:
+def _complain(verb: str, what: object, code: Code | str) -> int:
     """Say what goes wrong, to stderr. Names of a journal or a service could hold anything."""
     from daqsvc.commands.tables import harmless  # noqa: PLC0415 - only what a verb needs
 
@@ -267,12 +268,17 @@ class AlarmVerb:
             return _complain(name, error, error.code)
         if arguments.json:
             answer = {"verb": self._verb, "alarm": alarm, "occurrence": occurrence, "by": request.by}
-            came = {"accepted": outcome.accepted, "reason": outcome.reason, "events": list(outcome.events)}
+            came = {
+                "accepted": outcome.accepted,
+                "reason": outcome.reason,
+                "code": outcome.code,
+                "events": list(outcome.events),
+            }
             print(json.dumps(answer | came))  # noqa: T201 - this is what the verb is for
         elif outcome.accepted:
-            print(harmless(f"{alarm}: {outcome.reason or _DONE[self._verb]}"))  # noqa: T201
+            print(with_code(harmless(f"{alarm}: {outcome.reason or _DONE[self._verb]}"), outcome.code))  # noqa: T201
         else:
-            _complain(name, f"refused: {outcome.reason}", COMMAND_REFUSED)
+            _complain(name, f"refused: {outcome.reason}", outcome.code or COMMAND_REFUSED)
         # Accepted with a reason: the disk has not got it yet.
         return EXIT_OK if outcome.accepted and not outcome.reason else EXIT_FAILED
 

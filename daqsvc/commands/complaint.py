@@ -11,13 +11,13 @@ if TYPE_CHECKING:
     from daqsvc.errors.code import Code
 
 
-def complain(who: str, what: object, code: Code | None, exit_code: int = 1) -> int:
+def complain(who: str, what: object, code: Code | str | None, exit_code: int = 1) -> int:
     """Say what went wrong.
 
     Args:
         who: the verb, as in ``daqsvc status``, or the file that it is about.
         what: a message, or the error that has it.
-        code: of its kind; None where an error of a plugin from outside has none.
+        code: of its kind, or its id; None where an error of a plugin from outside has none.
         exit_code: what the verb ends with.
 
     Returns:

@@ -246,18 +246,17 @@ class _Reloader:
             self.ask()
 
     async def _reload(self) -> None:
-        from daqsvc.control import ReloadRefusedError  # noqa: PLC0415 - as above
-        from daqsvc.service import ENDS  # noqa: PLC0415
+        from daqsvc.control import ReloadRefusedError, ReloadTooLateError  # noqa: PLC0415 - as above
 
         while self._asked:
             self._asked = False
             try:
                 if not await self._service.reload():
                     log.warning("SIGHUP: the machine files say nothing different")
+            except ReloadTooLateError:
+                log.info("SIGHUP is ignored: the service ends")
+                return
             except ReloadRefusedError as refused:
-                if refused.reasons == [ENDS]:
-                    log.info("SIGHUP is ignored: %s", ENDS)
-                    return
                 for reason in refused.reasons:
                     log.error(  # noqa: TRY400 - the message says it all
                         "SIGHUP is refused, and the service goes on as it is: %s",

@@ -51,10 +51,11 @@ class SnapshotCommand:
         except (StoreNotFoundError, ControlError) as error:
             return complain("daqsvc snapshot", error, error.code)
         if arguments.json:
-            told = {"accepted": answer.accepted, "reason": answer.reason, "path": answer.path}
+            told = {"accepted": answer.accepted, "reason": answer.reason, "code": answer.code}
+            told["path"] = answer.path
             print(json.dumps(told))  # noqa: T201 - this is what the verb is for
         elif answer.accepted:
             print(answer.path)  # noqa: T201 - as above
         else:
-            complain("daqsvc snapshot", answer.reason, COMMAND_REFUSED)
+            complain("daqsvc snapshot", answer.reason, answer.code or COMMAND_REFUSED)
         return EXIT_OK if answer.accepted else EXIT_FAILED

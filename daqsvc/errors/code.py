@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
+
+_ENDS_WITH_CODE = re.compile(r" \[[A-Z]+[0-9]{2}\]\Z")
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,8 +37,8 @@ def coded(code: Code | None) -> dict[str, Code | None]:
     return {"code": code}
 
 
-def with_code(text: str, code: Code | None) -> str:
-    """A message with its code at the end, once; as it is without one, e.g. that of a plugin from outside."""
-    if code is None or text.endswith(f"[{code}]"):
+def with_code(text: str, code: Code | str | None) -> str:
+    """A message with a code at its end: its own if it has one, else this one, given as it is or by its id."""
+    if code is None or _ENDS_WITH_CODE.search(text):
         return text
     return f"{text} [{code}]"

@@ -42,8 +42,9 @@ NO_SUCH_MACHINE = Code(
 NO_SUCH_ALARM = Code(
     "C05",
     "It is not known which alarm is meant",
-    "What was written begins the ids of several alarms.",
-    "Write more of the id, or the name of the alarm. daqsvc alarms lists both.",
+    "No alarm has this name, several machines have one, or what was written begins the ids of several.",
+    "Write the name of the alarm, or more of its id; with several machines the machine, too. daqsvc alarms "
+    "lists them.",
     "alarms.md",
     "daqsvc ack: '0c4f' begins the ids of housing, shaft: write more of the id, or the alarm's name",
 )
@@ -59,8 +60,10 @@ NO_SERVICE = Code(
 NOT_ASKED = Code(
     "C07",
     "The service cannot be asked that",
-    "It takes commands from its own user and from root only, is of an older version, or is too busy.",
-    "Try again with sudo, or as the user of the service. Restart a service that is older than this program.",
+    "It takes commands from its own user and from root only, is of an older version, is too busy, or is "
+    "about to stop. Or what was sent is no request that it knows.",
+    "Try again with sudo, or as the user of the service. Restart a service that is older than this program. "
+    "Programs write requests as the page says.",
     _PAGE,
     "daqsvc status: the daqsvc of /var/lib/daqsvc/lab takes commands from its own user and from root only: "
     "try again with sudo",
@@ -68,8 +71,8 @@ NOT_ASKED = Code(
 COMMAND_REFUSED = Code(
     "C08",
     "The service has refused the command",
-    "The alarm or the machine is not there, or its state does not allow it. No snapshot is made without "
-    "[recorder].",
+    "The state of the alarm does not allow it, or this person may not ask for it. No snapshot is made "
+    "without [recorder].",
     "Do as the message says. daqsvc alarms shows the state of each alarm.",
     "alarms.md",
     "daqsvc reset: refused: cannot reset rotor-fault: its condition still stands; remove the cause, then "

@@ -168,9 +168,8 @@ HOST_MISSING = Code(
 COMMAND_NOT_OBEYED = Code(
     "O21",
     "A command that came over an output is refused",
-    "It is not signed, too old, has no time, is of a person who may not, or the state of the alarm does "
-    "not "
-    "allow it.",
+    "It is no command of daqsvc, has no time, is too old, has come before, or the machine file does not "
+    "allow it over this output.",
     "Do as the message says. daqsvc alarms shows the state of each alarm.",
     "mqtt.md",
     "spBv1.0/plant/DCMD/edge-1/pump is refused: it does not say when it was sent",
@@ -178,8 +177,9 @@ COMMAND_NOT_OBEYED = Code(
 NOT_SHOWN = Code(
     "O22",
     "A viewer does not get what it shows",
-    "The broker does not let this client send or listen to what a page or a dashboard asks for.",
-    "Allow the topics to this client in the access list of the broker.",
+    "The broker does not let this client send or listen to what a page or a dashboard asks for, or there are "
+    "as many viewers as max_viewers of [mqtt.live] allows.",
+    "Allow the topics to this client in the access list of the broker, or close another viewer.",
     "page.md",
     "the MQTT broker does not let this client subscribe to daqsvc/lab/live: no live data is sent over it",
 )

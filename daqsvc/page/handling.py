@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from starlette.responses import PlainTextResponse, RedirectResponse
 
 from daqsvc.alarms.commands import AlarmCommand, CommandOutcome, Verb
+from daqsvc.errors.code import with_code
 from daqsvc.page.access.person import peer_of
 from daqsvc.page.access.role import Role
 from daqsvc.page.guard import FormError
@@ -157,10 +158,10 @@ async def handle(source: MachineSource, machine: str, request: Request, forms: F
     # A browser that goes away takes nothing back.
     outcome: CommandOutcome = await asyncio.shield(handling)
     if outcome.accepted:
-        then = f"; {outcome.reason}" if outcome.reason else ""
+        then = f"; {with_code(outcome.reason, outcome.code)}" if outcome.reason else ""
         text = f"{command.alarm} is {DONE[command.verb]} by {person.name}{then}."
     else:
-        text = f"Nothing was done: {outcome.reason}."
+        text = f"Nothing was done: {with_code(outcome.reason, outcome.code)}."
     return _shown(request, machine, command.alarm, said.keep(text, is_good=outcome.accepted))
 
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import SampleBlock
 from daqsvc.alarms.commands import CommandOutcome
+from daqsvc.errors.command_line import COMMAND_REFUSED
 from daqsvc.errors.recordings import NOT_REPLAYABLE
 from daqsvc.page.machine_live import MachineLive
 from daqsvc.page.text import standing
@@ -136,7 +137,11 @@ class Playing:
 
 def refused_of_the_past(machine: str) -> CommandOutcome:
     """What comes of a command to an alarm of a snapshot."""
-    return CommandOutcome(accepted=False, reason=f"{machine} is a snapshot: its alarms are of the past")
+    return CommandOutcome(
+        accepted=False,
+        reason=f"{machine} is a snapshot: its alarms are of the past",
+        code=COMMAND_REFUSED.id,
+    )
 
 
 class SnapshotSource:

@@ -172,13 +172,13 @@ class BoxSource:
         try:
             request = request_of(dataclasses.replace(command, denied=denied), machine, via)
             return await asyncio.to_thread(ask, self._store, request)
-        except NotRunningError:
-            reason = "no daqsvc runs on this box: start it with daqsvc run"
-        except AbsentError:
-            reason = "the service does not answer now: look at its log, and try again"
+        except NotRunningError as error:
+            code, reason = error.code, "no daqsvc runs on this box: start it with daqsvc run"
+        except AbsentError as error:
+            code, reason = error.code, "the service does not answer now: look at its log, and try again"
         except ControlError as error:
-            reason = f"{error}"
-        return CommandOutcome(accepted=False, reason=reason)
+            code, reason = error.code, f"{error}"
+        return CommandOutcome(accepted=False, reason=reason, code=code.id)
 
     async def close(self) -> None:
         """Listen no more."""

@@ -131,6 +131,7 @@ async def test_what_cannot_be_done_is_refused_counted_logged_and_changes_nothing
     assert not outcome.accepted
     assert outcome.events == ()
     assert why in outcome.reason
+    assert outcome.code == ("C05" if "no alarm is named" in why else "C08")
     asked, answered = log(tmp_path)
     assert (asked["outcome"], answered["outcome"]) == ("asked", "refused")
     assert answered["answer"] == outcome.reason
@@ -143,6 +144,7 @@ async def test_a_command_that_cannot_be_written_down_is_not_obeyed(tmp_path: Pat
         outcome = await desk.execute(ACK, "test")
         assert not outcome.accepted
         assert "audit.jsonl cannot be written" in outcome.reason
+        assert outcome.code == "S08"
         assert state(desk) is AlarmState.ACTIVE_UNACKNOWLEDGED
         assert await kinds(desk) == ["raised"]
         assert (desk.commands.refused, desk.commands.unwritten) == (1, 1)
@@ -187,6 +189,7 @@ async def test_an_event_that_the_disk_does_not_take_is_not_called_committed(
         assert outcome.accepted
         assert outcome.events == ()
         assert outcome.reason.startswith("done, but the journal cannot be written yet")
+        assert outcome.code == "S06"
         desk.tick()
         assert state(desk, "store/journal").is_active
         monkeypatch.setattr(Journal, "write", write)
@@ -233,6 +236,7 @@ async def test_a_flood_of_refused_commands_is_summed_up_and_hides_nothing_that_w
                 AlarmCommand(verb=Verb.ACKNOWLEDGE, alarm="nobody", by="mallory", reason="x" * 500), "mqtt t"
             )
             assert "no alarm is named 'nobody'" in refused.reason
+            assert refused.code == "C05"
         assert (desk.commands.accepted, desk.commands.refused) == (len(obeyed), 600)
         assert desk.manager.counters.events == len(await kinds(desk))
     told = log(tmp_path)
@@ -253,6 +257,7 @@ async def test_more_commands_than_can_wait_are_refused(
     async with desk_in(tmp_path) as desk:
         outcomes = await asyncio.gather(*(desk.execute(ACK, "test") for _ in range(5)))
         assert sum("wait for the disk already" in outcome.reason for outcome in outcomes) == 3
+        assert [outcome.code for outcome in outcomes].count("C07") == 3
         assert desk.commands.refused == 5
     assert len(log(tmp_path)) == 4
 
@@ -269,6 +274,7 @@ async def test_a_command_is_carried_out_to_its_end_although_nobody_waits_any_mor
         assert await kinds(desk) == ["raised", "acknowledged"]
         late = await desk.execute(ACK, "test")
         assert late.reason == "the service is stopping; ask again when it runs"
+        assert late.code == "C07"
     assert [line["outcome"] for line in log(tmp_path)] == ["asked", "accepted"]
 
 

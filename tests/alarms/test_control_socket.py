@@ -58,7 +58,7 @@ class Desk:
         self.told.append((command, source))
         await self.may_answer.wait()
         if command.alarm == "nothing":
-            return CommandOutcome(accepted=False, reason="no alarm is named 'nothing'")
+            return CommandOutcome(accepted=False, reason="no alarm is named 'nothing'", code="C05")
         return CommandOutcome(accepted=True, events=("edge-1-17",))
 
 
@@ -101,6 +101,7 @@ async def test_a_request_becomes_a_command_with_the_kernels_word_for_who_asks(tm
         "schema": "daqsvc.control-answer/1",
         "accepted": True,
         "reason": "",
+        "code": None,
         "events": ["edge-1-17"],
         "waiting": 0,
     }
@@ -123,7 +124,7 @@ async def test_the_client_and_the_server_understand_each_other(tmp_path: Path) -
     )
     async with serving(tmp_path, desk):
         outcome = await asyncio.to_thread(ask, tmp_path, request)
-    assert outcome == CommandOutcome(accepted=False, reason="no alarm is named 'nothing'")
+    assert outcome == CommandOutcome(accepted=False, reason="no alarm is named 'nothing'", code="C05")
     assert desk.told[0][0] == request.command(request.verb)
 
 
@@ -169,6 +170,7 @@ async def test_what_is_no_request_is_refused_with_the_reason_counted_and_does_no
         answer = await say(server, sent)
         assert answer["accepted"] is False
         assert why in answer["reason"]
+        assert answer["code"] == ("C04" if "watches" in why else "C07")
         assert len(answer["reason"].splitlines()) == 1
         assert (server.counters.malformed, server.counters.requests) == (1, 0)
         assert not desk.told

@@ -134,6 +134,7 @@ async def test_a_day_in_the_life_of_a_latching_alarm(tmp_path: Path) -> None:
                 "by": "Bob",
                 "accepted": True,
                 "reason": "",
+                "code": None,
                 "events": [shelved["id"]],
             }
             _, out, _ = await daqsvc("alarms", file)
@@ -363,7 +364,7 @@ async def test_what_the_disk_has_not_got_is_told(tmp_path: Path) -> None:
     await outbox.close()
 
     async def execute(command: AlarmCommand, source: str) -> CommandOutcome:
-        return CommandOutcome(accepted=True, reason="done, but the journal cannot be written yet", events=())
+        return CommandOutcome(accepted=True, reason="done, but the journal cannot be written yet", code="S06")
 
     server = ControlServer(tmp_path, ("rig",), execute, lambda: 3)
     await server.open()
@@ -373,7 +374,7 @@ async def test_what_the_disk_has_not_got_is_told(tmp_path: Path) -> None:
         assert "3 events wait in the service's memory" in err
         assert err.endswith("[S06]\n")
         code, out, _ = await daqsvc("ack", "shaking", "--store", tmp_path)
-        assert "cannot be written yet" in out
+        assert out.endswith("cannot be written yet [S06]\n")
         assert code == 1, "0 says that it is on disk"
     finally:
         await server.close()

@@ -19,7 +19,7 @@ import daqsvc.service
 from daqsvc.commands import early_signals, run
 from daqsvc.commands.process_guard import ProcessGuard
 from daqsvc.commands.service_manager import ServiceManager
-from daqsvc.control import ReloadRefusedError
+from daqsvc.control import ReloadTooLateError
 from daqsvc.outbox.files import is_possessed
 from daqsvc.supervision import Supervisor
 
@@ -200,7 +200,7 @@ def test_the_store_is_held_while_the_service_is_made(monkeypatch, tmp_path):
 
 async def test_a_hang_up_right_before_the_end_is_no_error(caplog):
     async def reload():
-        raise ReloadRefusedError([daqsvc.service.ENDS])
+        raise ReloadTooLateError
 
     reloader = run._Reloader(SimpleNamespace(supervisor=Supervisor(), reload=reload))
     reloader.ask()

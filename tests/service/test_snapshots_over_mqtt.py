@@ -98,7 +98,7 @@ async def test_why_there_is_none_is_the_answer(tmp_path: Path) -> None:
     async with commanded(tmp_path, "mqtt-none", "snapshot") as (_, mosquitto, live):
         await asyncio.to_thread(say, mosquitto.port, SNAPSHOT, wish())
         told = await answer(live)
-        assert (told["accepted"], told["path"]) == (False, "")
+        assert (told["accepted"], told["path"], told["code"]) == (False, "", "C08")
         assert "has no table [recorder]" in told["reason"]
         await asyncio.to_thread(say, mosquitto.port, SNAPSHOT, wish("s2", alarm="rotor-fault"))
         reason = (await answer(live))["reason"]
@@ -126,6 +126,7 @@ async def test_who_asks_again_and_again_is_refused(tmp_path: Path) -> None:
         await asyncio.to_thread(say, mosquitto.port, SNAPSHOT, wish("more"))
         told = await answer(live)
         assert not told["accepted"]
+        assert told["code"] == "C07"
         assert told["reason"].startswith(
             f"{MOST_SNAPSHOTS} snapshots of laval-rig were asked for within 600 s"
         )

@@ -10,6 +10,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.alarms.commands import CommandOutcome
+from daqsvc.errors.command_line import NO_SERVICE, NO_SUCH_MACHINE
+from daqsvc.errors.outputs import BROKER_AWAY
 from daqsvc.page.listening import Listenings
 from daqsvc.page.plant.known import KnownPlant
 from daqsvc.page.plant.leased import LeasedListening
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from daqsvc.alarms.commands import AlarmCommand
+    from daqsvc.errors.code import Code
     from daqsvc.page.box_snapshots import KeptSnapshot
     from daqsvc.page.sources import Heard
     from daqsvc.publish.mqtt.settings import Mqtt
@@ -123,7 +126,7 @@ class PlantSource:
         """See `daqsvc.page.sources.MachineSource.handle`: as a command over the broker."""
         found = self._known.machine(machine)
         if found is None:
-            return CommandOutcome(accepted=False, reason=f"there is no {machine!r} here")
+            return _refused(f"there is no {machine!r} here", NO_SUCH_MACHINE)
         box, known = found
         asked: Document = {"alarm": command.alarm, "by": command.by, "reason": command.reason}
         if command.duration_s is not None:
@@ -139,11 +142,16 @@ class PlantSource:
         try:
             answer = await self._link.command(topic, asked)
         except BrokerAwayError as error:
-            return CommandOutcome(accepted=False, reason=f"{error}")
+            return _refused(f"{error}", BROKER_AWAY)
         if answer is None:
             why = box.away or "it takes commands only if its machine file says so in [mqtt.commands]"
-            return CommandOutcome(accepted=False, reason=f"the box has not answered: {why}")
-        return CommandOutcome(accepted=bool(answer.get("accepted")), reason=f"{answer.get('reason', '')}")
+            return _refused(f"the box has not answered: {why}", NO_SERVICE)
+        code = answer.get("code")
+        return CommandOutcome(
+            accepted=bool(answer.get("accepted")),
+            reason=f"{answer.get('reason', '')}",
+            code=code if isinstance(code, str) else None,
+        )
 
     async def close(self) -> None:
         """Listen no more."""
@@ -152,3 +160,7 @@ class PlantSource:
         await self._listenings.close()
         if self._running is not None:
             await asyncio.wait({self._running})
+
+
+def _refused(reason: str, code: Code) -> CommandOutcome:
+    return CommandOutcome(accepted=False, reason=reason, code=code.id)

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from daqsvc.alarms.commands import faults_of
 from daqsvc.errors.code import coded
+from daqsvc.errors.command_line import NO_SUCH_MACHINE
 from daqsvc.errors.outputs import NOT_SHOWN
 from daqsvc.publish.live.pieces import Packer
 from daqsvc.publish.live.request import MOST_BYTES, LiveRequestPayload
@@ -20,6 +21,7 @@ from daqsvc.publish.mqtt.errors import PublishRefusedError
 from daqsvc.publish.mqtt.link import MqttLink
 
 if TYPE_CHECKING:
+    from daqsvc.errors.code import Code
     from daqsvc.publish.live.settings import Live
     from daqsvc.publish.looking import Look
     from daqsvc.publish.mqtt.connection import Connection, Incoming
@@ -177,7 +179,7 @@ class LiveLink(MqttLink):
         """Serve one viewer, or refuse it; if the broker refuses the feed, only that feed ends."""
         try:
             if refused:
-                await self._refuse(connection, topic, request.feed, refused)
+                await self._refuse(connection, topic, request.feed, refused, NOT_SHOWN)
             else:
                 await self._tell(connection, topic, request)
         except PublishRefusedError as error:
@@ -188,8 +190,10 @@ class LiveLink(MqttLink):
                 extra=coded(NOT_SHOWN),
             )
 
-    async def _refuse(self, connection: Connection, topic: LiveTopic, feed: int, why: str) -> None:
-        line = json.dumps({"accepted": False, "reason": why}).encode() + b"\n"
+    async def _refuse(
+        self, connection: Connection, topic: LiveTopic, feed: int, why: str, code: Code
+    ) -> None:
+        line = json.dumps({"accepted": False, "reason": why, "code": code.id}).encode() + b"\n"
         await self._send(connection, topic, Packer(feed).pack(line))
 
     async def _tell(self, connection: Connection, topic: LiveTopic, request: LiveRequestPayload) -> None:
@@ -199,7 +203,7 @@ class LiveLink(MqttLink):
             why = (
                 f"there is no machine {topic.machine!r:.200} here; alarms under that name are of the service"
             )
-            await self._refuse(connection, topic, request.feed, why)
+            await self._refuse(connection, topic, request.feed, why, NO_SUCH_MACHINE)
             return
         packer = Packer(request.feed)
         try:

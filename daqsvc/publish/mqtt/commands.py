@@ -31,6 +31,10 @@ from daqsvc.alarms.commands import (
     Verb,
     faults_of,
 )
+from daqsvc.errors.code import coded
+from daqsvc.errors.command_line import COMMAND_REFUSED, NO_SUCH_MACHINE, NOT_ASKED
+from daqsvc.errors.outputs import COMMAND_NOT_OBEYED
+from daqsvc.errors.service import DISK_REFUSES, NOT_REMEMBERED
 from daqsvc.outbox.command_ids import REMEMBERED
 from daqsvc.publish.payloads import SCHEMA_ABOUT, Stamped, stamp_now
 from daqsvc.publish.topics import ANSWER
@@ -40,6 +44,7 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.clock import Clock
     from daqsvc.alarms.commands import AlarmCommand, CommandHandler, SnapshotHandler
+    from daqsvc.errors.code import Code
     from daqsvc.outbox.command_ids import CommandIds
     from daqsvc.publish.mqtt.connection import Incoming
     from daqsvc.publish.mqtt.settings import MqttCommands
@@ -114,13 +119,22 @@ class ResponsePayload(Stamped):
     machine: str = Field(description="name of the machine")
     verb: str = Field(description="what was asked")
     accepted: bool = Field(description="whether it was carried out")
-    reason: str = Field(description="why it was refused; empty if it was not")
+    reason: str = Field(description="why it was refused, or why a restart may undo it; empty if neither")
+    code: str | None = Field(None, description="code of that reason; null if there is none")
     events: tuple[str, ...] = Field(description="ids of the alarm events that followed")
     path: str = Field(default="", description="file of the snapshot on the box; empty if none was made")
 
 
 class CommandRefusedError(Exception):
-    """A command that is not even looked at by the alarms; the text says why."""
+    """A command that is not even looked at by the alarms; the text says why.
+
+    Attributes:
+        code: of that.
+    """
+
+    def __init__(self, why: str, code: Code = COMMAND_NOT_OBEYED) -> None:
+        super().__init__(why)
+        self.code = code
 
 
 @dataclass(slots=True)
@@ -216,7 +230,7 @@ class CommandIntake:
             command = await self._command(machine, message)
         except CommandRefusedError as refusal:
             self._log(message.topic, refusal)
-            outcome = CommandOutcome(accepted=False, reason=str(refusal))
+            outcome = CommandOutcome(accepted=False, reason=str(refusal), code=refusal.code.id)
         else:
             outcome = await self._carried_out(command, f"mqtt {message.topic}")
             if outcome.accepted:
@@ -230,6 +244,7 @@ class CommandIntake:
             verb=machine.verb[:_SHOWN_TOPIC],
             accepted=outcome.accepted,
             reason=outcome.reason,
+            code=outcome.code,
             events=outcome.events,
             path=outcome.path,
         )
@@ -239,7 +254,9 @@ class CommandIntake:
         if not isinstance(command, SnapshotRequest):
             return await self._handler(command, source)
         if self._snapshots is None:
-            return CommandOutcome(accepted=False, reason="nobody makes snapshots here")
+            return CommandOutcome(
+                accepted=False, reason="nobody makes snapshots here", code=COMMAND_REFUSED.id
+            )
         return await self._snapshots(command, source)
 
     def _log(self, topic: str, refusal: CommandRefusedError) -> None:
@@ -247,7 +264,7 @@ class CommandIntake:
         now_ns = self._clock.monotonic_ns()
         loud = now_ns >= self._quiet_until_ns
         level = logging.WARNING if loud else logging.DEBUG
-        log.log(level, "command on %r refused: %s", topic[:_SHOWN_TOPIC], refusal)
+        log.log(level, "command on %r refused: %s", topic[:_SHOWN_TOPIC], refusal, extra=coded(refusal.code))
         if loud:
             self._quiet_until_ns = now_ns + QUIET_NS
 
@@ -263,7 +280,8 @@ class CommandIntake:
             self.counters.unauthorised += 1
             raise CommandRefusedError(
                 f"this box takes no commands for machine {machine[:_SHOWN_TOPIC]!r}; it watches "
-                f"{', '.join(self._machines)}"
+                f"{', '.join(self._machines)}",
+                NO_SUCH_MACHINE,
             )
         if verb not in _VERBS:
             self.counters.malformed += 1
@@ -331,7 +349,8 @@ class CommandIntake:
             self.counters.stale += 1
             raise CommandRefusedError(
                 "it was issued before the service started, and the list of commands that had come by then is "
-                "lost, so it might be obeyed twice: look at the alarm, and ask again with a new id"
+                "lost, so it might be obeyed twice: look at the alarm, and ask again with a new id",
+                NOT_REMEMBERED,
             )
         too_old_s = message.issued_at.timestamp() + self._settings.max_age_s
         try:
@@ -346,7 +365,8 @@ class CommandIntake:
             self.counters.unwritten += 1
             raise CommandRefusedError(
                 f"its id cannot be written down ({error.strerror or error}), so it might be obeyed twice: "
-                f"{_remedy(error)}, then ask again"
+                f"{_remedy(error)}, then ask again",
+                DISK_REFUSES,
             ) from error
         if known == "known":
             self.counters.stale += 1
@@ -355,7 +375,9 @@ class CommandIntake:
             )
         if known == "full":
             self.counters.stale += 1
-            raise CommandRefusedError(f"there were {REMEMBERED} commands in a short time; ask again later")
+            raise CommandRefusedError(
+                f"there were {REMEMBERED} commands in a short time; ask again later", NOT_ASKED
+            )
 
     def _answer_topic(self, message: Incoming) -> str:
         """Where the sender wants the answer, unless that would speak in the name of this box or of others.

@@ -129,11 +129,14 @@ async def test_too_many_and_unknown_machines_are_refused_in_the_feed() -> None:
         await eventually(lambda: len(machine.looking) == 1, "it looks")
         ask(link, 5, 60.0, topic=TOPICS.live_request("rig", "page-2"))
         await eventually(lambda: b"max_viewers" in broker.told(5, "page-2"), "it is refused")
+        assert json.loads(broker.told(5, "page-2"))["code"] == "O22"
         ask(link, 1, 0.0)
         await eventually(lambda: machine.left == 1, "there is room")
         ask(link, 6, 60.0, topic=TOPICS.live_request("other", "page-2"))
         await eventually(lambda: "other/live" in broker.sent[-1][0], "it is refused")
-        assert b"no machine 'other' here" in Unpacker(6).take(broker.sent[-1][1])
+        refused = json.loads(Unpacker(6).take(broker.sent[-1][1]))
+        assert "no machine 'other' here" in refused["reason"]
+        assert refused["code"] == "C04"
 
 
 async def test_a_machine_that_is_watched_no_more_says_that_it_is_over() -> None:

@@ -100,11 +100,11 @@ async def test_a_command_reaches_the_desk_with_all_that_it_says(intake, desk):
 
 async def test_a_refusal_of_the_alarms_is_passed_on_and_counted(intake):
     async def strict(_command, _source):
-        return CommandOutcome(accepted=False, reason="the condition stands")
+        return CommandOutcome(accepted=False, reason="the condition stands", code="C08")
 
     intake._handler = strict
     response, _ = await answer(intake)
-    assert (response.accepted, response.reason) == (False, "the condition stands")
+    assert (response.accepted, response.reason, response.code) == (False, "the condition stands", "C08")
     assert (intake.counters.accepted, intake.counters.refused) == (0, 1)
 
 
@@ -177,11 +177,13 @@ REFUSED = {
 
 @pytest.mark.parametrize(("options", "counted", "reason"), REFUSED.values(), ids=REFUSED)
 async def test_what_is_not_a_command_is_refused_counted_and_changes_nothing(
-    intake, desk, options, counted, reason
+    intake, desk, options, counted, reason, caplog
 ):
     response, _ = await answer(intake, **options)
     assert not response.accepted
     assert reason in response.reason
+    assert response.code == ("C04" if "for machine" in reason else "O21")
+    assert [f"{line.code}" for line in caplog.records] == [response.code]
     assert response.events == ()
     assert desk.asked == []
     counters = asdict(intake.counters)
@@ -263,6 +265,7 @@ async def test_a_command_whose_id_cannot_be_written_is_not_obeyed(desk, tmp_path
     intake = make(desk, tmp_path)
     response, _ = await answer(intake)
     assert "its id cannot be written down" in response.reason
+    assert response.code == "S08"
     assert desk.asked == []
     assert intake.counters.unwritten == 1
 
@@ -285,14 +288,15 @@ async def test_a_command_that_comes_twice_is_carried_out_once(intake, desk):
     second, _ = await answer(intake)
     other, _ = await answer(intake, id="c2")
     assert (first.accepted, second.accepted, other.accepted) == (True, False, True)
+    assert (first.code, second.code, other.code) == (None, "O21", None)
     assert "'c1' has come before" in second.reason
     assert len(desk.asked) == 2
 
 
 async def test_a_flood_of_commands_cannot_make_the_box_forget_an_id(intake, desk, monkeypatch):
     monkeypatch.setattr("daqsvc.outbox.command_ids.REMEMBERED", 10)
-    for number in range(30):
-        await answer(intake, id=f"n{number}")
+    answers = [(await answer(intake, id=f"n{number}"))[0] for number in range(30)]
+    assert [one.code for one in answers] == [None] * 10 + ["C07"] * 20
     repeated, _ = await answer(intake, id="n0")
     assert "has come before" in repeated.reason
     assert len(desk.asked) == 10
@@ -411,6 +415,7 @@ async def test_with_its_ids_lost_a_restart_obeys_nothing_from_before(desk, tmp_p
     response, _ = await answer(again)
     assert not response.accepted
     assert "before the service started" in response.reason
+    assert response.code == "S13"
     assert len(desk.asked) == 1
     response, _ = await answer(again, id="c2", issued_at=(NOW + timedelta(seconds=11)).isoformat())
     assert response.accepted
