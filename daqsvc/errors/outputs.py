@@ -177,8 +177,8 @@ COMMAND_NOT_OBEYED = Code(
 NOT_SHOWN = Code(
     "O22",
     "A viewer does not get what it shows",
-    "The broker does not let this client send or listen to what a page or a dashboard asks for, or there are "
-    "as many viewers as max_viewers of [mqtt.live] allows.",
+    "The broker does not let this client send or listen to what a page or a dashboard asks for, what comes "
+    "there is no message of daqsvc, or there are as many viewers as max_viewers of [mqtt.live] allows.",
     "Allow the topics to this client in the access list of the broker, or close another viewer.",
     "page.md",
     "the MQTT broker does not let this client subscribe to daqsvc/lab/live: no live data is sent over it",

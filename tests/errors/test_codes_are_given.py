@@ -195,7 +195,8 @@ def test_the_test_elsewhere_asserts_the_code(code: str, place: str) -> None:
 def logged() -> Iterator[str]:
     """The codes that lines of the log name, as `test_logs_name_codes` holds them to."""
     names = {name: code for code, name in named()}
-    for call in (call for file in SERVICE for call in lines(file)):
+    calls = (call for file in SERVICE for call, _ in lines(file.read_text(encoding="utf-8")))
+    for call in calls:
         for node in ast.walk(call):
             if isinstance(node, ast.Name) and node.id in names:
                 yield names[node.id]

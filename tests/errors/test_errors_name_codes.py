@@ -48,19 +48,23 @@ NO_FAULT = {
     "daqsvc/commands/reload.py": {"run"},  # lines of the service, which have their codes
     "daqsvc/commands/sniff.py": {"_tell"},  # progress
     "daqsvc/commands/store_argument.py": {"_of_file"},  # goes on with what was said before
+    "daqsvc/reference/__main__.py": {"main"},  # what a developer is told who makes the pages
     "sim_hw/bus_socket.py": {"run_hub"},  # progress
     "sim_hw/demo/command.py": {"_say"},  # warnings, and all goes on
     "sim_hw/reproduce/command.py": {"_note"},  # progress
     "sim_hw/sim_command.py": {"_say"},  # progress, and problems of a machine file, which have their codes
 }
 """Functions that print to stderr what ends no command."""
+WRITES_TO_STDERR = {"sys.stderr.write", "warnings.warn", "traceback.print_exc", "traceback.print_exception"}
 
 
 def raised(tree: ast.AST) -> Iterator[tuple[ast.Call, str]]:
     """The calls that make what users are shown, with what they make."""
     for node in ast.walk(tree):
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in CODE_AT:
-            yield node, node.func.id
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name | ast.Attribute):
+            made = node.func.id if isinstance(node.func, ast.Name) else node.func.attr
+            if made in CODE_AT:
+                yield node, made
 
 
 def code_of(call: ast.Call, kind: str) -> ast.expr | None:
@@ -76,39 +80,83 @@ def code_of(call: ast.Call, kind: str) -> ast.expr | None:
     return None if isinstance(value, ast.Constant) else value
 
 
+def without_code(text: str) -> list[tuple[int, str]]:
+    """What users are shown without a code: the line, and what is made there."""
+    return [(call.lineno, kind) for call, kind in raised(ast.parse(text)) if code_of(call, kind) is None]
+
+
 @pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(ROOT)))
 def test_what_users_are_shown_has_a_code(file: Path) -> None:
     place = str(file.relative_to(ROOT))
-    tree = ast.parse(file.read_text(encoding="utf-8"))
-    without = [
-        f"{place}:{call.lineno}: {kind}"
-        for call, kind in raised(tree)
-        if code_of(call, kind) is None and (place, kind) not in EXEMPT
-    ]
+    found = without_code(file.read_text(encoding="utf-8"))
+    without = [f"{place}:{line}: {kind}" for line, kind in found if (place, kind) not in EXEMPT]
     assert not without, "name a code of daqsvc.errors"
 
 
+@pytest.mark.parametrize(
+    ("line", "is_found"),
+    [
+        ("raise RecordingError('it is damaged')", True),
+        ("raise recording.RecordingError('it is damaged', None)", True),
+        ("complain('daqsvc status', error, None)", True),
+        ("raise PydanticCustomError('odd', 'it is odd', {'remedy': 'mend it'})", True),
+        ("yield problems.Finding(('box',), 'is odd', 'mend it', 'x')", True),
+        ("raise RecordingError('it is damaged', DAMAGED)", False),
+        ("raise RecordingError('it is damaged', code=DAMAGED)", False),
+        ("raise PydanticCustomError('odd', 'it is odd', {'code': BAD_TEXT})", False),
+        ("raise ValueError('for whoever has written the call')", False),
+    ],
+)
+def test_an_error_without_a_code_is_found(line: str, *, is_found: bool) -> None:
+    assert bool(without_code(line)) is is_found
+
+
 def prints_to_stderr(node: ast.AST) -> bool:
-    """Whether a call is ``print(..., file=sys.stderr)``."""
-    return (
-        isinstance(node, ast.Call)
-        and isinstance(node.func, ast.Name)
-        and node.func.id == "print"
-        and any(one.arg == "file" and ast.unparse(one.value) == "sys.stderr" for one in node.keywords)
-    )
+    """Whether a call writes to stderr by itself."""
+    if not isinstance(node, ast.Call):
+        return False
+    if ast.unparse(node.func) == "print":
+        return any(one.arg == "file" and ast.unparse(one.value) == "sys.stderr" for one in node.keywords)
+    if ast.unparse(node.func) in {"SystemExit", "sys.exit"}:
+        # A text is printed, a number is the exit code.
+        return any(
+            isinstance(one, ast.JoinedStr) or isinstance(getattr(one, "value", 0), str) for one in node.args
+        )
+    return ast.unparse(node.func) in WRITES_TO_STDERR
+
+
+def printing(text: str) -> set[str]:
+    """The functions that write to stderr by themselves; ``<module>`` is what no function does."""
+    tree = ast.parse(text)
+    functions = [one for one in ast.walk(tree) if isinstance(one, ast.FunctionDef | ast.AsyncFunctionDef)]
+    within = {node: one.name for one in functions for node in ast.walk(one)}
+    return {within.get(node, "<module>") for node in ast.walk(tree) if prints_to_stderr(node)}
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(ROOT)))
 def test_what_goes_to_stderr_has_a_code(file: Path) -> None:
     """A command says what went wrong with `complain`, which asks for the code."""
     place = str(file.relative_to(ROOT))
-    printing = {
-        function.name
-        for function in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
-        if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef)
-        and any(map(prints_to_stderr, ast.walk(function)))
-    }
-    assert printing == NO_FAULT.get(place, set())
+    assert printing(file.read_text(encoding="utf-8")) == NO_FAULT.get(place, set())
+
+
+@pytest.mark.parametrize(
+    ("line", "is_found"),
+    [
+        ("print('away', file=sys.stderr)", True),
+        ("sys.stderr.write('away')", True),
+        ("raise SystemExit('away')", True),
+        ("sys.exit(f'{error}')", True),
+        ("warnings.warn('away')", True),
+        ("traceback.print_exc()", True),
+        ("print('there')", False),
+        ("sys.exit(main())", False),
+        ("raise SystemExit(EXIT_USAGE)", False),
+    ],
+)
+def test_what_goes_to_stderr_is_found(line: str, *, is_found: bool) -> None:
+    assert printing(line) == ({"<module>"} if is_found else set())
+    assert printing(f"def run():\n    {line}") == ({"run"} if is_found else set())
 
 
 def test_every_code_is_raised_somewhere() -> None:

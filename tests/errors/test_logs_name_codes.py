@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-LEVELS = {"warning", "error", "exception", "critical"}
-LOGGERS = {"log", "logger", "self._log"}
+LEVELS = {"warning", "warn", "error", "exception", "critical", "fatal"}
+QUIET = {"logging.DEBUG", "logging.INFO"}
 
 NO_FAULT = {
     "daqsvc/acquisition/link.py": {"'%s is back' if self._ever_up else '%s is there now'"},
@@ -62,16 +62,17 @@ NO_FAULT = {
 """The lines about no fault: something is back, or was asked for."""
 
 
-def lines(file: Path) -> Iterator[ast.Call]:
-    """The calls that write a line of the log from WARNING on."""
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-        if (
-            isinstance(node, ast.Call)
-            and isinstance(node.func, ast.Attribute)
-            and node.func.attr in LEVELS
-            and ast.unparse(node.func.value) in LOGGERS
-        ):
-            yield node
+def lines(text: str) -> Iterator[tuple[ast.Call, ast.expr]]:
+    """The calls that may write a line of the log from WARNING on, with their messages."""
+    for node in ast.walk(ast.parse(text)):
+        if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.args):
+            continue
+        logger = ast.unparse(node.func.value)
+        is_parser = logger.endswith("parser") or logger == "root"
+        if node.func.attr in LEVELS and not is_parser:
+            yield node, node.args[0]
+        elif node.func.attr == "log" and "log" in logger and ast.unparse(node.args[0]) not in QUIET:
+            yield node, node.args[1]
 
 
 def names_a_code(call: ast.Call) -> bool:
@@ -83,11 +84,37 @@ def names_a_code(call: ast.Call) -> bool:
 SERVICE = [file for file in FILES if file.relative_to(ROOT).parts[0] != "sim_hw"]
 
 
+def without_code(text: str) -> set[str]:
+    return {ast.unparse(message) for call, message in lines(text) if not names_a_code(call)}
+
+
 @pytest.mark.parametrize("file", SERVICE, ids=lambda file: str(file.relative_to(ROOT)))
 def test_a_line_about_a_fault_names_a_code(file: Path) -> None:
     place = str(file.relative_to(ROOT))
-    without = {ast.unparse(call.args[0]) for call in lines(file) if not names_a_code(call)}
-    assert without == NO_FAULT.get(place, set())
+    assert without_code(file.read_text(encoding="utf-8")) == NO_FAULT.get(place, set())
+
+
+@pytest.mark.parametrize(
+    ("line", "is_found"),
+    [
+        ("log.warning('%s is away', name)", True),
+        ("self._logger.error('away')", True),
+        ("logging.getLogger(__name__).exception('away')", True),
+        ("logging.warning('away')", True),
+        ("log.critical('away', extra={'code': None})", True),
+        ("log.error('away', extra=coded(None))", True),
+        ("log.log(level, 'away')", True),
+        ("log.log(logging.ERROR, 'away')", True),
+        ("log.log(level, 'away', extra=coded(LINK_LOST))", False),
+        ("log.warning('away', extra=coded(LINK_LOST))", False),
+        ("log.log(logging.INFO, 'back')", False),
+        ("log.info('back')", False),
+        ("task.exception()", False),
+        ("self._parser.error('which has a code by itself')", False),
+    ],
+)
+def test_a_line_without_a_code_is_found(line: str, *, is_found: bool) -> None:
+    assert bool(without_code(line)) is is_found
 
 
 def test_the_code_is_a_field_of_the_record_and_ends_the_line(caplog: pytest.LogCaptureFixture) -> None:

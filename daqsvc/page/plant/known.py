@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.acquisition.clock import iso_utc
+from daqsvc.errors.code import coded
+from daqsvc.errors.outputs import NOT_SHOWN
 from daqsvc.live_feed import SCHEMA
 from daqsvc.page.text import BETWEEN
 from daqsvc.publish.payloads import AlarmPayload, AvailabilityPayload, DiagnosisPayload
@@ -167,7 +169,13 @@ class KnownPlant:
         except (ValueError, TypeError, LookupError, RecursionError) as error:
             level = logging.DEBUG if self._has_warned else logging.WARNING
             self._has_warned = True
-            log.log(level, "what came on %.200r cannot be read and is left out: %.200s", message.topic, error)
+            log.log(
+                level,
+                "what came on %.200r cannot be read and is left out: %.200s",
+                message.topic,
+                error,
+                extra=coded(NOT_SHOWN),
+            )
 
     def _note_of_machine(self, box: KnownBox, rest: tuple[str, ...], payload: bytes) -> None:
         name, kind, what = rest

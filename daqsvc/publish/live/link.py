@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from daqsvc.alarms.commands import faults_of
 from daqsvc.errors.code import coded
 from daqsvc.errors.command_line import NO_SUCH_MACHINE
-from daqsvc.errors.outputs import NOT_SHOWN
+from daqsvc.errors.outputs import COMMAND_NOT_OBEYED, NOT_SHOWN
 from daqsvc.publish.live.pieces import Packer
 from daqsvc.publish.live.request import MOST_BYTES, LiveRequestPayload
 from daqsvc.publish.looking import Looking
@@ -91,7 +91,13 @@ class LiveLink(MqttLink):
             fault = faults_of(error, "payload")[0] if isinstance(error, ValidationError) else f"{error}"
             level = logging.DEBUG if self._has_warned else logging.WARNING
             self._has_warned = True
-            log.log(level, "a request on %.200r is no daqsvc.live-request/1: %.300s", message.topic, fault)
+            log.log(
+                level,
+                "a request on %.200r is no daqsvc.live-request/1: %.300s",
+                message.topic,
+                fault,
+                extra=coded(COMMAND_NOT_OBEYED),
+            )
             return True
         self._asked.put_nowait((topic, request))
         return True
