@@ -2,7 +2,8 @@
 
 A package registers a `DriverPlugin` in the group of entry points ``daqsvc.drivers`` under the name that
 ``driver = "..."`` of a bus gives, a `DetectorPlugin` in ``daqsvc.detectors`` under the key of its table in
-``[pipeline]``, or an `OutputPlugin` in ``daqsvc.outputs`` under the path of its table.
+``[pipeline]``, or an `OutputPlugin` in ``daqsvc.outputs`` under the path of its table. Codes of its
+messages are each a `PluginCode` in a module that it registers in ``daqsvc.codes`` under their letters.
 ``docs/write-a-driver.md``, ``docs/detectors.md`` and ``docs/outputs.md`` show one of each. Names leave
 this module only with a new major version.
 """
@@ -19,6 +20,7 @@ from daqsvc.diagnosis.reading import Reading
 from daqsvc.diagnosis.record import Diagnosis, Severity
 from daqsvc.diagnosis.recorded import Evaluated, Recorded, RecordedDetector, RecordingOptions, statements_of
 from daqsvc.diagnosis.window_detector import Judgement, WindowDetector
+from daqsvc.errors.code import PluginCode, coded
 from daqsvc.outbox.messages import OutboxMessage
 from daqsvc.publish.output import Output, OutputPort, Watched
 from daqsvc.publish.plugin import OutputPlugin
@@ -74,6 +76,7 @@ __all__ = [
     "OutputPlugin",
     "OutputPort",
     "PackedLayout",
+    "PluginCode",
     "Question",
     "Reading",
     "Recorded",
@@ -100,6 +103,7 @@ __all__ = [
     "WindowDetector",
     "assembler_of",
     "choice",
+    "coded",
     "in_thread",
     "questions",
     "run_with_reconnect",

@@ -7,10 +7,13 @@ from typing import TYPE_CHECKING
 
 from daqsvc.commands.arguments import EXIT_OK, EXIT_USAGE
 from daqsvc.commands.complaint import complain
+from daqsvc.commands.plugged import plugged_codes
+from daqsvc.errors.code import PluginCode
 from daqsvc.errors.command_line import NOT_KNOWN
 
 if TYPE_CHECKING:
     import argparse
+    from collections.abc import Iterable
 
     from daqsvc.errors.code import Code
 
@@ -37,33 +40,37 @@ class ExplainCommand:
         from daqsvc.errors.table import CODES  # noqa: PLC0415 - texts that no other verb needs
 
         wanted = [text.strip("[]").upper() for text in arguments.codes]
-        unknown = [text for text in wanted if text not in CODES]
+        known = dict(CODES)
+        if not known.keys() >= {*wanted} or not wanted:
+            known |= plugged_codes()
+        unknown = [text for text in wanted if text not in known]
         if unknown:
             words = f"there is no code {unknown[0]!r}; daqsvc explain lists them"
             return complain("daqsvc explain", words, NOT_KNOWN, EXIT_USAGE)
-        print("\n\n".join(_told(CODES[text]) for text in wanted) or _listed())  # noqa: T201 - what the verb is for
+        print("\n\n".join(_told(known[text]) for text in wanted) or _listed(known.values()))  # noqa: T201 - what the verb is for
         return EXIT_OK
 
 
 def _told(code: Code) -> str:
+    more = f"docs/{code.page}, docs/reference/errors.md#{code.id.lower()}"
     parts = {
-        **({"Example": code.example} if code.example else {}),
+        "Example": code.example,
         "Cause": code.cause,
         "Remedy": code.remedy,
-        "More": f"docs/{code.page}, docs/reference/errors.md#{code.id.lower()}",
+        "More": code.page if isinstance(code, PluginCode) else more,
     }
     blocks = [f"{code}  {code.title}"]
-    for name, text in parts.items():
+    for name, text in ((name, text) for name, text in parts.items() if text):
         lines = textwrap.wrap(text, _COLUMNS, break_long_words=False, break_on_hyphens=False)
         blocks.append("\n".join([f"{name}:", *(f"  {line}" for line in lines)]))
     return "\n".join(blocks)
 
 
-def _listed() -> str:
-    from daqsvc.errors.table import CODES, GROUPS, group_title  # noqa: PLC0415 - as above
+def _listed(codes: Iterable[Code]) -> str:
+    from daqsvc.errors.table import group_title  # noqa: PLC0415 - as above
 
-    blocks = []
-    for letter in GROUPS:
-        codes = [f"  {code}  {code.title}" for code in CODES.values() if code.id.startswith(letter)]
-        blocks.append("\n".join([group_title(letter), *codes]))
-    return "\n\n".join(blocks)
+    groups: dict[str, list[str]] = {}
+    for code in codes:
+        title = code.letters if isinstance(code, PluginCode) else group_title(code.id[0])
+        groups.setdefault(title, []).append(f"  {code}  {code.title}")
+    return "\n\n".join("\n".join([title, *lines]) for title, lines in groups.items())

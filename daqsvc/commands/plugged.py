@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from importlib.metadata import entry_points
 from typing import TypeVar
 
 from daqsvc.commands.complaint import complain
+from daqsvc.errors.code import PluginCode
 from daqsvc.errors.command_line import LEFT_OUT
+
+CODES = "daqsvc.codes"
+"""The group of entry points of modules with codes, by the letters of these."""
 
 T = TypeVar("T")
 
@@ -33,4 +38,23 @@ def plugged(group: str, base: type[T], what: str) -> dict[str, T]:
         else:
             why = f"it is not derived from {base.__name__} of daqsvc.api"
             complain("daqsvc", f"{what} {point.name} is left out: {why}", LEFT_OUT)
+    return known
+
+
+def plugged_codes() -> dict[str, PluginCode]:
+    """The codes of packages, by id; letters that two packages have are left out and reported on stderr."""
+    points = {(point.name, point.value): point for point in entry_points(group=CODES)}
+    packages = Counter(name for name, _ in points)
+    known: dict[str, PluginCode] = {}
+    for (letters, value), point in points.items():
+        try:
+            if packages[letters] > 1:
+                raise ValueError(f"two packages have these letters, one of them {value}")  # noqa: TRY301 - as others
+            codes = [one for one in vars(point.load()).values() if isinstance(one, PluginCode)]
+            if strange := [code.id for code in codes if code.letters != letters]:
+                raise ValueError(f"{strange[0]} has other letters than its entry point")  # noqa: TRY301 - as above
+        except Exception as error:  # noqa: BLE001 - no package may take the others along
+            complain("daqsvc", f"group of codes {letters} is left out: {error}", LEFT_OUT)
+            continue
+        known |= {code.id: code for code in codes}
     return known

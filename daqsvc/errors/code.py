@@ -32,6 +32,34 @@ class Code:
         return self.id
 
 
+_OF_PLUGIN = re.compile(r"[A-Z]{2,8}[0-9]{2}")
+
+
+@dataclass(frozen=True, slots=True)
+class PluginCode(Code):
+    """A code of a package that adds drivers, detectors or outputs.
+
+    ``id`` is two to eight capital letters, the same in all codes of the package, and two digits, e.g.
+    ``ACME01``: codes of daqsvc have one letter, so that no two are alike. ``page`` is the address of a page;
+    it may be empty.
+
+    Raises:
+        ValueError: the id is none.
+    """
+
+    def __post_init__(self) -> None:
+        if not _OF_PLUGIN.fullmatch(self.id):
+            raise ValueError(
+                f"{self.id!r} is no code of a plugin; write two to eight capital letters of your own and two "
+                "digits, e.g. ACME01, as one letter is for codes of daqsvc"
+            )
+
+    @property
+    def letters(self) -> str:
+        """Of the package."""
+        return self.id[:-2]
+
+
 def coded(code: Code | None) -> dict[str, Code | None]:
     """What a logger takes as ``extra``: the code is a field of the record, and ends its line."""
     return {"code": code}

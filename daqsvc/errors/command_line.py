@@ -220,9 +220,10 @@ PROCESS_LOST = Code(
 )
 LEFT_OUT = Code(
     "C26",
-    "A verb is left out",
-    "A package registers a verb of daqsvc that cannot be loaded.",
-    "Install the package again, or remove it. All other verbs work.",
+    "A verb or an addition to one is left out",
+    "A package registers a verb, a kind of sniff, questions or codes that cannot be loaded, or codes with "
+    "the letters of another package.",
+    "Install the package again, update it, or remove it. Everything else works.",
     _PAGE,
     "daqsvc: verb 'twin' is left out: No module named 'twin'",
 )

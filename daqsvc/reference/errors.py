@@ -13,7 +13,8 @@ if TYPE_CHECKING:
 _ABOUT = """A message ends with a code, e.g. `[F01]`. It stands for one kind of mistake or fault, and is never
 used for another. `daqsvc explain F01` prints what is written here. The message itself names the thing, its
 value and what to do; here is what leads to it. Messages of plugins that are not part of daqsvc may have no
-code."""
+code, or one that begins with [two letters or more](../write-a-driver.md#codes-of-messages), which
+`daqsvc explain` knows where the package is installed."""
 
 
 def gaps() -> Iterator[str]:

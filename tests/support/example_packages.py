@@ -21,6 +21,7 @@ DOCS = ROOT / "docs"
 DRIVER = DOCS / "example_driver"
 DETECTOR = DOCS / "example_detector"
 OUTPUT = DOCS / "example_output"
+MESSAGE_CODES = DOCS / "example_codes"
 
 
 def installed(example: Path, site: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
