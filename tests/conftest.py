@@ -17,6 +17,7 @@ import pytest_asyncio
 from hypothesis import settings
 from hypothesis.internal.conjecture import providers
 from support.examples import examples
+from support.given_codes import codes_logged
 from support.paths import ROOT
 
 if TYPE_CHECKING:
@@ -78,6 +79,18 @@ async def _no_leaked_tasks() -> AsyncIterator[None]:
         _, leaked = await asyncio.wait(leaked, timeout=GRACE_S)
     if leaked:
         pytest.fail(f"tasks that outlive the test: {sorted(t.get_name() for t in leaked)}")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Generator[None]:
+    """A test that is marked with ``gives`` makes lines of the log with these codes, or fails."""
+    mark = item.get_closest_marker("gives")
+    if mark is None:
+        return (yield)
+    with codes_logged() as codes:
+        outcome = yield
+    assert {*mark.args} <= codes, f"no line of the log has {', '.join(sorted({*mark.args} - codes))}"
+    return outcome
 
 
 @pytest.hookimpl(wrapper=True)

@@ -246,6 +246,7 @@ def test_an_hour_without_anything_is_not_written_row_by_row() -> None:
     np.testing.assert_array_equal(ring.read(ring.end_index - 900, 900), rows[-900:])
 
 
+@pytest.mark.gives("B39")
 def test_samples_that_nobody_can_place_are_left_out_and_said_so(caplog: pytest.LogCaptureFixture) -> None:
     cuts = list(range(0, 100_001, 50))
     sources = [AlignedSource(name, ("x",), 1000.0) for name in "ab"]

@@ -124,6 +124,7 @@ def test_a_gap_is_given_up_when_the_stream_falls_silent() -> None:
     assert blocks[-1].lost_before == PER_FRAME
 
 
+@pytest.mark.gives("B37")
 def test_a_restart_starts_a_new_run_with_its_loss_marked_as_estimated(caplog) -> None:
     blocks: list[SampleBlock] = []
     unit = assembler(blocks)
@@ -154,6 +155,7 @@ def test_patience_starts_afresh_with_every_gap() -> None:
     assert unit.counters.frames_reordered > 90
 
 
+@pytest.mark.gives("B35")
 def test_gaps_are_told_once(caplog: pytest.LogCaptureFixture) -> None:
     unit = assembler([])
     feed(unit, [0, 1, 2, 4, 5, 6, 7, 8, 9, 11, 12, 13, 14, 15, 16])

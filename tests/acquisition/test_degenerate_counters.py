@@ -138,6 +138,7 @@ def test_no_arrivals_keep_the_line_from_being_laid(seed, n, counts, times) -> No
     assert line is None or (told and np.isfinite(line).all())
 
 
+@pytest.mark.gives("B38")
 def test_a_counter_that_stands_still_is_said_and_its_stream_set_aside(caplog) -> None:
     caplog.set_level(logging.WARNING)
     blocks: list[SampleBlock] = []

@@ -152,6 +152,7 @@ async def test_a_command_that_cannot_be_written_down_is_not_obeyed(tmp_path: Pat
         assert state(desk, "store/audit-log") is AlarmState.ACTIVE_UNACKNOWLEDGED
 
 
+@pytest.mark.gives("S08")
 async def test_a_command_whose_outcome_cannot_be_written_down_has_been_obeyed_and_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 
+import pytest
 from support.alarm_rig import AlarmRig
 
 from daqsvc.alarm_log import LINE_EVERY_NS, LINES, AlarmLog
@@ -13,6 +14,7 @@ from daqsvc.alarms.setpoints import Setpoint
 from daqsvc.alarms.states import Level
 
 
+@pytest.mark.gives("S11")
 def test_a_flood_is_counted_once_a_second_and_what_comes_after_it_is_named(caplog):
     caplog.set_level(logging.INFO, "daqsvc.alarm_log")
     rig = AlarmRig(LevelRule("vibration-x", "probe-x", "rms", Setpoint(alert=4.0)))

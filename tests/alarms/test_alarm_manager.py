@@ -215,6 +215,7 @@ def test_a_sensor_is_good_again_only_when_every_detector_says_so():
     assert ("sensor-ok/probe-x", K.RETURNED) in kinds(desk.rms(0.0))
 
 
+@pytest.mark.gives("A16")
 def test_a_measure_that_the_detector_does_not_have_is_reported_once(caplog):
     desk = Desk(LevelRule("odd", "probe-x", "velocity_rms", Setpoint(alert=1.0)))
     with caplog.at_level(logging.ERROR):

@@ -312,6 +312,7 @@ async def test_a_socket_that_is_taken_away_or_cannot_be_made_comes_back(
     assert not server.path.exists()
 
 
+@pytest.mark.gives("S12")
 async def test_a_link_that_is_taken_away_is_made_again_and_why_not_is_said_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

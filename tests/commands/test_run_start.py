@@ -19,7 +19,7 @@ import daqsvc.service
 from daqsvc.commands import early_signals, run
 from daqsvc.commands.process_guard import ProcessGuard
 from daqsvc.commands.service_manager import ServiceManager
-from daqsvc.control import ReloadTooLateError
+from daqsvc.control import ReloadRefusedError, ReloadTooLateError
 from daqsvc.outbox.files import is_possessed
 from daqsvc.supervision import Supervisor
 
@@ -196,6 +196,21 @@ def test_the_store_is_held_while_the_service_is_made(monkeypatch, tmp_path):
     box = SimpleNamespace(names="rig", machines={})
     assert run._run(box, [], tmp_path / "store", guard, ServiceManager()) == 0
     assert held == [True, False]
+
+
+@pytest.mark.gives("S16")
+async def test_a_hang_up_that_is_refused_is_an_error_for_each_reason(caplog):
+    async def reload():
+        raise ReloadRefusedError(["rig.toml:3: box: restart the service [S01]", "it is odd"])
+
+    reloader = run._Reloader(SimpleNamespace(supervisor=Supervisor(), reload=reload))
+    reloader.ask()
+    await reloader.part.over
+    refused = "SIGHUP is refused, and the service goes on as it is: "
+    assert caplog.messages == [
+        f"{refused}rig.toml:3: box: restart the service [S01]",
+        f"{refused}it is odd [S16]",
+    ]
 
 
 async def test_a_hang_up_right_before_the_end_is_no_error(caplog):

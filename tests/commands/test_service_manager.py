@@ -104,7 +104,12 @@ def test_a_process_that_was_suspended_or_starved_has_not_stalled(monkeypatch: py
 @pytest.mark.parametrize(
     ("told", "watchdog_s", "warning"),
     [
-        ("300000", 0.3, "WatchdogSec= is 0.3 s, and the limit of parts is 3 s"),
+        pytest.param(
+            "300000",
+            0.3,
+            "WatchdogSec= is 0.3 s, and the limit of parts is 3 s",
+            marks=pytest.mark.gives("S17"),
+        ),
         ("3000000", 3.0, ""),
         *[(odd, None, f"WATCHDOG_USEC is '{odd}', not a number") for odd in ("0", "-5", "abc", "1e20")],
     ],
@@ -237,6 +242,7 @@ def test_the_status_names_no_broker_that_there_is_not(
     assert service_manager._in_short(service) == ("0 of 0 buses up; alarms: none", said)
 
 
+@pytest.mark.gives("S10")
 @pytest.mark.parametrize(("watchdog_s", "held_to_s"), [(0.5, 3.0), (3.0, 3.0), (5.0, 5.0)])
 def test_parts_are_held_to_the_watchdog_but_to_three_seconds_at_least(
     watchdog_s: float, held_to_s: float, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture

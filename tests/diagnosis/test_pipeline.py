@@ -315,6 +315,7 @@ def always_failing(window: Window) -> list[Diagnosis]:
     raise RuntimeError("boom")
 
 
+@pytest.mark.gives("D20")
 async def test_without_detectors_it_lasts_as_long_as_the_rings_and_says_what_falls_silent(
     caplog: pytest.LogCaptureFixture,
 ) -> None:

@@ -55,6 +55,7 @@ async def test_modbus_units_on_a_pseudo_terminal_are_read_with_the_parity_of_the
     assert f"instead of parity {parity or 'even'!r} and 8 data bits" in said
 
 
+@pytest.mark.gives("B44")
 async def test_a_serial_device_on_a_pseudo_terminal_is_opened_and_opened_again(tmp_path, caplog):
     blocks = []
     given = {"port": str(tmp_path / "port"), "framing": "lines", "parity": "even", "data_bits": 7}

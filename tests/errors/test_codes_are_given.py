@@ -1,18 +1,19 @@
-"""For every code there is a broken machine file, or something else that is wrong, which gives it."""
+"""For every code there is a broken machine file, or something else that is wrong, which gives it.
+
+Codes of a service that runs come in lines of its log: the tests that make such lines have the mark ``gives``,
+and fail without them.
+"""
 
 from __future__ import annotations
 
-import ast
 import re
 from typing import TYPE_CHECKING
 
 import pytest
-from errors.test_codes import named
-from errors.test_logs_name_codes import SERVICE, lines
+from support.given_codes import codes_of_marks
 from support.machine_files import LAVAL, MACHINES, changed
 from support.paths import ROOT
 
-from daqsvc.alarms.codes import OF_SERVICE
 from daqsvc.cli import main
 from daqsvc.detectors.make import check_files
 from daqsvc.errors.table import CODES
@@ -20,7 +21,6 @@ from daqsvc.settings import MachineFileError, parse_machine_file
 from daqsvc.settings.problems import AssemblyError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
 SPECIMENS = ROOT / "tests" / "guard" / "specimens"
@@ -80,10 +80,12 @@ ELSEWHERE = {
     "C25": "offline/test_analyze_parts.py",
     "C26": "service/test_assembly.py",
     "C27": "commands/test_store_argument.py",
+    "D21": "errors/test_logs_name_codes.py",
     "D14": "detectors/rotor_bank/test_bank_of_a_run_up.py",
     "O02": "publish/mqtt/test_mqtt_settings.py",
     "O10": "errors/test_logs_name_codes.py",
     "O11": "errors/test_logs_name_codes.py",
+    "O23": "errors/test_logs_name_codes.py",
     "O06": "service/test_several_machines.py",
     "R04": "recording/test_recording_bombs.py",
     "R10": "recording/test_recording_files.py",
@@ -192,22 +194,10 @@ def test_the_test_elsewhere_asserts_the_code(code: str, place: str) -> None:
     assert f"[{code}]" in text or f'"{code}"' in text
 
 
-def logged() -> Iterator[str]:
-    """The codes that lines of the log name, as `test_logs_name_codes` holds them to."""
-    names = {name: code for code, name in named()}
-    calls = (call for file in SERVICE for call, _ in lines(file.read_text(encoding="utf-8")))
-    for call in calls:
-        for node in ast.walk(call):
-            if isinstance(node, ast.Name) and node.id in names:
-                yield names[node.id]
-
-
 def test_every_code_is_given_by_something() -> None:
     golden = (ROOT / "tests" / "guard" / "golden").glob("*.txt")
     shown = {
         code for file in golden for code in re.findall(r"\[([A-Z]\d\d)\]", file.read_text(encoding="utf-8"))
     }
-    given = (
-        {one[0] for one in [*GIVEN, *COMMANDS]} | set(ELSEWHERE) | {*logged(), *map(str, OF_SERVICE.values())}
-    )
+    given = {one[0] for one in [*GIVEN, *COMMANDS]} | set(ELSEWHERE) | codes_of_marks()
     assert [code for code in CODES if code not in shown | given] == []

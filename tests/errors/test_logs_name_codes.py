@@ -160,6 +160,19 @@ def test_what_keeps_a_broker_away_has_a_code(caplog: pytest.LogCaptureFixture) -
     assert codes_of_faults(caplog) == ["O09", "O10", "O11", "O13", "O01"]
 
 
+@pytest.mark.gives("B29", "B31")
+def test_a_test_that_gives_its_codes_passes() -> None:
+    link = Link("can0")
+    link.down("nobody is there")
+    link.fail("its reader failed", ValueError("odd"))
+
+
+@pytest.mark.gives("Z99")
+@pytest.mark.xfail(raises=AssertionError, reason="what the mark is for")
+def test_a_test_that_does_not_give_its_code_fails() -> None:
+    Link("can0").down("nobody is there")
+
+
 def test_every_alarm_of_the_service_has_a_code() -> None:
     of_handling = {"alarm-flood", "trip-multiply"}  # nothing is wrong with data or service
     assert OF_SERVICE.keys() == OWN.keys() - of_handling

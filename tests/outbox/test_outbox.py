@@ -146,6 +146,7 @@ async def test_a_payload_that_cannot_be_built_fails_its_own_append_only(outbox):
     assert [m.sequence for m in await outbox.pending(0, 10)] == [await good]
 
 
+@pytest.mark.gives("S08")
 async def test_a_full_disk_is_reported_once_and_nothing_is_lost(tmp_path, connections, caplog):
     outbox = await opened(tmp_path / "outbox.sqlite")
     disk = connections[-1]

@@ -199,6 +199,7 @@ async def test_telemetry_goes_on_in_memory_and_comes_back(disk, monkeypatch, cap
     await outbox.close()
 
 
+@pytest.mark.gives("O15")
 async def test_telemetry_of_a_former_run_makes_way_before_the_journal_is_opened(disk, caplog):
     outbox = await opened(disk, NO_RESERVE)
     for _ in range(3000):

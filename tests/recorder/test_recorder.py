@@ -395,6 +395,7 @@ async def test_files_of_a_continuous_recording_join_over_an_alarm(tmp_path: Path
     assert np.diff(begins) == pytest.approx(5.0, abs=0.4)
 
 
+@pytest.mark.gives("S15")
 async def test_a_continuous_recording_goes_on_when_the_disk_does(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -186,6 +186,7 @@ def errors_of_plugins(log: pytest.LogCaptureFixture) -> list[str]:
     return [line for line in said if not line.endswith("is left behind")]
 
 
+@pytest.mark.gives("B31", "S09")
 @pytest.mark.parametrize(
     ("driver", "detector", "by_driver", "by_detector"),
     [

@@ -300,6 +300,7 @@ channels = [{{ name = "x" }}]
 """
 
 
+@pytest.mark.gives("B29")
 async def test_a_new_bus_may_be_absent_whatever_it_says_of_the_start(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -128,6 +128,7 @@ async def test_what_ends_the_service_does_so_at_the_first_start_only() -> None:
     await stop_all([part], 5.0)
 
 
+@pytest.mark.gives("S18")
 async def test_a_part_that_ignores_its_end_is_said_and_left_behind(caplog: pytest.LogCaptureFixture) -> None:
     supervisor = Supervisor()
     may_end = asyncio.Event()

@@ -161,6 +161,7 @@ def test_a_calibration_is_read_beside_the_machine_file(tmp_path):
         detectors(given)
 
 
+@pytest.mark.gives("D19")
 def test_a_kept_healthy_state_is_used_with_what_the_file_says_of_the_rotor_now(tmp_path, caplog):
     calibration = healthy(LavalRotor(natural_frequency_hz=99.0, damping_ratio=0.5), 50)
 

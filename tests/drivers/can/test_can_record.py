@@ -217,6 +217,7 @@ class FullDisk:
         raise OSError(errno.ENOSPC, "No space left on device")
 
 
+@pytest.mark.gives("B42")
 @pytest.mark.parametrize("log_format", FORMATS)
 @pytest.mark.parametrize("writes", [3, 0])
 def test_a_full_disk_costs_what_is_counted_and_is_said_once(

@@ -67,6 +67,7 @@ async def test_frames_become_blocks_and_strays_are_counted(bus: StandInBus) -> N
     assert driver.streams["s"][0].samples_lost == 0
 
 
+@pytest.mark.gives("B40")
 @pytest.mark.parametrize("restart", [frame_bytes(ERROR | 0x100, bytes(8)), sample_frame(0)])
 async def test_bus_off_takes_the_link_down_until_the_controller_is_back(
     bus: StandInBus, restart: bytes, caplog: pytest.LogCaptureFixture
@@ -119,6 +120,7 @@ async def test_a_bus_that_is_opened_again_keeps_its_state_until_something_comes(
         assert driver.counters.controller_state == "error-passive", "frames alone do not make it active again"
 
 
+@pytest.mark.gives("B41")
 async def test_frames_that_the_kernel_dropped_are_counted_and_said_once(
     caplog: pytest.LogCaptureFixture,
 ) -> None:

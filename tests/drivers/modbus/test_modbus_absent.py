@@ -38,6 +38,7 @@ LAYOUTS = {
 }
 
 
+@pytest.mark.gives("B36")
 @pytest.mark.parametrize("way", LAYOUTS)
 def test_what_is_no_number_is_missing_and_counted(way, caplog):
     layout = LAYOUTS[way]

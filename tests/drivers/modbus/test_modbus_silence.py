@@ -96,6 +96,7 @@ def test_a_line_that_was_opened_is_quiet_as_if_somebody_had_just_asked():
         assert rig.counters("a").samples_lost == 0
 
 
+@pytest.mark.gives("B32")
 @pytest.mark.parametrize("fault", ["silent", "wrong function", "gateway"])
 @pytest.mark.parametrize("demote_after", first_of(3, 1))
 def test_a_unit_lives_while_it_answers_anything(fault, demote_after, caplog):
@@ -212,6 +213,7 @@ def test_all_that_a_dead_unit_was_asked_shares_its_probes():
         unit.check(enquiry, now_ns)
 
 
+@pytest.mark.gives("B33")
 def test_each_refusal_is_told_once_with_what_to_do_about_it(caplog):
     unit_side = units()
     answer = unit_side[1].answer

@@ -309,6 +309,7 @@ def zipped(path: Path) -> Path:
     return packed
 
 
+@pytest.mark.gives("B43")
 @pytest.mark.parametrize("name", first_of("run.blf", "run.log.gz", "run.asc.gz"))
 @pytest.mark.parametrize("at_end", ["stop", "loop"])
 async def test_what_is_left_of_a_damaged_log_is_played_and_the_damage_said_once(

@@ -120,6 +120,7 @@ async def test_a_port_that_another_program_has_is_waited_for(tmp_path: Path) -> 
             assert "stop that program" in second.link.reason
 
 
+@pytest.mark.gives("B34")
 async def test_what_is_wrong_is_said_once_with_its_remedy(tmp_path: Path, caplog: Any) -> None:
     blocks: list[SampleBlock] = []
     driver = lines_driver(tmp_path / "port", blocks)

@@ -206,6 +206,7 @@ async def test_a_disk_without_room_is_said_once_and_nothing_is_lost_within_bound
     assert "make room on the disk" in said[0]
 
 
+@pytest.mark.gives("O18")
 async def test_a_damaged_file_is_set_aside_and_another_begun(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

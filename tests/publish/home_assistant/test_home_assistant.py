@@ -233,6 +233,7 @@ async def test_a_broker_that_forbids_discovery_still_gets_the_alarms(tmp_path, o
             assert publisher.counters.connections == 1
 
 
+@pytest.mark.gives("O16")
 @pytest.mark.parametrize("told", [RIG, {}], ids=["told", "no longer told"])
 async def test_what_a_full_disk_did_not_take_is_remembered_once_it_has_room(
     told, mosquitto, outbox, monkeypatch, caplog

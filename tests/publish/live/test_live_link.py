@@ -173,6 +173,7 @@ async def test_a_lost_connection_ends_it_and_everybody_who_looks() -> None:
         assert machine.left == 1
 
 
+@pytest.mark.gives("O22")
 @pytest.mark.parametrize("machine_name", ["rig", "other"])
 async def test_a_broker_that_takes_no_feed_ends_that_and_nothing_else(
     machine_name: str, caplog: pytest.LogCaptureFixture
@@ -191,6 +192,7 @@ async def test_a_broker_that_takes_no_feed_ends_that_and_nothing_else(
         await eventually(lambda: broker.told(2).endswith(b"two\n"), "others are told")
 
 
+@pytest.mark.gives("O21")
 @pytest.mark.parametrize(
     "payload",
     [

@@ -397,6 +397,7 @@ async def test_whatever_comes_there_is_an_answer(payload):
     assert response.accepted or response.reason
 
 
+@pytest.mark.gives("S13")
 @pytest.mark.parametrize("damage", ["", None, "spoilt"])
 async def test_with_its_ids_lost_a_restart_obeys_nothing_from_before(desk, tmp_path, damage):
     clock = DrivenClock(wall_start_ns=round(NOW.timestamp()) * 10**9)

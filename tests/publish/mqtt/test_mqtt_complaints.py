@@ -166,6 +166,7 @@ async def test_the_last_word_of_a_broker_that_flapped_is_that_it_is_back(
         assert back.endswith("is back")
 
 
+@pytest.mark.gives("O13")
 @pytest.mark.mosquitto
 async def test_a_broker_that_tells_of_a_rival_is_believed_at_once(mosquitto, outbox, caplog):
     """MQTT 5 has a reason code for it, 0x8E, session taken over."""

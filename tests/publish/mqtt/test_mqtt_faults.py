@@ -17,6 +17,7 @@ pytestmark = pytest.mark.integration
 ALARM = "daqsvc/lab/edge-1/rig/alarms/rotor-fault"
 
 
+@pytest.mark.gives("O17")
 @pytest.mark.parametrize(
     "error", [KeyError("x"), RecursionError(), ValueError("\ud800"), RuntimeError("a\nb")]
 )

@@ -63,6 +63,7 @@ def test_only_an_expired_certificate_has_expired():
     assert not has_expired(ConnectionRefusedError())
 
 
+@pytest.mark.gives("O09")
 def test_each_reason_is_said_once_in_an_outage_and_anew_in_the_next(caplog):
     outage = Outage(logging.getLogger("outage"))
     lost, refused = MqttError("connection lost: closed"), ConnectionRefusedError()

@@ -58,6 +58,7 @@ async def opened(path):
         await outbox.close()
 
 
+@pytest.mark.gives("O12")
 @pytest.mark.mosquitto
 async def test_one_topic_that_the_broker_refuses_holds_up_no_other(tmp_path, caplog):
     """And once it is allowed, what was refused comes in its order, after a restart of both too."""

@@ -226,6 +226,7 @@ async def test_a_half_written_renewal_does_not_cost_the_connection(tmp_path, out
             await eventually(lambda: publisher.counters.connections == 2, "the whole one is taken")
 
 
+@pytest.mark.gives("O14")
 async def test_a_certificate_that_only_openssl_can_read_is_used_all_the_same(
     tmp_path, outbox, monkeypatch, caplog
 ):

@@ -113,6 +113,7 @@ async def test_a_page_that_waits_to_start_again_ends_at_once(tmp_path: Path) -> 
     await running
 
 
+@pytest.mark.gives("O19")
 async def test_a_page_that_is_killed_comes_back(tmp_path: Path) -> None:
     port = free_port()
     output = PageOutput([f"--listen=127.0.0.1:{port}"], f"127.0.0.1:{port}", tmp_path)

@@ -133,6 +133,7 @@ async def test_a_host_of_sparkplug_2_2_is_waited_for_and_followed(mosquitto, out
             await born(host, 2)
 
 
+@pytest.mark.gives("O20")
 async def test_a_host_that_never_comes_is_said_with_those_that_are_there(
     mosquitto, outbox, tmp_path, monkeypatch, caplog
 ) -> None:
@@ -163,6 +164,7 @@ async def test_a_host_that_never_comes_is_said_with_those_that_are_there(
     assert caplog.text.count("Sparkplug sends nothing yet") == 1
 
 
+@pytest.mark.gives("O09")
 async def test_a_host_that_is_there_at_once_and_a_broker_that_comes_late_are_said_rightly(
     mosquitto, outbox, tmp_path, caplog
 ) -> None:
