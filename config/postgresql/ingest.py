@@ -39,6 +39,7 @@ SESSION_S = 7 * 86_400
 """How long the broker keeps messages for this ingester while it is away."""
 GATHER_S = 0.2
 RETRY_S = 1.0
+# Messages end with the codes of daqsvc: docs/reference/errors.md, or `daqsvc explain O24`.
 MOST_KEY_BYTES = 2000
 """Of what makes up a key: an entry of an index of PostgreSQL has room for 2704."""
 LONGEST_REASON = 2000
@@ -231,7 +232,7 @@ class Ingester:
     ) -> None:
         if reason.is_failure:
             why = f"it refuses the connection ({reason}): see to --user, $MQTT_PASSWORD and --id"
-            self._is_away(why, is_news=True)
+            self._is_away(why, "O11", is_news=True)
             return
         log.info("connected to the broker %s", self._broker)
         self._why_away.clear()
@@ -249,7 +250,7 @@ class Ingester:
             if reason.is_failure:
                 log.error(
                     "the broker %s refuses to send %s (%s), and nothing of it is written: let this user read "
-                    "it there, and start the ingester again",
+                    "it there, and start the ingester again [O12]",
                     *(self._broker, topic, reason),
                 )
 
@@ -264,10 +265,10 @@ class Ingester:
     def _broker(self) -> str:
         return f"{self._options.broker}:{self._options.port}"
 
-    def _is_away(self, why: str, *, is_news: bool = False) -> None:
+    def _is_away(self, why: str, code: str = "O09", *, is_news: bool = False) -> None:
         """Say so once, however often it is tried; and once more if the reason is news."""
         if not self._why_away or (is_news and why not in self._why_away):
-            log.warning("the broker %s is away, and is tried again: %s", self._broker, why)
+            log.warning("the broker %s is away, and is tried again: %s [%s]", self._broker, why, code)
         self._why_away.add(why)
 
     def _another_connection(self) -> None:
@@ -294,7 +295,7 @@ class Ingester:
                 self._acknowledge(batch)
             except psycopg.Error as error:
                 # Of a message it is not: such are taken one by one and rejected.
-                log.warning("PostgreSQL is away, and nothing is acknowledged: %s", f"{error}".strip())
+                log.warning("PostgreSQL is away, and nothing is acknowledged: %s [O24]", f"{error}".strip())
                 self._disconnect()
                 time.sleep(RETRY_S)
             else:
@@ -376,8 +377,8 @@ def _name(text: str) -> str:
     return text
 
 
-def _misused(words: str) -> NoReturn:
-    print(f"ingest.py: {words}", file=sys.stderr)  # noqa: T201 - errors of the command line go to stderr
+def _misused(words: str, code: str = "C01") -> NoReturn:
+    print(f"ingest.py: {words} [{code}]", file=sys.stderr)  # noqa: T201 - errors of the command line go to stderr
     raise SystemExit(EXIT_USAGE)
 
 
@@ -412,7 +413,10 @@ def _database() -> str:
         psycopg.conninfo.conninfo_to_dict(database)
     except psycopg.Error as error:
         reason = " ".join(f"{error}".split())
-        _misused(f"$DATABASE does not say where PostgreSQL is ({reason}); write postgresql://user@host/plant")
+        _misused(
+            f"$DATABASE does not say where PostgreSQL is ({reason}); write postgresql://user@host/plant",
+            "C02",
+        )
     return database
 
 
@@ -428,7 +432,8 @@ def _ingester() -> Ingester:
         # A file without certificates is an SSLError, which is an OSError.
         reason = "it holds no certificates" if isinstance(error, ssl.SSLError) else _in_words(error)
         _misused(
-            f"--ca {options.ca} cannot be used: {reason}; name the PEM file of the broker's certificates"
+            f"--ca {options.ca} cannot be used: {reason}; name the PEM file of the broker's certificates",
+            "C10",
         )
 
 

@@ -191,3 +191,11 @@ CERTIFICATE_ENDS = Code(
     "mqtt.md",
     "certificate broker ends at 2026-12-07T09:00:00Z, in less than 14 days: renew it",
 )
+DATABASE_AWAY = Code(
+    "O24",
+    "PostgreSQL does not take the messages",
+    "config/postgresql/ingest.py does not reach it, it is read-only or full, or lacks a table or a right.",
+    "Do as the message says. Nothing is lost: the broker keeps the messages until PostgreSQL takes them.",
+    "postgresql.md",
+    "PostgreSQL is away, and nothing is acknowledged: the database system is shutting down",
+)

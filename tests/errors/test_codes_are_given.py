@@ -86,6 +86,7 @@ ELSEWHERE = {
     "O10": "errors/test_logs_name_codes.py",
     "O11": "errors/test_logs_name_codes.py",
     "O23": "errors/test_logs_name_codes.py",
+    "O24": "publish/mqtt/test_postgresql_ingest.py",
     "O06": "service/test_several_machines.py",
     "R04": "recording/test_recording_bombs.py",
     "R10": "recording/test_recording_files.py",

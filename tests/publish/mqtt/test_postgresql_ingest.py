@@ -22,7 +22,7 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.reasoncodes import ReasonCode
 from support.brokers import Mosquitto
 from support.paths import ROOT
-from support.ports import LOOPBACK
+from support.ports import LOOPBACK, free_port
 from support.postgres import Postgres
 from support.waiting import PATIENCE_S
 
@@ -346,6 +346,7 @@ def test_a_mistake_of_its_command_line_is_one_sentence(tmp_path, arguments, envi
     assert done.stderr.startswith("ingest.py: ")
     assert why in done.stderr
     assert done.stderr.count("\n") == 1
+    assert re.search(r" \[C(01|02|10)\]\n$", done.stderr)
 
 
 def test_a_broker_that_goes_and_comes_is_one_line_each(broker):
@@ -356,7 +357,7 @@ def test_a_broker_that_goes_and_comes_is_one_line_each(broker):
         try:
             named = f"the broker 127.0.0.1:{broker.port}"
             gone = f"WARNING {named} is away, and is tried again: "
-            assert running.stderr.readline() == f"{gone}Connection refused\n"
+            assert running.stderr.readline() == f"{gone}Connection refused [O09]\n"
             for _ in range(2):
                 time.sleep(1.5)  # it is tried again meanwhile, and nothing is said
                 broker.start()
@@ -473,6 +474,7 @@ def test_what_the_broker_refuses_is_said(ingest, caplog):
         ingester._on_connect(client, None, None, refused, None)
     [line] = caplog.records
     assert "it refuses the connection (Not authorized): see to --user" in line.getMessage()
+    assert line.getMessage().endswith(" [O11]")
     caplog.clear()
     ingester._on_connect(client, None, None, ReasonCode(PacketTypes.CONNACK, "Success"), None)
     reasons = [
@@ -482,3 +484,15 @@ def test_what_the_broker_refuses_is_said(ingest, caplog):
     ingester._on_subscribe(client, None, 1, reasons, None)
     [line] = [one.getMessage() for one in caplog.records if one.levelname == "ERROR"]
     assert f"refuses to send {client.asked[1]} (Not authorized), and nothing of it is written: let" in line
+    assert line.endswith(" [O12]")
+
+
+def test_a_database_that_is_away_is_said_with_its_code(ingest, caplog, monkeypatch):
+    options = argparse.Namespace(id="x", user=None, ca=None, broker="broker.plant", port=1883)
+    monkeypatch.setattr(ingest, "RETRY_S", 0.0)
+    ingester = ingest.Ingester(options, f"host=127.0.0.1 port={free_port()} dbname=plant")
+    turns = iter([False, True])
+    ingester._write([], lambda: next(turns))
+    [line] = caplog.messages
+    assert line.startswith("PostgreSQL is away, and nothing is acknowledged: connection ")
+    assert line.endswith(" [O24]")
