@@ -126,8 +126,10 @@ def _first(alarm: Document | None) -> str:
 
 
 def _what(event: Document) -> str:
-    """What was found, or who did it and why."""
-    return escape(": ".join(filter(None, (event["message"], event["by"], event["reason"]))))
+    """What was found, or who did it and why; the message of most events states that already."""
+    message = str(event["message"])
+    others = (event["by"], event["reason"])
+    return escape(": ".join([message, *(str(one) for one in others if one and str(one) not in message)]))
 
 
 def _state(alarm: Document | None) -> str:

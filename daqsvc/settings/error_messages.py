@@ -25,7 +25,7 @@ from daqsvc.settings.schema import declared_at, homes_of, kinds_of, section_of, 
 from daqsvc.settings.section import NamesDetector
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from pydantic.fields import FieldInfo
     from pydantic_core import ErrorDetails
@@ -204,9 +204,9 @@ class ErrorFormatter:
         if isinstance(value, str):
             if value in {str(item) for item in allowed}:
                 return message, f"take the quotes away: {self._key(path)} = {value}"
-            close = get_close_matches(value.lower(), [item for item in allowed if isinstance(item, str)], n=1)
-            if close:
-                return message, f'did you mean "{close[0]}"?'
+            meant = _meant(value, [item for item in allowed if isinstance(item, str)])
+            if meant is not None:
+                return message, f'did you mean "{meant}"?'
         return message, f"write one of these, e.g. {self._key(path)} = {listed[0]}"
 
     def _greater_than(self, path: KeyPath, context: Mapping[str, Any]) -> tuple[str, str]:
@@ -344,3 +344,16 @@ class ErrorFormatter:
             named = f' "{name}"' if isinstance(name, str) else ""
             return f"the entry{named} of {dotted(path[:-1])}"
         return f"[{dotted(path)}]"
+
+
+def _meant(word: str, allowed: Sequence[str]) -> str | None:
+    """Which of some words was meant: one in other case, the commonest that begins so, or the most alike."""
+    plain = word.lower()
+    begun = [one for one in allowed if one.lower() == plain] or [
+        one for one in allowed if len(plain) > 2 and one.lower().startswith(plain)
+    ]
+    if begun:
+        # Of numbers of several widths most devices send those of 32 bits, or of 16.
+        return next((one for one in begun if one.endswith("32")), begun[0])
+    close = get_close_matches(plain, allowed, n=1)
+    return close[0] if close else None

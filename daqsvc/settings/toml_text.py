@@ -169,9 +169,60 @@ def _syntax_error(text: str, reason: str) -> TomlTextError:
         line = int(place[1]) if place[1] else text.rstrip("\n").count("\n") + 1
         where = f"column {place[2]}" if place[2] else "the end of the file"
         reason = f"{reason}, at {where}"
-    return TomlTextError(
-        f"is not valid TOML: {reason}",
-        "correct the TOML there: text stands in quotes, tables are [name], values are key = value",
-        NOT_TOML,
-        line,
+    opened = None if line is None else _left_open(text, line, reason)
+    remedy = _remedy_in(text, line) if opened is None else f"close the bracket of line {opened}"
+    return TomlTextError(f"is not valid TOML: {reason}", remedy, NOT_TOML, line)
+
+
+_TOKENS = re.compile(
+    r"\"\"\".*?\"\"\"|'''.*?'''|\"(?:[^\"\\\n]|\\.)*\"|'[^'\n]*'|#[^\n]*|[\[\]{}]", re.DOTALL
+)
+"""Texts and comments, in which brackets mean nothing, and brackets."""
+_KEY, _END = r"^\s*(?P<key>[\w.-]+)", r"\s*(?:#.*)?$"
+_SLIPS = tuple(
+    (re.compile(f"{_KEY}{pattern}{_END}"), remedy)
+    for pattern, remedy in (
+        (r"\s*=\s*(?P<whole>[+-]?\d+),(?P<part>\d+)", "write {key} = {whole}.{part}, with a decimal point"),
+        (r"\s*=\s*(?P<word>True|False)", "write {key} = {lower}: TOML has true and false in lower case"),
+        (r"\s*=\s*(?P<number>[+-]?\d[\d_.]*)\s*[^\W\d][^\s#]*", "write {key} = {number}, without a unit"),
+        (r"\s*=\s*(?P<word>[^\W\d][^\s\"'#=\[\]{{}},]*)", 'write {key} = "{word}", with quotes'),
+        (
+            r"\s*:\s*(?P<word>[^\W\d][^\s\"'#=\[\]{{}},]*)",
+            'write {key} = "{word}", with an equals sign and quotes',
+        ),
+        (r"\s*:\s*(?P<value>[^#\s].*?)", "write {key} = {value}, with an equals sign"),
+        (r"\s*=\s*\"[^\"]*", 'end the text with a quote: "'),
+        (r"\s*=", "write a value behind {key} ="),
     )
+)
+"""Lines that people write, and that are no TOML: the first that fits tells what was meant."""
+
+
+_HEADER = re.compile(r"\s*\[[\w.\[-]+\]")
+"""A new table: what is open there should have been closed before."""
+
+
+def _left_open(text: str, line: int, reason: str) -> int | None:
+    """The line of the first bracket that is still open where an error shows; None if none is."""
+    lines = text.split("\n")
+    is_header = _HEADER.match(lines[line - 1]) is not None
+    if not (is_header or "Unclosed" in reason or "Expected ']'" in reason):
+        return None
+    before = "\n".join(lines[: line - 1 if is_header else line])
+    opened: list[int] = []
+    for token in _TOKENS.finditer(before):
+        if token[0] in "[{":
+            opened.append(token.start())
+        elif token[0] in "]}" and opened:
+            opened.pop()
+    return _line_at(before, opened[-1]) if opened else line if "Expected ']'" in reason else None
+
+
+def _remedy_in(text: str, line: int | None) -> str:
+    """What to write in place of the line that is no TOML."""
+    wrong = "" if line is None else text.split("\n")[line - 1]
+    for slip, remedy in _SLIPS:
+        if (found := slip.match(wrong)) is not None:
+            words = found.groupdict()
+            return remedy.format(**words, lower=words.get("word", "").lower())
+    return "correct the TOML there: text stands in quotes, tables are [name], values are key = value"

@@ -11,6 +11,7 @@ from daqsvc.settings.measures import UNITS, VELOCITIES
 from daqsvc.settings.problems import Finding
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.sensors import ProximityProbe, TrendValue
+from daqsvc.settings.units import same_unit
 from daqsvc.settings.zones import boundaries
 
 if TYPE_CHECKING:
@@ -108,7 +109,7 @@ def _of_housing(
         yield Finding(
             here,
             f"are those of a velocity in mm/s, but {what}",
-            'write measure = "velocity_rms", or setpoints in place of zones',
+            _remedy(others[0] if others else None),
             code=UNFIT_ZONES,
         )
     elif zones.group is None or zones.support is None:
@@ -120,3 +121,11 @@ def _of_housing(
             "proximity probes",
             code=UNFIT_ZONES,
         )
+
+
+def _remedy(other: TrendValue | None) -> str:
+    if other is None:
+        return 'write measure = "velocity_rms", or setpoints in place of zones'
+    if same_unit(other.unit, "mm/s"):
+        return f'write unit = "mm/s" for "{other.name}"'
+    return "give it an alarm of its own, with setpoints in place of zones"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from drivers import questions as q
@@ -135,7 +137,7 @@ class _ModbusQuestions(BusQuestions):
     def questions(self, answers: Answers, folder: Path) -> Iterator[Question]:
         """See `BusQuestions.questions`."""
         del folder
-        yield from self._line()
+        yield from self._line(answers)
         yield self.ask("unit", q.whole, "1")
         yield self.choose("way", _WAYS, "values")
         way = answers["way"]
@@ -191,13 +193,14 @@ class _ModbusQuestions(BusQuestions):
         types, orders = dict.fromkeys(REGISTERS, ""), dict.fromkeys(("ABCD", "CDAB", "BADC", "DCBA"), "")
         following = f"{self._next_address(answers, channel)}"
         yield self.ask_of(channel, "address", q.whole, following, doubt=_doubt)
-        temperature = "temp" in channel.lower()
-        default = "int16" if temperature else "uint16"
+        unit = _unit(channel)
+        default = "int16" if unit == "degC" else "uint16"
         yield self.ask_of(channel, "register-type", q.one_of(types), default, choices=types)
         wide = answers[sensor_key(channel, "register-type")].endswith("32")
         yield self.ask_of(channel, "order", q.exactly(orders), "ABCD", choices=orders, quiet=not wide)
         is_float = answers[sensor_key(channel, "register-type")].startswith("float")
-        yield self.ask_of(channel, "scale", q.number, "1" if is_float else "0.1" if temperature else "0.01")
+        scale = "1" if is_float else {"degC": "0.1", "mm/s": "0.01"}.get(unit, "1")
+        yield self.ask_of(channel, "scale", q.number, scale)
 
     def _next_address(self, answers: Answers, channel: str) -> int:
         """Behind the registers of all channels before."""
@@ -219,7 +222,7 @@ class _ModbusQuestions(BusQuestions):
         """See `BusQuestions.guess`."""
         if answers["way"] != "values":
             return ("accelerometer" if answers["rate"] >= WAVEFORM_HZ else "trend"), None
-        return "trend", "degC" if "temp" in channel.lower() else "mm/s"
+        return "trend", _unit(channel)
 
     def tables(self, answers: Answers) -> Iterator[str]:
         """See `BusQuestions.tables`."""
@@ -275,6 +278,12 @@ class _ModbusQuestions(BusQuestions):
             yield entry("acknowledge", answers["acknowledge"], "is told how far the queue was read")
 
     def _registers(self, answers: Answers) -> Iterator[str]:
+        runs = sorted(
+            (answers[sensor_key(name, "address")], _width(answers[sensor_key(name, "register-type")]))
+            for name in answers["channels"]
+        )
+        if any(before + width < after for (before, width), (after, _) in pairwise(runs)):
+            yield entry("max_gap", 0, "registers between are not read: the device may not have them")
         yield "# value = raw * scale, in the unit of the sensor below"
         tables = []
         for name in answers["channels"]:
@@ -282,7 +291,7 @@ class _ModbusQuestions(BusQuestions):
             tables.append({"name": name} | {k: answers[sensor_key(name, t)] for k, t in keys.items()})
         yield from array("channels", tables)
 
-    def _line(self) -> Iterator[Question]:
+    def _line(self, answers: Answers) -> Iterator[Question]:
         """What is asked about the line that the unit is on."""
         raise NotImplementedError
 
@@ -297,22 +306,27 @@ class TcpQuestions(_ModbusQuestions):
     about = "Modbus TCP"
     listens_behind = "tcp-port"
     topics: ClassVar[Mapping[str, Topic]] = {
-        "host": Topic("Address of the Modbus device", "An IP address or a host name, without http://."),
+        "host": Topic(
+            "Address of the Modbus device",
+            "An IP address or a host name, without http://. Its port is 502 unless it stands behind: "
+            "192.0.2.20:5020.",
+        ),
         "tcp-port": Topic("TCP port of the Modbus device", "Nearly always 502."),
         **_ModbusQuestions.topics,
     }
 
-    def _line(self) -> Iterator[Question]:
+    def _line(self, answers: Answers) -> Iterator[Question]:
         yield self.ask("host", q.line)
-        yield self.ask("tcp-port", q.whole, "502", quiet=True)
+        yield self.ask("tcp-port", q.whole, _host_and_port(answers["host"])[1], quiet=True)
 
     def _sniffed_as(self, answers: Answers) -> Sequence[str]:
-        host = f"[{answers['host']}]" if ":" in answers["host"] else answers["host"]
+        host, _ = _host_and_port(answers["host"])
+        host = f"[{host}]" if ":" in host else host
         return ["--function", "both", "--", f"{host}:{answers['tcp-port']}"]
 
     def _line_keys(self, answers: Answers) -> Iterator[str]:
         yield entry("transport", "tcp")
-        yield entry("host", answers["host"])
+        yield entry("host", _host_and_port(answers["host"])[0])
         yield entry("tcp_port", answers["tcp-port"])
 
 
@@ -326,7 +340,8 @@ class RtuQuestions(_ModbusQuestions):
         **_ModbusQuestions.topics,
     }
 
-    def _line(self) -> Iterator[Question]:
+    def _line(self, answers: Answers) -> Iterator[Question]:
+        del answers
         yield self.ask("port", q.line, only_port())
         yield self.ask("baud", q.whole, "19200")
         yield self.choose("parity", dict.fromkeys(("none", "even", "odd"), ""), "even")
@@ -348,6 +363,29 @@ class RtuQuestions(_ModbusQuestions):
         yield entry("baud", answers["baud"], "bit/s, as the device is set")
         yield entry("parity", answers["parity"])
         yield entry("stop_bits", 1)
+
+
+_HOST_AND_PORT = re.compile(r"(\[[^\]]*\]|[^:\[\]]+):(\d+)")
+
+
+def _host_and_port(text: str) -> tuple[str, str]:
+    """The host and the port of an address, as the sniffer takes it too; 502 if no port stands there."""
+    both = _HOST_AND_PORT.fullmatch(text)
+    return (text, "502") if both is None else (both[1].strip("[]"), both[2])
+
+
+_NAMED_BY_ADDRESS = re.compile(r"[a-z]+\d+", re.IGNORECASE)
+"""Channels that are called like registers, as those found on the line: what they mean is not known."""
+_UNIT_OF = {"temp": "degC", "speed": "rpm", "rpm": "rpm", "curr": "A", "volt": "V", "press": "bar"}
+"""Unit by what a name begins with, or has behind a dash; any other name is that of a vibration."""
+
+
+def _unit(channel: str) -> str:
+    """The unit that a value with this name has, as a rule."""
+    if _NAMED_BY_ADDRESS.fullmatch(channel):
+        return "count"
+    found = (unit for word, unit in _UNIT_OF.items() if word in channel.lower())
+    return next(found, "mm/s")
 
 
 def _width(raw_type: str) -> int:

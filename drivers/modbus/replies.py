@@ -42,7 +42,10 @@ EXCEPTIONS = {
 }
 
 REMEDIES = {
-    **dict.fromkeys((1, 2, 3), "compare the register map of the device with the layout"),
+    1: "see whether the device has the other table: holding or input registers",
+    2: "compare address and table with the register map of the device; what a map that begins at 1 calls "
+    "101 is address 100 here",
+    3: "let a request read less (max_count), or compare the register map of the device with the layout",
     4: "see to the device",
     5: "it takes longer than a reply may; lower the rate of what is read from it",
     6: "it is at something else; lower the rate of what is read from it",

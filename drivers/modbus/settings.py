@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeAlias
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field
 from pydantic_core import PydanticCustomError
 
-from daqsvc.errors.buses import RING_DEPTH
+from daqsvc.errors.buses import MANUALS_NUMBER, RING_DEPTH
 from daqsvc.settings.addresses import DevicePath, Host, serial_port
 from daqsvc.settings.buses import Block, Bus, Device, Layout, WireRange
 from daqsvc.settings.packing import Scale  # noqa: TC001 - pydantic reads the annotations
@@ -32,7 +32,28 @@ FIFO_REGISTERS = 31
 
 RegisterType = Literal["int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64"]
 Order = Literal["ABCD", "CDAB", "BADC", "DCBA"]
-Address = Annotated[int, Field(ge=0, le=65_535)]
+_LAST_ADDRESS = 65_535
+_MANUALS_LONG = (300_001, 400_001)
+"""What manuals with six digits call the first input register and the first holding register."""
+
+
+def _on_the_line(address: Any) -> Any:
+    """An address of six digits is one of a manual: there are none so large."""
+    if isinstance(address, int):
+        for first in _MANUALS_LONG:
+            if first <= address <= first + _LAST_ADDRESS:
+                raise PydanticCustomError(
+                    "manuals_number",
+                    f"looks like a number of the manual, where registers begin at {first}",
+                    {
+                        "remedy": f"write {address - first}, as registers begin at 0 here",
+                        "code": MANUALS_NUMBER,
+                    },
+                )
+    return address
+
+
+Address = Annotated[int, Field(ge=0, le=_LAST_ADDRESS), BeforeValidator(_on_the_line)]
 UnitAddress = Annotated[int, Field(ge=0, le=255)]
 Table = Literal["holding", "input"]
 CountBits = Literal[16, 32]

@@ -21,8 +21,8 @@ from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.acquisition.timebase import RECENT_DELAYS, TimeBaseState
 from daqsvc.errors.buses import REGISTER_REFUSED
 from daqsvc.errors.code import coded
-from drivers.modbus.reading import PollingReader
-from drivers.modbus.registers import RegisterRecord, run_of
+from drivers.modbus.reading import PollingReader, streams_in_words
+from drivers.modbus.registers import RegisterRecord, RunLimits, plan_runs, run_of
 from drivers.modbus.replies import FUNCTIONS, NoReplyError, RequestRefusedError
 
 if TYPE_CHECKING:
@@ -63,10 +63,15 @@ class _Failure(NamedTuple):
     takers: frozenset[_TrendStream]
 
     @property
-    def of_sharing(self) -> bool:
-        """Whether the unit may have each stream's registers, and not all that lies between them."""
+    def of_merging(self) -> bool:
+        """Whether the unit may have all registers that are wanted, and not all that lies between them."""
         refused = isinstance(self.error, RequestRefusedError) and self.error.code in REFUSALS_OF_REGISTERS
-        return refused and len(self.takers) > 1
+        return refused and (self.of_sharing or any(self.run not in one.bare_runs for one in self.takers))
+
+    @property
+    def of_sharing(self) -> bool:
+        """Whether several streams have registers in the request."""
+        return len(self.takers) > 1
 
     @property
     def in_words(self) -> NoReplyError | RequestRefusedError:
@@ -97,6 +102,9 @@ class _TrendStream:
         self.counters = StreamCounters()
         self._record = RegisterRecord.of(spec.layout)
         self.own_runs = self._record.runs
+        bare = replace(RunLimits.of(spec.layout), max_gap=0)
+        self.bare_runs = plan_runs(map(run_of, spec.layout.channels), bare)
+        """As `own_runs`, but without any register that nobody wants."""
         self._deliver = port.deliver
         self._period_ns = NS_PER_S / spec.rate_hz
         self._places: tuple[int, ...] = ()
@@ -206,13 +214,12 @@ class TrendReader(PollingReader):
         self._without_sample: Sequence[str] = ()
         self._streams = [_TrendStream(spec, port) for spec in specs]
         self._shared = runs
+        self._bare: set[_TrendStream] = set()
+        """Streams of which nothing is read but their own registers."""
         self._apart_ns = APART_NS
         self._together_at_ns: int | None = None
-        """When the streams, now read apart, are tried together again."""
-        if runs is None:
-            self._read_apart()
-        else:
-            self._read_together(runs)
+        """When what is read apart now is tried together again."""
+        self._read_together()
 
     @property
     def streams(self) -> Mapping[str, tuple[StreamCounters, TimeBaseState]]:
@@ -227,10 +234,10 @@ class TrendReader(PollingReader):
     async def _look(self, line: ModbusLine) -> None:
         slot = await self._wait_for_slot(line)
         now_ns = self._clock.monotonic_ns()
-        if self._shared and self._together_at_ns is not None and now_ns >= self._together_at_ns:
-            self._read_together(self._shared)
+        if self._together_at_ns is not None and now_ns >= self._together_at_ns:
+            self._read_together()
         readings, failure = await self._ask(line)
-        if failure is not None and failure.of_sharing:
+        while failure is not None and failure.of_merging:
             self._part(failure)
             readings, failure = await self._ask(line)
         self._append(slot, readings)
@@ -267,17 +274,22 @@ class TrendReader(PollingReader):
             stream.append(self._done, self._start_ns, readings)
 
     def _part(self, failure: _Failure) -> None:
-        """Read the streams apart: the unit has not all that they share. Sooner or later try again."""
+        """Ask for less at once: the unit has not all that lies between. Sooner or later try again."""
+        what = "each stream is polled by itself"
+        if not failure.of_sharing:
+            self._bare |= failure.takers
+            what = "the registers between those of the channels are left out"
         self._read_apart()
         self._together_at_ns = self._clock.monotonic_ns() + self._apart_ns
         self._apart_ns = min(2 * self._apart_ns, APART_MOST_NS)
         if (message := f"{failure.error} ({_words(failure.run)})") not in self._said:
             self._said.add(message)
             logger.warning(
-                "%s: %s; each stream is polled by itself, and they are tried together only now and then. A "
-                "smaller max_gap, or forbidden, avoids it from the start",
-                self._who,
+                "%s: %s; from now on %s, and the whole request is tried only now and then. A smaller "
+                "max_gap, or forbidden, avoids it from the start",
+                streams_in_words(sorted(stream.name for stream in failure.takers)),
                 message,
+                what,
                 extra=coded(REGISTER_REFUSED),
             )
 
@@ -287,16 +299,23 @@ class TrendReader(PollingReader):
     async def _pause_after_failure(self) -> None:
         """The schedule itself is the pause."""
 
-    def _read_together(self, runs: Sequence[RegisterRun]) -> None:
+    def _read_together(self) -> None:
+        """Read what all streams share, or what each may read at once."""
         self._together_at_ns = None
-        self._read_from(runs, {stream: stream.places_in(runs) for stream in self._streams})
+        self._bare.clear()
+        if self._shared is None:
+            self._read_apart()
+        else:
+            runs = self._shared
+            self._read_from(runs, {stream: stream.places_in(runs) for stream in self._streams})
 
     def _read_apart(self) -> None:
         runs: list[RegisterRun] = []
         places = {}
         for stream in self._streams:
-            places[stream] = range(len(runs), len(runs) + len(stream.own_runs))
-            runs += stream.own_runs
+            own = stream.bare_runs if stream in self._bare else stream.own_runs
+            places[stream] = range(len(runs), len(runs) + len(own))
+            runs += own
         self._read_from(runs, places)
 
     def _read_from(self, runs: Sequence[RegisterRun], places: Mapping[_TrendStream, Sequence[int]]) -> None:
@@ -331,4 +350,4 @@ class TrendReader(PollingReader):
 
 
 def _words(run: RegisterRun) -> str:
-    return f"registers {run.address} to {run.end - 1}"
+    return f"register {run.address}" if run.count == 1 else f"registers {run.address} to {run.end - 1}"

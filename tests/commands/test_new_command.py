@@ -225,12 +225,8 @@ def test_answers_of_a_file_are_those_of_the_options(tmp_path, capsys):
     assert layout["unit"] == 4
     assert [(one["address"], one["scale"]) for one in layout["channels"]] == [(17, 0.01), (32, 0.001)]
     assert [alarm.alert for alarm in machine.alarms] == [7.1, 7.1]
-    # Of a velocity the range that is offered is not that of a temperature, and can be taken as it is.
-    offered = file.read_text(encoding="utf-8").replace(
-        "# ok_between = [0.0, 65.0]", "ok_between = [0.0, 65.0]"
-    )
-    assert offered.count("\nok_between") == 2
-    file.write_text(offered, encoding="utf-8")
+    # A velocity that no machine has is not believed.
+    assert [sensor.ok_between for sensor in machine.sensors] == [(-1.0, 100.0)] * 2
     assert main(["check", f"{file}"]) == 0
 
 
@@ -366,6 +362,45 @@ def test_at_a_terminal_it_explains_asks_again_and_takes_defaults(tmp_path):
     machine = load_machine_file(tmp_path / "pump.toml")
     assert [(alarm.alert, alarm.danger) for alarm in machine.alarms] == [(50.0, 75.0), (50.0, 75.0)]
     assert (tmp_path / "pump-3.toml").read_text() == "mine"
+
+
+def test_a_wrong_answer_is_corrected_by_going_back(tmp_path):
+    terminal = Terminal(tmp_path, "pump.toml")
+    terminal.until("[virtual]: ")
+    terminal.type("<")
+    terminal.until("this is the first question")
+    terminal.until("[virtual]: ")
+    terminal.type("modbus-tcp")
+    terminal.until("[machine]: ")
+    terminal.type("<")
+    terminal.until("[virtual]: ")
+    terminal.type("modbus-tcp")
+    terminal.until("[machine]: ")
+    terminal.type("Pmup")
+    terminal.until(" : ")  # the host
+    terminal.type("<")
+    terminal.until("[machine]: ")
+    terminal.type("Pump")
+    terminal.until(" : ")
+    terminal.type("127.0.0.1:5020")
+    terminal.until("[1]: ")
+    terminal.type("")
+    terminal.until("[values]: ")
+    terminal.type("")
+    terminal.until("[holding]: ")
+    terminal.type("")
+    terminal.until("[vibration, temperature]: ")
+    terminal.type("speed")
+    terminal.until("[1480]: ")
+    for _ in range(12):
+        terminal.type("")
+    terminal.rest()
+    text = (tmp_path / "pump.toml").read_text()
+    machine = load_machine_file(tmp_path / "pump.toml")
+    assert machine.machine.name == "pump"
+    assert "tcp_port = 5020" in text
+    assert 'host = "127.0.0.1"' in text
+    assert machine.sensors[0].unit == "rpm"
 
 
 def test_a_file_of_the_command_line_that_is_there_is_asked_about_first(tmp_path):

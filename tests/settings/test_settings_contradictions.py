@@ -423,6 +423,40 @@ def test_the_number_of_a_manual_in_place_of_an_address_is_a_warning(address, mea
     assert f"{warning}".endswith("[B26]")
 
 
+@pytest.mark.parametrize(("address", "meant"), [(400_001, 0), (400_101, 100), (300_002, 1)])
+def test_a_number_of_six_digits_of_a_manual_is_no_address(address, meant):
+    channels = f'{{ name = "a", address = {address}, type = "int16" }}'
+    ((key, problem),) = outcome(registers(channels))[0].items()
+    assert key == "streams.s.layout.channels[0].address"
+    assert f"write {meant}, as registers begin at 0" in problem.remedy
+    assert f"{problem}".endswith("[B26]")
+
+
+@pytest.mark.parametrize(
+    ("word", "meant"), [("float", "float32"), ("int", "int32"), ("uint", "uint32"), ("INT16", "int16")]
+)
+def test_a_type_without_its_width_is_the_commonest_one(word, meant):
+    ((_, problem),) = outcome(registers(f'{{ name = "a", address = 0, type = "{word}" }}'))[0].items()
+    assert problem.remedy == f'did you mean "{meant}"?'
+
+
+def test_a_byte_order_in_lower_case_is_recognised():
+    channels = '{ name = "a", address = 0, type = "float32", order = "cdab" }'
+    ((_, problem),) = outcome(registers(channels))[0].items()
+    assert problem.remedy == 'did you mean "CDAB"?'
+
+
+@pytest.mark.parametrize("samples", [15, 16])
+def test_a_block_that_is_shorter_than_the_velocity_needs_is_a_warning(samples):
+    text = waveform(samples=samples).replace('type = "trend"', 'type = "velocity"')
+    _, warnings = outcome(f"{text}[pipeline.levels]\nvelocity_band_hz = [12.5, 40.0]\n")
+    found = warnings.get("streams.s.layout")
+    assert (found is not None) == (samples == 15)
+    if found is not None:
+        assert "blocks of 15 samples are 0.15 s long. That is 1.88 periods of 12.5 Hz" in found.message
+        assert "have the device take 16 samples or more" in found.remedy
+
+
 @pytest.mark.parametrize("address", [17, 30000, 40000, 50000])
 def test_other_addresses_are_taken_as_they_are(address):
     assert outcome(registers(f'{{ name = "a", address = {address}, type = "int16" }}')) == ({}, {})

@@ -26,14 +26,17 @@ if TYPE_CHECKING:
     from drivers.questions import Answers, Question
 
 
+_HOW_TO_ANSWER = "Enter takes what is in brackets, ? explains, < goes back, Ctrl-C ends and writes nothing.\n"
+
+
 class NewCommand:
     """``daqsvc new [FILE]``."""
 
     help = "write a first machine file: asks a few questions"
     description = (
         "Ask a few questions about a machine and write a machine file, with comments, that daqsvc check "
-        "accepts. Enter takes the default, ? explains a question, Ctrl-C ends and writes nothing. Every "
-        "answer is an option as well: with all of them, or with --yes, nothing is asked."
+        "accepts. Enter takes the default, ? explains a question, < goes back, Ctrl-C ends and writes "
+        "nothing. Every answer is an option as well: with all of them, or with --yes, nothing is asked."
     )
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
@@ -85,7 +88,7 @@ class NewCommand:
             given = Given(_given(arguments), arguments.yes)
             target.see()
             if ask is not None:
-                _say("Enter takes what is in brackets, ? explains, Ctrl-C ends and writes nothing.\n")
+                _say(_HOW_TO_ANSWER)
             listen = partial(_heard, target.folder) if arguments.listen else None
             answers = conduct(
                 target.file, given, ask, lambda reason: _say(f"  {reason}"), listen, target.named
@@ -214,7 +217,13 @@ def _typed(value: Any) -> str:
 
 
 def _ask(question: Question) -> str:
-    """What a person types; ``?`` is answered with help."""
+    """What a person types; ``?`` is answered with help.
+
+    Raises:
+        BackError: ``<`` was typed.
+    """
+    from daqsvc.commands.new.interview import BackError  # noqa: PLC0415 - slow to import
+
     bracket = "" if question.default is None else f" [{question.default}]"
     _say(question.topic.text)
     width = max(map(len, question.choices or [""]))
@@ -227,6 +236,8 @@ def _ask(question: Question) -> str:
         text = input(f" {options}{bracket}: ").strip()
         if text == "?":
             _say(f"  {question.topic.help}")
+        elif text == "<":
+            raise BackError
         elif text:
             return text
         elif question.default is not None:

@@ -59,32 +59,85 @@ def conduct(
     Raises:
         AnswerError: what was given cannot be used, or something is missing.
     """
-    answers: Answers = {}
-    asked: list[str] = []
-    heard: Heard | None = None
-    for plain in questions(answers, file.parent):
-        question = plain if heard is None else _offered(plain, heard, answers, file)
-        asked.append(question.key)
-        if question.key in given.texts:
-            reason = take(question, given.texts[question.key], answers, file)
+    interview = _Interview(file, given, ask, say, listen, answered)
+    while not interview.is_over():
+        pass
+    _refuse_others(given, interview.asked)
+    return interview.answers
+
+
+class BackError(Exception):
+    """A person wants to correct the answer before."""
+
+
+class _Interview:
+    """Questions and answers so far; see `conduct`."""
+
+    def __init__(
+        self,
+        file: Path,
+        given: Given,
+        ask: Callable[[Question], str] | None,
+        say: Callable[[str], None],
+        listen: Callable[[BusQuestions, Answers], Heard | None] | None,
+        answered: Callable[[Question, Answers], None] | None,
+    ) -> None:
+        self.answers: Answers = {}
+        self.asked: list[str] = []
+        self._file, self._given = file, given
+        self._ask, self._say, self._listen, self._answered = ask, say, listen, answered
+        self._typed: list[str] = []
+        """Keys of what a person has answered, the last one last."""
+        self._heard: Heard | None = None
+
+    def is_over(self) -> bool:
+        """Ask what is not answered yet; False if a person goes back, and the rest must be asked anew."""
+        self.asked = []
+        try:
+            for question in questions(self.answers, self._file.parent):
+                self.asked.append(question.key)
+                if question.key not in self.answers:
+                    self._take(question)
+        except BackError:
+            self._go_back()
+            return False
+        return True
+
+    def _take(self, plain: Question) -> None:
+        question = plain
+        if self._heard is not None:
+            question = _offered(plain, self._heard, self.answers, self._file)
+        key, texts = question.key, self._given.texts
+        if key in texts:
+            reason = take(question, texts[key], self.answers, self._file)
             if reason is not None:
-                raise AnswerError(f"{option(question.key)} {given.texts[question.key]}: {reason}")
-        elif question.default is not None and (given.defaults or question.quiet):
-            reason = take(question, question.default, answers, file)
+                raise AnswerError(f"{option(key)} {texts[key]}: {reason}")
+        elif question.default is not None and (self._given.defaults or question.quiet):
+            reason = take(question, question.default, self.answers, self._file)
             if reason is not None:
-                raise AnswerError(
-                    f"{option(question.key)} must be given: {question.default} does not do: {reason}"
-                )
-        elif ask is None:
+                raise AnswerError(f"{option(key)} must be given: {question.default} does not do: {reason}")
+        elif self._ask is None:
             raise AnswerError(_missing(question))
         else:
-            _answer(question, ask, say, answers, file)
-        if answered is not None:
-            answered(question, answers)
-        if listen is not None and question.key == bus_of(answers).listens_behind:
-            heard = listen(bus_of(answers), answers)
-    _refuse_others(given, asked)
-    return answers
+            _answer(question, self._ask, self._say, self.answers, self._file)
+            self._typed.append(key)
+        if self._answered is not None:
+            self._answered(question, self.answers)
+        bus = bus_of(self.answers)
+        if self._listen is not None and key == bus.listens_behind:
+            self._heard = self._listen(bus, self.answers)
+
+    def _go_back(self) -> None:
+        """Forget the last answer of a person, and what was taken by itself behind it."""
+        if not self._typed:
+            self._say("this is the first question")
+            return
+        listens_behind = bus_of(self.answers).listens_behind
+        keys = list(self.answers)
+        for key in keys[keys.index(self._typed.pop()) :]:
+            del self.answers[key]
+        if listens_behind not in self.answers:
+            self._heard = None
 
 
 def _answer(

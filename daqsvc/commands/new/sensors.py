@@ -238,9 +238,19 @@ def sensor_tables(answers: Answers) -> Iterator[str]:
             yield entry("hysteresis_v", 0.5)
             yield entry("edge", "rising", 'or "falling": the edge that marks angle zero')
         if sensor.type == "trend":
-            between = "0.0, 65.0" if sensor.unit == "mm/s" else "-40.0, 105.0"
-            yield f"# ok_between = [{between}]    # what it can measure; beyond, it is not believed"
+            yield from _ok_between(sensor, answers)
         yield ""
+
+
+def _ok_between(sensor: Sensor, answers: Answers) -> Iterator[str]:
+    """What the sensor can measure: by it a wrong type, order or scale is found, and a broken sensor."""
+    about = "beyond, it is not believed; see its manual"
+    usual = {"mm/s": (-1.0, 100.0), "degC": (-40.0, 150.0)}.get(sensor.unit)
+    own = [answers[key] for key in ("alert", "danger") if key in answers]
+    if usual is None or any(not usual[0] < limit < usual[1] for limit in own):
+        yield f"# ok_between = [0.0, 100.0]    # what it can measure; {about}"
+    else:
+        yield entry("ok_between", list(usual), f"what it can measure; {about}")
 
 
 def pipeline_tables(answers: Answers) -> Iterator[str]:

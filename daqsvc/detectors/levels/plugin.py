@@ -347,10 +347,26 @@ def _velocity_band(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
 
 def _lowest_frequency(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
     """A window holds the lowest frequency of the velocity band: below, the mean value leaks into it."""
-    if not any(sensor.type in {"accelerometer", "velocity"} for sensor in draft.sensors):
-        return
+    streams = dict.fromkeys(one.stream for one in draft.sensors if one.type in {"accelerometer", "velocity"})
     low_hz, window_s = levels.velocity_band_hz[0], levels.window_s
-    if low_hz * window_s < _LEAST_PERIODS:
+    blocks = {name: draft.streams[name].layout.block for name in streams if name in draft.streams}
+    for name, block in blocks.items():
+        if block is None:
+            continue
+        block_s = block.samples / draft.streams[name].rate_hz
+        if low_hz * block_s < _LEAST_PERIODS:
+            begin_hz = rounded_up(_LEAST_PERIODS / block_s)
+            needed = math.ceil(_LEAST_PERIODS / low_hz * draft.streams[name].rate_hz)
+            yield Finding(
+                ("streams", name, "layout"),
+                f"its blocks of {block.samples} samples are {block_s:.3g} s long. That is "
+                f"{low_hz * block_s:.3g} periods of {low_hz:g} Hz, the lowest frequency of velocity_band_hz: "
+                "the velocity RMS is too low, or that of the mean value",
+                f"have the device take {needed} samples or more, or begin the band at {begin_hz} Hz",
+                fatal=False,
+                code=WINDOW_TOO_SHORT,
+            )
+    if any(block is None for block in blocks.values()) and low_hz * window_s < _LEAST_PERIODS:
         yield Finding(
             ("pipeline", "levels", "window_s"),
             f"{window_s:g} s hold {low_hz * window_s:.3g} periods of {low_hz:g} Hz, the lowest frequency of "

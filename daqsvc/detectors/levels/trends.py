@@ -32,6 +32,12 @@ VALUE = "value"
 """The one measure of a trend value."""
 
 
+LEAST_RMS_MM_S = 1.0
+"""A velocity RMS so far below 0 is no offset of an analogue input."""
+MOST_RMS_MM_S = 1000.0
+"""A hundred times where zone D begins: no machine stands that, and few sensors measure it."""
+
+
 @dataclass(frozen=True, slots=True)
 class TrendChannel:
     """One trend value as its detector sees it.
@@ -151,7 +157,7 @@ class TrendDetector:
             return self._missing(channel, evidence, reason)
         self._missed[channel.sensor] = 0
         misread = self._misread[channel.sensor].update(known)
-        if wrong := misread or beyond_any_value(known):
+        if wrong := misread or beyond_any_value(known) or _no_rms(channel, known):
             reason = f"{channel.sensor} {wrong}; {channel.remedy}"
             share = 1.0 - len(known) / len(samples)
             return self._statements.state(
@@ -193,6 +199,19 @@ def _bounds(value: float, known: NDArray[np.float32], missing: int) -> Bounds:
 def _as_read(known: NDArray[np.float32]) -> float:
     """The average to the seven digits of float32: 2.8 must reach a limit of 2.8, and 2.79999995 is less."""
     return float(f"{known.mean(dtype=np.float64):.7g}")
+
+
+def _no_rms(channel: TrendChannel, known: NDArray[np.float32]) -> str:
+    """Why values are no velocity RMS of a machine, in a clause; empty if they may be, or are something else.
+
+    Only where zones of a standard say that it is one: such a value is never negative, and never so large.
+    """
+    if all(limits.zones is None for limits in channel.limits):
+        return ""
+    worst = float(known[np.argmax(np.abs(known))])
+    if worst < -LEAST_RMS_MM_S or worst > MOST_RMS_MM_S:
+        return f"reads {worst:.4g} {channel.unit}, which is no velocity RMS of a machine"
+    return ""
 
 
 def _beyond_ok(channel: TrendChannel, known: NDArray[np.float32]) -> str:

@@ -477,6 +477,11 @@ class MqttPublisher(Output):
         if self._quick_losses == SUSPICIOUS_LOSSES:
             how = f"{SUSPICIOUS_LOSSES} connections have broken at once, perhaps because of another client"
             self._report_rival(how, error)
+        if self._quick_losses >= SUSPICIOUS_LOSSES:
+            self.reason = (
+                f"{self.reason}; perhaps another client has client_id {self._settings.client_id!r}, too"
+            )
+            self.code = CLIENT_ID_TAKEN
         self._report_outage(error)
 
     def _calm_down(self, of_use_s: float) -> None:

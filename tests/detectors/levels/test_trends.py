@@ -73,6 +73,21 @@ def test_a_value_that_no_sensor_measures_is_not_judged(value, rate_hz):
     assert (after.quality, after.decision) == ("good", "danger")
 
 
+@pytest.mark.parametrize("value", [-3411.0, 1.066e9, -1.5])
+def test_a_value_that_is_no_velocity_of_a_machine_is_not_judged_by_zones(value):
+    zones = Limits("value", 2.8, 4.5, zones=(1.4, 2.8, 4.5))
+    subject = detector(unit="mm/s", limits=[zones], number_keys="order and type")
+    said = subject.process(window([3.0, value, -0.5, 900.0]))
+    assert [one.quality for one in said] == ["good", "not_ok", "good", "good"]
+    assert said[1].reason == (
+        f"oil reads {np.float32(value):.4g} mm/s, which is no velocity RMS of a machine; "
+        "correct order and type of its channel in the layout, or its scale or unit"
+    )
+    # What zones do not call a velocity may be anything.
+    other = detector(unit="mm/s", limits=[Limits("value", 2.8, 4.5)])
+    assert other.process(window([value]))[0].quality == "good"
+
+
 def swapped(values):
     """What is read of floats in two registers with the words exchanged."""
     return np.array(values, np.float32).view(np.uint16).reshape(-1, 2)[:, ::-1].copy().view(np.float32)[:, 0]

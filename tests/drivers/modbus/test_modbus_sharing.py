@@ -159,6 +159,31 @@ def test_a_unit_that_has_not_what_lies_between_is_asked_by_stream(caplog):
     )
 
 
+def test_a_unit_that_has_not_what_lies_between_the_registers_of_one_stream_is_asked_for_less(caplog):
+    streams = {"pump": (trend([16, 20, 22]), 10.0)}
+    with caplog.at_level(logging.WARNING):
+        rig = watched(streams, without_register(18), 3.0)
+    assert rig.driver.counters.exceptions == {"illegal data address": 1}
+    assert (rig.samples("pump") == [1016, 1020, 1022]).all()
+    assert rig.counters("pump").samples_received == pytest.approx(30, abs=1)
+    assert rig.counters("pump").samples_lost == 0
+    (said,) = [record.message for record in caplog.records]
+    assert said.startswith(
+        "stream 'pump': unit 1 refuses function 3: illegal data address (registers 16 to 22)"
+    )
+    assert "the registers between those of the channels are left out" in said
+
+
+def test_a_register_of_its_own_that_is_refused_is_named_alone(caplog):
+    streams = {"pump": (trend([16, 18]), 1.0)}
+    with caplog.at_level(logging.WARNING):
+        rig = watched(streams, without_register(18), 30.0)
+    assert rig.counters("pump").samples_received == 0
+    assert caplog.records[-1].message.startswith(
+        "stream 'pump': unit 1 refuses function 3: illegal data address (register 18)"
+    )
+
+
 def test_streams_that_were_parted_are_tried_together_again():
     """A gateway that refused everything while it started is asked once for both, as before."""
     streams = {"one": (trend([16]), 1.0), "other": (trend([20]), 1.0)}
@@ -187,9 +212,7 @@ def test_who_is_refused_for_good_is_named_alone_and_costs_the_others_nothing(cap
     assert rig.counters("b").samples_received == 0
     parted, refused = [record.message for record in caplog.records]
     assert parted.startswith("streams 'a', 'b' and 'c': unit 1 refuses function 3: illegal data address")
-    assert refused.startswith(
-        "stream 'b': unit 1 refuses function 3: illegal data address (registers 18 to 18)"
-    )
+    assert refused.startswith("stream 'b': unit 1 refuses function 3: illegal data address (register 18)")
 
 
 def test_a_refusal_that_says_nothing_of_the_registers_leaves_them_together():

@@ -20,7 +20,7 @@ from support.modbus_lines import Rig, options_of, responding, simulate
 from daqsvc.acquisition import link as supervision
 from daqsvc.acquisition.clock import NS_PER_S
 from drivers.modbus.line import Enquiry, RetryPolicy, UnitSetAsideError, UnitSilence
-from drivers.modbus.replies import READ_FIFO, WRITE_REGISTERS, ModbusCounters
+from drivers.modbus.replies import READ_FIFO, REMEDIES, WRITE_REGISTERS, ModbusCounters
 from sim_hw.nodes.modbus_node import PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit
 
@@ -234,12 +234,12 @@ def test_each_refusal_is_told_once_with_what_to_do_about_it(caplog):
 
     with caplog.at_level(logging.WARNING):
         simulate(main)
-    begin = "stream 'a': unit 1 refuses function 3: {} (registers 3 to 3), which is counted from now on; {}"
+    begin = "stream 'a': unit 1 refuses function 3: {} (register 3), which is counted from now on; {}"
     assert [record.message for record in caplog.records if "refuses" in record.message] == [
         begin.format(*told)
         for told in (
             ("server device busy", "it is at something else; lower the rate of what is read from it"),
-            ("illegal data address", "compare the register map of the device with the layout"),
+            ("illegal data address", REMEDIES[2]),
             ("exception 77", "look the exception up in the manual of the device"),
         )
     ]

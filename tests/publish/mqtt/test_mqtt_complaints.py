@@ -15,6 +15,7 @@ from support.mqtt_publishing import CLOCK, publishing
 from support.rogue_broker import PickyBroker, only_availability
 from support.waiting import PATIENCE_S, eventually
 
+from daqsvc.errors.outputs import CLIENT_ID_TAKEN
 from daqsvc.outbox.store import Outbox
 from daqsvc.publish.mqtt import credentials
 from daqsvc.publish.mqtt.delivery import IN_FLIGHT
@@ -138,6 +139,11 @@ async def test_availability_flaps_when_two_boxes_share_a_client_id(tmp_path, mos
         assert weary._backoff.ceiling_ns >= FIRST_RETRY_NS * 2**3
         weary._judge(11.0, OSError("lost"))
         assert weary._backoff.ceiling_ns >= FIRST_RETRY_NS * 2**3, "eleven seconds are no peace yet"
+        weary._quick_losses = SUSPICIOUS_LOSSES
+        weary._away(OSError("lost"))
+        weary._judge(0.1, OSError("lost"))
+        assert weary.reason.endswith("lost; perhaps another client has client_id 'daqsvc-test', too")
+        assert weary.code is CLIENT_ID_TAKEN
     await other.close()
 
 
