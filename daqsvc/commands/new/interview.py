@@ -91,7 +91,7 @@ class _Interview:
         self._heard: Heard | None = None
 
     def is_over(self) -> bool:
-        """Ask what is not answered yet; False if a person goes back, and the rest must be asked anew."""
+        """Ask what is not answered yet; False if a person goes back, and the rest must be asked again."""
         self.asked = []
         try:
             for question in questions(self.answers, self._file.parent):
