@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 
 LINES = 100
 LINE_EVERY_NS = NS_PER_S // 5
-"""So many events are logged one by one, and one more for each of these times that pass."""
+"""Events that are logged one by one; one more is allowed each time this period passes."""
 
 
 class AlarmLog:

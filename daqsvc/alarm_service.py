@@ -61,7 +61,7 @@ logger = logging.getLogger(__name__)
 
 TICK_NS = NS_PER_S
 REFUSED_TICKS = 60
-"""Refused commands that are only counted are written down so often."""
+"""How often the number of refused commands that are only counted is logged."""
 DISK_TICKS = 10
 """The disk fills slowly, and asking it may take long."""
 COMMIT_S = 5.0
@@ -73,8 +73,8 @@ SNAPSHOTS_NS = 600 * NS_PER_S
 """Commands that may wait at a time; further ones are refused."""
 GRACE_S = 0.1
 """What outputs may take beyond their deadline before they are left behind."""
-FORGOTTEN = "the journal was damaged and no longer knows how it stood; it begins anew"
-UNJOURNALLED = "the service ended while the journal could not be written; it begins anew"
+FORGOTTEN = "the journal was damaged and its state is lost; it begins again"
+UNJOURNALLED = "the service ended while the journal could not be written; it begins again"
 STOPPING = "the service is stopping; ask again when it runs"
 
 
@@ -101,7 +101,7 @@ class MadeOutputs(NamedTuple):
     Attributes:
         made: by the path of its table; each is to be run.
         conditions: see `OutputSet`.
-        outdated: likewise.
+        outdated: as above.
     """
 
     made: dict[str, Output]
@@ -119,7 +119,7 @@ class AlarmService:
         manager: the alarms of the machine; of several ones, those of the service itself.
         store: directory of the journal and the audit log.
         clock: the service's clock.
-        outputs: who is told; None keeps everything in the journal.
+        outputs: who gets the events; None keeps everything in the journal.
         others: the alarms of each machine, if there are several.
         limits: how much the journal may keep.
         buses: by name, what can be watched of each bus.
@@ -179,7 +179,7 @@ class AlarmService:
             stalls=stalls,
         )
         self.outputs = dict(asked.make(self._port))
-        """Who is told, by the path of its table; each is to be run by itself, until `stop`."""
+        """Who gets the events, by the path of its table; each is to be run by itself, until `stop`."""
         self._outdated = asked.outdated
         self._waiting_max = limits.alarms_waiting_max
         self._clock = clock
@@ -283,7 +283,7 @@ class AlarmService:
             gone: machines that are no longer watched; their alarms return to normal.
             buses: see `__init__`.
             active_detectors: see `resume`.
-            outputs: who is told from now on; to be run. None if the same as before are, which still do.
+            outputs: get the events from now on; to be run. None if the same as before are, which still do.
         """
         newest: dict[str, list[AlarmEvent]] = {}
         for (machine, _), event in self._newest.items():
@@ -316,7 +316,7 @@ class AlarmService:
         return self.outbox.counters.quarantined + self.outbox.counters.vanished
 
     def _forget(self, events: Iterable[AlarmEvent]) -> list[asyncio.Future[int]]:
-        """Say of alarms that nobody knows any more that they are normal: the broker shows how they stood.
+        """Say of alarms that are no longer known that they are normal: the broker shows how they stood.
 
         The broker has nothing about those that were never published.
         """
@@ -628,7 +628,7 @@ class AlarmService:
 
     async def _snapshot_outcome(self, command: SnapshotRequest, source: str) -> CommandOutcome:
         if self._snapshot is None:
-            return self._refuse("nobody makes snapshots here", COMMAND_REFUSED)
+            return self._refuse("this service makes no snapshots", COMMAND_REFUSED)
         why = f": {command.reason}" if command.reason else ""
         try:
             path = await self._snapshot(command.machine, f"asked for by {command.by} ({source}){why}")
@@ -694,7 +694,7 @@ class AlarmService:
         except AuditError as error:
             self.commands.unanswered_in_log += 1
             logger.error(  # noqa: TRY400 - the message says it all
-                "what came of command %s is not in the log: %s", entry, error, extra=coded(DISK_REFUSES)
+                "the result of command %s is not in the log: %s", entry, error, extra=coded(DISK_REFUSES)
             )
 
     async def _tell_refused(self) -> None:
@@ -747,7 +747,9 @@ class AlarmService:
         except OSError as error:
             if self._free_bytes is not None:
                 logger.error(  # noqa: TRY400 - the message says it all
-                    "nobody knows how full the disk of the journal is: %s", error, extra=coded(DISK_REFUSES)
+                    "it is not known how full the disk of the journal is: %s",
+                    error,
+                    extra=coded(DISK_REFUSES),
                 )
             self._free_bytes = None
 
@@ -758,7 +760,7 @@ class AlarmService:
     def _post(self, event: AlarmEvent) -> asyncio.Future[int]:
         self._log.say(event)
         committed = self._submit(event)
-        with self._supervisor.sparing_others("recorder", "it is not told of one alarm event"):
+        with self._supervisor.sparing_others("recorder", "it does not get one alarm event"):
             self._heard(event)
         return committed
 

@@ -42,7 +42,7 @@ PARTS = 8
 """Files that make up the quota: the one that is written is at most one part of it."""
 REFUSED_IN_FULL = 30
 REFUSED_EVERY_NS = 30 * NS_PER_S
-"""So many refused commands are written down one by one, and another one for each of these times that pass."""
+"""Refused commands that are logged one by one; one more is allowed each time this period passes."""
 SOURCES = 5
 """Sources that a count of refused commands names; the rest are the others."""
 OTHERS = "others"
@@ -159,7 +159,7 @@ class AuditLog:
         except OSError as error:
             raise AuditError(
                 f"the audit log {self.path} cannot be written: {error.strerror or error}; "
-                "no command is obeyed unless it can be written down: make room or correct its permissions"
+                "no command is carried out unless it can be logged: make room or correct its permissions"
             ) from error
 
 

@@ -113,7 +113,7 @@ def _of_the_box(files: Sequence[MachineFile]) -> Iterator[Problem]:
                 )
         name = file.machine.name
         if name == BOX:
-            words = "stands for the service itself where it watches several machines"
+            words = "is the name of the service itself if it watches several machines"
             yield _problem(file, ("machine", "name"), f'"{name}"', words, "choose another name")
         if name in names:
             words = f"is the name of the machine of {names[name].path} already"
@@ -129,7 +129,7 @@ def _tables_once(files: Sequence[MachineFile]) -> Iterator[Problem]:
         having = [file for file in files if getattr(file, key) is not None]
         for file in having[1:]:
             if getattr(file, key) != getattr(having[0], key):
-                words = f"is another one than that of {having[0].path}"
+                words = f"differs from that of {having[0].path}"
                 remedy = (
                     f"one box has one [{key}]: write it in one of the files only, or in all of them alike"
                 )

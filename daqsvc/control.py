@@ -128,7 +128,7 @@ class ControlRequest(CommandMessage):
     """What a person asks for.
 
     ``via`` is for the audit log: how the person has asked a program that passes it on, such as the page.
-    ``denied`` is why that program has found that the person may not: then it is written down, and refused.
+    ``denied`` is why that program has found that the person may not: then it is logged, and refused.
     """
 
     model_config = ConfigDict(populate_by_name=True)
@@ -382,7 +382,7 @@ class ControlServer:
                     except ControlError as error:
                         if self._refused != known:
                             log.error(  # noqa: TRY400 - the message says it all
-                                "no commands on this box until this is mended: %s",
+                                "no commands on this box until this is corrected: %s",
                                 error,
                                 extra=coded(CONTROL_SOCKET),
                             )
@@ -396,7 +396,7 @@ class ControlServer:
                 if not await asyncio.to_thread(_is_at, self.path, self._inode):
                     is_reported = True
                     log.warning(
-                        "the control socket %s was taken away; another one is made",
+                        "the control socket %s was removed; another one is made",
                         self.path,
                         extra=coded(CONTROL_SOCKET),
                     )
@@ -425,7 +425,7 @@ class ControlServer:
         else:
             self._refused = ""
             log.warning(
-                "the link %s to the control socket was taken away; it is made again",
+                "the link %s to the control socket was removed; it is made again",
                 link,
                 extra=coded(CONTROL_SOCKET),
             )
@@ -607,7 +607,7 @@ class ControlServer:
             if self._make_room_to_look(client.uid):
                 return looking
             looking.leave()
-            return _refused(f"{MOST_LOOKING} others look already; end one of them", NOT_ASKED)
+            return _refused(f"{MOST_LOOKING} others use live already; close one of them", NOT_ASKED)
         return _which_machine(machine, looking)
 
     async def _answer(self, line: bytes, source: str) -> ControlAnswer:
@@ -828,13 +828,13 @@ def _status_of(store: Path, machine: str | None, timeout_s: float) -> dict[str, 
         return tuple(f"{one}" for one in answer["machines"])
     if schema == _ANSWER:
         raise ControlError(
-            f"the daqsvc of {store} is of an older version, which does not tell its status: restart it"
+            f"the daqsvc of {store} is of an older version, which does not report its status: restart it"
         )
     return answer
 
 
 def _outcome(store: Path, line: bytes, timeout_s: float) -> ControlAnswer:
-    then = "whether it has obeyed, see daqsvc alarms"
+    then = "daqsvc alarms shows whether it was carried out"
     try:
         return ControlAnswer.model_validate_json(_asked(store, line, timeout_s, LONGEST_LINE, then))
     except ValidationError as error:
@@ -882,7 +882,7 @@ def _absence(store: Path) -> AbsentError:
         why = "it cannot make it on a read-only file system: mount it writable again, or ask over MQTT"
     else:
         why = (
-            f"it starts or stops, or it was taken away and is made again within {LOOK_S:g} s: try again "
+            f"it starts or stops, or the socket was removed and is made again within {LOOK_S:g} s: try again "
             "then; the service's log says why, if it cannot be made"
         )
     return UnreachableError(
@@ -960,7 +960,7 @@ def _bind(path: Path, link: Path | None) -> tuple[socket.socket, int]:
         made.close()
         raise ControlError(
             f"the control socket {path} cannot be made: {error.strerror or error}; "
-            "give the service a store that it may write in, on a file system that knows sockets"
+            "give the service a store that it may write in, on a file system that supports sockets"
         ) from error
     except BaseException:
         made.close()
@@ -994,7 +994,9 @@ def _leads(link: Path, path: Path) -> bool:
 def _check_free(path: Path) -> None:
     """Only a socket, or a link to one, may be replaced: it is left over from a service that was killed."""
     if path.exists() and not (path.is_symlink() or stat.S_ISSOCK(path.lstat().st_mode)):
-        raise ControlError(f"{path} is in the way of the control socket and is none; move it away")
+        raise ControlError(
+            f"{path} is not a socket, and no control socket can be made there; move it to another place"
+        )
 
 
 def _is_at(path: Path, inode: int | None) -> bool:

@@ -1,6 +1,6 @@
 """What passes of a machine, for who looks on: samples, statements, alarms. Nothing is made while nobody does.
 
-Who looks is told in lines of JSON. The first one is `LiveFeed.about`. Each further one has one key:
+A viewer gets lines of JSON. The first one is `LiveFeed.about`. Each further one has one key:
 ``samples`` (of a stream, base64 of float32), ``statement``, ``alarm``, ``standing``, ``left_out``: how many
 samples and other things were left out since the last line, as they were not taken fast enough. Or ``alive``,
 where nothing else has passed for a while.
@@ -35,16 +35,16 @@ if TYPE_CHECKING:
 
 SCHEMA = "daqsvc.live/1"
 ALIVE_S = 1.0
-"""After so long without anything it is told that the service is there."""
+"""Time without other lines after which a line shows that the service is there."""
 ALIVE = b'{"alive":true}\n'
 GATHER_S = 0.05
-"""What comes in so short a time is told together."""
+"""What comes within this time is sent together."""
 MOST_WAITING_BYTES = 4_000_000
 """Samples that wait for one who looks."""
 MOST_WAITING = 2000
-"""Likewise items of every kind."""
+"""Items of every kind that wait for one who looks."""
 BEFORE_S = 20.0
-"""What the rings hold of so long before is told at first."""
+"""Time before the request whose samples are sent first, as far as the rings hold them."""
 
 
 class _StreamStands(NamedTuple):
@@ -171,7 +171,7 @@ class LiveFeed:
             alarms: see `about`.
             standings: see `about`.
             rings: what has come lately, by stream and grid.
-            before_bytes: samples of these that are told at first, at most, to who is elsewhere; None for
+            before_bytes: samples of these that are sent first, at most, to who is elsewhere; None for
                 a process of this box, which is told as well where the machine file lies.
         """
         # Copied here, and made into text on a thread: that takes its time of thousands of sensors.

@@ -162,7 +162,7 @@ class MachineWatch:
         now_ns = self._clock.monotonic_ns()
         active: dict[str, Sequence[str]] = {}
         for detector in self.pipeline.detectors:
-            with self.supervisor.sparing_others(f"detector {detector.name}", "its alarms begin anew"):
+            with self.supervisor.sparing_others(f"detector {detector.name}", "its alarms begin again"):
                 active.update({s.detector: s.sensors for s in said_of_silence(detector, 0.0, now_ns)})
         return active
 

@@ -74,7 +74,7 @@ SPARE_NS = NS_PER_S
 MOST_WAITING_BYTES = 64_000_000
 """Samples that wait for a disk that is slow, at most, beside those that the history holds anyway."""
 MOST_WAITING = 50_000
-"""Likewise items of every kind."""
+"""Items of every kind that wait for it, at most."""
 SCHEDULED = "scheduled"
 MOST_CAUSES = 100
 """Of one snapshot that are written down."""
@@ -95,7 +95,7 @@ AGAIN_NS = 10 * NS_PER_S
 CONTINUOUS_SHARE = 0.25
 """Of the size of all, that one file of a continuous recording may have: there are several then."""
 SNAPSHOT_SHARE = 0.5
-"""Likewise any other file."""
+"""Of the size of all, that any other file may have."""
 ROOM_SHARE = 0.05
 """Of the size of all, after which it is seen to that what is there is not more."""
 END_S = 0.25
@@ -103,7 +103,7 @@ END_S = 0.25
 
 
 ENDS = "nothing more is recorded: the service ends, or goes on by another machine file"
-"""What people are told who wait for a snapshot then."""
+"""What people who wait for a snapshot get then."""
 
 
 class SnapshotRefusedError(Exception):

@@ -67,12 +67,12 @@ class Changes:
         return [
             *(f"machine {name} is no longer watched" for name in self.machines_gone),
             *(f"machine {name} is watched from now on" for name in self.machines_new),
-            *(f"machine {name}: detectors begin anew ({why})" for name, why in self.machines_anew.items()),
+            *(f"machine {name}: detectors begin again ({why})" for name, why in self.machines_anew.items()),
             *(f"machine {name}: other alarms or setpoints ({why})" for name, why in self.alarms_anew.items()),
             *(f"bus {name} is closed" for name in self.buses_gone),
             *(f"bus {name} is opened" for name in self.buses_new),
-            *(f"bus {name} is opened anew ({why})" for name, why in self.buses_anew.items()),
-            *([f"outputs begin anew ({', '.join(self.outputs)})"] if self.outputs else []),
+            *(f"bus {name} is opened again ({why})" for name, why in self.buses_anew.items()),
+            *([f"outputs begin again ({', '.join(self.outputs)})"] if self.outputs else []),
         ]
 
 

@@ -43,7 +43,7 @@ class BusHealth(NamedTuple):
         bus_off: how often its controller took itself off the bus.
         state: state of the controller; None for a bus that has none.
         unrecorded: frames that are missing from its recording.
-        heard: whether anything has come from it since the start: until then nobody knows its state.
+        heard: whether anything has come from it since the start: until then its state is not known.
     """
 
     overruns: int
@@ -60,7 +60,7 @@ class Vitals:
     Attributes:
         now_ns: monotonic clock.
         conditions_reported: conditions of the service that were ever reported, also before a restart.
-        free_bytes: free space on the store's disk; None if nobody has looked.
+        free_bytes: free space on the store's disk; None if it was not read.
         waiting: alarm events in memory that the disk has not taken.
         write_errors: failed writes of alarms so far.
         lost: alarm events that could not even wait, so far.
@@ -164,7 +164,7 @@ class SelfCheck:
     def _once_known(
         self, condition: Condition, vitals: Vitals, *, watched: bool = True
     ) -> Iterator[Condition]:
-        """A condition of what happens now and then, unless nobody knows yet whether it still does."""
+        """A condition of what happens now and then, unless it is not known yet whether it still does."""
         name = condition.name
         if condition.level is not Level.NORMAL:
             self._said.add(name)
@@ -195,9 +195,9 @@ class SelfCheck:
             return Condition(JOURNAL, Level.DANGER, sentence)
         if self._unwritable:
             sentence = (
-                f"the journal in {self._store} cannot be written: delivery of alarms is not backed by the "
-                "disk, they go out from memory, and what the broker does not get before the process ends is "
-                f"lost: {self._remedy}"
+                f"the journal in {self._store} cannot be written: delivery of alarms is not backed by "
+                "the disk. They are sent from memory, and what the broker does not get before the process "
+                f"ends is lost; {self._remedy}"
             )
             return Condition(JOURNAL, Level.ALERT, sentence)
         return Condition(JOURNAL, Level.NORMAL, f"the journal in {self._store} takes what comes")
@@ -256,8 +256,8 @@ class SelfCheck:
         if not self._unrecorded[bus].goes_on(health.unrecorded, now_ns):
             return Condition(name, Level.NORMAL, f"no frame is missing from the recording of bus {bus}")
         sentence = (
-            f"frames of bus {bus} are missing from its recording: see that the folder is there, and its disk "
-            "has room and is fast enough"
+            f"frames of bus {bus} are missing from its recording: check that the folder is there, and its "
+            "disk has room and is fast enough"
         )
         return Condition(name, Level.ALERT, sentence)
 

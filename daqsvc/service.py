@@ -308,7 +308,7 @@ class Service:
         except ControlError as error:
             # Watching the machine matters more than being told what to do.
             logger.error(  # noqa: TRY400 - the message says it all
-                "no commands on this box until this is mended: %s", error, extra=coded(CONTROL_SOCKET)
+                "no commands on this box until this is corrected: %s", error, extra=coded(CONTROL_SOCKET)
             )
 
     async def _prepare(self, watch: MachineWatch) -> None:
@@ -587,7 +587,7 @@ class Service:
             self.alarms.take(diagnosis)
         for path, output in self.alarms.outputs.items():
             about = f"{output_name(path)} of {diagnosis.detector}"
-            with self.supervisor.sparing_others(about, "it is not told of one statement"):
+            with self.supervisor.sparing_others(about, "it does not get one statement"):
                 output.report(diagnosis)
 
     def _record_alarm(self, event: AlarmEvent) -> None:
@@ -649,7 +649,7 @@ class Service:
     def _publish_status(self) -> None:
         figures = self.figures() if self.alarms.outputs else {}
         for path, output in self.alarms.outputs.items():
-            with self.supervisor.sparing_others(output_name(path), "it is not told of one status"):
+            with self.supervisor.sparing_others(output_name(path), "it does not get one status"):
                 output.status(figures)
 
     def figures(self) -> dict[str, Any]:

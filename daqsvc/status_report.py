@@ -61,7 +61,7 @@ class _Seen(NamedTuple):
         alarms: how each stands.
         newest: by stream, its newest sample ``[channels]`` and when that was taken; None before the first.
         latest: what each detector has said last.
-        measured: likewise, with figures.
+        measured: the same, with figures.
     """
 
     now_ns: int
@@ -378,7 +378,7 @@ async def _by_turns(things: Iterable[T]) -> AsyncIterator[T]:
 
 
 def _json_line(document: Document) -> bytes:
-    """JSON in pieces, between which other threads get on; what JSON or UTF-8 do not know is null or ``?``."""
+    """JSON in pieces, so that other threads run between; what JSON or UTF-8 do not know is null or ``?``."""
     parts = []
     for name, value in document.items():
         if isinstance(value, list):

@@ -295,7 +295,7 @@ class StallWatch:
     """Finds parts that have something to do and get nowhere, for all who act on that, and says each once.
 
     Time is counted from look to look, and without what a part's thread has waited for a processor. Where
-    the whole process gets on slowly, or not at all for a while, no part of it has stalled.
+    the whole process runs slowly, or not at all for a while, no part of it has stalled.
 
     Args:
         progress: by name, how far each part has come.
@@ -326,7 +326,7 @@ class StallWatch:
             before = self._parts.get(name)
             if before is None or step is None or step != before.step:
                 if before is not None and before.said:
-                    logger.warning("%s gets on again", name)
+                    logger.warning("%s works again", name)
                 self._parts[name] = _Standstill(step, waited_s=waited_s)
                 continue
             before.still_s += max(0.0, passed_s - max(0.0, waited_s - before.waited_s))

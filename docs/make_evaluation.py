@@ -421,7 +421,7 @@ TABLES: dict[str, Callable[[Path], Iterator[Row]]] = {
 
 
 def evaluation(docs: Path) -> str:
-    """The text of the page with its tables made anew.
+    """The text of the page with its tables made again.
 
     Args:
         docs: the folder of all pages.

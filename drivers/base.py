@@ -78,7 +78,7 @@ class BusPort:
         clock: the service's clock.
         deliver: called with each block, on the event loop.
         start: what to do if the device is absent at start: fail, try again, or go on without it.
-        tell: called, on the event loop, when it changes whether anything can be judged by a stream's samples;
+        tell: called on the event loop when a stream's samples become fit or unfit for judging;
             `StreamAssembler` does so.
     """
 
@@ -100,7 +100,7 @@ class BusCounters:
         frames_error: error frames.
         bus_off: how often the controller went bus-off.
         open_failures: how often the bus could not be opened.
-        reader_failures: how often the reader gave up on an error that nobody had foreseen.
+        reader_failures: how often the reader gave up on an unexpected error.
         unknown_ids: frames per unknown id, e.g. ``"0x7ff (11 bit)"``, for the first ids seen.
     """
 

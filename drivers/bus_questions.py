@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 BUS, STREAM = "main", "device"
 """Names of the only bus and the only stream of the file."""
 WAVEFORM_HZ = 100.0
-"""What comes at least so often is a waveform, as a rule; else a value that the device measures itself."""
+"""Rate from which on samples are usually a waveform; below it, values that the device measures itself."""
 _BY_ID = Path("/dev/serial/by-id")
 
 SHARED = {
@@ -177,7 +177,7 @@ class BusQuestions(ABC):
 
 
 def by_name(channel: str) -> str | None:
-    """The type of sensor that the name of a channel speaks of; None if it speaks of none."""
+    """The type of sensor that the name of a channel suggests; None if it suggests none."""
     low = channel.lower()
     if any(part in low for part in ("kph", "key", "phas", "tacho")):
         return "keyphasor"
@@ -189,7 +189,7 @@ def by_name(channel: str) -> str | None:
 
 
 def is_count(name: str) -> bool:
-    """Whether the name of a signal or column speaks of a counter."""
+    """Whether the name of a signal or column suggests a counter."""
     return any(part in name.lower() for part in ("seq", "count", "cnt", "index"))
 
 

@@ -90,7 +90,7 @@ class Field:
 def j1939_valid_raw(cell: Field) -> tuple[float, float] | None:
     """Raw values of a field that are a measurement by SAE J1939-71, e.g. 0 to 0xFAFF of 16 bits.
 
-    Those above say "error" (0xFE..) or "not available" (0xFF..), or are kept back. None for a field to which
+    Those above mean "error" (0xFE..) or "not available" (0xFF..), or are kept back. None for a field to which
     the standard gives no such range: one that is signed, a float, or no whole number of bytes.
     """
     if cell.kind != "unsigned" or cell.bits not in J1939_WIDTHS:

@@ -51,7 +51,7 @@ class DecodedFrames(NamedTuple):
         counter: int64 ``[n]``, the device's counter as sent (wrapped); zeros if it sends none.
         samples: float32 ``[n, samples_per_frame, channels]`` in physical units.
         intact: bool ``[n]``, False where the frame's CRC does not match (all True without a CRC).
-        arrival_ns: int64 ``[n]``, host monotonic; zeros where nobody has said.
+        arrival_ns: int64 ``[n]``, host monotonic; zeros where it is not known.
     """
 
     counter: NDArray[np.int64]
@@ -77,7 +77,7 @@ class DecodedBatch:
         malformed: what the first piece was that should have been a frame, and why it is none; empty if there
             was none, or it has been told before.
         errors: what error frames say, of a bus that has such; see `drivers.can.errors.ErrorCounts`.
-        data_frames: frames that carry data, whosever they are.
+        data_frames: frames that carry data, of any stream or none.
         drained_ns: when the bus was last known to hold no frame that was sent before; None if there may be
             more.
     """

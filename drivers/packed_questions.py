@@ -27,7 +27,7 @@ TOPICS = {
     "samples-per-frame": Topic("Samples of each channel in a frame", "The device's manual says so."),
 }
 _PROBE_V = 18.0
-"""A proximity probe goes down to so many volts below 0."""
+"""Lowest voltage of a proximity probe, in V below 0."""
 
 
 def sample_questions(
@@ -90,7 +90,7 @@ def layout_lines(answers: Answers) -> Iterator[str]:
     """Lines of the layout, behind what is of the kind of bus only."""
     yield entry("byte_order", answers["byte-order"], '"big" if the device sends the high byte first')
     if answers["counter-byte"] is None:
-        yield entry("no_counter", value=True, comment="losses are told by the times of arrival")
+        yield entry("no_counter", value=True, comment="losses are estimated from the times of arrival")
     else:
         counts = answers["counter-counts"]
         counter = {"byte": answers["counter-byte"], "bits": int(answers["counter-bits"]), "counts": counts}

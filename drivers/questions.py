@@ -25,7 +25,7 @@ SENSOR = "sensor"
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """What a question is about, whatever its default.
+    """What a question is about, independent of its default.
 
     Attributes:
         text: the question.

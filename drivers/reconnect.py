@@ -43,7 +43,7 @@ class Attempt(NamedTuple):
         present: whether the device was there.
         useful: whether anything came from it: a link that opens and fails at once is not back.
         reason: why the attempt ended.
-        error: what its driver has failed with, which nobody has foreseen.
+        error: the unexpected error that its driver has failed with.
     """
 
     present: bool
@@ -63,7 +63,7 @@ async def run_with_reconnect(
 ) -> None:
     """Try a link again and again, each time later unless something came over it; until cancelled.
 
-    An attempt that fails in a way that nobody has foreseen is said once, with its plugin and line, and tried
+    An attempt that fails unexpectedly is logged once, with its plugin and line, and tried
     again like any other. What to do about a device that is absent at first holds until it has been there
     once, also if this is called again.
 
@@ -119,7 +119,7 @@ async def ended(reason: asyncio.Future[str], *threads: Thread) -> str:
         alive = all(thread.is_alive() for thread in threads)
         await asyncio.wait({reason}, timeout=LOOK_S)
         if not alive and not reason.done():
-            return "its reader has ended without a word"
+            return "its reader has ended without a reason"
     return reason.result()
 
 
@@ -232,7 +232,7 @@ class HandOver:
         self._loop.call_soon_threadsafe(self._line_up)
 
     def finish(self) -> None:
-        """Make at once all calls that wait; on the event loop, when nobody posts any more."""
+        """Make at once all calls that wait; on the event loop, when nothing posts any more."""
         while self._calls:
             self._make()
 

@@ -1,4 +1,4 @@
-"""What a driver brings to ``daqsvc sniff``: a look at a bus of its kind before there is any machine file.
+"""What a driver brings to ``daqsvc sniff``: what is on a bus of its kind, without a machine file.
 
 A sniffer listens or asks, and says what it found: for a person, for a program, and as tables of a machine
 file to begin with. Those of this tree are named in `daqsvc.commands.sniff`; its own package registers
@@ -89,7 +89,7 @@ class Sniffer(ABC):
     def sniff(
         self, arguments: argparse.Namespace, stop: threading.Event, tell: Callable[[str], None]
     ) -> Sniffed:
-        """Look at the bus. Nothing may wait for longer than some 0.2 s without a look at ``stop``.
+        """Look at the bus. Nothing may wait for longer than some 0.2 s without checking ``stop``.
 
         Args:
             arguments: as parsed.
@@ -186,7 +186,7 @@ def sniffed(
 
     Raises:
         SniffError: nothing can be seen; says what to do.
-        NothingFoundError: nothing was there; likewise.
+        NothingFoundError: nothing was there; the same holds.
     """
     parser = _Words(add_help=False)
     sniffer.add_arguments(parser)

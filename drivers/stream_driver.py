@@ -126,7 +126,7 @@ class StreamDriver(ABC):
         finally:
             ticking.cancel()
             await asyncio.gather(ticking, return_exceptions=True)
-        # One that answers and says nothing is not back.
+        # A device that answers but sends nothing is not back.
         return Attempt(present=True, useful=self._frames > before, reason=reason)
 
     async def _tick(self) -> None:

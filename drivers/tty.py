@@ -53,7 +53,7 @@ class CharacterFormat:
         self._said = False
 
     def on(self, port: str | Path) -> Character:
-        """The characters with which to open a port; what is left out is told once, as a warning.
+        """The characters with which to open a port; what is left out is logged once, as a warning.
 
         Args:
             port: path of its device, which may be a link to it, and need not be there.

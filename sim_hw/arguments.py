@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     Group = argparse._ArgumentGroup  # noqa: SLF001 - argparse has no public name for it
 
 MOST_DB = 200.0
-"""Signal to noise beyond this, either way, is noise or none in double precision."""
+"""Beyond this ratio, either way, there is only noise or none in double precision."""
 
 
 def add_random(group: Group) -> None:

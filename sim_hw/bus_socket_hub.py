@@ -237,7 +237,7 @@ class _HubClient:
         while self.backlog and self._sent(self.backlog[0]):
             self.backlog.popleft()
         if not self.backlog:
-            # A client that has caught up is told its loss at once, not with the next frame.
+            # A client that has caught up learns its loss at once, not with the next frame.
             self._queue_notice()
             while self.backlog and self._sent(self.backlog[0]):
                 self.backlog.popleft()

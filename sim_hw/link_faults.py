@@ -32,7 +32,7 @@ class Fault(IntEnum):
     SILENCED = 5
     """Not sent, because its node is silent."""
     BABBLED = 6
-    """Sent by a babbling node that nobody asked."""
+    """Sent by a babbling node."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +127,7 @@ class LinkFaults:
     """A link with random faults, at most one to a frame, the same for the same seed.
 
     The first and the last frame pass untouched: what is missing before the first or after the last
-    frame, no receiver can know.
+    frame, a receiver cannot know.
 
     Attributes:
         drop: probability that a frame is not sent.

@@ -157,7 +157,7 @@ def planned_faults(
         seed: of every random draw.
 
     Raises:
-        ValueError: something in a table cannot be, or two of them contradict each other.
+        ValueError: a table has an impossible value, or two of them contradict each other.
     """
     if not tables and always is None:
         return None

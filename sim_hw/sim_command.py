@@ -1,4 +1,4 @@
-"""``daqsvc sim``: simulated devices on real or virtual buses, for whatever client is pointed at them."""
+"""``daqsvc sim``: simulated devices on real or virtual buses, for any client."""
 
 from __future__ import annotations
 
@@ -253,7 +253,7 @@ def _script(
         )
     if scenario is None and arguments.seed is not None:
         raise SignalError(
-            "--seed draws the faults of a scenario anew, and a recording has none; name a scenario too with "
+            "--seed draws the faults of a scenario again, and a recording has none; name a scenario too with "
             "--scenario, or leave --seed out"
         )
     faults = None if scenario is None else scenario.node_faults(arguments.seed)

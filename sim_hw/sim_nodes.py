@@ -50,7 +50,7 @@ class NodeError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class NodeOrder:
-    """What a node is asked to be.
+    """What a node is made from.
 
     Attributes:
         machine: the machine file.
@@ -220,7 +220,7 @@ class ReplyFaults:
         faults: of the scenario.
 
     Raises:
-        NodeError: the scenario asks for what cannot happen to replies.
+        NodeError: the scenario has faults that cannot happen to replies.
     """
 
     def __init__(self, faults: NodeFaults) -> None:

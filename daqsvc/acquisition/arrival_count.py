@@ -17,7 +17,7 @@ WATCH_MOST_NS = 2_000_000_000
 """For how many frames' time a late one waits for those after it, which tell whether it was held up."""
 
 SURE_FRAMES = 50
-"""So many missing ones are told exactly: meanwhile a rate that is off by 0.5 % gains a quarter of a frame."""
+"""Missing frames up to this number are counted exactly: 0.5 % of rate error is then a quarter of a frame."""
 
 _FALLING_BEHIND = 1.0 / 32.0
 _CATCHING_UP = 1.0 / 2.0
@@ -28,7 +28,7 @@ class ArrivalCount:
     """Gives each frame the count that fits its time of arrival.
 
     Frames come late, never early, so the time at which a frame is due follows the earliest ones: a device
-    whose rate is off the nominal one by up to 0.5 % gains and loses nothing. Loss is told exactly while no
+    whose rate is off the nominal one by up to 0.5 % gains and loses nothing. Loss is counted exactly while no
     frame is later than half the time between frames, and the device's clock drifts by less than a quarter of
     it during a gap. A longer delay is no loss if the frames have caught up within `WATCH_FRAMES` of that
     time, as those do that a busy gateway sends all at once; else it is taken for missing frames. A repeated

@@ -261,7 +261,8 @@ class StreamAssembler:
             )
         if anew:
             self._say(
-                "stream %r: its samples do not arrive when its clock has told; its time base begins anew",
+                "stream %r: its samples do not arrive at the times that its clock predicts; its "
+                "time base begins again",
                 newest_ns,
             )
         start = 0
@@ -443,7 +444,7 @@ def _joined(parts: list[Frames]) -> Frames:
 
 
 def note_received(counters: StreamCounters, stream: str, samples: Samples) -> Samples:
-    """Count samples that are handed on, and what in them is absent; the first such is told.
+    """Count samples that are handed on, and what in them is absent; the first such is logged.
 
     A value is absent if the device says that it has none (NaN), or if it is infinite. An overflow on the
     device, or a number too large for a float32, leaves such a value; it is no measurement.
@@ -475,7 +476,7 @@ def note_received(counters: StreamCounters, stream: str, samples: Samples) -> Sa
 
 
 def note_gap(counters: StreamCounters, stream: str, lost: int, first: int) -> None:
-    """Count a gap; the first one is told.
+    """Count a gap; the first one is logged.
 
     Args:
         counters: of the stream.

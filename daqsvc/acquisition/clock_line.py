@@ -6,9 +6,9 @@ arrivals whose delay is often close to the least one, its error is about delay /
 moves it. Where a small delay is rare the support hangs on two lucky arrivals; there the **mean** line, of
 least squares through all arrivals and lowered until it touches, errs less.
 
-How far the line may be off is told by the earliest arrivals of parts of the window. The constants below make
-that a 95th percentile for delays whose least value is not rare (uniform, exponential, in bursts), and about
-the 85th for others: tests/acquisition/test_alignment_clocks.py draws them.
+How far the line may be off is estimated from the earliest arrivals of parts of the window. The constants
+below make that a 95th percentile for delays whose least value is not rare (uniform, exponential, in bursts),
+and about the 85th for others: tests/acquisition/test_alignment_clocks.py draws them.
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ def _touching(x: Floats, late: Floats, along: Floats, slope: float) -> tuple[flo
         gaps[k] = min(ranked.mean(), _CALM * calm.mean())
     gap, fine_gap = gaps
     if gap <= 0.0:
-        # So few arrivals that the line touches one in each part: the rest of them tell what there is to tell.
+        # Too few arrivals: the line touches one in each part, and the others carry all the information.
         gap = above.mean() - offset
         return offset, gap, gap
     growth = min(max(fine_gap / gap - 1.0, _LEAST_GROWTH), float(PARTS))

@@ -175,7 +175,7 @@ class CounterSense:
     def _watch_cause(self, now_ns: int, *, calm: bool, sound: bool) -> None:
         """Another reason to set frames aside takes over once the one that stands is no longer true.
 
-        One look is not enough: it may have begun before the device was right again.
+        One reading is not enough: it may have begun before the device was right again.
         """
         holds = {"still": self._alike >= STILL_FRAMES, "senseless": not sound, "flood": not calm}
         over = self._kind is not None and not holds[self._kind]

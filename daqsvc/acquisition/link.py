@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 
 SAID_AT_MOST, SAID_WITHIN_NS = 3, 60 * NS_PER_S
 
-OFTEN = "; it comes and goes, which is said three times a minute at most"
+OFTEN = "; if this repeats, it is logged three times a minute at most"
 """To be added to what is said for the third time."""
 
 
@@ -181,7 +181,7 @@ class Link:
         self.state, self.reason, self.code = "down", reason, LINK_LOST
 
     def fail(self, reason: str, error: BaseException) -> None:
-        """The driver has failed in a way that nobody has foreseen, and begins again; said once an hour."""
+        """The driver has failed unexpectedly, and begins again; logged once an hour."""
         if self.state == "up":
             self.losses += 1
         if self._failures.may_say(cause_of(error)):

@@ -1,7 +1,7 @@
 """The sample ring: one writer, many readers, every sample at its absolute index.
 
 Missing samples keep their place as rows of NaN, so an index means the same instant to every reader. A
-reader that falls behind is told exactly how many samples it has lost; it never sees a row that was
+reader that falls behind learns exactly how many samples it has lost; it never sees a row that was
 overwritten under its hands.
 """
 
@@ -28,7 +28,7 @@ ANCHORS = 4096
 SNAPSHOTS = 1024
 """Snapshots that a ring remembers the places of."""
 GAPS = 256
-"""Gaps that a ring remembers, to tell what a reader has missed from what nobody ever had; breaks likewise."""
+"""Gaps that a ring remembers, to tell what a reader has missed from what never came; breaks as well."""
 
 
 class RingError(Exception):

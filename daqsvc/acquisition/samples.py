@@ -53,7 +53,7 @@ class SampleBlock:
         pause_before: of a snapshot, how many samples long the time was before it in which nobody sampled, by
             the clock, beside ``lost_before``. None if the stream goes on from block to block.
         t_error_ns: how far ``t_first_ns`` may be off (95th percentile), beside the constant part of the delay
-            from the device to the host; infinite if nobody knows.
+            from the device to the host; infinite if it is not known.
     """
 
     stream: str

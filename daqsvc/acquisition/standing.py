@@ -19,7 +19,7 @@ QUIET_NS = 60 * NS_PER_S
 """A stream whose standing changes again and again is reported no more often than this."""
 
 AGAIN_NS = NS_PER_S // 2
-"""A doubt is told again so often while frames come: if it is not, none come any more."""
+"""How often a doubt is repeated while frames come: if it is not, none come any more."""
 
 PROVING_NS = 5 * NS_PER_S
 """Until then a stream's rate is either known, or it is not waited for."""
@@ -46,7 +46,7 @@ Tell: TypeAlias = "Callable[[str, StreamState], None]"
 
 
 def tell_nobody(stream: str, standing: StreamState) -> None:
-    """Nobody wants to know how a stream stands."""
+    """Takes no reports of the state of a stream."""
 
 
 def cause_of(doubt: str) -> str:

@@ -39,7 +39,7 @@ RECENT_DELAYS = 1024
 CONTRADICTION_NS = NS_PER_S // 2
 """How far arrivals must be off the line, beyond what it may err, to contradict it."""
 LATE_NS = 20_000_000
-"""By how much all arrivals of a while must be late, likewise, for the line to be in doubt."""
+"""By how much all arrivals of a while must be late, too, for the line to be in doubt."""
 CONTRADICTED_NS = 4 * NS_PER_S
 """How long late arrivals must contradict the line until it is given up."""
 FELL_BEHIND_NS = 10 * NS_PER_S
@@ -146,7 +146,7 @@ class TimeBase:
         self._contradiction_ns = CONTRADICTION_NS + 2 * samples_per_frame * self._nominal_ns
         self._late: deque[Late] = deque()
         self.rate_doubt = ""
-        """Why the device's rate is not the nominal one, in words; empty if it is, or nobody knows yet."""
+        """Why the device's rate is not the nominal one, in words; empty if it is, or if not known yet."""
         self._doubted_hz = 0.0
         self.rate_known = False
         """Whether the device's rate has been measured, or seems to be the nominal one."""

@@ -203,11 +203,11 @@ class Alarm:
 
         Args:
             event: that event.
-            finding: `RuleFinding.identity` of what stood; empty if nobody knows.
+            finding: `RuleFinding.identity` of what stood; empty if not known.
             since: when it was, by the clocks as they are now.
             now: the time now. Shelving goes on by the wall clock, which may have been set since: what was
                 left of it at ``told`` is never exceeded.
-            sentence: what stood, in words, where ``told`` does not say it; empty if nobody knows.
+            sentence: what stood, in words, where ``told`` does not say it; empty if not known.
         """
         self._state, self._level = event.own_state, event.to_level
         self._holds = {Hold(state) for state in event.holds}
@@ -454,7 +454,7 @@ class Alarm:
         return self._execute(Stimulus.ACKNOWLEDGE, EventKind.ACKNOWLEDGED, request)
 
     def reset(self, request: HandlingRequest) -> AlarmEvent:
-        """A person lets go of a latched alarm.
+        """A person resets a latched alarm.
 
         Raises:
             CommandNotAllowedError: its condition stands, there is nothing to reset, or the alarm is held.

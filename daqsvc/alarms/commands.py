@@ -45,7 +45,7 @@ class AlarmCommand:
             None means whichever stands.
         reason: why, in the person's words; it stands in the event and in the audit log.
         machine: whose alarm; None for the one machine that has an alarm of that name.
-        denied: why the person may not ask for it, if that is known: then it is written down, and refused.
+        denied: why the person may not ask for it, if that is known: then it is logged, and refused.
     """
 
     verb: Verb
@@ -122,7 +122,7 @@ class JsonCommand(BaseModel):
 
         Raises:
             ValidationError: it is none.
-            ValueError: a key is there twice: nobody knows which one is meant.
+            ValueError: a key is there twice: it is not known which one is meant.
         """
         message = cls.model_validate_json(raw)
         json.loads(raw, object_pairs_hook=_once)
@@ -246,5 +246,5 @@ def _once(pairs: list[tuple[str, object]]) -> dict[str, object]:
     if len(made) < len(pairs):
         keys = [key for key, _ in pairs]
         twice = next(key for key in made if keys.count(key) > 1)
-        raise ValueError(f"key {twice!a} stands twice; say it once")
+        raise ValueError(f"key {twice!a} is there twice; write it once")
     return made

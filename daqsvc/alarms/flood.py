@@ -65,7 +65,7 @@ class FloodWatch:
                 f"{self._most}); {advice()}shelve what is known"
             )
         while len(self._called_ns) > self._most + 1:
-            # So many say that it is a flood; a longer list of them would only take memory.
+            # This many show that it is a flood; a longer list of them would only take memory.
             self._called_ns.popleft()
         if self.flooding and 2 * count < self._most:
             self.flooding = False
@@ -74,7 +74,7 @@ class FloodWatch:
 
 
 def where_to_look(first_out: Iterable[str], unjudged_streams: Mapping[str, int]) -> str:
-    """Where to look first in a flood, as the beginning of a sentence; empty if nobody knows.
+    """Where to look first in a flood, as the beginning of a sentence; empty if that is not known.
 
     Args:
         first_out: the alarms that hold the first-out mark of their group and stand.

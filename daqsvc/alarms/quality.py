@@ -34,7 +34,7 @@ def quality_alarm(detector: str, sensors: Sequence[str]) -> str:
 
 
 LASTING = 8
-"""So many partial statements more than good ones make a quality alarm, and as many good ones end it."""
+"""Excess of partial statements over good ones that makes a quality alarm; as many good ones end it."""
 
 SHARE_NS = 5 * NS_PER_S
 """The share of samples that a detector lacks is taken over so much time."""

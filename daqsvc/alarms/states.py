@@ -46,7 +46,7 @@ _LABELS: dict[Level, Severity] = {
 
 
 class AlarmState(StrEnum):
-    """What a consumer is told about an alarm."""
+    """What a consumer learns about an alarm."""
 
     NORMAL = "normal"
     ACTIVE_UNACKNOWLEDGED = "active_unacknowledged"
@@ -174,7 +174,7 @@ def transition(state: AlarmState, stimulus: Stimulus, *, latching: bool) -> Alar
         raise CommandNotAllowedError(f"there is nothing to acknowledge: it is {state.in_words}")
     if stimulus is Stimulus.RESET:
         if state.is_active:
-            raise CommandNotAllowedError("its condition still stands; remove the cause, then reset")
+            raise CommandNotAllowedError("its condition is still present; remove the cause, then reset")
         raise CommandNotAllowedError(f"there is nothing to reset: it is {state.in_words}")
     return state
 

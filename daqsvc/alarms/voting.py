@@ -55,7 +55,7 @@ class VotingRule:
 
     def __post_init__(self) -> None:
         if len(set(self.sensors)) < len(self.sensors):
-            raise ValueError(f"alarm {self.alarm}: a sensor stands twice in {', '.join(self.sensors)}")
+            raise ValueError(f"alarm {self.alarm}: a sensor is listed twice in {', '.join(self.sensors)}")
         if not 1 <= self.vote <= len(self.sensors):
             raise ValueError(
                 f"alarm {self.alarm}: {self.vote} votes of {len(self.sensors)} sensors cannot be; "

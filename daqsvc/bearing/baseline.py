@@ -167,7 +167,7 @@ _PREAMBLE = """\
 # A machine in good order, as its bearings' detectors remember it.
 # [[residual]]: innovations model of one accelerometer, or of several together, and how large the innovations
 # are, in dB, window by window: all bands together, then each.
-# [[race]]: what spoke for each part of a bearing although it was in good order; its fault orders.
+# [[race]]: evidence for each part of a bearing although it was in good order; its fault orders.
 # [[pair]]: cross-spectra of the residual of accelerometers on rotor and housing, with these masses (kg),
 # springs (N/m) and dampers (N s/m). A line holds the power of either race's component, and their cross-power.
 """

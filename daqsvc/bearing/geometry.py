@@ -28,7 +28,7 @@ ROUNDED = 2e-3
 
 
 _NAMED = 3
-"""So many bearings of the same orders are named."""
+"""Largest number of bearings with the same orders that are named."""
 
 
 @dataclass(frozen=True, slots=True)

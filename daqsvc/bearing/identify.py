@@ -192,7 +192,7 @@ def whiteness(innovations: Floats, lags: int = _WHITENESS_LAGS) -> Whiteness:
     statistic = n * n * float(((correlations**2).sum(axis=(1, 2)) / (n - np.arange(1, lags + 1))).sum())
     ladder = _whittle(covariances)
     gained = np.linalg.slogdet(ladder[0].covariance)[1] - np.linalg.slogdet(ladder[-1].covariance)[1]
-    # So much even white noise seems to be predicted by its own sample correlations.
+    # Even white noise seems to be predicted this much by its own sample correlations.
     by_chance = lags * m * m / n
     return Whiteness(
         float(chdtrc(m * m * lags, statistic)), float(-np.expm1(-max(0.0, gained - by_chance) / m))
@@ -480,7 +480,7 @@ def _refuse_unsteady(levels: Floats, begin_s: Floats) -> None:
         raise NotIdentifiableError(
             f"the machine is not steady: at {begin_s[worst]:.3g} s its innovations differ by "
             f"{off[worst]:+.1f} dB from the median; learn from a recording of the healthy machine without "
-            "knocks, starts or changes of load"
+            "impacts, starts or changes of load"
         )
     half = len(total) // 2
     drift = float(total[-half:].mean() - total[:half].mean())

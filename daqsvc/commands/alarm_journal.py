@@ -135,7 +135,7 @@ def _documents(entries: Iterable[JournalEntry]) -> Iterable[EventDocument]:
 
 
 ID_LENGTH = 8
-"""So much of an occurrence's id is enough for a person to name it by."""
+"""Characters of an occurrence's id that are enough to name it."""
 
 
 def current_table(alarms: Sequence[AlarmView], now_ns: int) -> str:

@@ -43,9 +43,9 @@ class AlarmsCommand:
 
     help = "show the alarms and their events, from the journal"
     description = (
-        "Show the alarms that are not normal, from the journal, with and without a running service. "
-        "daqsvc ack, reset, shelve, unshelve, bypass and unbypass take the ID shown here, or the name "
-        "of the alarm."
+        "Show the alarms that are not normal, from the journal, with and without a running service. The "
+        "ID shown here, or the name of the alarm, is what daqsvc ack, reset, shelve, unshelve, bypass "
+        "and unbypass take."
     )
 
     def __init__(self, load: Load) -> None:
@@ -164,15 +164,15 @@ def _doubt(store: Path) -> str:
             waiting = events_waiting(store)
     except UnreachableError as error:
         journal = "the journal cannot be written" if is_read_only(store) else "the journal may not be written"
-        return f"{journal}, so this may not be how the alarms stand by now; {error}"
+        return f"{journal}, so this may not be their present state; {error}"
     except ControlError:
         return ""  # no service, or one that this user may not ask: the journal is all there is
     if not waiting:
         return ""
     events = "1 event waits" if waiting == 1 else f"{waiting} events wait"
     return (
-        f"{events} in the service's memory for a disk that cannot be written: this is not how the alarms "
-        f"stand by now; {remedy(store)}"
+        f"{events} in the service's memory for a disk that cannot be written: this "
+        f"is not their present state; {remedy(store)}"
     )
 
 

@@ -60,8 +60,8 @@ class AnalyzeCommand(VerbWithKernels):
         """See `Command.add_arguments`."""
         self._parser = parser
         parser.epilog = (
-            "Exit code: 0 if every recording was judged, 3 if one could not be (its line says why), 2 for "
-            "wrong usage, 1 if something else failed."
+            "Exit code: 0 if every recording was judged; 2 for wrong usage; 3 if one could not be "
+            "judged (its line has the reason); 1 if something else failed."
         )
         add_analyze_options(parser)
 

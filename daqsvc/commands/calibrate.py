@@ -50,8 +50,8 @@ class CalibrateCommand(VerbWithKernels):
         """See `Command.add_arguments`."""
         self._parser = parser
         parser.epilog = (
-            "Exit code: 0 if the calibration was made, 3 if the data were refused (one line says why), 2 for "
-            "wrong usage, 1 if something else failed."
+            "Exit code: 0 if the calibration was made; 2 for wrong usage; 3 if the data were refused "
+            "(one line has the reason); 1 if something else failed."
         )
         add_calibrate_options(parser)
 
@@ -94,7 +94,7 @@ class CalibrateCommand(VerbWithKernels):
         if machine is None:
             return calibrates_bearing(arguments)
         from daqsvc.detectors.bearing.settings import Bearing  # noqa: PLC0415 - brings pydantic
-        from daqsvc.detectors.rotor_synchronous.settings import RotorSynchronous  # noqa: PLC0415 - likewise
+        from daqsvc.detectors.rotor_synchronous.settings import RotorSynchronous  # noqa: PLC0415 - as above
 
         if machine.pipeline.table(RotorSynchronous) is not None:
             return False

@@ -82,8 +82,8 @@ class DetectabilityCommand(VerbWithKernels):
         if machine is None:
             return EXIT_USAGE
         from daqsvc.diagnosis.plugin import DetectabilityOptions, UnfitOptionError  # noqa: PLC0415 - pydantic
-        from daqsvc.settings.plugins import configured  # noqa: PLC0415 - likewise
-        from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415 - likewise
+        from daqsvc.settings.plugins import configured  # noqa: PLC0415 - as above
+        from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415 - as above
 
         if wrong := _misuse(machine, arguments):
             return complain(f"{arguments.file}", wrong, ARGUMENTS, EXIT_USAGE)
@@ -112,7 +112,7 @@ class DetectabilityCommand(VerbWithKernels):
 def _of_values(file: Path, folder: Path) -> MachineFile | None:
     """The machine file of values in JSON, as if it lay in a folder; None after its errors were said."""
     from daqsvc.settings.load import machine_file_of  # noqa: PLC0415 - brings pydantic
-    from daqsvc.settings.problems import MachineFileError  # noqa: PLC0415 - likewise
+    from daqsvc.settings.problems import MachineFileError  # noqa: PLC0415 - as above
 
     try:
         return machine_file_of(json.loads(file.read_text()), folder / "machine.toml")

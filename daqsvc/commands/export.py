@@ -39,9 +39,9 @@ class ExportCommand(VerbWithKernels):
         """See `daqsvc.cli.Command.add_arguments`."""
         self._parser = parser
         parser.epilog = (
-            "Exit code: 0 if it was written, 3 if the recording cannot be read or the format cannot "
-            "contain it; 2 for wrong usage or a file that exists already, 1 if the file cannot be "
-            "written."
+            "Exit code: 0 if it was written; 1 if the file cannot be written; 2 for wrong usage or a "
+            "file that exists already; 3 if the recording cannot be read or the format cannot contain "
+            "it."
         )
         parser.add_argument(
             "files",

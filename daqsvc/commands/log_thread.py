@@ -102,4 +102,4 @@ class LogThread(logging.Handler):
         except OSError as error:
             if error.errno in _GONE and self.on_gone is not None:
                 gone, self.on_gone = self.on_gone, None
-                gone(f"nobody reads the log any more ({error.strerror})")
+                gone(f"the log is no longer read ({error.strerror})")

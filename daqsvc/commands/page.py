@@ -131,8 +131,8 @@ class PageCommand:
         store = chosen_store(arguments, self._load).directory
         if not store.is_dir():
             raise StoreNotFoundError(
-                f"the store {store} does not exist: name that of a service by --store, or start the "
-                "service at first"
+                f"the store {store} does not exist: name that of a service by --store, or start "
+                "the service first"
             )
         return store
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 ENDINGS = (".blf", ".asc", ".log")
 LIVE_S, TOLD_S = 1.0, 10.0
-"""How often is said how it gets on: in a terminal, and elsewhere."""
+"""How often progress is shown: in a terminal, and elsewhere."""
 WIDTH = 79
 """Of that line in a terminal."""
 
@@ -142,7 +142,7 @@ def _check_new(log: Path) -> None:
         what = f"--out {log}: ends in none of {', '.join(ENDINGS)}, which say the format; add one"
         raise _MisuseError(what, WRONG_VALUE)
     if log.exists():
-        what = f"--out {log}: is there already; give another name, or take it away first"
+        what = f"--out {log}: is there already; give another name, or remove it first"
         raise _MisuseError(what, THERE_ALREADY)
     if not log.parent.is_dir():
         raise _MisuseError(f"--out {log}: there is no folder {log.parent}; make it first", CANNOT_WRITE)
@@ -155,7 +155,7 @@ def _logs(log: Path) -> set[Path]:
 
 
 class _Progress:
-    """Says on stderr how the recording gets on: over the same line in a terminal, else now and then.
+    """Shows the progress of the recording on stderr: over the same line in a terminal, else now and then.
 
     Args:
         driver: of the bus.
@@ -190,7 +190,7 @@ class _Progress:
 
 
 def _tell(words: str) -> None:
-    print(words, end="", file=sys.stderr, flush=True)  # noqa: T201 - how it gets on is no result
+    print(words, end="", file=sys.stderr, flush=True)  # noqa: T201 - progress is no result
 
 
 async def _run_until_stopped(driver: Driver, duration_s: float | None, progress: _Progress) -> None:

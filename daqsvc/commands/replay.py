@@ -32,9 +32,9 @@ class ReplayCommand(VerbWithKernels):
         "Play the samples of a snapshot into the rings, detectors and alarms of the service, as fast as "
         "possible or at a stated speed. Print the alarms that follow. Compare them, and every statement "
         "of the detectors, bit by bit with those of the service. With MACHINE, use that machine file "
-        "instead of the one in the snapshot. Exit code: 0 if it was replayed, with --check 1 if "
-        "anything differs or nothing could be compared, 3 if it cannot be read or replayed, 2 for wrong "
-        "usage."
+        "instead of the one in the snapshot. Exit code: 0 if it was replayed; with --check 1 if "
+        "anything differs or nothing could be compared; 2 for wrong usage; 3 if it cannot be read or "
+        "replayed."
     )
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
@@ -101,7 +101,7 @@ def _lines(replayed: Replayed) -> Iterator[str]:
         yield f"made for: {shown}" + (f"; {more} more (--json has all)" if more > 0 else "")
     yield from replayed.notes
     for detector, why in replayed.anew.items():
-        yield f"{detector} is judged anew: {why}"
+        yield f"{detector} is judged again: {why}"
     if not replayed.alarms:
         yield "no alarm changes"
     for words, comparison in (("statements", replayed.said), ("alarm events", replayed.alarmed)):

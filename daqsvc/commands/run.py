@@ -252,14 +252,14 @@ class _Reloader:
             self._asked = False
             try:
                 if not await self._service.reload():
-                    log.warning("SIGHUP: the machine files say nothing different")
+                    log.warning("SIGHUP: the machine files have not changed")
             except ReloadTooLateError:
                 log.info("SIGHUP is ignored: the service ends")
                 return
             except ReloadRefusedError as refused:
                 for reason in refused.reasons:
                     log.error(  # noqa: TRY400 - the message says it all
-                        "SIGHUP is refused, and the service goes on as it is: %s",
+                        "SIGHUP is refused, and the service goes on as before: %s",
                         reason,
                         extra=coded(RELOAD_REFUSED),
                     )
@@ -296,7 +296,7 @@ async def _run_until_stopped(
         store: directory of the journal.
         guard: of the process.
         manager: the service manager, which hears how the service stands.
-        let_go: lets go of the store, which the service takes itself.
+        let_go: releases the store, which the service takes itself.
 
     Raises:
         AssemblyError, DeviceAbsentError, EssentialLostError, LayoutError, OutboxError: see `Service`.

@@ -37,9 +37,9 @@ SEND_S = 0.1
 
 LOOK_S = 0.2
 CHANGE_S = 1.0
-"""A change of the status is told no sooner than so long after the last one."""
+"""A change of the status is reported no sooner than this time after the last one."""
 REFRESH_S = 10.0
-"""How often figures are told that change all the time."""
+"""How often figures are reported that change all the time."""
 
 EXTEND_EVERY_S, EXTEND_BY_S = 5.0, 30.0
 START_MOST_S = 900.0
@@ -112,7 +112,7 @@ class ServiceManager:
         try:
             self._socket.sendto(lines.encode(), self._address)
         except OSError as error:
-            log.info("the service manager cannot be told %r: %s", lines, error)
+            log.info("the service manager cannot be sent %r: %s", lines, error)
             return False
         return True
 
@@ -162,7 +162,7 @@ class ServiceManager:
         self.tell(STOPPING=1, STATUS="stopping")
 
     async def follow(self, service: Service) -> None:
-        """Tell how a service stands and that it gets on, until cancelled; not for long on its event loop.
+        """Report the state of a service and that it works, until cancelled; not for long on its event loop.
 
         It is told to be ready when every bus delivers that it must have (`Service.awaited`), and to be alive
         for as long as none of its parts has stalled. A service that is not alive is started again by systemd.

@@ -105,7 +105,7 @@ def _default_directory(machine: MachineFile, end: str = "") -> Path:
 def store_doubts(machine: MachineFile) -> Iterator[str]:
     """Why the service could not use the store that a machine file names, if this account ran it.
 
-    Root is told what would keep the owner of the store from using it: nobody lets the service run as root.
+    Root learns what would keep the owner of the store from using it: nobody lets the service run as root.
 
     Raises:
         AssemblyError: nobody could: it is no directory, or a newer version of the program has written it.

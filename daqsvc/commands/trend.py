@@ -240,7 +240,7 @@ def _tell(
     shown = [one for one in shown if len(one.trend.t_s)]
     if not shown:
         raise NoTrendError(
-            f"nothing was written down of these {step.name.lower()}s; ask for another time with --since, or "
+            f"nothing was stored for these {step.name.lower()}s; ask for another time with --since, or "
             "another --step"
         )
     if arguments.json:

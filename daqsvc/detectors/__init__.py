@@ -1,1 +1,1 @@
-"""The detectors: one folder each, with settings, checks, description and what makes the detector of them."""
+"""The detectors: one folder each, with settings, checks, description and what builds the detector."""

@@ -365,7 +365,7 @@ class Pipeline:
         for detector in self.detectors:
             if detector.stream == stream:
                 with self._supervisor.sparing_others(
-                    _part(detector), "the others say that nothing is judged"
+                    _part(detector), "the others report that nothing is judged"
                 ):
                     for diagnosis in said_of_silence(detector, 0.0, now_ns):
                         self._report(replace(diagnosis, quality="missing", reason=doubt))
@@ -476,7 +476,7 @@ class Pipeline:
         for detector in self.detectors:
             if detector.stream == stream:
                 with self._supervisor.sparing_others(
-                    _part(detector), "the other detectors say that nothing comes"
+                    _part(detector), "the other detectors report that nothing comes"
                 ):
                     for diagnosis in said_of_silence(detector, silence_s, now_ns):
                         self._report(replace(diagnosis, reason=reason) if over or why else diagnosis)

@@ -23,10 +23,10 @@ SettingsT = TypeVar("SettingsT", bound=Section)
 
 
 class DetectabilityOptions(NamedTuple):
-    """What ``daqsvc detectability`` is told beside the machine file; None: nothing.
+    """What ``daqsvc detectability`` gets beside the machine file; None: nothing.
 
     Attributes:
-        process_noise: how much the machine itself shakes at random, as power spectral density, normalised.
+        process_noise: random motion of the machine itself, as power spectral density, normalised.
         noise_um: noise of one probe.
         eccentricity_um: mass eccentricity.
     """

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 STALE_S = 120
-"""A figure that has not been told for so long is no longer true, unless it is told more seldom."""
+"""Age from which on a figure is no longer true, unless it is stated less often than that."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,7 +18,7 @@ class Reading:
         kind: where it stands in them.
         key: its name there, e.g. ``"rms"`` or ``"F1"``.
         unit: its unit as in the statements, e.g. ``"um"``; empty for none.
-        stale_s: a figure that has not been told for so long is no longer true.
+        stale_s: age from which on a figure is no longer true.
     """
 
     detector: str

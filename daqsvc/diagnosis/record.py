@@ -24,7 +24,7 @@ class Diagnosis:
         stream: the stream the samples came from.
         first_index: first sample of the window of evidence (absolute index).
         end_index: one past its last sample.
-        decision: the mode or level that the detector stands by now, e.g. ``"F1L2"`` or ``"alert"``;
+        decision: the mode or level that the detector holds now, e.g. ``"F1L2"`` or ``"alert"``;
             ``"undetermined"`` while it cannot say.
         where: the part of the machine that it is about, e.g. the name of a bearing; empty if it is about the
             machine as a whole.

@@ -270,8 +270,8 @@ class RecordedLive(RecordedDetector[SettingsT]):
 
     Args:
         machine: see `RecordedDetector`.
-        given: likewise.
-        options: likewise.
+        given: as above.
+        options: as above.
         build: `DetectorPlugin.build`.
     """
 

@@ -68,7 +68,7 @@ def _said(
             for one in said:
                 see_statement(one, earliest_ns, latest_ns)
         except ValueError as error:
-            raise BrokenContractError(say, f"it returns a statement that cannot be told: {error}") from None
+            raise BrokenContractError(say, f"it returns a statement that cannot be sent: {error}") from None
     return said
 
 

@@ -126,7 +126,7 @@ class WindowDetector(ABC):
 
     def silent(self, silence_s: float, t_ns: int) -> Sequence[Diagnosis]:
         """See `Detector.silent`."""
-        reason = f"nothing has come of stream {self.stream} for {silence_s:.3g} s"
+        reason = f"no samples have come of stream {self.stream} for {silence_s:.3g} s"
         return [replace(self._held, t_ns=t_ns, changed=False, quality="missing", reason=reason)]
 
     def _state(self, window: Window, at: int, length: int) -> Diagnosis:

@@ -340,7 +340,7 @@ FRAMES_UNRECORDED = Code(
     "The disk is full, too slow or gone, or the frames are of a kind that is not recorded. What is read "
     "from "
     "the bus goes on.",
-    "See to the disk: room, speed, rights. frames_unrecorded counts what is missing.",
+    "Check the disk: room, speed, rights. frames_unrecorded counts what is missing.",
     "can.md",
     "CAN bus 'can0' (socketcan can0) cannot be recorded in /var/log/can: No space left on device",
 )

@@ -51,7 +51,7 @@ NO_SUCH_ALARM = Code(
 NO_SERVICE = Code(
     "C06",
     "No service answers",
-    "No service runs on the store, or it has just begun, or its control socket was taken away.",
+    "No service runs on the store, or it has just begun, or its control socket was removed.",
     "Start the service, or name the store of the one that runs: with the machine file, or with --store.",
     _PAGE,
     "daqsvc status: no daqsvc runs on the store /var/lib/daqsvc/lab: start it with daqsvc run, or name "
@@ -75,7 +75,7 @@ COMMAND_REFUSED = Code(
     "without [recorder].",
     "Do as the message says. daqsvc alarms shows the state of each alarm.",
     "alarms.md",
-    "daqsvc reset: refused: cannot reset rotor-fault: its condition still stands; remove the cause, then "
+    "daqsvc reset: refused: cannot reset rotor-fault: its condition is still present; remove the cause, then "
     "reset",
 )
 CANNOT_WRITE = Code(
@@ -98,7 +98,7 @@ THERE_ALREADY = Code(
     "C11",
     "The file is there already",
     "No file is replaced unless the arguments say so.",
-    "Give another name, or take the file away first. Some verbs replace it with --force.",
+    "Give another name, or remove the file first. Some verbs replace it with --force.",
     _PAGE,
     "daqsvc example: pump.toml is there already; give another name",
 )
@@ -171,7 +171,7 @@ ACCOUNTS = Code(
 NOTHING_ON_BUS = Code(
     "C20",
     "Nothing was seen on the bus",
-    "Nobody sends, the bit rate or the parity is another one, or the cable is not plugged in.",
+    "Nobody sends, the bit rate or the parity is wrong, or the cable is not plugged in.",
     "Check power, cable and the settings of the line, and look for longer.",
     "sniff.md",
     "daqsvc: CAN bus 'can0' (socketcan can0) has carried no frame, so there is no plant.blf; its state at"

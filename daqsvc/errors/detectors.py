@@ -101,7 +101,7 @@ NO_REVOLUTIONS = Code(
     "D14",
     "The bank would not learn how the rotor runs now",
     "The rotor comes from a run-up. Its unbalance and its rest may have changed since, and are learnt "
-    "anew at start.",
+    "again at start.",
     "Write e.g. calibrate_revolutions = 50.",
     "calibration.md",
 )
@@ -117,7 +117,7 @@ CALIBRATION_FILE = Code(
     "The calibration cannot be used",
     "The file is not there or damaged, was written by another program, or is of another machine, other "
     "sensors or another speed.",
-    "Correct the path, or make the file anew with daqsvc calibrate.",
+    "Correct the path, or make the file again with daqsvc calibrate.",
     "calibration.md",
 )
 NO_OBSERVERS = Code(
@@ -138,11 +138,11 @@ UNFIT_BEARING = Code(
 )
 HEALTHY_STATE = Code(
     "D19",
-    "The healthy state is learnt anew, or will be lost",
+    "The healthy state is learnt again, or will be lost",
     "The file that keeps what was learnt of the healthy machine cannot be read, used or written.",
-    "Make sure that the machine is in good order now, or calibrate it again. See to the disk.",
+    "Make sure that the machine is in good order now, or calibrate it again. Check the disk.",
     "calibration.md",
-    "the healthy state of the rotor is measured anew: /var/lib/daqsvc/rotor.toml was made at another speed",
+    "the healthy state of the rotor is measured again: /var/lib/daqsvc/rotor.toml was made at another speed",
 )
 NO_DETECTOR = Code(
     "D20",
@@ -155,7 +155,8 @@ NO_DETECTOR = Code(
 SENSOR_NOT_OK = Code(
     "D21",
     "A sensor is not OK",
-    "What it sends is not what a sound sensor delivers: it is dead, clipped, outside its OK limits or loose.",
+    "What it sends is not what a working sensor delivers: it is dead, clipped, outside its OK "
+    "limits or loose.",
     "Look at the sensor, its cable and its supply. The message says what is wrong with its signal.",
     "alarms.md",
     "alarm sensor-ok/probe-x raised: probe-x is not OK: probe-x does not move at all (0 um): dead or "

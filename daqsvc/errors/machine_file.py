@@ -37,7 +37,7 @@ TOO_LARGE = Code(
     "The file is larger than a machine file can be",
     "Size, depth, numbers and entries have limits far above what a machine needs. Usually the wrong file "
     "was given.",
-    "See whether it is the right file. Watch a very large plant with several machine files.",
+    "Check whether it is the right file. Watch a very large plant with several machine files.",
     _PAGE,
 )
 UNKNOWN_KEY = Code(

@@ -15,7 +15,7 @@ CREDENTIAL_OPEN = Code(
     "O02",
     "Everybody on this machine can read the credential",
     "The rights of the file let every user read it.",
-    "Take the rights away: chmod o-rwx FILE. Then replace what is in it.",
+    "Remove that right: chmod o-rwx FILE. Then replace what is in it.",
     _PAGE,
 )
 UNENCRYPTED = Code(
@@ -77,7 +77,8 @@ BROKER_TLS = Code(
     "certificate or a version of TLS.",
     "Correct ca_file and the host in mqtt.url, or renew the certificate that the message names.",
     "mqtt.md",
-    "MQTT broker 10.0.0.1:8883 is away: nobody in ca_file vouches for its certificate: self-signed "
+    "MQTT broker 10.0.0.1:8883 is away: its certificate is not signed by an authority in "
+    "ca_file: self-signed "
     "certificate",
 )
 BROKER_REFUSES = Code(
@@ -113,13 +114,13 @@ CERTIFICATE_UNKNOWN = Code(
     "The certificate cannot be read as one, so that no alarm can be raised before it ends.",
     "Look at the file that the message names, and note when the certificate ends.",
     "mqtt.md",
-    "nobody will be told when the certificates in /etc/daqsvc/ca.pem end: it holds no certificate",
+    "no alarm will warn before the certificates in /etc/daqsvc/ca.pem end: it holds no certificate",
 )
 MESSAGE_DROPPED = Code(
     "O15",
     "Messages are dropped",
     "Telemetry is dropped where there is no room, or the broker does not take it. Alarms are not.",
-    "See to the disk and the broker. Every dropped message is counted: daqsvc status.",
+    "Check the disk and the broker. Every dropped message is counted: daqsvc status.",
     "outbox.md",
     "telemetry in /var/lib/daqsvc/telemetry.bin is dropped: the disk is nearly full",
 )
@@ -128,7 +129,7 @@ OUTPUT_STATE = Code(
     "What an output remembers cannot be kept",
     "A small file of the output in the store cannot be read or written. After a restart it may tell things "
     "twice, or leave old ones standing.",
-    "See to the disk and the rights of the store.",
+    "Check the disk and the rights of the store.",
     "outputs.md",
     "Sparkplug memory /var/lib/daqsvc/sparkplug.json cannot be written: No space left on device",
 )
@@ -144,7 +145,7 @@ HISTORY_DAMAGED = Code(
     "O18",
     "The history is damaged",
     "The file of the history cannot be read any more. It is set aside, and a new one is begun.",
-    "See to the disk. What was set aside may be read with the tools of SQLite.",
+    "Check the disk. What was set aside may be read with the tools of SQLite.",
     "history.md",
     "the history /var/lib/daqsvc/history.sqlite is damaged (database disk image is malformed): it is now "
     "history.sqlite.corrupt-1, and a new one is begun",
@@ -163,7 +164,7 @@ HOST_MISSING = Code(
     "The host that the machine file names is offline, so that nothing is sent to it. Alarms wait.",
     "Start the host application, or correct primary_host.",
     "sparkplug.md",
-    "Sparkplug tells nothing yet: primary host scada is offline on 10.0.0.1:8883",
+    "Sparkplug sends nothing yet: primary host scada is offline on 10.0.0.1:8883",
 )
 COMMAND_NOT_OBEYED = Code(
     "O21",
@@ -177,8 +178,8 @@ COMMAND_NOT_OBEYED = Code(
 NOT_SHOWN = Code(
     "O22",
     "A viewer does not get what it shows",
-    "The broker does not let this client send or listen to what a page or a dashboard asks for, what comes "
-    "there is no message of daqsvc, or there are as many viewers as max_viewers of [mqtt.live] allows.",
+    "The broker does not let this client send or listen to what a page or a dashboard asks for. Or what "
+    "comes there is no message of daqsvc, or there are as many viewers as max_viewers of [mqtt.live] allows.",
     "Allow the topics to this client in the access list of the broker, or close another viewer.",
     "page.md",
     "the MQTT broker does not let this client subscribe to daqsvc/lab/live: no live data is sent over it",

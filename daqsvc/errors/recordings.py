@@ -15,7 +15,8 @@ NOT_FOUND = Code(
 UNKNOWN_FORMAT = Code(
     "R02",
     "The file is of no kind that can be read",
-    "The ending of its name says the kind. It is none that is known, or what is in the file is another kind.",
+    "The ending of its name says the kind. It is none that is known, or the file has contents "
+    "of another kind.",
     "Save it as one of the kinds that the message lists, with the ending of that kind.",
     _PAGE,
     "daqsvc export: shaft.wav is not a WAV file: it begins with b'RF64', not with RIFF; save it as WAV "
@@ -27,8 +28,8 @@ DAMAGED = Code(
     "What is in the file contradicts itself, or its end is missing: a copy or the logger stopped too early.",
     "Copy the file again, or save it again with the program that wrote it.",
     _PAGE,
-    "daqsvc export: shaft.wav is cut short: its 'data' chunk should have 8000 bytes and has 4000; copy or"
-    " save it anew",
+    "daqsvc export: shaft.wav is cut short: its 'data' chunk should have 8000 bytes and has 4000; copy "
+    "or save it again",
 )
 TOO_LARGE = Code(
     "R04",
@@ -37,8 +38,8 @@ TOO_LARGE = Code(
     "Give more with --max-memory, or cut the recording into shorter ones.",
     _PAGE,
     "daqsvc export: shaft.csv cannot be read: it takes more memory than it may; allow more (--max-memory,"
-    " or max_memory_gb of a replayed bus; it is 0.05 GB), or unless it is that large it is damaged: copy "
-    "or save it anew",
+    " or max_memory_gb of a replayed bus; it is 0.05 GB), or if it is not that large, it is damaged: copy "
+    "or save it again",
 )
 NO_SUCH_CHANNEL = Code(
     "R05",
@@ -86,7 +87,7 @@ NOT_TOGETHER = Code(
     "R10",
     "The channels were not taken together",
     "They have different lengths or times, and cannot be compared sample by sample.",
-    "Map only channels that were taken together, or record them anew.",
+    "Map only channels that were taken together, or record them again.",
     _PAGE,
     "the channels of run.npz have different lengths: x 1000, y 900; map only channels taken together",
 )
@@ -117,9 +118,9 @@ NOT_IN_LOG = Code(
 )
 UNFIT_SAMPLES = Code(
     "R14",
-    "The samples are not what a sound sensor delivers",
+    "The samples are not what a working sensor delivers",
     "They are clipped, stuck at one value, too weak, or in another unit.",
-    "Look at sensor, cable and range, and record anew. --map says which channel is meant.",
+    "Look at sensor, cable and range, and record again. --map says which channel is meant.",
     _PAGE,
     "shaft.csv: not judged: channel is clipped: 310 of 8000 samples are at 200; use a sensor or a gain "
     "with a larger range",
@@ -128,7 +129,7 @@ NOT_JUDGED = Code(
     "R15",
     "The recording cannot be judged",
     "What it shows does not go with what was said of the machine: speed, keyphasor, length or state.",
-    "Do as the message says: correct the option, or record anew.",
+    "Do as the message says: correct the option, or record again.",
     _PAGE,
     "run.csv: not judged: run.csv has no channel for shaft-x of pump.toml; name its variable, e.g. --map "
     "shaft-x=VARIABLE. It holds a, b",
@@ -150,7 +151,7 @@ SNAPSHOT = Code(
     "Copy it again, or give another one.",
     "recorder.md",
     "daqsvc replay: pump.mcap cannot be read: it is no MCAP file: it does not begin as one; it may be "
-    "damaged: copy it anew, or give another one",
+    "damaged: copy it again, or give another one",
 )
 NOT_REPLAYABLE = Code(
     "R18",

@@ -13,8 +13,8 @@ NEEDS_RESTART = Code(
 UNUSABLE_STORE = Code(
     "S02",
     "The store cannot be used",
-    "Its path is no directory, this user may not write there, a newer version of daqsvc has written it, or "
-    "it is that of another machine file with the same site, box and machine name.",
+    "Its path is no directory, this user may not write there, or a newer version of daqsvc has written it. "
+    "Or it is that of another machine file with the same site, box and machine name.",
     "Correct store.directory, give the user of the service the right to write there, install the newer"
     " version, or give the machine another name.",
     "outbox.md",
@@ -32,7 +32,7 @@ JOURNAL = Code(
     "S04",
     "The alarm journal cannot be used",
     "It is not there yet, is empty, this user may not read it, or the disk answers with errors.",
-    "Start the service on the store once, ask with sudo, or see to the disk.",
+    "Start the service on the store once, ask with sudo, or check the disk.",
     "outbox.md",
     "daqsvc alarms: there is no journal /var/lib/daqsvc/lab/outbox.sqlite: the service has not run with "
     "this "
@@ -50,11 +50,10 @@ JOURNAL_BEHIND = Code(
     "S06",
     "The journal does not show the latest",
     "Events wait in the memory of the service for a disk that cannot be written. They are lost if it ends.",
-    "See to the disk: make room, or mount it writable. The service writes them as soon as it can.",
+    "Check the disk: make room, or mount it writable. The service writes them as soon as it can.",
     "outbox.md",
-    "daqsvc alarms: 2 events wait in the service's memory for a disk that cannot be written: this is not "
-    "how "
-    "the alarms stand by now",
+    "daqsvc alarms: 2 events wait in the service's memory for a disk that cannot be written: this "
+    "is not their present state",
 )
 JOURNAL_DAMAGED = Code(
     "S07",
@@ -88,7 +87,7 @@ PART_STALLED = Code(
     "S10",
     "A part of the service hangs",
     "It has made no step for some time: a disk, an adapter or a plugin does not return.",
-    "Look at what the message names. systemd starts the service again if it does not get on.",
+    "Look at what the message names. systemd starts the service again if that lasts.",
     "status.md",
     "the outbox has stalled, without a step for 60 s: the service is started again",
 )
@@ -105,12 +104,11 @@ TOO_SLOW = Code(
 CONTROL_SOCKET = Code(
     "S12",
     "The control socket cannot be used",
-    "It, or the link to it, was taken away, or cannot be made in the store. daqsvc status and ack need it.",
-    "Give the service a store on a file system that knows sockets, and take nothing out of it.",
+    "It, or the link to it, was removed, or cannot be made in the store. daqsvc status and ack need it.",
+    "Give the service a store on a file system that supports sockets, and take nothing out of it.",
     "commands.md",
-    "no commands on this box until this is mended: /var/lib/daqsvc/control.sock is in the way of the "
-    "control "
-    "socket and is none; move it away",
+    "no commands on this box until this is corrected: /var/lib/daqsvc/control.sock is "
+    "not a socket, and no control socket can be made there; move it to another place",
 )
 NOT_REMEMBERED = Code(
     "S13",
@@ -118,7 +116,7 @@ NOT_REMEMBERED = Code(
     "The disk has lost or not taken what the last run wrote, so that states of alarms are sent again, or "
     "the "
     "ids of commands are not known.",
-    "Look at the alarms once: daqsvc alarms. See to the disk if it happens again.",
+    "Look at the alarms once: daqsvc alarms. Check the disk if it happens again.",
     "outbox.md",
     "an earlier run has sent the broker what the disk never got, so the state of every alarm is sent again",
 )
@@ -145,8 +143,8 @@ RELOAD_REFUSED = Code(
     "They have errors, or the change needs a restart. The service goes on as it was.",
     "Correct the files: daqsvc check names each error. Then ask again, or restart the service.",
     "commands.md",
-    "SIGHUP is refused, and the service goes on as it is: site of pump.toml is another one: restart the "
-    "service",
+    "SIGHUP is refused, and the service goes on as before: site of pump.toml is "
+    "different: restart the service",
 )
 WATCHDOG = Code(
     "S17",
@@ -154,7 +152,7 @@ WATCHDOG = Code(
     "It is no number, or shorter than parts of the service may take for one step.",
     "Write the time that the message names into the unit file.",
     "install.md",
-    "WatchdogSec= is 1 s, and parts are held to 5 s: write that much at least",
+    "WatchdogSec= is 1 s, and the limit of parts is 5 s: write at least that",
 )
 STOPPED_HARD = Code(
     "S18",

@@ -56,7 +56,7 @@ def is_within(place: tuple[Any, str], whole: tuple[Any, str]) -> bool:
 
     Args:
         place: file system and path of it.
-        whole: likewise of the other.
+        whole: the same of the other.
     """
     (files, path), (other_files, other) = place, whole
     if not protocols(files) & protocols(other_files):

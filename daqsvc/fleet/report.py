@@ -298,7 +298,7 @@ def read_truth(path: Path) -> list[KnownFault]:
                 )
             known.append(KnownFault(**values, where=f"--truth {path}, line {table.line_num}"))
     except csv.Error as error:
-        raise FleetError(f"--truth {path} is no CSV table: {error}; save it anew") from None
+        raise FleetError(f"--truth {path} is no CSV table: {error}; save it again") from None
     return known
 
 

@@ -374,7 +374,7 @@ def _check_version(connection: sqlite3.Connection, path: Path) -> None:
     if version > VERSION:
         raise NewerHistoryError(
             f"{path} was written by a newer version of daqsvc (its form is {version}, this version knows "
-            f"{VERSION}); install that again, or move the file away to begin anew"
+            f"{VERSION}); install that again, or move the file away to begin again"
         )
 
 

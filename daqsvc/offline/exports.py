@@ -133,7 +133,7 @@ def _of_snapshot(path: Path, snapshot: Snapshot) -> list[RecordedStream]:
         raise RecordingError(f"{path} {error}; give a snapshot of a shorter time", GAPS) from None
     except (ArithmeticError, AttributeError, KeyError, TypeError, ValueError) as error:
         raise RecordingError(
-            f"{path} cannot be read: {error}; it may be damaged: copy it anew", DAMAGED
+            f"{path} cannot be read: {error}; it may be damaged: copy it again", DAMAGED
         ) from None
     if not streams:
         raise RecordingError(f"{path} holds no samples of any sensor; give another snapshot", TOO_SHORT)

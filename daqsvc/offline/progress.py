@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 PATIENCE_S = 2.0
-"""So long there is no bar."""
+"""Time until a bar is shown."""
 _WIDTH = 40
 
 

@@ -104,7 +104,7 @@ class Replayed:
         again: the detectors that began again, and why.
         notes: what a person should know of the snapshot, in sentences.
         said: the statements compared with those of the snapshot.
-        alarmed: likewise the events of alarms, but for people's.
+        alarmed: the same for the events of alarms, but for people's.
     """
 
     causes: list[str] = field(default_factory=list)

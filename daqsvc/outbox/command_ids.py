@@ -54,7 +54,7 @@ class CommandIds:
     def open(self, begun_ns: int, *, is_new: bool) -> bool:
         """Read the file at the start of the service. Blocks.
 
-        If ids that were there are gone, nobody knows which commands have come: all that were issued before
+        If ids that were there are gone, it is not known which commands have come: all that were issued before
         this start are refused, see `is_from_before`.
 
         Args:
@@ -83,7 +83,7 @@ class CommandIds:
             self._lost_until_ns = begun_ns
             log.error(
                 "the list of commands that have come, %s, is missing or damaged: commands that were issued "
-                "before this start are refused, for they may have been obeyed already",
+                "before this start are refused, as they may have been carried out already",
                 self._path,
                 extra=coded(NOT_REMEMBERED),
             )

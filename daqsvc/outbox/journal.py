@@ -351,7 +351,7 @@ class Journal:
 
         Raises:
             sqlite3.Error: the new file cannot be written; the corrupt one is as it was.
-            OSError: likewise, or it cannot be set aside.
+            OSError: as above, or it cannot be set aside.
         """
         self._disconnect()
         if not self.path.exists():
@@ -402,7 +402,7 @@ class Journal:
         self._connection = connection
         gone = self._mark.vanished(stored)
         if is_new and self._mark.is_damaged:
-            gone = max(gone, 1)  # there was a journal, and nobody knows what was in it
+            gone = max(gone, 1)  # there was a journal, and it is not known what was in it
         last, was_emptied = stored or 0, False
         if self._log_copy.is_there and (gone or not stored or self._mark.is_damaged):
             back = self._take_back(connection, stored or 0)
@@ -411,7 +411,7 @@ class Journal:
             gone -= sum(self._mark.used - gone < number <= self._mark.used for number in back)
             was_emptied = self._log_copy.was_emptied and bool(self._mark.used)
             if was_emptied:
-                gone = max(gone, 1)  # what was in the journal but not in the log, nobody knows
+                gone = max(gone, 1)  # what was in the journal but not in the log is not known
         if gone:
             self.vanished += gone
             self._renewal.remember(JournalDamage(self.quarantined, self.vanished))
@@ -428,7 +428,7 @@ class Journal:
         self._mark.begin(self._next, self._unwritten.first)
 
     def _first_unwritten(self) -> int:
-        """The first number that is not in the journal by a commit that has succeeded; 0 if nobody knows."""
+        """The first number that is not in the journal by a commit that has succeeded; 0 if not known."""
         first = self._unwritten.first
         return self._next if first is None else first
 
@@ -510,7 +510,7 @@ class Journal:
 
         Raises:
             OSError: there are no numbers to be had; try again with the same drafts.
-            OutboxError: nobody has looked yet which numbers are free.
+            OutboxError: it has not been read yet which numbers are free.
         """
         if not self._next:
             self._begin_unread()
@@ -567,7 +567,7 @@ class Journal:
 
         Raises:
             sqlite3.Error: nothing was written; try again.
-            OSError: likewise, from the side file.
+            OSError: as above, from the side file.
         """
         connection = self._open_connection()
         messages, marks = self._unwritten.next(at_most)
@@ -789,7 +789,7 @@ class Journal:
 
         Raises:
             sqlite3.Error: it cannot be looked at, or may say what the disk never got (see `_prove`).
-            OSError: likewise.
+            OSError: as above.
         """
         if self._is_ready or self._connection is not None or self._lock is None:
             try:

@@ -1,6 +1,6 @@
 """Of which topics the journal ever had a retained message, apart from the journal itself.
 
-After damage this tells the alarms that the broker may show in a state that nobody knows any more from those
+After damage this tells the alarms that the broker may show in a state that is no longer known from those
 that were never raised.
 
 Each line of the file holds topics that came together, with a checksum. New ones get a line of their own: in a
@@ -41,7 +41,7 @@ class KnownTopics:
 
     @property
     def topics(self) -> frozenset[str] | None:
-        """The topics; None if nobody knows them."""
+        """The topics; None if they are not known."""
         return self._topics
 
     def open(self, latest: Iterable[str], *, is_whole: bool) -> None:

@@ -2,7 +2,7 @@
 
 For SQLite a log ends before its first wrong checksum: one flipped bit takes all that was committed behind it.
 But messages have their own checksums. So the pages in the log are read one by one, and each message that
-is whole counts; likewise the pages of a database whose first one, with the tables' definitions, is lost.
+is whole counts; so do the pages of a database whose first one, with the tables' definitions, is lost.
 Formats: https://www.sqlite.org/fileformat2.html, "The Write-Ahead Log" and "B-tree Pages".
 """
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     Value: TypeAlias = int | bytes | None
 
 PAGE_BYTES = 4096
-"""Page of a file that SQLite makes if nobody says otherwise."""
+"""Page of a file that SQLite makes by default."""
 
 _SIZES = {1 << power for power in range(9, 17)}
 _HEADER_BYTES, _FRAME_HEADER_BYTES, _PAGE_HEADER_BYTES = 32, 24, 8

@@ -85,7 +85,7 @@ class Renewal:
 
         Raises:
             sqlite3.Error: the new journal cannot be written.
-            OSError: likewise.
+            OSError: as above.
         """
         delete(self._draft)
         if self._saved.exists():
@@ -116,7 +116,7 @@ class Renewal:
 
         Raises:
             sqlite3.Error: the new file cannot be written; the corrupt one is as it was.
-            OSError: likewise.
+            OSError: as above.
         """
         try:
             count = self._write(chain(readable(source, below), others), source, last, wall_ns)

@@ -42,7 +42,7 @@ def rescue(
 
     Raises:
         sqlite3.Error: the new file cannot be written; the corrupt one is as it was.
-        OSError: likewise.
+        OSError: as above.
     """
     rows = _rows(path, table, is_row_sound)
     draft = path.with_name(path.name + ".draft")

@@ -197,9 +197,9 @@ def refuse_unopenable(store: Path) -> None:
             continue
         us = account()
         if status.st_uid == os.geteuid():
-            raise StoreRefusedError(f"{path} may not be opened by {us}, whose it is: chmod u+rw {path}")
+            raise StoreRefusedError(f"{path} may not be opened by {us}, the owner: chmod u+rw {path}")
         raise StoreRefusedError(
-            f"{path} belongs to {_user(status.st_uid)}, and {us}, as whom the service runs, may not open it: "
+            f"{path} belongs to {_user(status.st_uid)}, and the user of the service, {us}, may not open it: "
             f"chown -R {us} {store}"
         )
 
@@ -233,7 +233,7 @@ def refuse_foreign(path: Path) -> None:
     """The same for who only reads a file: it may also be of the owner of its store, which is no link either.
 
     Raises:
-        StoreRefusedError, OSError: likewise.
+        StoreRefusedError, OSError: as above.
     """
     status = path.lstat()
     if not stat.S_ISREG(status.st_mode) or status.st_uid != path.parent.stat().st_uid:

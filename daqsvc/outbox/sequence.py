@@ -43,7 +43,7 @@ STEP = 1024
 """How far the ceiling is ahead: one sync of the side files for so many numbers."""
 
 LEAP = 10_000_000
-"""How far numbers jump where nobody knows any more what was used: hours of the worst flood of alarms."""
+"""How far numbers jump where it is not known any more what was used: hours of the worst flood of alarms."""
 
 UNRECORDED = 10_000_000
 """Numbers above the ceiling that may be given while no side file can be written. A run whose wall clock is so

@@ -67,7 +67,7 @@ def version_of(connection: sqlite3.Connection, writer: str) -> int:
     """The version that the file gives for its tables; 0 for a new one.
 
     Another number than `SCHEMA_VERSION` is damage if the tables are of `SCHEMA_VERSION` to the last column
-    and nobody says that another program has written them: no version changes the number alone.
+    and nothing shows that another program has written them: no version changes the number alone.
 
     Args:
         connection: to the file.

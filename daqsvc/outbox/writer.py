@@ -1,7 +1,7 @@
 """The thread that writes the journal: group commits, retries, and what to do about a file that fails.
 
 While the disk takes no writes, messages get their numbers all the same and can be read from memory, so that
-they reach the broker; the disk is told later, in the same order.
+they reach the broker; the disk gets them later, in the same order.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ CROWD_LINGER_S = 0.05
 """How long messages wait for company while they come in a crowd: a commit costs more than 20 of them."""
 
 CROWD_OVER_S, CROWD = 0.1, 20
-"""So many messages within so long are a crowd."""
+"""A crowd: this number of messages within this time."""
 
 RETRY_FIRST_S, RETRY_MOST_S = 0.1, 5.0
 
@@ -91,7 +91,7 @@ class Crowd:
         self._before = 0
 
     def come(self, count: int, now_s: float) -> None:
-        """So many messages have come by ``now_s``, on a monotonic clock."""
+        """Note how many messages have come by ``now_s``, on a monotonic clock."""
         self._look(now_s)
         self._came += count
 

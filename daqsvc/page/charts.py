@@ -58,7 +58,7 @@ class ChartAxis(NamedTuple):
     Attributes:
         label: with its unit.
         lowest: where it begins; None to follow the data.
-        highest: likewise where it ends.
+        highest: where it ends.
         log: whether it is logarithmic.
     """
 

@@ -97,7 +97,7 @@ def finding_rows(live: MachineLive) -> str:
     if rows:
         return "".join(rows)
     heard = len(live.latest)
-    sentence = "No detector finds a fault." if heard else "No detector has said anything yet."
+    sentence = "No detector finds a fault." if heard else "No detector has stated anything yet."
     return f'<tr><td colspan="4">{escape(sentence + _unjudged(live))}</td></tr>'
 
 

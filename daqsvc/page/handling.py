@@ -39,8 +39,8 @@ TIMES = {"1": "1 hour", "4": "4 hours", "8": "8 hours", "24": "1 day"}
 """How long an alarm may be shelved for by the page, h."""
 OFFERS: Mapping[Verb, tuple[str, str]] = {
     Verb.ACKNOWLEDGE: ("Acknowledge", "You have seen it."),
-    Verb.RESET: ("Reset", "Let go of a latched alarm whose condition has gone."),
-    Verb.SHELVE: ("Shelve", "Cover it for a time; it comes back by itself."),
+    Verb.RESET: ("Reset", "Reset a latched alarm whose condition is no longer present."),
+    Verb.SHELVE: ("Shelve", "Suppress it for a time; it returns by itself."),
     Verb.UNSHELVE: ("Unshelve", "Uncover it now."),
     Verb.BYPASS: ("Bypass", "Take it out of service until somebody puts it back."),
     Verb.UNBYPASS: ("Put back into service", "End the bypass."),
@@ -93,7 +93,7 @@ class Said:
         return secret
 
     def of(self, secret: str) -> tuple[str, bool]:
-        """What came of it, and whether that is good; empty if nobody knows."""
+        """What came of it, and whether that is good; empty if that is not known."""
         return self._said.get(secret, ("", True))
 
 
@@ -184,10 +184,10 @@ def _command(fields: Mapping[str, str], machine: str, person: Person) -> AlarmCo
     verb = Verb(fields["verb"])
     hours = fields.get("hours", "")
     if verb is Verb.SHELVE and hours not in TIMES:
-        raise FormError("it says not for how long")
+        raise FormError("it does not state for how long")
     reason = _ONE_LINE.sub(" ", fields.get("reason", "")).strip()
     if verb in {Verb.SHELVE, Verb.BYPASS} and not reason:
-        raise FormError(f"say why {fields['alarm'][:100]} is to be covered")
+        raise FormError(f"give a reason for {fields['alarm'][:100]}")
     return AlarmCommand(
         verb=verb,
         alarm=fields["alarm"],

@@ -34,11 +34,11 @@ class Listening(ABC):
     def __init__(self, machine: str, history: Path | None) -> None:
         self.machine = machine
         self.live: MachineLive | None = None
-        """What was told; None before anything was told for the first time."""
+        """What was received; None before the first message."""
         self.why_not = "the service has not answered yet"
-        """Why nothing is told by now; empty if something is."""
+        """Why nothing is received at present; empty if something is."""
         self.heard_s = time.monotonic()
-        """When something was told last."""
+        """When something was last received."""
         self.streams: frozenset[str] = frozenset()
         """Those whose samples are to be asked for."""
         self.anew = asyncio.Event()
@@ -49,14 +49,14 @@ class Listening(ABC):
 
     @abstractmethod
     async def listen(self, backoff: Backoff) -> None:
-        """Ask for the `streams`, and take what is told, until that ends or `anew` is set.
+        """Ask for the `streams`, and take what comes, until that ends or `anew` is set.
 
         Args:
             backoff: to be reset as soon as something comes.
         """
 
     def in_words(self, error: Exception) -> str:
-        """Why nothing is told, for a person."""
+        """Why nothing is received, for a person."""
         return f"{error}" or type(error).__name__
 
     async def first(self, timeout_s: float) -> MachineLive | None:

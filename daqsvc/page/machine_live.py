@@ -133,7 +133,7 @@ class SensorPlace(NamedTuple):
 
 
 class MachineLive:
-    """One machine, as it was told.
+    """One machine, as it was received.
 
     The event loop tells it, and threads look at it meanwhile: they copy what they go through, by ``[*...]``.
 
@@ -193,7 +193,7 @@ class MachineLive:
 
     @property
     def speed_in_words(self) -> str:
-        """The speed, and whether it is only the machine file's; "" if nobody says any."""
+        """The speed, and whether it is only the machine file's; "" if none is stated."""
         measured = self.measured_rpm is not None
         return f"{self.speed_rpm:.0f} rpm{'' if measured else ' nominal'}" if self.speed_rpm else ""
 
@@ -226,7 +226,7 @@ class MachineLive:
         self.left_out += line.get("left_out", 0)
 
     def told_of(self, alarm: Document) -> str:
-        """What was found last of an alarm, as far as it was told, and what was done about it since."""
+        """What was found last of an alarm, as far as it was received, and what was done about it since."""
         found, message = self._found.get(alarm["alarm"], ""), str(alarm["message"])
         return message if not found or found == message else f"{found}; {message}"
 

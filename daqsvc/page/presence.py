@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 HEAD_EVERY_S = 0.5
-"""How often at least something is told, so that a browser knows that it is still heard."""
+"""Longest time between two messages, so that a browser knows that the page is there."""
 STALE_S = 3.0
-"""Of a service that has said nothing for so long it is told that it is silent."""
+"""Time without a line from the service after which the page shows it as silent."""
 
 
 class Picture:
@@ -130,7 +130,7 @@ class Picture:
         return ""
 
     def _whatever(self, listening: Heard) -> bytes:
-        """See `_told`; also of a mistake in this program browsers are told."""
+        """See `_told`; a mistake in this program is reported to browsers, too."""
         try:
             return self._told(listening)
         except Exception:
@@ -144,7 +144,7 @@ class Picture:
             ).encode()
 
     def _told(self, listening: Heard) -> bytes:
-        """What browsers are told now, as JSON; on a thread."""
+        """What browsers get now, as JSON; on a thread."""
         live = listening.live
         silent_s = time.monotonic() - listening.heard_s
         why = listening.why_not or ("the service sends nothing" if silent_s > STALE_S else "")

@@ -97,7 +97,7 @@ def whirl(live: MachineLive, probes: tuple[str, str], revolutions: float) -> Whi
 def order_1x(seen: Whirl) -> Order | None:
     """1X by least squares over all samples; None if they are too few.
 
-    By two marks or more the speed is theirs, over these samples; else the one that was told.
+    By two marks or more the speed is theirs, over these samples; else the stated one.
     """
     index = np.arange(len(seen.xy_um), dtype=np.float64)
     mark, period = _turning(seen)

@@ -22,12 +22,12 @@ class Heard(Protocol):
 
     @property
     def live(self) -> MachineLive | None:
-        """What was told; None before anything was."""
+        """What was received; None before the first message."""
         ...
 
     @property
     def why_not(self) -> str:
-        """Why nothing is told by now; empty if something is."""
+        """Why nothing is received at present; empty if something is."""
         ...
 
     @property
@@ -51,7 +51,7 @@ class MachineSource(Protocol):
         """How each machine stands: the names and alarms of `daqsvc.publish.service_status`.
 
         Raises:
-            OSError, ValueError: nobody answers.
+            OSError, ValueError: there is no answer.
         """
         ...
 
@@ -90,7 +90,7 @@ class MachineSource(Protocol):
         Args:
             machine: its name.
             command: what is asked.
-            denied: why the page has found that the person may not: it is written down, and refused.
+            denied: why the page has found that the person may not: it is logged, and refused.
             via: over what the person has asked, for the audit log.
         """
         ...

@@ -192,7 +192,7 @@ def machine_rows(live: MachineLive) -> str:
                 escape(one["quality"]),
             )
         )
-    return "".join(rows) or '<tr><td colspan="5">No detector has said anything yet.</td></tr>'
+    return "".join(rows) or '<tr><td colspan="5">No detector has stated anything yet.</td></tr>'
 
 
 def row(*cells: str) -> str:

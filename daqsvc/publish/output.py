@@ -84,7 +84,7 @@ class OutputPort:
             by ``await outbox.next_following(sequence, most)``. Open while `Output.run` runs.
         topics: of the box, whose site and name they have; by them events are known in the outbox.
         commands: carries out what people ask of alarms; an output has to see that they may.
-        snapshots: has snapshots of machines made for people; likewise.
+        snapshots: has snapshots of machines made for people; as above.
         look: begins a feed of live data of a machine; None if there is none.
         earlier: what a broker is asked for before it is told anything; None for nothing.
         progress: says how far each part of the service has come that can stall.
@@ -109,7 +109,7 @@ class Output:
 
     _reason = ""
     code: Code | None = None
-    """Of the kind of `reason`; None where nobody has said it."""
+    """Of the kind of `reason`; None where it is not stated."""
     _away_since_s: float | None = None
 
     @property

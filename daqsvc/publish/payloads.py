@@ -82,7 +82,7 @@ class _Statement(JsonPayload):
     detector: str = Field(description="name of the detector")
     decision: str = Field(description="what the detector has decided, e.g. normal or a mode")
     severity: Severity = Field(description="how bad that is")
-    changed: bool = Field(description="whether the decision is another one than before")
+    changed: bool = Field(description="whether the decision has changed")
     probabilities: dict[str, Number] = Field(description="by mode; empty if the detector has none")
     group: tuple[str, ...] = Field(description="modes that the evidence cannot tell apart")
     statistics: dict[str, Number] = Field(description="what was measured, by name")
@@ -158,7 +158,7 @@ class AlarmPayload(Stamped):
     shelved_until_wall_ns: int | None = Field(None, description="when shelving ends; null if not shelved")
     first_out: bool = Field(default=False, description="whether it stood first in its group")
     chattering: bool = Field(
-        default=False, description="whether it comes and goes so often that returns are held"
+        default=False, description="whether it is raised and returns so often that returns are held back"
     )
     found: str = Field("", description="what is found, joined with what it is not told apart from by |")
     doubts: tuple[DoubtPayload, ...] = Field(

@@ -119,7 +119,7 @@ def timing_of(
         channels: the channels themselves, by their names in the file.
 
     Raises:
-        RecordingError: nobody says the rate, the file contradicts itself or what is given, most samples are
+        RecordingError: the rate is not stated, the file contradicts itself or what is given, most samples are
             missing, or the rate is outside of `LEAST_RATE_HZ` to `MOST_RATE_HZ`.
     """
     stated = _stated(contents, channels)

@@ -298,12 +298,12 @@ def _there(
             if error.kind == known.__name__:
                 raise known(error.message, CODES.get(error.code, DAMAGED)) from None
         raise RecordingError(
-            f"{path} cannot be read: {error}; it may be damaged: copy or save it anew", DAMAGED
+            f"{path} cannot be read: {error}; it may be damaged: copy or save it again", DAMAGED
         ) from None
     except ConfinedError as error:
-        remedy = "it is damaged: copy or save it anew"
+        remedy = "it is damaged: copy or save it again"
         if error.reason != "crash":
-            remedy = f"unless it is that large it is damaged: {remedy.partition(': ')[2]}"
+            remedy = f"if it is not that large, it is damaged: {remedy.partition(': ')[2]}"
         if error.reason == "memory":
             remedy = (
                 f"allow more (--max-memory, or max_memory_gb of a replayed bus; it is "

@@ -47,10 +47,10 @@ class RecordedStream:
         name: of the stream.
         rate_hz: samples per second, as the machine file or the recording says.
         names: of the channels: those of the sensors where there are any.
-        units: of the channels; empty where nobody says one.
+        units: of the channels; empty where none is stated.
         samples: float ``[n, channels]`` in these units; NaN where samples are missing.
         start_ns: wall time of the first sample, ns since the Unix epoch; None if the recording does not say.
-        measured_hz: samples per second by the clock of the box; None if nobody measured.
+        measured_hz: samples per second by the clock of the box; None if it was not measured.
     """
 
     name: str
@@ -107,13 +107,13 @@ def checked(stream: RecordedStream, recording: str) -> tuple[RecordedStream, lis
     if not channels or not len(stream.names) == len(stream.units) == channels:
         raise RecordingError(
             f"{recording} cannot be read: stream {printable(stream.name):.80} has {len(stream.names)} names "
-            f"and {len(stream.units)} units of {channels} channels; it may be damaged: copy it anew",
+            f"and {len(stream.units)} units of {channels} channels; it may be damaged: copy it again",
             DAMAGED,
         )
     if not 0.0 < stream.rate_hz < np.inf or len(stream.samples) / stream.rate_hz > LAST_NS / NS_PER_S:
         raise RecordingError(
             f"{recording} cannot be read: stream {printable(stream.name):.80} is said to have "
-            f"{stream.rate_hz!r} samples a second; it may be damaged: copy it anew",
+            f"{stream.rate_hz!r} samples a second; it may be damaged: copy it again",
             DAMAGED,
         )
     notes = []

@@ -96,12 +96,13 @@ ENVIRONMENT: Mapping[str, str] = {
     "XDG_CACHE_HOME": "where kernels of a user are kept, below `daqsvc/kernels`; `~/.cache` if absent",
     CREDENTIALS_DIRECTORY: "where `password_credential` and `key_credential` are looked for; systemd sets it "
     "by `LoadCredential=`",
-    _NOTIFY: "socket on which systemd is told that the service is ready, how it stands, and that it stops",
-    _WATCHDOG_US: "how often systemd wants a sign of life, in us; systemd sets it by `WatchdogSec=`",
+    _NOTIFY: "socket on which the service reports to systemd that it is ready, its state, and that it stops",
+    _WATCHDOG_US: "how often systemd expects a sign of life, in us; systemd sets it by `WatchdogSec=`",
     _WATCHDOG_PID: "process that these signs are expected of; systemd sets it",
     "JOURNAL_STREAM": "says that the log goes to systemd's journal, which has the times; systemd sets it",
-    "SUDO_USER": "who handled an alarm, where root does so by `sudo`: it stands in the audit log",
-    "TERM": "with `dumb`, `daqsvc status --watch` prints one status after another in place of drawing anew",
+    "SUDO_USER": "who handled an alarm, if root does so by `sudo`: this name is in the audit log",
+    "TERM": "with `dumb`, `daqsvc status --watch` prints one status after another instead of drawing "
+    "over the last one",
 }
 
 

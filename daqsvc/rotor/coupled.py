@@ -43,7 +43,7 @@ COUPLED = np.dtype(
 """What an observer of coupled axes has besides `discretise.OBSERVER`; of that, its orbit and contact hold."""
 
 _REACH_REVOLUTIONS = 3.0
-"""So long it is remembered how far from the centre an estimate has been: rubs touch once a revolution."""
+"""Time for which the largest distance of an estimate from the centre is kept: a rub is once a revolution."""
 
 _POSITIONS = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
 _ACCELERATED = np.diag([0.0, 1.0, 0.0, 1.0])

@@ -206,7 +206,7 @@ class StartUp(Section):
     )
     change_per_s: Annotated[float, Field(ge=1e-9, le=MOST)] | None = Field(
         default=None,
-        description="the machine starts up while the signal changes at least so fast",
+        description="the machine starts up while the signal changes at least at this rate",
         examples=[20.0],
     )
     at_most_s: Annotated[float, Field(ge=0.1, le=86_400)] = Field(

@@ -59,7 +59,7 @@ class Bus(Hooks, Section):
 
 
 class UnknownBus(Bus):
-    """A bus whose driver is not installed: nobody knows what its table may hold."""
+    """A bus whose driver is not installed: it is not known what its table may hold."""
 
     model_config = ConfigDict(extra="ignore")
     kind: ClassVar[str] = "a bus without a driver"

@@ -361,7 +361,7 @@ SAMPLE_BYTES = 4
 _HISTORY_SPARE_S = 8.0
 """What the recorder remembers beyond the begin of a snapshot."""
 _CONTINUOUS_SPARE_S = 16.0
-"""Likewise, where it records continuously: what waits for the next file."""
+"""The same where it records continuously: what waits for the next file."""
 _MOST_SHARE = 0.5
 """Of the memory: the rest is for detectors, outbox, operating system and whoever else there is."""
 _CGROUP_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))

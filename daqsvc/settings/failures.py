@@ -174,7 +174,7 @@ def authors_of(module: str) -> str:
         module: of the plugin, or of one of its tables.
     """
     home = module.partition(".")[0]
-    return f"have the authors of {packages.get(home, f'the package of {home}')} mend it"
+    return f"have the authors of {packages.get(home, f'the package of {home}')} fix it"
 
 
 def _failure(error: BaseException, part: str, place: tuple[str, int], module: str) -> Failure:

@@ -65,7 +65,7 @@ def read_bounded(path: Path, most_bytes: int) -> bytes:
         os.close(descriptor)
     if len(data) > most_bytes:
         limit = f"{most_bytes / 1e6:.3g} MB"
-        raise UnreadableFileError(f"is larger than {limit}", "see whether it is the right file", TOO_LARGE)
+        raise UnreadableFileError(f"is larger than {limit}", "check whether it is the right file", TOO_LARGE)
     return data
 
 
@@ -98,7 +98,7 @@ def _usable_path(path: Path) -> Path:
     if "$" in text:
         raise PydanticCustomError(
             "path_variable",
-            "holds a variable of the shell, which nobody puts in here",
+            "holds a variable of the shell, which is not replaced here",
             {
                 "remedy": 'write the path in full, or from "~", the home of the user that runs the service',
                 "code": BAD_PATH,

@@ -99,7 +99,7 @@ class StreamWords(NamedTuple):
         frame_id: what the stream is known by on its bus.
         frames: how many frames come in a second.
         frame: what is in one.
-        counter: how loss is told.
+        counter: how loss is counted.
         share: of the bus's time that it takes.
     """
 

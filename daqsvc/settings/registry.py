@@ -237,7 +237,7 @@ def _bus_kind(table: Mapping[str, Any]) -> type[Bus]:
     drivers = bus_tables()
     settings = table.get("driver")
     name = settings if isinstance(settings, str) else next(iter(drivers), "")
-    with suppress(PluginFailedError):  # it is a finding, and nobody knows what the table may hold
+    with suppress(PluginFailedError):  # it is a finding, and it is not known what the table may hold
         if name in drivers:
             return drivers[name].bus_of(table)
     return UnknownBus

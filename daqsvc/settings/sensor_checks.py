@@ -94,8 +94,8 @@ def check_voltages(draft: MachineFile, sensor: Sensor, at: KeyPath) -> Iterator[
     if "zero_v" in probe.model_fields_set:
         yield Finding(
             (*at, "zero_v"),
-            f"lies outside gap_ok_v, {low_v:g} to {high_v:g} V: the probe would not be believed where the "
-            "shaft belongs",
+            f"lies outside gap_ok_v, {low_v:g} to {high_v:g} V: the "
+            "readings would be rejected where the shaft belongs",
             "write the gap voltage with the shaft centred, with its sign, e.g. zero_v = "
             f"{(low_v + high_v) / 2:g}; or correct gap_ok_v",
             code=GAP_VOLTAGE,

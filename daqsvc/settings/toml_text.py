@@ -82,7 +82,7 @@ def parse(text: str) -> tuple[dict[str, Any], Mapping[KeyPath, Spot]]:
     text = text.removeprefix("\ufeff")
     if len(text) > MOST_BYTES:
         raise TomlTextError(
-            f"is larger than {MOST_BYTES / 1e6:.3g} MB", "see whether it is the right file", TOO_LARGE
+            f"is larger than {MOST_BYTES / 1e6:.3g} MB", "check whether it is the right file", TOO_LARGE
         )
     if (match := _LONG_KEY.search(text)) is not None:
         raise _too_deep(_line_at(text, match.start()))
@@ -104,7 +104,7 @@ def parse(text: str) -> tuple[dict[str, Any], Mapping[KeyPath, Spot]]:
             raise _too_deep(error.line) from None
         raise TomlTextError(
             f"holds more than {MOST_VALUES:,} values",
-            "see whether it is the right file",
+            "check whether it is the right file",
             TOO_LARGE,
             error.line,
         ) from None
@@ -121,7 +121,7 @@ def _check_sizes(document: dict[str, Any], spots: Mapping[KeyPath, Spot]) -> Non
             subject = f"{dotted(path)} has" if path else "has"
             raise TomlTextError(
                 f"{subject} {len(value):,} entries: a machine file has at most {MOST_ENTRIES:,} in one place",
-                "see whether it is the right file",
+                "check whether it is the right file",
                 TOO_LARGE,
                 spots[path].line,
             )

@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from daqsvc.confined.limits import ResourceLimits
     from daqsvc.snapshots.contents import Document
 
-WAS_CUT = "was cut before any sample was written in it; copy it anew, or give another one"
+WAS_CUT = "was cut before any sample was written in it; copy it again, or give another one"
 """What is said behind a snapshot of which only the begin is there."""
-_REMEDY = "it may be damaged: copy it anew, or give another one"
+_REMEDY = "it may be damaged: copy it again, or give another one"
 
 
 class SnapshotError(Exception):

@@ -41,7 +41,7 @@ class CanAdapter:
 
     Args:
         bus: the bus; it is shut down with this.
-        clock: what arrivals are told in; each is stamped when it is taken.
+        clock: clock of the arrival times; each frame is stamped when it is taken.
         error_classes: see `drivers.can.batches.CanSource`.
     """
 
@@ -98,7 +98,7 @@ def open_adapter(bus: CanBus, clock: Clock) -> CanAdapter:
 
     Args:
         bus: its table in the machine file.
-        clock: what arrivals are told in.
+        clock: clock of the arrival times.
 
     Raises:
         Exception: adapters raise what they like.

@@ -167,7 +167,7 @@ class CanReader(threading.Thread):
     def _post(self, call: Callable[[Any], None], argument: object) -> None:
         try:
             self._hand.post(call, argument)
-        except RuntimeError:  # the event loop is closed: there is nobody left to tell
+        except RuntimeError:  # the event loop is closed: nothing takes the call any more
             self._stopping.set()
 
 
@@ -214,7 +214,7 @@ class CanDriver:
         self.link.faults = self._faults
         self._said: set[str] = set()
         self._is_fresh = False
-        """Whether nothing has come since the bus was opened: what its controller was then, nobody knows."""
+        """Whether nothing has come since the bus was opened: its controller's state is then not known."""
         self._recorder: CanRecorder | None = None
 
     @property

@@ -29,7 +29,7 @@ _LAST_SHORT_ID = 0x7FF
 _LISTEN_S = 5.0
 _SHOWN = 8
 _SURE_FRAMES = 20
-"""So many frames of a message without a signal that counts: it has none."""
+"""Frames of a message without a signal that counts, after which it is taken to have none."""
 
 
 class _CanQuestions(BusQuestions):
@@ -259,7 +259,7 @@ class DbcQuestions(_CanQuestions):
             name: f"{one.length} bits" for name, one in signals.items() if _may_count(one, len(signals))
         }
         likely = next((name for name in counters if is_count(name)), NONE)
-        choices = {**counters, NONE: "losses are then told by the times of arrival"}
+        choices = {**counters, NONE: "losses are then estimated from the times of arrival"}
         yield self.ask("counter", q.exactly(choices), likely, choices=choices)
         rest = [name for name in signals if name != answers["counter"]]
         measured = _likely_measured([signals[name] for name in rest])
@@ -331,7 +331,7 @@ class DbcQuestions(_CanQuestions):
         yield entry("dbc", answers["dbc"], "relative to this file; where signals lie, scale, unit")
         yield entry("message", answers["message"])
         if answers["counter"] is None:
-            yield entry("no_counter", value=True, comment="losses are told by the times of arrival")
+            yield entry("no_counter", value=True, comment="losses are estimated from the times of arrival")
         else:
             counter = toml({"signal": answers["counter"], "counts": "frames"})
             yield behind(f"counter = {counter}", "grows by 1 with each frame: losses are counted by it")

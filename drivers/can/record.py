@@ -56,7 +56,7 @@ class CanRecorder:
         interface: what logs call it.
         logs: where the recording goes.
         clock: the service's clock; its wall time labels the frames.
-        counters: what is counted on; these two figures are touched by nobody else.
+        counters: what is counted on; only the recorder changes these two figures.
     """
 
     def __init__(
@@ -232,7 +232,7 @@ class CanRecorder:
         if self._failed_ns is None:
             logger.warning(
                 "%s cannot be recorded in %s: %s; its frames are counted in frames_unrecorded until it can. "
-                "See that the disk has room and can be written",
+                "Check that the disk has room and can be written",
                 self._link_name,
                 self._logs.place,
                 words(error),

@@ -224,7 +224,7 @@ class Logs(Protocol):
     """A file that is this large is ended, and another one begun."""
 
     place: Path
-    """What a person is told."""
+    """The description for a person."""
 
     def next_path(self, wall_ns: int) -> Path:
         """The path of the next file, whose first frame came at ``wall_ns``; makes room for it.

@@ -139,7 +139,7 @@ class PlainLayout(PackedFields):
 
 @dataclass(frozen=True, slots=True)
 class DbcMessage:
-    """What a machine file needs to know of a message in a DBC file.
+    """What the checks of a machine file need to know of a message in a DBC file.
 
     Attributes:
         frame_id: CAN id.

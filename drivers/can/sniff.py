@@ -313,18 +313,18 @@ class _Report(NamedTuple):
         name = self.bus.channel
         of_kernel = self.bus.interface == "socketcan"
         if self.lost:
-            remedy = _set_up(name) if of_kernel else "see whether it is still plugged in, or still runs"
+            remedy = _set_up(name) if of_kernel else "check whether it is still plugged in, or still runs"
             return f"{name} was lost after {self.seconds:.1f} s: {self.lost}. Remedy: {remedy}"
         if self.traffic.ids:
             return ""
         if "/" in name and not of_kernel:
             return (
                 f"{name}: no frame in {self.seconds:.1f} s. Remedy: start the program that sends there, and "
-                "see that it has the same path"
+                "check that it has the same path"
             )
         if not of_kernel and not self.traffic.error_frames:
             return (
-                f"{name}: no frame in {self.seconds:.1f} s. Remedy: see that the devices are powered and "
+                f"{name}: no frame in {self.seconds:.1f} s. Remedy: check that the devices are powered and "
                 "send without being asked, and that CAN_H and CAN_L are not swapped; give the bit rate with "
                 "--bitrate"
             )
@@ -335,7 +335,7 @@ class _Report(NamedTuple):
                 f"{name} down`, then `{_set_up(name, self.bus.bitrate)}`; check termination and wiring"
             )
         return (
-            f"{name}: no frame in {self.seconds:.1f} s. Remedy: see that the devices are powered and send "
+            f"{name}: no frame in {self.seconds:.1f} s. Remedy: check that the devices are powered and send "
             "without being asked; that CAN_H and CAN_L are not swapped, with 120 ohm at both ends; and that "
             f"the bit rate is theirs (`ip link set {name} down`, then `{_set_up(name, self.bus.bitrate)}`)"
         )

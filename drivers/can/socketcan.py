@@ -4,8 +4,8 @@ python-can takes one frame per call, gives the receive buffer no size and cannot
 drops (python-can#474, #1881), so on Linux the raw socket is read here. Options of the bus, beside those
 of every CAN bus:
 
-- ``receive_buffer_bytes``: how much the kernel holds while nobody reads. It allows itself twice that, and
-  a frame takes some 768 bytes of it.
+- ``receive_buffer_bytes``: how much the kernel holds while frames are not read. It allows itself twice that,
+  and a frame takes some 768 bytes of it.
 - ``filter``: whether the kernel passes on only frames that some stream has (and error frames). It saves
   the work for all others, which are then not seen and hence not counted as unknown. Left out, it does so
   unless the bus is recorded.
@@ -78,8 +78,8 @@ class SocketCan:
 
     Args:
         sock: a bound socket, one ``can_frame`` or ``canfd_frame`` per datagram; it is closed with this.
-        clock: what arrivals are told in.
-        receive_buffer_bytes: how much the kernel holds while nobody reads.
+        clock: clock of the arrival times.
+        receive_buffer_bytes: how much the kernel holds while frames are not read.
 
     Raises:
         OSError: this is no Linux, or the socket takes no time stamps.
@@ -190,7 +190,7 @@ def open_socketcan(
     Args:
         bus: its table in the machine file.
         matches: ids that some stream has.
-        clock: what arrivals are told in.
+        clock: clock of the arrival times.
         recorded: whether the bus is recorded: what is read of it then does not depend on what the streams
             are, unless its table says so.
 

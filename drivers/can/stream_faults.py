@@ -1,4 +1,4 @@
-"""Why no samples of a stream come though its bus is up: what comes in place of its frames."""
+"""Why no samples of a stream come although its bus is up: what comes instead of its frames."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from drivers.frames import FrameLayout
 
 RECENT_NS = 10 * NS_PER_S
-"""Frames of other ids count as coming for so long."""
+"""Time for which frames of other ids count as coming."""
 MOST_NAMED = 5
 
 

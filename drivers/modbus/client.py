@@ -169,7 +169,7 @@ class ModbusWire(ModbusProtocol):
         self.recv_buffer = data
 
     def callback_disconnected(self, exc: Exception | None) -> None:
-        """Let nobody wait for a reply that cannot come any more."""
+        """End the wait for a reply that cannot come any more."""
         self.why_lost = f"{self._bus.where} has closed the connection" + (f" ({exc})" if exc else "")
         self._fail(LineLostError(self.why_lost))
 
@@ -192,9 +192,9 @@ class ModbusWire(ModbusProtocol):
         if isinstance(error, ConnectionRefusedError):
             return "nobody listens there; start the server, or correct host and tcp_port"
         if isinstance(error, TimeoutError):
-            return f"nobody answers there within {patience_s:g} s; correct host, or see to the network"
+            return f"nobody answers there within {patience_s:g} s; correct host, or check the network"
         if isinstance(error, OSError) and error.errno in {errno.ENETUNREACH, errno.EHOSTUNREACH}:
-            return "no route leads there from this box; correct host, or see to its network"
+            return "no route leads there from this box; correct host, or check its network"
         return f"{error}" or type(error).__name__
 
     def _begin_anew(self) -> None:
@@ -250,8 +250,7 @@ class ModbusWire(ModbusProtocol):
     def _look_at_the_clock(self) -> None:
         """Give a request up whose time is over.
 
-        One alarm goes on from request to request: one for each of thousands a second would mostly be
-        cancelled.
+        One timer serves all requests: with one for each of thousands a second, most would be cancelled.
         """
         self._alarm = None
         if not self._waits:

@@ -31,19 +31,19 @@ LARGEST_DRIFT = 0.05
 """How far a device's rate may be off its nominal one."""
 
 AT_ONCE_NS = NS_PER_S
-"""A device may show at once what it has sampled in so long."""
+"""Time whose samples a device may show at once."""
 
 STANDSTILL_NS = 2 * NS_PER_S
 """A count that falls behind the clock by more than this has stood still, or has begun again."""
 
 STILL_PERIODS = 4
-"""A count that is seen to stay for longer than that, and than so many samples or looks, stands still."""
+"""A count that stays for longer than that, and than this number of samples or reads, stands still."""
 
 LEAST_SLACK = 16
 """Samples by which a count may be off the clock, however slow the device is."""
 
 SURE = 4
-"""Looks in a row by which a count is believed that neither its past nor the clock explains."""
+"""Reads in a row after which a count is believed that neither its past nor the clock explains."""
 
 CountedT = TypeVar("CountedT", FifoLayout, RingLayout)
 
@@ -145,7 +145,8 @@ class CountedRows:
         if anew and (self._anew_said_ns is None or seen_ns - self._anew_said_ns >= QUIET_NS):
             self._anew_said_ns = seen_ns
             logger.warning(
-                "stream %r: its samples do not arrive when its clock has told; its time base begins anew",
+                "stream %r: its samples do not arrive at the times that its clock predicts; its "
+                "time base begins again",
                 self._name,
                 extra=coded(TIME_UNSURE),
             )

@@ -66,7 +66,7 @@ class FifoReader(CountedReader[FifoLayout]):
         self._emptied: _Emptied | None = None
 
     def flush(self) -> None:
-        """Hand over what is held back, unless its count is beyond belief."""
+        """Hand over what is held back, unless its count cannot be right."""
         if self._held and self._gap(self._held[0]) is not None:
             self._go_on_with(self._held)
         self._reject_held()

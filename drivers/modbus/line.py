@@ -145,7 +145,7 @@ class Silence:
     hopeful: bool = False
 
     def set_aside(self, patience: RetryPolicy, now_ns: int) -> bool:
-        """Let nobody ask for a while; returns whether that is new."""
+        """Make no request for a while; returns whether that is new."""
         new = self.probe_ns is None
         self.wait_ns = patience.demotion_ns if new else min(2 * self.wait_ns, patience.longest_demotion_ns)
         self.probe_ns = now_ns + self.wait_ns
@@ -348,7 +348,7 @@ class ModbusLine:
         self._due_ns: dict[object, int] = {}
 
     def expect(self, who: object, due_ns: int) -> None:
-        """Know when somebody will next ask: what may stay without reply is put between such times."""
+        """Note the time of the next request: what may stay without reply is sent between such times."""
         self._due_ns[who] = due_ns
 
     async def poll(self, unit: int, function: int, run: RegisterRun, what: str = "") -> RegisterValues:
@@ -473,7 +473,7 @@ class ModbusLine:
     def _miss(self, asked: UnitSilence, silence: Silence, why: str) -> None:
         asked.missed(silence, why, self._clock.monotonic_ns())
         if all(unit.dead for unit in self._units.values()):
-            self._lose(f"no unit answers any more; the last: {why}")
+            self._lose(f"no unit answers any more, the last one to answer was: {why}")
 
     def _lose(self, why: str) -> None:
         if not self.lost.done():

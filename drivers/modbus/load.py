@@ -3,7 +3,7 @@
 A request of a read has 8 characters and its reply 5 beside two for each register (Modbus Application
 Protocol 1.1b3, 6). Each character has 11 bits, or 10 without parity and a second stop bit. Before the reply,
 and before the next request, the line is silent for 3.5 characters, 1.75 ms at least (Modbus over serial line
-1.02, 2.5.1.1). How long a unit takes until it answers nobody knows: `USUAL_ANSWER_S` is a usual time.
+1.02, 2.5.1.1). How long a unit takes until it answers is not known: `USUAL_ANSWER_S` is a usual time.
 """
 
 from __future__ import annotations
@@ -61,13 +61,13 @@ class _Asked(NamedTuple):
 
     @classmethod
     def reads(cls, requests: Iterable[int], per_s: float) -> _Asked:
-        """Reads of so many registers each, all of them so often."""
+        """Reads of these numbers of registers, each at this rate."""
         counts = list(requests)
         return cls(per_s * len(counts), per_s * sum(_READ + _REPLY + 2 * count for count in counts))
 
     @classmethod
     def write(cls, registers: int, per_s: float) -> _Asked:
-        """A write of so many registers."""
+        """A write of this number of registers."""
         return cls(per_s, per_s * (_WRITE + _WRITTEN + 2 * registers))
 
 
@@ -145,7 +145,7 @@ def _samples(layout: FifoLayout | RingLayout, rate_hz: float) -> Iterable[_Asked
 
 
 def _blocks(layout: WaveformLayout) -> Iterable[_Asked]:
-    """Blocks that the device is asked to take; how often it takes others nobody knows."""
+    """Blocks that the device is asked to take; how often it takes others is not known."""
     if layout.trigger is None:
         return
     per_s = 1.0 / layout.trigger.every_s

@@ -273,9 +273,11 @@ class _ModbusQuestions(BusQuestions):
         yield entry("address", answers["fifo-address"], "pointer of the queue, read by function 24")
         yield entry("count", {"bits": int(answers["count-bits"])}, "at the head of each reply")
         if answers["acknowledge"] is None:
-            yield "# acknowledge = 700 if the device keeps samples until it is told how far they were read"
+            yield "# acknowledge = 700 if the device keeps samples until it gets the read position"
         else:
-            yield entry("acknowledge", answers["acknowledge"], "is told how far the queue was read")
+            yield entry(
+                "acknowledge", answers["acknowledge"], "the read position of the queue is written there"
+            )
 
     def _registers(self, answers: Answers) -> Iterator[str]:
         runs = sorted(

@@ -44,14 +44,14 @@ class Reader(Protocol):
 
 
 class PollingReader(ABC):
-    """A reader that looks again and again, and goes on after a request that failed.
+    """A reader that polls, and goes on after a request that failed.
 
     Args:
         streams: names of what it reads.
         clock: the service's clock.
 
     Attributes:
-        faults: by stream, why the last request for it has failed, in a clause; without those that get on.
+        faults: by stream, why the last request for it has failed, in a clause; without those that work.
     """
 
     def __init__(self, streams: Sequence[str], clock: Clock) -> None:

@@ -60,7 +60,7 @@ class RunLimits:
     """What requests may do.
 
     Attributes:
-        max_gap: registers nobody wants that one merge may read.
+        max_gap: unwanted registers that one merge may read.
         max_count: registers in a request, at most; the protocol allows 125.
         forbidden: registers that must not be read.
     """

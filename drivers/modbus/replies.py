@@ -46,12 +46,12 @@ REMEDIES = {
     2: "compare address and table with the register map of the device; what a map that begins at 1 calls "
     "101 is address 100 here",
     3: "let a request read less (max_count), or compare the register map of the device with the layout",
-    4: "see to the device",
+    4: "check the device",
     5: "it takes longer than a reply may; lower the rate of what is read from it",
     6: "it is at something else; lower the rate of what is read from it",
     8: "its memory fails; have it repaired",
     10: "compare unit with the routes of the gateway",
-    11: "see to the unit and its line behind the gateway, and compare unit with its address",
+    11: "check the unit and its line behind the gateway, and compare unit with its address",
 }
 """What to do about each of these."""
 
@@ -274,7 +274,7 @@ class ModbusCounters(BusCounters):
         blocks_torn: waveform blocks that the device replaced while they were read.
         blocks_missed: waveform blocks that were over before they could be read.
         ring_overruns: how often a ring was overwritten before it was read.
-        counts_doubted: write counters and block ids that another look did not confirm.
+        counts_doubted: write counters and block ids that another reading did not confirm.
     """
 
     requests: int = 0

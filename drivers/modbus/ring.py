@@ -19,7 +19,7 @@ REQUESTS_PER_LOOK = 16
 
 
 class _Look(NamedTuple):
-    """A look at the write counter.
+    """A reading of the write counter.
 
     Attributes:
         written: how many samples have been written, as many bits of it as the counter has.
@@ -39,7 +39,7 @@ class DeviceRingReader(CountedReader[RingLayout]):
     whether any of it may have been overwritten meanwhile. A request that fails is repeated at the next
     reading: only what the device has overwritten is lost, and the counter says how much that is.
 
-    No look is believed by itself. A counter does not go back: one that was damaged on its way is above the
+    No single reading is believed. A counter does not go back: one that was damaged on its way is above the
     next one, or below the one before. A counter that has begun again is so at the next reading, too, and
     then only what must have been written since is read.
     """
@@ -81,7 +81,7 @@ class DeviceRingReader(CountedReader[RingLayout]):
             await self._clock.sleep_ns(self._poll_ns)
 
     async def _believable(self, line: ModbusLine) -> _Look | None:
-        """The next look at the counter; None if another one contradicts it."""
+        """The next reading of the counter; None if another one contradicts it."""
         first, self._seen = self._seen or await self._count(line), None
         explained = self._advance(first) is not None
         if explained and self._checked:
@@ -93,7 +93,7 @@ class DeviceRingReader(CountedReader[RingLayout]):
             ahead = (second.written - first.written) % self._modulus
             most = self._sample_clock.most(second.seen_ns - first.asked_ns) + self._at_once
             if self._advance(second) is not None or ahead > most:
-                return None  # the counter is where it was, or nobody knows where
+                return None  # the counter is where it was, or its place is not known
             first = second
         return first
 

@@ -1,4 +1,4 @@
-"""Which units and registers answer on a Modbus line: asked politely, one request at a time, never writing."""
+"""Which units and registers answer on a Modbus line: one request at a time, and nothing is written."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE = 1, 2, 3
 BLOCK = 100
 """Registers in a request at first."""
 ALIKE = 8
-"""So many addresses in a row, of units that all answer: the server does not look at the address."""
+"""Addresses in a row that all answer, from which on the server is taken to ignore the address."""
 QUIET_S = 0.1
 """Silence on a serial line after a request without reply, which may still come."""
 
@@ -82,7 +82,7 @@ class Scan:
     Attributes:
         requests: how many were made.
         units: those that answered, in order.
-        gateway: addresses of which a gateway said that nobody is behind them.
+        gateway: addresses of which a gateway reported that no unit is behind them.
         alike: whether every address answered, so that only the first is taken for a unit.
         tables: what was read.
         lost: why the line was lost; empty if it was not.

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _NS_PER_MS = 1_000_000
 _POLL_MS = 100.0
 _LOOKS_PER_FILL = 4
-"""How often a store of samples in a device is looked at while it fills once."""
+"""How often a store of samples in a device is read while it fills once."""
 
 _REGISTER_BYTES = 2
 _SAMPLE_BYTES = 4
@@ -413,7 +413,7 @@ class FifoLayout(_Sampled):
     )
     acknowledge: Address | None = Field(
         default=None,
-        description="holding register to which is written how far the queue has been read",
+        description="holding register to which the read position of the queue is written",
         examples=[200],
     )
 
@@ -474,7 +474,9 @@ class RingLayout(_Sampled):
 class BlockPage(Section):
     """A window on a block that is too long for the address space."""
 
-    select: Annotated[Address, Field(description="register that is told which page, from 0", examples=[99])]
+    select: Annotated[
+        Address, Field(description="register to which the page is written, from 0", examples=[99])
+    ]
     registers: Annotated[int, Field(ge=1, le=65_535, description="registers in the window", examples=[100])]
 
 

@@ -192,10 +192,10 @@ class _Report(NamedTuple):
         if not scan.units:
             asked = f"units {self.units[0]} to {self.units[1]}"
             gateway = (
-                f"; a gateway says of {len(scan.gateway)} that they do not answer" if scan.gateway else ""
+                f"; a gateway reports of {len(scan.gateway)} that they do not answer" if scan.gateway else ""
             )
             return (
-                f"{where}: none of {asked} answers{gateway}. Remedy: see that the device is powered, that "
+                f"{where}: none of {asked} answers{gateway}. Remedy: check that the device is powered, that "
                 "baud rate and parity are its own, that A and B are not swapped, and its unit address; a "
                 "slow one needs a longer --timeout-ms"
             )
@@ -217,7 +217,7 @@ class _Report(NamedTuple):
         if scan.alike:
             yield "It answers in the name of every unit, so it is one device; only the first one was read."
         if scan.gateway:
-            yield f"A gateway says of {len(scan.gateway)} addresses that nobody answers behind it."
+            yield f"A gateway reports of {len(scan.gateway)} addresses that no unit answers behind it."
         for table in scan.tables:
             yield from self._table(table)
 

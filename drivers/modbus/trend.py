@@ -75,7 +75,7 @@ class _Failure(NamedTuple):
 
     @property
     def in_words(self) -> NoReplyError | RequestRefusedError:
-        """The error, with the registers that are refused; whoever is silent is told by the line."""
+        """The error, with the registers that are refused; the line reports units that are silent."""
         if not isinstance(self.error, RequestRefusedError):
             return self.error
         return RequestRefusedError(f"{self.error} ({_words(self.run)})", self.error.code)
@@ -252,7 +252,7 @@ class TrendReader(PollingReader):
         failure: _Failure | None = None
         for run, what, takers in self._plan:
             reading = None
-            if not takers <= lost:  # else nobody's sample can be whole any more
+            if not takers <= lost:  # else no stream's sample can be whole any more
                 try:
                     reading = await line.poll(self._unit, self._function, run, what)
                 except (NoReplyError, RequestRefusedError) as error:
@@ -262,7 +262,7 @@ class TrendReader(PollingReader):
         return readings, failure
 
     def _append(self, slot: int, readings: Sequence[RegisterValues | None]) -> None:
-        """Hand the sample to the streams; its place in the schedule is told by when the request went out."""
+        """Hand the sample to the streams; its place in the schedule is that of its request."""
         asked_ns = next((reading.asked_ns for reading in readings if reading is not None), None)
         if asked_ns is None:
             return

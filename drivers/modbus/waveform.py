@@ -71,9 +71,9 @@ def pages_of(layout: WaveformLayout) -> tuple[tuple[RegisterRun, ...], ...]:
 class WaveformReader(PollingReader):
     """Fetches every block that the device takes.
 
-    Blocks are snapshots: between them nobody samples, and nothing is missing. How long that was is told by
-    the host clock; as lost are counted only those of blocks that the device took and that could not be read
-    whole.
+    Blocks are snapshots: between them there are no samples, and nothing is missing. The host clock shows how
+    long that was. Only samples of blocks that the device took, and that could not be read whole, count as
+    lost.
 
     A trigger is written when it is due, never more often: it may cost a sensor a part of its battery. So it
     is not written again when its reply is lost, for the device may have heard it.
@@ -81,7 +81,7 @@ class WaveformReader(PollingReader):
     Nothing in a block tells when it was taken. But the last look at the id that found another one was before
     its end, and the first that found its own was after it: it ended midway, give or take half of that time.
 
-    A new id is believed once another look finds it, too; several looks, if it is not the one that was due.
+    A new id is believed once another reading finds it, too; several, if it is not the one that was due.
 
     Args:
         spec: the stream.
@@ -207,7 +207,7 @@ class WaveformReader(PollingReader):
         self._last_id, self._last_seen_ns = NO_BLOCK, self._asked_ns or 0
 
     def _lose_until(self, block_id: int) -> None:
-        """Count the blocks between the last one and this one, which nobody can read any more."""
+        """Count the blocks between the last one and this one, which can no longer be read."""
         last, self._last_id = self._last_id, block_id
         since_ns, self._last_seen_ns = self._last_seen_ns, self._asked_ns or 0
         if last is None:

@@ -117,7 +117,7 @@ REMAP_NS = 2 * NS_PER_S
 """A growing log whose times are off by more than this is from another clock than before."""
 
 LEAP_NS = 3600 * NS_PER_S
-"""A recording whose time leaps ahead by more is played on at once: nobody waits for a damaged time stamp."""
+"""A recording whose time leaps ahead by more is played on at once: a damaged time stamp must not stop it."""
 
 REMEMBERED_IDS = 64
 END_OF_FILE = "end of file"

@@ -23,12 +23,12 @@ if TYPE_CHECKING:
     from can.io.generic import TextIOMessageReader
 
 LONGEST_LINE = 4096
-"""No line of a log is as long, in characters."""
+"""No line of a log is longer, in characters."""
 MOST_WITHOUT_FRAME = 100_000
 """Lines in a row that are no frames, after which a log is given up: a thread waits for the next frame."""
 _SHOWN = 60
 LATEST_S = 9e9
-"""No recording is of so long after 1970, the year 2255; nanoseconds of it still are integers of 64 bits."""
+"""No recording is later than the year 2255; nanoseconds of it still are integers of 64 bits."""
 
 _NEVER = re.compile(r"(?!)")
 _IN_HEADER: Final[dict[type[TextIOMessageReader], re.Pattern[str]]] = {

@@ -60,9 +60,9 @@ class SerialCounters(BusCounters):
         resyncs: how often a frame was found again after something malformed.
         stalls: how often the reader had to wait because the event loop was behind.
         overruns: bytes that the UART or the kernel's buffer lost, as far as the UART's driver tells.
-        framing_errors: characters without a stop bit, likewise.
-        parity_errors: characters of wrong parity, likewise.
-        breaks: break conditions, likewise.
+        framing_errors: characters without a stop bit, as far as the UART's driver tells.
+        parity_errors: characters of wrong parity, as far as it tells.
+        breaks: break conditions, as far as it tells.
     """
 
     bytes_received: int = 0
@@ -266,7 +266,7 @@ def _assembler(spec: StreamSpec[Any], port: BusPort) -> StreamAssembler:
 
 
 def _wrap_s(spec: StreamSpec[Any]) -> float:
-    """In what time a stream's counter begins again; 0 if it has none, and its rate is told by arrivals."""
+    """In what time a stream's counter begins again; 0 if it has none, and arrivals give its rate."""
     layout: FrameLayout | LineLayout = spec.layout
     if isinstance(layout, LineLayout):
         return 0.0 if layout.counter is None else 2.0**layout.counter.bits / spec.rate_hz

@@ -1,7 +1,7 @@
 """Frames out of a stream of bytes: what every framing of a serial port has in common.
 
-A byte stream has no frames of its own. A framing cuts it into frames, finds its feet again after garbage,
-and says how much of it was garbage. All frames of a batch are cut, checked and decoded as arrays: no Python
+A byte stream has no frames of its own. A framing cuts it into frames, finds the next frame after garbage,
+and counts the garbage. All frames of a batch are cut, checked and decoded as arrays: no Python
 runs per frame that is of a known stream. The virtual bus wraps its frames with the same objects.
 """
 
@@ -25,7 +25,7 @@ ArrivalsOf: TypeAlias = "Callable[[NDArray[np.int64]], NDArray[np.int64]]"
 
 
 SHOWN_BYTES = 16
-"""So many bytes of what is no frame are shown."""
+"""Bytes that are shown of what is no frame."""
 
 
 def in_place(ends: NDArray[np.int64]) -> NDArray[np.int64]:

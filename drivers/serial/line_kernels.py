@@ -98,7 +98,7 @@ _DIGIT, _SIGN, _POINT, _E, _SPACE, _ALIEN = range(6)
 
 
 def _classes() -> NDArray[np.uint8]:
-    """What each byte is to a number, uint8 ``[256]``."""
+    """What each byte means in a number, uint8 ``[256]``."""
     classes = np.full(256, _ALIEN, np.uint8)
     for kind, bytes_ in (
         (_DIGIT, b"0123456789"),

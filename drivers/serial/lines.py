@@ -43,7 +43,7 @@ LATEST_S = 1e12
 """A device's time in s that is later than this is no time."""
 
 SHOWN_CHARACTERS = 80
-"""So many characters of a line that is none are shown."""
+"""Characters that are shown of what is no line."""
 _NUMBER = re.compile(r" *[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)? *")
 _PRINTABLE = frozenset(range(0x20, 0x7F)) | {0x09}
 
@@ -60,7 +60,7 @@ LEAP_S, LEAP_PERIODS = 1.0, 16
 
 
 class Lines(NamedTuple):
-    """What lines say to one stream.
+    """What lines contain for one stream.
 
     Attributes:
         mine: bool ``[n]``, which of them are of the stream.

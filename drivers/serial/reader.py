@@ -57,7 +57,7 @@ GONE = {errno.EIO, errno.ENXIO, errno.ENODEV, errno.EBADF}
 
 
 class Receiver(Protocol):
-    """Who is given what the reader finds; called on the event loop, once in a turn of it."""
+    """Receives what the reader finds; called on the event loop, once in a turn of it."""
 
     def accept(self, batch: DecodedBatch) -> None:
         """Take in a batch."""
@@ -88,8 +88,8 @@ class _HungUpError(Exception):
 class SerialReader(threading.Thread):
     """Reads one open port until told to stop or the port fails; `ended` then holds the reason.
 
-    It brings the thread that cuts what it has read. Whatever the event loop is told goes through that one, so
-    it is told in order.
+    It brings the thread that cuts what it has read. All calls to the event loop go through that thread, so
+    they arrive in order.
 
     Args:
         name: what a person calls the port.
@@ -297,7 +297,7 @@ class SerialReader(threading.Thread):
     def _post(self, call: Any, *arguments: object) -> None:
         try:
             self._hand.post(call, *arguments)
-        except RuntimeError:  # the event loop is closed: there is nobody left to tell
+        except RuntimeError:  # the event loop is closed: nothing takes the call any more
             self._stopping.set()
 
 

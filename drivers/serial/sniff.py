@@ -32,7 +32,7 @@ BAUDS = (115_200, 9600, 19_200, 57_600, 38_400, 230_400, 460_800, 921_600, 4800,
 """Tried in this order, until one is beyond doubt."""
 TRY_S = 1.0
 TRY_BYTES = 512
-"""So many bytes are enough to judge a rate."""
+"""Bytes that are enough to judge a rate."""
 SECONDS = 5.0
 LONGEST_SECONDS = 3600.0
 MOST_KEPT = 1 << 20
@@ -278,15 +278,16 @@ class _Report(NamedTuple):
             return f"{self.port} was lost: {heard.lost}. Remedy: plug it in again and see `dmesg`"
         if not heard.received and not any(one.heard.received for one in self.tried):
             return (
-                f"{self.port}: no byte came. Remedy: see that the device is powered and sends without being "
-                "asked, that its TX leads to RX of this port (for RS-485: A to A, B to B), and that ground "
-                "is connected; a Modbus device is asked: daqsvc sniff modbus"
+                f"{self.port}: no byte came. Remedy: check that the device is powered and sends without "
+                "being asked, that its TX leads to RX of this port (for RS-485: A to A, B to B), and that "
+                "ground is connected; a Modbus device is asked: daqsvc sniff modbus"
             )
         if self._what is None:
             tried = f"--baud {self.best.baud}" if self.asked else "each of the usual baud rates"
             return (
                 f"{self.port}: bytes come, but by {tried} they are neither lines of text nor frames of one "
-                "length. Remedy: state the device's rate by --baud; see that nobody else drives the line"
+                "length. Remedy: state the device's rate by --baud; check that no other device drives "
+                "the line"
             )
         return ""
 

@@ -23,7 +23,7 @@ _NOISY_LOGGERS = ("amqtt", "transitions")
 
 
 class _TidyBroker(Broker):  # type: ignore[misc, unused-ignore]
-    """A broker that knows its connections: amqtt lets go of one whose closing is cancelled half-way."""
+    """A broker that knows its connections: amqtt forgets one whose closing is cancelled half-way."""
 
     def __init__(self, config: BrokerConfig) -> None:
         super().__init__(config)

@@ -168,7 +168,7 @@ def _run(arguments: argparse.Namespace) -> int:
 async def _interruptible(session: DemoSession) -> DemoOutcome:
     """Have SIGTERM and a lost terminal cancel what is played, as Ctrl-C does: it then ends in order.
 
-    What is only played again has been played as a whole: one of them ends it with its outcome.
+    Once all has been played and it only repeats, one of them ends it with its outcome.
 
     Raises:
         KeyboardInterrupt: one of them came.

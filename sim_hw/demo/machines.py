@@ -1,6 +1,6 @@
 """The machine files of the demo: the paper's rig, and one made to measure for a recording.
 
-A recording is played if a device could send it and something would come of it, else refused (`playable`);
+A recording is played if a device could send it and the service could use it, else refused (`playable`);
 one of the healthy machine gives setpoints.
 """
 

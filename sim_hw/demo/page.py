@@ -23,8 +23,8 @@ class PageAddress(NamedTuple):
     """Where the page is.
 
     Attributes:
-        look: for who looks.
-        act: for who handles alarms.
+        look: for viewers.
+        act: for operators, who handle alarms.
     """
 
     look: str

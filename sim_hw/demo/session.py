@@ -127,7 +127,7 @@ class Listener:
         await self._subscribed.wait()
 
     async def farewell(self) -> bool:
-        """Wait until the box has said that it goes; False if that takes too long."""
+        """Wait until the box has reported that it goes offline; False if that takes too long."""
         try:
             await asyncio.wait_for(self._offline.wait(), FAREWELL_S)
         except TimeoutError:
@@ -147,7 +147,7 @@ LAST_FRAMES_S = 5.0
 
 @dataclass(frozen=True)
 class Script:
-    """What to play, and to whom.
+    """What to play, and for whom.
 
     Attributes:
         title: what a person reads.
@@ -206,7 +206,7 @@ class DemoOutcome:
         alarms: alarm events that it got.
         real_s: how long the playing took.
         snapshots: files of the snapshots that alarms have left, and that are kept.
-        snapshots_gone: how many are not kept, as nobody has asked for them.
+        snapshots_gone: how many are not kept, as they were not asked for.
     """
 
     diagnoses: list[dict[str, Any]] = field(default_factory=list)
@@ -295,7 +295,7 @@ class DemoSession:
                 self.outcome.complete = await _unless_ended(listening, listener.farewell())
             except aiomqtt.MqttError as error:
                 raise DemoError(
-                    f"the broker {url} was lost while the demo played ({error}); see that it runs, and "
+                    f"the broker {url} was lost while the demo played ({error}); check that it runs, and "
                     "play again"
                 ) from error
             self.outcome.messages = listener.messages
@@ -411,7 +411,7 @@ class DemoSession:
     def backlog(self) -> int:
         """Samples that are on the bus, or have come off it and have not been diagnosed yet.
 
-        What the node took while it was silent or off never goes onto the bus, and nobody waits for it.
+        What the node took while it was silent or off never goes onto the bus, and is not waited for.
         """
         counters = self.counters()
         if self.service is None or self.node is None or counters is None:

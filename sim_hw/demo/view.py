@@ -37,7 +37,7 @@ COLOURS = {"normal": "green", "alert": "yellow", "danger": "red"}
 
 
 class _PipeConsole(Console):
-    """Says it when nobody reads any more, where rich would exit at once and leave everything as it is."""
+    """Reports when the output is no longer read; rich would exit at once and leave everything as it is."""
 
     def on_broken_pipe(self) -> None:
         self.quiet = True

@@ -75,7 +75,7 @@ class UnitConnection:
     """One connection seen from the units: bytes of requests in, bytes of replies out.
 
     Args:
-        units: the units, by address. Others stay silent on a serial line, as there is nobody.
+        units: the units, by address. Others stay silent on a serial line, as no unit has them.
         send: puts bytes on the wire.
         serial: RTU frames rather than those of TCP.
         plan: what becomes of each reply.
@@ -258,7 +258,7 @@ class ModbusRtuServer:
 
     def _send(self, frame: bytes) -> None:
         if self._fds is not None:
-            with contextlib.suppress(BlockingIOError):  # nobody reads: a wire does not wait
+            with contextlib.suppress(BlockingIOError):  # no reader: a wire does not wait
                 os.write(self._fds[0], frame)
 
 

@@ -151,7 +151,7 @@ class RingStore:
 
 
 class FifoStore:
-    """A queue of bounded length, from which the oldest samples are lost when nobody reads them.
+    """A queue of bounded length, from which the oldest samples are lost when they are not read.
 
     Args:
         unit: where it is read.

@@ -106,7 +106,7 @@ class PseudoTerminal:
         """Put one frame on the wire. One that finds room in part is finished by the next calls.
 
         Returns:
-            False if nobody listens, or the other end has not read enough for the frame to find room.
+            False if the port is not open, or the other end has not read enough for the frame to find room.
         """
         if not self.listening:
             self._unsent = b""
@@ -144,7 +144,7 @@ class SerialNode(PlannedNode):
     """Sends samples over a serial cable, each frame at the time its last sample is taken.
 
     All frames are made, and all faults planned, when the node is: playing only sends. While the
-    cable is out, or nobody has the port open, what is sent is gone.
+    cable is out, or the port is not open, what is sent is gone.
 
     Args:
         cable: what to send over.
@@ -213,7 +213,7 @@ class SerialNode(PlannedNode):
         ]
 
     async def play(self, pacer: Pacer) -> None:
-        """See `PlannedNode.play`; returns when all that was sent has gone, or nobody has the port open."""
+        """See `PlannedNode.play`; returns when all that was sent has gone, or the port is not open."""
         await super().play(pacer)
         # A pseudo-terminal does not tell when it has room again.
         while self._cable.listening and not self._cable.flush():  # noqa: ASYNC110

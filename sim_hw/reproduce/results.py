@@ -1,4 +1,4 @@
-"""What a study finds: statements of the paper beside what was obtained, and how they are written down."""
+"""What a study finds: statements of the paper beside what was obtained, and how they are written."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ def test_a_link_that_comes_and_goes_does_not_fill_the_log(
         link.down("half a frame")
         now_s[0] += 0.1
     assert link.losses == 100
-    often = "; it comes and goes, which is said three times a minute at most"
+    often = "; if this repeats, it is logged three times a minute at most"
     said = [r.message for r in caplog.records if r.levelno >= logging.WARNING]
     assert [text for text in said if text != "bus is back"] == [
         "bus is lost: half a frame; it is being tried again",

@@ -104,7 +104,7 @@ async def test_a_command_is_in_the_log_before_it_is_obeyed_and_on_disk_before_it
 @pytest.mark.parametrize(
     ("command", "why"),
     [
-        (AlarmCommand(verb=Verb.RESET, alarm=RUB, by="ann"), "condition still stands"),
+        (AlarmCommand(verb=Verb.RESET, alarm=RUB, by="ann"), "condition is still present"),
         (AlarmCommand(verb=Verb.RESET, alarm="one", by="ann"), "cannot reset one: "),
         (AlarmCommand(verb=Verb.ACKNOWLEDGE, alarm="none", by="ann"), "no alarm is named 'none'; there are"),
         (
@@ -364,7 +364,7 @@ async def test_commands_over_mqtt_reach_the_alarms_and_the_audit_log(tmp_path: P
                 await eventually(lambda: consumer.on("/alarms/shaking"), "the alarm is raised")
                 reset = await ask("reset", "shaking", "c1")
                 assert not reset["accepted"]
-                assert "condition still stands" in reset["reason"]
+                assert "condition is still present" in reset["reason"]
                 acknowledged = await ask("acknowledge", "shaking", "c2")
                 assert acknowledged["accepted"]
                 await eventually(lambda: len(consumer.on("/alarms/shaking")) == 2, "the event arrives")

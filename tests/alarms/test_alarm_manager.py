@@ -114,7 +114,9 @@ def test_a_latched_alarm_keeps_its_worst_level_and_refuses_reset_while_it_stands
     desk = Desk(LATCHING)
     desk.rms(70.0)
     assert desk.rms(50.0) == []
-    with pytest.raises(CommandNotAllowedError, match="cannot reset vibration-x: its condition still stands"):
+    with pytest.raises(
+        CommandNotAllowedError, match="cannot reset vibration-x: its condition is still present"
+    ):
         desk.reset("vibration-x")
     [latched] = desk.rms(0.0)
     assert (latched.kind, latched.to_state) == (K.LATCHED, S.LATCHED_UNACKNOWLEDGED)

@@ -61,7 +61,7 @@ def test_what_the_data_says_never_fails_and_clearing_never_activates():
 
 @pytest.mark.parametrize("state", [S.ACTIVE_UNACKNOWLEDGED, S.ACTIVE_ACKNOWLEDGED])
 def test_a_standing_condition_refuses_reset(state):
-    with pytest.raises(CommandNotAllowedError, match="condition still stands"):
+    with pytest.raises(CommandNotAllowedError, match="condition is still present"):
         transition(state, Stimulus.RESET, latching=True)
 
 

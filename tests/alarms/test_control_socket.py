@@ -155,7 +155,7 @@ async def test_the_client_and_the_server_understand_each_other(tmp_path: Path) -
         (wish(duration_s="1800"), "duration_s"),
         (wish(colour="red"), "colour"),
         (wish(machine="pump"), "this service watches 'laval-rig', not 'pump'"),
-        (json.dumps(wish()).encode()[:-1] + b', "by": "eve"}\n', "key 'by' stands twice; say it once"),
+        (json.dumps(wish()).encode()[:-1] + b', "by": "eve"}\n', "key 'by' is there twice; write it once"),
         (b'{"a":' * 2000 + b"\n", "not valid"),
         (b"x" * 20_000 + b"\n", "longer than 16384 bytes"),
         (b"x" * 200_000, "longer than 16384 bytes"),
@@ -340,9 +340,12 @@ async def test_a_link_that_is_taken_away_is_made_again_and_why_not_is_said_once(
         serving.cancel()
         await asyncio.wait({serving})
     assert server._inode == inode, "the socket was none the worse for it"
-    again = f"the link {link} to the control socket was taken away; it is made again"
+    again = f"the link {link} to the control socket was removed; it is made again"
     first, why, *rest = caplog.messages
-    assert f"{link} is in the way of the control socket and is none; move it away; that is tried again" in why
+    assert (
+        f"{link} is not a socket, and no control socket can be made there; move it to another "
+        f"place; that is tried again" in why
+    )
     assert [first, *rest] == [again, again]
 
 
@@ -363,9 +366,9 @@ async def test_why_the_socket_cannot_be_made_is_said_once_by_whoever_learns_it_f
         await eventually(lambda: server._server is not None, "there is a socket")
         (tmp_path / "control.sock").unlink()
         (tmp_path / "control.sock").write_text("in the way")
-        await eventually(lambda: "until this is mended" in caplog.text, "it is said")
+        await eventually(lambda: "until this is corrected" in caplog.text, "it is said")
         await asyncio.sleep(0.05)
-        assert caplog.text.count("until this is mended") == 1
+        assert caplog.text.count("until this is corrected") == 1
         caplog.clear()
     serving.cancel()
     await asyncio.wait({serving})
@@ -462,7 +465,7 @@ async def test_what_waits_in_memory_is_told_to_who_asks(tmp_path: Path) -> None:
 
 async def test_what_is_in_the_way_and_no_socket_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "control.sock").write_text("precious")
-    with pytest.raises(ControlError, match=r"control\.sock is in the way"):
+    with pytest.raises(ControlError, match=r"control\.sock is not a socket"):
         await ControlServer(tmp_path, (MACHINE,), Desk()).open()
     assert (tmp_path / "control.sock").read_text() == "precious"
 
@@ -486,7 +489,7 @@ async def test_a_service_that_dies_before_its_answer_is_told(answer: bytes, tmp_
         writer.close()
 
     server = await asyncio.start_unix_server(hang_up, tmp_path / "control.sock")
-    with pytest.raises(ControlError, match="whether it has obeyed, see daqsvc alarms"):
+    with pytest.raises(ControlError, match="daqsvc alarms shows whether it was carried out"):
         await asyncio.to_thread(ask, tmp_path, RESET)
     server.close()
     await server.wait_closed()
@@ -537,7 +540,7 @@ async def test_a_service_without_its_socket_is_not_said_to_be_away(
                 await asyncio.to_thread(ask, store, RESET)
             assert await asyncio.to_thread(main, ["alarms", "--store", str(store)]) == 0
             said = capsys.readouterr().err
-            assert "the journal cannot be written, so this may not be how the alarms stand" in said
+            assert "the journal cannot be written, so this may not be their present state" in said
         finally:
             await outbox.close()
 

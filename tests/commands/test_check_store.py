@@ -290,7 +290,7 @@ def test_the_owner_of_a_store_has_not_the_group_that_chown_has_left_to_root(
     os.chown(owned, NOBODY, 0)
     code, out, err = check(owned)
     assert (code, err) == (0, "")
-    assert f"could not start as nobody: {owned}/outbox.sqlite belongs to root, and nobody, as whom the" in out
+    assert f"could not start as nobody: {owned}/outbox.sqlite belongs to root, and the user of the" in out
 
 
 def test_what_a_store_says_of_itself_does_nothing_to_a_terminal(tmp_path: Path, check: Check) -> None:
@@ -312,7 +312,7 @@ def test_a_copy_of_a_store_that_belongs_to_root_is_a_warning_with_its_remedy(
     (owned / "outbox.sqlite").touch(0o600)
     code, out, err = check(owned)
     assert (code, err) == (0, "")
-    assert f"could not start as nobody: {owned}/outbox.sqlite belongs to root, and nobody, as whom the" in out
+    assert f"could not start as nobody: {owned}/outbox.sqlite belongs to root, and the user of the" in out
     assert f"chown -R nobody {owned}" in out
     assert "[S02]" in out
 

@@ -118,7 +118,7 @@ async def test_a_day_in_the_life_of_a_latching_alarm(tmp_path: Path) -> None:
             code, out, err = await daqsvc("reset", "shaking", "--store", store, "--by", "Ann")
             assert (code, out) == (1, "")
             assert err.startswith("daqsvc reset: refused: ")
-            assert "condition still stands" in err
+            assert "condition is still present" in err
             assert err.endswith("[C08]\n")
             assert (await stands(store, "shaking", "active_acknowledged"))["id"] == acknowledged["id"]
 
@@ -170,7 +170,7 @@ async def test_a_day_in_the_life_of_a_latching_alarm(tmp_path: Path) -> None:
             ("refused", "reset", "shaking", "Ann", ""),
             ("accepted", "shelve", "shaking", "Bob", ""),
         ]
-        assert "condition still stands" in answered[1]["answer"]
+        assert "condition is still present" in answered[1]["answer"]
         assert answered[0]["events"] == [acknowledged["id"]]
         assert answered[-1]["outcome"] == "refused"
 
@@ -208,7 +208,7 @@ async def test_a_service_that_was_killed_leaves_a_journal_that_can_be_read(tmp_p
         assert "no daqsvc runs on the store" in err
         async with daqsvc_run(file, store):
             await eventually(
-                lambda: (store / "control.sock").stat().st_ino != left, "the socket is made anew"
+                lambda: (store / "control.sock").stat().st_ino != left, "the socket is made again"
             )
             assert (await daqsvc("ack", raised["occurrence"], "--store", store))[0] == 0
 

@@ -97,7 +97,7 @@ async def test_however_often_sighup_comes_meanwhile_the_files_are_read_once_more
     reloader.ask()
     await reloader.part.over
     assert len(reloads) == 3
-    assert caplog.text.count("SIGHUP: the machine files say nothing different") == 3
+    assert caplog.text.count("SIGHUP: the machine files have not changed") == 3
 
 
 async def test_a_hang_up_while_the_service_starts_is_obeyed_once_when_it_is_ready(caplog):
@@ -206,7 +206,7 @@ async def test_a_hang_up_that_is_refused_is_an_error_for_each_reason(caplog):
     reloader = run._Reloader(SimpleNamespace(supervisor=Supervisor(), reload=reload))
     reloader.ask()
     await reloader.part.over
-    refused = "SIGHUP is refused, and the service goes on as it is: "
+    refused = "SIGHUP is refused, and the service goes on as before: "
     assert caplog.messages == [
         f"{refused}rig.toml:3: box: restart the service [S01]",
         f"{refused}it is odd [S16]",

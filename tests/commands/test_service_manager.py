@@ -72,7 +72,7 @@ def test_a_part_has_stalled_that_has_work_and_takes_no_step(caplog: pytest.LogCa
     assert stalls([1, 1, 1, 1, 1, 2, 2]) == [False, False, False, True, True, False, False]
     assert [record.message for record in caplog.records] == [
         "part has stalled, without a step for 3 s: it is restarted",
-        "part gets on again",
+        "part works again",
     ]
 
 

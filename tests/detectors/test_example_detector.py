@@ -174,7 +174,7 @@ def test_a_statement_by_hand_that_cannot_be_told_is_refused_in_recordings_too(
     monkeypatch.setattr(importlib.import_module("crest").CrestDetector, "process", process, raising=False)
     main(["analyze", str(two_sensors(tmp_path)), str(tmp_path / "accel-de.npz")])
     said = "".join(capsys.readouterr())
-    assert "it returns a statement that cannot be told: rms is nan; give a finite number" in said
+    assert "it returns a statement that cannot be sent: rms is nan; give a finite number" in said
     assert "Traceback" not in said
 
 

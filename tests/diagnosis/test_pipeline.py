@@ -305,7 +305,7 @@ async def test_a_statement_by_hand_is_held_to_what_a_judgement_is(
     own = broken.process
     broken.process = lambda window: [replace(one, **odd) for one in own(window)]  # type: ignore[method-assign]
     said = await said_of_a_failed_window(broken)
-    begins = f"detector broken has failed: it returns a statement that cannot be told: {words}"
+    begins = f"detector broken has failed: it returns a statement that cannot be sent: {words}"
     assert said[0].reason.startswith(begins)
     [line] = [r.getMessage() for r in caplog.records if r.levelno >= logging.ERROR]
     assert line.isprintable()

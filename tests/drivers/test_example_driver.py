@@ -139,7 +139,7 @@ class _Unfinished(DriverPlugin[Any]):
     """A plugin whose author has forgotten the model of its bus."""
 
 
-MEND = "have the authors of daqsvc-tcp-frames 1.0 mend it"
+MEND = "have the authors of daqsvc-tcp-frames 1.0 fix it"
 
 
 @pytest.mark.parametrize(

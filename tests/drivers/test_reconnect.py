@@ -116,7 +116,7 @@ async def test_a_reader_whose_thread_is_gone_has_ended(monkeypatch: pytest.Monke
     reader = threading.Thread(target=lambda: None)
     reader.start()
     async with asyncio.timeout(20):
-        assert await ended(reason, reader) == "its reader has ended without a word"
+        assert await ended(reason, reader) == "its reader has ended without a reason"
     reason.set_result("it was closed")
     assert await ended(reason, reader) == "it was closed"
 

@@ -37,7 +37,7 @@ NO_FAULT = {
         "'SIGHUP: the service starts; it reads its machine files again when it is ready'",
         "'%s'",  # why it was asked to stop
     },
-    "daqsvc/commands/run.py": {"'SIGHUP: the machine files say nothing different'"},
+    "daqsvc/commands/run.py": {"'SIGHUP: the machine files have not changed'"},
     "daqsvc/control.py": {"'commands are taken at %s now'"},
     "daqsvc/kernel_cache.py": {"'compiling kernels for this processor (%stakes up to a minute)'"},
     "daqsvc/outbox/journal.py": {
@@ -56,7 +56,7 @@ NO_FAULT = {
     },
     "daqsvc/recorder.py": {"'snapshots of %s are written again'"},
     "daqsvc/service.py": {"'reloaded: %s'"},
-    "daqsvc/supervision.py": {"'%s gets on again'"},
+    "daqsvc/supervision.py": {"'%s works again'"},
     "drivers/modbus/line.py": {"message"},  # that a unit is back
 }
 """The lines about no fault: something is back, or was asked for."""

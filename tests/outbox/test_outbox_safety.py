@@ -202,7 +202,7 @@ async def test_a_file_of_roots_in_the_store_of_the_service_is_refused_before_any
     (store / name).touch(0o600)
     (store / "outbox.sqlite.bak").touch(0o600)
     os.chown(store, STRANGER, STRANGER)
-    remedy_ = f"{name} belongs to root, and {STRANGER}, as whom the service runs, may not open it: chown -R"
+    remedy_ = f"{name} belongs to root, and the user of the service, {STRANGER}, may not open it: chown -R"
     there = sorted(path.name for path in store.iterdir())
     for _ in range(2):
         outbox = Outbox(store / "outbox.sqlite", SystemClock())

@@ -133,7 +133,7 @@ def test_since_is_when_it_was_said_first_and_before_it_was_looked_at_that_is_sai
 def test_a_healthy_machine_has_no_finding() -> None:
     healthy = said("N", severity="normal", probabilities={"N": 1.0})
     assert "No detector finds a fault." in finding_rows(looking(healthy))
-    assert "No detector has said anything yet." in finding_rows(looking())
+    assert "No detector has stated anything yet." in finding_rows(looking())
 
 
 def test_what_nobody_knows_is_shown_as_it_is_and_is_no_markup() -> None:

@@ -117,7 +117,7 @@ async def test_an_operator_handles_an_alarm_and_a_viewer_does_not(tmp_path: Path
         shown = (await ann.get(answer.headers["location"])).text
         assert re.search(r"Nothing was done: .* is over, now .* stands \[C08\]\.", shown)
         answer = await ann.post(MACHINE, wish(token, verb="shelve", hours="1", reason=" "))
-        assert "say why rotor-fault is to be covered" in (await ann.get(answer.headers["location"])).text
+        assert "give a reason for rotor-fault" in (await ann.get(answer.headers["location"])).text
 
         answer = await ann.post(MACHINE, wish(token, occurrence=str(alarms[ALARM].occurrence)))
         shown = (await ann.get(answer.headers["location"])).text

@@ -220,9 +220,9 @@ def test_a_damaged_bearing_shows_in_the_envelope_at_its_lines() -> None:
 def test_a_trend_is_drawn_from_the_history_and_broken_where_nothing_was_measured(tmp_path: Path) -> None:
     live = MachineLive(about())
     view = VIEWS["trend"]
-    assert "nothing is written down" in view.why_not(live)
+    assert "no history of this machine is stored" in view.why_not(live)
     live.history = tmp_path / "history.sqlite"
-    assert "nothing is written down" in view.why_not(live)
+    assert "no history of this machine is stored" in view.why_not(live)
     now_s = int(time.time())
     series = Series("rig", "levels/left", "statistic", "rms", "um")
     seconds = np.array(

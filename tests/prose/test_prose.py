@@ -77,6 +77,42 @@ def test_an_entry_of_the_vocabulary_is_whole(entry: dict[str, str]) -> None:
     assert {*entry.get("in", KINDS)} <= {*KINDS}
 
 
+@pytest.mark.parametrize(
+    ("kind", "bad", "good"),
+    [
+        ("message", "Copy it anew, or give another one.", "Copy it again, or give another one."),
+        ("message", "Nobody knows when it ends.", "It is not known when it ends."),
+        ("message", "Its certificate is vouched for.", "Its certificate is signed."),
+        ("message", "This waits until it is mended.", "This waits until it is corrected."),
+        ("message", "Its id is written down first.", "Its id is stored first."),
+        ("message", "The socket was taken away.", "The socket was removed."),
+        ("message", "It is told of one event.", "It is not told apart from one."),
+        ("message", "The site is another one.", "The site is different."),
+        ("message", "False alarms are 0.001 a look.", "False alarms are 0.001 an evaluation."),
+        ("message", "See to the disk if it happens.", "Check the disk if it happens."),
+        ("docstring", "Nobody has seen what lies between.", "What lies between is not known."),
+        (
+            "docstring",
+            "So many looks in a row agree.",
+            "Evaluations in a row that agree, so that it is sure.",
+        ),
+        ("docstring", "OSError: likewise, or it is gone.", "OSError: as above, or it is gone."),
+        ("comment", "Two looks must agree first.", "It looks like a counter that stands still."),
+    ],
+)
+def test_words_that_readers_stumbled_over_are_found(kind: str, bad: str, good: str, tmp_path: Path) -> None:
+    file = tmp_path / "module.py"
+    form = {
+        "message": "raise ValueError('{}')\n",
+        "docstring": 'X = 1\n"""{}"""\n',
+        "comment": "x = 1\n# {}\n",
+    }
+    file.write_text(form[kind].format(bad), "utf-8")
+    assert found(file)
+    file.write_text(form[kind].format(good), "utf-8")
+    assert found(file) == []
+
+
 def test_a_limit_is_there_for_each_kind_of_text_but_cells() -> None:
     assert {*rules().longest} == {*KINDS} - {"cell"}
 

@@ -106,7 +106,7 @@ def test_a_reader_that_crashes_or_never_ends_costs_its_own_line(tmp_path, capsys
     code, said = analyze(capsys, spoils, run, *OPTIONS, "--jobs", 1)
     assert code == 3
     assert why in said[0]["refused"]
-    assert "copy or save it anew" in said[0]["refused"]
+    assert "copy or save it again" in said[0]["refused"]
     assert said[1]["verdict"] == "normal"
 
 

@@ -535,7 +535,7 @@ def test_a_gap_beside_stamps_out_of_order_is_a_gap(tmp_path):
 
 @pytest.mark.parametrize("dtype", [np.uint32, np.int16])
 def test_differences_of_unsigned_or_short_stamps_do_not_wrap(tmp_path, dtype):
-    t = (np.arange(400) * 150).astype(dtype)  # those of int16 begin anew beyond 32 767, as of a counter
+    t = (np.arange(400) * 150).astype(dtype)  # those of int16 begin again beyond 32 767, as of a counter
     t[0], t[50:53] = t[5], t[50:53][::-1].copy()
     np.savez(tmp_path / "rig.npz", time_us=t, x=X[:400])
     recording = load_recording(tmp_path / "rig.npz")

@@ -244,7 +244,7 @@ async def test_a_driver_and_a_detector_that_fail_are_named_once_and_the_rest_goe
     ):
         [line] = [line for line in said if words in line]
         assert line.startswith(begins)
-        assert line.endswith(f"; have the authors of daqsvc-mishap 2.1 mend it; {then}")
+        assert line.endswith(f"; have the authors of daqsvc-mishap 2.1 fix it; {then}")
     assert len(said) == 2
     assert not any(record.exc_info for record in caplog.records if record.levelno > logging.INFO)
 
@@ -265,7 +265,7 @@ async def test_a_driver_with_a_run_of_its_own_is_named_once_and_started_again(
         await eventually(lambda: service.supervisor.failures["driver bad"] >= 3, "it was started again")
     [line] = errors_of_plugins(caplog)
     assert line.startswith(f"driver bad: run of mishap.OwnDriver has failed: {said} (mishap.py, line ")
-    assert line.endswith("have the authors of daqsvc-mishap 2.1 mend it; it is started again")
+    assert line.endswith("have the authors of daqsvc-mishap 2.1 fix it; it is started again")
 
 
 @pytest.mark.parametrize("levels", [LevelDetector, TrendDetector])
@@ -374,4 +374,4 @@ async def test_what_a_driver_tells_wrong_is_named_once_and_spares_the_other_buse
         bad.link, bad.counters, type(bad).streams = link, BusCounters(), {}
     [line] = errors_of_plugins(caplog)
     assert line.startswith(f"driver bad: {said}")
-    assert "; have the authors of daqsvc-mishap 2.1 mend it; " in line
+    assert "; have the authors of daqsvc-mishap 2.1 fix it; " in line

@@ -149,7 +149,7 @@ async def test_who_looks_on_is_one_of_another_user_and_stays(tmp_path: Path) -> 
         for client in service.control._clients:
             client.uid += 1
         async with looking(store) as (refused, _):
-            assert (await next_line(refused))["reason"] == "6 others look already; end one of them"
+            assert (await next_line(refused))["reason"] == "6 others use live already; close one of them"
         assert len(watch_of(service).live._lookers) == MOST_LOOKING
 
 

@@ -291,7 +291,7 @@ def test_signals_that_do_not_stop_the_service_are_said(tmp_path: Path) -> None:
             process.send_signal(signal.SIGHUP)
             assert process.stderr is not None
             until_said = iter(process.stderr.readline, "")
-            assert any("SIGHUP: the machine files say nothing different" in line for line in until_said)
+            assert any("SIGHUP: the machine files have not changed" in line for line in until_said)
         for number in (signal.SIGUSR1, signal.SIGUSR2):
             process.send_signal(number)
             assert process.stderr is not None

@@ -202,8 +202,8 @@ async def test_another_sensor_costs_no_other_bus_a_sample(tmp_path: Path) -> Non
         shaft, casing = service.drivers
         put(file, more=ANOTHER)
         assert await service.reload() == [
-            "machine laval-rig: detectors begin anew (sensors.accel-nde is new, bus can1)",
-            "bus can1 is opened anew (units)",
+            "machine laval-rig: detectors begin again (sensors.accel-nde is new, bus can1)",
+            "bus can1 is opened again (units)",
         ]
         assert service.drivers[0] is shaft
         assert service.drivers[1] is not casing
@@ -229,7 +229,7 @@ async def test_a_machine_comes_and_goes_while_another_is_watched(tmp_path: Path)
         await eventually(
             lambda: service.watches["one"].pipeline.counters["rotor-bank"].windows > 10, "judged"
         )
-        # On a bus of its own: what shares a bus is read by one driver, which then begins anew.
+        # On a bus of its own: what shares a bus is read by one driver, which then begins again.
         (plant / "two.toml").write_text(second.replace("buses.can0", "buses.b").replace('"can0"', '"b"'))
         assert await service.reload() == ["machine two is watched from now on", "bus b is opened"]
         assert sorted(service.alarms.managers) == [BOX, "one", "two"]
@@ -260,8 +260,8 @@ async def test_what_is_on_a_bus_that_is_opened_anew_is_judged_again(tmp_path: Pa
             (plant / "two.toml").unlink()
             assert await service.reload() == [
                 "machine two is no longer watched",
-                "machine one: detectors begin anew (bus can0)",
-                "bus can0 is opened anew (its streams, units)",
+                "machine one: detectors begin again (bus can0)",
+                "bus can0 is opened again (its streams, units)",
             ]
             assert gone() is None, "its memory is free without the collector, which would hold up the loop"
         finally:
@@ -348,12 +348,12 @@ async def test_another_broker_gets_what_happens_from_then_on(tmp_path: Path) -> 
         async with Consumer(second.port) as consumer, serving(file, store=tmp_path / "store") as service:
             await eventually(lambda: service.figures()["mqtt"]["connected"], "the first is connected")
             put(file, more=broker.format(second.port))
-            assert await service.reload() == ["outputs begin anew ([mqtt])"]
+            assert await service.reload() == ["outputs begin again ([mqtt])"]
             bypass = AlarmCommand(verb=Verb.BYPASS, alarm="rotor-fault", by="the test")
             assert (await service.alarms.execute(bypass, "test")).accepted
             await eventually(lambda: consumer.on("alarms/rotor-fault"), "the second one is told")
             put(file)
-            assert await service.reload() == ["outputs begin anew ([mqtt])"]
+            assert await service.reload() == ["outputs begin again ([mqtt])"]
             assert not service.alarms.outputs
             await eventually(
                 lambda: [m.payload["state"] for m in consumer.on("availability")][-1] == "offline", "it left"
@@ -421,15 +421,15 @@ def test_what_is_different_is_said_with_its_reason(tmp_path: Path) -> None:
     assert not changes(before, read_box([file]))
     for change, said in {
         ("ring_s = 30.0", "ring_s = 20.0"): [
-            "machine laval-rig: detectors begin anew (pipeline.ring_s 30.0 -> 20.0)"
+            "machine laval-rig: detectors begin again (pipeline.ring_s 30.0 -> 20.0)"
         ],
         ("id = 0x201", "id = 0x202"): [
-            "machine laval-rig: detectors begin anew (streams.casing.layout.id 513 -> 514, bus can1)",
-            "bus can1 is opened anew (its streams)",
+            "machine laval-rig: detectors begin again (streams.casing.layout.id 513 -> 514, bus can1)",
+            "bus can1 is opened again (its streams)",
         ],
         ('channel = "can1"', 'channel = "can2"'): [
-            "machine laval-rig: detectors begin anew (bus can1)",
-            "bus can1 is opened anew (its table)",
+            "machine laval-rig: detectors begin again (bus can1)",
+            "bus can1 is opened again (its table)",
         ],
         ("shelve_at_most_s = 28_800.0", "shelve_at_most_s = 60.0"): [
             "machine laval-rig: other alarms or setpoints (alarm_handling.shelve_at_most_s 28800.0 -> 60.0)"

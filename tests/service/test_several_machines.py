@@ -92,7 +92,7 @@ def test_files_that_do_not_make_one_box_are_refused_with_what_is_wrong() -> None
         'site = "plant": but': ('site = "lab"', 'site = "plant"'),
         'box = "edge-2": but': ('box = "edge-1"', 'box = "edge-2"'),
         'machine.name = "one": is the name': ('name = "two"', 'name = "one"'),
-        f'machine.name = "{BOX}": stands for': ('name = "two"', f'name = "{BOX}"'),
+        f'machine.name = "{BOX}": is the name of the service': ('name = "two"', f'name = "{BOX}"'),
         'id 0x101 on bus "can0" belongs to stream "one/shaft" already': ("0x102", "0x101"),
         "buses.can0.channel = 'can1': the bus of that name": ('channel = "can0"', 'channel = "can1"'),
     }
@@ -106,7 +106,7 @@ def test_files_that_do_not_make_one_box_are_refused_with_what_is_wrong() -> None
     other_name = machine("two", 2, "", ("buses.can0", "buses.b"), ('bus = "can0"', 'bus = "b"'))
     assert 'channel: belongs to bus "can0" already' in refused(machine("one", 1), other_name)
     one = machine("one", 1, store.format("a"))
-    assert "[store]: is another one than that of" in refused(one, machine("two", 2, store.format("b")))
+    assert "[store]: differs from that of" in refused(one, machine("two", 2, store.format("b")))
     assert Box.several([one, machine("two", 2, store.format("a"))]).own.store == one.store
     away = machine("two", 2, store.format("a"), folder=LAVAL.parent / "away")
     assert "write these in files of one directory" in refused(one, away)

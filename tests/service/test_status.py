@@ -321,7 +321,7 @@ def test_without_a_service_one_sentence_says_what_to_do(
 @pytest.mark.parametrize(
     ("answer", "error", "words"),
     [
-        (None, ControlError, "is of an older version, which does not tell its status: restart it"),
+        (None, ControlError, "is of an older version, which does not report its status: restart it"),
         (b"nonsense\n", AbsentError, "without an answer"),
         (b"[1]\n", AbsentError, "without an answer"),
     ],

@@ -217,7 +217,7 @@ def test_a_hook_that_fails_is_named_with_who_can_mend_it(
     said = " ".join(all_said(file, tmp_path, capsys, caplog, hook).split())
     if (owner, hook) not in NOT_ASKED:
         assert failed in said
-        assert f"have the authors of {BROUGHT[owner]} mend it" in said
+        assert f"have the authors of {BROUGHT[owner]} fix it" in said
     assert "Traceback" not in said
 
 
@@ -299,7 +299,7 @@ def test_a_hook_that_answers_something_else_is_named_with_who_can_mend_it(
     if (owner, hook) not in NOT_ASKED:
         assert re.search(rf"{hook} of {re.escape(owner)} has failed: it (is|returns|yields) .+, not ", said)
         assert f"({HERE}, line {answering.__code__.co_firstlineno})" in said
-        assert f"have the authors of {BROUGHT[owner]} mend it" in said
+        assert f"have the authors of {BROUGHT[owner]} fix it" in said
     assert "Traceback" not in said
 
 
@@ -337,7 +337,7 @@ def test_a_hook_that_fails_is_one_finding_with_its_line(
     assert problem.key == table
     assert problem.line is not None
     removed = table.removesuffix(".layout")
-    assert problem.remedy == f"have the authors of {BROUGHT[owner]} mend it, or remove [{removed}]"
+    assert problem.remedy == f"have the authors of {BROUGHT[owner]} fix it, or remove [{removed}]"
 
 
 @pytest.mark.parametrize("names", [("ghost",), ("casing-x", "ghost")])
@@ -349,7 +349,7 @@ def test_sensors_that_a_plugin_takes_together_and_there_are_none_of_are_its_fail
     assert problem.key == "pipeline.crest"
     words = "it names 'ghost', which is no sensor; name some of casing-x (test_failing_plugins.py, line"
     assert f"sampled_together of crest.CrestPlugin has failed: {words}" in problem.message
-    assert problem.remedy == "have the authors of daqsvc-crest 1.0 mend it, or remove [pipeline.crest]"
+    assert problem.remedy == "have the authors of daqsvc-crest 1.0 fix it, or remove [pipeline.crest]"
     # A table that names them is to blame for it, and says so itself.
     [problem] = problems_of(TABLES.replace('sensor = "casing-x"', 'sensor = "ghost"'), MACHINE)
     assert problem.key == "pipeline.crest.sensor"
@@ -385,7 +385,7 @@ def test_an_init_that_forgets_its_base_is_named_with_the_remedy(
     remedy = "call super().__init__() in its __init__, or set it"
     assert f"<Bare> lacks name of {contract}; {remedy} (test_failing_plugins.py, line" in f"{caught.value}"
     assert f"build of {owner} has failed: " in f"{caught.value}"
-    assert f"have the authors of {BROUGHT[owner]} mend it" in f"{caught.value}"
+    assert f"have the authors of {BROUGHT[owner]} fix it" in f"{caught.value}"
 
 
 def test_a_plugin_cannot_change_the_machine_file_that_it_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -486,7 +486,7 @@ def test_a_device_that_cannot_be_told_apart_is_one_finding(
     assert "device of tcp_frames.LoggerBus has failed: it is Device(key='address', iden" in problem.message
     assert "in its identity, " in problem.message
     assert " is no Hashable (" in problem.message
-    assert problem.remedy == "have the authors of daqsvc-tcp-frames 1.0 mend it, or remove [buses.logger]"
+    assert problem.remedy == "have the authors of daqsvc-tcp-frames 1.0 fix it, or remove [buses.logger]"
 
 
 def test_a_validator_that_fails_is_one_finding_and_the_others_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -507,7 +507,7 @@ def test_a_validator_that_fails_is_one_finding_and_the_others_go_on(monkeypatch:
     assert (
         "a validator of crest.Picky has failed: KeyError: 'casing-x' (" in problems["pipeline.crest"].message
     )
-    assert problems["pipeline.crest"].remedy == "have the authors of daqsvc-crest 1.0 mend it"
+    assert problems["pipeline.crest"].remedy == "have the authors of daqsvc-crest 1.0 fix it"
 
 
 @pytest.mark.parametrize("answer", [None, 42])
@@ -518,7 +518,7 @@ def test_a_hook_that_answers_nothing_or_something_else_is_named(
     [problem] = problems_of(TABLES, MACHINE)
     words = f"checks of crest.CrestPlugin has failed: it returns {answer}, not Iterator["
     assert words in problem.message
-    assert problem.remedy == "have the authors of daqsvc-crest 1.0 mend it, or remove [pipeline.crest]"
+    assert problem.remedy == "have the authors of daqsvc-crest 1.0 fix it, or remove [pipeline.crest]"
 
 
 @pytest.mark.parametrize(
@@ -541,7 +541,7 @@ def test_a_plugin_with_odd_attributes_is_one_finding(
     [problem] = problems_of(TABLES, MACHINE)
     assert problem.key == "pipeline.crest"
     assert problem.message == f"the detector cannot be loaded from crest:CrestPlugin: {said}"
-    assert problem.remedy == "have the authors of daqsvc-crest 1.0 mend it, or remove [pipeline.crest]"
+    assert problem.remedy == "have the authors of daqsvc-crest 1.0 fix it, or remove [pipeline.crest]"
 
 
 @pytest.mark.parametrize(
@@ -561,7 +561,7 @@ def test_a_driver_with_odd_attributes_is_one_finding(
     registry.forget()
     [problem] = problems_of(MACHINE.read_text(), MACHINE)
     assert problem.message == f"the driver cannot be loaded from tcp_frames:LoggerPlugin: {said}"
-    assert problem.remedy == "have the authors of daqsvc-tcp-frames 1.0 mend it, or remove [buses.logger]"
+    assert problem.remedy == "have the authors of daqsvc-tcp-frames 1.0 fix it, or remove [buses.logger]"
 
 
 @pytest.mark.parametrize(
@@ -587,7 +587,7 @@ def test_a_plugin_whose_own_module_fails_is_named_with_its_line(
         registry.forget()
         [problem] = problems_of(TABLES, MACHINE)
     assert problem.message == f"the detector cannot be loaded from crest:CrestPlugin: {said}"
-    assert problem.remedy == f"{remedy} the authors of daqsvc-crest 1.0 mend it, or remove [pipeline.crest]"
+    assert problem.remedy == f"{remedy} the authors of daqsvc-crest 1.0 fix it, or remove [pipeline.crest]"
 
 
 def test_a_check_that_fails_later_is_one_finding_with_its_line(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -628,7 +628,7 @@ def test_figures_that_cannot_be_asked_for_do_not_keep_the_service_from_its_work(
     assert [detector.name for detector in watch_of(service).pipeline.detectors] == ["crest"]
     assert failed in caplog.text
     assert (
-        "have the authors of daqsvc-crest 1.0 mend it, or remove [pipeline.crest]; the service" in caplog.text
+        "have the authors of daqsvc-crest 1.0 fix it, or remove [pipeline.crest]; the service" in caplog.text
     )
 
 
@@ -646,7 +646,7 @@ def test_words_that_fail_end_check_with_an_error(
             assert main(["check", str(file)]) == 2
         said = capsys.readouterr()
         assert said.err.startswith(f"{file}: {table}: {failed}")
-        assert said.err.endswith(f" mend it, or remove [{table}] [F23]\n")
+        assert said.err.endswith(f" fix it, or remove [{table}] [F23]\n")
         assert "128 bytes, 30 x 2 samples" in " ".join(said.out.split())
 
 

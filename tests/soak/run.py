@@ -403,7 +403,7 @@ class Soak:
         await self.well()
 
     async def another_sensor(self) -> None:
-        """A machine gets another sensor, and loses it again; its bus begins anew, and no other."""
+        """A machine gets another sensor, and loses it again; its bus begins again, and no other."""
         file = self.file_of("fan")
         for text, how in ((self.files["fan"] + ANOTHER_SENSOR, "new"), (self.files["fan"], "gone")):
             file.write_text(text)
@@ -411,8 +411,8 @@ class Soak:
                 asked_before = self.plant.answered
                 await self.reload(
                     [
-                        f"machine fan: detectors begin anew (sensors.count is {how}, bus tcp)",
-                        "bus tcp is opened anew (units)",
+                        f"machine fan: detectors begin again (sensors.count is {how}, bus tcp)",
+                        "bus tcp is opened again (units)",
                     ]
                 )
                 self.ledger.open(self.plant.devices["fan"])

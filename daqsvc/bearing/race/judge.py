@@ -335,7 +335,7 @@ def _empty_above(top_hz: float, rate_hz: float) -> str:
 def _wander_note(track: SpeedTrack) -> str:
     return (
         f"the speed wanders by {track.wander:.1%} within the record: followed by the harmonics of the shaft; "
-        "record at a steady speed for a surer word"
+        "record at a steady speed for a more certain result"
     )
 
 

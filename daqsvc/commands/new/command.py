@@ -247,7 +247,7 @@ def _ask(question: Question) -> str:
 
 
 def _heard(folder: Path, bus: BusQuestions, answers: Answers) -> Heard | None:
-    """What is on the bus, which a person is told, too; None if nothing was found."""
+    """What is on the bus, which is shown to the person, too; None if nothing was found."""
     from daqsvc.commands.stopping import stopping  # noqa: PLC0415 - only for who listens
     from drivers.sniffing import SniffError  # noqa: PLC0415
 

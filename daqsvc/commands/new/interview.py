@@ -115,7 +115,7 @@ class _Interview:
         elif question.default is not None and (self._given.defaults or question.quiet):
             reason = take(question, question.default, self.answers, self._file)
             if reason is not None:
-                raise AnswerError(f"{option(key)} must be given: {question.default} does not do: {reason}")
+                raise AnswerError(f"{option(key)} must be given: {question.default} cannot be used: {reason}")
         elif self._ask is None:
             raise AnswerError(_missing(question))
         else:
@@ -190,7 +190,7 @@ def refusal(answers: Answers, file: Path) -> str | None:
     for question in questions(complete, file.parent):
         if question.key not in complete:
             if question.default is None:
-                return None  # nobody knows yet
+                return None  # not known yet
             complete[question.key] = question.read(question.default)
     from daqsvc.settings.problems import AssemblyError, MachineFileError  # noqa: PLC0415 - slow to import
 

@@ -273,7 +273,7 @@ def pipeline_tables(answers: Answers) -> Iterator[str]:
     yield ""
     yield "[pipeline.levels]"
     if waveforms:
-        yield entry("window_s", window_s, "RMS, peak and so on are measured over so long")
+        yield entry("window_s", window_s, "time over which RMS, peak and so on are measured")
     if housing:
         high_hz = min(_BAND_HZ[1], float(f"{0.4 * rate_hz:.3g}"))
         band = [low_hz, high_hz]
@@ -367,7 +367,7 @@ def _alarm(name: str, measure: str, limits: dict[str, Any], alert: float) -> Ite
     for key, value in limits.items():
         yield entry(key, value)
     yield entry("deadband", float(f"{0.05 * abs(alert):.2g}"), "returns this far below a limit")
-    yield entry("on_delay_s", 3.0, "so long at a limit before it counts")
+    yield entry("on_delay_s", 3.0, "time at a limit before it counts")
     yield entry("off_delay_s", 5.0, "so long below before it returns")
     yield entry("latching", value=False, comment="true: it stays until somebody resets it")
 

@@ -23,8 +23,8 @@ _TOPICS_BEFORE = {
 _TOPICS_BEHIND = {
     "speed": Topic(
         "Speed of the shaft, in rpm",
-        "The usual one, from the nameplate; negative if the shaft turns clockwise. A keyphasor measures it "
-        "besides.",
+        "The usual one, from the nameplate; negative if the shaft turns clockwise. A "
+        "keyphasor measures it as well.",
     ),
     "rate": Topic(
         "Samples a second of each channel", "The sampling rate in Hz. For values that are read: how often."

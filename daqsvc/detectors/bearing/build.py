@@ -1,4 +1,4 @@
-"""The bearings' detector out of a machine file."""
+"""Build the bearings' detector from a machine file."""
 
 from __future__ import annotations
 
@@ -283,12 +283,14 @@ def _kept(
     path: Path, bearings: list[HousedBearing], rate_hz: float, speed_rpm: float | None
 ) -> BearingBaseline | None:
     """The healthy machine that was learnt before a restart."""
-    if not os.path.lexists(path):  # also where nobody may look: the outbox refuses it
+    if not os.path.lexists(path):  # also if it cannot be read: the outbox reports that
         return None
     try:
         return _fitting(path, bearings, rate_hz, speed_rpm)
     except BaselineFileError as error:
-        log.warning("the healthy state of the bearings is learnt anew: %s", error, extra=coded(HEALTHY_STATE))
+        log.warning(
+            "the healthy state of the bearings is learnt again: %s", error, extra=coded(HEALTHY_STATE)
+        )
         return None
 
 

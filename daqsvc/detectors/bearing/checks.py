@@ -1,4 +1,4 @@
-"""Whether what the bearings' detector is told fits together: sensors, rates, windows, orders."""
+"""Whether the settings of the bearings' detector fit together: sensors, rates, windows, orders."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ if TYPE_CHECKING:
 
 _BEARING: KeyPath = ("pipeline", "bearing")
 _LEAST_RATE_HZ = 2500.0
-"""Whatever tells of a bearing lies from 400 Hz up, and a band of less than 1.6 octaves tells little."""
+"""All signs of a bearing lie above 400 Hz, and a band of less than 1.6 octaves shows little."""
 _DIRECTION_RATE_HZ = 24_000.0
 _OFF, _OFF_BSF = 0.02, 0.1
-"""By so large a share orders may be rounded; bsf rests on a difference."""
+"""Share by which stated orders may be rounded; bsf is computed from a difference."""
 _LEAST_REVOLUTIONS = 25.0
 _RING_WINDOWS = 2
 _LEAST_BLOCK_S = 0.5 * WINDOW_S
-"""A shorter block of samples tells the detector nothing."""
+"""A shorter block of samples is of no use to the detector."""
 
 
 def bearing_checks(draft: MachineFile, settings: Bearing) -> Iterator[Iterator[Finding]]:
@@ -161,13 +161,13 @@ def _sensors(draft: MachineFile, bearing: WatchedBearing, at: KeyPath) -> Iterat
 
 
 def _direction(draft: MachineFile, bearing: WatchedBearing, at: KeyPath) -> Iterator[Finding]:
-    """What tells the races by direction is there as a whole, and can."""
+    """The keys for telling the races apart by direction are complete, and they can do it."""
     if (bearing.rotor_sensor is None) != (bearing.model is None):
         missing, there = ("model", "rotor_sensor") if bearing.model is None else ("rotor_sensor", "model")
         yield Finding(
             (*at, there),
             f"is of no use without {missing}",
-            f"add {missing}, or remove it: the races are then told by their lines alone",
+            f"add {missing}, or remove it: the races are then told apart by their lines alone",
             code=INCOMPLETE,
         )
         return
@@ -213,7 +213,7 @@ def _one_stream(draft: MachineFile, settings: Bearing) -> Iterator[Finding]:
 
 
 def _keyphasor(draft: MachineFile, settings: Bearing) -> Iterator[Finding]:
-    """What measures the speed is a keyphasor, sampled with the accelerometers."""
+    """The speed is measured by a keyphasor, sampled with the accelerometers."""
     if settings.keyphasor is None:
         return
     at = (*_BEARING, "keyphasor")

@@ -1,6 +1,6 @@
 """Rolling bearings as a detector: accelerometers on their housings in, the damaged part out.
 
-The healthy machine is learnt out of the first seconds in which nothing is found.
+The healthy state is learnt from the first seconds in which nothing is found.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 
 class HealthyGathering:
-    """Gathers looks at a machine in good order until the healthy machine can be learnt of them.
+    """Collects evaluations of a machine in good order until its healthy state can be learnt from them.
 
     Args:
         bearings: the bearings.
@@ -118,7 +118,7 @@ class HealthyGathering:
         return learnt
 
     def forget(self) -> None:
-        """Looks before do not belong to those after."""
+        """Evaluations before this do not belong to those after it."""
         self._gathered = []
 
 
@@ -136,16 +136,16 @@ SAME_SPEED = 0.05
 class BearingDetector:
     """Says whether a rolling bearing is damaged, and which part of it; see `Detector`.
 
-    Every 2.5 s the last ten seconds are looked at (`RaceWatch`), each bearing by the accelerometer on its
+    Every 2.5 s the last ten seconds are evaluated (`RaceWatch`), each bearing by the accelerometer on its
     housing; the bearing that shows most decides. What the healthy machine's own vibration cannot predict
     says whether anything has changed. The first seconds, or a baseline of an earlier time, are the healthy
     machine; seconds that show a fault or are not steady are not taken for it, and the reason is said.
 
     Decisions are ``undetermined``, ``normal``, ``changed``, ``inner``, ``outer``, ``ball`` and
-    ``inner_or_outer``. Two looks must agree before a fault is raised, eight before it is taken back. Any
+    ``inner_or_outer``. Two evaluations must agree before a fault is raised, eight before it is withdrawn. Any
     fault is alert; danger from ten times the healthy innovations on.
 
-    A look with missing samples, or at a dead or clipped accelerometer, or at a machine at rest, clears
+    An evaluation with missing samples, a dead or clipped accelerometer, or a machine at rest clears
     nothing. The decision is held and the reason stated, unless another bearing shows a fault.
 
     A bearing with two accelerometers is also watched by direction (`RaceDirection`); `find` says how that
@@ -201,14 +201,14 @@ class BearingDetector:
         self._pending: list[NDArray[np.float32]] = []
         self._persistence = PersistenceFilter()
         self.seen: Evaluation | None = None
-        """The last look at good samples."""
+        """The last evaluation of good samples."""
         self._large = False
         self._end_index = 0
         self._speed_unknown = self._has_looked = False
 
     @property
     def standing(self) -> ConfirmedState:
-        """What it stands by."""
+        """The confirmed state."""
         return self._persistence.standing
 
     def warm(self) -> None:
@@ -259,7 +259,7 @@ class BearingDetector:
         return self._look(t_ns, last=True)
 
     def _snapshot(self, window: Window) -> Diagnosis:
-        """A look at a block by itself: evidence is not gathered over several, but they must agree as ever."""
+        """Evaluate a block by itself: evidence is not summed over several, but they must agree as usual."""
         self._end_index = window.first_index + len(window.samples)
         for watch in self._watches.values():
             watch.forget()
@@ -376,7 +376,7 @@ class BearingDetector:
             if self._has_looked:
                 yield (
                     "not_ok",
-                    f"the speed has gone from {before:.0f} to {speed.rpm:.0f} rpm: the evidence begins anew",
+                    f"the speed has gone from {before:.0f} to {speed.rpm:.0f} rpm: the evidence begins again",
                 )
         self._has_looked = True
         if self.baseline is not None and not self._comparable:
@@ -440,7 +440,7 @@ class BearingDetector:
         }
 
     def _begin_anew(self) -> None:
-        """The speed is another one."""
+        """The speed has changed."""
         self._learning.forget()
         self._persistence.interrupt()
         self._watches = self._new_watches()

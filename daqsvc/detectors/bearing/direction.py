@@ -1,7 +1,7 @@
 """Which race by direction: accelerometers on rotor and housing, compared with the healthy machine.
 
-The monitor of `daqsvc.bearing.two_sensors`, look by look: whether the residual holds more than the healthy
-machine's, which race the hits in it come from, and what the sliding units say to that.
+The monitor of `daqsvc.bearing.two_sensors`, evaluation by evaluation: whether the residual holds more than
+the healthy machine's, from which race its impacts come, and what the sliding units show.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What one look at the bearings of a machine has found, and its figures."""
+"""What one evaluation of the bearings of a machine has found, and its figures."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from daqsvc.dsp.quality import Quality
 
 LARGE = 10.0
-"""Innovations of so many times those of the healthy machine are danger."""
+"""Multiple of the healthy machine's innovations from which on it is danger."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ if they leave it open, and contradicts them if it is sure of the other race: the
 ``inner_or_outer``. Where no lines stand out the direction names the part that is hit, or leaves it open; if
 nothing is hit, for the change is steady, the machine has ``changed``.
 
-It takes several looks to raise a fault that the detector stands by, and more to take it back.
+It takes several evaluations to confirm a fault, and more to withdraw it.
 """
 
 from __future__ import annotations
@@ -135,19 +135,19 @@ def _probabilities(verdict: RaceVerdict) -> dict[RaceWord, float]:
 UNDETERMINED = "undetermined"
 
 CONFIRM_LOOKS = 2
-"""So many looks in a row must agree before a fault is raised, or called by another name."""
+"""Evaluations in a row that must agree before a fault is raised, or gets another name."""
 CLEAR_LOOKS = 8
-"""So many looks in a row must find nothing before a fault is taken back: damage does not heal."""
+"""Evaluations in a row that must find nothing before a fault is withdrawn: damage does not heal."""
 
 
 @dataclass(frozen=True, slots=True)
 class ConfirmedState:
-    """What is stood by.
+    """The confirmed state.
 
     Attributes:
         decision: the word, or ``"undetermined"`` before anything was found.
         group: what it cannot be told apart from, itself among it; empty if there is nothing.
-        where: the bearing that it is about; empty while nothing is stood by.
+        where: the bearing that it is about; empty while nothing is confirmed.
     """
 
     decision: str = UNDETERMINED
@@ -171,7 +171,7 @@ class PersistenceFilter:
     """Follows findings evaluation by evaluation, without flicker.
 
     Attributes:
-        standing: what is stood by.
+        standing: the confirmed state.
     """
 
     def __init__(self) -> None:
@@ -184,7 +184,7 @@ class PersistenceFilter:
 
         Args:
             finding: what was found.
-            last: whether there will be no other; it counts by itself then, unless something is stood by.
+            last: whether there will be no other; it counts by itself then, unless something is confirmed.
 
         Returns:
             Whether the standing has changed.
@@ -207,7 +207,7 @@ class PersistenceFilter:
         return True
 
     def interrupt(self) -> None:
-        """Looks before a gap do not count with those after it; what is stood by stays."""
+        """Evaluations before a gap do not count with those after it; the confirmed state stays."""
         self._looks = 0
 
     def _needed(self, state: ConfirmedState) -> int:

@@ -1,4 +1,4 @@
-"""The fault orders of a bearing of a machine file, whichever way that tells them."""
+"""The fault orders of a bearing of a machine file, in whichever way it states them."""
 
 from __future__ import annotations
 

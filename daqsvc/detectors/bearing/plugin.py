@@ -83,7 +83,7 @@ def _described(settings: Bearing) -> str:
             *(_watched(bearing) for bearing in settings.bearings),
             *(() if settings.keyphasor is None else (f"speed by {settings.keyphasor}",)),
             healthy,
-            f'false alarms of "changed" {settings.false_alarm_probability:g} a look',
+            f'false alarms of "changed" {settings.false_alarm_probability:g} an evaluation',
         ]
     )
 

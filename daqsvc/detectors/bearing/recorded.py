@@ -212,7 +212,7 @@ def _watched_against(
 
 
 def _watched(detector: BearingDetector, recorded: Recorded) -> tuple[list[Diagnosis], _Looks]:
-    """Have the detector see a recording block by block, so that no look is missed: statements and looks."""
+    """Have the detector see a recording block by block, so that none is missed: statements, evaluations."""
     diagnoses: list[Diagnosis] = []
     looks = _Looks()
     for statements in _watch(detector, recorded.blocks_of(detector.stream), recorded.recording.rate_hz):
@@ -223,7 +223,7 @@ def _watched(detector: BearingDetector, recorded: Recorded) -> tuple[list[Diagno
 
 
 class _Looks:
-    """The looks at a recording that a verdict may rest on: the strongest of each finding, and the last.
+    """The evaluations of a recording that a verdict may rest on: the strongest of each finding, and the last.
 
     Attributes:
         last: None before the first.
@@ -279,7 +279,7 @@ def _concluded(
     diagnoses: list[Diagnosis],
     looks: _Looks,
 ) -> BearingVerdict:
-    """What the detector stands by at the end, with the figures of the evaluation that shows it most."""
+    """The confirmed state at the end, with the figures of the evaluation that shows it most."""
     columns = [recording.names.index(bearing.sensor) for bearing in detector.bearings]
     in_turn = columns == list(range(columns[0], columns[0] + len(columns)))
     chosen = slice(columns[0], columns[0] + len(columns)) if in_turn else columns  # the former copies nothing
@@ -302,7 +302,7 @@ def _concluded(
         return replace(
             analysis,
             refused=f"the recording is too short: {len(recording.samples) / recording.rate_hz:.3g} s are not "
-            "enough for two looks that agree; give 10 s or more",
+            "enough for two evaluations that agree; give 10 s or more",
         )
     where = standing.where if standing.where in look.races else look.finding.where
     finding = look.finding
@@ -357,7 +357,7 @@ def _against(rate_hz: float, judge: Judge, healthy: HealthyRun | None) -> Bearin
             "--baseline-fs, or give one at this speed"
         )
     return analysis.with_problem(
-        f"the healthy run {source}: {doubt}; see whether its rate and speed are right"
+        f"the healthy run {source}: {doubt}; check whether its rate and speed are right"
     )
 
 
@@ -461,11 +461,11 @@ def _change(
     if change.quiet:
         raise ValueError(
             f"{', '.join(names)}: {-change.rise_db[0]:.1f} dB quieter than in the healthy run: the machine "
-            "stands still, a sensor is loose, or the unit is another; give recordings at one speed and unit"
+            "stands still, a sensor is loose, or the unit differs; give recordings at one speed and unit"
         )
     if change.gain:
         raise ValueError(
             f"{', '.join(names)}: {change.rise_db[0]:.1f} dB louder than in the healthy run in all bands "
-            f"alike (a factor of {change.ratio:.3g}): gain or unit is another; give both in one unit"
+            f"alike (a factor of {change.ratio:.3g}): gain or unit differs; give both in one unit"
         )
     return change

@@ -1,4 +1,4 @@
-"""The level detector: how much each sensor shakes, and whether the sensor is to be believed."""
+"""The level detector: how strong the vibration at each sensor is, and whether the sensor can be believed."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ _LEAST_SAMPLES = 4
 """Fewer make no spectrum."""
 
 _GLITCH = 2
-"""So few samples beyond the gap limits inside a window are interference, not the probe."""
+"""Samples beyond the gap limits within a window, up to which they are interference and not the probe."""
 
 SensorUnit = Literal["um", "mm", "mil", "g", "m/s2", "mm/s"]
 
@@ -147,7 +147,7 @@ class LevelDetector:
         channels: the sensors.
         window_s: length of a window.
         velocity_band_hz: band of the velocity, in Hz.
-        speed_rpm: stated speed of the shaft, for 1X and 2X; of its sign nothing depends.
+        speed_rpm: stated speed of the shaft, for 1X and 2X; its sign does not matter.
         shaft: the keyphasor of the stream; None: 1X is looked for near the stated speed, and has no phase.
     """
 
@@ -214,7 +214,7 @@ class LevelDetector:
         return [self._state(c, nothing, {}, "missing", reason) for c in self._channels]
 
     def _skipped(self, channel: LevelChannel, window: Window) -> Diagnosis:
-        """Nobody has seen what lies between two windows: no delay goes on over it."""
+        """What lies between two windows is not known: no delay continues over it."""
         first = window.first_index - window.skipped
         t_ns = window.t_end_ns - round(len(window.samples) * window.period_ns)
         unseen = Evidence(first, window.first_index, t_ns)
@@ -353,7 +353,7 @@ class LevelDetector:
         by_pulses = angle_rad is not None
         if angle_rad is None:
             if self._turns_per_sample is None:
-                return {}, f"1X of {sensor} is not known: nobody says how fast the shaft turns"
+                return {}, f"1X of {sensor} is not known: the speed of the shaft is not stated"
             angle_rad = steady_angle(samples, self._turns_per_sample)
         found = window_orders(samples, angle_rad)
         if found is None and by_pulses and self._shaft is not None and not np.isfinite(angle_rad[-1]):

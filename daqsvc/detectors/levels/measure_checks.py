@@ -104,7 +104,7 @@ def _has(sensor: Sensor, measure: str) -> bool:
 
 
 def _keyphasor(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
-    """The keyphasor is one, its pulses can be seen, and something is told by it."""
+    """The keyphasor is one, its pulses can be seen, and something uses it."""
     name, at = levels.keyphasor, (*_LEVELS, "keyphasor")
     if name is None:
         return
@@ -174,7 +174,7 @@ def _of_the_shaft(draft: MachineFile, levels: Levels, asked: _Asked) -> Iterator
         keyphasors = [sensor.name for sensor in draft.sensors if sensor.type == "keyphasor"]
         yield Finding(
             asked.at,
-            "needs a keyphasor: by the stated speed alone nobody knows where the shaft stands",
+            "needs a keyphasor: from the stated speed alone the angle of the shaft is not known",
             f'write keyphasor = "{keyphasors[0]}" in [pipeline.levels]'
             if keyphasors
             else "add a sensor of type keyphasor, or watch the amplitude only",
@@ -188,7 +188,7 @@ def _of_the_shaft(draft: MachineFile, levels: Levels, asked: _Asked) -> Iterator
         yield Finding(
             asked.at,
             f'"{apart[0].name}" is in stream "{apart[0].stream}", but keyphasor "{levels.keyphasor}" is in '
-            f'stream "{streams[0]}": a phase is told of what is sampled with its mark',
+            f'stream "{streams[0]}": a phase needs samples of one stream with its mark',
             "take a sensor and a keyphasor of one stream, or watch the amplitude only",
             code=SAMPLED_APART,
         )

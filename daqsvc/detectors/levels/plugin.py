@@ -1,6 +1,6 @@
 """The level detectors as a plugin: from ``[pipeline.levels]`` to one detector a stream.
 
-And whether what is said of them fits the streams and sensors.
+And whether their settings fit the streams and sensors.
 """
 
 from __future__ import annotations

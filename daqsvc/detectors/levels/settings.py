@@ -37,7 +37,7 @@ class Levels(Section):
     )
     measures: Annotated[tuple[ListedMeasure, ...], Field(strict=False, max_length=100)] = Field(
         default=(),
-        description="what is measured besides, of every sensor that has it, with or without alarm",
+        description="what else is measured, of every sensor that has it, with or without alarm",
         examples=['["kurtosis"]'],
     )
     keyphasor: Name | None = Field(

@@ -125,7 +125,7 @@ class TrendDetector:
         return [self._missing(channel, nothing, reason) for channel in self._channels]
 
     def _skipped(self, channel: TrendChannel, window: Window) -> Diagnosis:
-        """Nobody has seen what lies between two windows: no delay goes on over it."""
+        """What lies between two windows is not known: no delay continues over it."""
         t_ns = window.t_end_ns - round(len(window.samples) * window.period_ns)
         unseen = Evidence(window.first_index - window.skipped, window.first_index, t_ns)
         return self._statements.state(

@@ -1,4 +1,4 @@
-"""The rotor's model bank out of a machine file."""
+"""Build the rotor's model bank from a machine file."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Whether what is said of a rotor bank fits sensors and machine, and its modes what they are called.
+"""Whether a rotor bank fits sensors and machine, and whether its modes fit their names.
 
-And whether its noise, its rate and its modes can be, with such a rotor in such a clearance.
+And whether its noise, rate and modes are possible with this rotor in this clearance.
 """
 
 from __future__ import annotations
@@ -189,7 +189,7 @@ def _mode_fault(draft: MachineFile, mode: Mode, at: KeyPath) -> Iterator[Finding
 
 
 def _static_load(draft: MachineFile, mode: Mode, at: KeyPath) -> Iterator[Finding]:
-    """Nobody looks for a static load with probes that show none."""
+    """A static load is not sought with probes that do not show one."""
     if mode.static_load_um != (0.0, 0.0) and draft.ac_coupled:
         yield Finding(
             (*at, "static_load_um"),

@@ -38,7 +38,7 @@ def bank_detectability(
         machine: the machine file.
         settings: its rotor bank.
         detector: made of that.
-        process_noise: how much the machine itself shakes at random; None: what the bank says.
+        process_noise: random motion of the machine itself, as PSD, normalised; None: that of the bank.
 
     Raises:
         ValueError: it cannot be computed of these figures.

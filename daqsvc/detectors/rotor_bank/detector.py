@@ -45,7 +45,7 @@ _MIN_PROBE_SPREAD = 0.5
 _RETUNE = 0.003
 """Relative change of speed that the reference orbits follow; smaller ones are jitter of the edges."""
 _BLIND_REVOLUTIONS = 3.0
-"""So long the angle is trusted without an edge."""
+"""Time for which the angle is trusted without an edge."""
 
 
 class RotorBankDetector:

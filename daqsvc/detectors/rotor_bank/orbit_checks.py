@@ -1,4 +1,4 @@
-"""Whether probes and keyphasor together show what they are said to: direction, static position, speed."""
+"""Whether probes and keyphasor show what the machine file states: direction, static position, speed."""
 
 from __future__ import annotations
 

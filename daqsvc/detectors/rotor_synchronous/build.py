@@ -1,4 +1,4 @@
-"""The calibrated rotor out of a machine file: its detector, and its healthy state."""
+"""Build the calibrated rotor from a machine file: its detector, and its healthy state."""
 
 from __future__ import annotations
 
@@ -115,12 +115,12 @@ def rotor_synchronous(
 
 def _kept_calibration(path: Path, speed_rpm: float, rotor: LavalRotor) -> Calibration | None:
     """The healthy state that was measured before a restart, with what the file says of the rotor now."""
-    if not os.path.lexists(path):  # also where nobody may look: the outbox refuses it
+    if not os.path.lexists(path):  # also if it cannot be read: the outbox reports that
         return None
     try:
         return replace(load_calibration(path, speed_rpm), rotor=rotor)
     except CalibrationFileError as error:
-        log.warning("the healthy state of the rotor is measured anew: %s", error, extra=coded(HEALTHY_STATE))
+        log.warning("the healthy state of the rotor is measured again: %s", error, extra=coded(HEALTHY_STATE))
         return None
 
 

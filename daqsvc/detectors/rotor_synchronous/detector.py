@@ -42,19 +42,19 @@ __all__ = [
 ]
 
 _WINDOW_S = 0.05
-"""A fast shaft is looked at so often, several revolutions at a time; a slow one every revolution."""
+"""How often a fast shaft is evaluated, several revolutions at a time; a slow one at every revolution."""
 _DEAD = 0.05
 """A probe that moves less than this part of what it did when it was calibrated is dead."""
 _BLIND_REVOLUTIONS = 8.0
-"""So long no revolution may come out, at the stated speed; the cutters need up to five and a half."""
+"""Longest time without a revolution, at the stated speed; the cutters need up to five and a half."""
 _ORBIT_LOCK_REVOLUTIONS = 20.0
 """The same of the orbit cutter, which has to find the speed first."""
 _OVERSPEED = 2.0
-"""No machine turns at so many times its stated speed; pulses that say so are noise."""
+"""Multiple of its stated speed at which no machine turns; pulses at this rate are noise."""
 _NO_MEAN_UM = 1e6
 """A drift of the probes beside which no mean position is evidence of anything."""
 _DOUBTED = 2
-"""So many of the last few revolutions must be worth nothing before the statement is not good."""
+"""Number of the last few revolutions that must be bad before the statement is not good."""
 _REMEMBERED = 4
 _REACH = 256
 """Revolutions whose ends are kept, so that an onset can be placed in the stream."""
@@ -74,7 +74,7 @@ class RotorSynchronousDetector:
     Severity: any change is alert; a rub, and a change larger than the healthy whirl itself, is danger.
 
     One `Diagnosis` a revolution at most: when something changes, at each look at a change, and else once a
-    second. A revolution with missing samples, a dead or clipped probe, an angle that nobody knows, or a speed
+    second. A revolution with missing samples, a dead or clipped probe, an unknown angle, or a speed
     farther than 5 % from the calibrated one is not judged. The decision is held and the reason said. A
     calibration that is refused is a quality that is not good, with the reason, until one succeeds.
 

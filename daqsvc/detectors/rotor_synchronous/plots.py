@@ -1,4 +1,4 @@
-"""Figures of a verdict: what the shaft did, and what the detector made of it.
+"""Figures of a verdict: what the shaft did, and what the detector found.
 
 Needs matplotlib (``pip install 'daqsvc[plot]'``); imported only by who draws.
 """

@@ -1,4 +1,4 @@
-"""The calibrated rotor as a plugin, and whether what is said of it fits its sensors and the machine."""
+"""The calibrated rotor as a plugin, and whether its settings fit its sensors and the machine."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def _healthy_rotor(
     machine: MachineFile, settings: RotorSynchronous
 ) -> tuple[LavalRotor, tuple[Calibration, ...]]:
     from daqsvc.detectors.rotor_synchronous.build import healthy_rotor  # noqa: PLC0415 - brings SciPy
-    from daqsvc.rotor.calibration.file import CalibrationFileError  # noqa: PLC0415 - likewise
+    from daqsvc.rotor.calibration.file import CalibrationFileError  # noqa: PLC0415 - as above
 
     try:
         return healthy_rotor(machine, settings)
@@ -170,7 +170,7 @@ def synchronous_checks(draft: MachineFile, synchronous: RotorSynchronous) -> Ite
 
 
 def _speed_source(synchronous: RotorSynchronous) -> Iterator[Finding]:
-    """What tells the shaft angle is there, and what is there tells it."""
+    """The source of the shaft angle is there, and what is there gives the angle."""
     if synchronous.reference == "keyphasor" and synchronous.keyphasor is None:
         yield Finding(
             (*_SYNCHRONOUS, "speed_source"),
@@ -181,7 +181,7 @@ def _speed_source(synchronous: RotorSynchronous) -> Iterator[Finding]:
     elif synchronous.reference != "keyphasor" and synchronous.keyphasor is not None:
         yield Finding(
             (*_SYNCHRONOUS, "keyphasor"),
-            f'is not looked at: the shaft angle comes from speed_source = "{synchronous.reference}"',
+            f'is not used: the shaft angle comes from speed_source = "{synchronous.reference}"',
             'write speed_source = "keyphasor", or remove it',
             fatal=False,
             code=NO_EFFECT,

@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 _WINDOW_REVOLUTIONS = 256
-"""Revolutions handed to the detector at a time: often enough to see it get on."""
+"""Revolutions handed to the detector at a time: often enough to see its progress."""
 _NO_MEAN = (
     "no mean position: AC-coupled probes? Static load and half of the evidence for stiffness loss cannot be "
     "seen"
@@ -305,7 +305,7 @@ def _feed(
 
 @dataclass(frozen=True, slots=True)
 class _Conclusion:
-    """A recording, and what the detector has made of it."""
+    """A recording, and what the detector has found in it."""
 
     recording: Recording
     setup: RotorSetup
@@ -499,7 +499,7 @@ def rotor_alarms(places: Places, last: Identification | None) -> tuple[RotorAlar
 
     Args:
         places: the recording.
-        last: the look at its end; None if the machine is healthy then.
+        last: the evaluation at its end; None if the machine is healthy then.
     """
     alarms: list[RotorAlarm] = []
     segment: list[WatchReport] = []

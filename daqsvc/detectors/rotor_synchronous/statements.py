@@ -34,7 +34,7 @@ DEPARTURE = "departure"
 """Decision while the machine has changed and the cause is not yet known."""
 
 _STEADY_S = 1.0
-"""While nothing changes a statement is made so often."""
+"""How often a statement is made while nothing changes."""
 _LARGE = 1.0
 """A change larger than this part of the healthy whirl is danger, whatever it is ..."""
 _NO_LONGER_LARGE = 0.8
@@ -56,7 +56,7 @@ _DIRECTIONS = frozenset(("change_deg", "shift_deg"))
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """How things stand after a revolution.
+    """The state after a revolution.
 
     Attributes:
         report: the last report of the watch; None if there was none yet.

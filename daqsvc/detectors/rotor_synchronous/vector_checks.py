@@ -118,7 +118,7 @@ def speed_verdict(speed_rpm: float, calibration: Calibration) -> RevolutionQuali
     return RevolutionQuality(
         "missing",
         f"not judged at {speed_rpm:.0f} rpm: the machine was calibrated at {calibration.speed_rpm:.0f} rpm, "
-        f"and beyond {100.0 * SPEED_TOLERANCE:.0f} % of that its healthy orbit is another; run it at that "
+        f"and beyond {100.0 * SPEED_TOLERANCE:.0f} % of that its healthy orbit differs; run it at that "
         "speed, or calibrate it at this one",
     )
 

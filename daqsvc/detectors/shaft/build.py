@@ -1,4 +1,4 @@
-"""Probes and keyphasor out of a machine file."""
+"""Build probes and keyphasor from a machine file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether what detectors of the rotor ask of probes, keyphasor and rotor is there and fits together."""
+"""Whether probes, keyphasor and rotor are there as detectors of the rotor need them, and fit together."""
 
 from __future__ import annotations
 

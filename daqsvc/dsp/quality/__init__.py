@@ -11,7 +11,7 @@ from typing import Literal
 from daqsvc.errors.recordings import NOT_JUDGED, UNFIT_SAMPLES
 
 Quality = Literal["good", "missing", "not_ok"]
-"""Of what a statement rests on: good, too little of it there, or not what a sound sensor delivers."""
+"""Of what a statement rests on: good, too little of it there, or not what a working sensor delivers."""
 
 
 class RefusedError(ValueError):

@@ -234,7 +234,7 @@ def repaired(samples: Real, rate_hz: float, revolution: int, band_hz: tuple[floa
                 "channel",
                 f"is much louder for {lost:.0%} of its time, first at {stretches[0][0] / rate_hz:.2f} s, "
                 "than the machine is otherwise",
-                "give a recording of steady running without knocks, and check cable and mounting",
+                "give a recording of steady running without impacts, and check cable and mounting",
             )
         values = blanked(values, events, rate_hz)
     if len(spikes) > MOST_SPIKES * len(samples):

@@ -27,7 +27,7 @@ CLIPPED_NOTE_SHARE = 1e-4
 CLIPPED_REVOLUTION = 1 / 16
 """Part of a revolution at one extreme value that makes a probe clipped."""
 LEAST_CUT_OFF = 8
-"""So often a recording must end at its extreme value."""
+"""How often a recording must reach its extreme value."""
 LEAST_IN_REVOLUTION = 3.0
 _USUAL = 4
 """An extreme value is a limit if it comes so many times as often as any other."""

@@ -23,13 +23,13 @@ REMEMBERED = 16
 """Values that are looked at together; a third is of an ordinary size by chance, but never all of them."""
 FEWEST = 2
 LEAST_SHARE = 0.25
-"""So many of them, and such a share of them, must be impossible: a glitch now and then is none."""
+"""Number and share of them that must be impossible: a glitch now and then does not count."""
 DECADES = 6.0
 """A step over so many decades up is no quantity that is measured; down it may be one that dies away."""
 STEPS = 2
-"""So many of such steps: a machine that starts makes one."""
+"""Number of such steps: a machine that starts makes one."""
 STILL = 8
-"""So many equal values in a row that are all but 0 do not die away, and are no rounding."""
+"""Equal values in a row, all nearly 0, from which on they neither decay nor are rounding."""
 
 
 class Misread:

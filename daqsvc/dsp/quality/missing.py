@@ -54,7 +54,7 @@ LEAST_KNOWN_ERROR = 0.5
 _NS_PER_S = 10**9
 
 BRIDGED = 2
-"""So many values in a row may be missing: until then the last one stands. A lost poll is no lost sensor."""
+"""Values in a row that may be missing: until then the last one holds. A lost poll is no lost sensor."""
 
 SILENCE_NS = 2 * _NS_PER_S
 """A stream from which nothing has come for so long is silent, ..."""
@@ -63,7 +63,7 @@ SILENT_PERIODS = BRIDGED + 1.5
 """... but not before so many of its sampling periods: a value that is polled once a minute is no silence."""
 
 UNKNOWN_NS = 60 * _NS_PER_S
-"""How often a device takes snapshots that nobody has said it of, until it has been seen."""
+"""How often a device takes snapshots that are not declared as such, until it has been seen."""
 
 _REMEMBERED = 8
 

@@ -97,7 +97,7 @@ LEAST_DEVIATIONS = 12.0
 JUMP_DEVIATIONS = 1.5
 """Least step that is looked for in the mean of revolutions, over the deviation within them."""
 LASTING, LASTING_SHARE = 3, 0.5
-"""So much of a step is there for so many revolutions."""
+"""Share of a step that lasts, and for how many revolutions."""
 ROUNDS = 12
 """One event can hide another."""
 REST_SHARE = 0.06

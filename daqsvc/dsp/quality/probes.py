@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 POOLED_REVOLUTIONS = 4
-"""So many revolutions together are searched for clipping."""
+"""Revolutions that are searched together for clipping."""
 DEAD = 0.05
 """A probe that moves less than this part of what it must is dead."""
 _SURE = 3.0

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 _LEAST_BAD_REVOLUTIONS = 3
-"""So many revolutions that stand still, or are clipped, are no chance."""
+"""Number of still or clipped revolutions from which on this is no chance."""
 _NO_MEAN = 1e-3
 """A mean position within this part of the 1X amplitude is none."""
 _FIGURES = re.compile(r"[-+]?\d[\d.]*(?:e[-+]?\d+)?")

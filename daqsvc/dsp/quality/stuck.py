@@ -26,7 +26,7 @@ _SURE_NATS = 30.0
 LONGER = 6
 """It is no habit if it is so many times as long as any other; at its crest a rounded sine rests up to 5."""
 RUNS = 8
-"""So many other runs are needed to know a habit."""
+"""Other runs that are needed to know a habit."""
 _REMEMBERED = 8
 """Windows that the habit is taken from, besides the present one."""
 _DROP_STEPS = 4.0

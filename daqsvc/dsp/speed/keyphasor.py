@@ -28,16 +28,16 @@ _ABOVE_MINUS_ONE = math.nextafter(-1.0, 0.0)
 _TOLERANCE = 0.2
 """An edge may come this part of a revolution early or late."""
 _REJECTED_IN_A_ROW = 3
-"""So many edges out of place, but in step with each other, are right and the line is wrong."""
+"""Edges out of place, but in step with each other, from which on they are right and the line is wrong."""
 _STEP = 0.25
 """Gaps between edges in step change by no more from one to the next."""
 _ALIAS_STEP = 0.1
 """The same, where it must not be a second pulse that happens to come half a revolution later."""
 _MIN_LOCK_EDGES = 2
 _FREE_LOCK_EDGES = 4
-"""So many edges in step make a lock where the speed is not known beforehand."""
+"""Edges in step that make a lock if the speed is not known beforehand."""
 _ALIAS_EDGES = 8
-"""So many edges in step at a part of the period (or at a multiple, half of them) unmask a wrong lock."""
+"""Edges in step at a part of the period (at a multiple, half of them) that show a wrong lock."""
 _MIN_BEND_EDGES = 3
 _BEND_EDGES = 1.5
 """The curvature is taken from so many times the edges that the line goes through."""
@@ -48,7 +48,7 @@ _CONTRADICTED = 4.0
 _QUARTILE = 1.15
 """Upper quartile of the absolute deviation from the mean, in standard deviations."""
 _FOLLOWED_REVOLUTIONS = 4.0
-"""So long without an edge the acceleration is carried on; then the speed is held."""
+"""Time without an edge for which the acceleration is continued; then the speed is held."""
 _FORGOTTEN_REVOLUTIONS = 32.0
 """After so long without an edge there is no counting of revolutions any more."""
 
@@ -393,7 +393,7 @@ def _median(values: Floats) -> Floats:
 
 
 def _upper_quartile(values: Floats) -> float:
-    """``numpy.quantile`` of 0.75, likewise."""
+    """``numpy.quantile`` of 0.75, in the same way."""
     ranked = np.sort(values).tolist()
     place = 0.75 * (len(ranked) - 1)
     below = math.floor(place)

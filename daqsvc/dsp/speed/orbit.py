@@ -39,7 +39,7 @@ AT_THE_EDGE = 0.08
 """A line so far from the stated speed, of the tenth that is searched, may be the flank of another one."""
 _LEAST_TURNS = 10.0
 _STRONGER = 4.0
-"""So many times the 1X amplitude another line may have and still be a whirl or a harmonic."""
+"""Largest amplitude of another line, as a multiple of 1X, that is still a whirl or a harmonic."""
 
 _LOCK_REVOLUTIONS = 16
 _LOCK_SEARCH = 0.04
@@ -52,7 +52,7 @@ _MAX_SCATTER_REV = 0.15
 _MAX_DRIFT = 0.1
 """A speed that has drifted further from the expected one is not followed any more."""
 _MAX_UNMEASURED = 3
-"""So many revolutions without samples, or without phases around them, are bridged."""
+"""Revolutions without samples, or without phases around them, that are bridged."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +133,7 @@ def refuse_elsewhere(first: Floats, rate_hz: float, stated_rpm: float, found_rpm
     """
     try:
         strongest_rpm = estimate_speed(first, rate_hz).speed_rpm
-        # So many revolutions at the true speed: beyond, the machine need not be healthy any more.
+        # This many revolutions at the true speed: after them, the machine need not be healthy any more.
         turns = max(_LEAST_TURNS, len(first) * abs(stated_rpm) / 60.0 / rate_hz)
         healthy = first[: math.ceil(turns * 60.0 * rate_hz / strongest_rpm)]
         strongest_rpm = estimate_speed(healthy, rate_hz, strongest_rpm).speed_rpm

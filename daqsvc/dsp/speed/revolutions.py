@@ -132,7 +132,7 @@ _SPEED_RATIO = 10.0
 _SHORTEST_PERIOD = 3.0
 _BELOW_ONE = math.nextafter(1.0, 0.0)
 _BRIDGED = 3
-"""So many missing pulses in a row are bridged."""
+"""Missing pulses in a row that are bridged."""
 WAIT_REVOLUTIONS = 5.5
 """A mark that has not come by then (three missing ones, slowing down) does not close its revolution."""
 _JUMP = 0.2

@@ -97,7 +97,7 @@ class AccountsFile:
             self._stamp = ()
             if self._why != f"{error}":
                 self._why = f"{error}"
-                log.error("nobody can sign in until this is mended: %s", error, extra=coded(error.code))  # noqa: TRY400
+                log.error("nobody can sign in until this is corrected: %s", error, extra=coded(error.code))  # noqa: TRY400
         return self._accounts.get(name)
 
     def _read(self) -> None:
@@ -196,7 +196,7 @@ def write_account(path: Path, name: str, line: str | None) -> bool:
                 os.fsync(file.fileno())
             os.replace(made, path)  # noqa: PTH105 - a name of a temporary file
         except BaseException:
-            os.unlink(made)  # noqa: PTH108 - likewise
+            os.unlink(made)  # noqa: PTH108 - as above
             raise
     except OSError as error:
         raise AccountsError(f"{path} cannot be written: {error.strerror or error}") from None

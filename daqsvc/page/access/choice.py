@@ -72,7 +72,7 @@ class AccessChoice:
             raise UnsafeError("--user-header is believed of known proxies only: name them by --proxy ADDRESS")
         if is_everywhere(self.host) and not self.names:
             raise UnsafeError(
-                f"the page listens at {self.host}, and nobody knows by which names it is opened: give "
+                f"the page listens at {self.host}, and it is not known by which names it is opened: give "
                 "--host-name for each, also if it is an address of this machine"
             )
         if self.is_local or self.user_header:

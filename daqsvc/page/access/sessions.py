@@ -19,7 +19,7 @@ MOST = 500
 """Sessions at a time; of more the one that was used least lately ends."""
 TRIES = 5
 TRY_EVERY_S = 10.0
-"""So many may be made at once, and another one for each of these times that pass."""
+"""Number that may be made at once; one more is allowed each time this period passes."""
 MOST_TRIERS = 2000
 
 

@@ -51,7 +51,7 @@ class KnownMachine:
         alarms: the last event of each alarm.
         events: those heard, as they came, oldest first.
         statements: the last one of each detector, as it came.
-        hearing: who is told each line as it comes, by `daqsvc.live_feed`.
+        hearing: who receives each line as it comes, by `daqsvc.live_feed`.
     """
 
     site: str

@@ -132,7 +132,7 @@ class LeasedListening(Listening):
         if away := self._link.why_not or self._box.away:
             raise ConnectionError(away)
         if silent_s > SILENT_S and not self._is_poor:
-            raise ConnectionError("nothing comes of the box any more")
+            raise ConnectionError("the box sends nothing any more")
         if silent_s > PATIENCE_S:
             self._show_known()
 
@@ -148,7 +148,7 @@ class LeasedListening(Listening):
             line.pop("folder", None)  # no box says which files are opened here
             self.begin(line)
         elif line.get("over"):
-            raise ConnectionError("the service begins anew")
+            raise ConnectionError("the service begins again")
         else:
             self.take(line)
 

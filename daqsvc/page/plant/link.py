@@ -227,7 +227,7 @@ class BrokerLink:
             raise BrokerAwayError(f"the broker {self.name} does not take it: {in_words(error)}") from None
 
     def tell(self, topic: str, payload: bytes) -> None:
-        """Publish, if there is a connection; nobody says whether it arrives."""
+        """Publish, if there is a connection; whether it arrives is not reported."""
         if self._connection is not None:
             with contextlib.suppress(MqttError):
                 self._connection.tell(topic, payload)

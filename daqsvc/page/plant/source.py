@@ -74,7 +74,7 @@ class PlantSource:
                 standing = [one for one in machine.alarms.values() if one["state"] != "normal"]
                 told.append({"machine": machine.name, "alarms": {"standing": standing}, **about})
             if not box.machines:
-                away = box.away or "no machine of this box has said anything yet"
+                away = box.away or "no machine of this box has sent anything yet"
                 told.append({"machine": "", "alarms": {"standing": []}, **about, "away": away})
         return told
 

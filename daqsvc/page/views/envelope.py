@@ -28,7 +28,7 @@ WHITENING_HZ = 100.0
 SHOWN_HZ = 500.0
 LEAST_S = 0.5
 SLIP = 0.01
-"""So far from where it is reckoned a line of a bearing is looked for, as its balls slip."""
+"""Distance from its computed frequency within which a line of a bearing is sought, as its balls slip."""
 
 
 class EnvelopeSpectrumView:

@@ -38,7 +38,7 @@ class ModesView:
 
     def why_not(self, live: MachineLive) -> str:
         """See `daqsvc.page.views.view.MachineView.why_not`."""
-        return "" if live.probable else "no detector of this machine has told any probabilities yet"
+        return "" if live.probable else "no detector of this machine has stated probabilities yet"
 
     def streams(self, live: MachineLive, chosen: Mapping[str, str]) -> set[str]:
         """See `daqsvc.page.views.view.MachineView.streams`."""

@@ -30,7 +30,7 @@ LEAST_RANGE = 1.1
 BIN = 0.005
 """Width of a bin of speed, as a part of it."""
 HALF_POWER = 1.0 / np.sqrt(2.0)
-NO_KEY = "it needs a keyphasor that is sampled with the sensor: without one nobody knows the phase"
+NO_KEY = "it needs a keyphasor that is sampled with the sensor: without one the phase is not known"
 
 
 class Critical(NamedTuple):
@@ -110,8 +110,8 @@ class BodeView(_RunView):
     title = "Bode"
     sentence = (
         "Amplitude and phase lag of 1X against the speed, every four revolutions, since the page looks at "
-        "this sensor: a run-up or coast-down shows the critical speeds, where the amplitude has its peak and "
-        "the lag passes by 180 degrees."
+        "this sensor. A run-up or coast-down shows the critical speeds: there the amplitude has its peak, "
+        "and the lag changes by 180 degrees."
     )
 
     def figures(self, live: MachineLive, chosen: Mapping[str, str], theme: Theme) -> list[Figure]:

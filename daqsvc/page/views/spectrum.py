@@ -233,5 +233,5 @@ class FullSpectrumView:
 
 
 def _cursors(made: Any, theme: Theme) -> None:
-    """Where the orders are; the browser is told, for the speed changes."""
+    """Where the orders are; for the browser, as the speed changes."""
     made.vspan(x="x", source=source("orders", ["x"]), line_color=theme.series[1], line_dash="dashed")

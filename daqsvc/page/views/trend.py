@@ -35,7 +35,7 @@ DAYS_FROM_H = 48.0
 """What is longer is shown in days."""
 MOST_POINTS = 1500
 """Of a line: more cannot be told apart on a screen."""
-NONE = "nothing is written down of this machine yet; that needs [history] in its machine file"
+NONE = "no history of this machine is stored yet; that needs [history] in its machine file"
 
 
 class TrendView:
@@ -107,7 +107,7 @@ class TrendView:
             step = step_of(hours)
             points = reader.trend(series, step, now_s - 3600.0 * hours, now_s + 1.0)
         if not len(points.t_s):
-            return Shown(note="nothing was written down in this time")
+            return Shown(note="nothing was stored in this time")
         t_h, low, mean, high = thinned(points, now_s, step)
         rows = [
             ("mean", f"{np.average(points.mean, weights=points.n):.4g}", series.unit),

@@ -45,7 +45,7 @@ T = TypeVar("T")
 log = logging.getLogger(__name__)
 
 WRITE_EVERY_S = 10.0
-"""So much is lost at most if the power goes."""
+"""Time of which at most data are lost in a power failure."""
 WAITING_SECONDS = 600
 """Seconds of all figures that may wait in memory for a disk that takes none."""
 LEAST_WAITING = 20_000
@@ -214,7 +214,7 @@ class HistoryOutput(Output):
 
         Raises:
             sqlite3.Error: the disk takes no writes, or the file is damaged; all waits for the next time.
-            OSError: likewise.
+            OSError: as above.
             NoRoomError: the rest of the disk is for alarms.
             NewerHistoryError: the file was written by a newer version.
         """

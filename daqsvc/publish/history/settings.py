@@ -19,7 +19,7 @@ class History(Section):
         default=400.0, description="for how long minutes are kept: least, mean and greatest value"
     )
     hours_keep_days: Annotated[float, Field(ge=30, le=36_500)] = Field(
-        default=3650.0, description="for how long hours are kept, likewise"
+        default=3650.0, description="for how long hours are kept: least, mean and greatest value"
     )
     max_mb: Annotated[int, Field(ge=10, le=100_000)] = Field(
         default=1000,

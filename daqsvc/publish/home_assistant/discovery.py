@@ -1,4 +1,4 @@
-"""What Home Assistant is told, so that a machine shows up there by itself.
+"""What Home Assistant gets, so that a machine shows up there by itself.
 
 One retained message per machine describes the device with all its entities (MQTT integration of Home
 Assistant, "device discovery payload", 2024.11 and later). States come from the topics that every other
@@ -38,7 +38,7 @@ _ABOUT = {"sensor-ok/": "sensor fault", "detector-ok/": "detector fault"}
 """Alarms that are called after what is well while they are not raised, and what a person reads instead."""
 
 _MISSED = 2.5
-"""A figure is no longer true when so many of its turns to be told have passed without it."""
+"""Number of missed reports after which a figure is no longer true."""
 
 _BUTTONS = {Verb.ACKNOWLEDGE: "mdi:check", Verb.RESET: "mdi:restore"}
 """What can be done with an alarm by one press, and how that is drawn."""
@@ -58,7 +58,7 @@ class Discovery:
     """The discovery message of a machine.
 
     Args:
-        settings: where, and how often figures are told.
+        settings: where, and how often figures are sent.
         commands: what may be asked over the broker: these have buttons.
         watched: what there is to tell.
         topics: the box.

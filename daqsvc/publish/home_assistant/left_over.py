@@ -1,4 +1,4 @@
-"""What Home Assistant was told and stays retained at the broker, remembered over restarts.
+"""What Home Assistant got and stays retained at the broker, remembered over restarts.
 
 A machine that is taken out of the machine file, renamed or told under another prefix would stand there as it
 was last seen, healthy for ever.
@@ -36,7 +36,7 @@ class LeftOver(MqttLink):
 
     Args:
         directory: where the topics are remembered that hold a retained message of this box.
-        now: those that are told from now on.
+        now: those that are sent from now on.
     """
 
     name = "Home Assistant"
@@ -49,7 +49,7 @@ class LeftOver(MqttLink):
         self._is_unwritable = False
 
     async def run(self, connection: Connection) -> None:
-        """Take it away, and remember what is told from now on.
+        """Take it away, and remember what is sent from now on.
 
         Raises:
             MqttError: the connection is lost.
@@ -58,7 +58,7 @@ class LeftOver(MqttLink):
         await self.until_remembered()
 
     async def take_away(self, connection: Connection) -> None:
-        """Take away what is not told any more, and try to remember what is told from now on.
+        """Take away what is not told any more, and try to remember what is sent from now on.
 
         Raises:
             MqttError: the connection is lost.
@@ -67,12 +67,12 @@ class LeftOver(MqttLink):
         for topic in await asyncio.to_thread(self.left_over):
             try:
                 await connection.deliver(topic, b"", retain=True)
-                log.info("taken away from Home Assistant, as the machine file no longer has it: %s", topic)
+                log.info("removed from Home Assistant, as the machine file no longer has it: %s", topic)
             except PublishRefusedError as error:
                 self._refused.append(topic)
                 log.warning(
-                    "Home Assistant keeps showing what the machine file no longer has: %s; take the retained "
-                    "message away from %s at the broker, or allow this client to",
+                    "Home Assistant keeps showing what the machine file no longer has: %s; remove "
+                    "the retained message from %s at the broker, or allow this client to",
                     error,
                     topic,
                     extra=coded(TOPIC_REFUSED),
@@ -90,7 +90,7 @@ class LeftOver(MqttLink):
         return sorted(self._read() - self.now)
 
     def remember(self, left_over: Iterable[str] = ()) -> bool:
-        """Write down what is told from now on, and what could not be taken away; blocks.
+        """Write down what is sent from now on, and what could not be taken away; blocks.
 
         Returns:
             Whether it is written; that it is not is said once.
@@ -103,7 +103,7 @@ class LeftOver(MqttLink):
         except OSError as error:
             if not self._is_unwritable:
                 log.warning(
-                    "%s cannot be written: %s; what Home Assistant is told now may stay there when the "
+                    "%s cannot be written: %s; what Home Assistant gets now may stay there when the "
                     "machine file no longer has it",
                     self._path,
                     error,

@@ -175,7 +175,7 @@ class MachineDevice:
             await self._run(connection)
         except PublishRefusedError as error:
             log.warning(
-                "Home Assistant is not told of %s: %s; allow this client to write %s and %s at the broker",
+                "Home Assistant does not get %s: %s; allow this client to write %s and %s at the broker",
                 self._machine,
                 error,
                 self._discovery.topic,

@@ -29,6 +29,6 @@ class HomeAssistantPlugin(MqttLinkPlugin[HomeAssistant]):
     def link(self, settings: HomeAssistant | None, mqtt: Mqtt, port: OutputPort) -> MqttLink:
         """See `MqttLinkPlugin.link`."""
         from daqsvc.publish.home_assistant.left_over import LeftOver  # noqa: PLC0415 - brings paho
-        from daqsvc.publish.home_assistant.link import HomeAssistantLink  # noqa: PLC0415 - likewise
+        from daqsvc.publish.home_assistant.link import HomeAssistantLink  # noqa: PLC0415 - as above
 
         return LeftOver(port.store) if settings is None else HomeAssistantLink(settings, mqtt.commands, port)

@@ -1,6 +1,6 @@
 """The figures that Home Assistant shows: rounded, now and then, and at once when something changes.
 
-Detectors state several figures a second. Home Assistant keeps every state that it is told: at that rate a
+Detectors state several figures a second. Home Assistant keeps every state that it gets: at that rate a
 healthy machine would fill its database by a gigabyte a day.
 """
 
@@ -29,7 +29,7 @@ LEAST_NS = 10 * NS_PER_S
 """Figures that move go out so often at most."""
 
 PROBABILITY_STEP = 0.1
-"""A probability that has moved by more is told before its time."""
+"""Change of a probability from which on it is sent before its time."""
 
 DIGITS: Mapping[str, int] = {
     "um": 1,
@@ -82,7 +82,7 @@ class Readings:
     """Decides which figures go out when.
 
     Args:
-        settings: how often figures are told.
+        settings: how often figures are sent.
         watched: the machine and its figures.
         topics: the box.
         clock: the service's clock.
@@ -157,7 +157,7 @@ class Readings:
 
 
 def digits_of(unit: str) -> int:
-    """Decimal places that a figure in this unit is told to."""
+    """Decimal places that a figure in this unit is sent with."""
     return DIGITS.get(unit, DIGITS_OF_A_NUMBER)
 
 

@@ -1,4 +1,4 @@
-"""What Home Assistant is told, and how often."""
+"""What Home Assistant gets, and how often."""
 
 from __future__ import annotations
 

@@ -67,7 +67,7 @@ class Unpacker:
             raise BrokenFeedError("what came is no piece of a live feed")
         feed, number = map(int, numbers)
         if feed == self._feed and number == 0 and self._number > 1:
-            raise BrokenFeedError("the feed has begun anew")  # whoever sends it has lost the connection
+            raise BrokenFeedError("the feed has begun again")  # whoever sends it has lost the connection
         if feed != self._feed or number < self._number:
             return b""
         if number > self._number:

@@ -140,7 +140,7 @@ def reading_metrics(
 
 def health_metric(machine: str, *, is_healthy: bool) -> Metric:
     """What ``/healthz`` says, as a metric."""
-    words = "Whether acquisition, detectors and outbox get on, as /healthz says."
+    words = "Whether acquisition, detectors and outbox work, as /healthz states."
     return _Maker(machine).gauge("healthy", words, {(): float(is_healthy)})
 
 

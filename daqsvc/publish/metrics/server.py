@@ -132,7 +132,7 @@ def _handler(registry: Collector, unhealthy: Callable[[], Sequence[str]]) -> typ
             else:
                 self.send_error(HTTPStatus.NOT_FOUND, explain="there are /metrics and /healthz")
 
-        def do_HEAD(self) -> None:  # noqa: N802 - likewise
+        def do_HEAD(self) -> None:  # noqa: N802 - as above
             self.do_GET()
 
         def end_headers(self) -> None:

@@ -88,7 +88,7 @@ def _transport(mqtt: Mqtt) -> Iterator[Finding]:
         yield Finding(
             ("mqtt", "url"),
             "would go over the network unencrypted, and to whoever answers",
-            "write mqtts://, or insecure = true if that is meant",
+            "write mqtts://, or insecure = true if you accept that",
             code=UNENCRYPTED,
         )
     if mqtt.tls and mqtt.insecure:

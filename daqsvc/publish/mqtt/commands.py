@@ -94,7 +94,7 @@ class CommandPayload(CommandMessage):
     reason: Reason = Field(default="", description="why")
     denied: Reason = Field(
         default="",
-        description="why the sender has found that this person may not: it is written down, and refused",
+        description="why the sender has found that this person may not: it is logged, and refused",
     )
 
 
@@ -255,7 +255,7 @@ class CommandIntake:
             return await self._handler(command, source)
         if self._snapshots is None:
             return CommandOutcome(
-                accepted=False, reason="nobody makes snapshots here", code=COMMAND_REFUSED.id
+                accepted=False, reason="this service makes no snapshots", code=COMMAND_REFUSED.id
             )
         return await self._snapshots(command, source)
 
@@ -348,8 +348,8 @@ class CommandIntake:
         if self._ids.is_from_before(round(message.issued_at.timestamp() * NS_PER_S)):
             self.counters.stale += 1
             raise CommandRefusedError(
-                "it was issued before the service started, and the list of commands that had come by then is "
-                "lost, so it might be obeyed twice: look at the alarm, and ask again with a new id",
+                "it was issued before the service started, and the list of earlier commands is lost, so it "
+                "might be carried out twice; look at the alarm, and ask again with a new id",
                 NOT_REMEMBERED,
             )
         too_old_s = message.issued_at.timestamp() + self._settings.max_age_s
@@ -364,7 +364,7 @@ class CommandIntake:
         except OSError as error:
             self.counters.unwritten += 1
             raise CommandRefusedError(
-                f"its id cannot be written down ({error.strerror or error}), so it might be obeyed twice: "
+                f"its id cannot be stored ({error.strerror or error}), so it might be carried out twice: "
                 f"{_remedy(error)}, then ask again",
                 DISK_REFUSES,
             ) from error

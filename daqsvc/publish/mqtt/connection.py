@@ -340,7 +340,7 @@ class Connection:
         self._in_flight = max(in_flight, self._in_flight)
 
     def tell(self, topic: str, payload: bytes) -> None:
-        """Publish with QoS 0, not retained: nobody says whether it arrives.
+        """Publish with QoS 0, not retained: whether it arrives is not reported.
 
         Raises:
             MqttError: the connection is lost.

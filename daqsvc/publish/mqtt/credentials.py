@@ -205,7 +205,7 @@ def _watched(path: Path) -> list[Certificate]:
         return certificates(path)
     except CertificateError as error:
         log.warning(
-            "nobody will be warned when the certificates in %s end: %s",
+            "no alarm will warn before the certificates in %s end: %s",
             path,
             error,
             extra=coded(CERTIFICATE_UNKNOWN),

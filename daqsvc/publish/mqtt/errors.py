@@ -38,7 +38,7 @@ MOST_REASONS = 8
 _EXPIRED = 10
 _VERIFICATION = {
     9: "its certificate is not valid yet; look at the clock of the box",
-    _EXPIRED: "its certificate, or one that vouches for it, has expired; renew it there, or set the clock of "
+    _EXPIRED: "its certificate, or that of its authority, has expired; renew it there, or set the clock of "
     "the box",
 }
 _OTHER_HOST = {62, 64}
@@ -186,7 +186,7 @@ def _unverified(error: ssl.SSLCertVerificationError) -> str:
     if error.verify_code in _OTHER_HOST:
         return f"its certificate is for another host: {problem}"
     if error.verify_code in _UNKNOWN_AUTHORITY:
-        return f"nobody in ca_file vouches for its certificate: {problem}"
+        return f"its certificate is not signed by an authority in ca_file: {problem}"
     return _VERIFICATION.get(error.verify_code, f"its certificate is refused: {problem}")
 
 

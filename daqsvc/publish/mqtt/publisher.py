@@ -64,7 +64,7 @@ FIRST_RETRY_NS = 800_000_000
 """Ceiling of the first wait after a loss."""
 
 SUSPICIOUS_LOSSES = 3
-"""So many connections in a row that broke soon after they were made make a rival likely."""
+"""Connections in a row that broke soon after they were made, from which on a rival is likely."""
 
 TAKEN_OVER_S = 60.0
 """Least wait after another client has come with the same client id: two that fight help nobody."""
@@ -115,7 +115,7 @@ class MqttPublisher(Output):
             )
         self._expiry: dict[str, int] = {}
         """When certificates end, wall clock in ns since 1970, as far as they were seen: ``client`` is the
-        box's own, ``broker`` what that has shown, ``ca`` the authority of `ca_file` that vouches for it."""
+        box's own, ``broker`` what that has shown, ``ca`` the authority of `ca_file` that signs it."""
         self._backoff = Backoff(FIRST_RETRY_NS)
         self._quick_losses = 0
         self._outage = Outage(log)
@@ -227,7 +227,7 @@ class MqttPublisher(Output):
                 except Exception as error:  # noqa: BLE001  any, for watching the machine must go on
                     self._away(error)
                     self._faults.note(
-                        "publishing was interrupted and begins anew with a new connection", error
+                        "publishing was interrupted and begins again with a new connection", error
                     )
                     await self._wait(self._backoff.next_ns() / NS_PER_S)
         finally:
@@ -380,7 +380,7 @@ class MqttPublisher(Output):
             shown = certificate(der)
         except CertificateError as error:
             log.warning(
-                "nobody will be warned when the certificate of %s ends: %s",
+                "no alarm will warn before the certificate of %s ends: %s",
                 self._name,
                 error,
                 extra=coded(CERTIFICATE_UNKNOWN),

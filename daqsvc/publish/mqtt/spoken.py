@@ -97,7 +97,7 @@ class Spoken:
             replace_durably(self._path, json.dumps(note).encode())
         except OSError as error:
             log.info(
-                "%s cannot be written: %s; the version is found out anew after a restart", self._path, error
+                "%s cannot be written: %s; the version is found out again after a restart", self._path, error
             )
 
     def falls_back(self, error: Exception) -> bool:

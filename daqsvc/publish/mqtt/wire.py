@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import socket
 
 LARGEST_PACKET: Final = 1 << 20
-"""Bytes of the largest packet that is taken from a broker; MQTT 5 brokers are told."""
+"""Bytes of the largest packet that is taken from a broker; MQTT 5 brokers get this limit."""
 
 CUT_TO: Final = 1 << 18
 """What is left of a larger message of MQTT 3.1.1: too much to be a command, so it is refused as too long."""

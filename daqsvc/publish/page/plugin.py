@@ -55,7 +55,7 @@ def _who(settings: Page) -> str:
 
 
 def _arguments(machine: MachineFile, settings: Page) -> list[str]:
-    """What `daqsvc page` is told."""
+    """The arguments of `daqsvc page`."""
     told = [f"--listen={settings.listen}"]
     files = {
         "certificate": settings.certificate_file,
@@ -100,7 +100,7 @@ def _open_to_the_network(settings: Page) -> Iterator[Finding]:
     if address is not None and is_everywhere(address.host) and not settings.host_names:
         yield Finding(
             ("page", "listen"),
-            "is every address of the box, and nobody knows by which names the page is opened",
+            "is every address of the box, and it is not known by which names the page is opened",
             'write host_names = ["..."] with each, also if it is an address of the box',
             code=HOST_NAMES,
         )

@@ -58,7 +58,7 @@ class AlarmCommands:
     """Turns written metrics into commands.
 
     The metrics are ``Alarms/<machine>/<alarm>/Acknowledge`` of the node, beside what it tells of the alarm,
-    and ``Alarms/<alarm>/Acknowledge`` of the device; likewise ``Reset``.
+    and ``Alarms/<alarm>/Acknowledge`` of the device; the same for ``Reset``.
 
     Args:
         settings: what the machine file allows.

@@ -115,7 +115,7 @@ class SparkplugEdge(Output):
                 self._board.put(device, commands.of_device(alarms))
 
     def report(self, diagnosis: Diagnosis) -> None:
-        """Take in a statement of a detector; its figures are told within a second."""
+        """Take in a statement of a detector; its figures are sent within a second."""
         readings = self._port.machines[diagnosis.machine].readings
         if any(reading.detector == diagnosis.detector for reading in readings):
             wall_ns = self._clock.wall_ns() - self._clock.monotonic_ns() + diagnosis.t_ns
@@ -142,7 +142,7 @@ class SparkplugEdge(Output):
                     await self._one_session(self._brokers[self._turn], self._spoken[self._turn])
                 except Exception as error:  # noqa: BLE001  any, for watching the machine must go on
                     self._faults.note(
-                        "Sparkplug was interrupted and begins anew with a new connection", error
+                        "Sparkplug was interrupted and begins again with a new connection", error
                     )
                     await self._wait()
         finally:

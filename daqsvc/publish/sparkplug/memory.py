@@ -40,8 +40,8 @@ class Memory:
             return
         except (OSError, ValueError, KeyError, TypeError) as error:
             log.warning(
-                "Sparkplug memory %s cannot be read (%s): the session's number begins anew, and alarms of "
-                "the time before are not told to Sparkplug hosts; it is replaced at the next connection",
+                "Sparkplug memory %s cannot be read (%s): the session's number begins again, and alarms of "
+                "the time before are not sent to Sparkplug hosts; it is replaced at the next connection",
                 self._path,
                 error,
                 extra=coded(OUTPUT_STATE),

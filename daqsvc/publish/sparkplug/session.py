@@ -29,10 +29,10 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 READ_AHEAD = 100
-"""Alarm events that are told before the broker is asked whether it has them."""
+"""Alarm events that are sent before the broker is asked whether it has them."""
 
 TELL_S = 1.0
-"""How often changed figures are told."""
+"""How often changed figures are sent."""
 
 HEARD = 16
 """Messages from the broker that may wait here; more wait, and are dropped, in the connection."""
@@ -149,7 +149,7 @@ class EdgeSession:
         """Listen, wait for the host, tell everything; until ``stopping`` is set.
 
         Args:
-            stopping: ends the session when the alarms that are on disk are told.
+            stopping: ends the session when the alarms that are on disk are sent.
             there: by machine, whether it can be reached by now.
 
         Raises:
@@ -265,7 +265,7 @@ class EdgeSession:
         if self._host.online:
             return
         offline = self._host.online is False
-        word = "says that it is offline" if offline else "has told no state that can be read"
+        word = "says that it is offline" if offline else "has sent no state that can be read"
         closed = [topic for topic in self._ungranted if topic in wanted]
         there = ", ".join(repr(name) for name in sorted(others))
         barred = f" (the broker lets this client not listen to {' and '.join(closed)})" if closed else ""

@@ -118,7 +118,7 @@ def read(path: Path, limits: ResourceLimits, wanted: Collection[str] | None = No
     except OSError as error:
         reason = error.strerror or _one_line(error)
         raise RecordingError(
-            f"{path} cannot be read: {reason}; copy it anew, or give another file", NOT_FOUND
+            f"{path} cannot be read: {reason}; copy it again, or give another file", NOT_FOUND
         ) from error
     except RecursionError as error:
         raise RecordingError(
@@ -127,7 +127,7 @@ def read(path: Path, limits: ResourceLimits, wanted: Collection[str] | None = No
     except Exception as error:
         # On damaged bytes the libraries behind the readers raise almost anything.
         raise RecordingError(
-            f"{path} cannot be read: {_one_line(error)}; it may be damaged: copy or save it anew", DAMAGED
+            f"{path} cannot be read: {_one_line(error)}; it may be damaged: copy or save it again", DAMAGED
         ) from error
 
 

@@ -89,7 +89,7 @@ def unit_as_name(cell: str) -> str:
 
 
 def is_surely_unit(cell: str) -> bool:
-    """Whether a cell is a unit even where a name may stand: nobody knows that of a letter or a word."""
+    """Whether a cell is a unit even where a name may stand: that is not known of a letter or a word."""
     spelt = _AS_SPELT.fullmatch(_one_micro(without_brackets(cell)))
     if spelt is None:
         return False

@@ -50,7 +50,7 @@ STATEMENT = re.compile(r"#\s*([A-Za-z]\w*)\s*[=:]\s*([-+.\deE]+)\s*")
 UNIT = re.compile(r"#\s*unit of (.+?) = (\S.*)")
 """The unit of a column in a comment, as `daqsvc export` writes it: ``# unit of probe-x = um``."""
 START = re.compile(rf"#\s*{STATED_START} = (\S+)")
-"""The begin in a comment, likewise."""
+"""The begin in a comment, in the same way."""
 
 LONGEST_LINE = 1_000_000
 """Characters; what is longer among the first lines is no table."""
@@ -119,7 +119,7 @@ class _DelimitedTable:
             is_table=True,
             has_header=layout.has_header,
             units={name: unit for name, unit in units.items() if name in entries},
-            # A begin of the times alone: nobody knows the day, and the channels have none.
+            # A begin of the times alone: the day is not known, and the channels have none.
             starts_ns=dict.fromkeys(undated, 0),
         )
         return replace(contents, elsewhere=_by_short_names(contents))

@@ -91,7 +91,7 @@ def _stream(variable: object) -> _Stream | None:
         return None
     lists = [np.atleast_1d(getattr(variable, key)).ravel() for key in ("names", "fields", "units")]
     try:
-        # Of one channel whose unit nobody says nothing at all is left.
+        # Of one channel without a stated unit nothing at all is left.
         names, fields, units = (
             [str(one) if np.size(one) else "" for one in texts] or [""] for texts in lists
         )
@@ -167,7 +167,7 @@ def check_mat_structure(path: Path, budget: Budget) -> None:
             for variable in variables:
                 _check_array(variable, order)
     except _DamageError as damage:
-        raise RecordingError(f"{path} cannot be read: {damage}; copy or save it anew", DAMAGED) from None
+        raise RecordingError(f"{path} cannot be read: {damage}; copy or save it again", DAMAGED) from None
 
 
 def _unpacked(body: memoryview, budget: Budget) -> bytes:

@@ -69,7 +69,7 @@ def check_mdf_structure(path: Path, budget: Budget) -> None:
         _File(content, budget).check()
     except (_DamageError, struct.error) as damage:
         raise RecordingError(
-            f"{path} cannot be read: {damage}; it is damaged or cut short: copy or save it anew", DAMAGED
+            f"{path} cannot be read: {damage}; it is damaged or cut short: copy or save it again", DAMAGED
         ) from None
 
 

@@ -29,12 +29,12 @@ def read_npz(path: Path, budget: Budget) -> Contents:
             if file.read(len(ZIP_BEGIN)) == ZIP_BEGIN:
                 raise RecordingError(
                     f"{path} cannot be read: it is cut short, as the directory at its end is missing; copy "
-                    "it anew, or give another file",
+                    "it again, or give another file",
                     DAMAGED,
                 )
             raise RecordingError(
                 f"{path} cannot be read: it is not a zip archive, as numpy.savez writes; "
-                "save it anew, or give it the suffix of what it is",
+                "save it again, or give it the suffix of what it is",
                 UNKNOWN_FORMAT,
             )
         with zipfile.ZipFile(file) as archive:

@@ -86,7 +86,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, list[SampleBlock]], Dam
                 about = about or one.what.document
     except McapError as error:
         raise RecordingError(
-            f"{path} cannot be read: it {error}; copy it anew, or give another one", SNAPSHOT
+            f"{path} cannot be read: it {error}; copy it again, or give another one", SNAPSHOT
         ) from None
     return about, blocks, damage
 

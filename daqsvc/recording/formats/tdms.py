@@ -79,7 +79,7 @@ def _check_segments(path: Path, file_bytes: int) -> None:
             if len(head) < LEAD.size or head[:4] != TAG:
                 raise RecordingError(
                     f"{path} cannot be read: {head[:4]!r} stands at byte {at:,}, where a segment (TDSm) "
-                    "belongs; copy or save it anew",
+                    "belongs; copy or save it again",
                     DAMAGED,
                 )
             _, _, _, after, metadata = LEAD.unpack(head)
@@ -87,7 +87,7 @@ def _check_segments(path: Path, file_bytes: int) -> None:
             if after == UNFINISHED or at > file_bytes or metadata > after:
                 raise RecordingError(
                     f"{path} cannot be read: a segment has not the length that it says; it is cut short, or "
-                    "was not finished: copy or save it anew",
+                    "was not finished: copy or save it again",
                     DAMAGED,
                 )
 

@@ -78,7 +78,7 @@ def read_uff(path: Path, budget: Budget) -> Contents:
         if len(samples) != one["num_pts"]:
             raise RecordingError(
                 f"{path} cannot be read: {name!r} should have {one['num_pts']} samples and has "
-                f"{len(samples)}; copy or save it anew",
+                f"{len(samples)}; copy or save it again",
                 DAMAGED,
             )
         entries[name] = samples
@@ -112,7 +112,7 @@ def _check_ends(path: Path) -> None:
     if marks % 2:
         raise RecordingError(
             f"{path} cannot be read: data set {marks // 2 + 1} of it begins and does not end; it is cut: "
-            "copy or save it anew",
+            "copy or save it again",
             DAMAGED,
         )
 

@@ -49,7 +49,7 @@ def read_wav(path: Path, budget: Budget) -> Contents:
     if missing:
         raise RecordingError(
             f"{path} cannot be read: it has no {missing[0].strip()!r} chunk; it is cut short or empty, "
-            "and has to be copied or saved anew",
+            "and has to be copied or saved again",
             DAMAGED,
         )
     encoding, bits, channels, rate_hz = _format(path, chunks["fmt "])
@@ -58,7 +58,7 @@ def read_wav(path: Path, budget: Budget) -> Contents:
     if len(data) % frame_bytes:
         raise RecordingError(
             f"{path} cannot be read: its {len(data)} bytes of samples are no whole number of frames of "
-            f"{frame_bytes} bytes; copy or save it anew",
+            f"{frame_bytes} bytes; copy or save it again",
             DAMAGED,
         )
     check_columns(channels)
@@ -106,7 +106,7 @@ def _chunks(path: Path, content: bytes) -> dict[str, memoryview]:
         if len(body) < size:
             raise RecordingError(
                 f"{path} is cut short: its {tag.decode('latin-1').strip()!r} chunk should have {size} bytes "
-                f"and has {len(body)}; copy or save it anew",
+                f"and has {len(body)}; copy or save it again",
                 DAMAGED,
             )
         chunks.setdefault(tag.decode("latin-1"), body)
@@ -128,7 +128,7 @@ def _format(path: Path, chunk: memoryview) -> tuple[int, int, int, int]:
     if frame_bytes != channels * bits // 8 or not channels:
         raise RecordingError(
             f"{path} cannot be read: {channels} channels of {bits} bits do not make frames of {frame_bytes} "
-            "bytes; copy or save it anew",
+            "bytes; copy or save it again",
             DAMAGED,
         )
     return encoding, bits, channels, rate_hz

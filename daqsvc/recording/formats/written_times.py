@@ -93,7 +93,7 @@ class WrittenTimes:
         times: datetime64[ns] ``[n]``, of a clock alone since midnight of 1970-01-01; NaT where there is none.
         others: the same with day and month the other way round; None where that cannot be meant.
         offsets_ns: int64 ``[n]``, what the clock is ahead of UTC, 0 where no zone is written; None if none.
-        zoned: bool ``[n]``, whether a zone is written; None likewise.
+        zoned: bool ``[n]``, whether a zone is written; None as above.
     """
 
     times: Times

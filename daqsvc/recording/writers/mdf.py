@@ -22,7 +22,7 @@ def write_mdf(path: Path, streams: Sequence[RecordedStream], about: Mapping[str,
     """Write all streams; times are seconds from the begin of the first stream on; a missing sample is NaN.
 
     Returns:
-        That nobody says the begin, which the file must have, or that it is before any that it can have.
+        That the begin is not stated, which the file must have, or that it is before any that it can have.
     """
     import asammdf  # noqa: PLC0415 - an extra, and only this format needs it
 

@@ -20,8 +20,8 @@ GROUP_ROWS, GROUP_VALUES = 1 << 20, 1 << 22
 def write_parquet(path: Path, streams: Sequence[RecordedStream], about: Mapping[str, str]) -> list[str]:
     """Write one stream.
 
-    The column ``time`` is UTC with nanoseconds, or ``time_s`` from the first sample on where nobody says when
-    that was. Units are metadata of the columns, the rest of the file; a missing sample is NaN.
+    The column ``time`` is UTC with nanoseconds, or ``time_s`` from the first sample on where that time is
+    not stated. Units are metadata of the columns, the rest of the file; a missing sample is NaN.
 
     Returns:
         Which channels are called otherwise, as the times have their name, in sentences.

@@ -228,7 +228,7 @@ def fit_two_modes(
         found = least_squares(left_late, nearest.x, bounds=(low, high), x_scale=_PRIORS, max_nfev=40)
         if best is None or found.cost < best.cost:
             best = found
-    assert best is not None  # noqa: S101 - likewise
+    assert best is not None  # noqa: S101 - as above
     residual = _orbits(best.x, w, w_rate, late) - orbit
     energy = float(np.mean((np.abs(residual) ** 2).sum(axis=0))) - 2.0 * (noise / whirl) ** 2
     return _concluded(

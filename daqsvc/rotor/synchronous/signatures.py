@@ -246,7 +246,7 @@ def _static_load(change: Complexes, variance: Floats, healthy: Healthy) -> float
 
 
 def _sunk(change: complex, variance: float, healthy: Healthy) -> float:
-    """Log density of the mean position where some support, nobody knows which, gives way under the weight."""
+    """Log density of the mean position where some unknown support gives way under the weight."""
     sag_um = max(healthy.rotor.sag_um, 1e-6)
     depth, aside = np.meshgrid(_SINKS, _SINKS_ASIDE, indexing="ij")
     moved: Complexes = np.asarray(-1j * sag_um * depth * np.exp(1j * aside), dtype=np.complex128).ravel()
@@ -484,7 +484,7 @@ def identify(
     named = may_name and agreed and "normal" not in candidates
     group = candidates
     if previous is not None and previous.named and not named:
-        # One look does not take a name away.
+        # One evaluation does not remove a name.
         group = previous.group
         named = True
     return Identification(

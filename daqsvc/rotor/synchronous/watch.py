@@ -140,7 +140,7 @@ State: TypeAlias = Literal["calibrating", "watching", "departed"]
 LOOKS = (3, 5, 8, 12, 20, 30, 50, 80, 120, 220)
 """Revolutions since the onset after which a change is looked at; then every 110 more."""
 _NAMED_FROM = 8
-"""Revolutions since the onset before which no look gives a name: the rotor is still on its way."""
+"""Revolutions since the onset before which no evaluation gives a name: the rotor is still on its way."""
 _TRUSTED_FROM = 12
 """Revolutions since the onset from which on two evaluations that see nothing end the alarm."""
 _LATER_LOOKS = 110
@@ -404,7 +404,7 @@ class RotorWatch:
         self._identify(revolution, may_name=since >= _NAMED_FROM)
         looks = (before, self._identification)
         if since >= _TRUSTED_FROM and all(one is not None and "normal" in one.candidates for one in looks):
-            # One look that sees nothing may be chance; what comes and goes is one alarm.
+            # One evaluation that sees nothing may be chance; what comes and goes is one alarm.
             self._return_to_health()
         return True
 

@@ -51,7 +51,7 @@ S3 = BearingParameters(
 
 _POINTS = 400
 _PLAIN_DEG = 10.0
-"""Races that look so much different stay apart in a model that is wrong by a tenth."""
+"""Angle between the races from which on they stay apart in a model that is wrong by a tenth."""
 _RANK_TOLERANCE = 1e-9
 
 

@@ -115,7 +115,7 @@ def _ball(experiment: BearingExperiment) -> ResultRow:
         paper="a ball fault is detected too, but not told from inner and outer raceway faults together",
         obtained=f"ball fault: {ball}; both raceways: {both}",
         agrees=ball == both == "ball",
-        remark="two faults at once are called a ball's if their hits are about as strong, else by the "
+        remark="two faults at once are called a ball's if their impacts are about as strong, else by the "
         "stronger: the outer one, where the load does not leave it",
         values={"called_ball": float((ball, both).count("ball"))},
     )

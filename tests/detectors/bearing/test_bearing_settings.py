@@ -355,4 +355,4 @@ def test_a_kept_state_is_taken_up_or_learnt_anew(right, tmp_path, caplog) -> Non
     (tmp_path / "bearing.toml").write_text("broken = ")
     with caplog.at_level(logging.WARNING):
         assert detector(machine(), tmp_path).baseline is None
-    assert "learnt anew" in caplog.text
+    assert "learnt again" in caplog.text

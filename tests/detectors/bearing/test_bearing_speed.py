@@ -92,7 +92,7 @@ def test_another_speed_begins_anew_and_clears_nothing() -> None:
     assert watch.baseline.speed_rpm == pytest.approx(SPEED_RPM, rel=0.002)
     raised, away, back = said[7], said[8:20], said[20]
     assert (raised.decision, raised.quality) == ("outer", "good")
-    assert "the speed has gone from 1797 to 1527 rpm: the evidence begins anew" in away[0].reason
+    assert "the speed has gone from 1797 to 1527 rpm: the evidence begins again" in away[0].reason
     assert "the healthy state is that at 1797 rpm: only damage with lines shows" in away[-1].reason
     assert {(d.quality, d.decision, d.changed) for d in away} == {("not_ok", "outer", False)}
     assert (back.quality, back.decision) == ("not_ok", "outer")

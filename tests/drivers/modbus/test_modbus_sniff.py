@@ -190,7 +190,7 @@ def test_nobody_and_nothing_are_failures_that_say_what_to_check(
     with tcp({9: Watched(11)}) as target:
         assert main(words(target, "--units", "8-9")) == 1
     said = capsys.readouterr().err
-    assert "none of units 8 to 9 answers; a gateway says of 1 that they do not answer. Remedy: " in said
+    assert "none of units 8 to 9 answers; a gateway reports of 1 that they do not answer. Remedy: " in said
     with tcp({1: Watched(2)}) as target:
         assert main(words(target, "--units", "1", "--registers", "0-3")) == 1
     assert "no register could be read by function 3 and 4. Remedy: " in capsys.readouterr().err
@@ -292,7 +292,7 @@ def test_new_says_what_to_do_when_nobody_answers_and_goes_on(
     assert "nobody listens there; start the server, or correct its address" in capsys.readouterr().out
     with tcp({9: pump()}) as target:
         new(tmp_path, target)
-    assert "none of units 2 to 2 answers. Remedy: see that the device is powered" in capsys.readouterr().out
+    assert "none of units 2 to 2 answers. Remedy: check that the device is powered" in capsys.readouterr().out
     assert [one["name"] for one in tables["streams"]["device"]["layout"]["channels"]] == [
         "vibration",
         "temperature",

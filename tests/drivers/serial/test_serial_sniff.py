@@ -161,7 +161,7 @@ def test_a_silent_port_and_noise_are_failures_that_say_what_to_check(
     monkeypatch.setattr(sniff, "TRY_S", 0.05)
     assert main(["sniff", "serial", f"{cable.path}"]) == 1
     said = capsys.readouterr()
-    assert "no byte came. Remedy: see that the device is powered" in said.err
+    assert "no byte came. Remedy: check that the device is powered" in said.err
     noise = iter(os.urandom(1_000_000))
     with talking(cable, lambda _: bytes(next(noise) for _ in range(40))):
         assert main(["sniff", "serial", f"{cable.path}", "--seconds", "0.3", "--baud", "9600"]) == 1
@@ -282,7 +282,7 @@ def test_new_says_what_to_do_when_it_hears_nothing_and_goes_on(
     layout = new(cable, tmp_path / "silent.toml")["streams"]["device"]["layout"]
     said = capsys.readouterr().out
     assert "Nothing was found: " in said
-    assert "no byte came. Remedy: see that the device is powered" in said
+    assert "no byte came. Remedy: check that the device is powered" in said
     assert layout["line"] == ["t", "x", "y"]
 
 

@@ -227,7 +227,7 @@ async def test_a_broker_that_forbids_discovery_still_gets_the_alarms(tmp_path, o
     directory.mkdir()
     with running_mosquitto(directory, acl=acl) as strict:
         async with publishing(outbox, strict.port, **RIG) as publisher:
-            await eventually(lambda: "Home Assistant is not told of rig" in caplog.text, "it is said")
+            await eventually(lambda: "Home Assistant does not get rig" in caplog.text, "it is said")
             await outbox.append("daqsvc/lab/edge-1/rig/alarms/a", lambda n: b"{}", retain=True)
             await eventually(lambda: outbox.counters.sent == 1, "alarms pass")
             assert publisher.counters.connections == 1

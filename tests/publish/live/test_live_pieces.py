@@ -35,7 +35,7 @@ def test_a_feed_that_begins_anew_under_its_number_is_seen() -> None:
     packer, unpacker = Packer(7), Unpacker(7)
     for text in (b"one\n", b"two\n"):
         unpacker.take(packer.pack(text)[0])
-    with pytest.raises(BrokenFeedError, match="begun anew"):
+    with pytest.raises(BrokenFeedError, match="begun again"):
         unpacker.take(Packer(7).pack(b"one\n")[0])
 
 

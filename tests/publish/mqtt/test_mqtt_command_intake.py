@@ -131,7 +131,7 @@ REFUSED = {
     "a key twice": (
         {"payload": json.dumps(COMMAND).encode()[:-1] + b', "by": "Eve"}'},
         "malformed",
-        "key 'by' stands twice; say it once",
+        "key 'by' is there twice; write it once",
     ),
     "no offset": (
         {"issued_at": "2026-11-21T12:00:00"},
@@ -264,7 +264,7 @@ async def test_a_command_whose_id_cannot_be_written_is_not_obeyed(desk, tmp_path
     (tmp_path / "command-ids").mkdir()
     intake = make(desk, tmp_path)
     response, _ = await answer(intake)
-    assert "its id cannot be written down" in response.reason
+    assert "its id cannot be stored" in response.reason
     assert response.code == "S08"
     assert desk.asked == []
     assert intake.counters.unwritten == 1

@@ -30,7 +30,10 @@ def coded(number):
         (unverified(10, "certificate has expired"), "has expired; renew it there"),
         (unverified(9, "certificate is not yet valid"), "not valid yet; look at the clock of the box"),
         (unverified(62, "Hostname mismatch."), "for another host: Hostname mismatch"),
-        (unverified(20, "unable to get local issuer certificate"), "nobody in ca_file vouches"),
+        (
+            unverified(20, "unable to get local issuer certificate"),
+            "its certificate is not signed by an authority in ca_file",
+        ),
         (unverified(23, "certificate revoked"), "its certificate is refused: certificate revoked"),
         (ssl.SSLError(1, "wrong"), "TLS failed: "),
         (ConnectionRefusedError(errno.ECONNREFUSED, "Connection refused"), "nothing listens there"),

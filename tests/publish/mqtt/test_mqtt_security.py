@@ -60,7 +60,7 @@ async def test_a_broker_with_a_trusted_certificate_is_served(tmp_path, outbox):
     ("host", "trusted", "reason"),
     [
         ("another.example", True, "its certificate is for another host: IP address mismatch"),
-        ("127.0.0.1", False, "nobody in ca_file vouches for its certificate: self"),
+        ("127.0.0.1", False, "its certificate is not signed by an authority in ca_file: self"),
     ],
 )
 async def test_a_broker_that_cannot_prove_itself_is_refused(tmp_path, outbox, caplog, host, trusted, reason):
@@ -86,7 +86,7 @@ async def test_the_reason_why_a_broker_does_not_come_back_is_told_when_it_change
             await eventually(lambda: publisher.counters.connected, "connected")
             for pair, words in (
                 (other, "is still away: its certificate is for another host"),
-                (expired, "is still away: its certificate, or one that vouches for it, has expired"),
+                (expired, "is still away: its certificate, or that of its authority, has expired"),
             ):
                 mosquitto.stop()
                 pair.replaces(good)
@@ -241,7 +241,7 @@ async def test_a_certificate_that_only_openssl_can_read_is_used_all_the_same(
         async with publishing(outbox, tls_settings(mosquitto.port, ca.cert, box)) as publisher:
             await eventually(lambda: publisher.counters.connected, "connected")
             assert dict(publisher._expiry) == {}
-    assert f"when the certificates in {box.cert} end" in caplog.text
+    assert f"before the certificates in {box.cert} end" in caplog.text
 
 
 async def test_an_encrypted_key_is_refused_and_nobody_is_asked_at_the_terminal(tmp_path, outbox, caplog):

@@ -94,7 +94,7 @@ async def test_a_host_acknowledges_and_resets_what_it_has_seen_in_a_birth(
         host.ask(topic, written(true(name.replace("Acknowledge", "Reset"))))
         await eventually(
             lambda: desk.outputs["mqtt.sparkplug"].counters.commands_refused == 1,
-            "the condition still stands",
+            "the condition is still present",
         )
         desk.take(said("N", "normal"))
         alias = Metric(

@@ -145,7 +145,7 @@ async def test_a_host_that_never_comes_is_said_with_those_that_are_there(
         async with edge_node(outbox, tmp_path, mosquitto.port, primary_host="scada1") as edge:
             await eventually(lambda: "hosts at this broker are" in caplog.text, "it is said")
             assert edge.counters.waiting_for_host
-            assert "primary host scada1 has told no state that can be read" in caplog.text
+            assert "primary host scada1 has sent no state that can be read" in caplog.text
             assert "on spBv1.0/STATE/scada1 or STATE/scada1;" in caplog.text
             assert "hosts at this broker are 'old', 'scada-1'" in caplog.text
             await eventually(lambda: "UNSUBACK" in mosquitto.log_text, "others are listened to no longer")
