@@ -5,8 +5,8 @@ from __future__ import annotations
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from daqsvc.errors.buses import BUFFER_FULL, BUS_ERRORS, FRAMES_UNRECORDED, SAMPLES_MISSING
-from daqsvc.errors.detectors import SENSOR_NOT_OK
+from daqsvc.errors.buses import BUFFER_FULL, BUS_ERRORS, FRAMES_UNRECORDED
+from daqsvc.errors.detectors import NOT_JUDGED, SENSOR_NOT_OK
 from daqsvc.errors.outputs import CERTIFICATE_ENDS, MESSAGE_DROPPED, TOPIC_REFUSED
 from daqsvc.errors.service import DISK_REFUSES, JOURNAL_DAMAGED
 
@@ -33,7 +33,7 @@ OF_SERVICE: Mapping[str, Code] = MappingProxyType(
 )
 """Each alarm that a service has by itself; behind a slash at the end stands the name of a thing."""
 
-_OF_QUALITY: Mapping[str, Code] = MappingProxyType({"missing": SAMPLES_MISSING, "not_ok": SENSOR_NOT_OK})
+_OF_QUALITY: Mapping[str, Code] = MappingProxyType({"missing": NOT_JUDGED, "not_ok": SENSOR_NOT_OK})
 
 
 def code_of_alarm(alarm: str, quality: str) -> Code | None:

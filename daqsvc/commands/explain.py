@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daqsvc.commands.arguments import EXIT_OK, EXIT_USAGE
@@ -51,8 +52,23 @@ class ExplainCommand:
         return EXIT_OK
 
 
+_SOURCES = Path(__file__).parents[2] / "docs"
+_PACKAGE = Path("/usr/share/doc/daqsvc/html")
+
+
+def _where(code: Code) -> str:
+    """Where a page about a code and its subject is on this computer."""
+    anchor = f"#{code.id.lower()}"
+    if (_SOURCES / "reference" / "errors.md").is_file():
+        return f"docs/{code.page}, docs/reference/errors.md{anchor}"
+    if (_PACKAGE / "index.html").is_file():
+        page = code.page.replace(".md", ".html")
+        return f"{_PACKAGE / page}, {_PACKAGE}/reference/errors.html{anchor}; in daqsvc page below /docs/"
+    return f"the pages {code.page} and reference/errors.md{anchor} of the documentation"
+
+
 def _told(code: Code) -> str:
-    more = f"docs/{code.page}, docs/reference/errors.md#{code.id.lower()}"
+    more = _where(code)
     parts = {
         "Example": code.example,
         "Cause": code.cause,

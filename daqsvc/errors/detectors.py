@@ -162,3 +162,13 @@ SENSOR_NOT_OK = Code(
     "alarm sensor-ok/probe-x raised: probe-x is not OK: probe-x does not move at all (0 um): dead or "
     "disconnected",
 )
+NOT_JUDGED = Code(
+    "D22",
+    "A sensor or a detector cannot be judged",
+    "No samples come, or too few: the device is off, its bus is interrupted, or many samples are lost.",
+    "The message names the stream and, where it is known, the reason. Look at the device and its bus; daqsvc "
+    "status shows both. Alarms keep their states until samples come again.",
+    "alarms.md",
+    "alarm sensor-ok/probe-x raised: probe-x cannot be judged: no samples of stream 'shaft' for more than "
+    "2.0 s; check bus and device",
+)

@@ -196,6 +196,8 @@ def _table(section: type[Section]) -> Schema:
         value = single_value(section, name)
         if value is not None and "const" not in schema and "enum" not in schema:
             schema["const"] = value
+        if value is not None:
+            schema.setdefault("description", "which kind of table this is: its other keys depend on it")
     required = [name for name, field in section.model_fields.items() if field.is_required()]
     return {
         "type": "object",

@@ -68,7 +68,7 @@ class CanSniffer(Sniffer):
         parser.add_argument(
             "--fd",
             action="store_true",
-            help="also receive CAN FD frames; interfaces of the kernel always do",
+            help="also receive CAN FD frames; interfaces of the kernel and those between programs always do",
         )
         parser.add_argument(
             "--bitrate",
@@ -179,6 +179,10 @@ def _dbc(file: Path) -> DbcTraffic:
         raise SniffError(f"--dbc: {error}", usage=True) from error
 
 
+_BETWEEN_PROGRAMS = frozenset({"unixbus", "virtual"})
+"""Interfaces without hardware, which carry both kinds of frames."""
+
+
 def _opened(bus: CanBus, clock: Any) -> CanSource:
     """The open bus.
 
@@ -205,8 +209,10 @@ def _opened(bus: CanBus, clock: Any) -> CanSource:
         )
     # python-can logs which optional parts are missing, beside the error that says what is wrong.
     logging.getLogger("can").addHandler(logging.NullHandler())
+    # Between programs FD frames cost nothing; whether they are there is what somebody wants to know.
+    opened = bus.model_copy(update={"fd": True}) if bus.interface in _BETWEEN_PROGRAMS else bus
     try:
-        return open_adapter(bus, clock)
+        return open_adapter(opened, clock)
     except Exception as error:
         said = f"{error}" or type(error).__name__
         raise SniffError(
@@ -326,7 +332,7 @@ class _Report(NamedTuple):
             return (
                 f"{name}: no frame in {self.seconds:.1f} s. Remedy: check that the devices are powered and "
                 "send without being asked, and that CAN_H and CAN_L are not swapped; give the bit rate with "
-                "--bitrate"
+                "--bitrate, and --fd on a bus with CAN FD"
             )
         if self.traffic.error_frames:
             return (

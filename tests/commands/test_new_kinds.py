@@ -60,7 +60,7 @@ def test_its_questions_are_options_too(capsys: pytest.CaptureFixture[str]) -> No
         main(["new", "--help"])
     assert "--logger-port ANSWER" in capsys.readouterr().out
     assert main(["new", "--yes", "--bus", "tcp-frame"]) == 2
-    assert "Give --logger" in capsys.readouterr().err
+    assert "give --logger" in capsys.readouterr().err
 
 
 def test_the_documentation_shows_the_example_as_it_is() -> None:

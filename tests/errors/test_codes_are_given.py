@@ -81,6 +81,7 @@ ELSEWHERE = {
     "C26": "service/test_assembly.py",
     "C27": "commands/test_store_argument.py",
     "D21": "errors/test_logs_name_codes.py",
+    "D22": "errors/test_logs_name_codes.py",
     "D14": "detectors/rotor_bank/test_bank_of_a_run_up.py",
     "O02": "publish/mqtt/test_mqtt_settings.py",
     "O10": "errors/test_logs_name_codes.py",

@@ -176,7 +176,7 @@ def test_a_test_that_does_not_give_its_code_fails() -> None:
 def test_every_alarm_of_the_service_has_a_code() -> None:
     of_handling = {"alarm-flood", "trip-multiply"}  # nothing is wrong with data or service
     assert OF_SERVICE.keys() == OWN.keys() - of_handling
-    assert f"{code_of_alarm('sensor-ok/probe-x', 'missing')}" == "B35"
+    assert f"{code_of_alarm('sensor-ok/probe-x', 'missing')}" == "D22"
     assert f"{code_of_alarm('sensor-ok/probe-x', 'not_ok')}" == "D21"
     assert f"{code_of_alarm('certificate/broker', 'good')}" == "O23"
     assert code_of_alarm("housing", "good") is None

@@ -97,6 +97,8 @@ class NewCommand:
             _write(target.file, text)
         except AnswerError as error:
             return complain("daqsvc new", error, error.code, EXIT_USAGE)
+        except KeyboardInterrupt:
+            return complain("daqsvc new", "interrupted; nothing was written", INTERRUPTED)
         except EOFError:
             return complain("daqsvc new", "the input has ended; nothing was written", INTERRUPTED)
         except OSError as error:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from daqsvc.commands.new.buses import bus_of
 from daqsvc.commands.new.machine_text import machine_text, questions
+from daqsvc.commands.new.sensors import why_no_bearing
 from daqsvc.errors.command_line import ANSWER
 from drivers.questions import SENSOR, Answers, Question
 
@@ -62,7 +63,7 @@ def conduct(
     interview = _Interview(file, given, ask, say, listen, answered)
     while not interview.is_over():
         pass
-    _refuse_others(given, interview.asked)
+    _refuse_others(given, interview)
     return interview.answers
 
 
@@ -111,7 +112,13 @@ class _Interview:
         if key in texts:
             reason = take(question, texts[key], self.answers, self._file)
             if reason is not None:
-                raise AnswerError(f"{option(key)} {texts[key]}: {reason}")
+                refused = f"{given_as(key, texts[key])}: {reason}"
+                if self._ask is None:
+                    raise AnswerError(refused)
+                # What a person has typed by now is not lost for that.
+                self._say(refused)
+                _answer(question, self._ask, self._say, self.answers, self._file)
+                self._typed.append(key)
         elif question.default is not None and (self._given.defaults or question.quiet):
             reason = take(question, question.default, self.answers, self._file)
             if reason is not None:
@@ -229,16 +236,25 @@ def option(key: str) -> str:
     return f"--{key}"
 
 
+def given_as(key: str, text: str) -> str:
+    """An answer as it was given on the command line."""
+    return f"{option(key)}{'' if key.startswith(f'{SENSOR}.') else ' '}{text}"
+
+
 def _missing(question: Question) -> str:
-    words = f"{question.topic.text} Give {option(question.key)}"
+    text = question.topic.text
+    words = f"{text if text.endswith('?') else f'{text}:'} give {option(question.key)}"
     more = "" if question.default is None else f", or --yes for {question.default} and all other defaults"
     return f"{words}{more}; there is no terminal to ask at"
 
 
-def _refuse_others(given: Given, asked: list[str]) -> None:
+def _refuse_others(given: Given, interview: _Interview) -> None:
     """What was given and nobody asked for is a slip of the pen, or of another bus."""
+    asked = interview.asked
     for key in given.texts:
         if key not in asked:
             close = difflib.get_close_matches(key, asked, n=1)
             hint = f"did you mean {option(close[0])}?" if close else "leave it out"
+            if key.endswith(".bearing"):
+                hint = why_no_bearing(interview.answers)
             raise AnswerError(f"{option(key)} is not asked for with these answers; {hint}")

@@ -150,6 +150,16 @@ def _tells_bearings(answers: Answers) -> bool:
     )
 
 
+def why_no_bearing(answers: Answers) -> str:
+    """What is missing for a bearing to be watched, and what to do."""
+    if _tells_bearings(answers):
+        return "only an accelerometer watches a bearing"
+    return (
+        f"bearings need {_BEARING_RATE_HZ:g} samples a second or more, {_BEARING_RPM:g} rpm or more, and "
+        f"blocks of {_BEARING_BLOCK_S:g} s or more"
+    )
+
+
 def _free_name(wanted: str, taken: set[str]) -> str:
     begin = wanted[: q.LONGEST_NAME]
     numbered = (f"{wanted[: q.LONGEST_NAME - 5]}-{number}" for number in range(2, 9999))
