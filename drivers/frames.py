@@ -76,6 +76,7 @@ class DecodedBatch:
         wrong_length: frames by stream, and the length of the last of them.
         malformed: what the first piece was that should have been a frame, and why it is none; empty if there
             was none, or it has been told before.
+        remedy: what to do if all pieces are like that one; empty if nothing special.
         errors: what error frames say, of a bus that has such; see `drivers.can.errors.ErrorCounts`.
         data_frames: frames that carry data, of any stream or none.
         drained_ns: when the bus was last known to hold no frame that was sent before; None if there may be
@@ -87,6 +88,7 @@ class DecodedBatch:
     unknown: Counter[str] = field(default_factory=Counter)
     wrong_length: dict[str, tuple[int, int]] = field(default_factory=dict)
     malformed: str = ""
+    remedy: str = ""
     errors: Any = None
     data_frames: int = 0
     drained_ns: int | None = None

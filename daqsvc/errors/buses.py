@@ -270,8 +270,9 @@ NO_FRAME = Code(
     "file.",
     "Compare baud rate, framing, length, checksum and ids with the device. daqsvc sniff shows what it sends.",
     "driver-contract.md",
-    "serial port 'line' (/dev/ttyUSB0) carries bytes that are no frame; they are counted and left out: "
-    "7 columns, the file lists 6",
+    "serial port 'line' (/dev/ttyUSB0) carries bytes that are no frame; they are counted and left out; the "
+    'first line is "17,0.012,-0.998": 3 columns, the file lists 2 (seq, x). If it is all of them, name the '
+    '1 column more in line of the layout, needed or not, or correct separator = ","',
 )
 SAMPLES_MISSING = Code(
     "B35",

@@ -147,27 +147,35 @@ def _bus(arguments: argparse.Namespace) -> ModbusBus:
     """
     from pydantic import ValidationError  # noqa: PLC0415 - only for who scans
 
+    from daqsvc.settings.error_messages import ErrorFormatter  # noqa: PLC0415
     from drivers.modbus.settings import ModbusRtuBus, ModbusTcpBus  # noqa: PLC0415
     from drivers.tty import is_pseudo_terminal  # noqa: PLC0415
 
     common = {"driver": "modbus", "timeout_ms": arguments.timeout_ms}
     target: str = arguments.target
-    try:
-        if target.startswith("/"):
-            parity = "none" if is_pseudo_terminal(target) else arguments.parity
-            serial = {"serial_port": target, "baud": arguments.baud, "parity": parity}
-            return ModbusRtuBus.model_validate({**common, "transport": "rtu", **serial})
+    model: type[ModbusTcpBus | ModbusRtuBus] = ModbusTcpBus
+    if target.startswith("/"):
+        model = ModbusRtuBus
+        parity = "none" if is_pseudo_terminal(target) else arguments.parity
+        serial = {"serial_port": target, "baud": arguments.baud, "parity": parity}
+        table = {**common, "transport": "rtu", **serial}
+    else:
         host, colon, port = target.rpartition(":")
         if not colon or "]" in port or (host.count(":") and not host.startswith("[")):
             host, port = target, f"{TCP_PORT}"
         if not port.isdecimal():
             raise SniffError(f"TARGET {target!r}: write HOST, HOST:PORT or /dev/ttyS0", usage=True)
-        tcp = {"host": host.strip("[]"), "tcp_port": int(port)}
-        return ModbusTcpBus.model_validate({**common, "transport": "tcp", **tcp})
+        table = {**common, "transport": "tcp", "host": host.strip("[]"), "tcp_port": int(port)}
+    try:
+        return model.model_validate(table)
     except ValidationError as error:
         wrong = error.errors()[0]
-        option = {"timeout_ms": "--timeout-ms", "baud": "--baud"}.get(f"{wrong['loc'][-1]}", "TARGET")
-        raise SniffError(f"{option} {wrong['input']!r}: {wrong['msg']}", usage=True) from error
+        key = f"{wrong['loc'][-1]}"
+        option = {"timeout_ms": "--timeout-ms", "baud": "--baud"}.get(key)
+        subject = f"TARGET {target!r}" if option is None else f"{option} {wrong['input']:g}"
+        what = {"tcp_port": "the TCP port "}.get(key, "")
+        said, _, _ = ErrorFormatter(model, table).say(wrong, wrong["loc"])
+        raise SniffError(f"{subject}: {what}{said}", usage=True) from error
 
 
 class _Report(NamedTuple):
@@ -192,7 +200,9 @@ class _Report(NamedTuple):
         if not scan.units:
             asked = f"units {self.units[0]} to {self.units[1]}"
             gateway = (
-                f"; a gateway reports of {len(scan.gateway)} that they do not answer" if scan.gateway else ""
+                f"; a gateway reports that no unit answers at {len(scan.gateway)} of them"
+                if scan.gateway
+                else ""
             )
             return (
                 f"{where}: none of {asked} answers{gateway}. Remedy: check that the device is powered, that "
@@ -217,7 +227,8 @@ class _Report(NamedTuple):
         if scan.alike:
             yield "It answers in the name of every unit, so it is one device; only the first one was read."
         if scan.gateway:
-            yield f"A gateway reports of {len(scan.gateway)} addresses that no unit answers behind it."
+            many = f"{len(scan.gateway)} address{'es' * (len(scan.gateway) != 1)}"
+            yield f"A gateway reports that no unit answers behind it at {many}."
         for table in scan.tables:
             yield from self._table(table)
 

@@ -139,6 +139,13 @@ def _check_room(layout: SerialLayout, path: KeyPath) -> Iterator[Finding]:
 
 def _check_columns(layout: LineLayout, path: KeyPath) -> Iterator[Finding]:
     """Every column is there once; a line has a counter, or the device's time."""
+    if layout.separator == layout.decimal:
+        yield Finding(
+            (*path, "decimal"),
+            "is the separator too, and a number would be two columns",
+            'write separator = ";", or whatever the device puts between columns, or remove decimal',
+            code=CONTRADICTION,
+        )
     seen: set[str] = set()
     for place, name in enumerate(layout.line):
         if name in seen:

@@ -24,6 +24,7 @@ from daqsvc.errors.code import coded
 from drivers.base import BusCounters, BusPort
 from drivers.reconnect import Attempt, CannotOpenError, ended, in_thread, run_with_reconnect, sparing_others
 from drivers.serial.binary import BodyCodec, CobsFraming, SyncFraming
+from drivers.serial.framing import COMPARE
 from drivers.serial.lines import TIME_COUNTER_BITS, LineFraming
 from drivers.serial.pauses import longest_pause_s
 from drivers.serial.reader import SHUTDOWN_S, SerialReader, close_port
@@ -169,9 +170,10 @@ class SerialDriver:
                 "malformed",
                 NO_FRAME,
                 "%s carries bytes that are no frame; they are counted and left out%s. If it is all of them, "
-                "compare baud, parity, framing and checksum with the device's",
+                "%s",
                 self.link.name,
                 f"; {batch.malformed}" if batch.malformed else "",
+                batch.remedy or COMPARE,
             )
         for name, count in batch.unknown.items():
             self._count_unknown(name, count)

@@ -26,6 +26,20 @@ ArrivalsOf: TypeAlias = "Callable[[NDArray[np.int64]], NDArray[np.int64]]"
 
 SHOWN_BYTES = 16
 """Bytes that are shown of what is no frame."""
+COMPARE = "compare baud, parity, framing and checksum with the device's"
+"""What to do about bytes that tell nothing more."""
+
+
+class NoFrame(NamedTuple):
+    """A piece that should have been a frame.
+
+    Attributes:
+        why: what it is, and what is wrong with it.
+        remedy: what to do if all pieces are like it.
+    """
+
+    why: str
+    remedy: str = COMPARE
 
 
 def in_place(ends: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -170,7 +184,8 @@ class DelimitedFraming(ABC):
                 first = int(strange[0]) + skipped
                 # As they came: who sorts pieces may change the buffer.
                 came = kept.tobytes() + data
-                batch.malformed = self._why_no_frame(came[pieces.starts[first] : pieces.stops[first]])
+                piece = came[pieces.starts[first] : pieces.stops[first]]
+                batch.malformed, batch.remedy = self._why_no_frame(piece)
                 self._told = True
         self._astray |= overlong
         return batch
@@ -180,10 +195,11 @@ class DelimitedFraming(ABC):
         del heard
         return self._delimiter in chunk
 
-    def _why_no_frame(self, piece: bytes) -> str:
+    def _why_no_frame(self, piece: bytes) -> NoFrame:
         """What a piece is that should have been a frame, and what is wrong with it."""
         begin = piece[:SHOWN_BYTES].hex(" ")
-        return f"the first has {len(piece)} bytes: {begin}{' ...' if len(piece) > SHOWN_BYTES else ''}"
+        shown = f"{begin}{' ...' if len(piece) > SHOWN_BYTES else ''}"
+        return NoFrame(f"the first has {len(piece)} bytes: {shown}")
 
     @abstractmethod
     def _sort(self, pieces: Pieces, batch: DecodedBatch, arrivals_of: ArrivalsOf) -> NDArray[np.bool_]:

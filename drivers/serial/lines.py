@@ -8,6 +8,7 @@ field that names the stream, and a checksum behind a ``*``.
 from __future__ import annotations
 
 import binascii
+import json
 import math
 import re
 from functools import reduce
@@ -18,8 +19,17 @@ import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S
 from drivers.frames import DecodedFrames, LayoutError
-from drivers.serial.framing import DelimitedFraming
-from drivers.serial.line_kernels import HARD, KNOWN, OTHER, READ, check_lines, count_stamps, read_lines
+from drivers.serial.framing import DelimitedFraming, NoFrame
+from drivers.serial.line_kernels import (
+    CLASSES,
+    HARD,
+    KNOWN,
+    OTHER,
+    READ,
+    check_lines,
+    count_stamps,
+    read_lines,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -44,7 +54,11 @@ LATEST_S = 1e12
 
 SHOWN_CHARACTERS = 80
 """Characters that are shown of what is no line."""
-_NUMBER = re.compile(r" *[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)? *")
+_NUMBER = {
+    mark: re.compile(rf" *[+-]?(\d+{re.escape(mark)}?\d*|{re.escape(mark)}\d+)([eE][+-]?\d+)? *")
+    for mark in (".", ",")
+}
+"""A number, by decimal mark."""
 _PRINTABLE = frozenset(range(0x20, 0x7F)) | {0x09}
 
 DIGITS: Mapping[Checksum, int] = {"xor": 2, "crc16": 4}
@@ -118,12 +132,14 @@ class LineCodec:
             stops,
             self._prefix,
             ord(layout.separator),
+            CLASSES[layout.decimal],
             len(layout.line),
             self._picks,
             self._units_per_s is None,
         )
         for k in np.flatnonzero(states == HARD).tolist():
-            fields = buffer[starts[k] : stops[k]].tobytes().split(layout.separator.encode("ascii"))
+            text = buffer[starts[k] : stops[k]].tobytes().decode("ascii", "replace")
+            fields = [one.replace(layout.decimal, ".") for one in text.split(layout.separator)]
             values[k] = [float(fields[pick + bool(layout.prefix)]) for pick in self._picks.tolist()]
         places = values[:, 0]
         if self._units_per_s is None:
@@ -136,23 +152,45 @@ class LineCodec:
             samples = (values[good, 1:] * self._scale + self._offset).astype(np.float32)[:, None, :]
         return Lines(states != OTHER, good, places[good], samples)
 
-    def why_not(self, fields: Sequence[str]) -> str:
+    def why_not(self, fields: Sequence[str]) -> NoFrame:
         """Why the fields of a line, its prefix left out, are no sample."""
-        columns = self._layout.line
+        columns, decimal = self._layout.line, self._layout.decimal
         if len(fields) != len(columns):
-            return f"{len(fields)} columns, the file lists {len(columns)} ({', '.join(columns)})"
+            many = f"{len(fields)} column{'s' * (len(fields) != 1)}"
+            why = f"{many}, the file lists {len(columns)} ({', '.join(columns)})"
+            return NoFrame(why, self._other_columns(len(fields) - len(columns)))
         for name in (self._place, *self._layout.channel_names):
             text = fields[columns.index(name)]
-            if not _NUMBER.fullmatch(text):
-                return f"column {name} is {text!r}, no number"
-        place = fields[columns.index(self._place)]
+            if not _NUMBER[decimal].fullmatch(text):
+                return NoFrame(f"column {name} is {text!r}, no number", self._other_number(text))
+        place = fields[columns.index(self._place)].replace(decimal, ".")
         if self._units_per_s is not None:
-            return f"time {self._place} is {place}, later than any"
+            return NoFrame(
+                f"time {self._place} is {place}, later than any", "correct column and unit of time"
+            )
         if not place.strip().isdigit():
-            return f"counter {self._place} is {place}, no whole number from 0 up"
+            why = f"counter {self._place} is {place}, no whole number from 0 up"
+            return NoFrame(why, "name the column that counts lines, or write time in place of counter")
         if float(place) >= self._counts:
-            return f"counter {self._place} is {place}, by its bits in the file {self._counts - 1:.0f} at most"
-        return "it cannot be read"
+            most = f"by its bits in the file {self._counts - 1:.0f} at most"
+            return NoFrame(f"counter {self._place} is {place}, {most}", "correct bits of counter")
+        return NoFrame("it cannot be read")
+
+    def _other_number(self, text: str) -> str:
+        """What to do if all lines have such a text where a number should be."""
+        other = "." if self._layout.decimal == "," else ","
+        if other != self._layout.separator and _NUMBER[other].fullmatch(text):
+            return f"write decimal = {json.dumps(other)} in the layout"
+        return "put the names in line in the order in which the device sends its columns"
+
+    def _other_columns(self, more: int) -> str:
+        """What to do if lines have so many columns more than the file lists; fewer if it is negative."""
+        many = f"{abs(more)} column{'s' * (abs(more) != 1)}"
+        if more > 0:
+            change = f"name the {many} more in line of the layout, needed or not"
+        else:
+            change = f"remove the {many} that the device does not send from line of the layout"
+        return f"{change}, or correct separator = {json.dumps(self._layout.separator)}"
 
     def write(self, place: float, sample: NDArray[np.float64]) -> bytes:
         """One line without its checksum and end.
@@ -172,7 +210,9 @@ class LineCodec:
                 fields.append(str(int(place) % int(self._counts)))
             else:
                 fields.append(f"{place * self._units_per_s:.4f}")
-        return layout.separator.join(fields).encode("ascii")
+        first = layout.prefix is not None
+        numbers = [one.replace(".", layout.decimal) for one in fields[first:]]
+        return layout.separator.join(fields[:first] + numbers).encode("ascii")
 
 
 class DeviceTime:
@@ -274,24 +314,31 @@ class LineFraming(DelimitedFraming):
         ends = [b"*%0*X" % (digits, value) + self._end for value in sums]
         return [line + end for line, end in zip(lines, ends, strict=True)]
 
-    def _why_no_frame(self, piece: bytes) -> str:
+    def _why_no_frame(self, piece: bytes) -> NoFrame:
         shown = piece[:SHOWN_CHARACTERS].decode("ascii", "backslashreplace")
         said = f'the first line is "{shown}{"..." if len(piece) > SHOWN_CHARACTERS else ""}"'
         if not all(byte in _PRINTABLE for byte in piece):
-            return f"{said}: no text, as at another baud rate or parity, or of a device that sends no lines"
+            why = "no text, as at another baud rate or parity, or of a device that sends no lines"
+            return NoFrame(f"{said}: {why}")
         if self._checksum != "none":
             text, star, sent = piece.rpartition(b"*")
             if not star:
-                return f"{said}: no checksum behind a *"
+                remedy = 'write checksum = "none" in the table of the bus'
+                return NoFrame(f"{said}: no checksum behind a *", remedy)
             made = b"%0*X" % (DIGITS[self._checksum], _SUMS[self._checksum](text[text[:1] in {b"$", b"!"} :]))
             if made != sent.upper():
-                return f"{said}: checksum {sent.decode()}, its text makes {made.decode()}"
+                why = f"checksum {sent.decode()}, its text makes {made.decode()}"
+                return NoFrame(f"{said}: {why}", "compare checksum with the device's")
             piece = text
         fields = piece.decode("ascii").split(self._separator.decode("ascii"))
         if None in self._by_prefix:
-            return f"{said}: {self._codecs[self._by_prefix[None]].why_not(fields)}"
+            why, remedy = self._codecs[self._by_prefix[None]].why_not(fields)
+            return NoFrame(f"{said}: {why}", remedy)
         name = self._by_prefix.get(fields[0].encode("ascii"))
-        return f"{said}: {'of no stream' if name is None else self._codecs[name].why_not(fields[1:])}"
+        if name is None:
+            return NoFrame(f"{said}: of no stream", "correct prefix and separator of the layout")
+        why, remedy = self._codecs[name].why_not(fields[1:])
+        return NoFrame(f"{said}: {why}", remedy)
 
     def _sort(self, pieces: Pieces, batch: DecodedBatch, arrivals_of: ArrivalsOf) -> NDArray[np.bool_]:
         intact = np.ones(len(pieces.ends), np.bool_)

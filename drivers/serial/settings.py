@@ -284,6 +284,7 @@ class LineLayout(Layout):
     separator: Annotated[str, AfterValidator(_separator), Field(min_length=1, max_length=1)] = Field(
         default=",", description="character between two columns"
     )
+    decimal: Literal[".", ","] = Field(default=".", description="decimal mark of the numbers")
     prefix: Annotated[str, Field(pattern=r"^[!$]?[A-Za-z0-9_-]+$", max_length=16)] | None = Field(
         default=None,
         description="first field of each line of this stream; lines with another one are not of it",

@@ -190,7 +190,9 @@ def test_nobody_and_nothing_are_failures_that_say_what_to_check(
     with tcp({9: Watched(11)}) as target:
         assert main(words(target, "--units", "8-9")) == 1
     said = capsys.readouterr().err
-    assert "none of units 8 to 9 answers; a gateway reports of 1 that they do not answer. Remedy: " in said
+    assert (
+        "none of units 8 to 9 answers; a gateway reports that no unit answers at 1 of them. Remedy: " in said
+    )
     with tcp({1: Watched(2)}) as target:
         assert main(words(target, "--units", "1", "--registers", "0-3")) == 1
     assert "no register could be read by function 3 and 4. Remedy: " in capsys.readouterr().err
@@ -209,7 +211,7 @@ def test_nobody_and_nothing_are_failures_that_say_what_to_check(
         (("--units", "0-300"), "--units '0-300': write FIRST-LAST from 0 to 255"),
         (("--registers", "9-3"), "--registers '9-3': write FIRST-LAST"),
         (("--pause-ms", "-1"), "--pause-ms -1: give 0 to 10000 ms"),
-        (("--timeout-ms", "0"), "--timeout-ms 0.0: "),
+        (("--timeout-ms", "0"), "--timeout-ms 0: must be "),
     ],
 )
 def test_wrong_arguments_are_one_line(
@@ -219,6 +221,22 @@ def test_wrong_arguments_are_one_line(
     line = capsys.readouterr().err
     assert said in line
     assert len(line.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("target", "said"),
+    [
+        ("127.0.0.1:99999", "TARGET '127.0.0.1:99999': the TCP port must be 65535 or less"),
+        ("127.0.0.1:0", "TARGET '127.0.0.1:0': the TCP port must be 1 or more"),
+        ("http://plc", "TARGET 'http://plc': write HOST, HOST:PORT or /dev/ttyS0"),
+        ("a b", "TARGET 'a b': is no name or address of a host"),
+    ],
+)
+def test_a_target_that_is_none_is_named_whole(
+    target: str, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["sniff", "modbus", target]) == 2
+    assert said in capsys.readouterr().err
 
 
 def test_ctrl_c_ends_it_early_and_shows_what_was_found() -> None:

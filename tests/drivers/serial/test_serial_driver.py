@@ -136,8 +136,8 @@ async def test_what_is_wrong_is_said_once_with_its_remedy(tmp_path: Path, caplog
     assert len(said) == 4
     assert f"there is no {tmp_path / 'port'}; plug the device in, or correct port" in said[0]
     assert said[1].endswith("is there now")
-    assert 'left out; the first line is "#": 1 columns, the file lists 2 (seq, x). If it is all' in said[2]
-    assert "compare baud, parity, framing and checksum with the device's" in said[2]
+    assert 'left out; the first line is "#": 1 column, the file lists 2 (seq, x). If it is all' in said[2]
+    assert "If it is all of them, remove the 1 column that the device does not send from line" in said[2]
     assert "unplugged" in said[3]
     assert [block.samples[:, 0].tolist() for block in blocks] == [[1.0, 2.0, 3.0]] or len(blocks) > 1
     assert driver.counters.bytes_garbage == 12 + 2 + 6

@@ -152,27 +152,48 @@ def test_a_sentence_of_a_gps_receiver_is_a_line():
 
 
 @pytest.mark.parametrize(
-    ("spoilt", "said"),
+    ("spoilt", "said", "remedy"),
     [
-        (b"1,2,3,4,5,6,7", '"1,2,3,4,5,6,7": 7 columns, the file lists 3 (seq, x, y)'),
-        (b"1,abc,2", "column x is 'abc', no number"),
-        (b"1,,2", "column x is '', no number"),
-        (b"1.5,1,2", "counter seq is 1.5, no whole number from 0 up"),
-        (b"-3,1,2", "counter seq is -3, no whole number from 0 up"),
-        (b"4294967296,1,2", "counter seq is 4294967296, by its bits in the file 4294967295 at most"),
-        (b"\xfe\x01\x80", '"\\xfe\x01\\x80": no text, as at another baud rate or parity'),
-        (b"7," * 100 + b"7", "..." + '": 101 columns'),
+        (
+            b"1,2,3,4,5,6,7",
+            '"1,2,3,4,5,6,7": 7 columns, the file lists 3 (seq, x, y)',
+            "name the 4 columns more in line",
+        ),
+        (b"1,2", '"1,2": 2 columns, the file lists 3 (seq, x, y)', "remove the 1 column that the device"),
+        (b"1;2;3", '"1;2;3": 1 column, the file lists 3', 'or correct separator = ","'),
+        (b"1,abc,2", "column x is 'abc', no number", "names in line in the order"),
+        (b"1,,2", "column x is '', no number", "names in line in the order"),
+        (b"1.5,1,2", "counter seq is 1.5, no whole number from 0 up", "write time in place of counter"),
+        (b"-3,1,2", "counter seq is -3, no whole number from 0 up", "write time in place of counter"),
+        (
+            b"4294967296,1,2",
+            "counter seq is 4294967296, by its bits in the file 4294967295 at most",
+            "correct bits",
+        ),
+        (b"\xfe\x01\x80", '"\\xfe\x01\\x80": no text, as at another baud rate or parity', "compare baud"),
+        (b"7," * 100 + b"7", "..." + '": 101 columns', "name the 98 columns more"),
     ],
 )
-def test_a_line_that_is_none_is_quoted_with_what_is_wrong(spoilt, said):
+def test_a_line_that_is_none_is_quoted_with_what_is_wrong(spoilt, said, remedy):
     columns = line_layout(("seq", "x", "y"), ("x", "y"), counter="seq")
     framing = LineFraming({"a": columns}, {"a": 100.0})
     framing.cut(b"half a line\n")
     found = framing.cut(b"0,1,2\n" + spoilt + b"\n1,1,2\n")
     assert found.notes["frames_malformed"] == 1
     assert said in found.malformed
+    assert remedy in found.remedy
     again = framing.cut(spoilt + b"\n")
     assert (again.notes["frames_malformed"], again.malformed) == (1, ""), "once"
+
+
+def test_the_other_decimal_mark_is_named():
+    for mark, other, text in ((".", ",", b"1;0,5"), (",", ".", b"1;0.5")):
+        columns = line_layout(("seq", "x"), ("x",), counter="seq", separator=";", decimal=mark)
+        framing = LineFraming({"a": columns}, {"a": 100.0})
+        framing.cut(b"half a line\n")
+        found = framing.cut(text + b"\n")
+        assert f"column x is '{text[2:].decode()}', no number" in found.malformed
+        assert found.remedy == f'write decimal = "{other}" in the layout'
 
 
 @pytest.mark.parametrize(

@@ -77,6 +77,36 @@ def test_times_are_those_of_python_to_the_last_bit(stamps: list[str]) -> None:
     assert lines.places.tolist() == [ms / 1e3 for ms in read if ms is not None and abs(ms / 1e3) <= 1e12]
 
 
+@given(st.lists(st.tuples(NUMBERS, NUMBERS), min_size=1, max_size=8))
+@example([("1", "9007199254740993.5"), ("1", "1e999"), ("1", ",5"), ("1", "1.5"), ("1", "1,234.5")])
+def test_decimal_commas_are_read_as_points_are(rows: list[tuple[str, str]]) -> None:
+    points, commas = codec(separator=";"), codec(separator=";", decimal=",")
+    # A comma in place of each point, and the other way round.
+    swap = str.maketrans(".,", ",.")
+    texts = [f"{counter};;{value}" for counter, value in rows]
+    want = points.read(pieces([text.encode() for text in texts]))
+    got = commas.read(pieces([text.translate(swap).encode() for text in texts]))
+    assert got.good.tolist() == want.good.tolist()
+    np.testing.assert_array_equal(got.places, want.places)
+    np.testing.assert_array_equal(got.samples, want.samples)
+
+
+def test_a_point_is_no_decimal_comma_nor_a_comma_a_point() -> None:
+    cut = pieces([b"1;;0,249", b"2;;0.249", b"3;;249"])
+    for mark, good in ((",", [True, False, True]), (".", [False, True, True])):
+        lines = codec(separator=";", decimal=mark).read(cut)
+        assert lines.good.tolist() == good
+        np.testing.assert_array_equal(lines.samples[:, 0, 0], np.float32([0.249, 249]))
+
+
+def test_what_is_written_with_decimal_commas_is_read_again() -> None:
+    stream = codec(separator=";", decimal=",", counter=None, time="seq")
+    text = stream.write(1.25, np.array([-0.5]))
+    assert text == b"1250,0000;0,000000;-0,500000"
+    lines = stream.read(pieces([text]))
+    assert (lines.places.tolist(), lines.samples.ravel().tolist()) == ([1.25], [-0.5])
+
+
 @given(st.lists(st.text("ab,1", max_size=8), min_size=1, max_size=8))
 def test_a_line_belongs_to_the_stream_that_its_first_field_names(texts: list[str]) -> None:
     lines = codec(prefix="a").read(pieces([text.encode() for text in texts]))

@@ -120,6 +120,7 @@ def test_the_driver_is_found_by_its_name():
             "earlier",
             "own name",
         ),
+        (LINE, LINE + 'decimal = ","\n', "streams.casing.layout.decimal", "is the separator too", '";"'),
         (LINE, LINE + 'separator = "."\n', "streams.casing.layout.separator", "cannot stand between", '";"'),
         (
             LINE,
