@@ -171,8 +171,9 @@ ACCOUNTS = Code(
 NOTHING_ON_BUS = Code(
     "C20",
     "Nothing was seen on the bus",
-    "Nobody sends, the bit rate or the parity is wrong, or the cable is not plugged in.",
-    "Check power, cable and the settings of the line, and look for longer.",
+    "Nobody sends or answers. On a line, the bit rate or the parity is wrong, or the cable is not plugged "
+    "in. On a network, the address, the port or the unit is wrong, or a firewall is between.",
+    "Check power, cable and the settings that the message names, and look for longer.",
     "sniff.md",
     "daqsvc: CAN bus 'can0' (socketcan can0) has carried no frame, so there is no plant.blf; its state at"
     " the end: up",

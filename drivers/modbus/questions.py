@@ -403,14 +403,17 @@ def _sample_registers(answers: Answers) -> int:
 
 def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
     """What was found, in a few lines: which units answer, and the registers that are worth reading."""
-    yield f"units that answer: {', '.join(map(str, found['units']))}"
+    first, last = found["units_asked"]
+    yield f"units that answer: {', '.join(map(str, found['units']))} (units {first} to {last} were asked)"
     for table in found["tables"]:
         if not table["registers"]:
             continue
         runs = ", ".join(f"{low}" if low == high else f"{low} to {high}" for low, high in table["runs"])
-        yield f"unit {table['unit']} has {_TABLES[table['function']]} registers {runs}:"
+        asked = " to ".join(map(str, table["asked"]))
+        name = f"unit {table['unit']} has {_TABLES[table['function']]} registers {runs}"
+        yield f"{name} ({asked} were asked; daqsvc sniff modbus --registers looks further):"
         by_address = {one["address"]: one for one in table["registers"]}
-        wide = {one["address"]: one for one in table["channels"] if one["type"] != "uint16"}
+        wide = {one["address"]: one for one in table["channels"] if not one["type"].endswith("int16")}
         behind = {
             address + number
             for address, one in wide.items()

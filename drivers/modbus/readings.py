@@ -1,15 +1,24 @@
-"""What registers can mean: numbers of 16, 32 and 64 bits in all orders of bytes and words, and how likely."""
+"""What registers can mean: numbers of 16, 32 and 64 bits in all orders of bytes and words, and how likely.
+
+Registers are read several times. Those of a number of 32 or 64 bits move together: an upper one moves only if
+the one below it wraps, or changes wildly. Two numbers of 16 bits side by side do not do this.
+"""
 
 from __future__ import annotations
 
 import math
 import struct
+from collections import Counter
+from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from drivers.modbus.settings import Order, RegisterType
+
+    Registers = Mapping[int, int]
+    """Values by address, 0 to 65535."""
 
 ORDERS: Sequence[Order] = ("ABCD", "CDAB", "BADC", "DCBA")
 _WIDE: Sequence[tuple[RegisterType, str, int]] = (
@@ -20,10 +29,21 @@ _WIDE: Sequence[tuple[RegisterType, str, int]] = (
 )
 
 LEAST, MOST = 1e-6, 1e9
-SMOOTH = 0.2
-"""Part of its value by which a quantity may change between two readings."""
-_SHORT = 5
+SMOOTH = 0.5
+"""Part of its value by which a quantity may change while it is read."""
+NONE, BESIDE_OTHERS, ALONE, SURE = 0, 1, 2, 3
+"""Evidence: only if others of the unit have the same order, enough by itself, and beyond doubt."""
+_USUAL = (1e-3, 1e6)
+"""Values of which a float is likely, although only its lower register moves."""
+_SHORT, _ROUND = 5, 3
+"""Digits of a number that a person has set; of a round one."""
 _LEAST_COUNT = 65_536
+_WILD = 1024
+"""A register that moves by so much, either way round, is rather the lower part of a number."""
+_CLEARLY = 8
+"""Factor by which a movement must be smaller to be clearly smaller."""
+_MODULUS = 65_536
+_SIGN = 32_768
 
 
 class Reading(NamedTuple):
@@ -34,8 +54,9 @@ class Reading(NamedTuple):
         registers: how many.
         type: of the number.
         order: of bytes and words.
-        value: the number; not finite where floats are none.
-        plausible: whether it looks like a quantity.
+        value: the number when it was read first; not finite where floats are none.
+        evidence: that it is a quantity, from `NONE` to `SURE`.
+        change: part of its value by which it changed while it was read.
     """
 
     address: int
@@ -43,30 +64,39 @@ class Reading(NamedTuple):
     type: RegisterType
     order: Order
     value: float
-    plausible: bool
+    evidence: int
+    change: float
+
+    @property
+    def plausible(self) -> bool:
+        """Whether it looks like a quantity."""
+        return self.evidence >= ALONE
+
+    @property
+    def places(self) -> range:
+        """Addresses of its registers."""
+        return range(self.address, self.address + self.registers)
 
 
-def readings(first: Mapping[int, int], second: Mapping[int, int], address: int) -> list[Reading]:
+def readings(rounds: Sequence[Registers], address: int) -> list[Reading]:
     """Every way to read the registers from an address on, as far as they are there.
 
     Args:
-        first: registers by address.
-        second: the same a while later; some may be missing.
+        rounds: registers by address, as they were read first, again, and so on; later ones may lack some.
         address: of the first register of the number.
     """
     found: list[Reading] = []
     for kind, code, count in _WIDE:
         places = range(address, address + count)
-        if not all(place in first for place in places):
+        if not rounds or not all(place in rounds[0] for place in places):
             continue
-        words = [first[place] for place in places]
-        later = [second.get(place, first[place]) for place in places]
+        rows = [[these[place] for place in places] for these in rounds if all(p in these for p in places)]
         for order in ORDERS:
-            value, then = (struct.unpack(code, arranged(these, order))[0] for these in (words, later))
-            likely = _is_likely(
-                kind, words, value, then, moved=[word != now for word, now in zip(words, later, strict=True)]
-            )
-            found.append(Reading(address, count, kind, order, float(value), likely))
+            raw = [arranged(row, order) for row in rows]
+            numbers = _Numbers(kind, order, raw, [float(struct.unpack(code, one)[0]) for one in raw])
+            evidence = numbers.evidence()
+            change = numbers.change if evidence else math.inf
+            found.append(Reading(address, count, kind, order, numbers.values[0], evidence, change))
     return found
 
 
@@ -76,49 +106,204 @@ def arranged(words: Sequence[int], order: Order) -> bytes:
     return b"".join(word.to_bytes(2, "little" if order in {"BADC", "DCBA"} else "big") for word in ordered)
 
 
-def _is_likely(kind: str, words: Sequence[int], value: float, then: float, moved: Sequence[bool]) -> bool:
-    """Whether a number is a quantity rather than bits.
+class _Numbers(NamedTuple):
+    """The same registers in one order, read several times.
 
-    A float that was measured changes little from one reading to the next, and one that was set has few
-    digits; any bits are a float in the range of quantities once in five times.
+    Attributes:
+        kind: type of the number.
+        order: of bytes and words.
+        raw: its bytes, most significant first.
+        values: what they are as numbers.
     """
-    if not (math.isfinite(value) and math.isfinite(then)) or (
-        len(set(words)) < 2 and not kind.startswith("f")
-    ):
-        return False
-    smooth = abs(then - value) <= SMOOTH * max(abs(value), abs(then))
-    if kind.startswith("float"):
-        in_range = all(LEAST <= abs(number) <= MOST for number in (value, then))
-        return in_range and smooth and (any(moved) or _digits(value, kind) <= _SHORT)
-    # Two registers of 16 bits side by side look like one of 32, until the upper one is seen to carry.
-    return _LEAST_COUNT <= abs(value) <= MOST and smooth and all(moved) and kind == "int32"
+
+    kind: str
+    order: str
+    raw: Sequence[bytes]
+    values: Sequence[float]
+
+    @property
+    def change(self) -> float:
+        """Part of its value by which the number changed."""
+        most = max(map(abs, self.values))
+        return (max(self.values) - min(self.values)) / most if most else 0.0
+
+    @property
+    def moved(self) -> bool:
+        """Whether it changed at all."""
+        return len(set(self.raw)) > 1
+
+    def evidence(self) -> int:
+        """See `Reading.evidence`."""
+        if self._is_exchanged:
+            return NONE
+        if self.kind == "float64":
+            return self._float64()
+        if self.kind == "float32":
+            return self._float32()
+        # What is not negative is an int32, too, unless it is beyond the range of counts.
+        return self._count() if self.kind == "int32" else NONE
+
+    def _float32(self) -> int:
+        if not _in_range(self.values):
+            return NONE
+        if not self.moved:
+            return self._constant()
+        if self.change > SMOOTH:
+            # One that swings about 0.
+            swings = len(set(self.raw)) >= 4 and self._carries(0) and self._moves(0)
+            return BESIDE_OTHERS if swings else NONE
+        if not self._moves(0):
+            return ALONE if self._lower_is_natural() else BESIDE_OTHERS
+        if self._is_zero(1):
+            return ALONE if max(map(self._digits, self.values)) <= _ROUND else NONE
+        return SURE if self._carries(0) else NONE
+
+    def _float64(self) -> int:
+        if not _in_range(self.values) or self.change > SMOOTH:
+            return NONE
+        if not self.moved:
+            return self._constant()
+        if self._is_zero(2) and self._is_zero(3):
+            return ALONE if max(map(self._digits, self.values)) <= _SHORT else NONE
+        # Of two float32 side by side the second would be one, too.
+        lower = [struct.unpack(">f", one[4:])[0] for one in self.raw]
+        if self._is_zero(2) or _in_range([value for value in lower if value]):
+            return NONE
+        if not (self._moves(1) or self._moves(2)):
+            return BESIDE_OTHERS
+        last = 3 if not self._is_zero(3) else 2
+        return SURE if all(self._carries(upper) for upper in range(last)) else NONE
+
+    def _constant(self) -> int:
+        """A number that was set has few digits."""
+        digits = self._digits(self.values[0])
+        is_round = digits <= _ROUND or (digits <= _SHORT and self._is_zero(len(self.raw[0]) // 2 - 1))
+        if self._is_usual_order:
+            return ALONE if is_round else BESIDE_OTHERS if digits <= _SHORT else NONE
+        return BESIDE_OTHERS if is_round else NONE
+
+    def _count(self) -> int:
+        """A count of 32 bits goes one way by small steps, and was seen to carry."""
+        if not all(_LEAST_COUNT <= abs(value) <= MOST for value in self.values):
+            return NONE
+        steps = [after - before for before, after in pairwise(self.values)]
+        small = all(abs(step) < _SIGN for step in steps)
+        one_way = all(step >= 0 for step in steps) or all(step <= 0 for step in steps)
+        return SURE if small and one_way and self._moves(0) else NONE
+
+    def _words(self, place: int) -> list[int]:
+        """One register, as it was read each time; 0 is the most significant one."""
+        return [int.from_bytes(one[2 * place : 2 * place + 2], "big") for one in self.raw]
+
+    def _moves(self, place: int) -> bool:
+        return len(set(self._words(place))) > 1
+
+    def _is_zero(self, place: int) -> bool:
+        return not any(self._words(place))
+
+    def _lower_is_natural(self) -> bool:
+        """Whether the value is usual, and bytes that are not in the usual order show it."""
+        here, there = self._movement(1)
+        usual = all(_USUAL[0] <= abs(value) <= _USUAL[1] for value in self.values)
+        return usual and (self._is_usual_order or _CLEARLY * here <= there)
+
+    @property
+    def _is_exchanged(self) -> bool:
+        """Whether a register moves by much less with its bytes exchanged, as a number of 16 bits does."""
+        movements = map(self._movement, range(len(self.raw[0]) // 2))
+        return any(here > _CLEARLY * there for here, there in movements)
+
+    def _movement(self, place: int) -> tuple[int, int]:
+        """How far a register moves in all, and how far with its bytes exchanged."""
+        words = self._words(place)
+        exchanged = [(word & 0xFF) << 8 | word >> 8 for word in words]
+        here, there = (sum(_around(b - a) for a, b in pairwise(these)) for these in (words, exchanged))
+        return here, there
+
+    def _carries(self, upper: int) -> bool:
+        """Whether the register below an upper one wraps, or changes wildly, when the upper one moves."""
+        fits = [
+            _wraps(one - before, below - below_before)
+            for (before, below_before), (one, below) in pairwise(
+                zip(self._words(upper), self._words(upper + 1), strict=True)
+            )
+            if one != before
+        ]
+        return 2 * sum(fits) >= len(fits)
+
+    def _digits(self, value: float) -> int:
+        """Digits of the shortest decimal number that is this float."""
+        import numpy as np  # noqa: PLC0415 - only for who scans
+
+        text = f"{np.float32(value) if self.kind == 'float32' else np.float64(value)}"
+        return len(text.partition("e")[0].replace(".", "").replace("-", "").strip("0"))
+
+    @property
+    def _is_usual_order(self) -> bool:
+        """Small integers look like floats whose bytes are exchanged."""
+        return self.order in {"ABCD", "CDAB"}
 
 
-def _digits(value: float, kind: str) -> int:
-    """Digits of the shortest decimal number that is this float."""
-    import numpy as np  # noqa: PLC0415 - only for who scans
-
-    text = f"{np.float32(value) if kind == 'float32' else np.float64(value)}"
-    return len(text.partition("e")[0].replace(".", "").replace("-", "").strip("0"))
+def _in_range(values: Sequence[float]) -> bool:
+    return bool(values) and all(LEAST <= abs(value) <= MOST for value in values)
 
 
-def chosen(first: Mapping[int, int], second: Mapping[int, int]) -> list[Reading]:
+def _around(step: int) -> int:
+    """How far a register moved, the shorter way round."""
+    return min(step % _MODULUS, -step % _MODULUS)
+
+
+def _wraps(upper_step: int, lower_step: int) -> bool:
+    return _around(lower_step) >= _WILD or (
+        abs(upper_step) == 1 and abs(upper_step * _MODULUS + lower_step) < _SIGN
+    )
+
+
+def is_signed(values: Sequence[int]) -> bool:
+    """Whether a register of 16 bits has been near below 0."""
+    return any(value >= 3 * _SIGN // 2 for value in values) and not any(
+        _SIGN // 2 <= value < 3 * _SIGN // 2 for value in values
+    )
+
+
+def chosen(rounds: Sequence[Registers]) -> list[Reading]:
     """The likeliest readings that do not overlap, in the order of addresses; registers left over are none.
 
-    The order that most of them agree on goes first, since devices have one order throughout.
+    Each float64 beyond doubt goes first, since a part of it looks like a float32. Then the order that most
+    agree on goes first: devices have one for all numbers, or at least for those of a type.
+
+    Args:
+        rounds: see `readings`.
     """
-    likely = [one for address in sorted(first) for one in readings(first, second, address) if one.plausible]
-    votes: dict[str, int] = {}
-    for one in likely:
-        votes[one.order] = votes.get(one.order, 0) + (2 if one.type.startswith("float") else 1)
-    ranked = sorted(
-        likely, key=lambda one: (-votes[one.order], not one.type.startswith("float"), one.address)
-    )
-    taken: set[int] = set()
+    if not rounds:
+        return []
+    found = [one for address in sorted(rounds[0]) for one in readings(rounds, address) if one.evidence]
+    sure = {one.order for one in found if one.evidence == SURE}
+    likely = [one for one in found if one.plausible or one.order in sure]
+    doubles = _apart([one for one in likely if one.type == "float64" and one.evidence == SURE], [])
+    return sorted(doubles + _apart(likely, doubles), key=lambda one: one.address)
+
+
+def _apart(likely: Sequence[Reading], taken: Sequence[Reading]) -> list[Reading]:
+    """Those of the likely readings that overlap neither each other nor what is taken, the likeliest first."""
+    places = {place for one in taken for place in one.places}
+    free = [one for one in likely if not places & set(one.places)]
+    votes: Counter[tuple[str, str]] = Counter()
+    for one in [*free, *taken]:
+        for kind, _, _ in _WIDE:
+            votes[kind, one.order] += one.evidence * (2 if kind == one.type else 1)
     kept: list[Reading] = []
-    for one in ranked:
-        places = set(range(one.address, one.address + one.registers))
-        if not places & taken:
-            taken |= places
+    for one in sorted(
+        free,
+        key=lambda one: (
+            -votes[one.type, one.order],
+            one.type != "float32",
+            -one.evidence,
+            one.change,
+            one.address,
+        ),
+    ):
+        if not places & set(one.places):
+            places |= set(one.places)
             kept.append(one)
-    return sorted(kept, key=lambda one: one.address)
+    return kept

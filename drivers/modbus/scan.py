@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from daqsvc.acquisition.clock import NS_PER_S
 from drivers.modbus.client import ModbusClient
 from drivers.modbus.replies import (
     GATEWAY_CODES,
@@ -18,7 +20,7 @@ from drivers.modbus.settings import ModbusRtuBus
 
 if TYPE_CHECKING:
     import threading
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from daqsvc.acquisition.clock import Clock
     from drivers.modbus.settings import ModbusBus
@@ -30,6 +32,14 @@ ALIKE = 8
 """Addresses in a row that all answer, from which on the server is taken to ignore the address."""
 QUIET_S = 0.1
 """Silence on a serial line after a request without reply, which may still come."""
+ROUNDS, ROUND_S = 5, 0.3
+"""Readings of the registers that are there, and the pause before each further one."""
+READ_ON = 800
+"""Registers that are read beyond those asked for, as long as there are any."""
+TELL_S = 5.0
+"""Time from one line about the progress to the next."""
+LAST_REGISTER = 65_535
+TABLES = {3: "holding", 4: "input"}
 
 
 @dataclass(slots=True)
@@ -39,18 +49,34 @@ class FoundTable:
     Attributes:
         unit: its address.
         function: 3 or 4.
+        begin: first register that is asked for.
+        last: last one that was asked for; None if there was no time for any.
+        complete: whether all were asked for.
         first: registers by address, as they were read first.
-        second: as they were read again.
+        again: the same, each time that they were read again.
         refused: exception codes but illegal address, by the first address of a request.
         silent: first addresses of requests that stayed without reply.
     """
 
     unit: int
     function: int
+    begin: int = 0
+    last: int | None = None
+    complete: bool = False
     first: dict[int, int] = field(default_factory=dict)
-    second: dict[int, int] = field(default_factory=dict)
+    again: list[dict[int, int]] = field(default_factory=list)
     refused: dict[int, int] = field(default_factory=dict)
     silent: list[int] = field(default_factory=list)
+
+    @property
+    def name(self) -> str:
+        """Of the table, for a person."""
+        return f"unit {self.unit}, {TABLES[self.function]} registers (function {self.function})"
+
+    @property
+    def rounds(self) -> list[dict[int, int]]:
+        """Registers by address, as they were read first, again, and so on."""
+        return [self.first, *self.again]
 
     @property
     def runs(self) -> list[tuple[int, int]]:
@@ -66,7 +92,12 @@ class FoundTable:
     @property
     def moved(self) -> set[int]:
         """Addresses of registers that had another value when they were read again."""
-        return {address for address, value in self.second.items() if value != self.first.get(address)}
+        return {
+            address
+            for again in self.again
+            for address, value in again.items()
+            if value != self.first.get(address)
+        }
 
 
 @dataclass(slots=True)
@@ -78,9 +109,13 @@ class Scan:
         clock: of the client.
         stop: set when the person has seen enough.
         pause_s: silence between two requests.
+        tell: reports its progress now and then.
 
     Attributes:
         requests: how many were made.
+        first_unit: the first unit that is asked.
+        asked: the last one that was; None if none was.
+        searched: whether all were asked, or the answers tell that the others need not be.
         units: those that answered, in order.
         gateway: addresses of which a gateway reported that no unit is behind them.
         alike: whether every address answered, so that only the first is taken for a unit.
@@ -92,13 +127,23 @@ class Scan:
     clock: Clock
     stop: threading.Event
     pause_s: float
+    tell: Callable[[str], None]
     requests: int = 0
+    first_unit: int = 0
+    asked: int | None = None
+    searched: bool = False
     units: list[int] = field(default_factory=list)
     gateway: list[int] = field(default_factory=list)
     alike: bool = False
     tables: list[FoundTable] = field(default_factory=list)
     lost: str = ""
     _client: ModbusClient | None = None
+    _told_ns: int = 0
+
+    def longest_s(self, units: int) -> float:
+        """Time to ask so many units that do not answer."""
+        quiet_s = QUIET_S if isinstance(self.bus, ModbusRtuBus) else 0.0
+        return units * (self.pause_s + self.bus.timeout_ms / 1000 + quiet_s)
 
     async def run(
         self,
@@ -108,8 +153,9 @@ class Scan:
         end: int,
         *,
         until_found: bool = False,
+        read_on: bool = False,
     ) -> None:
-        """Find units, read their registers, and read those that are there again.
+        """Find units, read their registers, and read those that are there again and again.
 
         Args:
             units: addresses to try.
@@ -117,32 +163,39 @@ class Scan:
             begin: first register.
             end: last one.
             until_found: whether no further function is tried on a unit that has registers.
+            read_on: whether registers behind the last one are read, too, if that one is there.
 
         Raises:
             LineLostError: the line cannot be opened.
         """
+        self._told_ns = self.clock.monotonic_ns()
+        most = min(end + READ_ON, LAST_REGISTER) if read_on else end
         await self._connect()
         try:
             await self._find(units, functions[0], begin)
             for unit in self.units:
                 for function in functions:
-                    table = FoundTable(unit, function)
+                    table = FoundTable(unit, function, begin)
                     self.tables.append(table)
-                    for at in range(begin, end + 1, BLOCK):
-                        await self._read(table, at, min(BLOCK, end + 1 - at))
-                    if table.first and until_found:
+                    await self._read_table(table, end, most)
+                    if until_found and (table.first or self.stop.is_set()):
                         break
-            for table in self.tables:
-                await self._read_again(table)
+            if any(table.first for table in self.tables):
+                await self._read_again()
         except LineLostError as error:
             self.lost = f"{error}"
         finally:
             await self._close()
 
     async def _find(self, units: Sequence[int], function: int, address: int) -> None:
+        self.first_unit = units[0]
         for tried, unit in enumerate(units, 1):
             if self.stop.is_set():
                 return
+            rest_s = math.ceil(self.longest_s(len(units) + 1 - tried))
+            answered = ", ".join(map(str, self.units)) or "none"
+            self._progress(f"asking unit {unit}, at most {rest_s} s to go; units that answer: {answered}")
+            self.asked = unit
             try:
                 await self._ask(unit, function, address, 1)
             except NoReplyError:
@@ -154,7 +207,27 @@ class Scan:
             self.units.append(unit)
             if tried == ALIKE == len(self.units) and not isinstance(self.bus, ModbusRtuBus):
                 self.alike, self.units = True, self.units[:1]
+                break
+        self.searched = True
+
+    def _progress(self, words: str) -> None:
+        now_ns = self.clock.monotonic_ns()
+        if now_ns - self._told_ns >= TELL_S * NS_PER_S:
+            self._told_ns = now_ns
+            self.tell(words)
+
+    async def _read_table(self, table: FoundTable, end: int, most: int) -> None:
+        """Registers to the last one, and on to the most as long as the last one is there."""
+        at = table.begin
+        while at <= end:
+            count = min(BLOCK, end + 1 - at)
+            await self._read(table, at, count)
+            if self.stop.is_set():
                 return
+            at += count
+            if at > end and end in table.first:
+                end = min(end + BLOCK, most)
+        table.complete = True
 
     async def _read(self, table: FoundTable, address: int, count: int) -> None:
         """Registers in a row; where one of them is not there, both halves by themselves."""
@@ -163,30 +236,42 @@ class Scan:
         if ILLEGAL_FUNCTION in table.refused.values():
             return
         try:
+            self._progress(f"reading {table.name} from {address} on")
             raw = await self._ask(table.unit, table.function, address, count)
+            table.first.update(_registers(raw, address))
         except NoReplyError:
             table.silent.append(address)
-            return
         except RequestRefusedError as error:
             if error.code in {ILLEGAL_ADDRESS, ILLEGAL_VALUE} and count > 1:
                 await self._read(table, address, count // 2)
                 await self._read(table, address + count // 2, count - count // 2)
-            elif error.code != ILLEGAL_ADDRESS:
+                return
+            if error.code != ILLEGAL_ADDRESS:
                 table.refused[address] = error.code
-            return
-        table.first.update(_registers(raw, address))
+        table.last = address + count - 1
 
-    async def _read_again(self, table: FoundTable) -> None:
+    async def _read_again(self) -> None:
+        """What is there, so often that what moves is seen to, also if the device measures once a second."""
+        for _ in range(ROUNDS - 1):
+            if self.stop.is_set():
+                return
+            await asyncio.sleep(ROUND_S)
+            for table in self.tables:
+                table.again.append({})
+                await self._read_round(table, table.again[-1])
+
+    async def _read_round(self, table: FoundTable, again: dict[int, int]) -> None:
         for first, last in table.runs:
             for at in range(first, last + 1, BLOCK):
                 if self.stop.is_set():
                     return
+                self._progress(f"reading {table.name} again")
                 count = min(BLOCK, last + 1 - at)
                 try:
                     raw = await self._ask(table.unit, table.function, at, count)
                 except (NoReplyError, RequestRefusedError):
                     continue
-                table.second.update(_registers(raw, at))
+                again.update(_registers(raw, at))
 
     async def _ask(self, unit: int, function: int, address: int, count: int) -> bytes:
         """One request, after a pause.
@@ -220,12 +305,6 @@ class Scan:
         if self._client is not None:
             await self._client.close()
             self._client = None
-
-
-def most_requests(units: int, functions: int, registers: int) -> tuple[int, int]:
-    """Requests to find units, and the most for the registers of one unit, both readings."""
-    blocks = -(-registers // BLOCK)
-    return units, functions * (2 * registers - blocks + (registers + 1) // 2)
 
 
 def _registers(raw: bytes, address: int) -> dict[int, int]:

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING
 
-from drivers.sniffing import Sniffed, Sniffer, SniffError, SniffTable, quoted, sensor_lines
+from drivers.sniffing import Sniffed, Sniffer, SniffError
 
 if TYPE_CHECKING:
     import argparse
     import threading
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable
 
-    from drivers.modbus.readings import Reading
-    from drivers.modbus.scan import FoundTable, Scan
     from drivers.modbus.settings import ModbusBus
 
 TCP_PORT = 502
@@ -22,9 +20,10 @@ UNITS = "1-247"
 REGISTERS = "0-200"
 _AUTO = "auto"
 _FUNCTIONS = {_AUTO: (3, 4), "3": (3,), "4": (4,), "both": (3, 4)}
-_TABLES = {3: "holding", 4: "input"}
-_MOST_CHANNELS = 64
 _LAST_REGISTER = 65_535
+_LONG_MANUALS_FIRST = (300_001, 400_001)
+"""What manuals with six digits call the first input register and the first holding register."""
+_INPUT = (30_001, 300_001)
 
 
 class ModbusSniffer(Sniffer):
@@ -32,8 +31,8 @@ class ModbusSniffer(Sniffer):
 
     help = "scan a Modbus server or line: units that answer, their registers, what those may mean"
     description = (
-        "Read the registers of a Modbus TCP server, or of the units on a serial line, twice. Print "
-        "which registers exist, which of them change, and which numbers they may be. It sends one "
+        "Read the registers of a Modbus TCP server, or of the units on a serial line, several times. "
+        "Print which registers exist, which of them change, and which numbers they may be. It sends one "
         "request at a time, with a pause before each. Nothing is written to a device."
     )
 
@@ -50,9 +49,9 @@ class ModbusSniffer(Sniffer):
         )
         parser.add_argument(
             "--registers",
-            default=REGISTERS,
             metavar="A-B",
-            help=f"addresses of registers to read, e.g. 0-99 (default: {REGISTERS})",
+            help=f"addresses of registers to read, counted from 0, e.g. 0-99 (default: {REGISTERS}, and on "
+            "if the last one exists)",
         )
         parser.add_argument(
             "--function",
@@ -98,25 +97,32 @@ class ModbusSniffer(Sniffer):
         """See `drivers.sniffing.Sniffer.sniff`."""
         from daqsvc.acquisition.clock import SystemClock  # noqa: PLC0415 - only for who scans
         from drivers.modbus.replies import LineLostError  # noqa: PLC0415
-        from drivers.modbus.scan import Scan, most_requests  # noqa: PLC0415
+        from drivers.modbus.scan import Scan  # noqa: PLC0415
+        from drivers.modbus.scan_report import ScanReport  # noqa: PLC0415
 
         first_unit, last_unit = _range(arguments.units, "--units", 255)
-        begin, end = _range(arguments.registers, "--registers", _LAST_REGISTER)
+        begin, end, note = _registers(arguments.registers or REGISTERS)
         if not 0 <= arguments.pause_ms <= 10_000:
             raise SniffError(f"--pause-ms {arguments.pause_ms:g}: give 0 to 10000 ms", usage=True)
         bus = _bus(arguments)
         functions = _FUNCTIONS[arguments.function]
         units = range(first_unit, last_unit + 1)
-        probes, most = most_requests(len(units), len(functions), end + 1 - begin)
-        wait_s = probes * (arguments.pause_ms + arguments.timeout_ms) / 1000
+        scan = Scan(bus, SystemClock(), stop, arguments.pause_ms / 1000, tell)
+        asked = f"unit {first_unit}" if len(units) == 1 else f"units {first_unit} to {last_unit}"
         tell(
-            f"asking {bus.where}: {probes} request{'s' * (probes != 1)} to find units, at most "
-            f"{math.ceil(wait_s)} s; then at most {most} for each unit that answers; Ctrl-C ends it early"
+            f"asking {bus.where} for {asked}, at most {math.ceil(scan.longest_s(len(units)))} s; then for "
+            f"registers {begin} to {end} of each one that answers; Ctrl-C ends it early"
         )
-        scan = Scan(bus, SystemClock(), stop, arguments.pause_ms / 1000)
         try:
-            until_found = arguments.function == _AUTO
-            asyncio.run(scan.run(units, functions, begin, end, until_found=until_found))
+            scanning = scan.run(
+                units,
+                functions,
+                begin,
+                end,
+                until_found=arguments.function == _AUTO,
+                read_on=arguments.registers is None,
+            )
+            asyncio.run(scanning)
         except LineLostError as error:
             said = f"{error}".replace("correct host and tcp_port", "correct TARGET").replace(
                 "correct host", "correct TARGET"
@@ -124,7 +130,32 @@ class ModbusSniffer(Sniffer):
             raise SniffError(
                 f"{bus.where}: {said.replace('correct serial_port', 'correct TARGET')}"
             ) from error
-        return _Report(bus, scan, arguments.all_orders, (first_unit, last_unit), functions).sniffed()
+        return ScanReport(bus, scan, functions, note, all_orders=arguments.all_orders).sniffed()
+
+
+def _registers(text: str) -> tuple[int, int, str]:
+    """First and last register, and what to say if they look like the numbers of a manual.
+
+    Raises:
+        SniffError: they are no registers.
+    """
+    from drivers.modbus.checks import manuals_first  # noqa: PLC0415 - brings the settings
+
+    begin, end = _range(text, "--registers", _LONG_MANUALS_FIRST[-1] + _LAST_REGISTER)
+    first = manuals_first(begin) or next(
+        (one for one in _LONG_MANUALS_FIRST if one <= begin <= one + _LAST_REGISTER), None
+    )
+    note = ""
+    if first is not None:
+        kind, function = ("input", " --function 4") if first in _INPUT else ("holding", "")
+        there = f"{begin - first}-{max(end - first, begin - first)}"
+        note = (
+            f"registers {begin} to {end} look like numbers of a manual, where {kind} registers begin at "
+            f"{first}; on the line they are {there}. Remedy: write --registers {there}{function}"
+        )
+    if end <= _LAST_REGISTER:
+        return begin, end, note
+    raise SniffError(note or _no_range("--registers", text, _LAST_REGISTER), usage=True)
 
 
 def _range(text: str, option: str, most: int) -> tuple[int, int]:
@@ -136,7 +167,11 @@ def _range(text: str, option: str, most: int) -> tuple[int, int]:
     low, _, high = text.partition("-")
     if low.isdecimal() and (high or low).isdecimal() and int(low) <= int(high or low) <= most:
         return int(low), int(high or low)
-    raise SniffError(f"{option} {text!r}: write FIRST-LAST from 0 to {most}, e.g. 1-10", usage=True)
+    raise SniffError(_no_range(option, text, _LAST_REGISTER if option == "--registers" else most), usage=True)
+
+
+def _no_range(option: str, text: str, most: int) -> str:
+    return f"{option} {text!r}: write FIRST-LAST from 0 to {most}, e.g. 1-10"
 
 
 def _bus(arguments: argparse.Namespace) -> ModbusBus:
@@ -176,211 +211,3 @@ def _bus(arguments: argparse.Namespace) -> ModbusBus:
         what = {"tcp_port": "the TCP port "}.get(key, "")
         said, _, _ = ErrorFormatter(model, table).say(wrong, wrong["loc"])
         raise SniffError(f"{subject}: {what}{said}", usage=True) from error
-
-
-class _Report(NamedTuple):
-    """What was found, in words, in figures and as a machine file."""
-
-    bus: ModbusBus
-    scan: Scan
-    all_orders: bool
-    units: tuple[int, int]
-    functions: tuple[int, ...]
-
-    def sniffed(self) -> Sniffed:
-        """All of it."""
-        return Sniffed(list(self._parts()), self._figures(), self._fragment(), self._problem())
-
-    def _problem(self) -> str:
-        scan, where = self.scan, self.bus.where
-        if scan.lost:
-            return f"{where} was lost: {scan.lost}"
-        if not scan.units and scan.stop.is_set():
-            return f"{where}: it was ended before a unit answered"
-        if not scan.units:
-            asked = f"units {self.units[0]} to {self.units[1]}"
-            gateway = (
-                f"; a gateway reports that no unit answers at {len(scan.gateway)} of them"
-                if scan.gateway
-                else ""
-            )
-            return (
-                f"{where}: none of {asked} answers{gateway}. Remedy: check that the device is powered, that "
-                "baud rate and parity are its own, that A and B are not swapped, and its unit address; a "
-                "slow one needs a longer --timeout-ms"
-            )
-        if not any(table.first for table in scan.tables) and not scan.stop.is_set():
-            asked = " and ".join(map(str, self.functions))
-            other = ""
-            if len(self.functions) == 1:
-                other = ", and for its tables (--function both)"
-            return (
-                f"{where}: no register could be read by function {asked}. Remedy: see the device's manual "
-                f"for its addresses (--registers){other}"
-            )
-        return ""
-
-    def _parts(self) -> Iterator[str | SniffTable]:
-        scan = self.scan
-        found = ", ".join(map(str, scan.units)) or "none"
-        yield f"{self.bus.where}: {scan.requests} requests; units that answer: {found}"
-        if scan.alike:
-            yield "It answers in the name of every unit, so it is one device; only the first one was read."
-        if scan.gateway:
-            many = f"{len(scan.gateway)} address{'es' * (len(scan.gateway) != 1)}"
-            yield f"A gateway reports that no unit answers behind it at {many}."
-        for table in scan.tables:
-            yield from self._table(table)
-
-    def _table(self, table: FoundTable) -> Iterator[str | SniffTable]:
-        from drivers.modbus.replies import EXCEPTIONS  # noqa: PLC0415 - only for who scans
-
-        name = f"Unit {table.unit}, {_TABLES[table.function]} registers (function {table.function})"
-        runs = ", ".join(f"{low}" if low == high else f"{low}-{high}" for low, high in table.runs)
-        yield f"{name}: {f'{len(table.first)} at {runs}' if runs else 'none'}"
-        for address, code in table.refused.items():
-            yield f"{name}: refused from {address} on: exception {code}, {EXCEPTIONS.get(code, 'unknown')}"
-        if table.silent:
-            yield f"{name}: no reply to requests from {', '.join(map(str, table.silent))} on"
-        if table.first:
-            yield SniffTable(
-                ("address", "hex", "uint16", "int16", "moves", "may be"),
-                [self._row(table, address) for address in sorted(table.first)],
-            )
-
-    def _row(self, table: FoundTable, address: int) -> Sequence[str]:
-        from drivers.modbus.readings import chosen, readings  # noqa: PLC0415 - only for who scans
-
-        raw = table.first[address]
-        shown = [one for one in chosen(table.first, table.second) if one.address == address]
-        if self.all_orders:
-            shown = readings(table.first, table.second, address)
-        return (
-            f"{address}",
-            f"{raw:04x}",
-            f"{raw}",
-            f"{_signed(raw)}",
-            "yes" if address in table.moved else "",
-            "; ".join(_words(one, mark=self.all_orders) for one in shown),
-        )
-
-    def _figures(self) -> dict[str, Any]:
-        from drivers.modbus.readings import readings  # noqa: PLC0415 - only for who scans
-
-        scan = self.scan
-        return {
-            "bus": "modbus",
-            "where": self.bus.where,
-            "requests": scan.requests,
-            "units": scan.units,
-            "units_gateway": scan.gateway,
-            "units_alike": scan.alike,
-            "tables": [
-                {
-                    "unit": table.unit,
-                    "function": table.function,
-                    "runs": [list(run) for run in table.runs],
-                    "refused": [[address, code] for address, code in table.refused.items()],
-                    "silent": table.silent,
-                    "moved": sorted(table.moved),
-                    "channels": [one._asdict() for one in _channels(table)],
-                    "registers": [
-                        {
-                            "address": address,
-                            "uint16": value,
-                            "int16": _signed(value),
-                            "later": table.second.get(address),
-                            "readings": [
-                                {
-                                    "type": one.type,
-                                    "order": one.order,
-                                    "value": one.value if math.isfinite(one.value) else None,
-                                    "plausible": one.plausible,
-                                }
-                                for one in readings(table.first, table.second, address)
-                            ],
-                        }
-                        for address, value in sorted(table.first.items())
-                    ],
-                }
-                for table in scan.tables
-            ],
-        }
-
-    def _fragment(self) -> str:
-        from drivers.modbus.settings import ModbusTcpBus  # noqa: PLC0415 - only for who scans
-
-        tables = [table for table in self.scan.tables if table.first]
-        if not tables:
-            return ""
-        bus = self.bus
-        lines = ["[buses.modbus]", 'driver = "modbus"']
-        if isinstance(bus, ModbusTcpBus):
-            lines += ['transport = "tcp"', f"host = {quoted(bus.host)}", f"tcp_port = {bus.tcp_port}"]
-        else:
-            lines += ['transport = "rtu"', f"serial_port = {quoted(bus.serial_port)}", f"baud = {bus.baud:_}"]
-            lines.append(f"parity = {quoted(bus.parity)}")
-        lines.append(f"timeout_ms = {bus.timeout_ms}")
-        sensors: set[str] = set()
-        for table in tables:
-            lines += ["", *self._stream(table, sensors)]
-        return "\n".join(lines)
-
-    def _stream(self, table: FoundTable, sensors: set[str]) -> Iterator[str]:
-        channels = list(_channels(table))
-        name = f"unit-{table.unit}" + ("" if table.function == 3 else "-input")
-        yield f"[streams.{name}]"
-        yield 'bus = "modbus"'
-        yield "rate_hz = 1.0"
-        yield ""
-        yield f"[streams.{name}.layout]    # types are a guess: see the device's register map"
-        yield 'way = "registers"'
-        yield f"unit = {table.unit}"
-        if table.function == 4:
-            yield 'table = "input"'
-        yield "max_gap = 0    # registers between them may not be there"
-        yield "channels = ["
-        yield from (f"  {{ {one.keys} }}," for one in channels)
-        yield "]"
-        yield from sensor_lines(name, dict.fromkeys((one.name for one in channels), "1"), sensors)
-
-
-class _Channel(NamedTuple):
-    """A number that is worth reading."""
-
-    name: str
-    address: int
-    type: str
-    order: str
-
-    @property
-    def keys(self) -> str:
-        """As in a machine file."""
-        order = "" if self.order == "ABCD" else f", order = {quoted(self.order)}"
-        return f"name = {quoted(self.name)}, address = {self.address}, type = {quoted(self.type)}{order}"
-
-
-def _channels(table: FoundTable) -> Iterator[_Channel]:
-    """What to read: numbers that are likely, else registers that move, else those that are not 0."""
-    from drivers.modbus.readings import chosen  # noqa: PLC0415 - only for who scans
-
-    wide: dict[int, Reading] = {one.address: one for one in chosen(table.first, table.second)}
-    covered = {place for one in wide.values() for place in range(one.address, one.address + one.registers)}
-    alone = [address for address in sorted(table.first) if address not in covered]
-    moving = [address for address in alone if address in table.moved]
-    singles = set(
-        moving or ([] if wide else [address for address in alone if table.first[address]] or alone[:1])
-    )
-    for address in sorted({*wide, *singles})[:_MOST_CHANNELS]:
-        one = wide.get(address)
-        kind, order = ("uint16", "ABCD") if one is None else (one.type, one.order)
-        yield _Channel(f"r{address}", address, kind, order)
-
-
-def _words(one: Reading, *, mark: bool) -> str:
-    star = "*" if mark and one.plausible else ""
-    return f"{star}{one.type} {one.order} {one.value:.6g}"
-
-
-def _signed(raw: int) -> int:
-    return raw - 65_536 if raw >= 32_768 else raw

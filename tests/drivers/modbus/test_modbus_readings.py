@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -10,11 +11,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.examples import examples
 
-from drivers.modbus.readings import ORDERS, arranged, chosen, readings
+from drivers.modbus.readings import ORDERS, arranged, chosen, is_signed, readings
 from drivers.modbus.registers import byte_places
 from drivers.modbus.settings import RegisterChannel
 
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
 pytestmark = pytest.mark.property
+ROUNDS = 5
+UNITS = 40
+"""Units of each kind, each from its own seed."""
 
 
 def registers(raw: bytes, order: str, at: int = 0) -> dict[int, int]:
@@ -33,46 +40,180 @@ def test_a_number_is_read_as_the_driver_reads_it(kind: str, count: int, words: l
     raw = np.frombuffer(b"".join(word.to_bytes(2, "big") for word in words[:count]), np.uint8)
     theirs = raw[byte_places(channel)].tobytes()
     assert arranged(words[:count], order) == theirs
-    found = {(one.type, one.order): one.value for one in readings(dict(enumerate(words)), {}, 0)}
+    found = {(one.type, one.order): one.value for one in readings([dict(enumerate(words))], 0)}
     code = {"float32": ">f", "int32": ">i", "uint32": ">I", "float64": ">d"}[kind]
     assert found[kind, order] == pytest.approx(float(struct.unpack(code, theirs)[0]), nan_ok=True)
 
 
+def noisy_integers(
+    rng: np.random.Generator, count: int, low: float, high: float, noise: float
+) -> list[dict[int, int]]:
+    """Registers of 16 bits, each with a noise of its own up to this one, as they are read several times."""
+    base, spread = rng.uniform(low, high, count), rng.uniform(0.2 * noise, noise, count)
+    return [
+        {k: round(value) & 0xFFFF for k, value in enumerate(base + spread * rng.normal(size=count))}
+        for _ in range(ROUNDS)
+    ]
+
+
+def numbers(values: Iterator[list[float]], code: str, order: str) -> list[dict[int, int]]:
+    """Registers of numbers side by side, as they are read several times."""
+    width = struct.calcsize(code) // 2
+    rounds = []
+    for _ in range(ROUNDS):
+        held: dict[int, int] = {}
+        for k, value in enumerate(next(values)):
+            held |= registers(struct.pack(code, value), order, k * width)
+        rounds.append(held)
+    return rounds
+
+
+def measured(rng: np.random.Generator, count: int) -> Iterator[list[float]]:
+    """Quantities from 0.01 to 100,000 of either sign, with a noise of 0.01 to 5 % of their value."""
+    base = 10 ** rng.uniform(-2, 5, count) * rng.choice([1, 1, 1, -1], count)
+    noise = 10 ** rng.uniform(-4, -1.3, count)
+    while True:
+        yield list(base * (1 + noise * rng.normal(size=count)))
+
+
+def share_right(
+    make: Callable[[np.random.Generator], list[dict[int, int]]], kind: str, order: str, width: int
+) -> tuple[float, float]:
+    """Part of all numbers that is recognised, and how many are taken for something that they are not."""
+    right = wrong = total = 0
+    for seed in range(UNITS):
+        rounds = make(np.random.default_rng(seed))
+        found = chosen(rounds)
+        total += len(rounds[0]) // width
+        fits = [one for one in found if (one.type, one.order) == (kind, order) and one.address % width == 0]
+        right, wrong = right + len(fits), wrong + len(found) - len(fits)
+    return right / total, wrong / total
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "noise"),
+    [(-3000, 3000, 30), (0, 6000, 0.8), (0, 65_535, 30), (16_000, 17_000, 30)],
+)
+def test_integers_of_16_bits_side_by_side_stay_what_they_are(low: float, high: float, noise: float) -> None:
+    # Measured with 200 units of 6 registers: none of 1200 was taken for a part of a wider number. The last
+    # ones lie where the upper register of a float does.
+    assert share_right(lambda rng: noisy_integers(rng, 6, low, high, noise), "", "", 1)[1] == 0.0
+
+
+def test_two_temperatures_side_by_side_are_no_count() -> None:
+    first, second = {200: 543, 201: 478}, {200: 541, 201: 477}
+    assert chosen([first, second, {200: 544, 201: 479}]) == []
+
+
+@pytest.mark.parametrize(("amplitude", "step"), [(250, 0.15), (3000, 0.4), (12_000, 0.05)])
+@pytest.mark.parametrize("moves", [True, False])
+def test_samples_of_a_waveform_stay_what_they_are(amplitude: float, step: float, *, moves: bool) -> None:
+    def samples(rng: np.random.Generator) -> list[dict[int, int]]:
+        rounds = []
+        for _ in range(ROUNDS):
+            angle = rng.uniform(0, 2 * np.pi) + step * np.arange(64)
+            values = amplitude * np.sin(angle) + rng.normal(0, amplitude / 12, 64)
+            rounds.append({k: round(value) & 0xFFFF for k, value in enumerate(values)})
+        return rounds if moves else [rounds[0]] * ROUNDS
+
+    # Measured with 200 units of 64 registers: none of 12,800.
+    assert share_right(samples, "", "", 1)[1] == 0.0
+
+
 @pytest.mark.parametrize("order", ORDERS)
-@pytest.mark.parametrize("seed", range(5))
-def test_floats_that_move_smoothly_are_found_with_their_order(order: str, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    values = 10 ** rng.uniform(-2, 5, 12)
-    first, second = {}, {}
-    for k, value in enumerate(values):
-        first |= registers(struct.pack(">f", value), order, 2 * k)
-        second |= registers(struct.pack(">f", value * rng.uniform(0.99, 1.01)), order, 2 * k)
-    found = {one.address: one for one in chosen(first, second) if (one.type, one.order) == ("float32", order)}
-    right = [k for k in range(len(values)) if 2 * k in found]
-    assert len(right) >= 9
-    for k in right:
-        assert found[2 * k].value == pytest.approx(values[k], rel=1e-6)
+def test_float32_are_recognised_in_their_order(order: str) -> None:
+    # Measured with 200 units of 4 numbers: ABCD and CDAB 100 %, the others 97.6 %; wrong at most 0.3 %.
+    right, wrong = share_right(lambda rng: numbers(measured(rng, 4), ">f", order), "float32", order, 2)
+    assert right >= 0.94
+    assert wrong <= 0.01
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_a_float32_alone_is_recognised_or_left(order: str) -> None:
+    # Measured with 200 units of one number: ABCD and CDAB 100 %. BADC and DCBA 68 % and wrong 4.5 %: there
+    # the noise of a register looks alike with its bytes exchanged.
+    right, wrong = share_right(lambda rng: numbers(measured(rng, 1), ">f", order), "float32", order, 2)
+    assert right >= (0.97 if order in {"ABCD", "CDAB"} else 0.5)
+    assert wrong <= (0.0 if order in {"ABCD", "CDAB"} else 0.1)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("count", [1, 4])
+def test_float64_are_recognised_and_not_taken_for_two_float32(order: str, count: int) -> None:
+    # Measured with 200 units: 99.9 % of four side by side, wrong 0.1 %; 99.5 % of one alone, wrong none.
+    right, wrong = share_right(lambda rng: numbers(measured(rng, count), ">d", order), "float64", order, 4)
+    assert right >= 0.97
+    assert wrong <= 0.01
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_counts_of_32_bits_are_recognised_by_a_carry_or_left(order: str) -> None:
+    def counts(rng: np.random.Generator) -> list[dict[int, int]]:
+        begin, step = int(10 ** rng.uniform(5, 8.5)), int(10 ** rng.uniform(0, 4.3))
+        return numbers(iter([[begin + k * step] for k in range(ROUNDS)]), ">i", order)
+
+    # Measured with 200 units of one count that grows by 1 to 20,000 from reading to reading: 12.5 % were
+    # recognised, and at most 1.5 % were wrong.
+    right, wrong = share_right(counts, "int32", order, 2)
+    assert right >= 0.05
+    assert wrong <= 0.03
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_kinds_beside_each_other_are_told_apart(order: str) -> None:
+    # Measured with 200 units: 97 to 100 % of the four wide numbers, and at most 0.1 wrong ones in a unit.
+    right = wrong = 0
+    for seed in range(UNITS):
+        rng = np.random.default_rng(seed)
+        settings_ = {k: int(10 ** rng.uniform(0, 4)) for k in range(8)}
+        parts = (
+            (8, noisy_integers(rng, 4, -3000, 3000, 30)),
+            (12, numbers(measured(rng, 3), ">f", order)),
+            (18, numbers(measured(rng, 1), ">d", order)),
+        )
+        rounds = [
+            settings_ | {at + k: value for at, part in parts for k, value in part[n].items()}
+            for n in range(ROUNDS)
+        ]
+        found = {(one.address, one.type) for one in chosen(rounds) if one.order == order}
+        fits = found & {(12, "float32"), (14, "float32"), (16, "float32"), (18, "float64")}
+        right, wrong = right + len(fits), wrong + len(chosen(rounds)) - len(fits)
+    assert right >= 0.9 * 4 * UNITS
+    assert wrong <= 0.2 * UNITS
+
+
+def test_a_float_whose_upper_register_stands_still_is_found() -> None:
+    rounds = numbers(iter([[23.37 + 1e-5 * k] for k in range(ROUNDS)]), ">f", "CDAB")
+    [one] = chosen(rounds)
+    assert (one.type, one.order, one.value) == ("float32", "CDAB", pytest.approx(23.37))
 
 
 def test_a_setting_of_few_digits_is_a_float_though_it_does_not_move() -> None:
     first = registers(struct.pack(">f", 42.5), "CDAB", 10)
-    [one] = chosen(first, first)
+    [one] = chosen([first, first])
     assert (one.address, one.type, one.order, one.value) == (10, "float32", "CDAB", 42.5)
 
 
 def test_bits_that_jump_and_zeros_are_no_floats() -> None:
     rng = np.random.default_rng(1)
-    first = {k: int(value) for k, value in enumerate(rng.integers(0, 65_536, 100))}
-    second = {k: int(value) for k, value in enumerate(rng.integers(0, 65_536, 100))}
-    assert len(chosen(first, second)) < 15
+    rounds = [{k: int(value) for k, value in enumerate(rng.integers(0, 65_536, 100))} for _ in range(ROUNDS)]
+    assert chosen(rounds) == []
     nothing = dict.fromkeys(range(20), 0)
-    assert chosen(nothing, nothing) == []
+    assert chosen([nothing, nothing]) == []
+    assert chosen([]) == []
 
 
 def test_a_count_of_32_bits_is_found_once_its_upper_register_carries() -> None:
-    assert chosen({0: 7, 1: 1480}, {0: 7, 1: 1482}) == []
+    assert chosen([{0: 7, 1: 1480}, {0: 7, 1: 1482}]) == []
     first = registers((1_245_180).to_bytes(4, "big"), "ABCD")
     second = registers((1_245_190).to_bytes(4, "big"), "ABCD")
-    assert [(one.type, one.order, one.value) for one in chosen(first, second)] == [
+    assert [(one.type, one.order, one.value) for one in chosen([first, second])] == [
         ("int32", "ABCD", 1_245_180)
     ]
+
+
+def test_a_register_that_is_near_below_0_is_signed() -> None:
+    assert is_signed([65_530, 3])
+    assert is_signed([65_276])
+    assert not is_signed([543, 541])
+    assert not is_signed([40_000, 65_000])

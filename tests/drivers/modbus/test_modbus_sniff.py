@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import signal
 import struct
 import subprocess
@@ -18,7 +19,7 @@ from support.ports import free_port
 from support.waiting import PATIENCE_S
 
 from daqsvc.cli import main
-from drivers.modbus import questions, sniff
+from drivers.modbus import questions, scan, sniff
 from sim_hw.nodes.modbus_node import ModbusRtuServer, ModbusTcpServer
 from sim_hw.nodes.modbus_unit import ModbusUnit
 
@@ -28,6 +29,11 @@ if TYPE_CHECKING:
 
 pytestmark = pytest.mark.integration
 BEGIN = 'schema_version = 1\nsite = "lab"\nbox = "edge-1"\n\n[machine]\nname = "fan"\nspeed_rpm = 1480.0\n\n'
+
+
+@pytest.fixture(autouse=True)
+def _without_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scan, "ROUND_S", 0.0)
 
 
 class Watched(ModbusUnit):
@@ -131,7 +137,7 @@ def test_registers_are_shown_and_what_it_proposes_passes_check(
         fragment = figures(capsys)["machine_file"]
         assert main(words(target, "--units", "1", "--all-orders")) == 0
         everything = capsys.readouterr().out
-    assert "1 request to find units, at most 1 s; then" in shown.err
+    assert "for unit 1, at most 1 s; then for registers 0 to 200 of each one that answers" in shown.err
     assert "Unit 1, holding registers (function 3): 7 at 0-3, 40-41, 107" in shown.out
     assert "Unit 1, input registers (function 4): none" in shown.out
     rows = {line.split()[0]: line for line in shown.out.splitlines() if line[:3].strip().isdecimal()}
@@ -146,7 +152,128 @@ def test_registers_are_shown_and_what_it_proposes_passes_check(
     said = capsys.readouterr()
     assert (code, said.err) == (0, "")
     [stream] = tomllib.loads(fragment)["streams"].values()
-    assert stream["layout"]["channels"] == [{"name": "r40", "address": 40, "type": "float32"}]
+    assert [(one["address"], one["type"]) for one in stream["layout"]["channels"]] == [
+        (0, "uint16"),
+        (1, "int16"),
+        (2, "uint16"),
+        (3, "uint16"),
+        (40, "float32"),
+        (107, "uint16"),
+    ]
+
+
+def test_registers_beyond_the_usual_ones_are_read_as_far_as_there_are_any(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    unit = pump()
+    for address, count in ((200, 2), (210, 1), (299, 3), (305, 1)):
+        unit.put("holding", address, bytes(2 * count))
+    with tcp({1: unit}) as target:
+        assert main(words(target, "--units", "1", "--json")) == 0
+        [table] = figures(capsys)["tables"]
+        assert main(words(target, "--units", "1")) == 0
+        on = capsys.readouterr().out
+        assert main(words(target, "--units", "1", "--registers", "0-200")) == 0
+        bounded = capsys.readouterr().out
+    assert table["asked"] == [0, 300 + 100]
+    assert table["runs"][-4:] == [[200, 201], [210, 210], [299, 301], [305, 305]]
+    assert "Registers 0 to 400 were asked; --registers 0-800 looks further." in on
+    assert "Registers 0 to 200 were asked, and 200 exists: --registers 0-400 looks further." in bounded
+
+
+def test_reading_on_has_an_end(capsys: pytest.CaptureFixture[str]) -> None:
+    unit = ModbusUnit()
+    unit.map("holding", 0, 65_536)
+    with tcp({1: unit}) as target:
+        assert main(words(target, "--units", "1", "--json")) == 0
+    assert figures(capsys)["tables"][0]["asked"] == [0, 1000]
+
+
+def test_a_unit_with_many_registers_proposes_those_that_move_and_names_the_others(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    unit = pump()
+    unit.put("holding", 60, bytes(range(1, 21)))
+    with tcp({1: unit}) as target:
+        assert main(words(target, "--units", "1")) == 0
+    shown = capsys.readouterr().out
+    assert "address = 40" in shown
+    assert "address = 60" not in shown
+    assert "\n# left out, as they did not change: 0-3, 60-69, 107\n" in shown
+
+
+@pytest.mark.parametrize(
+    ("asked", "code", "said"),
+    [
+        (
+            "40101-40110",
+            1,
+            "where holding registers begin at 40001; on the line they are 100-109. Remedy: write",
+        ),
+        (
+            "30011-30012",
+            1,
+            "registers begin at 30001; on the line they are 10-11. Remedy: write --registers 10-11",
+        ),
+        ("400101-400110", 2, "registers begin at 400001; on the line they are 100-109. Remedy: write"),
+        ("300001-300002", 2, "on the line they are 0-1. Remedy: write --registers 0-1 --function 4"),
+    ],
+)
+def test_the_numbers_of_a_manual_are_translated(
+    asked: str, code: int, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with tcp({1: pump()}) as target:
+        assert main(words(target, "--units", "1", "--registers", asked)) == code
+    assert said in capsys.readouterr().err
+
+
+def test_the_numbers_of_a_manual_are_read_where_a_device_has_such_addresses(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    unit = ModbusUnit()
+    unit.put("holding", 40_100, bytes([0, 7]))
+    with tcp({1: unit}) as target:
+        assert main(words(target, "--units", "1", "--registers", "40100-40101")) == 0
+    shown = capsys.readouterr().out
+    assert "Registers 40100 to 40101 look like numbers of a manual" in shown
+    assert "1 at 40100" in shown
+
+
+class Ending(Watched):
+    """A unit at which the person loses patience."""
+
+    def __init__(self, after: int) -> None:
+        super().__init__()
+        self._after = after
+
+    def answer(self, pdu: bytes) -> bytes:
+        if len(self.asked) == self._after:
+            os.kill(os.getpid(), signal.SIGINT)
+        return super().answer(pdu)
+
+
+def test_what_was_not_read_is_not_called_absent(capsys: pytest.CaptureFixture[str]) -> None:
+    units: dict[int, ModbusUnit] = {1: pump(), 2: Ending(after=4), 3: pump()}
+    with tcp(units) as target:
+        assert main(words(target, "--units", "1-3", "--registers", "0-9")) == 0
+    shown = capsys.readouterr().out
+    assert "units that answer: 1, 2, 3" in shown
+    assert "Unit 1, holding registers (function 3): 4 at 0-3" in shown
+    assert "Unit 3, holding registers (function 3): not read: ended before" in shown
+    assert "Unit 2, holding registers (function 3): none so far\nRegisters 0 to " in shown
+    assert "Unit 3, holding registers (function 3): none" not in shown
+
+
+def test_a_long_scan_says_how_far_it_is(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scan, "TELL_S", 0.0)
+    with tcp({2: pump()}) as target:
+        assert main(words(target, "--units", "1-4", "--registers", "0-9")) == 0
+    said = capsys.readouterr().err
+    assert "asking unit 4, at most 1 s to go; units that answer: 2\n" in said
+    assert "reading unit 2, holding registers (function 3) from 5 on\n" in said
+    assert "reading unit 2, holding registers (function 3) again\n" in said
 
 
 def test_input_registers_are_found_where_there_are_no_holding_registers(
@@ -170,7 +297,7 @@ def test_a_server_that_ignores_the_unit_is_one_device(capsys: pytest.CaptureFixt
         assert main(words(target, "--registers", "0-9")) == 0
     said = capsys.readouterr().out
     assert "It answers in the name of every unit" in said
-    assert "units that answer: 1\n" in said
+    assert "units that answer: 1 (units 1 to 8 were asked)\n" in said
     assert len(unit.asked) < 60
 
 
@@ -190,12 +317,21 @@ def test_nobody_and_nothing_are_failures_that_say_what_to_check(
     with tcp({9: Watched(11)}) as target:
         assert main(words(target, "--units", "8-9")) == 1
     said = capsys.readouterr().err
-    assert (
-        "none of units 8 to 9 answers; a gateway reports that no unit answers at 1 of them. Remedy: " in said
-    )
+    assert "no unit answers (units 8 to 9 were asked); a gateway reports that no unit answers at 1" in said
+    assert "compare the gateway's baud rate, parity and wiring" in said
+    with tcp({9: pump()}) as target:
+        assert main(words(target, "--units", "1")) == 1
+    said = capsys.readouterr().err
+    assert "check that 127.0.0.1 is the device's address and " in said
+    assert "no firewall drops the requests" in said
+    assert "baud" not in said
+    with serving(lambda: ModbusRtuServer({9: pump()}, tmp_path / "ttyS0")):
+        assert main(words(f"{tmp_path / 'ttyS0'}", "--units", "1")) == 1
+    assert "baud rate and parity are its own, that A and B are not swapped" in capsys.readouterr().err
     with tcp({1: Watched(2)}) as target:
         assert main(words(target, "--units", "1", "--registers", "0-3")) == 1
-    assert "no register could be read by function 3 and 4. Remedy: " in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "no register could be read by function 3 and 4; registers 0 to 3 were asked. Remedy: " in said
     with tcp({1: Watched(2)}) as target:
         assert main(words(target, "--units", "1", "--registers", "0-3", "--function", "3")) == 1
     assert "for its addresses (--registers), and for its tables (--function both)" in capsys.readouterr().err
@@ -277,13 +413,18 @@ def test_new_proposes_the_registers_that_it_finds(tmp_path: Path, capsys: pytest
         tables = new(tmp_path, target)
         named = new(tmp_path, target, "--channels=speed, level, flow")
     said = capsys.readouterr().out
-    assert "units that answer: 3" in said
+    assert "units that answer: 3 (units 1 to 10 were asked)" in said
+    assert "unit 3 has holding registers 0 to 3, 40 to 41 (0 to 45 were asked; " in said
     assert "  40: 23.37" in said
     assert "as float32 ABCD, moves" in said
     layout = tables["streams"]["device"]["layout"]
     assert (layout["unit"], layout["table"]) == (3, "holding")
     assert [(one["name"], one["address"], one["type"]) for one in layout["channels"]] == [
-        ("r40", 40, "float32")
+        ("r0", 0, "uint16"),
+        ("r1", 1, "int16"),
+        ("r2", 2, "uint16"),
+        ("r3", 3, "uint16"),
+        ("r40", 40, "float32"),
     ]
     # Names of one's own: registers in a row as far as they are there.
     channels = named["streams"]["device"]["layout"]["channels"]
@@ -310,7 +451,7 @@ def test_new_says_what_to_do_when_nobody_answers_and_goes_on(
     assert "nobody listens there; start the server, or correct its address" in capsys.readouterr().out
     with tcp({9: pump()}) as target:
         new(tmp_path, target)
-    assert "none of units 2 to 2 answers. Remedy: check that the device is powered" in capsys.readouterr().out
+    assert "no unit answers (unit 2 was asked). Remedy: check that 127.0.0.1 is" in capsys.readouterr().out
     assert [one["name"] for one in tables["streams"]["device"]["layout"]["channels"]] == [
         "vibration",
         "temperature",

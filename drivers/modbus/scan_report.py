@@ -1,0 +1,315 @@
+"""What a scan of a Modbus line has found: in words, in figures, and as tables of a machine file."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from drivers.modbus.readings import chosen, is_signed, readings
+from drivers.modbus.replies import EXCEPTIONS
+from drivers.modbus.scan import ILLEGAL_FUNCTION, LAST_REGISTER
+from drivers.modbus.settings import ModbusTcpBus
+from drivers.sniffing import Sniffed, SniffTable, quoted, sensor_lines
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+
+    from drivers.modbus.readings import Reading
+    from drivers.modbus.scan import FoundTable, Scan
+    from drivers.modbus.settings import ModbusBus
+
+_FEW = 12
+"""Number of values up to which all are proposed, whether they moved or not."""
+_MOST_CHANNELS = 64
+
+
+class ScanReport:
+    """What was found.
+
+    Args:
+        bus: the line.
+        scan: of it, at its end.
+        functions: that were asked for.
+        note: what is to be said of the registers that were asked for; may be empty.
+        all_orders: whether registers are shown in all orders.
+    """
+
+    def __init__(
+        self, bus: ModbusBus, scan: Scan, functions: Sequence[int], note: str, *, all_orders: bool
+    ) -> None:
+        self._bus = bus
+        self._scan = scan
+        self._functions = functions
+        self._all_orders = all_orders
+        self._note = note
+        self._tables = [(table, chosen(table.rounds)) for table in scan.tables]
+
+    def sniffed(self) -> Sniffed:
+        """All of it."""
+        return Sniffed(list(self._parts()), self._figures(), self._fragment(), self._problem())
+
+    def _problem(self) -> str:
+        scan, where = self._scan, self._bus.where
+        if scan.lost:
+            return f"{where} was lost: {scan.lost}"
+        if not scan.units and scan.stop.is_set():
+            return f"{where}: it was ended before a unit answered ({self._asked})"
+        if not scan.units:
+            gateway = (
+                f"; a gateway reports that no unit answers at {len(scan.gateway)} of them"
+                if scan.gateway
+                else ""
+            )
+            return f"{where}: no unit answers ({self._asked}){gateway}. Remedy: {self._to_check()}"
+        if not any(table.first for table in scan.tables) and not scan.stop.is_set():
+            functions = " and ".join(map(str, self._functions))
+            last = max((table.last for table in scan.tables if table.last is not None), default=None)
+            asked = f"registers {scan.tables[0].begin} to {last}"
+            other = ", and for its tables (--function both)" if len(self._functions) == 1 else ""
+            more = self._note or (
+                f"{asked} were asked. Remedy: see the device's manual for its addresses (--registers){other}"
+            )
+            return f"{where}: no register could be read by function {functions}; {more}"
+        return ""
+
+    @property
+    def _asked(self) -> str:
+        """Which units were asked."""
+        first, last = self._scan.first_unit, self._scan.asked
+        if last is None:
+            return "none was asked"
+        return f"unit {first} was asked" if first == last else f"units {first} to {last} were asked"
+
+    def _to_check(self) -> str:
+        """What there is to see to if nobody answers."""
+        bus = self._bus
+        slow = "a slow one needs a longer --timeout-ms"
+        if not isinstance(bus, ModbusTcpBus):
+            return (
+                "check that the device is powered, that baud rate and parity are its own, that A and B are "
+                f"not swapped, and its unit address; {slow}"
+            )
+        if self._scan.gateway:
+            return (
+                "check that the device has one of these addresses (--units) and is powered, and compare the "
+                f"gateway's baud rate, parity and wiring (A, B) with the device's; {slow}"
+            )
+        return (
+            f"check that {bus.host} is the device's address and {bus.tcp_port} its Modbus port, that its "
+            f"unit address is among those (--units), and that no firewall drops the requests; {slow}"
+        )
+
+    def _parts(self) -> Iterator[str | SniffTable]:
+        scan = self._scan
+        found = ", ".join(map(str, scan.units)) or "none"
+        early = "" if scan.searched else ", then it was ended"
+        asked = f"{self._asked}{early}"
+        yield f"{self._bus.where}: {scan.requests} requests; units that answer: {found} ({asked})"
+        if scan.alike:
+            yield "It answers in the name of every unit, so it is one device; only the first one was read."
+        if scan.gateway:
+            many = f"{len(scan.gateway)} address{'es' * (len(scan.gateway) != 1)}"
+            yield f"A gateway reports that no unit answers behind it at {many}."
+        if self._note and any(table.first for table in scan.tables):
+            yield f"{self._note[0].upper()}{self._note[1:]}."
+        for table, numbers in self._tables:
+            yield from self._table(table, numbers)
+
+    def _table(self, table: FoundTable, numbers: Sequence[Reading]) -> Iterator[str | SniffTable]:
+        name = f"{table.name[0].upper()}{table.name[1:]}"
+        if table.last is None:
+            yield f"{name}: not read: {'the line was lost' if self._scan.lost else 'ended'} before"
+            return
+        none = "none" if table.complete else "none so far"
+        runs = f"{len(table.first)} at {_runs(table.first)}" if table.first else none
+        yield "\n".join([f"{name}: {runs}", *self._range(table)])
+        for address, code in table.refused.items():
+            yield f"{name}: refused from {address} on: exception {code}, {EXCEPTIONS.get(code, 'unknown')}"
+        if table.silent:
+            yield f"{name}: no reply to requests from {', '.join(map(str, table.silent))} on"
+        if table.first:
+            yield SniffTable(
+                ("address", "hex", "uint16", "int16", "moves", "may be"),
+                [self._row(table, numbers, address) for address in sorted(table.first)],
+            )
+
+    def _range(self, table: FoundTable) -> Iterator[str]:
+        """Which registers were asked for, and how to look further."""
+        if ILLEGAL_FUNCTION in table.refused.values():
+            return
+        last = table.begin if table.last is None else table.last
+        asked = f"Registers {table.begin} to {last} were asked"
+        further = min(2 * last - table.begin if last > table.begin else last + 100, LAST_REGISTER)
+        if not table.complete:
+            why = "the line was lost" if self._scan.lost else "it was ended"
+            yield f"{asked}, then {why}."
+        elif further <= last or self._note:
+            yield f"{asked}."
+        elif last in table.first:
+            yield f"{asked}, and {last} exists: --registers {table.begin}-{further} looks further."
+        else:
+            yield f"{asked}; --registers {table.begin}-{further} looks further."
+
+    def _row(self, table: FoundTable, numbers: Sequence[Reading], address: int) -> Sequence[str]:
+        raw = table.first[address]
+        shown = [one for one in numbers if one.address == address]
+        if self._all_orders:
+            shown = readings(table.rounds, address)
+        return (
+            f"{address}",
+            f"{raw:04x}",
+            f"{raw}",
+            f"{_signed(raw)}",
+            "yes" if address in table.moved else "",
+            "; ".join(_words(one, mark=self._all_orders) for one in shown),
+        )
+
+    def _figures(self) -> dict[str, Any]:
+        scan = self._scan
+        return {
+            "bus": "modbus",
+            "where": self._bus.where,
+            "requests": scan.requests,
+            "units": scan.units,
+            "units_asked": [] if scan.asked is None else [scan.first_unit, scan.asked],
+            "units_gateway": scan.gateway,
+            "units_alike": scan.alike,
+            "tables": [_table_figures(table, numbers) for table, numbers in self._tables],
+        }
+
+    def _fragment(self) -> str:
+        tables = [(table, numbers) for table, numbers in self._tables if table.first]
+        if not tables:
+            return ""
+        bus = self._bus
+        lines = ["[buses.modbus]", 'driver = "modbus"']
+        if isinstance(bus, ModbusTcpBus):
+            lines += ['transport = "tcp"', f"host = {quoted(bus.host)}", f"tcp_port = {bus.tcp_port}"]
+        else:
+            lines += ['transport = "rtu"', f"serial_port = {quoted(bus.serial_port)}", f"baud = {bus.baud:_}"]
+            lines.append(f"parity = {quoted(bus.parity)}")
+        lines.append(f"timeout_ms = {bus.timeout_ms}")
+        sensors: set[str] = set()
+        for table, numbers in tables:
+            lines += ["", *_stream(table, numbers, sensors)]
+        return "\n".join(lines)
+
+
+def _table_figures(table: FoundTable, numbers: Sequence[Reading]) -> dict[str, Any]:
+    last = table.again[-1] if table.again else {}
+    return {
+        "unit": table.unit,
+        "function": table.function,
+        "asked": [] if table.last is None else [table.begin, table.last],
+        "complete": table.complete,
+        "runs": [list(run) for run in table.runs],
+        "refused": [[address, code] for address, code in table.refused.items()],
+        "silent": table.silent,
+        "moved": sorted(table.moved),
+        "channels": [one._asdict() for one in _channels(table, numbers)],
+        "registers": [
+            {
+                "address": address,
+                "uint16": value,
+                "int16": _signed(value),
+                "later": last.get(address),
+                "readings": [
+                    {
+                        "type": one.type,
+                        "order": one.order,
+                        "value": one.value if math.isfinite(one.value) else None,
+                        "plausible": one in numbers or one.plausible,
+                    }
+                    for one in readings(table.rounds, address)
+                ],
+            }
+            for address, value in sorted(table.first.items())
+        ],
+    }
+
+
+def _stream(table: FoundTable, numbers: Sequence[Reading], sensors: set[str]) -> Iterator[str]:
+    channels = list(_channels(table, numbers))
+    name = f"unit-{table.unit}" + ("" if table.function == 3 else "-input")
+    yield f"[streams.{name}]"
+    yield 'bus = "modbus"'
+    yield "rate_hz = 1.0"
+    yield ""
+    yield f"[streams.{name}.layout]    # types are a guess: see the device's register map"
+    yield 'way = "registers"'
+    yield f"unit = {table.unit}"
+    if table.function == 4:
+        yield 'table = "input"'
+    yield "max_gap = 0    # registers between them may not be there"
+    yield "channels = ["
+    yield from (f"  {{ {one.keys} }}," for one in channels)
+    yield "]"
+    last = channels[-1].address
+    taken = _covered(numbers) | {one.address for one in channels}
+    left_out = [address for address in table.first if address not in taken and address <= last]
+    beyond = [address for address in table.first if address not in taken and address > last]
+    if len(channels) < _MOST_CHANNELS:
+        left_out, beyond = [*left_out, *beyond], []
+    if left_out:
+        yield f"# left out, as they did not change: {_runs(left_out)}"
+    if beyond:
+        yield f"# left out, as there are so many: {_runs(beyond)}"
+    yield from sensor_lines(name, dict.fromkeys((one.name for one in channels), "1"), sensors)
+
+
+class _Channel(NamedTuple):
+    """A number that is worth reading."""
+
+    name: str
+    address: int
+    type: str
+    order: str
+
+    @property
+    def keys(self) -> str:
+        """As in a machine file."""
+        order = "" if self.order == "ABCD" else f", order = {quoted(self.order)}"
+        return f"name = {quoted(self.name)}, address = {self.address}, type = {quoted(self.type)}{order}"
+
+
+def _channels(table: FoundTable, numbers: Sequence[Reading]) -> Iterator[_Channel]:
+    """What to read: all numbers if they are few, else likely ones and those that move, else not 0."""
+    wide = {one.address: one for one in numbers}
+    covered = _covered(numbers)
+    alone = [address for address in sorted(table.first) if address not in covered]
+    singles = alone
+    if len(wide) + len(alone) > _FEW:
+        moving = [address for address in alone if address in table.moved]
+        not_0 = [address for address in alone if table.first[address]] or alone[:1]
+        singles = moving or ([] if wide else not_0)
+    for address in sorted({*wide, *singles})[:_MOST_CHANNELS]:
+        if address in wide:
+            yield _Channel(f"r{address}", address, wide[address].type, wide[address].order)
+        else:
+            signed = is_signed([these[address] for these in table.rounds if address in these])
+            yield _Channel(f"r{address}", address, "int16" if signed else "uint16", "ABCD")
+
+
+def _covered(numbers: Iterable[Reading]) -> set[int]:
+    """Registers of numbers of 32 and 64 bits."""
+    return {place for one in numbers for place in one.places}
+
+
+def _runs(addresses: Iterable[int]) -> str:
+    """Registers as a person writes them: 0-3, 7."""
+    runs: list[list[int]] = []
+    for address in sorted(addresses):
+        if runs and address == runs[-1][-1] + 1:
+            runs[-1] = [runs[-1][0], address]
+        else:
+            runs.append([address])
+    return ", ".join("-".join(map(str, run)) for run in runs)
+
+
+def _words(one: Reading, *, mark: bool) -> str:
+    star = "*" if mark and one.plausible else ""
+    return f"{star}{one.type} {one.order} {one.value:.6g}"
+
+
+def _signed(raw: int) -> int:
+    return raw - 65_536 if raw >= 32_768 else raw
