@@ -7,12 +7,15 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
 LEAST_COUNTS = 8
 """Frames after which bytes that grew by the same step each time are taken for a counter."""
 
 _BYTE_STEPS, _WORD_STEPS = 256, 65_536
+_NEARLY_ALL = 0.9
 
 
 class FrameCounter(NamedTuple):
@@ -96,10 +99,46 @@ class CounterSearch:
         """What looks like a counter; None if nothing does."""
         if self._frames <= LEAST_COUNTS or self._changed is None:
             return None
-        alone = self._bytes.found
-        # Of 16 bits only where the upper byte was seen to carry; else its own 8 bits say as much.
-        for order, steps, upper in (("little", self._little.found, 1), ("big", self._big.found, 0)):
-            for place, step in steps.items():
-                if self._changed[place + upper] and place + 1 - upper in alone:
-                    return FrameCounter(place, 16, order, step)
-        return next((FrameCounter(place, 8, "little", step) for place, step in alone.items()), None)
+        return _widest(self._bytes.found, self._little.found, self._big.found, self._changed)
+
+
+def counter_between(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> FrameCounter | None:
+    """What looks like a counter in pairs of successive frames, some of which may be damaged or missing.
+
+    Args:
+        before: uint8 ``[n, length]``.
+        after: uint8 ``[n, length]``, the frame behind each of those.
+    """
+    if len(before) < LEAST_COUNTS:
+        return None
+    first, second = before.astype(np.int64), after.astype(np.int64)
+    changed = (before != before[0]).any(axis=0) | (after != before[0]).any(axis=0)
+    steps = second - first
+    return _widest(
+        _usual_steps(steps % _BYTE_STEPS),
+        _usual_steps((steps[:, :-1] + 256 * steps[:, 1:]) % _WORD_STEPS),
+        _usual_steps((256 * steps[:, :-1] + steps[:, 1:]) % _WORD_STEPS),
+        changed,
+    )
+
+
+def _usual_steps(steps: NDArray[np.int64]) -> dict[int, int]:
+    """By place, the step that nearly all pairs have, where it is not 0; ``steps`` is ``[n, places]``."""
+    usual = {}
+    for place, column in enumerate(steps.T):
+        values, times = np.unique(column, return_counts=True)
+        if times.max() >= _NEARLY_ALL * len(column) and values[times.argmax()]:
+            usual[place] = int(values[times.argmax()])
+    return usual
+
+
+def _widest(
+    alone: Mapping[int, int], little: Mapping[int, int], big: Mapping[int, int], changed: NDArray[np.bool_]
+) -> FrameCounter | None:
+    """The counter among bytes and words that grow by one step each, given by place."""
+    # Of 16 bits only where the upper byte was seen to carry; else its own 8 bits say as much.
+    for order, steps, upper in (("little", little, 1), ("big", big, 0)):
+        for place, step in steps.items():
+            if changed[place + upper] and place + 1 - upper in alone:
+                return FrameCounter(place, 16, order, step)
+    return next((FrameCounter(place, 8, "little", step) for place, step in alone.items()), None)

@@ -63,6 +63,7 @@ class SerialQuestions(BusQuestions):
             "Word that each line begins with", "e.g. $ACC; none if the first column is a number."
         ),
         "separator": Topic("Character between columns", "A comma, semicolon, blank or tab."),
+        "decimal": Topic("Decimal mark of the numbers", 'A comma, where a device writes "0,25".'),
         "checksum": Topic(
             "Checksum at the end of a line", "Behind a *: xor as in NMEA 0183, crc16, or none."
         ),
@@ -106,6 +107,9 @@ class SerialQuestions(BusQuestions):
     def _ask_lines(self, answers: Answers) -> Iterator[Question]:
         yield self.ask("prefix", q.text_or_none, NONE)
         yield self.ask("separator", _character, ",", quiet=True)
+        if answers["separator"] != ",":
+            marks = {".": "as in 0.25", ",": "as in 0,25"}
+            yield self.choose("decimal", marks, ".", quiet=True)
         yield self.choose("checksum", dict.fromkeys(("none", "xor", "crc16"), ""), "none", quiet=True)
         yield self.ask("columns", _columns, "t, x, y")
         columns = dict.fromkeys(answers["columns"], "")
@@ -173,6 +177,8 @@ class SerialQuestions(BusQuestions):
             yield entry("prefix", answers["prefix"], "what each line begins with")
         yield entry("line", answers["columns"], "the columns, in order")
         yield entry("separator", answers["separator"])
+        if answers.get("decimal") == ",":
+            yield entry("decimal", ",", "numbers have a decimal comma")
         if answers["counts"] == "count":
             yield entry("counter", {"column": answers["counter"]}, "losses are counted by it")
         else:
@@ -219,10 +225,15 @@ def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
         counter = found["counter"]
         counts = f"byte {counter['byte']} of the payload counts" if counter else "nothing counts"
         check = f"CRC {found['crc'] or 'unknown'}"
+        if found["frames_passing"] < 1:
+            check += f" (passes in {100 * found['frames_passing']:.0f} % of the frames)"
         yield f"{line}: {kind} of {found['frame_length']} bytes{rate}, {check}, {counts}"
         return
     prefix = f", each begins with {found['prefix']}" if found["prefix"] else ""
-    yield f"{line}: lines of text{rate}, {len(found['columns'])} columns{prefix}"
+    comma = ", numbers with a decimal comma" if found["decimal"] == "," else ""
+    yield f"{line}: lines of text{rate}, {len(found['columns'])} columns{prefix}{comma}"
+    if found["lines_damaged"]:
+        yield f"  {found['lines_damaged']} of {found['lines_heard']} lines are damaged"
     yield from (f"  {one}" for one in found["lines"][:_SHOWN_LINES])
 
 
@@ -237,6 +248,7 @@ def _proposals(found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
     proposed |= {
         "prefix": found["prefix"] or NONE,
         "separator": {"\t": r"\t"}.get(found["separator"], found["separator"] or ","),
+        "decimal": found["decimal"],
         "checksum": found["checksum"],
         "columns": ", ".join(named),
     }

@@ -26,7 +26,9 @@ if TYPE_CHECKING:
     import threading
     from collections.abc import Callable, Iterator, Sequence
 
-    from drivers.serial.recognise import BinaryFrames, Column, Recognised, TextLines
+    from drivers.serial.recognise import Recognised
+    from drivers.serial.recognise_frames import BinaryFrames
+    from drivers.serial.recognise_lines import Column, TextLines
 
 BAUDS = (115_200, 9600, 19_200, 57_600, 38_400, 230_400, 460_800, 921_600, 4800, 2400, 1200)
 """Tried in this order, until one is beyond doubt."""
@@ -43,6 +45,8 @@ _SHOWN_LINES = 8
 _SHOWN_ROWS = 8
 _ROW = 16
 _WIDEST = 100
+_WHOLE = 0.995
+"""Share of the bytes in frames from which on the rest is not worth a word."""
 BY_ID = Path("/dev/serial/by-id")
 
 
@@ -245,7 +249,8 @@ class _Report(NamedTuple):
 
     @property
     def _what(self) -> TextLines | BinaryFrames | None:
-        return self.best.found.what
+        """What was found; a guess is none of it."""
+        return self.best.found.what if self.best.found.sure else None
 
     @property
     def _parity(self) -> str:
@@ -259,7 +264,7 @@ class _Report(NamedTuple):
     @property
     def _rate_hz(self) -> float | None:
         """Lines or frames a second; None where it cannot be told."""
-        from drivers.serial.recognise import BinaryFrames, TextLines  # noqa: PLC0415 - only for who listens
+        from drivers.serial.recognise_lines import TextLines  # noqa: PLC0415 - only for who listens
 
         heard, what = self.best.heard, self._what
         seconds = heard.last_s - heard.first_s
@@ -268,11 +273,12 @@ class _Report(NamedTuple):
         if isinstance(what, TextLines):
             per_frame = len(heard.data) / max(1, heard.data.count(what.delimiter.encode()))
         else:
-            assert isinstance(what, BinaryFrames)  # noqa: S101 - for the type checker
-            per_frame = what.length + (2 if what.framing == "cobs" else 0)
+            per_frame = what.bytes_per_frame
         return max(heard.received - per_frame, 0) / per_frame / seconds or None
 
     def _problem(self) -> str:
+        from drivers.serial.recognise import LEAST_BYTES  # noqa: PLC0415 - only for who listens
+
         heard = self.best.heard
         if heard.lost:
             return f"{self.port} was lost: {heard.lost}. Remedy: plug it in again and see `dmesg`"
@@ -282,17 +288,37 @@ class _Report(NamedTuple):
                 "being asked, that its TX leads to RX of this port (for RS-485: A to A, B to B), and that "
                 "ground is connected; a Modbus device is asked: daqsvc sniff modbus"
             )
+        if self._what is None and heard.received < LEAST_BYTES:
+            return (
+                f"{self.port}: only {heard.received} bytes came, which are too few to tell what they are. "
+                "Remedy: listen longer by --seconds, with --baud if the device's rate is known"
+            )
         if self._what is None:
             tried = f"--baud {self.best.baud}" if self.asked else "each of the usual baud rates"
             return (
                 f"{self.port}: bytes come, but by {tried} they are neither lines of text nor frames of one "
-                "length. Remedy: state the device's rate by --baud; check that no other device drives "
-                "the line"
+                f"length{self._guess()}. Remedy: state the device's rate by --baud; check that no other "
+                "device drives the line"
             )
         return ""
 
+    def _guess(self) -> str:
+        """What the bytes are most likely, in words; empty if they are like nothing."""
+        from drivers.serial.recognise_lines import TextLines  # noqa: PLC0415 - only for who listens
+
+        what, score = self.best.found.what, self.best.found.score
+        if what is None:
+            return ""
+        if isinstance(what, TextLines):
+            likely = "lines of text"
+        elif what.framing == "cobs":
+            likely = f"COBS frames of {what.length} bytes"
+        else:
+            likely = f"frames of {what.length} bytes behind {what.sync.hex(' ')}"
+        return f"; most likely they are {likely}, but a score of {score:.2f} may be chance"
+
     def _parts(self) -> Iterator[str | SniffTable]:
-        from drivers.serial.recognise import TextLines  # noqa: PLC0415 - only for who listens
+        from drivers.serial.recognise_lines import TextLines  # noqa: PLC0415 - only for who listens
 
         heard = self.best.heard
         if len(self.tried) > 1:
@@ -317,12 +343,13 @@ class _Report(NamedTuple):
         yield f"The first lines:\n{_printable(shown)}"
         words = [f"{len(what.columns)} columns" if len(what.columns) != 1 else "1 column"]
         words += [f"separated by {quoted(what.separator)}"] * bool(what.separator)
+        words += ["numbers have a decimal comma"] * (what.decimal == ",")
         words += [f"each line begins with {what.prefix}"] * bool(what.prefix)
         words += ["the first line names them"] * what.header
         words += [f"checksum {what.checksum}"] * (what.checksum != "none")
-        words += [f"{what.other} of {len(what.lines)} lines have another number of columns"] * bool(
-            what.other
-        )
+        if what.damaged:
+            example = quoted(_printable(what.damaged[0][:_WIDEST]))
+            words.append(f"{len(what.damaged)} of {len(what.lines)} lines are damaged, e.g. {example}")
         rate = "" if self._rate_hz is None else f", {self._rate_hz:.4g} lines/s"
         yield f"Lines of text{rate}: {'; '.join(words)}"
         counter, time_column = _counter(what), self._time(what)
@@ -337,16 +364,15 @@ class _Report(NamedTuple):
         """The column that has the device's time, if none counts."""
         if _counter(what) is not None:
             return None
-        growing = [one for one in what.columns if one.grows and self._time_unit(what, one) is not None]
+        growing = [one for one in what.columns if one.grows and self._time_unit(one) is not None]
         return growing[0] if growing else None
 
-    def _time_unit(self, what: TextLines, column: Column) -> str | None:
+    def _time_unit(self, column: Column) -> str | None:
         """The unit in which a column grows by as much as lines take; None if there is none."""
-        if self._rate_hz is None or len(what.lines) < 2:
+        if self._rate_hz is None:
             return None
-        per_line = (column.most - column.least) / (len(what.lines) - what.header - what.other - 1 or 1)
         for unit, per_s in (("s", 1.0), ("ms", 1e3), ("us", 1e6)):
-            if 0.8 < per_line * self._rate_hz / per_s < 1.25:
+            if 0.8 < column.per_line * self._rate_hz / per_s < 1.25:
                 return unit
         return None
 
@@ -360,14 +386,20 @@ class _Report(NamedTuple):
             order = f", {what.crc_order} endian" if what.crc_bytes > 1 else ""
             begin = "" if what.crc_from or not what.sync else ", sync word included"
             check = f"check {what.crc}{order}{begin}"
+            count = len(what.frames) + what.damaged
+            share = f"{100 * what.passing:.0f} %" if what.damaged else "all"
+            check += f", passes in {share} of {count} frames"
         counter = f"counter at {what.counter}" if what.counter else "no counter"
+        stray = ""
+        if what.coverage < _WHOLE:
+            stray = f"; {100 * (1 - what.coverage):.0f} % of the bytes are in no frame"
         return (
             f"{name}{rate}: {what.length} bytes, of them {what.payload_length} of payload; {check}; "
-            f"{counter} (bytes of the payload count from 0)"
+            f"{counter} (bytes of the payload count from 0){stray}"
         )
 
     def _figures(self) -> dict[str, Any]:
-        from drivers.serial.recognise import TextLines  # noqa: PLC0415 - only for who listens
+        from drivers.serial.recognise_lines import TextLines  # noqa: PLC0415 - only for who listens
 
         heard, what = self.best.heard, self._what
         figures: dict[str, Any] = {
@@ -389,6 +421,7 @@ class _Report(NamedTuple):
                 "framing": "lines",
                 "delimiter": what.delimiter,
                 "separator": what.separator,
+                "decimal": what.decimal,
                 "prefix": what.prefix,
                 "checksum": what.checksum,
                 "header": what.header,
@@ -399,12 +432,13 @@ class _Report(NamedTuple):
                         "min": one.least,
                         "max": one.most,
                         "counts": one is counter,
-                        "time_unit": self._time_unit(what, one) if one is time_column else None,
+                        "time_unit": self._time_unit(one) if one is time_column else None,
                     }
                     for one in what.columns
                 ],
                 "lines": list(what.lines[:_SHOWN_LINES]),
-                "lines_other": what.other,
+                "lines_heard": len(what.lines),
+                "lines_damaged": len(what.damaged),
             }
         elif what is not None:
             figures |= {
@@ -416,13 +450,14 @@ class _Report(NamedTuple):
                 "crc_order": what.crc_order,
                 "crc_bytes": what.crc_bytes,
                 "crc_from": what.crc_from,
+                "frames_passing": round(what.passing, 4),
                 "counter": None if what.counter is None else what.counter._asdict(),
                 "counter_bits": None if (packed := _packed(what)) is None else packed.counter_bits,
             }
         return figures
 
     def _fragment(self) -> str:
-        from drivers.serial.recognise import TextLines  # noqa: PLC0415 - only for who listens
+        from drivers.serial.recognise_lines import TextLines  # noqa: PLC0415 - only for who listens
 
         what = self._what
         if what is None:
@@ -465,12 +500,14 @@ class _Report(NamedTuple):
         yield f"line = [{', '.join(quoted(name) for name in names.values())}]"
         if what.separator != ",":
             yield f"separator = {quoted(what.separator)}"
+        if what.decimal != ".":
+            yield f"decimal = {quoted(what.decimal)}"
         if counter is not None:
             bits = 8 if counter.most < 256 else 16 if counter.most < 65_536 else 32
             table = f"{{ column = {quoted(names[counter])}, bits = {bits} }}"
             yield f"counter = {table}    # as far as it was seen; see the manual"
         else:
-            unit = self._time_unit(what, place)
+            unit = self._time_unit(place)
             yield f'time = {{ column = {quoted(names[place])}, unit = "{unit}" }}'
         yield f"channels = [{', '.join(f'{{ name = {quoted(names[one])} }}' for one in numbers)}]"
         yield from sensor_lines("lines", {names[one]: "1" for one in numbers}, set())
@@ -563,4 +600,7 @@ def lasting_name(port: str) -> str:
 
 
 def _printable(text: str) -> str:
-    return "".join(letter if letter.isprintable() or letter == "\n" else "?" for letter in text)
+    shown = (
+        letter if letter.isascii() and (letter.isprintable() or letter in "\n\t") else "?" for letter in text
+    )
+    return "".join(shown)

@@ -19,7 +19,7 @@ from support.waiting import PATIENCE_S
 
 from daqsvc.cli import main
 from drivers.serial import questions, sniff
-from drivers.serial.recognise import CHECKS
+from drivers.serial.recognise_frames import CHECKS
 from sim_hw.nodes.serial_node import PseudoTerminal
 
 if TYPE_CHECKING:
@@ -110,6 +110,78 @@ def test_what_it_proposes_for_lines_passes_check(
     assert stream["layout"]["counter"]["column"] == "c1"
     assert [one["name"] for one in stream["layout"]["channels"]] == ["c2", "c3", "c4"]
     assert stream["rate_hz"] == pytest.approx(found["rate_hz"], rel=0.006)
+
+
+def test_decimal_commas_are_told_and_can_be_read(
+    cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 0.6)
+    with talking(cable, lambda number: b"%d;0,%03d;-1,5\n" % (number, number % 900)):
+        assert main(["sniff", "serial", f"{cable.path}", "--seconds", "0.6"]) == 0
+        said = capsys.readouterr().out
+        found = figures(cable, capsys)
+        new_layout = new(cable, tmp_path / "new.toml")["streams"]["device"]["layout"]
+    assert '3 columns; separated by ";"; numbers have a decimal comma' in said
+    [stream] = check(tmp_path, found["machine_file"], capsys)["streams"].values()
+    for layout in (stream["layout"], new_layout):
+        assert (layout["separator"], layout["decimal"]) == (";", ",")
+        assert layout["counter"]["column"] == "c1"
+        assert [one["name"] for one in layout["channels"]] == ["c2", "c3"]
+
+
+def test_damaged_lines_are_counted_and_a_stream_is_proposed(
+    cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with talking(
+        cable, lambda n: b"ERR sensor timeout\n" if n and n % 20 == 0 else b"%d,%d.5\n" % (n, n % 9)
+    ):
+        assert main(["sniff", "serial", f"{cable.path}", "--seconds", "0.8"]) == 0
+        said = capsys.readouterr().out
+        found = figures(cable, capsys)
+    assert ' lines are damaged, e.g. "ERR sensor timeout"' in said
+    assert 0 < found["lines_damaged"] < 0.1 * found["lines_heard"]
+    [stream] = check(tmp_path, found["machine_file"], capsys)["streams"].values()
+    assert stream["layout"]["counter"]["column"] == "c1"
+
+
+def test_the_share_of_frames_that_pass_is_told(
+    cable: PseudoTerminal, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def say(number: int) -> bytes:
+        sent = frame(number)
+        sent = sent if number % 7 else sent[:4] + bytes([sent[4] ^ 1]) + sent[5:]
+        return sent + (os.urandom(5) if number % 10 == 0 else b"")
+
+    with talking(cable, say):
+        assert main(["sniff", "serial", f"{cable.path}", "--seconds", "1"]) == 0
+        said = capsys.readouterr().out
+        found = figures(cable, capsys)
+    assert "12 bytes, of them 8 of payload; check ibm-3740, big endian, passes in 8" in said
+    assert " % of the bytes are in no frame" in said
+    assert (found["frame_length"], found["crc"]) == (12, "ibm-3740")
+    assert found["frames_passing"] == pytest.approx(6 / 7, abs=0.04)
+
+
+def test_a_guess_is_no_finding(cable: PseudoTerminal, capsys: pytest.CaptureFixture[str]) -> None:
+    with talking(cable, lambda _: b"\xaa" + os.urandom(11)):
+        words = ["sniff", "serial", f"{cable.path}", "--seconds", "1", "--baud", "9600"]
+        assert main(words) == 1
+        said = capsys.readouterr()
+        assert main([*words, "--json"]) == 1
+        found = json.loads(capsys.readouterr().out)
+    assert "most likely they are frames of 12 bytes behind aa, but a score of 0." in said.err
+    assert "Frames behind" not in said.out
+    assert "To begin a machine file" not in said.out
+    assert (found["framing"], found["machine_file"]) == (None, "")
+
+
+def test_too_few_bytes_are_no_verdict(cable: PseudoTerminal, capsys: pytest.CaptureFixture[str]) -> None:
+    with talking(cable, lambda number: b"T=21 C\n" if cable.listening and number < 2 else b""):
+        assert main(["sniff", "serial", f"{cable.path}", "--seconds", "0.5", "--baud", "9600"]) == 1
+    assert (
+        " bytes came, which are too few to tell what they are. Remedy: listen longer"
+        in capsys.readouterr().err
+    )
 
 
 def test_a_column_of_time_and_a_header_are_used(

@@ -1,0 +1,373 @@
+"""Binary frames of one length in a stream of bytes: behind a sync word, or in COBS, with noise among them.
+
+Frames are found by what they have in common, not by counting bytes from the first one: bytes that are lost
+or added move the frames behind them. A check that most of them pass is proof.
+"""
+
+from __future__ import annotations
+
+import binascii
+from collections import Counter
+from dataclasses import dataclass, field
+from functools import reduce
+from operator import xor
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from cobs import cobs
+
+from drivers.counter_search import counter_between
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from numpy.typing import NDArray
+
+    from drivers.counter_search import FrameCounter
+
+LEAST_FRAMES = 6
+LONGEST_FRAME = 1024
+LONGEST_SYNC = 8
+
+_CONSTANT = 0.95
+"""Bytes that are the same in so many frames belong to the sync word."""
+_MOST_LAGS = 12
+_MOST_ANCHORS = 3
+_MOST_CHECKED = 64
+_FIRST_CHECKED = 12
+_LEAST_PASSING = {1: 0.8, 2: 0.5}
+"""Share of the frames that must pass a check, by its bytes: by chance, one in 256 or one in 65536 does."""
+_ORDERS: tuple[Literal["big", "little"], ...] = ("big", "little")
+_IDLE = b"\x00\xff"
+
+
+@dataclass(frozen=True, slots=True)
+class BinaryFrames:
+    """Binary frames of one length.
+
+    Attributes:
+        framing: "sync" or "cobs".
+        sync: the bytes that each begins with; none with COBS.
+        length: bytes of a frame, with sync word and CRC, without the delimiter of COBS.
+        frames: how many came whole, uint8 ``[n, length]``; of COBS they are decoded.
+        damaged: how many came that do not pass the check, or cannot be decoded.
+        bytes_per_frame: bytes from frame to frame on average, what lies between them included.
+        coverage: share of the bytes that belong to frames, from the first of them to the last.
+        crc: name of the check at the end that most of them pass; empty if none of those tried.
+        crc_order: byte order of that.
+        crc_bytes: how many bytes it takes.
+        crc_from: the first byte that it covers.
+        counter: what looks like a counter, its byte counted from the sync word's end.
+    """
+
+    framing: Literal["sync", "cobs"]
+    sync: bytes
+    length: int
+    frames: NDArray[np.uint8]
+    damaged: int = 0
+    bytes_per_frame: float = 0.0
+    coverage: float = 1.0
+    crc: str = ""
+    crc_order: str = "big"
+    crc_bytes: int = 0
+    crc_from: int = 0
+    counter: FrameCounter | None = None
+
+    @property
+    def payload_length(self) -> int:
+        """Bytes between sync word and CRC."""
+        return self.length - len(self.sync) - self.crc_bytes
+
+    @property
+    def passing(self) -> float:
+        """Share of the frames that are not damaged."""
+        return len(self.frames) / (len(self.frames) + self.damaged)
+
+    @property
+    def score(self) -> float:
+        """How sure it is that these are frames, 0 to 1: a check that they pass is proof."""
+        if self.crc_bytes == 2:
+            return 0.9 + 0.1 * self.passing
+        if self.crc:
+            return 0.9 * self.passing
+        base = 0.55 if self.framing == "cobs" else 0.45 + 0.05 * min(len(self.sync), 3)
+        return (base + (0.2 if self.counter is not None else 0.0)) * self.coverage * self.passing
+
+
+# Checks at the end of a frame: bytes, and the sum of what is before it.
+def _reflected(polynomial: int, initial: int) -> Callable[[bytes], int]:
+    """A CRC-16 that takes the least significant bit first."""
+    table = []
+    for byte in range(256):
+        crc = byte
+        for _ in range(8):
+            crc = crc >> 1 ^ polynomial if crc & 1 else crc >> 1
+        table.append(crc)
+    return lambda data: reduce(lambda crc, byte: crc >> 8 ^ table[(crc ^ byte) & 0xFF], data, initial)
+
+
+def _crc8(data: bytes) -> int:
+    """CRC-8/SMBUS: polynomial 0x07."""
+    crc = 0
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = (crc << 1 ^ 0x07) & 0xFF if crc & 0x80 else crc << 1
+    return crc
+
+
+CHECKS: Mapping[str, tuple[int, Callable[[bytes], int]]] = {
+    "ibm-3740": (2, lambda data: binascii.crc_hqx(data, 0xFFFF)),
+    "xmodem": (2, lambda data: binascii.crc_hqx(data, 0)),
+    "modbus": (2, _reflected(0xA001, 0xFFFF)),
+    "arc": (2, _reflected(0xA001, 0)),
+    "kermit": (2, _reflected(0x8408, 0)),
+    "crc-8": (1, _crc8),
+    "sum-8": (1, lambda data: sum(data) & 0xFF),
+    "xor-8": (1, lambda data: reduce(xor, data, 0)),
+}
+"""By name: bytes, and what they hold; the first two are those that the driver checks."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Check:
+    """A check at the end of frames: its name in `CHECKS`, byte order, and the first byte that it covers."""
+
+    name: str = ""
+    order: Literal["big", "little"] = "big"
+    begin: int = 0
+
+    @property
+    def size(self) -> int:
+        """How many bytes it takes."""
+        return CHECKS[self.name][0] if self.name else 0
+
+    def passed(self, frames: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        """Which frames (uint8 ``[n, length]``) pass it, bool ``[n]``; all, if it is none."""
+        if not self.name:
+            return np.ones(len(frames), np.bool_)
+        size, check = CHECKS[self.name]
+        ends = (frame.tobytes() for frame in frames)
+        return np.array(
+            [check(one[self.begin : -size]) == int.from_bytes(one[-size:], self.order) for one in ends], bool
+        )
+
+
+def _check_of(frames: NDArray[np.uint8], sync: int) -> _Check | None:
+    """The check that most frames pass; None if there is none."""
+    frames = frames[:_MOST_CHECKED]
+    if len(np.unique(frames, axis=0)) < 3:
+        return None
+    for name, (size, _) in CHECKS.items():
+        for begin in dict.fromkeys((sync, 0)):
+            if frames.shape[1] - begin <= size:
+                continue
+            for order in _ORDERS[:size]:
+                check = _Check(name, order, begin)
+                if not check.passed(frames[:_FIRST_CHECKED]).any():
+                    continue
+                passed = check.passed(frames)
+                # Frames that are all alike say nothing: what they end with may be a constant.
+                kinds = len(np.unique(frames[passed], axis=0))
+                if passed.mean() >= _LEAST_PASSING[size] and kinds >= 3:
+                    return check
+    return None
+
+
+@dataclass(slots=True)
+class _Periods:
+    """How often bytes are the same a number of bytes later.
+
+    Args:
+        data: uint8 ``[n]``.
+    """
+
+    data: NDArray[np.uint8]
+    shares: dict[int, float] = field(default_factory=dict)
+
+    def likely(self) -> list[int]:
+        """Lengths that a frame may have, the likeliest first; the shorter of two that are as likely."""
+        most = min(LONGEST_FRAME, len(self.data) // LEAST_FRAMES)
+        for lag in range(3, most + 1):
+            self.shares[lag] = float((self.data[lag:] == self.data[:-lag]).mean())
+        best = sorted(self.shares, key=lambda lag: (-round(self.shares[lag], 2), lag))
+        return best[:_MOST_LAGS]
+
+
+def sync_frames(data: bytes) -> BinaryFrames | None:
+    """Frames of one length that begin with the same bytes; None if there are none."""
+    numbers = np.frombuffer(data, np.uint8)
+    best: BinaryFrames | None = None
+    for length in _Periods(numbers).likely():
+        found = _behind_sync(numbers, length)
+        if found is not None and (best is None or found.score > best.score + 0.01):
+            best = found
+    if best is None:
+        return None
+    # Two frames in a row are as regular as one.
+    for length in (part for part in range(3, best.length) if best.length % part == 0):
+        found = _behind_sync(numbers, length)
+        if found is not None and found.score >= best.score:
+            return found
+    return best
+
+
+def _behind_sync(numbers: NDArray[np.uint8], length: int) -> BinaryFrames | None:
+    """Frames of that length; None if there are none."""
+    best: BinaryFrames | None = None
+    tried: set[bytes] = set()
+    for anchors in _anchors(numbers, length):
+        grid = _rows(numbers, anchors, length)
+        modes = np.array([np.bincount(column, minlength=256).argmax() for column in grid.T], np.uint8)
+        constant = (grid == modes).mean(axis=0) >= _CONSTANT
+        if constant.all() or not constant.any():
+            continue
+        sync = _sync_word(modes, constant)
+        if sync in tried or not sync:
+            continue
+        tried.add(sync)
+        found = _with_sync(numbers, length, sync)
+        if found is not None and (best is None or found.score > best.score):
+            best = found
+    return best
+
+
+def _anchors(numbers: NDArray[np.uint8], length: int) -> Iterator[NDArray[np.int64]]:
+    """Places of the bytes, and of pairs of them, that most often come again a frame later."""
+    same = numbers[length:] == numbers[:-length]
+    words = numbers[:-length].astype(np.int64)
+    pairs = same[:-1] & same[1:]
+    for again, values in ((pairs, 256 * words[:-1] + words[1:]), (same, words)):
+        counts = np.bincount(values[again], minlength=65_536)
+        counts[list(_IDLE)] = 0  # as pairs, 00 00 and 00 ff
+        counts[[0xFF00, 0xFFFF]] = 0
+        for value in np.argsort(-counts, kind="stable")[:_MOST_ANCHORS].tolist():
+            if counts[value] >= LEAST_FRAMES - 1:
+                yield np.flatnonzero(again & (values == value))
+
+
+def _rows(numbers: NDArray[np.uint8], places: NDArray[np.int64], length: int) -> NDArray[np.uint8]:
+    """The bytes from each place on, uint8 ``[n, length]``."""
+    rows: NDArray[np.uint8] = np.lib.stride_tricks.sliding_window_view(numbers, length)[places]
+    return rows
+
+
+def _sync_word(modes: NDArray[np.uint8], constant: NDArray[np.bool_]) -> bytes:
+    """The bytes in a row that tell most, of those that are the same in all frames.
+
+    Args:
+        modes: uint8 ``[length]``, what each place of a frame holds most often.
+        constant: bool ``[length]``, where that is so in nearly all frames; not everywhere.
+    """
+    length = len(modes)
+    best, told = b"", 0
+    for first in np.flatnonzero(constant & ~np.roll(constant, 1)).tolist():
+        run = next(k for k in range(length) if not constant[(first + k) % length])
+        word = bytes(int(modes[(first + k) % length]) for k in range(run))
+        # What idles and what counts far have such bytes everywhere.
+        word = word.lstrip(_IDLE).rstrip(_IDLE)[:LONGEST_SYNC]
+        if (tells := sum(byte not in _IDLE for byte in word)) > told:
+            best, told = word, tells
+    return best
+
+
+def _with_sync(numbers: NDArray[np.uint8], length: int, sync: bytes) -> BinaryFrames | None:
+    """Frames of that length behind that sync word; None if they are too few."""
+    found = _places(numbers, length, sync)
+    chained = found[_chained(found, length)]
+    frames = _rows(numbers, chained, length)
+    if len(frames) < LEAST_FRAMES:
+        return None
+    check = _check_of(frames, len(sync))
+    for shorter in range(len(sync) - 1, 0, -1) if check is None else ():
+        # A length or an id may be constant, too, and the check begin in the middle of it.
+        check = _check_of(frames, shorter)
+        if check is not None:
+            sync = sync[:shorter]
+            found = _places(numbers, length, sync)
+            break
+    checked = check is not None
+    check = check or _Check()
+    frames = _rows(numbers, found, length)
+    passed = check.passed(frames)
+    # A frame between two stretches of noise passes its check; else another one must be beside it.
+    there = _chained(found, length) | passed if checked else _chained(found, length)
+    found, frames, passed = found[there], frames[there], passed[there]
+    gaps = np.diff(found)
+    count = 1 + int(np.maximum(gaps // length, 1).sum())
+    span = int(found[-1] - found[0]) + length
+    counter = None
+    whole = frames[passed]
+    if len(whole) > 1:
+        payloads = whole[:, len(sync) : length - check.size]
+        near = np.diff(found[passed]) < 2 * length
+        counter = counter_between(payloads[:-1][near], payloads[1:][near])
+    return BinaryFrames(
+        "sync",
+        sync,
+        length,
+        whole,
+        int((~passed).sum()),
+        span / count,
+        min(1.0, len(found) * length / span),
+        check.name,
+        check.order,
+        check.size,
+        check.begin,
+        counter,
+    )
+
+
+def _places(numbers: NDArray[np.uint8], length: int, sync: bytes) -> NDArray[np.int64]:
+    """Where the sync word is with a whole frame behind it, int64 ``[n]``."""
+    there = np.ones(len(numbers) - length + 1, np.bool_)
+    for k, byte in enumerate(sync):
+        there &= numbers[k : k + len(there)] == byte
+    return np.flatnonzero(there)
+
+
+def _chained(places: NDArray[np.int64], length: int) -> NDArray[np.bool_]:
+    """Which of the places have another one a frame before or behind, bool ``[n]``."""
+    return np.isin(places + length, places) | np.isin(places - length, places)
+
+
+def cobs_frames(data: bytes) -> BinaryFrames | None:
+    """COBS frames of one length with a zero byte behind each; None if there are none."""
+    pieces = [piece for piece in data.split(b"\0")[1:-1] if piece]
+    if len(pieces) < LEAST_FRAMES:
+        return None
+    bodies: list[bytes] = []
+    for piece in pieces:
+        try:
+            bodies.append(cobs.decode(piece))
+        except cobs.DecodeError:
+            bodies.append(b"")
+    length, times = Counter(map(len, filter(None, bodies))).most_common(1)[0] if any(bodies) else (0, 0)
+    if times < 0.5 * len(bodies) or length < 3:
+        return None
+    of_length = np.array([len(body) == length for body in bodies])
+    frames = np.array([list(body) for body in bodies if len(body) == length], np.uint8)
+    found = _check_of(frames, 0)
+    if found is None and times < 0.9 * len(bodies):
+        return None
+    check = found or _Check()
+    passed = check.passed(frames)
+    whole = np.flatnonzero(of_length)[passed]
+    payloads = frames[passed][:, : length - check.size]
+    near = np.diff(whole) == 1
+    counter = counter_between(payloads[:-1][near], payloads[1:][near]) if len(whole) > 1 else None
+    between = sum(map(len, pieces)) / len(pieces) + 1
+    return BinaryFrames(
+        "cobs",
+        b"",
+        length,
+        frames[passed],
+        len(bodies) - len(whole),
+        between,
+        1.0,
+        check.name,
+        check.order,
+        check.size,
+        check.begin,
+        counter,
+    )

@@ -1,0 +1,276 @@
+"""Lines of text in a stream of bytes: what separates columns, which are numbers, and which lines are damaged.
+
+Columns are judged by the great majority of the lines, so that noise, or a message of the device now and
+then, changes nothing.
+"""
+
+from __future__ import annotations
+
+import binascii
+import re
+from collections import Counter
+from dataclasses import dataclass
+from functools import reduce
+from operator import xor
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+SEPARATORS = (",", ";", "\t", "|", " ")
+MAJORITY = 0.8
+"""What so many of the lines have in common holds for all; the others are damaged."""
+_LEAST_LINES = 3
+_LEAST_STEPS = 5
+_MOST_RESETS = 2
+_WRAP = 256
+"""What counters wrap at is a multiple of it."""
+_ENDS = 5
+"""Lines at each end by which the growth of a column is judged."""
+_NUMBER = {
+    mark: re.compile(rf"\s*[+-]?(\d+{re.escape(mark)}?\d*|{re.escape(mark)}\d+)([eE][+-]?\d+)?\s*")
+    for mark in (".", ",")
+}
+"""A number, by decimal mark."""
+_CHECKSUM = re.compile(r"\*([0-9A-Fa-f]{4}|[0-9A-Fa-f]{2})$")
+_PREFIX = re.compile(r"[!$]?[A-Za-z_-][A-Za-z0-9_-]{0,14}")
+_PRINTABLE = re.compile(r"[\t -~]*")
+_SUMS: Mapping[int, tuple[str, Callable[[bytes], int]]] = {
+    2: ("xor", lambda text: reduce(xor, text, 0)),
+    4: ("crc16", lambda text: binascii.crc_hqx(text, 0xFFFF)),
+}
+"""Checksums, by the digits that they have: name, and what it is of the bytes before the ``*``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A column of lines.
+
+    Attributes:
+        name: as the header has it, else ``c1``, ``c2`` ...
+        numeric: whether it is a number in all lines that are not damaged.
+        least: least value; 0 of a text.
+        most: largest one.
+        step: by how much it counts, if it is whole numbers that do; else 0.
+        grows: whether it never falls, and grows at all.
+        per_line: by how much it grows from line to line, on average.
+        last: its last text.
+    """
+
+    name: str
+    numeric: bool
+    least: float = 0.0
+    most: float = 0.0
+    step: float = 0.0
+    grows: bool = False
+    per_line: float = 0.0
+    last: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class TextLines:
+    """Lines of text.
+
+    Attributes:
+        lines: whole lines, oldest first, without their ends.
+        delimiter: what ends one; a carriage return before a line feed is none of it.
+        separator: between columns; empty if there is one column.
+        decimal: decimal mark of the numbers.
+        prefix: the first field of each line, where it is the same word in all; else empty.
+        checksum: behind a ``*``: "xor", "crc16", "unknown", or "none".
+        columns: those of most lines, without prefix.
+        header: whether the first line names the columns.
+        damaged: lines that are not like most: other columns, no number where most have one, bytes that are
+            no text, or a wrong checksum.
+    """
+
+    lines: Sequence[str]
+    delimiter: str
+    separator: str
+    decimal: str
+    prefix: str
+    checksum: str
+    columns: Sequence[Column]
+    header: bool
+    damaged: Sequence[str]
+
+
+def text_lines(data: bytes) -> TextLines | None:
+    """Lines of text and their columns; None if there are not even three whole lines."""
+    for delimiter in (b"\n", b"\r", b";"):
+        # The first piece may lack its beginning, the last its end.
+        first, *pieces = data.split(delimiter)
+        lines = [line for piece in pieces[:-1] if (line := _text(piece))]
+        if len(lines) >= _LEAST_LINES:
+            if first.startswith(b"#") or _is_header(_text(first), lines[0]):
+                lines = [_text(first), *lines]
+            return _columns_of(lines, delimiter.decode())
+    return None
+
+
+def _text(piece: bytes) -> str:
+    return piece.decode("ascii", "replace").strip("\r\n")
+
+
+def _is_header(first: str, second: str) -> bool:
+    """Whether a line is a header: words, where the next one has numbers."""
+    separator, decimal = _marks_of([second])
+    fields = first.split(separator) if separator else [first]
+    same = len(fields) == (len(second.split(separator)) if separator else 1)
+    return (
+        same
+        and not any(_NUMBER[decimal].fullmatch(one) for one in fields)
+        and not second.startswith(fields[0])
+    )
+
+
+def _marks_of(lines: Sequence[str]) -> tuple[str, str]:
+    """What stands between columns, and the decimal mark of the numbers in them.
+
+    The separator is the mark that most lines have as often as each other, and with which most columns are
+    numbers. A decimal comma is as frequent as the separator, but then leaves no numbers.
+    """
+    best, most = ("", "."), 0.0
+    for separator in SEPARATORS:
+        rows = [line.split(separator) for line in lines]
+        width, agreeing = Counter(map(len, rows)).most_common(1)[0]
+        if width == 1:
+            continue
+        fields = [field for row in rows if len(row) == width for field in row]
+        for decimal in (mark for mark in (".", ",") if mark != separator):
+            numbers = sum(_NUMBER[decimal].fullmatch(field) is not None for field in fields)
+            score = agreeing / len(lines) * (1 + numbers / len(fields))
+            if score > most + 0.02:
+                best, most = (separator, decimal), score
+    if not best[0]:
+        alone = {
+            mark: sum(number.fullmatch(line) is not None for line in lines)
+            for mark, number in _NUMBER.items()
+        }
+        return "", max(alone, key=lambda mark: alone[mark])
+    return best
+
+
+def _columns_of(lines: Sequence[str], delimiter: str) -> TextLines:
+    checksum = _checksum_of(lines)
+    plain = [_CHECKSUM.sub("", line) if checksum != "none" else line for line in lines]
+    separator, decimal = _marks_of(plain[1:] or plain)
+    rows = [
+        [field.strip() for field in line.split(separator)] if separator else [line.strip()] for line in plain
+    ]
+    width = Counter(len(row) for row in rows[1:] or rows).most_common(1)[0][0]
+    number = _NUMBER[decimal]
+    header = (
+        len(rows[0]) == width
+        and not any(number.fullmatch(one) for one in rows[0])
+        and any(number.fullmatch(one) for one in rows[1])
+        and rows[0][0] != rows[1][0]
+    )
+    names = [name.lstrip("#").strip() for name in rows[0]] if header else []
+    sound = [
+        len(row) == width and _PRINTABLE.fullmatch(line) is not None and _sum_fits(line, checksum)
+        for row, line in zip(rows, lines, strict=True)
+    ]
+    sound[0] &= not header
+    prefix = _prefix_of([row for row, good in zip(rows, sound, strict=True) if good], width)
+    first = 1 if prefix else 0
+    numeric = []
+    for k in range(first, width):
+        there = [number.fullmatch(row[k]) is not None for row, good in zip(rows, sound, strict=True) if good]
+        numeric.append(bool(there) and sum(there) >= MAJORITY * len(there))
+    for at, row in enumerate(rows):
+        sound[at] = (
+            sound[at]
+            and (not prefix or row[0] == prefix)
+            and all(number.fullmatch(row[first + k]) for k, is_number in enumerate(numeric) if is_number)
+        )
+    places = np.flatnonzero(sound)
+    columns = [
+        _column(
+            [rows[at][first + k] for at in places.tolist()],
+            places,
+            names[first + k] if names else f"c{k + 1}",
+            decimal if is_number else "",
+        )
+        for k, is_number in enumerate(numeric)
+    ]
+    damaged = [line for line, good in zip(lines[header:], sound[header:], strict=True) if not good]
+    return TextLines(lines, delimiter, separator, decimal, prefix, checksum, columns, header, damaged)
+
+
+def _prefix_of(rows: Sequence[Sequence[str]], width: int) -> str:
+    """The word that nearly all rows begin with; empty if there is none."""
+    if width == 1 or not rows:
+        return ""
+    word, times = Counter(row[0] for row in rows).most_common(1)[0]
+    return word if times >= MAJORITY * len(rows) and _PREFIX.fullmatch(word) else ""
+
+
+def _column(texts: Sequence[str], places: NDArray[np.int64], name: str, decimal: str) -> Column:
+    """One column.
+
+    Args:
+        texts: its fields, of the lines that are not damaged.
+        places: int64 ``[n]``, which lines those are.
+        name: of the column.
+        decimal: decimal mark of the numbers; empty if it is text.
+    """
+    if not texts or not decimal:
+        return Column(name, numeric=False, last=texts[-1] if texts else "")
+    values = np.array([float(text.replace(decimal, ".")) for text in texts])
+    whole = all(text.isdigit() for text in texts)
+    rises = np.diff(values) >= 0
+    grows = bool(len(rises) and rises.mean() >= 0.98 and values[-1] > values[0])
+    ends = min(_ENDS, len(values) // 2)
+    per_line = 0.0
+    if ends:
+        # Medians: one damaged digit must not count.
+        lines = np.median(places[-ends:]) - np.median(places[:ends])
+        per_line = float((np.median(values[-ends:]) - np.median(values[:ends])) / lines)
+    step = _step_of(values, places) if whole else 0.0
+    return Column(name, True, float(values.min()), float(values.max()), step, grows, per_line, texts[-1])
+
+
+def _step_of(values: NDArray[np.float64], places: NDArray[np.int64]) -> float:
+    """By how much whole numbers count from line to line; 0 if they do not.
+
+    Nearly all steps are the same. A few lines may be missing, a digit damaged, and a counter wraps; but one
+    that begins again often, as a number of a channel does, counts no lines.
+    """
+    lines, steps = np.diff(places), np.diff(values)
+    if len(steps) < _LEAST_STEPS:
+        return 0.0
+    each = steps / lines
+    step, _ = Counter(each.tolist()).most_common(1)[0]
+    same = each == step
+    if step <= 0 or same.mean() < MAJORITY:
+        return 0.0
+    resets = (steps[1:-1] < 0) & same[:-2] & same[2:]
+    beyond = (steps[1:-1] - step * lines[1:-1]) % _WRAP != 0
+    return float(step) if (resets & beyond).sum() <= _MOST_RESETS else 0.0
+
+
+def _sum_fits(line: str, checksum: str) -> bool:
+    """Whether the checksum of a line is right, as far as it is known."""
+    if checksum not in {"xor", "crc16"}:
+        return True
+    match = _CHECKSUM.search(line)
+    if match is None:
+        return False
+    text = line[: match.start()].encode("ascii", "replace").lstrip(b"$!")
+    name, made = _SUMS[len(match[1])]
+    return name == checksum and made(text) == int(match[1], 16)
+
+
+def _checksum_of(lines: Sequence[str]) -> str:
+    found = [line for line in lines if _CHECKSUM.search(line) is not None]
+    if len(found) < MAJORITY * len(lines):
+        return "none"
+    for name, _ in _SUMS.values():
+        if sum(_sum_fits(line, name) for line in found) >= MAJORITY * len(found):
+            return name
+    return "unknown"
