@@ -1,4 +1,4 @@
-"""``daqsvc status``: how everything stands, by the word of the service that runs."""
+"""``daqsvc status``: the state of all parts, as the running service reports it."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ class Probe:
     Attributes:
         name: name of the sensor.
         column: its column in the stream, counted from the shaft-centred position.
-        angle_deg: where it points, from +x against the clock.
+        angle_deg: where it points, from +x anticlockwise.
         um_per_unit: micrometres in a unit of the column.
     """
 
@@ -36,7 +36,7 @@ def shaft_axes_deg(angles_deg: tuple[float, float], *, clockwise: bool) -> tuple
     A shaft that turns clockwise is looked at from its other end: x is mirrored, gravity still points down.
 
     Args:
-        angles_deg: where they point on the machine, from +x against the clock.
+        angles_deg: where they point on the machine, from +x anticlockwise.
         clockwise: whether the shaft turns clockwise there.
     """
     x, y = angles_deg

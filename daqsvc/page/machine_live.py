@@ -59,7 +59,7 @@ class Sensor(NamedTuple):
         name: its name.
         kind: ``"proximity"``, ``"accelerometer"``, ``"keyphasor"`` and the like.
         unit: of its samples.
-        angle_deg: where a probe points, from +x against the clock; None for others.
+        angle_deg: where a probe points, from +x anticlockwise; None for others.
         threshold: where a keyphasor's pulse begins; None for others.
         edge: the edge of that pulse that marks a revolution.
         hysteresis: how far the voltage must go back before there is another one.

@@ -196,7 +196,7 @@ class AvailabilityPayload(Stamped):
     schema_: Literal["daqsvc.availability/1"] = Field(
         "daqsvc.availability/1", alias="schema", description=SCHEMA_ABOUT
     )
-    state: Literal["online", "offline"] = Field(description="whether the box speaks")
+    state: Literal["online", "offline"] = Field(description="whether the box is online")
     reason: str = Field(description="why: connected, stopped, or connection lost")
 
 

@@ -48,7 +48,11 @@ def topics() -> dict[str, Topic]:
     command = _BOX.command("MACHINE", "VERB")
     return {
         "availability": Topic(
-            _BOX.availability, "daqsvc.availability/1", 1, "yes", "whether the box speaks; also its last will"
+            _BOX.availability,
+            "daqsvc.availability/1",
+            1,
+            "yes",
+            "whether the box is online; also its last will",
         ),
         "status": Topic(_BOX.status, "daqsvc.status/1", 1, "no", "figures of the service, each second"),
         "alarm": Topic(
@@ -83,7 +87,7 @@ def topics() -> dict[str, Topic]:
             "daqsvc.snapshot-command/1",
             1,
             "never",
-            "to the box: a wish for a snapshot",
+            "to the box: make a snapshot now",
         ),
         "response": Topic(
             f"{command}/{ANSWER}", "daqsvc.response/1", 1, "no", "from the box: what came of a command"

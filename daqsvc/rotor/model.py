@@ -292,7 +292,7 @@ class RotorParameters:
         natural_frequency_hz: undamped natural frequency of the healthy shaft, omega_s / 2 pi.
         damping_ratio: zeta of the healthy shaft.
         eccentricity_um: distance of the centre of mass from the geometric centre.
-        heavy_spot_deg: angle of the heavy spot from the keyphasor mark, against the clock.
+        heavy_spot_deg: angle of the heavy spot from the keyphasor mark, anticlockwise.
         clearance_um: radial clearance c.
         static_sag_um: sag of the shaft under its weight, towards -y.
         contact_stiffness: K* = K_beta / (M c omega_s^2), dimensionless.

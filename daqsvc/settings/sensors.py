@@ -101,7 +101,7 @@ class ProximityProbe(BaseSensor):
         examples=["[-18.0, -2.0]"],
     )
     angle_deg: AngleDeg | None = Field(
-        default=None, description="where the sensor points, from +x against the clock", examples=[45.0]
+        default=None, description="where the sensor points, from +x anticlockwise", examples=[45.0]
     )
     ac_coupled: bool = Field(
         default=False, description="says that it shows motion only, not the static position of the shaft"
@@ -116,7 +116,7 @@ class Accelerometer(BaseSensor):
     type: Annotated[Literal["accelerometer"], Field(description=TYPE, examples=["accelerometer"])]
     unit: Annotated[Literal["g", "m/s2"], Field(description="unit of the acceleration", examples=["g"])]
     angle_deg: AngleDeg | None = Field(
-        default=None, description="where the sensor points, from +x against the clock", examples=[45.0]
+        default=None, description="where the sensor points, from +x anticlockwise", examples=[45.0]
     )
 
 

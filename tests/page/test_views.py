@@ -135,7 +135,7 @@ def test_lines_of_a_spectrum_have_the_amplitudes_of_their_waves() -> None:
 
 def test_forward_and_backward_whirl_are_told_apart() -> None:
     live = MachineLive(about())
-    live.hear(told(turning(8.0, 20.0, -20.0j)))  # x leads y: it turns against the clock
+    live.hear(told(turning(8.0, 20.0, -20.0j)))  # x leads y: it turns anticlockwise
     shown = VIEWS["full-spectrum"].shown(live, {"probes": "left,right", "revolutions": "80"})
     rows = {name: float(value) for name, value, _ in shown.rows}
     assert rows["1X forward"] == pytest.approx(20.0, rel=0.05)

@@ -242,7 +242,7 @@ def sensor_tables(answers: Answers) -> Iterator[str]:
             if sensitivity is not None:
                 yield entry("zero_v", _ZERO_V, "gap voltage with the shaft centred: measure it")
                 yield entry("gap_ok_v", _OK_V, "beyond, the probe is not believed; see its manual")
-            yield entry("angle_deg", get("angle"), "0 to the right, 90 upwards, against the clock")
+            yield entry("angle_deg", get("angle"), "0 to the right, 90 upwards, anticlockwise")
         if sensor.type == "keyphasor":
             yield entry("threshold_v", get("threshold"), "half-way up a pulse: look at it on a scope")
             yield entry("hysteresis_v", 0.5)
@@ -304,7 +304,7 @@ def _bearing_table(bearings: list[Sensor], keyphasor: str | None) -> Iterator[st
     if keyphasor is not None:
         yield entry("keyphasor", keyphasor, "the speed is measured")
     else:
-        yield "# Without a keyphasor machine.speed_rpm must be right to 1 %."
+        yield "# Without a keyphasor machine.speed_rpm must be within 1 % of the true speed."
     yield entry("calibrate_s", 30.0, "the first seconds are the healthy machine; kept over restarts")
     tables = []
     for one in bearings:

@@ -64,7 +64,7 @@ SENSOR_TOPICS = {
     ),
     "angle": Topic(
         "Where does {channel} point, in degrees?",
-        "0 to the right (+x), 90 upwards, counted against the clock; seen from the driving end.",
+        "0 to the right (+x), 90 upwards, counted anticlockwise; seen from the driving end.",
     ),
     "threshold": Topic("Level that a pulse of {channel} crosses, in V", "Half-way up the pulse."),
     "bearing": Topic(

@@ -80,7 +80,7 @@ class RotorSetup:
     Attributes:
         probes: names of the two channels.
         rotor: what is known about the rotor.
-        probe_angles_deg: where they point, from +x against the clock.
+        probe_angles_deg: where they point, from +x anticlockwise.
         speed_rpm: shaft speed, negative if the shaft turns clockwise; may be None with a keyphasor.
         speed_step_rpm: step of the stated speed's last digit, which it is rounded to; 0: it is exact.
         unit: unit of the probes' samples.

@@ -62,7 +62,7 @@ class SpeedEstimate:
     Attributes:
         speed_rpm: revolutions per minute, with the sign of the stated speed; positive if none was stated.
         uncertainty_rpm: its standard deviation.
-        direction: ``"forward"`` if the orbit turns with the stated speed (against the clock, from +x to +y,
+        direction: ``"forward"`` if the orbit turns with the stated speed (anticlockwise, from +x to +y,
             for a positive one or none), ``"backward"`` if against it: reversed rotation or swapped probes,
             ``"straight"`` if the orbit is too flat to tell.
     """
