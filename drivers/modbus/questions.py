@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-REGISTERS = ("uint16", "int16", "uint32", "int32", "float32")
+REGISTERS = ("uint16", "int16", "uint32", "int32", "float32", "float64")
+_OF_SAMPLES = REGISTERS[:5]
 _WAYS = {
     "values": "levels that the device measures itself",
     "waveform": "blocks of samples",
@@ -146,7 +147,7 @@ class _ModbusQuestions(BusQuestions):
         yield self.ask("channels", q.names, "vibration, temperature" if way == "values" else "x")
         if way == "values":
             return
-        yield self.choose("raw-type", dict.fromkeys(REGISTERS, ""), "int16")
+        yield self.choose("raw-type", dict.fromkeys(_OF_SAMPLES, ""), "int16")
         yield self.ask("scale", q.number, "0.001")
         ways = {"waveform": self._ask_waveform, "ring": self._ask_ring, "fifo": self._ask_fifo}
         yield from ways[way](answers)
@@ -196,7 +197,7 @@ class _ModbusQuestions(BusQuestions):
         unit = _unit(channel)
         default = "int16" if unit == "degC" else "uint16"
         yield self.ask_of(channel, "register-type", q.one_of(types), default, choices=types)
-        wide = answers[sensor_key(channel, "register-type")].endswith("32")
+        wide = _width(answers[sensor_key(channel, "register-type")]) > 1
         yield self.ask_of(channel, "order", q.exactly(orders), "ABCD", choices=orders, quiet=not wide)
         is_float = answers[sensor_key(channel, "register-type")].startswith("float")
         scale = "1" if is_float else {"degC": "0.1", "mm/s": "0.01"}.get(unit, "1")
@@ -392,7 +393,7 @@ def _unit(channel: str) -> str:
 
 def _width(raw_type: str) -> int:
     """Registers of a number."""
-    return 2 if raw_type.endswith("32") else 1
+    return int(raw_type[-2:]) // 16
 
 
 def _sample_registers(answers: Answers) -> int:
