@@ -1,6 +1,6 @@
 """Every block of the pages is one that something checks, and every line of another program is known here.
 
-What reads TOML, JSON, Python and the lines of daqsvc is test_snippets.py.
+What runs the lines of daqsvc is test_shown_commands.py; what reads TOML, JSON and Python, test_snippets.py.
 """
 
 from __future__ import annotations
