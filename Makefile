@@ -73,6 +73,8 @@ check: $(READY)
 	@$(BIN)/lint-imports
 	@$(BIN)/codespell
 	@PYTHONPATH=tests $(BIN)/python -m prose
+	@$(BIN)/proselint check --config tests/prose/proselint.json README.md CONTRIBUTING.md \
+		docs/*.md docs/tutorials/*.md docs/reference/*.md docs/decisions/*.md
 
 bench: $(READY)
 	@missed=; for bench in tests/bench/bench_*.py; do PYTHONPATH=$(CURDIR):tests $(BIN)/python $$bench || missed="$$missed $$bench"; done; \
