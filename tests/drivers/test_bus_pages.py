@@ -38,9 +38,18 @@ def test_the_pages_of_a_multiplexed_message_are_streams(tmp_path):
     signals = 'SG_ Page M : 0|8@1+ (1,0) [0|0] "" A\n SG_ Temperature m0 : 8|16@1- (0.1,0) [0|0] "degC" A\n'
     signals += ' SG_ Supply m1 : 8|16@1+ (0.01,0) [0|0] "" A\n'
     dbc.write_text(f'VERSION ""\nBU_: A\nBO_ 801 Slow: 8 A\n {signals}')
-    bus, _, _, pages, _ = blocks("can.md")
+    bus, _, _, _, pages, _ = blocks("can.md")
     text = f"{bus}\n{pages}\n".replace("../devices/transmitter.dbc", f"{dbc}")
     assert list(machine(text, "supply", "supply").streams) == ["temperature", "supply"]
+
+
+def test_another_message_is_another_stream(tmp_path):
+    dbc = tmp_path / "drive.dbc"
+    signals = 'SG_ Speed : 0|16@1+ (1,0) [0|0] "" A\n SG_ WindingTemperature : 16|16@1- (0.1,0) [0|0] "" A\n'
+    dbc.write_text(f'VERSION ""\nBU_: A\nBO_ 802 MotorState: 8 A\n {signals}')
+    bus, _, _, several, _, _ = blocks("can.md")
+    text = f"{bus}\n{several}\n".replace("../devices/drive.dbc", f"{dbc}")
+    assert machine(text, "motor", "winding").streams["motor"].layout.channel_names == ("speed", "winding")
 
 
 def test_the_keys_of_a_serial_port_are_all_shown_with_their_defaults():
