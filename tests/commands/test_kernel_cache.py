@@ -189,6 +189,7 @@ def test_the_account_of_the_service_finds_what_the_service_has_compiled(
     assert chosen() == f"{places}/home/.cache/daqsvc/kernels", "what another account has compiled is not run"
 
 
+@pytest.mark.gives("S14")
 def test_a_place_that_others_can_write_is_not_trusted(places: Path, caplog: pytest.LogCaptureFixture) -> None:
     (places / "home").mkdir()
     (places / "home").chmod(0o777)

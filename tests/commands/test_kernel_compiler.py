@@ -103,7 +103,6 @@ def test_kernels_are_compiled_here_if_that_process_fails_which_is_said_once(
     assert re.fullmatch(why, here.removeprefix(HERE))
 
 
-@pytest.mark.gives("S14")
 def test_a_kernel_that_cannot_be_written_is_of_use_all_the_same(tmp_path: Path) -> None:
     """The directory could be written when it was chosen; the disk has filled up since."""
     done = used(tmp_path, "resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))")
