@@ -1,6 +1,7 @@
 """How Sphinx makes the site of the documentation: ``make docs``.
 
-Pages are plain Markdown that reads as well on a forge. What the site needs beyond that is in site_pages.py.
+Pages are plain Markdown that reads as well on a forge. What the site needs beyond that is in site_pages.py,
+and its search in site_search.py.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ author = "daqsvc developers"
 [release] = re.findall('__version__ = "(.+)"', (HERE.parent / "daqsvc/__init__.py").read_text("utf-8"))
 version = release
 
-extensions = ["myst_parser", "site_pages"]
+extensions = ["myst_parser", "site_pages", "site_search"]
 root_doc = "index"
 exclude_patterns = ["example_*"]
 highlight_language = "text"
@@ -27,6 +28,7 @@ myst_heading_anchors = 5
 
 html_theme = "furo"
 html_favicon = "favicon.svg"
+html_static_path = ["site_static"]
 html_title = f"daqsvc {release}"
 # The same sources make the same files: no times, no copies of the sources.
 html_last_updated_fmt = None

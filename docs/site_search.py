@@ -1,0 +1,100 @@
+"""A Sphinx extension: the search of the site finds sections and rows of tables, by any of the words.
+
+Sphinx finds pages that have every word. No page has every word of a message that was copied: some are
+names and numbers of this machine. And a page of the reference holds hundreds of things. Here each section is
+an entry, and so is each row of a table that has an anchor. ``site_search.js`` ranks them, in Sphinx's page.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from docutils import nodes
+from site_pages import ANCHOR
+from sphinx.search.en import SearchEnglish
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from sphinx.application import Sphinx
+
+SCRIPT = "site_search.js"
+INDEX = "site_search_index.js"
+_EXCERPT = 240
+
+
+def _words_apart(node: nodes.Node) -> Iterator[str]:
+    """The texts of a node, without the sections and the rows within it that are entries themselves."""
+    if isinstance(node, nodes.raw):
+        return
+    if isinstance(node, nodes.Text):
+        yield node.astext()
+        return
+    for child in node.children:
+        if not isinstance(child, nodes.section) and not _anchor(child):
+            yield from _words_apart(child)
+            # Paragraphs, and cells of a table, are words apart.
+            yield "" if isinstance(child, nodes.Inline | nodes.Text) else " "
+
+
+def _anchor(node: nodes.Node) -> str:
+    """The anchor of a row of a table, if it has one."""
+    if not isinstance(node, nodes.row):
+        return ""
+    return next((name for raw in node.findall(nodes.raw) for name in ANCHOR.findall(raw.astext())), "")
+
+
+def _text(node: nodes.Node) -> str:
+    return " ".join("".join(_words_apart(node)).split())
+
+
+def entries(doctree: nodes.document) -> Iterator[tuple[str, str, str]]:
+    """Anchor, title and text of all that can be found on a page."""
+    for section in doctree.findall(nodes.section):
+        title = _text(section.next_node(nodes.title) or section)
+        # The heading of the page is the page.
+        anchor = "" if section.parent is doctree else section["ids"][0]
+        yield anchor, title, _text(section).removeprefix(title).strip()
+    for row in doctree.findall(nodes.row):
+        if anchor := _anchor(row):
+            name, *cells = (_text(cell) for cell in row.children)
+            yield anchor, name, "; ".join(filter(None, cells))
+
+
+def _write_index(app: Sphinx, failure: Exception | None) -> None:
+    """Write all entries of the site, and how often each word is in each of them."""
+    if failure is not None or app.builder.format != "html":
+        return
+    language = SearchEnglish({})
+    pages = sorted(app.env.found_docs)
+    titles = [app.env.titles[page].astext() for page in pages]
+    found: list[tuple[int, str, str, str]] = []
+    terms: dict[str, list[tuple[int, int]]] = {}
+    lengths: list[int] = []
+    for number, page in enumerate(pages):
+        for anchor, title, text in entries(app.env.get_doctree(page)):
+            words = [language.stem(word) for word in language.split(f"{title} {title} {title} {text}")]
+            for word, times in Counter(words).items():
+                terms.setdefault(word, []).append((len(found), times))
+            lengths.append(len(words))
+            found.append((number, anchor, title, text[:_EXCERPT]))
+    index = {"pages": pages, "titles": titles, "entries": found, "lengths": lengths, "terms": terms}
+    text = json.dumps(index, ensure_ascii=False, separators=(",", ":"), sort_keys=True)
+    (Path(app.outdir) / "_static" / INDEX).write_text(f"const SITE_INDEX = {text};\n", encoding="utf-8")
+
+
+def _add_scripts(app: Sphinx, page: str, _: str, __: dict[str, Any], ___: nodes.document | None) -> None:
+    """Load the scripts where Sphinx searches: when the page is read, and before it searches."""
+    if page == "search":
+        for script in (INDEX, SCRIPT):
+            app.add_js_file(script, loading_method="defer")
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """See Sphinx."""
+    app.connect("html-page-context", _add_scripts)
+    app.connect("build-finished", _write_index)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,0 +1,105 @@
+"""The search box of the site: what users copy from the screen leads to its place in the reference."""
+
+from __future__ import annotations
+
+import random
+import re
+from typing import TYPE_CHECKING
+from urllib.parse import quote
+
+import pytest
+from support.browsers import browsing
+from support.docs_site import built_docs
+from support.paths import ROOT
+
+from daqsvc.errors.table import CODES
+from daqsvc.reference.counters import NAME, figures
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+pytestmark = [pytest.mark.integration, pytest.mark.long, pytest.mark.sources]
+GOLDEN = ROOT / "tests" / "guard" / "golden"
+MESSAGE = re.compile(r"^! machines/(.+ \[([A-Z]\d\d)\])$", re.MULTILINE)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The built site."""
+    return built_docs(tmp_path_factory)
+
+
+async def searched(site: Path, queries: Sequence[str]) -> list[list[str]]:
+    """The addresses of the first three results of each query, without a server: the site is read as files."""
+    found = []
+    async with browsing() as browser:
+        page = await (await browser.new_context()).new_page()
+        wrong: list[str] = []
+        page.on("console", lambda said: wrong.append(said.text) if said.type == "error" else None)
+        page.on("pageerror", lambda error: wrong.append(f"{error}"))
+        for query in queries:
+            await page.goto(f"{(site / 'search.html').as_uri()}?q={quote(query)}")
+            await page.wait_for_function(
+                "document.querySelector('#search-results h2').innerText == 'Search Results'"
+            )
+            links = await page.locator("#search-results li > a").all()
+            found.append([f"{await link.get_attribute('href')}" for link in links[:3]])
+        assert wrong == []
+    return found
+
+
+def messages() -> dict[str, str]:
+    """Of 25 codes a message that ``daqsvc check`` shows, by the code."""
+    texts = [file.read_text("utf-8") for file in sorted(GOLDEN.glob("broken-*.txt"))]
+    shown = [found.groups() for text in texts for found in MESSAGE.finditer(text)]
+    chance = random.Random(18)
+    chance.shuffle(shown)
+    by_code = {code: message for message, code in shown}
+    return {code: by_code[code] for code in chance.sample(sorted(by_code), 25)}
+
+
+async def test_a_counter_as_the_screen_shows_it_leads_to_its_row(site: Path) -> None:
+    paths = ["streams.NAME.frames_set_aside", "buses.NAME.rx_overflows", "buses.NAME.frames_unknown"]
+    paths += random.Random(18).sample([path for path in figures() if path not in paths], 10)
+    shown = [path.replace(NAME, "fan-de") for path in paths]
+    for path, found in zip(paths, await searched(site, shown), strict=True):
+        assert found[0] == f"reference/counters.html#{path}"
+
+
+async def test_a_message_leads_to_its_code(site: Path) -> None:
+    by_code = messages()
+    for code, found in zip(by_code, await searched(site, [*by_code.values()]), strict=True):
+        assert found[0].startswith(f"reference/errors.html#{code.lower()}-"), by_code[code]
+
+
+async def test_a_message_without_its_code_leads_to_the_errors(site: Path) -> None:
+    by_code = messages()
+    texts = [re.sub(r" \[\w+\]$", "", message) for message in by_code.values()]
+    right = 0
+    for (code, message), found in zip(by_code.items(), await searched(site, texts), strict=True):
+        assert any(link.startswith("reference/errors.html#") for link in found), (message, found)
+        right += any(link.startswith(f"reference/errors.html#{code.lower()}-") for link in found)
+    assert right >= 15, right
+
+
+async def test_codes_subjects_keys_topics_and_metrics_lead_to_their_places(site: Path) -> None:
+    first = {
+        "F07": "reference/errors.html#f07-the-value-is-of-another-type",
+        "pipeline.levels.window_s": "reference/keys-pipeline.html#pipeline-levels-window-s",
+        "alarms[2].sensor": "reference/keys-alarms.html#alarms-sensor",
+        "streams.fan.rate_hz": "reference/keys-streams.html#streams-name-rate-hz",
+        "daqsvc_stream_faults_total": "reference/metrics.html#daqsvc_stream_faults_total",
+        "daqsvc/plant/box1/status": "reference/topics.html#status",
+        "daqsvc trend --since": "reference/verbs.html#daqsvc-trend--since",
+        "calibrate": "calibration.html",
+        "snapshot": "recorder.html",
+    }
+    for where, found in zip(first.values(), await searched(site, [*first]), strict=True):
+        assert where in found, found
+
+
+async def test_codes_lead_to_the_errors_before_what_has_been_changed_or_decided(site: Path) -> None:
+    codes = [*CODES][::10]
+    for code, found in zip(codes, await searched(site, codes), strict=True):
+        assert found[0].startswith(f"reference/errors.html#{code.lower()}-")
