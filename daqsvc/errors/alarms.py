@@ -11,6 +11,8 @@ RESERVED_NAME = Code(
     " apart.",
     "Give the alarm another name.",
     _PAGE,
+    example='machine.toml:130: alarms[2].name = "alarm-flood": is an alarm that the service raises itself. '
+    "Remedy: give this one another name",
 )
 VOTE = Code(
     "A02",
@@ -18,6 +20,8 @@ VOTE = Code(
     "More sensors are asked for than there are, or sensors of different units would share one setpoint.",
     "Write a smaller vote, or add sensors of one unit.",
     _PAGE,
+    example="machine.toml:142: alarms[3].vote = 3: cannot be reached by 2 sensors. Remedy: write vote = 2 or "
+    "less, or add sensors",
 )
 NO_SETPOINT = Code(
     "A03",
@@ -25,6 +29,7 @@ NO_SETPOINT = Code(
     "Without alert and danger the alarm would never come.",
     "Add alert, danger or both.",
     _PAGE,
+    example="machine.toml:109: alarms[0]: has neither alert nor danger. Remedy: add alert, danger or both",
 )
 SETPOINT_ORDER = Code(
     "A04",
@@ -33,6 +38,8 @@ SETPOINT_ORDER = Code(
     "zones keep to the order of the zones.",
     "Swap the two, or correct one.",
     _PAGE,
+    example="machine.toml:113: alarms[0].alert = 80.0: must be below danger = 60. Remedy: swap the two, or "
+    "correct one of them",
 )
 UNFIT_SETPOINT = Code(
     "A05",
@@ -41,6 +48,8 @@ UNFIT_SETPOINT = Code(
     "amplitudes may have a phase.",
     "Remove the key, or take a measure that it goes with.",
     _PAGE,
+    example="machine.toml:113: alarms[0].alert = -40.0: must be greater than 0: rms is never less. Remedy: "
+    "write a positive setpoint",
 )
 NEVER_REACHED = Code(
     "A06",
@@ -49,6 +58,8 @@ NEVER_REACHED = Code(
     "move as far.",
     "Correct the setpoint, or the limits of the sensor.",
     _PAGE,
+    example='machine.toml:113: alarms[0].alert = 40.0: is never reached: the channel of "probe-x" carries '
+    "8.327 um at most. Remedy: correct it, or scale and sensitivity of the channel and its sensor",
 )
 DEADBAND = Code(
     "A07",
@@ -57,6 +68,8 @@ DEADBAND = Code(
     "room between.",
     "Write a smaller deadband, e.g. a twentieth of the setpoint.",
     _PAGE,
+    example="machine.toml:115: alarms[0].deadband = 40.0: must be smaller than the setpoint 40, or the alarm "
+    "never returns. Remedy: write e.g. deadband = 2",
 )
 UNFIT_MEASURE = Code(
     "A08",
@@ -65,6 +78,9 @@ UNFIT_MEASURE = Code(
     "sensors that send a level.",
     "Write the measure that the message names, or correct the type of the sensor.",
     _PAGE,
+    example='machine.toml:142: alarms[3].measure = "gap_voltage": is not known: "probe-x" has no '
+    "sensitivity_mv_per_unit. Remedy: add sensitivity_mv_per_unit and zero_v to the sensor, or write "
+    'measure = "rms" or "peak", with setpoints in um',
 )
 NOT_MEASURED = Code(
     "A09",
@@ -72,6 +88,8 @@ NOT_MEASURED = Code(
     "An alarm on the level of a sensor needs a detector that measures it.",
     "Write a table [pipeline.levels]; it may be empty.",
     _PAGE,
+    example='machine.toml:54: alarms[0].sensor = "accel-de": nothing measures its level. Remedy: write a '
+    "table [pipeline.levels] (it may be empty), or remove the alarm",
 )
 NO_REFERENCE = Code(
     "A10",
@@ -79,6 +97,9 @@ NO_REFERENCE = Code(
     "Setpoints of a phase are how far it may be from that of the machine in good order.",
     "Add reference_deg, the phase that was measured then.",
     _PAGE,
+    example="machine.toml:90: alarms[0]: does not say from where 1x_phase_lag counts: its setpoints are how "
+    "far it may be from a reference, either way. Remedy: add reference_deg, the phase of the machine "
+    "in good order, e.g. reference_deg = 135.0",
 )
 TRIP_MULTIPLY = Code(
     "A11",
@@ -87,6 +108,8 @@ TRIP_MULTIPLY = Code(
     "setpoints above 0.",
     "Add what is missing, or remove trip_multiply.",
     _PAGE,
+    example="machine.toml:145: alarms[3].trip_multiply = 2.0: never holds: nothing says when the machine "
+    "starts up. Remedy: write a table [alarm_handling.start_up], or remove it",
 )
 ALWAYS_STARTING = Code(
     "A12",
@@ -94,6 +117,8 @@ ALWAYS_STARTING = Code(
     "The range of start_up holds the nominal speed.",
     "End the range below machine.speed_rpm.",
     _PAGE,
+    example="machine.toml:136: alarm_handling.start_up.between = [60.0, 660.0]: holds machine.speed_rpm, 600 "
+    "rpm: the machine would always be starting up. Remedy: end it below 600, e.g. between = [60, 540]",
 )
 SILENT_DETECTOR = Code(
     "A13",
@@ -101,6 +126,8 @@ SILENT_DETECTOR = Code(
     "The alarm follows a detector that is not configured, or that gives probabilities only.",
     "Write the table of the detector, correct its rule, or remove the alarm.",
     _PAGE,
+    example='machine.toml:102: alarms[0].detector = "bearing": this detector is not configured. Remedy: '
+    "write a table [pipeline.bearing], or remove the alarm",
 )
 UNFIT_ZONES = Code(
     "A14",
@@ -109,6 +136,9 @@ UNFIT_ZONES = Code(
     "of a shaft.",
     "Write the zones that go with the sensor, or setpoints in place of them.",
     _PAGE,
+    example='machine.toml:104: alarms[1].zones = { standard = "iso-20816-3", group = 1, support = "rigid" }: '
+    'are those of the velocity of a housing, but "probe-x" is a proximity probe. Remedy: write zones '
+    '= { standard = "iso-20816-3", shaft = true }',
 )
 NOT_OF_STANDARD = Code(
     "A15",
@@ -117,6 +147,9 @@ NOT_OF_STANDARD = Code(
     "peak value.",
     'Write measure = "peak_to_peak", with setpoints from peak to peak.',
     _PAGE,
+    example='machine.toml:237: alarms[1].measure = "peak": is from the mean to the farthest point; the '
+    "limits of shaft vibration in ISO 20816 and API 670 are peak to peak, about twice that. Remedy: "
+    'write measure = "peak_to_peak", with setpoints from peak to peak',
 )
 CANNOT_JUDGE = Code(
     "A16",

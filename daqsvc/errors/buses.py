@@ -11,6 +11,8 @@ WRONG_LAYOUT = Code(
     "frames. This one is for another kind of bus.",
     "Correct bus of the stream, or write the keys of a layout for this bus.",
     "driver-contract.md",
+    example='machine.toml:32: streams.shaft.layout: is no layout of a line, and bus "casing" carries lines. '
+    'Remedy: write line = ["seq", "x"], the names of the columns',
 )
 FIELD_OUTSIDE = Code(
     "B02",
@@ -19,6 +21,8 @@ FIELD_OUTSIDE = Code(
     "have.",
     "Correct the place or the number of samples, or make the frame longer, as the device sends it.",
     _PAGE,
+    example="machine.toml:50: streams.shaft.layout.first_byte = 2: the samples would take bytes 2 to 67 of a "
+    "frame of 64 bytes. Remedy: write samples_per_frame = 10, or make the frame longer",
 )
 FIELDS_OVERLAP = Code(
     "B03",
@@ -26,6 +30,8 @@ FIELDS_OVERLAP = Code(
     "Two channels, or a channel and the counter, would take the same bytes.",
     "Compare the places with the description of the device.",
     _PAGE,
+    example="machine.toml:52: streams.shaft.layout.crc_byte = 60: the CRC (bytes 60 to 61) would overlap the "
+    "samples (bytes 2 to 61). Remedy: move the CRC to byte 62 or behind, as the device sends it",
 )
 RAW_VALUES = Code(
     "B04",
@@ -33,6 +39,9 @@ RAW_VALUES = Code(
     "valid_raw has raw values, before scale and offset. These cannot come in the type of the channel.",
     "Write the least and the largest whole number that the device sends for a measurement.",
     _PAGE,
+    example="machine.toml:68: streams.shaft.layout.channels[0].valid_raw = [-40000, 32767]: does not lie "
+    "within what int16 can carry, -32768 to 32767. Remedy: write the raw values as the device sends "
+    "them, before scale and offset",
 )
 LOSS_UNNOTICED = Code(
     "B05",
@@ -41,6 +50,9 @@ LOSS_UNNOTICED = Code(
     " does so less exactly.",
     "Say where the counter is. If the device sends none, write no_counter = true: loss is then estimated.",
     "driver-contract.md",
+    example="machine.toml:54: streams.casing.layout: has neither counter nor time: lost lines would not be "
+    'noticed. Remedy: add counter = { column = "seq" } or time = { column = "t", unit = "ms" }, '
+    "whichever it sends",
 )
 UNFIT_COUNTER = Code(
     "B06",
@@ -48,6 +60,9 @@ UNFIT_COUNTER = Code(
     "It wraps too soon to tell a gap from a turn, does not count by 1 from 0, or is signed or a float.",
     "Name another counter, have the device send a wider one, or write no_counter = true.",
     "driver-contract.md",
+    example='machine.toml:15: streams.casing.layout.counter = { byte = 0, bits = 8, counts = "samples" }: a '
+    "counter of 8 bits cannot tell frames of 64 samples apart: it wraps within four of them. Remedy: "
+    'have the device send a wider counter, or count "frames"',
 )
 CAN_ID = Code(
     "B07",
@@ -55,6 +70,8 @@ CAN_ID = Code(
     "Ids of CAN have 11 bits, or 29 with extended = true. Ids of SAE J1939 have 29.",
     "Correct the id, or write extended = true.",
     _PAGE,
+    example="machine.toml:46: streams.shaft.layout.id = 0x801: does not fit into 11 bits (0x7ff). Remedy: "
+    "write extended = true if the device sends 29-bit ids, else correct the id",
 )
 FRAME_LENGTH = Code(
     "B08",
@@ -62,6 +79,9 @@ FRAME_LENGTH = Code(
     "A frame of classic CAN has up to 8 bytes, one of CAN FD up to 64 in steps.",
     "Correct the length, or write fd = true in the table of the bus.",
     _PAGE,
+    example="machine.toml:15: streams.casing.layout.length = 64: has 64 bytes: only CAN FD carries more than "
+    '8, and bus "can0" is classic CAN. Remedy: write fd = true in [buses.can0], or make the frame 8 '
+    "bytes or shorter",
 )
 NOT_TOLD_APART = Code(
     "B09",
@@ -69,6 +89,8 @@ NOT_TOLD_APART = Code(
     "Streams on one bus differ by their id, prefix or stream_id, and these have the same.",
     "Give each stream its own, as the devices send it.",
     "driver-contract.md",
+    example='machine.toml:65: streams.other.layout.id = 0x101: id 0x101 on bus "can0" belongs to stream '
+    '"shaft" already. Remedy: give each stream of a bus an id of its own, as the devices send it',
 )
 BUS_TOO_SLOW = Code(
     "B10",
@@ -78,6 +100,9 @@ BUS_TOO_SLOW = Code(
     "Correct rate_hz of the streams, raise the bit rate of bus and devices, or divide the streams among "
     "buses.",
     "driver-contract.md",
+    example="machine.toml:23: buses.probes.baud = 115_200: is too slow: the streams on the port need 870,400 "
+    "bit/s at least, 756 % of it. Remedy: correct the rates of the streams, or set port and device "
+    "to a faster rate",
 )
 NO_SUCH_INTERFACE = Code(
     "B11",
@@ -85,6 +110,11 @@ NO_SUCH_INTERFACE = Code(
     "python-can has no interface of this name, or the package that brings it is not installed.",
     "Correct the name, or install the plugin of python-can for the device.",
     _PAGE,
+    example='machine.toml:33: buses.can0.interface = "socketcn": python-can knows no such interface. Remedy: '
+    'did you mean "socketcan"? There are: canalystii, cantact, etas, gs_usb, iscan, ixxat, kvaser, '
+    "neousys, neovi, nican, nixnet, pcan, robotell, seeedstudio, serial, slcan, socketcan, "
+    "socketcand, systec, udp_multicast, unixbus, usb2can, vector, virtual; or install the python-can "
+    "plugin that brings it",
 )
 TOO_LITTLE_KEPT = Code(
     "B12",
@@ -92,6 +122,8 @@ TOO_LITTLE_KEPT = Code(
     "keep_mb holds no finished file beside the one that is being written.",
     "Write keep_mb as twice file_mb or more.",
     _PAGE,
+    example="machine.toml:36: buses.can0.record.keep_mb = 599: keeps no finished file beside the one being "
+    "written, of up to 300 MB. Remedy: keep 600 MB or more, or write smaller files (file_mb)",
 )
 DBC_FILE = Code(
     "B13",
@@ -100,6 +132,8 @@ DBC_FILE = Code(
     "Correct the path, or export the file from its tool again. cantools comes with pip install "
     "'daqsvc[dbc]'.",
     _PAGE,
+    example='machine.toml:26: streams.housing.layout.dbc = "x.dbc": there is no file /etc/daqsvc/x.dbc. '
+    "Remedy: correct the path; a relative one starts at the directory of the machine file",
 )
 DBC_SIGNAL = Code(
     "B14",
@@ -107,6 +141,9 @@ DBC_SIGNAL = Code(
     "Its length, place, type or scale in the DBC file is none that a frame or a quantity can have.",
     "Correct the signal in the DBC file.",
     _PAGE,
+    example='machine.toml:30: streams.housing.layout.channels[0].signals[0] = "AccelX": has the scale 0 in '
+    "the DBC file, which would make every sample the same. Remedy: write in the DBC file what one "
+    "count of the raw value is worth, e.g. (0.0005,0)",
 )
 NOT_IN_ONE_FRAME = Code(
     "B15",
@@ -115,6 +152,8 @@ NOT_IN_ONE_FRAME = Code(
     "of a multiplexer never come in one frame.",
     "Make a stream of each group that comes together.",
     _PAGE,
+    example='machine.toml:31: streams.housing.layout.channels[1].signals = ["AccelY"]: has 1 samples in a '
+    'frame, but channel "x" has 2. Remedy: name as many signals for every channel of the stream',
 )
 UNIT_ADDRESS = Code(
     "B16",
@@ -122,6 +161,8 @@ UNIT_ADDRESS = Code(
     "Units of Modbus on a serial line have addresses 1 to 247. 0 is for all of them, and none answers.",
     "Write the address that is set in the unit.",
     "modbus.md",
+    example="machine.toml:43: streams.trend.layout.unit = 250: is no address of a unit on a serial line. "
+    "Remedy: take 1 to 247, as set in the unit",
 )
 NO_ROOM_FOR_REGISTERS = Code(
     "B17",
@@ -130,6 +171,8 @@ NO_ROOM_FOR_REGISTERS = Code(
     "enough for its counter.",
     "Leave out channels, or correct address, depth or number of samples.",
     "modbus.md",
+    example="machine.toml:73: streams.ring.layout.address = 65000: leaves no room: the samples would end at "
+    "register 67047, beyond 65535. Remedy: correct the address, or the number of samples",
 )
 FORBIDDEN_REGISTERS = Code(
     "B18",
@@ -137,6 +180,8 @@ FORBIDDEN_REGISTERS = Code(
     "forbidden lists registers that must never be read, since reading changes something in the unit.",
     "Leave out the channel, or narrow the forbidden range.",
     "modbus.md",
+    example="machine.toml:48: streams.trend.layout.channels[0].address = 100: lies in the forbidden "
+    "registers 100 to 110. Remedy: leave out the channel, or narrow the forbidden range",
 )
 WRITE_NOT_ALLOWED = Code(
     "B19",
@@ -144,6 +189,8 @@ WRITE_NOT_ALLOWED = Code(
     "Nothing is written to a unit unless the table of the bus lists the registers.",
     "Add the registers to writes of the bus, if they may be written.",
     "modbus.md",
+    example='machine.toml:18: streams.s.layout.page.select = 149: would have to be written, and bus "io" '
+    "does not allow it. Remedy: add { unit = 1, address = 149, count = 1 } to writes in [buses.io]",
 )
 REGISTERS_OVERLAP = Code(
     "B20",
@@ -151,6 +198,9 @@ REGISTERS_OVERLAP = Code(
     "Two channels share a register, or a register that steers the reading lies among the samples.",
     "Compare addresses and types with the register map of the unit. A float32 or int32 takes two registers.",
     "modbus.md",
+    example='machine.toml:13: streams.s.layout.channels[1].address = 1: is part of float32 "a" too, which '
+    "takes registers 0 to 1. Remedy: correct the two: float32 takes 2 registers, so the next number "
+    "begins at 2 or later",
 )
 BITS = Code(
     "B21",
@@ -158,6 +208,8 @@ BITS = Code(
     "bits names the lowest bit and the number of bits of an unsigned type. These do not lie in it.",
     "Write e.g. bits = [0, 4] for the lowest four.",
     "modbus.md",
+    example="machine.toml:48: streams.trend.layout.channels[0].bits = [30, 12]: are no part of uint32. "
+    "Remedy: write [lowest bit, number of bits] of an unsigned type that holds them, e.g. [0, 4]",
 )
 RING_DEPTH = Code(
     "B22",
@@ -165,6 +217,9 @@ RING_DEPTH = Code(
     "If the depth is no power of two, the place of a sample is not known once the counter has wrapped.",
     "Set the device to a depth of 2, 4, 8, ... places.",
     "modbus.md",
+    example="machine.toml:74: streams.ring.layout.depth = 10000000000000: is not a power of two: where a "
+    "sample lies would not be known once the counter wraps. Remedy: set the device to 8796093022208 "
+    "or 17592186044416 places",
 )
 NOT_PLAYABLE = Code(
     "B23",
@@ -172,6 +227,8 @@ NOT_PLAYABLE = Code(
     "It is no file, has an ending that no reader is known for, or cannot be read while it is written.",
     "Name a candump log, BLF, ASC, MDF or a table of samples; convert others.",
     "replay.md",
+    example='machine.toml:10: buses.tape.file = "gap.db": is a data base, which cannot be played. Remedy: '
+    "make a BLF of it: can_logconvert gap.db gap.blf",
 )
 PORT_MAY_CHANGE = Code(
     "B24",
@@ -180,6 +237,8 @@ PORT_MAY_CHANGE = Code(
     "have it.",
     "Write the path below /dev/serial/by-id.",
     "serial.md",
+    example='machine.toml:19: buses.cobs.port = "/dev/ttyUSB0": may be another device once a port has been '
+    "re-plugged. Remedy: write its path below /dev/serial/by-id (ls -l /dev/serial/by-id)",
 )
 BUS_OPTION = Code(
     "B25",
@@ -187,6 +246,7 @@ BUS_OPTION = Code(
     "The interface or port refuses a value of the table of the bus.",
     "Correct the option that the message names, as the manual of the interface has it.",
     _PAGE,
+    example="/etc/daqsvc/machine.toml: buses.logger: depth is odd; write an even one",
 )
 MANUALS_NUMBER = Code(
     "B26",
@@ -196,6 +256,9 @@ MANUALS_NUMBER = Code(
     "Take 40001 or 30001 off, if the manual counts so. A device that really has such addresses is read as "
     "it is.",
     "modbus.md",
+    example="machine.toml:48: streams.trend.layout.channels[0].address = 40018: looks like a number of the "
+    "manual, where registers begin at 40001. Remedy: write address = 17, as registers begin at 0 "
+    "here; leave it if the device has such addresses",
 )
 DEVICE_ABSENT = Code(
     "B27",

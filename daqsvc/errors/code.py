@@ -18,7 +18,7 @@ class Code:
         cause: what it means, and what usually leads to it.
         remedy: what to do about it.
         page: where to read on, a page of ``docs/``; may name a heading, e.g. ``alarms.md#votes``.
-        example: a message that has it, without the code; empty where the reference shows none.
+        example: a message that has it, without the code; a package may leave it empty.
     """
 
     id: str

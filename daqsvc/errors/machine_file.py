@@ -14,6 +14,8 @@ UNREADABLE_FILE = Code(
     "There is no such file, it is a directory or a device, or this user may not read it.",
     "Correct the path, or give the user of the service the right to read the file: chmod a+r FILE.",
     _PAGE,
+    example="machine.toml: there is no such file. Remedy: correct the path, or begin with an example: daqsvc "
+    "example",
 )
 NOT_UTF8 = Code(
     "F02",
@@ -22,6 +24,7 @@ NOT_UTF8 = Code(
     " page.",
     'Save the file as "UTF-8" in the editor.',
     _PAGE,
+    example="machine.toml:17: is not UTF-8: byte 0xf6 at column 9. Remedy: save machine.toml as UTF-8",
 )
 NOT_TOML = Code(
     "F03",
@@ -31,14 +34,17 @@ NOT_TOML = Code(
     "unit.",
     'Correct the line. Tables are written [name], values key = value, texts "in quotes", numbers 1.5.',
     _PAGE,
+    example="machine.toml:18: is not valid TOML: Unclosed array, at column 1. Remedy: close the bracket of "
+    "line 17",
 )
 TOO_LARGE = Code(
     "F04",
     "The file is larger than a machine file can be",
     "Size, depth, numbers and entries have limits far above what a machine needs. Usually the wrong file "
     "was given.",
-    "Check whether it is the right file. Watch a very large plant with several machine files.",
+    "Check whether it is the right file. Watch a large plant with several machine files.",
     _PAGE,
+    example="machine.toml:17: has a number with hundreds of digits. Remedy: write a number",
 )
 UNKNOWN_KEY = Code(
     "F05",
@@ -47,6 +53,8 @@ UNKNOWN_KEY = Code(
     "stands in the wrong table, or belongs to another kind of this table.",
     "Write the key that the message suggests, move the key to its table, or remove it.",
     _PAGE,
+    example="machine.toml:38: streams.drive-end.layout.channels[0].register = 17: unknown key. Remedy: did "
+    "you mean address?",
 )
 MISSING_KEY = Code(
     "F06",
@@ -54,6 +62,8 @@ MISSING_KEY = Code(
     "The table cannot be understood without this key, and no default would be right for every machine.",
     "Add the key. The message has an example.",
     _PAGE,
+    example="machine.toml:36: buses.can0.record.folder: is missing: holds the files, relative to the machine "
+    'file; must be there. Remedy: add folder = "/var/lib/daqsvc/can" to [buses.can0.record]',
 )
 WRONG_TYPE = Code(
     "F07",
@@ -62,6 +72,8 @@ WRONG_TYPE = Code(
     " Often quotes are missing, or there are too many of them.",
     'Write numbers, true and false without quotes, texts "in quotes", arrays [in, brackets].',
     _PAGE,
+    example='machine.toml:107: pipeline.rotor_bank.modes[2].unbalance_ratio = "1.8": must be a number. '
+    "Remedy: take the quotes away: unbalance_ratio = 1.8",
 )
 OUT_OF_RANGE = Code(
     "F08",
@@ -71,6 +83,8 @@ OUT_OF_RANGE = Code(
     " a minute).",
     "Write the value in the unit that the name of the key ends with.",
     _PAGE,
+    example="machine.toml:66: pipeline.bearing.calibrate_s = 3.0: must be 10 or more. Remedy: write "
+    "calibrate_s = 30.0 (first seconds, which are the healthy state; kept over restarts)",
 )
 NOT_ONE_OF = Code(
     "F09",
@@ -78,6 +92,8 @@ NOT_ONE_OF = Code(
     "The key takes one of a few words or numbers, which the message lists.",
     "Write one of them as it is listed, in lower case.",
     _PAGE,
+    example='machine.toml:48: streams.shaft.layout.byte_order = "middle": must be "little" or "big". Remedy: '
+    'write one of these, e.g. byte_order = "little"',
 )
 BAD_NAME = Code(
     "F10",
@@ -86,6 +102,8 @@ BAD_NAME = Code(
     "'_', '.' and '-' only.",
     "Write the name without spaces, umlauts and other signs. A description may have them.",
     _PAGE,
+    example="machine.toml:14: site = \"...\": may only have letters, digits, '_', '.' and '-', and must not "
+    "be empty; dots alone are no name. Remedy: give it a name",
 )
 BAD_TEXT = Code(
     "F11",
@@ -94,6 +112,8 @@ BAD_TEXT = Code(
     "needs it.",
     "Write it as in the example of the message.",
     _PAGE,
+    example='machine.toml:62: sensors[0].unit = " mm/s": is no unit: it holds spaces at an end, or what '
+    'cannot be printed. Remedy: write e.g. unit = "degC"',
 )
 WRONG_LENGTH = Code(
     "F12",
@@ -101,6 +121,8 @@ WRONG_LENGTH = Code(
     "Pairs such as ranges have exactly two values. Lists have an upper limit, and some must not be empty.",
     "Write as many values as the message says.",
     _PAGE,
+    example="machine.toml:67: sensors[0].gap_ok_v = [-18.0, -2.0, 0]: must have 2 values. Remedy: write "
+    "gap_ok_v = [-18.0, -2.0] (OK limits of the mean gap voltage, in V; needed where that is known)",
 )
 BAD_PATH = Code(
     "F13",
@@ -109,6 +131,8 @@ BAD_PATH = Code(
     "the root where it must.",
     "Write the path in full. A relative path starts at the directory of the machine file.",
     _PAGE,
+    example='machine.toml:45: buses.casing.port = "ttyUSB0": is not the whole path of a port. Remedy: write '
+    "it from the root, e.g. /dev/serial/by-id/... or /dev/ttyUSB0",
 )
 BAD_ADDRESS = Code(
     "F14",
@@ -117,6 +141,8 @@ BAD_ADDRESS = Code(
     "scheme such as http:// before it.",
     "Write it as in the example of the message, and the port in its own key where there is one.",
     _PAGE,
+    example='machine.toml:140: mqtt.url = "mqtts://broker/topic": has something after host and port. Remedy: '
+    "end the url after the port",
 )
 WRONG_ORDER = Code(
     "F15",
@@ -124,6 +150,8 @@ WRONG_ORDER = Code(
     "A range is written with its lower end first, and its ends must differ.",
     "Swap the two values, or make them differ.",
     _PAGE,
+    example="machine.toml:67: sensors[0].gap_ok_v = [-2.0, -18.0]: the lower limit must come first. Remedy: "
+    "write [-18.0, -2.0]",
 )
 SECRET_IN_FILE = Code(
     "F16",
@@ -132,6 +160,8 @@ SECRET_IN_FILE = Code(
     "Write the password into a file that only the service can read, name it in password_file, and change "
     "the password: it has been in a file that others can read.",
     "mqtt.md",
+    example='machine.toml:142: mqtt.password = "***": does not belong into a machine file. Remedy: write it '
+    "into a file that only the service can read and name that in password_file",
 )
 NO_SUCH_NAME = Code(
     "F17",
@@ -140,6 +170,8 @@ NO_SUCH_NAME = Code(
     "Usually the name is misspelt here or where it is defined.",
     "Write one of the names that the message lists, or define what is missing.",
     _PAGE,
+    example='machine.toml:141: alarm_handling.start_up.measure = "sped": is nothing that rotor-bank states '
+    'while the machine starts up. Remedy: did you mean "speed"? There are: speed',
 )
 NAMED_TWICE = Code(
     "F18",
@@ -147,6 +179,8 @@ NAMED_TWICE = Code(
     "Two entries have one name, one entry is listed twice, or two claim the same channel or device.",
     "Give each a name or a channel of its own.",
     _PAGE,
+    example='machine.toml:43: buses.can1.channel = "can0": belongs to bus "can0" already. Remedy: put all '
+    "streams of the interface on one bus, or correct the channel",
 )
 NO_EFFECT = Code(
     "F19",
@@ -155,6 +189,8 @@ NO_EFFECT = Code(
     "is missing.",
     "Remove the key, or add what the message names.",
     _PAGE,
+    example='machine.toml:34: streams.shaft.layout.stream_id = 1: has no effect: bus "probes" carries no '
+    "stream ids. Remedy: write stream_ids = true in [buses.probes], or remove it",
 )
 CONTRADICTION = Code(
     "F20",
@@ -162,6 +198,8 @@ CONTRADICTION = Code(
     "Both keys say the same in different ways, or exclude each other, and only one can be right.",
     "Remove or correct one of the two.",
     _PAGE,
+    example="machine.toml:37: buses.can0.data_bitrate = 250_000: is less than bitrate = 500,000, and the "
+    "data of CAN FD never go slower. Remedy: swap the two, or correct one of them",
 )
 INCOMPLETE = Code(
     "F21",
@@ -170,6 +208,8 @@ INCOMPLETE = Code(
     " names.",
     "Add the other key, or remove this one.",
     _PAGE,
+    example="machine.toml:66: sensors[0].zero_v = -10.0: has no effect without sensitivity_mv_per_unit. "
+    "Remedy: add sensitivity_mv_per_unit, or remove zero_v if the channel carries the physical unit",
 )
 NO_SUCH_DRIVER = Code(
     "F22",
@@ -178,6 +218,8 @@ NO_SUCH_DRIVER = Code(
     "Correct the name. A driver from outside comes with its package: install that into the environment of"
     " daqsvc.",
     "write-a-driver.md",
+    example='machine.toml:9: buses.can0.driver = "profibus": no such driver is installed. Remedy: take one '
+    "of: can, modbus, replay, serial; or install the package that brings it",
 )
 PLUGIN_FAILED = Code(
     "F23",
@@ -187,6 +229,7 @@ PLUGIN_FAILED = Code(
     "Install the package again. If that does not help, report it to the authors of the package, and "
     "remove its table until then.",
     "architecture.md",
+    example="output mqtt.live is left out: [mqtt.live] is a table of daqsvc itself; rename it",
 )
 TOO_MUCH_MEMORY = Code(
     "F24",
@@ -195,6 +238,9 @@ TOO_MUCH_MEMORY = Code(
     "times channels times ring_s.",
     "Write a smaller ring_s in [pipeline], or correct rate_hz.",
     _PAGE,
+    example="machine.toml:48: pipeline.ring_s = 3600.0: the rings of 3600 s would take 144 GB, most of it "
+    'for stream "drive-end" at 1e+07 Hz, and this computer has 8.2 GB. Remedy: write ring_s = 205.0 '
+    "or less in [pipeline], or correct rate_hz of the stream",
 )
 VALUE_REFUSED = Code(
     "F25",
@@ -202,6 +248,8 @@ VALUE_REFUSED = Code(
     "The model of this table refuses the value for a reason of its own, which the message gives.",
     "Do what the message says. A table of a plugin from outside is described by its package.",
     _PAGE,
+    example='machine.toml:12: buses.logger.host = "127.0.0.1": is not valid: 127.0.0.1 is no address. '
+    'Remedy: write host = "192.0.2.10" (name or address of the logger)',
 )
 NO_MACHINE_FILE = Code(
     "F26",
@@ -209,6 +257,8 @@ NO_MACHINE_FILE = Code(
     "A directory stands for all *.toml files in it that do not begin with a dot.",
     "Write a machine file there. daqsvc example shows some to begin with.",
     "several-machines.md",
+    example="/etc/daqsvc/pumps: no machine file (*.toml) is in this directory. Remedy: copy an example into "
+    "it: daqsvc example",
 )
 NOT_OF_ONE_BOX = Code(
     "F27",
@@ -217,6 +267,8 @@ NOT_OF_ONE_BOX = Code(
     "must be alike, and each machine needs a name of its own.",
     "Make the tables alike, or write them in one of the files only.",
     "several-machines.md",
+    example='machine.toml:13: box = "edge-3": but pump.toml says "edge-1", and one process is one box. '
+    'Remedy: write box = "edge-1", or run it by itself',
 )
 UNUSED_BUS = Code(
     "F28",
@@ -224,6 +276,8 @@ UNUSED_BUS = Code(
     "The bus is opened, and nothing is read from it.",
     "Add its streams, or remove the bus.",
     "driver-contract.md",
+    example="machine.toml:32: buses.sync: no stream comes over this bus. Remedy: remove it, or add its "
+    "streams",
 )
 SPEED_UNKNOWN = Code(
     "F29",
@@ -231,6 +285,10 @@ SPEED_UNKNOWN = Code(
     "A key asks for the speed while the machine runs, and neither a detector nor a trend value states it.",
     "Add a detector that states the speed, or a sensor of type trend in rpm; or remove the key.",
     _PAGE,
+    example='machine.toml:76: alarm_handling.start_up.detector = "levels/accel-de": no detector of this '
+    "machine states a speed. Remedy: write a table [pipeline.rotor_bank] or "
+    "[pipeline.rotor_synchronous], take a trend value that is the speed, or remove "
+    "[alarm_handling.start_up] and every trip_multiply",
 )
 SNAPSHOTS_OVERLAP = Code(
     "F30",
@@ -238,6 +296,9 @@ SNAPSHOTS_OVERLAP = Code(
     "every_s is shorter than before_s and after_s together: each snapshot would begin within the one before.",
     "Write a larger every_s, or continuous = true if all is to be recorded.",
     "recorder.md",
+    example="machine.toml:151: recorder.every_s = 15.0: asks for a snapshot every 15 s, and each holds 20 s "
+    "(before_s and after_s): they would overlap. Remedy: write every_s = 20 or more, or have all "
+    "recorded with continuous = true",
 )
 COARSE_ALIGNMENT = Code(
     "F31",
@@ -246,6 +307,9 @@ COARSE_ALIGNMENT = Code(
     "of the phase.",
     "Write a smaller max_error_us, or take the sensors together in one stream.",
     "alignment.md",
+    example="machine.toml:106: pipeline.alignment.max_error_us = 2000.0: 2000 us are 18 deg of a revolution "
+    "at 1500 rpm: as much as a fault moves the phase. Remedy: write max_error_us = 1110 or less, or "
+    "bring the sensors together in one stream",
 )
 WRONG_SENSOR_TYPE = Code(
     "F32",
@@ -253,6 +317,8 @@ WRONG_SENSOR_TYPE = Code(
     "The key takes sensors of one type only, e.g. accelerometers, proximity probes or a keyphasor.",
     "Name a sensor of that type, or correct the type of the sensor.",
     _PAGE,
+    example='machine.toml:111: alarms[0].sensor = "keyphasor": is a keyphasor, which measures no vibration. '
+    "Remedy: take one of: probe-x, probe-y",
 )
 SAMPLED_APART = Code(
     "F33",
@@ -260,6 +326,9 @@ SAMPLED_APART = Code(
     "What is compared sample by sample must be taken at the same instants. Streams have clocks of their own.",
     "Name sensors of one stream, or write [pipeline.alignment] where the message names it.",
     "alignment.md",
+    example='machine.toml:117: pipeline.rotor_bank.probes[0] = "probe-x": is in stream "shaft", but '
+    'keyphasor "keyphasor" is in stream "other". Remedy: take sensors of one stream, or write a '
+    "table [pipeline.alignment]: it puts samples that are not taken at the same instants on one grid",
 )
 SAMPLED_TOO_SLOWLY = Code(
     "F34",
@@ -268,6 +337,8 @@ SAMPLED_TOO_SLOWLY = Code(
     "samples each revolution.",
     "Sample faster, or correct rate_hz, machine.speed_rpm or the frequencies that are asked for.",
     _PAGE,
+    example='machine.toml:72: pipeline.bearing.bearings[0].sensor = "accel-de": is sampled at 2000 Hz: a '
+    "bearing rings above 400 Hz. Remedy: sample at 2500 Hz or faster",
 )
 RING_TOO_SHORT = Code(
     "F35",
@@ -275,6 +346,8 @@ RING_TOO_SHORT = Code(
     "A detector reads its windows from the ring of the last seconds, which must hold several of them.",
     "Write a larger ring_s in [pipeline], or a shorter window.",
     _PAGE,
+    example="machine.toml:95: pipeline.levels.window_s = 20: a ring of 30 s must hold at least 2 windows. "
+    "Remedy: write ring_s = 40 or more in [pipeline], or a shorter window",
 )
 UNLIKELY_SENSITIVITY = Code(
     "F36",
@@ -282,6 +355,8 @@ UNLIKELY_SENSITIVITY = Code(
     "Usually it was written in V in place of mV, or for another unit (m/s2 for g, mm for um).",
     "Copy it from the calibration sheet, in mV per unit of the sensor.",
     _PAGE,
+    example="machine.toml:65: sensors[0].sensitivity_mv_per_unit = 7870.0: 7870 mV/um is what no sensor has; "
+    "usual is some 7.87. Remedy: 7870 mV/mm are sensitivity_mv_per_unit = 7.87",
 )
 GAP_VOLTAGE = Code(
     "F37",
@@ -290,6 +365,8 @@ GAP_VOLTAGE = Code(
     " sensitivity_mv_per_unit, all in the range that the probe gives, usually negative.",
     "Write them as in the manual of the probe, with their signs.",
     _PAGE,
+    example="machine.toml:59: sensors[0].gap_ok_v: is missing: OK limits of the mean gap voltage, in V. "
+    'Remedy: add gap_ok_v = [-18.0, -2.0] to the entry "probe-x" of sensors, as its manual has it',
 )
 PROBES_IN_LINE = Code(
     "F38",
@@ -297,6 +374,9 @@ PROBES_IN_LINE = Code(
     "Together they see one direction of the motion only. An orbit needs two directions.",
     "Correct angle_deg of the sensors, or take probes that are some 90 degrees apart.",
     _PAGE,
+    example='machine.toml:98: pipeline.rotor_bank.probes = ["probe-x", "probe-y"]: the probes point along '
+    "one line (0 and 180 deg): they see one direction of the motion only. Remedy: correct angle_deg "
+    "of the sensors, or take probes that are some 90 deg apart",
 )
 BEYOND_CHANNEL = Code(
     "F39",
@@ -305,6 +385,8 @@ BEYOND_CHANNEL = Code(
     " that is written.",
     "Correct the value, or scale, offset and sensitivity.",
     _PAGE,
+    example="machine.toml:87: sensors[2].threshold_v = -60.0: is never crossed: the channel carries -32.768 "
+    "to 32.767 V. Remedy: correct it, or the scale of the channel",
 )
 WRONG_SCALE = Code(
     "F40",
@@ -313,6 +395,8 @@ WRONG_SCALE = Code(
     " e.g. mV for V.",
     "Write in scale what one count of the raw value is worth, in the unit of the channel.",
     "can.md",
+    example="machine.toml:54: streams.shaft.layout.channels[0].scale = 0: would make every sample the same. "
+    "Remedy: write what one count of the raw value is worth, e.g. 0.0005",
 )
 ROTOR_FIGURES = Code(
     "F41",
@@ -321,6 +405,9 @@ ROTOR_FIGURES = Code(
     "from its natural frequency. Usually one has another unit, or the clearance is not the radial one.",
     "Correct the figure that the message names.",
     "rotor-figures.md",
+    example="machine.toml:28: machine.rotor.static_sag_um = 130.0: lays the shaft on the stator: it would "
+    "rest 130 um from the middle of a clearance of 100 um. Remedy: correct the sag, or the clearance "
+    "(it is the radial one)",
 )
 STANDSTILL = Code(
     "F42",
@@ -328,4 +415,6 @@ STANDSTILL = Code(
     "machine.speed_rpm is the speed at which the machine runs. A machine that stands still has no vibration.",
     "Write the nominal speed, negative if the shaft turns clockwise.",
     _PAGE,
+    example="machine.toml:20: machine.speed_rpm = 0.0: is a shaft that stands still. Remedy: write the "
+    "nominal speed, negative if the shaft turns clockwise",
 )

@@ -10,6 +10,8 @@ CREDENTIAL_FILE = Code(
     "It is no regular file, or its first line is longer than MQTT can carry.",
     "Write the password, and nothing else, into the first line of a regular file.",
     _PAGE,
+    example='machine.toml:285: mqtt.password_file = "": is no regular file, and reading it might never end. '
+    "Remedy: name a file with that content",
 )
 CREDENTIAL_OPEN = Code(
     "O02",
@@ -17,6 +19,8 @@ CREDENTIAL_OPEN = Code(
     "The rights of the file let every user read it.",
     "Remove that right: chmod o-rwx FILE. Then replace what is in it.",
     _PAGE,
+    example='machine.toml:142: mqtt.password_file = "/etc/daqsvc/mqtt-password": can be read by every user '
+    "of this machine. Remedy: chmod o-rwx /etc/daqsvc/mqtt-password, and replace what is in it",
 )
 UNENCRYPTED = Code(
     "O03",
@@ -24,6 +28,9 @@ UNENCRYPTED = Code(
     "mqtt:// has no encryption and does not verify the broker. Others on the network can read or forge it.",
     "Write mqtts:// in the URL. insecure = true accepts the risk where a network is closed.",
     _PAGE,
+    example='machine.toml:140: mqtt.url = "mqtt://broker.example:8883": would go over the network '
+    "unencrypted, and to whoever answers. Remedy: write mqtts://, or insecure = true if you accept "
+    "that",
 )
 OPEN_TO_NETWORK = Code(
     "O04",
@@ -31,6 +38,9 @@ OPEN_TO_NETWORK = Code(
     "The address to listen at is not that of this box alone, and there is no TLS or no sign-in.",
     "Listen at 127.0.0.1, or set up what the message names.",
     "page.md",
+    example='machine.toml:151: page.listen = "192.0.2.1:8420": lets others than this box reach the page, '
+    "which needs TLS and accounts then. Remedy: write certificate_file, private_key_file and "
+    'accounts_file; or user_header and proxies, behind a reverse proxy; or listen = "127.0.0.1:8420"',
 )
 HOST_NAMES = Code(
     "O05",
@@ -39,6 +49,9 @@ HOST_NAMES = Code(
     "names none.",
     "Write host_names with each name or address by which browsers open the page.",
     "page.md",
+    example='machine.toml:151: page.listen = "0.0.0.0:8420": is every address of the box, and it is not '
+    'known by which names the page is opened. Remedy: write host_names = ["..."] with each, also if '
+    "it is an address of the box",
 )
 ONE_DEVICE = Code(
     "O06",
@@ -46,6 +59,8 @@ ONE_DEVICE = Code(
     "Each machine is a device of the edge node.",
     "Remove device: the name of each machine is its device id.",
     "sparkplug.md",
+    example='two.toml:140: mqtt.sparkplug.device = "fan": "fan" names one device, and each of several '
+    "machines is one. Remedy: remove it: the name of each machine is its device id",
 )
 SAME_CLIENT_ID = Code(
     "O07",
@@ -53,6 +68,8 @@ SAME_CLIENT_ID = Code(
     "A broker ends a connection when another one comes with the same client id.",
     "Remove client_id, or write another one.",
     "sparkplug.md",
+    example='machine.toml:146: mqtt.sparkplug.client_id = "daqsvc-lab:edge-1": is "daqsvc-lab:edge-1" like '
+    "that of [mqtt]: a broker ends one connection for the other. Remedy: remove it, or write another",
 )
 OTHER_ENCRYPTION = Code(
     "O08",
@@ -60,6 +77,8 @@ OTHER_ENCRYPTION = Code(
     "All servers of Sparkplug get the credentials of [mqtt]. An unencrypted one would give them away.",
     "Write mqtts:// in all URLs, or mqtt:// in all.",
     "sparkplug.md",
+    example='machine.toml:146: mqtt.sparkplug.servers[0] = "mqtt://other.example": has other encryption than '
+    "mqtt.url, whose credentials it would get. Remedy: write mqtts:// in both",
 )
 BROKER_AWAY = Code(
     "O09",

@@ -9,6 +9,8 @@ NEEDS_RESTART = Code(
     "the store change only when it starts.",
     "Restart the service, or undo the change: systemctl restart daqsvc.",
     "commands.md",
+    example='machine.toml:14: site = "plant": the service runs with "lab", and changes that only when it '
+    "starts. Remedy: restart the service for that, or take it back",
 )
 UNUSABLE_STORE = Code(
     "S02",
@@ -18,6 +20,10 @@ UNUSABLE_STORE = Code(
     "Correct store.directory, give the user of the service the right to write there, install the newer"
     " version, or give the machine another name.",
     "outbox.md",
+    example="the store /var/lib/daqsvc/lab is that of pump.toml: fan.toml has the same site 'lab', box "
+    "'edge-1' and machine 'pump', and would close its alarms. Remedy: write another name = ... in "
+    "[machine] of fan.toml. If fan.toml takes the place of pump.toml, delete pump.toml, or name the "
+    "store: daqsvc run fan.toml --store /var/lib/daqsvc/lab",
 )
 STORE_IN_USE = Code(
     "S03",

@@ -174,10 +174,8 @@ def test_the_command_is_answered_with_the_code(
     assert re.search(rf"\[{code}\]$", (err or out).rstrip(), re.MULTILINE), (out, err)
 
 
-@pytest.mark.parametrize(("code", "path", "edits"), GIVEN, ids=[one[0] for one in GIVEN])
-def test_the_broken_machine_file_is_answered_with_the_code(
-    code: str, path: Path, edits: list[tuple[str, str]]
-) -> None:
+def said_of(path: Path, edits: list[tuple[str, str]]) -> list[str]:
+    """What is said of a machine file that is changed so: errors and warnings, with their codes."""
     text, _ = changed(path, *edits)
     try:
         machine = parse_machine_file(text, path)
@@ -187,6 +185,14 @@ def test_the_broken_machine_file_is_answered_with_the_code(
         said = [f"{problem}" for problem in error.problems]
     except AssemblyError as error:
         said = [f"{error}"]
+    return said
+
+
+@pytest.mark.parametrize(("code", "path", "edits"), GIVEN, ids=[one[0] for one in GIVEN])
+def test_the_broken_machine_file_is_answered_with_the_code(
+    code: str, path: Path, edits: list[tuple[str, str]]
+) -> None:
+    said = said_of(path, edits)
     assert any(one.endswith(f"[{code}]") for one in said), said
 
 

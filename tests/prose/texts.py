@@ -93,7 +93,7 @@ def _of_module(source: str) -> Iterator[tuple[int, str, str]]:
 def _messages(tree: ast.Module, docstrings: set[int]) -> Iterator[tuple[int, str, str]]:
     """Strings of some words that are no docstrings; what is put in when they are formatted is code."""
     formatted = [node for node in ast.walk(tree) if isinstance(node, ast.JoinedStr)]
-    seen = docstrings | {id(part) for node in formatted for part in node.values}
+    seen = docstrings | {id(part) for node in formatted for part in node.values} | _examples(tree)
     for node in formatted:
         parts = (str(part.value) if isinstance(part, ast.Constant) else CODE for part in node.values)
         if not _PROGRAM.search(words := "".join(parts)):
@@ -101,6 +101,13 @@ def _messages(tree: ast.Module, docstrings: set[int]) -> Iterator[tuple[int, str
     for node in ast.walk(tree):
         if _is_text(node) and id(node) not in seen and not _PROGRAM.search(node.value):
             yield from _paragraphs(node.lineno, "message", node.value)
+
+
+def _examples(tree: ast.Module) -> set[int]:
+    """Examples of messages: a value is put in there, and where they are made they are judged without it."""
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    keywords = [one for call in calls if ast.unparse(call.func) == "Code" for one in call.keywords]
+    return {id(one.value) for one in keywords if one.arg == "example"}
 
 
 def _is_text(node: ast.AST) -> TypeGuard[ast.Constant]:
