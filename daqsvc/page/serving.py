@@ -17,7 +17,7 @@ from daqsvc.page.documentation import built_site
 from daqsvc.page.server import application
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from starlette.applications import Starlette
 
@@ -44,11 +44,12 @@ class PortInUseError(PortError):
 
 
 class _Server(uvicorn.Server):
-    """Ends at once: browsers listen for as long as they are let."""
+    """Ends at once, as browsers listen for as long as they are let; says where it is when it answers."""
 
-    def __init__(self, config: uvicorn.Config, app: Starlette) -> None:
+    def __init__(self, config: uvicorn.Config, app: Starlette, where: Sequence[str]) -> None:
         super().__init__(config)
         self._app = app
+        self._where = where
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -60,6 +61,13 @@ class _Server(uvicorn.Server):
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Start to answer, and say so."""
+        await super().startup(sockets)
+        if self.started:
+            for line in self._where:
+                print(line, flush=True)  # noqa: T201 - for a person
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Let go of all browsers, and end."""
@@ -106,9 +114,9 @@ def serve(
         where = f"http{'s' if tls else ''}://{_bracketed(_name(choice))}:{port}/"
         # Ctrl-C would end the parent, not only the page.
         how_to_end = "" if with_parent else "; Ctrl-C ends it"
-        print(f"the page of {what} is at {where}{how_to_end}", flush=True)  # noqa: T201 - for a person
+        lines = [f"the page of {what} is at {where}{how_to_end}"]
         if key:
-            print(f"who opens {where}operator?key={key} may handle alarms", flush=True)  # noqa: T201
+            lines.append(f"who opens {where}operator?key={key} may handle alarms")
         hosts = (*choice.names, *(() if choice.is_local else (_bracketed(choice.host),)))
         app = application(source, access, hosts=hosts, tls=tls, documentation=built_site())
         config = uvicorn.Config(
@@ -123,7 +131,7 @@ def serve(
         )
         if with_parent:
             Thread(target=_end_with_input, name="end with the parent", daemon=True).start()
-        _Server(config, app).run(sockets=[listening])
+        _Server(config, app, lines).run(sockets=[listening])
 
 
 def _end_with_input() -> None:

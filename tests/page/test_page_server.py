@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import http.client
+import signal
 import socket
 from typing import TYPE_CHECKING
 
 import pytest
 from support.browsers import page_served
+from support.waiting import PATIENCE_S
 
 from daqsvc.cli import main
 
@@ -55,6 +57,14 @@ async def test_strangers_are_not_answered(tmp_path: Path) -> None:
         assert (await asyncio.to_thread(ask, address, "/", "POST"))[0] == 405
         process.terminate()
         async with asyncio.timeout(30):
+            await process.wait()
+        assert process.returncode == 0
+
+
+async def test_ctrl_c_ends_it_in_order_as_soon_as_it_says_so(tmp_path: Path) -> None:
+    async with page_served("--store", tmp_path) as (_, process):
+        process.send_signal(signal.SIGINT)
+        async with asyncio.timeout(PATIENCE_S):
             await process.wait()
         assert process.returncode == 0
 
