@@ -125,7 +125,7 @@ class AlarmService:
         buses: by name, what can be watched of each bus.
         bus_health: says how the buses stand.
         supervisor: counts what outputs do wrong.
-        stalls: finds the parts of the service that have stalled, for outputs that tell it.
+        stalls: finds the parts of the service that have stalled, for outputs that report it.
         heard: told, on the event loop, of each event that comes about.
         snapshot: makes snapshots of machines. None if nobody may ask for one.
         look: begins to tell what passes of a machine. None if nobody may look on.
@@ -187,7 +187,7 @@ class AlarmService:
         self._heard = heard
         self._snapshot = snapshot
         self._snapshots: dict[str, deque[int]] = {}
-        """By machine, when others had some made lately, monotonic."""
+        """By machine, when others had some made recently, monotonic."""
         self._log = AlarmLog(clock, of_several=len(self.managers) > 1)
         self._conditions_of_outputs = asked.conditions
         self._conditions = [*conditions(buses or {}), *asked.conditions]
@@ -233,7 +233,7 @@ class AlarmService:
             events = await asyncio.to_thread(restore_alarms, latest or (), self.topics)
             self._take_over(events)
             if self._knows_journal and self.outbox.broker_is_ahead:
-                self._witness_known = None  # all of it is told anyway
+                self._witness_known = None  # all of it is sent anyway
                 self._confirm(self._tell_again(events))
             return
         latest = await self.outbox.latest()
@@ -389,12 +389,12 @@ class AlarmService:
         return self._topic_of[alarm]
 
     def _confirm(self, committed: Sequence[asyncio.Future[int]]) -> None:
-        """Once these are on disk, the damage need not be told again after a restart."""
+        """Once these are on disk, the damage need not be reported again after a restart."""
 
         async def confirm() -> None:
             outcomes = await asyncio.gather(*committed, return_exceptions=True)
             if not any(isinstance(outcome, BaseException) for outcome in outcomes):
-                with contextlib.suppress(OutboxError):  # it is being closed; then it is told once more
+                with contextlib.suppress(OutboxError):  # it is being closed; then it is reported once more
                     self.outbox.damage_is_told()
 
         self._watch(asyncio.create_task(confirm(), name="damage is reported"))
@@ -410,7 +410,7 @@ class AlarmService:
         """Bring journal and alarms into step again.
 
         What the alarms have done since counts. An alarm that has done nothing takes over what the journal
-        says, if that could not be asked before; the journal is told what it has forgotten.
+        says, if that could not be asked before; the journal receives what it has lost.
         """
         damage = self._damage()
         before = dict(self._newest)
@@ -480,7 +480,7 @@ class AlarmService:
             self._post(event)
 
     async def execute(self, command: AlarmCommand, source: str) -> CommandOutcome:
-        """Carry out a person's command, one after the other: written down, obeyed, committed, answered.
+        """Carry out a person's command, one after the other: recorded, carried out, committed, answered.
 
         A command that has begun is carried out to its end, even if nobody waits for the answer any more.
 
@@ -489,7 +489,7 @@ class AlarmService:
             source: the way it came, for the audit log.
 
         Returns:
-            What came of it; if it was obeyed, its events are on disk.
+            What came of it; if it was carried out, its events are on disk.
         """
         if self._stopping:
             return self._refuse(STOPPING, NOT_ASKED)
@@ -608,7 +608,7 @@ class AlarmService:
     async def _made_snapshot(self, command: SnapshotRequest, source: str) -> CommandOutcome:
         try:
             if self._refusals.flooding:
-                # What has not been written down is not done, and a flood is not written down.
+                # What has not been recorded is not done, and a flood is not recorded.
                 refusal = "too many commands were refused lately; ask again in a minute, or at the box"
                 self._refusals.count(command, source, refusal)
                 return self._refuse(refusal, NOT_ASKED)

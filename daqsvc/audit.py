@@ -2,13 +2,13 @@
 
 It is one file, ``audit.jsonl``, with one JSON object a line. Every command leaves two lines of the same
 ``id``: one with the outcome ``asked``, on disk before anything is done, and one with what came of it. An
-``asked`` that nothing follows is a command under way when the service died: whether it was obeyed, the
+``asked`` that nothing follows is a command under way when the service died: whether it was carried out, the
 alarm's history tells.
 
 No line is ever changed. The file is opened afresh for each line, so it may be renamed at any time, as
 logrotate does. Once it is large it becomes ``audit-000001.jsonl`` and so on by itself, and when all of them
 exceed a quota the oldest is deleted. Commands that are refused in a flood are counted in one line a minute
-(`Refusals`), so that nobody who is refused can push out what was obeyed.
+(`Refusals`), so that nobody who is refused can push out what was carried out.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class AuditLog:
         self._one_at_a_time = asyncio.Lock()
 
     async def asked(self, command: AlarmCommand | SnapshotRequest, source: str) -> str:
-        """Write down that a command has come, before it is obeyed.
+        """Write down that a command has come, before it is carried out.
 
         Args:
             command: what is asked for.
@@ -78,7 +78,7 @@ class AuditLog:
             The id by which `answered` refers to it.
 
         Raises:
-            AuditError: the line is not on disk; the command must not be obeyed.
+            AuditError: the line is not on disk; the command must not be carried out.
         """
         entry = str(uuid.uuid4())
         await self._append(self._line(entry, "asked", command, source))
@@ -172,7 +172,7 @@ class RefusedMany:
         count: how many they are.
         sources: how many came from where; of more than `SOURCES` sources the rest are `OTHERS`.
         verbs: how many asked for what.
-        answer: what the last of them was told.
+        answer: the answer to the last of them.
     """
 
     since_ns: int
@@ -214,7 +214,7 @@ class Refusals:
         return self._left <= 0
 
     def written(self) -> None:
-        """One was written down in full."""
+        """One was recorded in full."""
         self._left -= 1
 
     def count(self, command: AlarmCommand | SnapshotRequest, source: str, reason: str) -> None:

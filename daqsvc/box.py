@@ -161,7 +161,7 @@ def _buses(files: Sequence[MachineFile]) -> Iterator[Problem]:
 
 
 def _absolute(file: MachineFile, name: str) -> Bus:
-    """The table of a bus, by whichever file it is told."""
+    """The table of a bus, whichever file it is in."""
     bus = file.buses[name]
     plugin = cast("DriverPlugin[Any]", bus_tables()[bus.driver])
     absolute: Bus = plugin.absolute(file, bus)

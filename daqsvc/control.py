@@ -74,7 +74,7 @@ STATUS_S = 10.0
 RELOAD_S = 120.0
 """How long it waits for a reload, which may compile kernels."""
 LIVE_PIECE_BYTES = 64 * 1024
-"""What is told at a time to one who looks on; the rest when that was taken."""
+"""How much is sent to a viewer at a time; the rest follows when that was taken."""
 MOST_LOOKING = 6
 """Who may look on at a time, beside the connections for commands."""
 SNAPSHOT_S = 90_000.0
@@ -94,7 +94,7 @@ _RELOADS = {
 _SNAPSHOT_VERB = b'{"schema": "daqsvc.control/1", "verb": "snapshot"'
 _LIVE_VERB = b'{"schema": "daqsvc.control/1", "verb": "live"'
 _QUESTIONS = "'status', 'live', 'reload' or 'snapshot'"
-"""Those that the documents tell of, as a person reads them."""
+"""Those that the documents report, as a person reads them."""
 _ANSWER: Literal["daqsvc.control-answer/1"] = "daqsvc.control-answer/1"
 
 
@@ -146,7 +146,7 @@ class ControlRequest(CommandMessage):
 
 
 class LiveRequest(JsonCommand):
-    """Who asks to be told what passes of a machine; the samples of these streams and grids with it."""
+    """Who has asked for what happens at a machine; the samples of these streams and grids with it."""
 
     model_config = ConfigDict(populate_by_name=True)
 
@@ -368,9 +368,9 @@ class ControlServer:
         self._server = await asyncio.start_unix_server(self._welcome, sock=listening, limit=LONGEST_LINE)
 
     async def serve(self) -> None:
-        """Listen until cancelled, and begin again where that fails, or where the socket is taken away.
+        """Listen until cancelled, and begin again where that fails, or where the socket is removed.
 
-        Each new reason why it fails is said, but for one that `open` has told its caller.
+        Each new reason why it fails is said, but for one that `open` has raised.
         """
         backoff, is_reported = Backoff(), self._server is None
         try:
@@ -982,7 +982,7 @@ def _make_link(link: Path, path: Path) -> None:
 
 
 def _leads(link: Path, path: Path) -> bool:
-    """Whether the link that was made is still there; one that cannot be looked at may be."""
+    """Whether the link that was made is still there; one that cannot be examined may be."""
     try:
         return link.is_symlink() and link.readlink() == path
     except FileNotFoundError:
@@ -1000,7 +1000,7 @@ def _check_free(path: Path) -> None:
 
 
 def _is_at(path: Path, inode: int | None) -> bool:
-    """Whether the socket that was made is still at its path; one that cannot be looked at may be."""
+    """Whether the socket that was made is still at its path; one that cannot be examined may be."""
     try:
         return path.lstat().st_ino == inode
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""What a driver tells of itself, as far as it is what its contract says: none spoils what others tell."""
+"""What a driver reports about itself, if it keeps to its contract: no driver spoils the reports of others."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ import sys
 
 
 def give_back() -> None:
-    """Let go of free memory, which the C library keeps for later; takes some milliseconds.
+    """Release free memory, which the C library keeps for later; takes some milliseconds.
 
     Worth while around what needs very much for a moment. Where there is no such thing nothing happens.
     """

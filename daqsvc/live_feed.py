@@ -73,7 +73,7 @@ class Looker:
         self._is_over = False
 
     def add(self, happened: _Happened) -> None:
-        """Have it wait until it is told."""
+        """Have it wait until it is released."""
         size = happened.samples.nbytes if isinstance(happened, SampleBlock) else 0
         if len(self._waiting) >= MOST_WAITING or self._bytes + size > MOST_WAITING_BYTES:
             self._left_out += len(happened.samples) if isinstance(happened, SampleBlock) else 1
@@ -170,9 +170,9 @@ class LiveFeed:
             statements: see `about`.
             alarms: see `about`.
             standings: see `about`.
-            rings: what has come lately, by stream and grid.
+            rings: what has come recently, by stream and grid.
             before_bytes: samples of these that are sent first, at most, to who is elsewhere; None for
-                a process of this box, which is told as well where the machine file lies.
+                a process of this box, which also receives where the machine file is.
         """
         # Copied here, and made into text on a thread: that takes its time of thousands of sensors.
         about = partial(

@@ -1,4 +1,4 @@
-"""The recorder of a machine: what came and what was said lately, and snapshots of it on the disk.
+"""The recorder of a machine: what came and what was said recently, and snapshots of it on the disk.
 
 The event loop only puts references to what passes into a history; a thread writes them when there is a cause.
 A disk that is full, slow or gone costs the snapshot and nothing else.
@@ -77,7 +77,7 @@ MOST_WAITING = 50_000
 """Items of every kind that wait for it, at most."""
 SCHEDULED = "scheduled"
 MOST_CAUSES = 100
-"""Of one snapshot that are written down."""
+"""Of one snapshot that are recorded."""
 MEMORY_EVERY_NS = 5 * NS_PER_S
 """How often detectors are asked what they remember."""
 MOST_MEMORY_BYTES = 16_000_000
@@ -838,7 +838,7 @@ class MachineRecorder:
             snapshot.answer(path or SnapshotRefusedError(ENDS))
 
     def _about(self, before: Sequence[_Item], begin_ns: int, memories: Iterable[_Remembered]) -> Document:
-        """The first message of a snapshot: whose it is, and how things stood at its begin."""
+        """The first message of a snapshot: of which machine it is, and the states when it began."""
         wall_ns = self._clock.wall_ns() - self._clock.monotonic_ns()
         alarms, standings = dict(self._kept.alarms), dict(self._kept.standings)
         known = self._kept.streams | {one.what.stream for one in before if isinstance(one.what, SampleBlock)}

@@ -55,7 +55,7 @@ class BusHealth(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Vitals:
-    """What is looked at.
+    """What is examined.
 
     Attributes:
         now_ns: monotonic clock.

@@ -71,7 +71,7 @@ LAG_REMEMBERED = round(60.0 / LAG_EVERY_S)
 SUSPENDED_S = 1.0
 """A loop that is later than this was not busy: the process was suspended, or the host starved it."""
 RELEASE_S = 0.6
-"""What drivers may take to let go of their buses."""
+"""What drivers may take to release their buses."""
 DRAIN_S = 0.3
 """What the pipeline may take to finish, and again what the disk may take for the events of it."""
 GOODBYE_S = 0.5

@@ -48,7 +48,7 @@ FRESH_S = 0.2
 OLDEST_S = 1.0
 """The journal is waited for at most so long: a disk that hangs leaves the rest as it is."""
 AT_ONCE = 64
-"""Channels or alarms looked at in one turn of the event loop."""
+"""Channels or alarms reported in one turn of the event loop."""
 
 
 class _Seen(NamedTuple):

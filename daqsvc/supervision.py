@@ -115,7 +115,7 @@ class Supervisor:
         """What becomes the exception with which the service must end; else it stays undone."""
         if self._lost is None:
             self._lost = asyncio.get_running_loop().create_future()
-            # Looked at, so that a loss that comes while the service ends is not reported as unseen.
+            # Examined, so that a loss that comes while the service ends is not reported as unseen.
             self._lost.add_done_callback(lambda lost: lost.cancelled() or lost.exception())
         return self._lost
 

@@ -1,6 +1,6 @@
 """Blocking calls in their own threads, which nobody has to wait for.
 
-The threads of a common pool are waited for when the process ends, so one call that hangs, such as a look at a
+The threads of a common pool are waited for when the process ends, so one call that hangs, such as a read of a
 disk that is gone, would keep the process from ending. And a pool that has lost a thread does not notice.
 """
 

@@ -1,6 +1,6 @@
 """What a driver brings to ``daqsvc new``: questions about a bus of its kind, and the tables made of them.
 
-Those of this tree are named in `daqsvc.commands.new.buses`; a package of its own registers one by entry point
+Those of this tree are named in `daqsvc.commands.new.buses`; a separate package registers one by entry point
 in the group ``daqsvc.questions``, under the word that ``--bus`` takes.
 """
 

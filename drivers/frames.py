@@ -75,7 +75,7 @@ class DecodedBatch:
         unknown: frames by unknown id, in words.
         wrong_length: frames by stream, and the length of the last of them.
         malformed: what the first piece was that should have been a frame, and why it is none; empty if there
-            was none, or it has been told before.
+            was none, or it was reported before.
         remedy: what to do if all pieces are like that one; empty if nothing special.
         errors: what error frames say, of a bus that has such; see `drivers.can.errors.ErrorCounts`.
         data_frames: frames that carry data, of any stream or none.

@@ -115,7 +115,7 @@ def _failed(error: BaseException) -> Attempt:
 async def ended(reason: asyncio.Future[str], *threads: Thread) -> str:
     """Wait for the reason with which the threads of a reader end, or for the end of one that gives none."""
     while not reason.done():
-        # Looked at before the wait: what a thread has said last is on its way to the loop when it ends.
+        # Checked before the wait: what a thread has said last is on its way to the loop when it ends.
         alive = all(thread.is_alive() for thread in threads)
         await asyncio.wait({reason}, timeout=LOOK_S)
         if not alive and not reason.done():

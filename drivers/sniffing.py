@@ -43,7 +43,7 @@ class SniffError(Exception):
 
 
 class NothingFoundError(SniffError):
-    """The bus was looked at, and nothing of use was on it."""
+    """The bus was examined, and nothing of use was on it."""
 
 
 class SniffTable(NamedTuple):

@@ -83,7 +83,7 @@ class SimNode(Protocol):
     """Where a client finds it, in words: an interface, a port, the path of a terminal."""
 
     async def ready(self) -> None:
-        """Wait until a client is there, where that can be told."""
+        """Wait until a client is there, where that can be known."""
         ...
 
     async def play(self, pacer: Pacer) -> None:
@@ -400,7 +400,7 @@ class SerialNodes:
         return cls(cable, nodes)
 
     async def ready(self) -> None:
-        """See `SimNode.ready`: whether the port is open can be told."""
+        """See `SimNode.ready`: whether the port is open can be known."""
         while not self._cable.listening:  # noqa: ASYNC110 - a pseudo-terminal does not tell
             await asyncio.sleep(LOOK_S)
 

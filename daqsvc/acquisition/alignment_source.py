@@ -129,7 +129,7 @@ class SourceCounters:
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A stream's clock as its last block tells it.
+    """A stream's clock at its last block.
 
     Times are whole ns, and places are told from the line's own: floats would not hold either for long.
 
@@ -210,7 +210,7 @@ class Follower:
 
     @property
     def line(self) -> Line:
-        """The stream's clock as its last block tells it.
+        """The stream's clock at its last block.
 
         Raises:
             LookupError: nothing has come yet.

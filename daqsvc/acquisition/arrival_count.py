@@ -58,7 +58,7 @@ class ArrivalCount:
         self._count, self._due_ns = first, None
 
     def measured(self, rate_hz: float, drift: float) -> None:
-        """The device's rate has been measured, by these very counts: that tells nothing new."""
+        """The device's rate has been measured, by these very counts: there is nothing new in it."""
 
     def forget_rate(self) -> None:
         """Go by the nominal rate, as ever."""

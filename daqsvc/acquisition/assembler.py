@@ -39,7 +39,7 @@ logger = logging.getLogger(__name__)
 
 REMEMBERED_GAPS = 256
 ASK_AGAIN_NS = NS_PER_S // 20
-"""How often frames that wait for what comes after them are looked at again."""
+"""How often frames that wait for what comes after them are examined again."""
 
 
 @dataclass(slots=True)
@@ -89,7 +89,7 @@ class StreamAssembler:
         counts_per_frame: by how much the counter grows from frame to frame.
         deliver: called with each block, in order, from the thread that calls `accept`.
         reorder_window_ns: how long a gap may wait for an overtaken frame, in time of the samples.
-        stamped: whether the counter is made of the device's time stamps with the nominal rate, and so tells
+        stamped: whether the counter is made of the device's time stamps with the nominal rate, and so shows
             nothing of its rate.
         tell: called when it changes whether anything can be judged by the samples.
     """

@@ -91,7 +91,7 @@ def clock_line(
         slopes_ns: least and greatest slope, ns per sample beyond the nominal period.
 
     Returns:
-        None if all buckets have the same sample count, or have come at the same time: no line can be told.
+        None if all buckets have the same sample count, or have come at the same time: no line can be fitted.
     """
     table = _one_for_each_count(np.ascontiguousarray(buckets, np.float64))
     found, *line = _line_under(table, nominal_ns, *slopes_ns)

@@ -27,7 +27,7 @@ RAW, COUNT, SEEN_NS, HIGHEST, SUSPECT, SUSPECTED = range(6)
 so far; a counter that may be that of a restart, and whether there is one."""
 
 LOOKED_AHEAD = 16
-"""Frames that are looked at ahead of others, per frame of a batch: those beyond are not waited for."""
+"""Frames that are examined ahead of others, per frame of a batch: those beyond are not waited for."""
 
 
 class Rules(NamedTuple):
@@ -88,10 +88,10 @@ def catches_up(
         late: how late that frame was, in counts.
         rules: float64 ``[8]``, see `Rules`.
         unused_bits: of 64.
-        most: frames to be looked at.
+        most: frames to be examined.
 
     Returns:
-        And how many frames were looked at.
+        And how many frames were examined.
     """
     _, _, ahead, _, doubt, rate, drift, watch_ns = rules
     end = min(at + most, len(raw))
@@ -234,7 +234,7 @@ WATCH_NS = NS_PER_S
 _DOUBT, _RATE, _DRIFT = (Rules._fields.index(name) for name in ("doubt", "rate", "drift"))
 
 LEAST_BITS, MOST_BITS = 4, 64
-"""How wide a counter may be: one of fewer bits wraps within a few frames, and tells nothing of a gap."""
+"""How wide a counter may be: one of fewer bits wraps within a few frames, and cannot show a gap."""
 
 _FIRST_BITS = 32
 """A wider counter begins at so many of its low bits: far from the end of the integers that count on."""

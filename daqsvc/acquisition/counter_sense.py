@@ -1,6 +1,6 @@
 """Whether the frames of a stream can be placed: a counter that stands still or leaps about, and floods.
 
-The frames of a stream that cannot be placed are set aside: counted, and looked at only to see whether they
+The frames of a stream that cannot be placed are set aside: counted, and examined only to see whether they
 make sense again. That costs little, however many they are.
 """
 
@@ -22,11 +22,11 @@ STILL_FRAMES = 8
 
 LOOKED_FRAMES, LOOKED_NS = 64, NS_PER_S // 5
 REJECTED = 0.25
-"""A counter makes no sense if so large a share of so many frames fits nothing."""
+"""A counter makes no sense if this share of that many frames fits nothing."""
 
 SENSE_FRAMES, SENSE_NS = 32, NS_PER_S // 2
 SENSE = 0.75
-"""It makes sense again if so large a share of so many frames goes on from the one before, ..."""
+"""It makes sense again if this share of that many frames goes on from the one before, ..."""
 SENSE_STEPS = 4
 """... by so many frames at most."""
 

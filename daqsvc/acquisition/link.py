@@ -1,4 +1,4 @@
-"""Keeping a link up: when to try again, and how often what comes and goes may be logged."""
+"""Keeping a link up: when to try again, and how often an unstable link may be logged."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ class Backoff:
 class Link:
     """The state of one link, said once when it goes and once when it is back.
 
-    Of one that comes and goes that is said three times a minute at most.
+    Of one that keeps failing that is logged three times a minute at most.
 
     Attributes:
         name: what a person calls it.

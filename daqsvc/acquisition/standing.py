@@ -55,7 +55,7 @@ def cause_of(doubt: str) -> str:
 
 
 class StreamStanding:
-    """Keeps a stream's standing, tells it when it changes, and logs it.
+    """Keeps a stream's standing, reports it when it changes, and logs it.
 
     Args:
         stream: name of the stream.

@@ -465,7 +465,7 @@ class TimeBase:
 
 
 def rate_in_words(rate_hz: float, nominal_ns: float) -> str:
-    """What to tell of a device whose rate is not the nominal one.
+    """What to report about a device whose rate is not the nominal one.
 
     Args:
         rate_hz: what it sends, samples per second.

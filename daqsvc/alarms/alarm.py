@@ -345,7 +345,7 @@ class Alarm:
             return None
         message = self._saying(level, finding.sentence)
         if kind is EventKind.CHANGED and message == self._last_message:
-            # No person could tell it from what was said last; what is found goes with the next event.
+            # No person would see a difference from the last message; what is found goes with the next event.
             self._finding, self._seen_doubts = finding.identity, self.doubts
             return None
         self._last_message = message
@@ -501,7 +501,7 @@ class Alarm:
         message: str,
         before: AlarmState | None = None,
     ) -> AlarmEvent:
-        """Move to ``state`` and ``level``, and tell it."""
+        """Move to ``state`` and ``level``, and report it."""
         before, level_before, occurrence = before or self._shown, self._level, self._occurrence
         self._state, self._level, self._cause = state, level, cause
         if state is AlarmState.NORMAL:

@@ -1,4 +1,4 @@
-"""The code of what an alarm of the service itself tells of, by the name of the alarm."""
+"""The code of what an alarm of the service itself reports, by the name of the alarm."""
 
 from __future__ import annotations
 

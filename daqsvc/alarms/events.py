@@ -53,7 +53,7 @@ class EventKind(StrEnum):
     UNBYPASSED = "unbypassed"
     """A person has put it back into service."""
     CHATTERING = "chattering"
-    """It comes and goes so often that its returns are held back until it is quiet."""
+    """It becomes active and returns so often that its returns are held back until it is quiet."""
     QUIET = "quiet"
     """It no longer chatters."""
 
@@ -104,7 +104,7 @@ class AlarmEvent:
         covered: the alarm's own state under these; None if nothing covers it.
         shelved_until_wall_ns: wall-clock label of the end of shelving, as it looks now; None if not shelved.
         first_out: whether this alarm was the first of its group to stand since the group was normal.
-        chattering: whether its returns are held back because it comes and goes too often.
+        chattering: whether its returns are held back because it becomes active and returns too often.
         finding: what is found, where a level can have several causes (`Finding.identity`).
         doubts: of a quality alarm, what is said against the sensor.
 

@@ -165,7 +165,7 @@ class AlarmManager:
     def condition(self, name: str, level: Level, sentence: str) -> list[AlarmEvent]:
         """A condition of the service itself stands at ``level``; an event only if that is new.
 
-        Say it again as often as it is looked at, also when it is normal: after a restart it stands so long.
+        Report it again at each evaluation, also when it is normal: until then a restart leaves it as it was.
 
         Args:
             name: of the condition, e.g. ``"certificate/client"``.

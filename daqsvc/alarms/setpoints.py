@@ -159,7 +159,7 @@ class SetpointMonitor:
         """Take in a value of which only bounds are known; it may reach limits, and leaves none.
 
         A limit is reached if the value is beyond it wherever it lies between ``low`` and ``high``. What
-        cannot be told so holds, and no delay goes on.
+        cannot be judged is held, and no delay goes on.
         """
         for comparator in self._comparators:
             comparator.rise(low, high, t_ns, factor)

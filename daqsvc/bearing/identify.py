@@ -180,7 +180,7 @@ def whiteness(innovations: Floats, lags: int = _WHITENESS_LAGS) -> Whiteness:
 
     Args:
         innovations: float64 ``[n, m]``; NaN where missing.
-        lags: how many lags are looked at.
+        lags: how many lags are examined.
     """
     there = complete(innovations)
     n, m = int(there.sum()), innovations.shape[1]

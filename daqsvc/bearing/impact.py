@@ -98,7 +98,7 @@ def healthy_spectrum(
         residual: float64 ``[n, 2]``.
         rate_hz: its sampling rate.
         frame: samples.
-        kept: bool ``[frame // 2 + 1]``, lines that are looked at.
+        kept: bool ``[frame // 2 + 1]``, lines that are examined.
         least: frames that are needed.
         purpose: of the spectrum, for people.
 

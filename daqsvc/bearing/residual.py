@@ -34,7 +34,7 @@ ORDER = 6
 """Lags in a chain of the residual generator."""
 GENERATOR = np.dtype(
     [
-        # pole of every lag, and the samples after a start that are not told
+        # pole of every lag, and the samples after a start without a residual
         ("stay", np.float64), ("settling", np.int64),
         # from the inputs into the lags, and the state of the lags under constant inputs: input, lag and race
         ("drive", np.float64, (3, 2 * ORDER)), ("rest", np.float64, (3, 2 * ORDER)),

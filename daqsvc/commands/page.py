@@ -158,7 +158,7 @@ def _serve_box(store: Path, listen: Address, choice: AccessChoice, *, with_paren
 
 
 def _shows_its_page(store: Path) -> bool:
-    """Whether the service that runs on a store has a page of its own."""
+    """Whether the service that runs on a store has its own page."""
     from daqsvc.control import ControlError, ask_status  # noqa: PLC0415 - only what a verb needs
 
     try:

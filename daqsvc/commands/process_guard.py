@@ -1,6 +1,6 @@
 """The process around a service: its signals, its terminal, and the way out if something hangs.
 
-A thread hears the signals, so that a stop is obeyed whatever the event loop does, and sees that the loop
+A thread hears the signals, so that a stop is carried out whatever the event loop does, and sees that the loop
 turns and that a stop comes to its end. Time is counted in the thread's own turns: a process that was
 suspended has neither stood still nor stopped late.
 """
@@ -125,9 +125,9 @@ class ProcessGuard:
             stop()
 
     def reload_by(self, reload: Callable[[], object]) -> None:
-        """Say what SIGHUP has done on the event loop; called there. One that came before is obeyed now."""
+        """Set what SIGHUP does on the event loop; called there. One that came before is carried out now."""
         self._reload = reload
-        # In this order, as `_hear` has the other: one that comes right now is rather obeyed twice than never.
+        # In this order, as `_hear` has the other: of one that comes right now twice is better than never.
         if self._reload_asked:
             self._reload_asked = False
             reload()

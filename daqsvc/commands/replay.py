@@ -77,7 +77,7 @@ class ReplayCommand(VerbWithKernels):
         except ReplayError as error:
             what = harmless(f"{arguments.snapshot} {error}")
             return complain("daqsvc replay", what, error.code, EXIT_REFUSED)
-        # A snapshot may be anybody's: what is in it is shown and not obeyed.
+        # A snapshot may be anybody's: what is in it is shown and not carried out.
         lines = [json.dumps(_document(replayed))] if arguments.json else map(harmless, _lines(replayed))
         print("\n".join(lines))  # noqa: T201 - this is what the verb is for
         return EXIT_FAILED if arguments.check and not replayed.is_equal else EXIT_OK

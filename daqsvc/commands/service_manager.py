@@ -1,7 +1,7 @@
 """What a service reports to systemd: that it is ready, its status, that it is alive, that it stops.
 
 The protocol is sd_notify(3): datagrams of assignments to the socket that ``$NOTIFY_SOCKET`` names. Without
-that nothing is told and nothing is watched.
+that nothing is reported and nothing is watched.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class ServiceManager:
         watchdog_s: how soon the service is ended that is silent; None if nobody waits for it.
 
     Attributes:
-        is_ready: whether it has been told that the service is ready.
+        is_ready: whether it knows that the service is ready.
         begun_s: when `starting` was called, by the monotonic clock; None if it was not.
         is_overtold: whether other words stand in place of what the service waits for.
     """
@@ -81,7 +81,7 @@ class ServiceManager:
 
     @classmethod
     def of_environment(cls) -> Self:
-        """The one that has started this process; its variables are taken away, they are for no child."""
+        """The one that has started this process; its variables are removed, they are for no child."""
         address, watchdog_us, watchdog_pid = (os.environ.pop(name, "") for name in VARIABLES)
         if not address.startswith(("/", "@")):
             return cls()
@@ -99,13 +99,13 @@ class ServiceManager:
         return cls(address, watchdog_s)
 
     def close(self) -> None:
-        """Tell nothing more."""
+        """Send nothing more."""
         self._end_starting()
         if self._socket is not None:
             self._socket.close()
 
     def tell(self, **assignments: object) -> bool:
-        """Tell something; whether it could be told, or nobody wants to know."""
+        """Send a notice; True if it was sent, or if no manager expects any."""
         if self._socket is None:
             return True
         lines = "\n".join(f"{name}={' '.join(f'{value}'.split())}" for name, value in assignments.items())
@@ -164,7 +164,7 @@ class ServiceManager:
     async def follow(self, service: Service) -> None:
         """Report the state of a service and that it works, until cancelled; not for long on its event loop.
 
-        It is told to be ready when every bus delivers that it must have (`Service.awaited`), and to be alive
+        It is reported ready when every bus delivers that it must have (`Service.awaited`), and to be alive
         for as long as none of its parts has stalled. A service that is not alive is started again by systemd.
         """
         if self._socket is None:
@@ -222,7 +222,7 @@ class _Follower:
             self._extended_s = now_s
 
     def _status(self, standing: str, figures: str, now_s: float) -> None:
-        """Tell ``standing`` with ``figures`` if the former has changed, or is told for long."""
+        """Send ``standing`` with ``figures`` if it has changed, or was sent long ago."""
         if self._manager.is_overtold:
             self._told, self._manager.is_overtold = "", False
         is_new = standing != self._told and now_s - self._told_s >= CHANGE_S

@@ -58,7 +58,7 @@ class SniffCommand:
 
 
 def sniffers() -> dict[str, Sniffer]:
-    """Every kind of bus that can be looked at, by the name of its driver."""
+    """Every kind of bus that can be examined, by the name of its driver."""
     ours: dict[str, Sniffer] = {"can": CanSniffer(), "serial": SerialSniffer(), "modbus": ModbusSniffer()}
     return ours | plugged(SNIFFERS, Sniffer, "sniff")  # type: ignore[type-abstract]
 

@@ -38,7 +38,7 @@ def share_heaps() -> None:
 
 
 def give_back() -> None:
-    """Let go of the pages of libraries that have not been changed, and of free memory of the heap; blocks.
+    """Release the pages of libraries that have not been changed, and of free memory of the heap; blocks.
 
     Pages that are needed are mapped again when they are, without reading the file as long as the host has it
     in memory. Where the kernel has no such thing nothing happens.

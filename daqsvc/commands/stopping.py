@@ -1,4 +1,4 @@
-"""Ctrl-C that ends a look at a bus, and not the program."""
+"""Ctrl-C that ends reading a bus, and not the program."""
 
 from __future__ import annotations
 

@@ -133,7 +133,7 @@ class ConfinedProcess:
             arguments: of it, as JSON can say them.
             memory_bytes: what it may take beyond what the process has, in address space.
             cpu_s: processor time that it may take.
-            spill: leave large arrays that come back in files, to be looked at piece by piece
+            spill: leave large arrays that come back in files, to be read piece by piece
                 (`daqsvc.confined.spilled`).
 
         Raises:

@@ -1,4 +1,4 @@
-"""Arrays that lie in a file instead of in memory: a long recording is looked at piece by piece."""
+"""Arrays that lie in a file instead of in memory: a long recording is read piece by piece."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def spilled(
 
 
 def let_go(array: NDArray[Any]) -> None:
-    """Take what has been looked at of a spilled array out of memory again; any other stays as it is."""
+    """Take what has been examined of a spilled array out of memory again; any other stays as it is."""
     base: Any = array
     while isinstance(base, np.ndarray):
         base = base.base

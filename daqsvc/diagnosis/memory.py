@@ -34,7 +34,7 @@ Tree: TypeAlias = Any
 
 
 class MemoryNotTakenError(Exception):
-    """A detector remembers too much, or what cannot be told."""
+    """A detector remembers too much, or what cannot be stored."""
 
 
 class MemoryNotFittingError(Exception):
@@ -67,7 +67,7 @@ class DetectorMemory(NamedTuple):
 
     @classmethod
     def of(cls, document: dict[str, Any]) -> DetectorMemory:
-        """What `document` has told.
+        """The memory from what `document` has made.
 
         Raises:
             MemoryNotFittingError: it is none.

@@ -423,7 +423,7 @@ class Pipeline:
 
         It is said once more when only then the bus tells why nothing comes.
 
-        Of a stream in doubt samples may not come as far as the ring; that frames come is told with the doubt.
+        Of a stream in doubt samples may not come as far as the ring; the doubt states that frames come.
 
         A process that was suspended has not listened: what came meanwhile still waits to be read.
         """
@@ -497,7 +497,7 @@ class Pipeline:
             stream, diagnoses = detector.stream, job.outcome.result()
             if self._changes[stream] != self._seen_changes[detector.name]:
                 continue  # its samples may not have been what they seemed
-            # What lies before a silence that has been told is history: it must not speak after it.
+            # What lies before a silence that was reported is history: it must not be used after it.
             self._held[stream] += (one for one in diagnoses if one.t_ns > self._silent_until_ns[stream])
             if self._standings[stream].proven:
                 self._let_go(stream)

@@ -231,7 +231,7 @@ class RecordedDetector(Hooks, Generic[SettingsT]):
         return self.settings if all(name in sensors for name in named) else None
 
     def left_out(self, sensors: Container[str]) -> str:
-        """What of the machine a recording tells nothing of, in a sentence; empty if there is nothing.
+        """What a recording does not show of the machine, in a sentence; empty if there is nothing.
 
         Args:
             sensors: names of the sensors that the recording has.

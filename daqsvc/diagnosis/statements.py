@@ -40,7 +40,7 @@ def said_of_window(detector: Detector, window: Window) -> Sequence[Diagnosis]:
     """What a detector says of a window.
 
     Raises:
-        BrokenContractError: these are no statements, or they cannot be told.
+        BrokenContractError: these are no statements, or they cannot be sent.
         Exception: it has failed.
     """
     latest_ns = window.t_end_ns
@@ -51,7 +51,7 @@ def said_of_silence(detector: Detector, silence_s: float, t_ns: int) -> Sequence
     """What a detector says of a silence.
 
     Raises:
-        BrokenContractError: these are no statements, or they cannot be told.
+        BrokenContractError: these are no statements, or they cannot be sent.
         Exception: it has failed.
     """
     return _said(detector.silent, min(0, t_ns), t_ns, silence_s, t_ns)
@@ -109,7 +109,7 @@ def see_severity(severity: object) -> None:
 
 
 def see_names(what: str, named: object) -> None:
-    """See that figures or units are there by names that can be told.
+    """Check that the names of figures or units can be sent.
 
     Raises:
         ValueError: they are not.
@@ -150,7 +150,7 @@ def see_numbers(figures: Iterable[tuple[str, Any]]) -> None:
 
 
 def see_statement(one: Diagnosis, earliest_ns: int, latest_ns: int) -> None:
-    """See that a statement that somebody has put together by hand can be told, and is of its time.
+    """Check that a statement that was made by hand can be sent, and is of its time.
 
     Args:
         one: the statement.

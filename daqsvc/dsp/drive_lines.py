@@ -39,7 +39,7 @@ _SHARP_DB = 6.0
 _LEAST_TEETH, _MOST_TEETH = 12, 120
 """Gears with fewer are rare, as their teeth are cut away at the foot."""
 TOP_ORDER = 2.0 * _MOST_TEETH + 4.0
-"""The highest order that is looked at: beside the second harmonic of a mesh."""
+"""The highest order that is examined: beside the second harmonic of a mesh."""
 _CARRIER_DB = 6.0
 """How far a mesh and its second harmonic stand above the harmonics of the shaft beside them."""
 _MESH_SHARE = 0.06
@@ -50,7 +50,7 @@ _LEAST_REVOLUTIONS = 60.0
 _SIDEBAND_ORDERS = (1, 2, 3)
 _LEAST_PAIRS = 2
 _SHARP, _VAGUE = 0.0012, 0.006
-"""How well the shaft's speed is known, as shares, where its harmonics tell it sharply and where not."""
+"""How well the shaft's speed is known, as shares, where its harmonics show it sharply and where not."""
 _MOST_SLIP = 0.08
 _MOST_POLE_PAIRS = 8
 
@@ -119,7 +119,7 @@ class LineLevels:
     Args:
         spectrum: complex ``[bins]``, one-sided, of the whole record from 0 Hz, without window.
         step_hz: between two bins.
-        top_hz: what lies above is not looked at.
+        top_hz: what lies above is not examined.
     """
 
     def __init__(self, spectrum: Complex, step_hz: float, top_hz: float) -> None:

@@ -38,7 +38,7 @@ THINNING_TAPS = 7 * THINNING
 THINNING_KAISER = 6.5
 """Shape of the low-pass before: what lies where it would fold onto the lines is 60 dB down."""
 THINNED_BINS = 0.05
-"""Lines up to this share of an envelope's samples are looked at in the thinned one."""
+"""Lines up to this share of an envelope's samples are examined in the thinned one."""
 
 HANN_NOISE_BANDWIDTH = 1.5
 """Bins over which a line of a Hann-windowed spectrum spreads its power."""
@@ -120,7 +120,7 @@ def squared_envelope(band: Band, bins: int) -> Envelope:
 
     Args:
         band: one-sided spectrum of the band; where it lies does not matter.
-        bins: how many bins of the envelope's own spectrum will be looked at: those are free of aliasing.
+        bins: how many bins of the envelope's own spectrum will be examined: those are free of aliasing.
 
     Returns:
         ``[samples]`` at its own rate, over the signal's whole duration.

@@ -42,7 +42,7 @@ _DEVIATIONS = 4.0
 _BLOCK_WIDTHS = 2.0
 """Widths of a block's lines within which another one leaks into an order."""
 _MOTOR_TOP_HZ = 130.0
-"""What has to be looked at to find twice the mains."""
+"""What has to be examined to find twice the mains."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,7 +33,7 @@ class Probe:
 def shaft_axes_deg(angles_deg: tuple[float, float], *, clockwise: bool) -> tuple[float, float]:
     """Where probes point in the coordinates of the shaft, in which it turns from x to y.
 
-    A shaft that turns clockwise is looked at from its other end: x is mirrored, gravity still points down.
+    A shaft that turns clockwise is viewed from its other end: x is mirrored, gravity still points down.
 
     Args:
         angles_deg: where they point on the machine, from +x anticlockwise.

@@ -30,7 +30,7 @@ _SURE_OF_PHASE = 6.0
 SLIP = 0.03
 """A shaft whose speed nobody measures is looked for within this part of the stated one."""
 _PER_LINE = 4
-"""Places looked at in the width of a line."""
+"""Places examined in the width of a line."""
 _PER_TURN = 16.0
 """Samples of a revolution that are left for the search: orders beside a multiple of it are 24 dB down."""
 
@@ -124,7 +124,7 @@ def window_orders(samples: Floats, angle_rad: Floats) -> WindowOrders | None:
 def steady_angle(samples: Floats, turns_per_sample: float) -> Floats:
     """The angle of a shaft that turns evenly at about a stated speed, by the strongest line near to it.
 
-    Its zero is arbitrary: only amplitudes can be told by it. The line is searched within `SLIP` of the
+    Its zero is arbitrary: only amplitudes are meaningful. The line is searched within `SLIP` of the
     stated speed, by the periodogram of a Hann taper.
 
     Args:

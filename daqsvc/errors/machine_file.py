@@ -1,7 +1,7 @@
 """The machine file.
 
-Errors of the file as a whole, of its keys, and of sensors. Those of buses, detectors, alarms and outputs
-have groups of their own.
+Errors of the file as a whole, of its keys, and of sensors. Those of buses, detectors, alarms and outputs are
+in separate groups.
 """
 
 from daqsvc.errors.code import Code

@@ -61,7 +61,7 @@ class CampaignSummary:
         verdicts: of all in the archive, how many have each, as `daqsvc.fleet.report.verdict_of` has it.
         others: files among the recordings that are of no kind that is judged.
         left_out: folders that are no machine's.
-        failed: machines that could not be looked at, and why; what the results have of them stays.
+        failed: machines that could not be examined, and why; what the results have of them stays.
     """
 
     machines: int = 0

@@ -52,7 +52,7 @@ def why(error: OSError) -> str:
 
 
 def is_within(place: tuple[Any, str], whole: tuple[Any, str]) -> bool:
-    """Whether a place is another one, or in it.
+    """Whether a place is the same as another, or in it.
 
     Args:
         place: file system and path of it.

@@ -245,7 +245,7 @@ class Results:
 
 
 def folder_of(machine: str) -> str:
-    """The folder of a machine, named as Hive and its kin name partitions.
+    """The folder of a machine, named as Hive names partitions.
 
     A name that would be too long for a file system is cut, and told from others by its digest.
     """

@@ -145,7 +145,7 @@ class HistoryReader:
             raise
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Release the file."""
         self._sql.close()
 
     @property

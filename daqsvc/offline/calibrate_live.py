@@ -50,7 +50,7 @@ async def calibrate_live(
     May be cancelled at any time; it then leaves no task and no open bus behind.
 
     Args:
-        machine: a machine file with ``[pipeline.rotor_synchronous]``; its ``calibration`` is not looked at.
+        machine: a machine file with ``[pipeline.rotor_synchronous]``; its ``calibration`` is not examined.
         clock: the service's clock.
         revolutions: usable revolutions to wait for.
         timeout_s: how long to wait for them.

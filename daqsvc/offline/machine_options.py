@@ -49,7 +49,7 @@ def recording_options(arguments: argparse.Namespace, **others: Any) -> Recording
 
 
 def rotor_machine(arguments: argparse.Namespace) -> MachineFile:
-    """The calibrated rotor that options tell of.
+    """The calibrated rotor that options describe.
 
     Args:
         arguments: of `daqsvc.commands.recording_options.add_rotor`. What `calibrate` asks is not known yet:
@@ -113,7 +113,7 @@ def rotor_machine(arguments: argparse.Namespace) -> MachineFile:
 
 
 def bearing_machine(arguments: argparse.Namespace) -> MachineFile:
-    """The bearings that options tell of, one for each channel.
+    """The bearings that options name, one for each channel.
 
     Args:
         arguments: with ``channels``, ``speed_rpm``, ``map``, and ``bearing`` or ``orders``.

@@ -1,4 +1,4 @@
-"""Ids of commands, on disk before the command is obeyed, so that none is obeyed twice.
+"""Ids of commands, on disk before the command is carried out, so that none is carried out twice.
 
 A broker that has not seen our acknowledgement sends a command again, after a restart of the service too.
 Each id is a line of a small file, with a checksum; the file is written again when it has grown to twice what
@@ -36,7 +36,7 @@ log = logging.getLogger(__name__)
 
 
 class CommandIds:
-    """The ids of the commands that have come, and until when each could still be obeyed.
+    """The ids of the commands that have come, and until when each could still be carried out.
 
     Thread-safe: commands may come by several ways at a time.
 
@@ -131,7 +131,7 @@ class CommandIds:
         Args:
             machine: whom the command is for; without blanks.
             identifier: the command's id; without blanks.
-            until_ns: when it will be too old to be obeyed, wall clock.
+            until_ns: when it will be too old to be carried out, wall clock.
             now_ns: wall clock.
 
         Returns:

@@ -421,7 +421,7 @@ def is_corrupt(error: Exception) -> bool:
     """Whether an error says that the file itself is broken, rather than the disk full or busy.
 
     All statements of the outbox are constants, so one that a file does not understand, or whose constraints
-    it violates, tells of damage as well. So does one whose message Python cannot decode.
+    it violates, is a sign of damage as well. So does one whose message Python cannot decode.
     """
     if isinstance(error, sqlite3.OperationalError) and f"{error}".startswith("Could not decode"):
         return True  # Python's own words for text that is none

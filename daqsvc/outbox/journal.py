@@ -98,7 +98,7 @@ SHORT_BYTES = 1024 * 1024
 
 
 class Journal:
-    """Messages by sequence number, sent or not; how the numbers go on is told in `outbox.sequence`.
+    """Messages by sequence number, sent or not; `outbox.sequence` explains how the numbers go on.
 
     A message is numbered, then written; until then it waits in memory, under the number and with the content
     that it keeps. Nobody reads it there, unless it is shown because the disk takes no writes: see `show`.
@@ -175,7 +175,7 @@ class Journal:
 
     @property
     def was_ahead(self) -> bool:
-        """Whether an earlier run may have told the broker what the journal does not have.
+        """Whether an earlier run may have sent to the broker what the journal does not have.
 
         So it is until `damage_is_told`.
         """
@@ -216,7 +216,7 @@ class Journal:
         except OSError as error:
             if isinstance(error, PermissionError):
                 with contextlib.suppress(OSError):
-                    refuse_unsafe(self.path.parent)  # it says whose it is
+                    refuse_unsafe(self.path.parent)  # its message names the owner
             raise self._unusable(error) from error
 
     def open(self) -> None:
@@ -785,10 +785,10 @@ class Journal:
         return self._connection
 
     def _reading(self) -> sqlite3.Connection:
-        """The journal; while it cannot be opened, a look at it that needs no room on the disk.
+        """The journal; while it cannot be opened, a reader of it that needs no room on the disk.
 
         Raises:
-            sqlite3.Error: it cannot be looked at, or may say what the disk never got (see `_prove`).
+            sqlite3.Error: it cannot be examined, or may say what the disk never got (see `_prove`).
             OSError: as above.
         """
         if self._is_ready or self._connection is not None or self._lock is None:

@@ -172,7 +172,7 @@ def _tried(path: Path, query: Callable[[sqlite3.Connection], _T]) -> _T:
 
 def _read_once(path: Path, query: Callable[[sqlite3.Connection], _T]) -> _T:
     with opened_to_read(path) as connection:
-        connection.execute("BEGIN")  # all that follows tells of one moment
+        connection.execute("BEGIN")  # all that follows is of one moment
         _check_version(path, connection)
         return query(connection)
 
@@ -226,10 +226,10 @@ def refuse_newer(path: Path) -> None:
         NewerOutboxError: a newer version of the program has written it.
         StoreRefusedError: it is a file of others; or root reads, and others may put files there.
     """
-    # What else may be wrong with it, the service finds and mends when it opens it.
+    # What else may be wrong with it, the service finds and repairs when it opens it.
     with contextlib.suppress(*FileError):
         if os.geteuid() == 0:
-            # SQLite opens by name what may have become a link, or a pipe, after it was looked at.
+            # SQLite opens by name what may have become a link, or a pipe, after it was examined.
             refuse_unsafe(path.parent)
         with opened_to_read(path) as connection:
             known_version(connection, path)

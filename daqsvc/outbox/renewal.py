@@ -165,7 +165,7 @@ class Renewal:
         return bool(old)
 
     def remember(self, damage: JournalDamage) -> None:
-        """Keep what is to be told over a crash."""
+        """Keep over a crash what is still to be sent."""
         try:
             replace_durably(self._note, json.dumps(asdict(damage)).encode())
         except OSError as error:
@@ -188,7 +188,7 @@ class Renewal:
             return JournalDamage(quarantined=1)
 
     def is_told(self) -> None:
-        """It is told."""
+        """It was sent."""
         with contextlib.suppress(FileNotFoundError):
             self._note.unlink()
 

@@ -49,7 +49,7 @@ def refuse_no_directory(store: Path) -> None:
 
     Raises:
         StorePathError: something else is in its place, or above it.
-        OSError: it cannot be looked at.
+        OSError: it cannot be examined.
     """
     for at in (store, *store.parents):
         try:
@@ -138,7 +138,7 @@ def refuse_unsafe(store: Path) -> None:
 
     Raises:
         StoreRefusedError: somebody can, or has; or this account may not look. The text says what to do.
-        OSError: it cannot be looked at.
+        OSError: it cannot be examined.
     """
     _refuse_path(store)
     try:
@@ -158,7 +158,7 @@ def refuse_unwritable(store: Path) -> None:
 
     Raises:
         StoreRefusedError: it may not; the text says what to do.
-        OSError: it cannot be looked at.
+        OSError: it cannot be examined.
     """
     if is_read_only(store) or os.access(store, os.R_OK | os.W_OK | os.X_OK, effective_ids=True):
         return
@@ -182,7 +182,7 @@ def refuse_unopenable(store: Path) -> None:
 
     Raises:
         StoreRefusedError: it may not; the text says what to do.
-        OSError: it cannot be looked at.
+        OSError: it cannot be examined.
     """
     writable = 0 if is_read_only(store) else os.W_OK
     for path in (store / name for name in _OPENED):
@@ -208,7 +208,7 @@ def restrict_files(store: Path) -> None:
     """Take from the files of a store what they allow to others than their owner and group.
 
     Raises:
-        OSError: it cannot be looked at.
+        OSError: it cannot be examined.
     """
     for path in store.iterdir():
         if path.name.startswith(_OURS):
@@ -220,7 +220,7 @@ def refuse_link(path: Path) -> None:
 
     Raises:
         StoreRefusedError: it is; the text says what to do.
-        OSError: it cannot be looked at.
+        OSError: it cannot be examined.
     """
     try:
         status = path.lstat()

@@ -142,12 +142,12 @@ class SequenceMark:
 
     @property
     def is_ahead(self) -> bool:
-        """Whether the broker may have been told what the journal does not have."""
+        """Whether the broker may have received what the journal does not have."""
         return self._told.ahead
 
     @property
     def is_damaged(self) -> bool:
-        """Whether a side file is damaged or missing, as far as that can be told."""
+        """Whether a side file is damaged or missing, as far as that can be known."""
         return self._damaged
 
     @property
@@ -316,7 +316,7 @@ class SequenceMark:
 
 
 def _is_unset(wall_ms: int, known: int) -> bool:
-    """Whether the wall clock is so far behind the numbers that it can tell nothing of them."""
+    """Whether the wall clock is so far behind the numbers that it cannot be used to check them."""
     return wall_ms <= known - UNRECORDED
 
 

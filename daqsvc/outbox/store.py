@@ -126,7 +126,7 @@ class Outbox:
         self._telemetry.start()
 
     async def glimpse(self) -> list[OutboxMessage] | None:
-        """`latest` of a journal that cannot be opened for now; None if it cannot even be looked at."""
+        """`latest` of a journal that cannot be opened for now; None if it cannot even be examined."""
         try:
             return await asyncio.to_thread(_latest_of, self._journal.path)
         except (OutboxError, OSError) as error:
@@ -135,9 +135,9 @@ class Outbox:
 
     @property
     def broker_is_ahead(self) -> bool:
-        """Whether an earlier run may have told the broker what the journal never got.
+        """Whether an earlier run may have sent to the broker what the journal never got.
 
-        Until `damage_is_told`, which says that the broker has been told the state of everything by now.
+        Until `damage_is_told`, which states that the broker has received the state of everything by now.
         """
         return self._journal.was_ahead
 

@@ -1,7 +1,7 @@
 """The SQLite file of telemetry: bounded in bytes and age, not synced, used by one thread.
 
 It shares no page and no lock with the journal of alarms, so neither can harm the other. Where the file
-cannot be used (full or broken disk), the same table is kept in memory, smaller: the status that tells of the
+cannot be used (full or broken disk), the same table is kept in memory, smaller: the status that reports the
 full disk must still reach the broker.
 """
 

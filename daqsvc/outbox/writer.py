@@ -116,7 +116,7 @@ class Failure:
 
 
 class Reports(Protocol):
-    """Who is told, on the event loop, what the writer has done."""
+    """Called on the event loop with what the writer has done."""
 
     def committed(
         self,
@@ -161,7 +161,7 @@ class JournalWriter:
 
     Args:
         journal: the file; nobody else may use it.
-        reports: who is told.
+        reports: called with what the writer has done.
         make_way: called on the thread before the journal is opened, with its directory in our possession.
     """
 

@@ -31,7 +31,7 @@ class KeptSnapshot(NamedTuple):
     """A snapshot on the box.
 
     Attributes:
-        name: by which it is looked at, with its machine.
+        name: by which it is examined, with its machine.
         time_utc: of its cause, ISO 8601.
         kind: why it was made, e.g. ``"alarm"``.
         size_mb: of its file.
@@ -44,7 +44,7 @@ class KeptSnapshot(NamedTuple):
 
 
 class BoxSnapshots:
-    """Snapshots of a store that are looked at.
+    """Snapshots of a store that are shown.
 
     Args:
         store: its directory.

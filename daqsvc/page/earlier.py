@@ -39,7 +39,7 @@ def opened_history(live: MachineLive) -> Iterator[HistoryReader | None]:
 
 
 def probabilities_before(live: MachineLive, detector: str, modes: Sequence[str], until_ns: int) -> Earlier:
-    """The probabilities of modes before a time, each second, as far as they were written down; blocks.
+    """The probabilities of modes before a time, each second, as far as they were recorded; blocks.
 
     Args:
         live: the machine.

@@ -1,4 +1,4 @@
-"""What the page knows of one machine: what the service has told since somebody began to look.
+"""What the page knows of one machine: what the service has sent since the first viewer came.
 
 Nothing is kept over a restart, and of the waveforms no more than the last seconds.
 """
@@ -57,12 +57,12 @@ class Sensor(NamedTuple):
 
     Attributes:
         name: its name.
-        kind: ``"proximity"``, ``"accelerometer"``, ``"keyphasor"`` and the like.
+        kind: ``"proximity"``, ``"accelerometer"``, ``"keyphasor"`` or another type.
         unit: of its samples.
         angle_deg: where a probe points, from +x anticlockwise; None for others.
         threshold: where a keyphasor's pulse begins; None for others.
         edge: the edge of that pulse that marks a revolution.
-        hysteresis: how far the voltage must go back before there is another one.
+        hysteresis: how far the voltage must go back before the next one can come.
     """
 
     name: str
@@ -118,7 +118,7 @@ class Earlier(NamedTuple):
 
     Attributes:
         t_ns: ``[n]``, by the box's monotonic clock.
-        values: ``[n, keys]``; NaN where a figure was not told.
+        values: ``[n, keys]``; NaN where a figure was not sent.
     """
 
     t_ns: NDArray[np.int64]
@@ -135,7 +135,7 @@ class SensorPlace(NamedTuple):
 class MachineLive:
     """One machine, as it was received.
 
-    The event loop tells it, and threads look at it meanwhile: they copy what they go through, by ``[*...]``.
+    The event loop changes it, and threads read it meanwhile: they copy what they go through, by ``[*...]``.
 
     Args:
         about: the first line of `daqsvc.live_feed`.
@@ -167,7 +167,7 @@ class MachineLive:
         """What a person has to know of all that is shown, e.g. that it is of the past; empty for nothing."""
         self._runs = Runs()
         self.token = zlib.crc32(json.dumps([self.values, about["streams"]], sort_keys=True).encode())
-        """Another one where the machine file is another one."""
+        """Different where the machine file is different."""
         self._came: dict[str, _Came] = {}
         self._places = self._found_places()
         self.decided: dict[str, Decided] = {
@@ -178,7 +178,7 @@ class MachineLive:
 
     @property
     def measured_rpm(self) -> float | None:
-        """What a detector has measured of the speed lately; None if none has."""
+        """What a detector has measured of the speed recently; None if none has."""
         for one in [*self.latest.values()]:
             measured = one["statistics"].get("speed")
             if measured is not None and one["units"].get("speed") == "rpm":

@@ -1,6 +1,6 @@
 """What is kept of a sensor while somebody looks, longer than its waveform: 1X, and spectra.
 
-Both are made of what the rings hold, each sample once, and kept until the page has not been looked at for a
+Both are made of what the rings hold, each sample once, and kept until the page has not been viewed for a
 while.
 """
 

@@ -70,7 +70,7 @@ class _Server(uvicorn.Server):
                 print(line, flush=True)  # noqa: T201 - for a person
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Let go of all browsers, and end."""
+        """Release all browsers, and end."""
         await self._app.state.close()
         await super().shutdown(sockets)
 

@@ -1,4 +1,4 @@
-"""What two probes and a keyphasor tell of the shaft's centre: positions, revolutions, and its order 1X."""
+"""What two probes and a keyphasor show of the shaft's centre: positions, revolutions, and its order 1X."""
 
 from __future__ import annotations
 

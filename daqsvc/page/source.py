@@ -1,6 +1,6 @@
 """Where the page gets what it shows: the service on this box, over its control socket.
 
-A machine is listened to while somebody looks at it. Samples are asked for of the streams that are looked at.
+A machine is listened to while somebody views it. Samples are asked for of the streams that are shown.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the page asks of whatever tells it of machines: a service, or snapshots."""
+"""What the page asks of its source of machines: a service, or snapshots."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Heard(Protocol):
 
 
 class MachineSource(Protocol):
-    """Machines that can be looked at."""
+    """Machines that can be shown."""
 
     async def statuses(self) -> list[dict[str, Any]]:
         """How each machine stands: the names and alarms of `daqsvc.publish.service_status`.
@@ -77,7 +77,7 @@ class MachineSource(Protocol):
         ...
 
     async def snapshots(self, machine: str) -> list[KeptSnapshot]:
-        """The recorder's snapshots of a machine that can be looked at by their names, the newest first.
+        """The recorder's snapshots of a machine that can be shown, by their names, the newest first.
 
         Raises:
             OSError: they cannot be read here.

@@ -39,7 +39,7 @@ def output_set(
     Args:
         machine: the machine file.
         conditions: names of what the service may report about itself, outputs aside.
-        others: machine files of the same box, whose machines they tell of, too.
+        others: machine files of the same box, whose machines they report, too.
     """
     installed, tables = output_plugins(), {path: tables for path, _, tables in configured_outputs(machine)}
     own: list[str] = []
@@ -100,7 +100,7 @@ def check_outputs(machine: MachineFile) -> None:
 
 
 def watched(machine: MachineFile, conditions: Iterable[str] = (), *, spared: bool = True) -> Watched:
-    """What there is to tell of a machine.
+    """What there is to report about a machine.
 
     Args:
         machine: the machine file.

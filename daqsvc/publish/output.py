@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Watched:
-    """What there is to tell of a machine, known before anything of it happens.
+    """What there is to report about a machine, known before anything happens there.
 
     Attributes:
         machine: name of the machine.
@@ -80,13 +80,13 @@ class OutputPort:
             reports about itself as well; where there are several, it is the service alone, without readings.
         store: directory of what survives restarts.
         clock: the service's clock.
-        outbox: the alarm events, on disk and numbered; an output goes on after the last one that it has told
+        outbox: the alarm events, on disk and numbered; an output goes on after the last one that it has sent
             by ``await outbox.next_following(sequence, most)``. Open while `Output.run` runs.
         topics: of the box, whose site and name they have; by them events are known in the outbox.
         commands: carries out what people ask of alarms; an output has to see that they may.
         snapshots: has snapshots of machines made for people; as above.
         look: begins a feed of live data of a machine; None if there is none.
-        earlier: what a broker is asked for before it is told anything; None for nothing.
+        earlier: what a broker is asked for before anything is sent to it; None for nothing.
         progress: says how far each part of the service has come that can stall.
         stalls: finds those that have.
     """

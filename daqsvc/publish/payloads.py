@@ -61,7 +61,7 @@ class JsonPayload(BaseModel):
 
 
 class Stamped(JsonPayload):
-    """A payload that says whose it is and when it was true."""
+    """A payload with its origin and its time."""
 
     site: str = Field(description="the site, as the machine file names it")
     box: str = Field(description="the box, as the machine file names it")
@@ -246,7 +246,7 @@ def _code(event: AlarmEvent) -> str | None:
 
 
 def alarm_event(payload: bytes) -> AlarmEvent:
-    """The event that an alarm payload tells of; what JSON could not say is NaN.
+    """The event that an alarm payload reports; what JSON could not say is NaN.
 
     Raises:
         ValueError: it is no alarm payload of this version, or one that no event of this program has.
@@ -303,10 +303,10 @@ def statement_document(diagnosis: Diagnosis) -> dict[str, Any]:
 
 
 def recorded_statement(document: Mapping[str, Any]) -> Diagnosis:
-    """The diagnosis that `statement_document` has told; what JSON could not say is NaN.
+    """The diagnosis that `statement_document` has written; what JSON could not say is NaN.
 
     Raises:
-        ValueError: it tells of none.
+        ValueError: it has none.
     """
     told = {key: one for key, one in document.items() if key != "machine"}
     return _diagnosis(str(document.get("machine")), CausePayload.model_validate_json(json.dumps(told)))
@@ -438,7 +438,7 @@ def _or_nan(figures: Mapping[str, float | None]) -> dict[str, float]:
 
 
 def restore_alarms(messages: Iterable[OutboxMessage], topics: Topics) -> list[AlarmEvent]:
-    """The events that the alarm messages of a box tell of, in their order.
+    """The events that the alarm messages of a box report, in their order.
 
     Messages below other topics are left alone. What cannot be read is left out and logged, once for all.
 

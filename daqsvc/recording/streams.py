@@ -27,7 +27,7 @@ NS_PER_S = 1_000_000_000
 FIRST_NS, LAST_NS = -9_214_560_000_000_000_000, 9_214_646_400_000_000_000
 """Wall times of the years 1678 to 2261: what a count of nanoseconds in 64 bits holds in whole years."""
 PIECE_VALUES = 1 << 22
-"""Samples times channels that are looked at together."""
+"""Samples times channels that are evaluated together."""
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _WRITTEN = re.compile(
     r"(?P<second>\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:[.,](?P<part>\d{1,9})\d*)?\s*"

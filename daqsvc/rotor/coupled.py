@@ -35,7 +35,7 @@ COUPLED = np.dtype(
         ("gain", np.float64, (4, 2)), ("precision", np.float64, (2, 2)), ("log_norm", np.float64),
         # prediction over a sample, over half a sub-step of the contact, and over a whole one
         ("flow", np.float64, (4, 4)), ("half", np.float64, (4, 4)), ("full", np.float64, (4, 4)),
-        # of a rub observer: square of how far from the centre its estimate has been lately
+        # of a rub observer: square of how far from the centre its estimate has been recently
         # and what is left of it from one sample to the next
         ("reach_squared", np.float64), ("forgetting", np.float64),
     ]

@@ -103,7 +103,7 @@ def guarded(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def touches(coupling: Coupling, x: float, y: float) -> bool:
-    """Whether a rub observer's estimate has come near the housing lately.
+    """Whether a rub observer's estimate has come near the housing recently.
 
     The observer of a rub is noisy by design, so that it follows contacts that it does not know. It also
     follows whatever else fits no mode; without contact that is no evidence of a rub.

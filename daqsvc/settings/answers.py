@@ -37,12 +37,12 @@ def meaning(annotation: str | ForwardRef, module: str) -> Any:
 def misfit(value: object, wanted: Any, *, inside: bool = False) -> str:
     """In what a value is not as it should be; empty if it is.
 
-    What an iterator yields is not looked at.
+    What an iterator yields is not examined.
 
     Args:
         value: anything.
         wanted: a type, or an alias with its parameters.
-        inside: whether it is in an object of ours: a tuple must be one, and nothing further in is looked at.
+        inside: whether it is in an object of ours: a tuple must be one, and nothing further in is examined.
     """
     origin, args = get_origin(wanted) or wanted or NoneType, get_args(wanted)
     if isinstance(origin, TypeVar) or origin is ClassVar:

@@ -60,7 +60,7 @@ if TYPE_CHECKING:
 
 
 _MOST_FINDINGS = 200
-"""Whoever has mended these may ask again."""
+"""Once these are corrected, the check can be run again."""
 
 
 def check(draft: MachineFile, facts: Mapping[str, Any]) -> list[Finding]:

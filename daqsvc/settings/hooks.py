@@ -82,7 +82,7 @@ class PluginFailedError(AssemblyError, UnusableValueError):
         by: the plugin, or one of its tables.
         hook: the method or property that was asked.
         error: what it has raised.
-        at: where in the machine file it was asked about; None if the hook is not told.
+        at: where in the machine file it was asked about; None if the hook does not get it.
 
     Attributes:
         failure: what has failed, in words for the author of the plugin, with the line of the plugin's file.

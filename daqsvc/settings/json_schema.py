@@ -106,7 +106,7 @@ def tags(section: type[Section], kinds: Sequence[type[Section]]) -> Mapping[str,
     said = {
         name: single_value(section, name)
         for name in section.model_fields
-        # A sensor's unit tells nothing: some kinds have one of several.
+        # A sensor's unit is not enough: some kinds have one of several.
         if all(single_value(kind, name) is not None for kind in kinds if name in kind.model_fields)
     }
     if said:

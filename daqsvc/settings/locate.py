@@ -37,7 +37,7 @@ class Spot:
 
     Attributes:
         line: from 1.
-        source: the value as it is written; empty for a table with a header of its own.
+        source: the value as it is written; empty for a table with its own header.
     """
 
     line: int

@@ -166,7 +166,7 @@ class Origin:
 
     Attributes:
         path: the file.
-        warnings: what should be looked at although the file can be used.
+        warnings: what should be examined although the file can be used.
         layout_facts: by stream, what was read from the files that its layout names.
         text: the file as it was read; empty if it was made in memory.
     """
@@ -239,7 +239,7 @@ class MachineFile(Section):
 
     @property
     def warnings(self) -> tuple[Problem, ...]:
-        """What should be looked at although the file can be used."""
+        """What should be examined although the file can be used."""
         return self._origin.warnings
 
     @property

@@ -135,7 +135,7 @@ class CanRecorder:
         return threading.Thread(target=self._record_on, name=f"can-recorder {self._link_name}", daemon=True)
 
     def _is_lost(self) -> bool:
-        """Whether the thread has ended, which it does only when it is told to."""
+        """Whether the thread has ended, which it does only when it has to stop."""
         return self._thread.ident is not None and not self._thread.is_alive() and not self._ending
 
     def _begin_again(self) -> None:

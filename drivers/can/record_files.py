@@ -1,4 +1,4 @@
-"""The files of a CAN recording: what is in them, their names, how large they grow, what is taken away.
+"""The files of a CAN recording: what is in them, their names, how large they grow, what is removed.
 
 Frames go in, what is to be appended to a file comes out. ASC and BLF are written by python-can. A candump log
 is written here: python-can's writer leaves out what an error frame says and how much a remote frame asks for,
@@ -238,7 +238,7 @@ class Logs(Protocol):
 class LogFolder:
     """Files named by bus and UTC start, e.g. ``can0-20261121T133215.250000Z.blf``; the oldest make room.
 
-    Only files with such names are taken away. The folder must be there: if it were made here, it
+    Only files with such names are removed. The folder must be there: if it were made here, it
     would fill the wrong disk whenever the right one is not mounted.
 
     Args:
@@ -364,7 +364,7 @@ class LogFile:
         self.size += len(piece)
 
     def close(self) -> None:
-        """End the file; one that holds nothing is taken away.
+        """End the file; one that holds nothing is removed.
 
         Raises:
             OSError: the disk refuses even this; what was flushed stays.

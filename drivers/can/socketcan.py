@@ -151,7 +151,7 @@ class SocketCan:
     def gather(self, stopping: threading.Event) -> None:
         """See `drivers.can.batches.CanSource.gather`; ends when half of the receive buffer is full.
 
-        A buffer that the fullest bus fills sooner is looked at in between.
+        A buffer that the fullest bus fills sooner is examined in between.
         """
         look_s = self._half_bytes / FRAME_HELD_BYTES / FULLEST_BUS_HZ
         until_s = time.monotonic() + self._gather_s

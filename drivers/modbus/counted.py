@@ -210,7 +210,7 @@ class CountedReader(PollingReader, Generic[CountedT]):
         await self._clock.sleep_ns(self._poll_ns)
 
     def _begin_again(self, index: int) -> None:
-        """Go on at an index that is estimated from the clock, since the count tells it no more."""
+        """Go on at an index that is estimated from the clock, since the count does not show it any more."""
         now_ns = self._clock.monotonic_ns()
         if self._restart_said_ns is None or now_ns - self._restart_said_ns >= QUIET_NS:
             self._restart_said_ns = now_ns

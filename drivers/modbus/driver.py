@@ -1,7 +1,7 @@
 """The Modbus driver, TCP and RTU: keeps one line up and polls all streams on it.
 
 It reads. It writes nothing but what a layout needs (acknowledging a FIFO, selecting a page, triggering a
-block) and what `ModbusDriver.write` is told to, and of that only registers that the bus allows to write.
+block) and what `ModbusDriver.write` is called with, and of that only registers that the bus allows to write.
 """
 
 from __future__ import annotations

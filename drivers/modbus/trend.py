@@ -48,7 +48,7 @@ LATE_NS = 2_000_000
 """How late one may be at least: no event loop wakes up to the millisecond; what is overdue is soon asked."""
 
 REFUSALS_OF_REGISTERS = frozenset({2, 3})
-"""Exceptions by which a unit says that it has not these registers, or not so many at once."""
+"""Exceptions of a unit that does not have these registers, or not that many at once."""
 
 APART_NS = 60 * NS_PER_S
 APART_MOST_NS = 3600 * NS_PER_S

@@ -225,7 +225,7 @@ class ReplayDriver:
         return sum(a.counters.frames_received for a in self._assemblers.values())
 
     async def _open(self) -> RecordedLog:
-        self._reader.close()  # it may have been told to stop when it had just ended
+        self._reader.close()  # it may have ended just before it was stopped
         try:
             return await in_thread(self._open_file, undo=self._close, abort=self._reader.abort)
         except RecordedLogError as error:
@@ -352,7 +352,7 @@ class ReplayDriver:
     def _is_of_another_clock(self, due_ns: int, now_ns: int) -> bool:
         """Whether a growing log goes on with times of another clock: of the future, or before it was written.
 
-        That it is read late, because the process stood still, tells nothing of its clock.
+        That it is read late, because the process stood still, shows nothing of its clock.
         """
         if self._newest_ns is None:
             return False

@@ -69,7 +69,7 @@ class SampleTable:
         specs: the streams; their layouts are `TableLayout`.
         first_index: where each stream's count of samples goes on, by name; kept up to date.
         limits: what reading the file may take.
-        reader: reads it, can be told to stop, and is closed then; unless given, one of its own.
+        reader: reads it, can be stopped, and is closed then; unless given, one of its own.
 
     Attributes:
         seamless: whether all streams last as long: played again, it goes on without a step in time.

@@ -27,7 +27,7 @@ ArrivalsOf: TypeAlias = "Callable[[NDArray[np.int64]], NDArray[np.int64]]"
 SHOWN_BYTES = 16
 """Bytes that are shown of what is no frame."""
 COMPARE = "compare baud, parity, framing and checksum with the device's"
-"""What to do about bytes that tell nothing more."""
+"""What to do about bytes that show nothing more."""
 
 
 class NoFrame(NamedTuple):

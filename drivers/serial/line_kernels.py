@@ -151,7 +151,7 @@ def _number(state: int, mantissa: int, exponent: int) -> tuple[float, int]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _text_begins(buffer: Bytes, start: int, stop: int, prefix: Bytes, separator: int) -> int:
-    """Where the fields behind the prefix begin; -1 if it is another one, or the first if there is none."""
+    """Where the fields behind the prefix begin; -1 if it is different, or the first if there is none."""
     if not len(prefix):
         return start
     end = start + len(prefix)
@@ -253,7 +253,7 @@ COUNT, STAMP, DUE, GRAIN, SHARED = range(5)
 stamps are in s, and whether several samples share one."""
 KNOWN = SHARED + 1
 _SLACK = 0.6
-"""How many periods late, beside the half one, a sample must be for a shared stamp to tell of missing ones."""
+"""How many periods late, beside the half one, a sample must be for a shared stamp to show missing ones."""
 _NOT_BEFORE_STAMP = 0.5
 """In place of `tracking`, for samples that are due before the stamp that they share with others."""
 

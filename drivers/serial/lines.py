@@ -220,9 +220,9 @@ class DeviceTime:
 
     Each stamp is compared with the one expected after the stamp before it, so that a device whose rate is
     not quite the nominal one gains or loses no sample over the hours. Stamps may be rounded to a quarter
-    of a sampling period for every gap to be told exactly. Coarser ones, which several lines share, tell of
+    of a sampling period for every gap to be known exactly. Coarser ones, which several lines share, show
     gaps that are longer than their grain; a line is a sample all the same, so without a counter a repeated
-    line cannot be told.
+    line cannot be known.
 
     A line that was overtaken goes back to its place within the reorder window. Time that goes back farther
     means that the device was restarted: the count begins at 0 again. One damaged stamp moves no other.

@@ -19,7 +19,7 @@ LONGEST_S = 1.0 / 30.0
 SHORTEST_S = 0.001
 """A pause that would have to be shorter is none: it costs more than it saves."""
 PAUSE_BYTES = 1024
-"""What may gather in a pause, of the 4096 bytes that a port of Linux holds until its driver is told to wait
+"""What may gather in a pause, of the 4096 bytes that a port of Linux holds until its driver has to wait
 (N_TTY_BUF_SIZE); a UART without flow control loses what comes then."""
 WRAP_SHARE = 1.0 / 16.0
 """Of the time in which a counter begins again: frames are placed by when they come, to a quarter of that."""

@@ -21,7 +21,7 @@ CONCLUSIVE = 0.9
 SURE = 0.6
 """What has a lower score is a guess: it may be chance."""
 MOST_BYTES = 65_536
-"""Of a longer stream the end is looked at."""
+"""Of a longer stream the end is examined."""
 
 _TEXT = frozenset(range(0x20, 0x7F)) | {0x09, 0x0A, 0x0D}
 _LEAST_PRINTABLE = 0.95

@@ -263,7 +263,7 @@ class _Report(NamedTuple):
 
     @property
     def _rate_hz(self) -> float | None:
-        """Lines or frames a second; None where it cannot be told."""
+        """Lines or frames a second; None where it cannot be known."""
         from drivers.serial.recognise_lines import TextLines  # noqa: PLC0415 - only for who listens
 
         heard, what = self.best.heard, self._what

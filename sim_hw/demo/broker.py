@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _LOOPBACK = "127.0.0.1"
 _ATTEMPTS = 5
 
-# These tell about every client that comes and goes, at warning level and above.
+# These report every client that connects and leaves, at warning level and above.
 _NOISY_LOGGERS = ("amqtt", "transitions")
 
 

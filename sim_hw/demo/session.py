@@ -158,7 +158,7 @@ class Script:
         onsets: what changes when; empty for a recording.
         samples_per_rev: to count delays in revolutions; None if the shaft is not known.
         faults: of the node and its link.
-        seed: of everything random, to be told in the summary.
+        seed: of everything random, which the summary names.
         detector: the one whose decisions are compared with ``onsets``.
     """
 

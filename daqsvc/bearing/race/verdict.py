@@ -157,7 +157,7 @@ class RaceRules:
         z_limit: significance from which a part may be named.
         z_unresolved: what is added to it if the part's line cannot be told from a harmonic of the shaft.
         strong_z: significance from which a part that cannot be named keeps a weaker one from being named.
-        regular_z: significance that no noise has, from which lines too small for damage are told.
+        regular_z: significance that no noise has, from which lines too small for damage are reported.
         regular_least_damage: least belief in damage with such lines.
         severity_limit: of a race; ``z`` times ``depth``.
         ball_severity_limit: of a ball.

@@ -62,7 +62,7 @@ def bearing_detector(
     bearings = [_housed(machine, index, bearing) for index, bearing in enumerate(settings.bearings)]
     speed_rpm = machine.machine.speed_rpm
     keyphasor = None if settings.keyphasor is None else _keyphasor(machine, settings.keyphasor)
-    # A measured speed tells by itself when the healthy machine's is another one.
+    # A measured speed shows when it differs from the healthy machine's.
     same_speed_rpm = speed_rpm if keyphasor is None else None
     baseline = healthy
     kept: Path | None = None
@@ -223,7 +223,7 @@ def _refuse_other_units(path: Path, baseline: BearingBaseline, bearings: list[Ho
     """Refuse the healthy machine of a file whose levels are in other units than the samples.
 
     Raises:
-        BaselineFileError: an accelerometer's unit is another one.
+        BaselineFileError: an accelerometer's unit is different.
     """
     units = {name: unit for bearing in bearings for name, unit in bearing.units.items()}
     unknown = [name for name in units if name not in baseline.units]
@@ -244,7 +244,7 @@ def _refuse_other_units(path: Path, baseline: BearingBaseline, bearings: list[Ho
 
 
 def _refuse_other_bearing(path: Path, baseline: BearingBaseline, bearing: HousedBearing) -> None:
-    """Refuse the healthy machine of a file whose bearing at this place is another one.
+    """Refuse the healthy machine of a file whose bearing at this place is different.
 
     Raises:
         BaselineFileError: it has other orders, masses, springs or dampers.

@@ -248,7 +248,7 @@ class BearingDetector:
             t_ns: time of its last sample.
 
         Returns:
-            None if there is too little that has not been looked at.
+            None if there is too little that has not been examined.
         """
         if len(rest):
             self._pending.append(rest)

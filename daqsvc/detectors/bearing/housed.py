@@ -21,7 +21,7 @@ class HousedBearing:
         sensor: name of the accelerometer.
         column: its column in the stream.
         orders: fault orders.
-        two: the accelerometer on the rotor and the bearing's masses, if its races are also told by direction.
+        two: the accelerometer on the rotor and the bearing's masses, if its races also differ by direction.
         units: of the accelerometers that it is judged by, by their names; empty if not known.
     """
 

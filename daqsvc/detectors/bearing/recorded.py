@@ -1,7 +1,7 @@
 """From a recording of accelerometers to a verdict about the bearings of a machine.
 
 With a machine file the live detector watches the recording from its first sample to its last. What options
-tell of is judged at one go (`analyse_bearings`), by the tests inside the detector, unless it is too long for
+name is judged at once (`analyse_bearings`), by the tests inside the detector, unless it is too long for
 that: then it is watched, too.
 """
 
@@ -163,7 +163,7 @@ class RecordedBearings(RecordedDetector[Bearing]):
     def _judged(
         self, recorded: Recorded, settings: Bearing, setup: BearingSetup, judge: Judge
     ) -> BearingVerdict:
-        """Judge a recording against the healthy machine, if options tell of one."""
+        """Judge a recording against the healthy machine, if options name one."""
         path = self.options.calibration
         if path is None:
             return _against(recorded.recording.rate_hz, judge, self._healthy)

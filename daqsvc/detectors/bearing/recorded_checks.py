@@ -89,7 +89,7 @@ def ball_order_problem(orders: BearingOrders) -> str:
     """What is odd about a stated BSF; empty if nothing: BPFI and BPFO alone determine it.
 
     Their sum is the number of balls, their difference over it the ratio of ball to pitch diameter, times the
-    cosine of the contact angle, which makes BSF smaller by itself. So only about twice the value is told.
+    cosine of the contact angle, which makes BSF smaller by itself. So only about twice the value is reported.
 
     Args:
         orders: as stated.

@@ -51,7 +51,7 @@ class RotorMode:
 def fault_of(mode: RotorMode, rotor: RotorParameters) -> Fault | Literal["normal"]:
     """What a mode is in the words of a verdict.
 
-    Where several things differ, the one that a person would be told first: a rub before what led to it,
+    Where several things differ, the one that a person should know first: a rub before what led to it,
     and an external cause before damping, which often only follows.
 
     Args:

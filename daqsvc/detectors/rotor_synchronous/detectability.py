@@ -36,11 +36,11 @@ def synchronous_detectability(
     Args:
         machine: the machine file.
         settings: the table of its calibrated rotor.
-        noise_um: standard deviation of one probe's noise, where no calibration tells it.
-        eccentricity_um: mass eccentricity, where neither calibration nor machine file tells it.
+        noise_um: standard deviation of one probe's noise, where no calibration has it.
+        eccentricity_um: mass eccentricity, where neither calibration nor machine file has it.
 
     Raises:
-        ValueError: something is not known, or cannot be used; the message says which option tells it.
+        ValueError: something is not known, or cannot be used; the message names the option for it.
     """
     rotor_table = machine.machine.rotor
     assert rotor_table is not None  # noqa: S101 - detectors/shaft/checks.py: it needs [machine.rotor]

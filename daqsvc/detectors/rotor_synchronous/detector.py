@@ -78,7 +78,7 @@ class RotorSynchronousDetector:
     farther than 5 % from the calibrated one is not judged. The decision is held and the reason said. A
     calibration that is refused is a quality that is not good, with the reason, until one succeeds.
 
-    A shaft that turns clockwise is looked at from its other end (x mirrored): its whirl is then forward, and
+    A shaft that turns clockwise is viewed from its other end (x mirrored): its whirl is then forward, and
     gravity still points down. Statistics are in the machine's own coordinates.
 
     With AC-coupled probes the mean position says nothing and is left out: a static load cannot be seen,

@@ -71,7 +71,7 @@ class Revolution:
 class RevolutionStream:
     """Cuts a stream into revolutions, over gaps as well.
 
-    A shaft that turns clockwise is looked at from its other end (x mirrored): its whirl is then forward, and
+    A shaft that turns clockwise is viewed from its other end (x mirrored): its whirl is then forward, and
     gravity still points down.
 
     Args:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     Complexes = NDArray[np.complex128]
 
 _LENGTHS = (4, 8, 12, 32)
-"""Revolutions looked at together: short for what is clear, before a change gets a name; long for noise."""
+"""Revolutions evaluated together: short for what is clear, before a change gets a name; long for noise."""
 _SLIP_LENGTH = 12
 _VANISHED = 0.05
 _SURE = 6.0

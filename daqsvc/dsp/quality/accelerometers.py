@@ -168,7 +168,7 @@ WANDERING_DEVIATIONS = 1.0
 MOST_BLANKED = 0.2
 MOST_SPIKES = 0.003
 STEADY_REVOLUTIONS = 5
-"""What comes and goes within so many revolutions is vibration, or a single event."""
+"""What begins and ends within so many revolutions is vibration, or a single event."""
 MIDDLE_OF = 50
 """One sample of so many gives the spread of all."""
 TOLD = 3

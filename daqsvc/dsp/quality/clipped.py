@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 CLIPPED_SHARE = 0.01
 """Part of an accelerometer's samples at the ends of its range from which on it cannot be judged."""
 CLIPPED_NOTE_SHARE = 1e-4
-"""Part of them from which on a reader is told."""
+"""Part of them from which on it is reported."""
 CLIPPED_REVOLUTION = 1 / 16
 """Part of a revolution at one extreme value that makes a probe clipped."""
 LEAST_CUT_OFF = 8

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 LEAST_IN_ANY_UNIT = 1e-12
 """A smaller value that is not 0 is hardly measured. It may be what is left of a computation, or dies away."""
 REMEMBERED = 16
-"""Values that are looked at together; a third is of an ordinary size by chance, but never all of them."""
+"""Values that are evaluated together; a third is of an ordinary size by chance, but never all of them."""
 FEWEST = 2
 LEAST_SHARE = 0.25
 """Number and share of them that must be impossible: a glitch now and then does not count."""

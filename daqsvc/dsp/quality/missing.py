@@ -134,7 +134,7 @@ def nothing_known(measures: Iterable[str]) -> dict[str, tuple[float, float]]:
 
 
 def not_judged(sensor: str, samples: int) -> str:
-    """Why measures of a sensor are held that were there and not looked at, in words for a person."""
+    """Why measures of a sensor are held that were there and not examined, in words for a person."""
     return f"{samples} samples of {sensor} were not judged: this computer was too slow, or they were lost"
 
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 _SEGMENT = 4096
 _BANDS = 128
 _MOST = 1 << 20
-"""Samples that are looked at: an edge is there all the time."""
+"""Samples that are examined: an edge is there all the time."""
 _FIRST, _LAST = 8, 109
 """Bands between which an edge is looked for: filters against aliasing end just below half the rate."""
 _BELOW = (1.8, 1.25)

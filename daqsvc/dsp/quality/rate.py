@@ -274,7 +274,7 @@ class ArrivalRate:
             self.rate_hz = rate_hz
 
     def _rate_of(self, come: NDArray[np.int64], duration_s: float) -> float | None:
-        """The rate, if the frames that have come in equal times tell it."""
+        """The rate, if the frames that have come in equal times show it."""
         rate, expected = float(come.mean()) / duration_s, self._nominal_hz * duration_s
         off = abs(rate / self._nominal_hz - 1.0)
         if off <= FITS:

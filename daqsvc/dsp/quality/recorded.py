@@ -104,7 +104,7 @@ class DataQuality:
 
 
 _BLOCK = 1 << 18
-"""Samples of a channel that are looked at at a time."""
+"""Samples of a channel that are read at a time."""
 
 
 def count_bad(names: Sequence[str], samples: Floats) -> DataQuality:
@@ -135,7 +135,7 @@ def count_bad(names: Sequence[str], samples: Floats) -> DataQuality:
 
 
 class _Channels(Protocol):
-    """What is looked at of a `daqsvc.recording.recording.Recording`."""
+    """What is examined of a `daqsvc.recording.recording.Recording`."""
 
     @property
     def names(self) -> Sequence[str]:
@@ -239,7 +239,7 @@ def refuse_stuck(
 
 
 def _peaks_cut_off(quality: DataQuality, name: str, signal: Floats) -> DataQuality:
-    """Tell of a probe whose highest or lowest peaks all end at one value, now and then."""
+    """Report a probe whose highest or lowest peaks all end at one value, now and then."""
     ends = ends_cut_off(signal, LEAST_CUT_OFF)
     if not ends:
         return quality

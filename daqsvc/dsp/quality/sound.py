@@ -68,7 +68,7 @@ def is_sound(samples: Floats, least_motion_um: float) -> bool:
         least_motion_um: standard deviation that each probe must show at least.
 
     Returns:
-        False if it has to be looked at closely; that may still find nothing.
+        False if it has to be examined closely; that may still find nothing.
     """
     for value in samples.flat:
         if not abs(value) <= MOST_IN_ANY_UNIT:

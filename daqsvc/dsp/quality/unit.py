@@ -169,7 +169,7 @@ def refuse_size(samples: Floats, clearance_um: float | None, unit: str) -> None:
 
 
 def doubt_size(quality: DataQuality, samples: Floats, clearance_um: float | None, unit: str) -> DataQuality:
-    """Tell of an orbit so small in its clearance that the unit may be wrong.
+    """Report an orbit so small in its clearance that the unit may be wrong.
 
     Args:
         quality: what is known so far.
@@ -192,7 +192,7 @@ def _radius_um(samples: Floats) -> float:
 
 
 def accelerometer_quality(names: Sequence[str], samples: Floats, unit: AccelerationUnit) -> DataQuality:
-    """Count what is missing, and tell of sizes that no acceleration has; the race test tells of offsets.
+    """Count what is missing, and report sizes that no acceleration has; the race test reports offsets.
 
     Args:
         names: of the channels.

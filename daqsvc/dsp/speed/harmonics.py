@@ -34,7 +34,7 @@ MAINS_HZ = (50.0, 60.0)
 MAINS_BINS = 2.0
 """How far the skirt of a line of the mains reaches."""
 HIGHEST_ORDER = 18.0
-"""Highest multiple of the stated rate that is looked at: eight harmonics of the fastest speed compared with
+"""Highest multiple of the stated rate that is examined: eight harmonics of the fastest speed compared with
 it."""
 MEDIAN_ORDERS = 2.0
 """Width of the local noise level, in multiples of the stated rate."""
@@ -302,7 +302,7 @@ class SpeedScan:
         rates = harmonics.grid(SCAN[0] * stated_hz, SCAN[1] * stated_hz)
         share = rates / stated_hz
         others = np.abs(share - 1.0) > NEAR
-        # The shaft's own multiples are told by the half and the odd orders instead.
+        # The shaft's own multiples are recognised by the half and the odd orders instead.
         # A damaged ball strikes both races as the cage carries it past: at multiples of 1X less the cage.
         for own in (0.5, 2.0, *((1.0 - cage) * k for k in (1, 2, 3))):
             others &= np.abs(share / own - 1.0) > CAGE_SLIP

@@ -212,7 +212,7 @@ class FixedSpeedCutter:
         self._done = 0
 
     def process(self, xy: Floats, marker: Floats | None = None) -> Revolutions:
-        """See `RevolutionCutter.process`; ``marker`` is not looked at."""
+        """See `RevolutionCutter.process`; ``marker`` is not examined."""
         _check_samples(xy, marker)
         self._shaft.append(xy)
         while (end := KeyphasorEdge.at((self._done + 1) * self._period)).index <= self._shaft.position:
@@ -329,7 +329,7 @@ class OrbitCutter:
         self._last: KeyphasorEdge | None = None
 
     def process(self, xy: Floats, marker: Floats | None = None) -> Revolutions:
-        """See `RevolutionCutter.process`; ``marker`` is not looked at."""
+        """See `RevolutionCutter.process`; ``marker`` is not examined."""
         _check_samples(xy, marker)
         self._shaft.append(xy)
         for zero in self._phase.process(xy):

@@ -16,7 +16,7 @@ IDLE_S = 8 * 3600.0
 LONGEST_S = 7 * 24 * 3600.0
 """And after so long in any case."""
 MOST = 500
-"""Sessions at a time; of more the one that was used least lately ends."""
+"""Sessions at a time; of more the one that was used longest ago ends."""
 TRIES = 5
 TRY_EVERY_S = 10.0
 """Number that may be made at once; one more is allowed each time this period passes."""

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 COOKIE = "daqsvc_page"
 """Browsers know no port: two pages of one host end each other's sessions."""
 MOST_AT_ONCE = 2
-"""Passwords that are looked at at a time: each takes memory and a tenth of a second."""
+"""Passwords that are read at a time: each takes memory and a tenth of a second."""
 
 
 class SignInError(Exception):

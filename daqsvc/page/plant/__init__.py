@@ -1,1 +1,1 @@
-"""The machines of many boxes, as they tell of themselves over a broker."""
+"""The machines of many boxes, as they report themselves over a broker."""

@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 IN_FLIGHT = 20
 MOST_WAITING = 100_000
-"""Messages that wait to be looked at: at first all that the broker keeps comes at once."""
+"""Messages that wait to be examined: at first all that the broker keeps comes at once."""
 ANSWER_S = 10.0
 """How long the answer to a command is waited for."""
 CLOSE_S = 1.0

@@ -178,7 +178,7 @@ class PoincareView:
 
 
 def _means(live: MachineLive, probes: tuple[str, str]) -> tuple[Any, Any]:
-    """When, ns ``[n]``, and the means of both probes in their units ``[n, 2]``, as they were told."""
+    """When, ns ``[n]``, and the means of both probes in their units ``[n, 2]``, as they were sent."""
     said = [
         [
             (one.t_ns, one.statistics["mean"])

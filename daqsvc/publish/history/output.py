@@ -298,7 +298,7 @@ class HistoryOutput(Output):
         self._link.down(self.reason)
 
     async def _close(self) -> None:
-        """Let go of the file; one that a thread is busy with is closed by the next call of that thread."""
+        """Release the file; one that a thread is busy with is closed by the next call of that thread."""
         file, self._file = self._file, None
         if file is not None:
             busy = self._busy

@@ -32,7 +32,7 @@ _MOST_BYTES = 65_536
 
 
 class LeftOver(MqttLink):
-    """Takes away what an earlier start has told Home Assistant and this one does not.
+    """Removes what an earlier start has sent to Home Assistant and this one does not.
 
     Args:
         directory: where the topics are remembered that hold a retained message of this box.
@@ -49,7 +49,7 @@ class LeftOver(MqttLink):
         self._is_unwritable = False
 
     async def run(self, connection: Connection) -> None:
-        """Take it away, and remember what is sent from now on.
+        """Remove it, and remember what is sent from now on.
 
         Raises:
             MqttError: the connection is lost.
@@ -58,7 +58,7 @@ class LeftOver(MqttLink):
         await self.until_remembered()
 
     async def take_away(self, connection: Connection) -> None:
-        """Take away what is not told any more, and try to remember what is sent from now on.
+        """Remove what is not sent any more, and try to remember what is sent from now on.
 
         Raises:
             MqttError: the connection is lost.
@@ -86,11 +86,11 @@ class LeftOver(MqttLink):
             self._is_remembered = await asyncio.to_thread(self.remember, self._refused)
 
     def left_over(self) -> list[str]:
-        """Those that were told by an earlier start and are not any more; blocks."""
+        """Those that an earlier start has sent and this one does not; blocks."""
         return sorted(self._read() - self.now)
 
     def remember(self, left_over: Iterable[str] = ()) -> bool:
-        """Write down what is sent from now on, and what could not be taken away; blocks.
+        """Store what is sent from now on, and what could not be removed; blocks.
 
         Returns:
             Whether it is written; that it is not is said once.

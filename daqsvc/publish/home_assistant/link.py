@@ -155,7 +155,7 @@ class MachineDevice:
         """Take in a message from the broker; whether it was meant for this machine."""
         topic = message.topic
         if topic == self._discovery.birth_topic:
-            # What is retained tells of a birth in the past: the connection has just told everything.
+            # What is retained is a birth in the past: the connection has just sent everything.
             if message.payload == b"online" and not message.retain:
                 self._born.set()
         elif topic == self._discovery.topic:
@@ -188,7 +188,7 @@ class MachineDevice:
             await connection.deliver(self._discovery.topic, b"", retain=True)
             await connection.deliver(self._topics.summary(self._machine), b"", retain=True)
             return
-        # What the broker has known for long is not told again in time: no summary may begin without it.
+        # What the broker has known for long is not sent again in time: no summary may begin without it.
         for message in await self._outbox.retained():
             self.note(message)
         self._born.clear()
@@ -210,7 +210,7 @@ class MachineDevice:
                     born = asyncio.create_task(self._born.wait())
                 elif changed.done():
                     await self._summarise(connection)
-                    # A summary tells of all alarms. For each event of a flood again, it would be the flood.
+                    # A summary has all alarms. For each event of a flood again, it would be the flood.
                     await asyncio.wait({born}, timeout=self._pause_s)
                 if changed.done():
                     changed = asyncio.create_task(self._changed.wait())
@@ -219,11 +219,11 @@ class MachineDevice:
             changed.cancel()
 
     async def _remove(self, connection: Connection) -> None:
-        """Remove what an earlier start has told and this one has not: a renamed alarm, say."""
+        """Remove what an earlier start has sent and this one has not: a renamed alarm, say."""
         self._earlier = asyncio.get_running_loop().create_future()
         await connection.watch(self._discovery.topic)
         earlier = b""
-        with contextlib.suppress(TimeoutError):  # there is none: nothing has been told before
+        with contextlib.suppress(TimeoutError):  # there is none: nothing has been sent before
             earlier = await asyncio.wait_for(self._earlier, EARLIER_S)
         await connection.unsubscribe(self._discovery.topic)
         removals = self._discovery.removals(earlier)

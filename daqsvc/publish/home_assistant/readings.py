@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from daqsvc.publish.topics import Topics
 
 LEAST_NS = 10 * NS_PER_S
-"""Figures that move go out so often at most."""
+"""Figures that change are sent this often at most."""
 
 PROBABILITY_STEP = 0.1
 """Change of a probability from which on it is sent before its time."""
@@ -172,7 +172,7 @@ def _finding(shown: _Shown) -> str | None:
 
 
 def _figures(shown: _Shown) -> dict[tuple[str, str], float | None]:
-    """The figures as they would be told now; None where the detector has none, or no good data."""
+    """The figures as they would be sent now; None where the detector has none, or no good data."""
     figures: dict[tuple[str, str], float | None] = {}
     for reading in shown.readings:
         value = math.nan

@@ -82,7 +82,7 @@ class Summary:
             self._put(name, _UNTOLD)
 
     def note(self, message: OutboxMessage) -> bool:
-        """Take in a message of the outbox; whether it has told something of an alarm of the machine.
+        """Take in a message of the outbox; whether it is about an alarm of the machine.
 
         Raises:
             ValueError: it is on an alarm's topic and no alarm's message.

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 MOST_REQUESTS = 64
-"""That wait to be looked at; further ones are dropped, and asked again by who means them."""
+"""That wait to be examined; further ones are dropped, and asked again by who means them."""
 PIECE_EXPIRY_S = 10.0
 """How long a piece is of use."""
 OVER = b'{"over":true}\n'

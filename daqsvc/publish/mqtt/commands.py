@@ -1,4 +1,4 @@
-"""Commands from the broker: looked at, authorised, carried out by somebody else, answered.
+"""Commands from the broker: examined, authorised, carried out by somebody else, answered.
 
 Whoever may publish below ``<box>/<machine>/commands/<verb>`` may ask for that; which verbs are taken at all
 stands in the machine file. So the broker's access list says who, and the box says what.
@@ -126,7 +126,7 @@ class ResponsePayload(Stamped):
 
 
 class CommandRefusedError(Exception):
-    """A command that is not even looked at by the alarms; the text says why.
+    """A command that is not even examined by the alarms; the text says why.
 
     Attributes:
         code: of that.
@@ -147,8 +147,8 @@ class IntakeCounters:
         malformed: too large, not JSON, not a command of a known version, or on a topic without a verb.
         unauthorised: for a machine or a verb that the machine file does not allow.
         stale: too old, from the future, retained at the broker, here for the second time, or so many that
-            a second time could not be told. Or from before a start that found the ids of commands lost.
-        unwritten: refused because their id could not be written down.
+            a second time could not be known. Or from before a start that found the ids of commands lost.
+        unwritten: refused because their id could not be recorded.
         unanswered: answers that the broker did not take.
     """
 
@@ -260,7 +260,7 @@ class CommandIntake:
         return await self._snapshots(command, source)
 
     def _log(self, topic: str, refusal: CommandRefusedError) -> None:
-        """Say it, but not for each of a flood: the counters and the answers tell of the others."""
+        """Log it, but not for each of a flood: the others are in the counters and the answers."""
         now_ns = self._clock.monotonic_ns()
         loud = now_ns >= self._quiet_until_ns
         level = logging.WARNING if loud else logging.DEBUG
@@ -344,7 +344,7 @@ class CommandIntake:
         )
 
     async def _check_new(self, machine: str, message: CommandPayload | SnapshotCommandPayload) -> None:
-        """Write down that this command has come; before it is obeyed, for afterwards may be too late."""
+        """Write down that this command has come; before it is carried out, for afterwards may be too late."""
         if self._ids.is_from_before(round(message.issued_at.timestamp() * NS_PER_S)):
             self.counters.stale += 1
             raise CommandRefusedError(

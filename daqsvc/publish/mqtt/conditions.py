@@ -31,7 +31,7 @@ CERTIFICATE_DEADBAND_NS = NS_PER_DAY
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BrokerVitals:
-    """What is looked at.
+    """What is examined.
 
     Attributes:
         wall_ns: wall clock, ns since the Unix epoch.

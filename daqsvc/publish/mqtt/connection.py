@@ -47,7 +47,7 @@ PUBACK_S = 10.0
 """How long the broker may take to acknowledge a message, or a subscription."""
 
 INCOMING: Final = 64
-"""Messages from the broker that may wait to be looked at; a flood of them is dropped and counted."""
+"""Messages from the broker that may wait to be examined; a flood of them is dropped and counted."""
 
 FLOOD_PER_S: Final = 10_000
 """Packets a second that nobody waits for; a broker that sends more waits in its socket, not in our memory."""
@@ -144,7 +144,7 @@ class Connection:
         on_taken: called with the topic of each message for which a good PUBACK came.
         on_overlooked: called for each message from the broker that is dropped because too many wait.
         on_ignored: called for each message from the broker that came before its consent, or has no topic.
-        most_waiting: messages from the broker that may wait to be looked at.
+        most_waiting: messages from the broker that may wait to be examined.
     """
 
     def __init__(

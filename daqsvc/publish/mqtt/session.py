@@ -35,7 +35,7 @@ LOOK_S = 10.0
 """How often to look whether a certificate, key or password was replaced."""
 
 LOOK_AGAIN_S = 86_400.0
-"""After so long a connection is made again to see the broker's certificate, if the one it showed ends
+"""Time after which a connection is made again to see the broker's certificate, if the one it showed ends
 soon."""
 
 EARLIER_S = 3.0

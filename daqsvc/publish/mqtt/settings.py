@@ -222,7 +222,7 @@ def first_line(file: Path) -> bytes:
     Raises:
         OSError: it cannot be read.
     """
-    # Not to wait for whoever might write into it: what it is may have changed since it was looked at.
+    # Not to wait for whoever might write into it: what it is may have changed since it was examined.
     handle = os.open(file, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     with os.fdopen(handle, "rb") as opened:
         return opened.read(LONGEST_PASSWORD + 2).partition(b"\n")[0].rstrip(b"\r")

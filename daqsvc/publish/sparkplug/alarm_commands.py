@@ -57,7 +57,7 @@ class HostCommand(NamedTuple):
 class AlarmCommands:
     """Turns written metrics into commands.
 
-    The metrics are ``Alarms/<machine>/<alarm>/Acknowledge`` of the node, beside what it tells of the alarm,
+    The metrics are ``Alarms/<machine>/<alarm>/Acknowledge`` of the node, beside its report of the alarm,
     and ``Alarms/<alarm>/Acknowledge`` of the device; the same for ``Reset``.
 
     Args:

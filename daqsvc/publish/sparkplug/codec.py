@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 Value: TypeAlias = "bool | int | float | str | None"
 
 MOST_BYTES = 1_000_000
-"""No command is as long; a longer payload is not looked at."""
+"""No command is as long; a longer payload is not read."""
 
 _U32, _U64 = 2**32 - 1, 2**64 - 1
 _LARGEST_FLOAT = (2 - 2**-23) * 2.0**127

@@ -2,7 +2,7 @@
 
 Sparkplug's data have QoS 0, which nobody acknowledges. So after alarms the node asks the broker something
 harmless and waits for the answer: brokers work off a connection in order, so then they have the alarms too.
-Only what a broker has so taken is not told again, as history, after the next connection.
+Only what a broker has acknowledged is not sent again, as history, after the next connection.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ class SparkplugEdge(Output):
         self._running: asyncio.Future[None] | None = None
 
     def _declare(self, machine: str, watched: Watched) -> None:
-        """Name all that there will be to tell of a machine."""
+        """Name all that will be reported about a machine."""
         alarms, commands = (*watched.alarms, *watched.services), self._commands.get(machine)
         for alarm in alarms:
             self._board.put(None, quiet_alarm(machine, alarm))

@@ -41,7 +41,7 @@ class PrimaryHost:
         """Take in a STATE message; False if it changes nothing.
 
         One of 3.0 that is older than one before changes nothing, and one of 2.2, which has no time, nothing
-        once the host has told its state as of 3.0.
+        once the host has sent its state as of 3.0.
 
         Args:
             topic: one of `topics`.

@@ -1,4 +1,4 @@
-"""What an edge node must remember over restarts: the number of its session, and what hosts have been told."""
+"""What an edge node must remember over restarts: the number of its session, and what hosts have received."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Memory:
         """The broker has accepted a session with `bd_seq`: the next one gets another number.
 
         Args:
-            cursor: where to begin in the outbox if nobody has been told anything yet.
+            cursor: where to begin in the outbox if nothing was sent yet.
         """
         self.cursor = cursor if self.cursor is None else self.cursor
         self._save((self.bd_seq + 1) % NUMBERS, self.cursor)

@@ -140,7 +140,7 @@ class EdgeSession:
         self._wishes: asyncio.Queue[tuple[AlarmCommands, HostCommand]] = asyncio.Queue(MOST_AT_A_TIME)
         self._ungranted: list[str] = []
         self._told: dict[str, dict[str, Any]] = {}
-        """By device, what it has told."""
+        """By device, what it has sent."""
         self._there: Mapping[str, bool] = dict.fromkeys(devices, True)
         self.was_born = False
         """Whether this session got as far as its births."""

@@ -100,7 +100,7 @@ def read(path: Path, limits: ResourceLimits, wanted: Collection[str] | None = No
     Args:
         path: the file.
         limits: of reading it.
-        wanted: the channels whose samples are looked at; None: all. Of others, where they are too large,
+        wanted: the channels whose samples are examined; None: all. Of others, where they are too large,
             some formats tell the length only.
 
     Raises:

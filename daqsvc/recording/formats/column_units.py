@@ -30,7 +30,7 @@ _MASK = re.compile(
 )
 """How a date or a time is written, in place of a unit; some units look so, too."""
 _OTHER_AS_CAPITAL = re.compile(rf"(?:m(?:n|nm|pa|w|wh|v|va|var|a|j|hz|ohm|ω)|nm)(?:/.*|{_HOW})")
-"""Units, in small letters, whose first letter is another one as a capital."""
+"""Units, in small letters, that mean something else with a capital as their first letter."""
 
 _OPEN, _CLOSE = "[(", "])"
 _BEHIND = re.compile(r"(?P<name>.*\S)\s*(?:\[(?P<square>[^][]+)\]|\((?P<round>[^()]+)\))")

@@ -1,4 +1,4 @@
-"""Text tables: CSV by whatever delimiter, with or without preamble and header, gzipped or not.
+"""Text tables: CSV with any delimiter, with or without preamble and header, gzipped or not.
 
 The file may be in one of several encodings, and larger than it looks.
 """
@@ -57,7 +57,7 @@ LONGEST_LINE = 1_000_000
 
 _MOST_STATEMENTS = 1000
 _SEPARATOR = re.compile(r"(?i)sep=.?\s*")
-"""The first line of tables that Excel is told the delimiter of."""
+"""The first line of tables that state their delimiter for Excel."""
 _BLOCK_ROWS = 1 << 16
 
 

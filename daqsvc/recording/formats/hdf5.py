@@ -34,7 +34,7 @@ def read_hdf5(path: Path, budget: Budget, wanted: Collection[str] | None = None)
     Args:
         path: the file.
         budget: of it.
-        wanted: the channels whose samples are looked at; None: all. Where others would take too much, zeros
+        wanted: the channels whose samples are examined; None: all. Where others would take too much, zeros
             represent the largest, which take no memory.
     """
     # Before the library is loaded: no code is loaded to unpack what a file holds.

@@ -88,7 +88,7 @@ def write_uff(path: Path, streams: Sequence[RecordedStream], about: Mapping[str,
             ordinate_spec_data_type=QUANTITIES.get(label, UNKNOWN),
             ordinate_axis_units_lab=label,
             orddenom_spec_data_type=UNKNOWN,
-            # Only the first two are looked at, of steps that are even.
+            # Only the first two are examined, of steps that are even.
             x=np.array([0.0, 1.0 / stream.rate_hz]),
             data=finite,
         )

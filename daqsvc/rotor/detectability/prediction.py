@@ -307,7 +307,7 @@ class PairEvidence:
         rival: name of the other mode.
         nats_per_rev: expected evidence of the truth over the rival in a revolution, steady state.
         delay_rev: revolutions in which half of all abrupt changes from the rival to the truth have gathered a
-            threshold of evidence; infinite if they never do, or if the two look the same.
+            threshold of evidence; infinite if they never do, or if the two are alike.
         threshold_nats: that threshold.
         simulated: whether these two figures are from simulated runs or computed.
     """

@@ -256,7 +256,7 @@ def nonstationarity(
     """Variance of a sample that does not repeat with the shaft, float64 ``[R]``.
 
     The residual within the revolution, and the bend of the vector over three revolutions. A whirl at half
-    the speed leaves little in the residual, as five harmonics fit half a cycle well, but is another one
+    the speed leaves little in the residual, as five harmonics fit half a cycle well, but is different
     every time. A vector that creeps or settles hardly bends, and what jitter of the marks does to it (all
     components turn together) is left out. For white noise it equals the noise.
 

@@ -7,7 +7,7 @@ rotor's parameters are averaged over, so that a flexible hypothesis pays for its
 * unbalance: only 1X moves, anyhow; damping loss: only 1X moves, and along what less damping does to it.
 * static load: only the mean position moves; on a machine that is no Laval rotor, 1X may follow it a little.
 * stiffness loss: mean position and 1X move together, by one parameter. On a machine that is no Laval rotor
-  the shaft sinks, and 1X turns by about what that tells of the natural frequency, or by any amount.
+  the shaft sinks, and 1X turns by about as much as the natural frequency has moved, or by any amount.
 * rub: a pulse once a revolution, directed inwards where the orbit comes nearest to the wall, passed through
   the rotor (`daqsvc.rotor.synchronous.pulses`), with marks of contact (`daqsvc.rotor.synchronous.contact`);
   or an orbit that fills the clearance.
@@ -266,7 +266,7 @@ def _softer(change: Complexes, variance: Floats, healthy: Healthy, *, still: flo
     untied = _sunk(change[DC], variance[DC], healthy) + free
     sag_um = healthy.rotor.sag_um
     if sag_um <= 0.0:
-        return float(untied)  # an upright shaft: nothing sinks that could tell of 1X
+        return float(untied)  # an upright shaft: nothing sinks that could explain 1X
     omega, zeta = (axis.reshape(5, 5)[::2, ::2].ravel() for axis in healthy.rotor.box)
     depth, aside, part, point = (
         axis.ravel()

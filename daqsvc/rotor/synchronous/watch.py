@@ -138,7 +138,7 @@ def _energy(rows: Sequence[JudgedRevolution], healthy: Calibration) -> Energy:
 State: TypeAlias = Literal["calibrating", "watching", "departed"]
 
 LOOKS = (3, 5, 8, 12, 20, 30, 50, 80, 120, 220)
-"""Revolutions since the onset after which a change is looked at; then every 110 more."""
+"""Revolutions since the onset after which a change is examined; then every 110 more."""
 _NAMED_FROM = 8
 """Revolutions since the onset before which no evaluation gives a name: the rotor is still on its way."""
 _TRUSTED_FROM = 12
@@ -152,7 +152,7 @@ _SEGMENT_THRESHOLD_NATS = 30.0
 _KEPT = 512
 """Revolutions that identification can reach back."""
 _ABRUPT = 4
-"""Revolutions in the window of a departure up to which its transient is looked at."""
+"""Revolutions in the window of a departure up to which its transient is examined."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -404,7 +404,7 @@ class RotorWatch:
         self._identify(revolution, may_name=since >= _NAMED_FROM)
         looks = (before, self._identification)
         if since >= _TRUSTED_FROM and all(one is not None and "normal" in one.candidates for one in looks):
-            # One evaluation that sees nothing may be chance; what comes and goes is one alarm.
+            # One evaluation that sees nothing may be chance: with more evidence after it, it is one alarm.
             self._return_to_health()
         return True
 
