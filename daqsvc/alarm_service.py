@@ -127,8 +127,8 @@ class AlarmService:
         supervisor: counts what outputs do wrong.
         stalls: finds the parts of the service that have stalled, for outputs that report it.
         heard: told, on the event loop, of each event that comes about.
-        snapshot: makes snapshots of machines. None if nobody may ask for one.
-        look: begins to tell what passes of a machine. None if nobody may look on.
+        snapshot: makes snapshots of machines. None if none can be asked for.
+        look: begins to send what happens at a machine. None if there is no such service.
     """
 
     def __init__(
@@ -482,7 +482,7 @@ class AlarmService:
     async def execute(self, command: AlarmCommand, source: str) -> CommandOutcome:
         """Carry out a person's command, one after the other: recorded, carried out, committed, answered.
 
-        A command that has begun is carried out to its end, even if nobody waits for the answer any more.
+        A command that has begun is carried out to its end, even if its answer is not waited for any more.
 
         Args:
             command: what is asked; whoever calls has made sure that it may be asked.

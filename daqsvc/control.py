@@ -5,7 +5,7 @@ A request is one line of JSON, and so is its answer: see `ControlRequest` and `C
 directory, or in systemd's ``$RUNTIME_DIRECTORY`` with a link from there, mode 0600. Only the service's own
 user and root may open it, and whoever may open it may handle alarms. Whatever a client sends or leaves
 unsent costs the service a counter and a few kilobytes at most, or ten megabytes of one who looks on.
-Clients that hang keep nobody out: each user has their own connections, and the quietest of them makes way
+Clients that hang keep no others out: each user has their own connections, and the quietest of them makes way
 for the next; so does the one who has looked on for longest.
 """
 
@@ -105,7 +105,7 @@ class ControlError(Exception):
 
 
 class AbsentError(ControlError):
-    """Nobody answers at the control socket of a store, for now."""
+    """No service answers at the control socket of a store, for now."""
 
     code = NO_SERVICE
 
@@ -306,12 +306,12 @@ class ControlServer:
         runtime: directory for the socket itself, e.g. systemd's ``$RUNTIME_DIRECTORY``; the store then has a
             link to it.
         status: the line of JSON for who asks how a machine stands, or the only one; for one that is not
-            watched, the names of those that are. None if nobody may ask.
+            watched, the names of those that are. None if that cannot be asked.
         reload: reads the machine files again, or only says what would change; a line for each change. None if
-            nobody may ask.
+            it cannot be asked.
         files: what it reads then.
-        snapshot: makes a snapshot. None if nobody may ask.
-        look: begins to tell what passes. None if nobody may ask.
+        snapshot: makes a snapshot. None if that cannot be asked.
+        look: begins to send what happens. None if that cannot be asked.
     """
 
     def __init__(
@@ -699,7 +699,7 @@ def request_of(command: AlarmCommand, machine: str | None, via: str = "") -> Con
     Args:
         command: what is asked.
         machine: the machine that is meant; None for whichever the service watches.
-        via: over what a person has asked who passes it on; empty if nobody does.
+        via: what the person used who sent it, if another program passes it on; else empty.
 
     Raises:
         ControlError: it cannot be asked, e.g. because a text is too long.
@@ -872,7 +872,7 @@ def _unanswered(store: Path, error: Exception | None, then: str) -> AbsentError:
 
 
 def _absence(store: Path) -> AbsentError:
-    """Why nobody listens at the control socket of a store."""
+    """Why no service listens at the control socket of a store."""
     if not is_possessed(store / f"{JOURNAL_NAME}.lock"):
         return NotRunningError(
             f"no daqsvc runs on the store {store}: start it with daqsvc run, or name its store with --store; "
@@ -930,7 +930,7 @@ def _peer(writer: asyncio.StreamWriter) -> tuple[int, int]:
     """Who is at the other end, by the word of the kernel: uid and pid.
 
     Raises:
-        OSError: nobody any more.
+        OSError: no service any more.
     """
     connection = writer.get_extra_info("socket")
     credentials = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
@@ -943,7 +943,7 @@ def _bind(path: Path, link: Path | None) -> tuple[socket.socket, int]:
 
     Clients find it at ``link``, if that is given.
     """
-    # The mode is set under another name, no longer than its own, and nobody can connect before `listen`.
+    # The mode is set under another name, no longer than its own, and no client can connect before `listen`.
     draft = path.with_name(".control")
     made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
     try:

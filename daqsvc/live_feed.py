@@ -1,4 +1,4 @@
-"""What passes of a machine, for who looks on: samples, statements, alarms. Nothing is made while nobody does.
+"""What happens at a machine, for viewers: samples, statements, alarms. Nothing is made without viewers.
 
 A viewer gets lines of JSON. The first one is `LiveFeed.about`. Each further one has one key:
 ``samples`` (of a stream, base64 of float32), ``statement``, ``alarm``, ``standing``, ``left_out``: how many

@@ -649,7 +649,7 @@ class MachineRecorder:
                 # What is a cause while it is being closed begins another one.
                 self._open = None
                 if not snapshot.asked and snapshot.last is not None:
-                    # Who has asked waits for the whole file; nobody waits for this one.
+                    # Who has asked waits for the whole file; this one is not waited for.
                     self._lingering.append(snapshot)
                     is_over = False
             elif is_over:
@@ -717,7 +717,7 @@ class MachineRecorder:
         if is_over:
             self._finishing.append(snapshot)
         handed_ns = self._clock.monotonic_ns()
-        # A thread goes on when nobody waits for it any more: the end of the service must know of it.
+        # A thread goes on when it is not waited for any more: the end of the service must know of it.
         snapshot.writing = asyncio.ensure_future(
             asyncio.to_thread(self._write, snapshot, items, is_over=is_over)
         )

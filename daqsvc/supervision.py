@@ -33,7 +33,7 @@ WELL_S = 60.0
 """A part that has run for so long has earned a quick restart."""
 
 OTHERS = "event loop"
-"""The name under which failures of callbacks, and of tasks that nobody waits for, are counted."""
+"""The name under which failures of callbacks, and of tasks that are not waited for, are counted."""
 
 
 class EssentialLostError(Exception):
@@ -126,7 +126,7 @@ class Supervisor:
 
     @contextlib.contextmanager
     def hearing(self) -> Iterator[None]:
-        """Count and say what fails in callbacks, in tasks that nobody waits for, and in bare threads."""
+        """Count and log what fails in callbacks, in tasks that are not waited for, and in bare threads."""
         loop = asyncio.get_running_loop()
         loop_before, threads_before = loop.get_exception_handler(), threading.excepthook
         loop.set_exception_handler(self._hear_loop)

@@ -1,4 +1,4 @@
-"""Blocking calls in their own threads, which nobody has to wait for.
+"""Blocking calls in their own threads, which need not be waited for.
 
 The threads of a common pool are waited for when the process ends, so one call that hangs, such as a read of a
 disk that is gone, would keep the process from ending. And a pool that has lost a thread does not notice.
@@ -39,7 +39,7 @@ class CallThreads(ThreadPoolExecutor):
 
 
 def call_in_thread(call: Callable[[], T], *, name: str) -> Future[T]:
-    """Begin a call in a thread that nobody waits for.
+    """Begin a call in a thread that is not waited for.
 
     Args:
         call: blocks.

@@ -188,7 +188,7 @@ class CanNodes:
         return cls(f"{interface} {channel}", nodes)
 
     async def ready(self) -> None:
-        """See `SimNode.ready`: nobody can tell who listens to a CAN bus."""
+        """See `SimNode.ready`: it is not known who listens to a CAN bus."""
 
     async def play(self, pacer: Pacer) -> None:
         """See `SimNode.play`."""

@@ -403,7 +403,7 @@ class CounterUnwrapper:
 
 
 def _lateness(before: float, falling_behind: NDArray[np.floating]) -> NDArray[np.float64]:
-    """How late frames are, in counts: what they fall behind adds up, and nobody is ahead of his time.
+    """How late frames are, in counts: what they fall behind adds up, and no frame is early.
 
     Args:
         before: how late the frame before the first one was.

@@ -215,6 +215,6 @@ class Link:
         self.turns += 1
 
     def stop(self) -> None:
-        """Nobody keeps the link up any more: its driver was stopped. That is no loss."""
+        """The link is not kept up any more: its driver was stopped. That is no loss."""
         if self.state == "up":
             self.state, self.reason, self.code = "down", "it was stopped", None

@@ -254,7 +254,7 @@ class SampleRing:
         return self._closed
 
     def close(self) -> None:
-        """Let nobody wait any longer; what was written can still be read."""
+        """End all waiting; what was written can still be read."""
         self._closed = True
         for _, _, woken in self._waiting:
             if not woken.done():

@@ -50,7 +50,7 @@ class SampleBlock:
         period_ns: estimated time between samples.
         lost_before: samples known to be missing between the previous block and this one.
         quality: what is known against this block.
-        pause_before: of a snapshot, how many samples long the time was before it in which nobody sampled, by
+        pause_before: of a snapshot, how many samples long the time without samples was before it, by
             the clock, beside ``lost_before``. None if the stream goes on from block to block.
         t_error_ns: how far ``t_first_ns`` may be off (95th percentile), beside the constant part of the delay
             from the device to the host; infinite if it is not known.
@@ -103,8 +103,8 @@ class Window:
         period_ns: time between samples.
         skipped: samples between the previous window and this one that the detector was too slow
             for (they were overwritten), or that were withheld from it; 0 in normal operation.
-        snapshot: whether the samples are one block that was taken by itself. Between it and the window before
-            nobody sampled: nothing is missing there, nothing goes on from there, and its length is its own.
+        snapshot: whether the samples are one block that was taken by itself. Between it and the window
+            before, nothing was sampled: nothing is missing there, nothing goes on, and the time may be of any length.
         breaks: absolute indices, rising, of samples whose distance to the one before is a guess
             (`Quality.PLACE_ESTIMATED`). One among samples that were skipped is at the first sample.
     """

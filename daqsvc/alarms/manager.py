@@ -226,7 +226,7 @@ class AlarmManager:
             restarted: whether that may have been long ago; False in a replay, where it was just now.
 
         Returns:
-            The events by which alarms return to normal that nobody will judge any more: the machine file
+            The events by which alarms return to normal that are not judged any more: the machine file
             no longer has them, or not what a quality alarm is about.
         """
         events = list(events)
@@ -266,7 +266,7 @@ class AlarmManager:
         return self._tell(events)
 
     def withdraw(self, events: Iterable[AlarmEvent]) -> list[AlarmEvent]:
-        """Return alarms to normal that nobody will judge any more, of whichever machine.
+        """Return alarms of any machine to normal that are not judged any more.
 
         Args:
             events: the last event of each.
@@ -563,7 +563,7 @@ def _bears_on(doubt: Doubt, ruled: Ruled, event: AlarmEvent) -> bool:
 
 
 class _Statuses(Mapping[str, "AlarmStatus"]):
-    """The status of each alarm, made when it is asked for: those that nobody reads cost nothing."""
+    """The status of each alarm, made when it is asked for: those that are not read cost nothing."""
 
     def __init__(self, alarms: Mapping[str, Alarm], first_out: FirstOut) -> None:
         self._alarms = alarms

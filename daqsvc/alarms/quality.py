@@ -135,7 +135,7 @@ class SensorHealth:
         # By detector, the stream that it cannot judge by.
         self._unjudged: dict[str, str] = {}
         self._by_alarm: defaultdict[str, dict[str, Doubt]] = defaultdict(dict)
-        # By sensor who blames it by name and why, the latest last; a sensor that nobody blames has no row.
+        # By sensor who blames it by name and why, the latest last; one without blame has no row.
         self._blamed: dict[str, dict[str, str]] = {}
         # Who may have joined in before a restart and has not spoken since, and until when that counts.
         self._unheard: set[str] = set()

@@ -228,7 +228,7 @@ def _known_as(designation: str) -> str:
     near = difflib.get_close_matches(bare, known, n=4, cutoff=0.6)
     names = f"near names: {', '.join(near)}" if near else "no name in it is near"
     stem = bare.partition("-")[0]
-    # Of a known bearing, only the seals were written in a way that nobody uses.
+    # Of a known bearing, only the seals were written in an unusual way.
     meant = f" (did you mean {stem}-2RS?)" if stem in known else ""
     raise KeyError(
         f"bearing {designation!r} is not in the catalogue; {names}{meant}. "

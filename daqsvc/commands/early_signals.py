@@ -17,7 +17,7 @@ EXIT_INTERRUPTED = 128 + signal.SIGINT
 """What a shell says of a program that SIGINT has ended."""
 
 _came: set[int] = set()
-"""Signals that nobody has heard yet."""
+"""Signals that have no handler yet."""
 
 
 def ignore_until_heard(arguments: Sequence[str]) -> None:
@@ -38,7 +38,7 @@ def ignore_until_heard(arguments: Sequence[str]) -> None:
 
 
 def take_hang_up() -> bool:
-    """Whether a SIGHUP came since `ignore_until_heard` that nobody has taken yet."""
+    """Whether a SIGHUP came since `ignore_until_heard` that was not handled yet."""
     came = signal.SIGHUP in _came
     _came.clear()
     return came

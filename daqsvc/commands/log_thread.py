@@ -30,8 +30,8 @@ class LogThread(logging.Handler):
         fd: e.g. 2 for stderr.
 
     Attributes:
-        on_gone: told, once and on the thread, that nobody reads it any more, and why; None if that is no
-            matter.
+        on_gone: called once, on the thread, when nothing reads the log any more, with the reason; None if
+            that does not matter.
     """
 
     def __init__(self, fd: int) -> None:

@@ -241,7 +241,7 @@ class _Reloader:
             self.part.over.add_done_callback(self._ask_again)
 
     def _ask_again(self, over: asyncio.Future[None]) -> None:
-        """Somebody may have asked just when nobody looked any more."""
+        """Something may have been asked for right after the last check."""
         if self._asked and not over.cancelled() and not self.is_over:
             self.ask()
 

@@ -55,8 +55,8 @@ class ServiceManager:
     """The socket of systemd, or of whoever else speaks its protocol.
 
     Args:
-        address: ``$NOTIFY_SOCKET``: a path, or ``@`` and the name of an abstract socket; empty for nobody.
-        watchdog_s: how soon the service is ended that is silent; None if nobody waits for it.
+        address: ``$NOTIFY_SOCKET``: a path, or ``@`` and the name of an abstract socket; may be empty.
+        watchdog_s: how soon a silent service is ended; None if it never is.
 
     Attributes:
         is_ready: whether it knows that the service is ready.

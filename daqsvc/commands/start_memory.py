@@ -53,7 +53,7 @@ def give_back() -> None:
 
 
 def unchanged(smaps: Iterable[str]) -> Iterator[tuple[int, int]]:
-    """Address and length of the parts of shared libraries that are read or run, and nobody has written to.
+    """Address and length of the parts of shared libraries that are read or run, and were not written to.
 
     Other files are left alone: they may be unmapped meanwhile, and something else be there. What the loader
     has written to and then protected is no longer what the file holds, in memory or swapped out.

@@ -43,7 +43,7 @@ def serve() -> None:
 
 def _answer(request: Mapping[str, Any], replies: BinaryIO) -> None:
     if directory := request["directory"]:
-        # Where nobody may go, whole paths still lead to files.
+        # Where no process may go, whole paths still lead to files.
         with contextlib.suppress(OSError):
             os.chdir(directory)
     _confine(request["memory_bytes"], request["cpu_s"])

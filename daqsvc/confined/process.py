@@ -36,7 +36,7 @@ _LONGEST_HEADER = 256_000_000
 _END_S = 2.0
 
 _ENVIRONMENT = {
-    # Threads that nobody needs take address space, which is what is bounded; so do the pools of Arrow.
+    # Threads that are not needed take address space, which is what is bounded; so do the pools of Arrow.
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",

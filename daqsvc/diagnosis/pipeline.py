@@ -53,7 +53,7 @@ class Job(Generic[T]):
         outcome: what becomes of it.
         thread: who does it; None while it waits.
         apart: whether the thread does nothing else any more.
-        given_up: whether nobody waits for the thread any more.
+        given_up: whether the thread is not waited for any more.
     """
 
     call: Callable[[], T]
@@ -208,7 +208,7 @@ class KernelThreads:
             if not job.outcome.done():
                 job.outcome.set_result(result) if error is None else job.outcome.set_exception(error)
 
-        # The loop may be closed, and nobody left who waits.
+        # The loop may be closed, and nothing waits any more.
         with contextlib.suppress(RuntimeError):
             job.outcome.get_loop().call_soon_threadsafe(tell)
         with self._lock:
@@ -409,7 +409,7 @@ class Pipeline:
         ]
         try:
             await over(following)
-            while not all(ring.is_closed for ring in self._rings.values()):  # nobody follows some of them
+            while not all(ring.is_closed for ring in self._rings.values()):  # some of them are not followed
                 await self._clock.sleep_ns(LOOK_NS)
         finally:
             for part in (listening, *following):

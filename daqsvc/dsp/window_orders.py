@@ -28,7 +28,7 @@ _WORST_CONDITION = 25.0
 _SURE_OF_PHASE = 6.0
 """A phase is given if the amplitude is so many of its standard deviations: it is then good to 10 degrees."""
 SLIP = 0.03
-"""A shaft whose speed nobody measures is looked for within this part of the stated one."""
+"""A shaft whose speed is not measured is looked for within this part of the stated one."""
 _PER_LINE = 4
 """Places examined in the width of a line."""
 _PER_TURN = 16.0

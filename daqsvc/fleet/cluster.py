@@ -35,7 +35,7 @@ def connected(name: str, cores: int) -> Iterator[Any]:
         cores: workers of ``local``.
 
     Raises:
-        FleetError: there is nobody, or nobody who works.
+        FleetError: there is no scheduler, or it has no workers.
     """
     local = _LOCAL.fullmatch(name)
     if local is None:

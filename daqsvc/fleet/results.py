@@ -82,7 +82,7 @@ class Results:
         with lock:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                # A run that wrote nothing may have removed it since: it keeps nobody away any more.
+                # A run that wrote nothing may have removed it since: it keeps no other run away any more.
                 is_held = os.path.samestat(os.fstat(lock.fileno()), (folder / _LOCK).stat())
             except OSError:
                 is_held = False

@@ -34,7 +34,7 @@ MOST_OF_A_TOPIC = 1000
 """Letters of one topic that are kept; beyond that the oldest are dropped, counted, and that is said."""
 
 SCHEMA_VERSION = 0
-"""What SQLite gives to a file that nobody has given a version; changes of the table count from here."""
+"""What SQLite gives to a file without a version; changes of the table count from here."""
 
 _REASON_LETTERS = 300
 

@@ -361,7 +361,7 @@ def put_by(path: Path, version: int, wall_ns: int) -> Path:
     """Rename a sound database whose tables are of a newer version; such files are never deleted.
 
     Args:
-        path: the database, which nobody has open.
+        path: the database, which is not open anywhere.
         version: of its tables.
         wall_ns: wall clock, ns since the Unix epoch.
 

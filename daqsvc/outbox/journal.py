@@ -193,7 +193,7 @@ class Journal:
 
     @property
     def known_topics(self) -> frozenset[str] | None:
-        """Topics that ever had a retained message; None if damage has made nobody know them."""
+        """Topics that ever had a retained message; None if they are not known, because of damage."""
         return self._known_topics.topics
 
     def hold(self) -> None:
@@ -723,7 +723,7 @@ class Journal:
         except (OutboxError, *FileError):
             if not self._shows:
                 raise
-            sent, latest = marks, self._overlaid([])  # of what nobody can read, nothing is repeated
+            sent, latest = marks, self._overlaid([])  # of what cannot be read, nothing is repeated
         return [message for message in latest if message.sequence in sent]
 
     def latest(self) -> list[OutboxMessage]:

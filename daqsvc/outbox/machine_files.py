@@ -94,7 +94,7 @@ def other_file(store: Path, identity: Identity, file: Path) -> Path | None:
 
 
 def take_store(store: Path, files: Mapping[Identity, Path], *, on_purpose: bool) -> None:
-    """See that a store is that of these machine files, or of nobody, or was theirs before they were moved.
+    """See that a store is that of these machine files, or of no file, or was theirs before they were moved.
 
     Args:
         store: directory of the journal.

@@ -95,7 +95,7 @@ class Outbox:
 
     @property
     def known_topics(self) -> frozenset[str] | None:
-        """Topics that ever had a retained message; None if damage has made nobody know them."""
+        """Topics that ever had a retained message; None if they are not known, because of damage."""
         return self._journal.known_topics
 
     @property
@@ -260,7 +260,7 @@ class Outbox:
 
     async def until_broken(self) -> str:
         """Wait until the thread that writes the alarms has ended by itself; why, in a sentence."""
-        # A thread that is gone tells nobody.
+        # A thread that has ended reports nothing.
         while self._ended is None or self._writer.is_closing or self._writer.is_alive:  # noqa: ASYNC110
             await asyncio.sleep(LOOK_S)
         why = self._books.broken or "has stopped: its thread was lost"

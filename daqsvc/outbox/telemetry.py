@@ -138,7 +138,7 @@ class Telemetry:
 
     def _run(self, loop: asyncio.AbstractEventLoop, ended: asyncio.Future[None]) -> None:
         def post(function: Callable[..., object], *args: object) -> None:
-            # A loop that is closed already has nobody left who would wait for the answer.
+            # On a loop that is closed already nothing waits for the answer.
             with contextlib.suppress(RuntimeError):
                 loop.call_soon_threadsafe(function, *args)
 

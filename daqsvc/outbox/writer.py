@@ -35,7 +35,7 @@ _T = TypeVar("_T")
 log = logging.getLogger(__name__)
 
 MARK_LINGER_S = 0.05
-"""How long a mark may wait for company: nobody waits for it, and each commit costs the disk a sync."""
+"""How long a mark may wait for others: nothing depends on it, and each commit costs the disk a sync."""
 
 CROWD_LINGER_S = 0.05
 """How long messages wait for company while they come in a crowd: a commit costs more than 20 of them."""
@@ -241,7 +241,7 @@ class JournalWriter:
         self, loop: asyncio.AbstractEventLoop, opened: asyncio.Future[int | None], ended: asyncio.Future[None]
     ) -> None:
         def post(function: Callable[..., object], *args: object) -> None:
-            # A loop that is closed already has nobody left who would wait for the answer.
+            # On a loop that is closed already nothing waits for the answer.
             with contextlib.suppress(RuntimeError):
                 loop.call_soon_threadsafe(function, *args)
 
@@ -256,7 +256,7 @@ class JournalWriter:
             post(succeed, opened, unsent)
             self._serve(batch, post)
         except BaseException as error:
-            # A mistake in this program. Whoever waits must hear of it, and nobody may wait in vain.
+            # A mistake in this program. What waits must get it as an error: it must not wait in vain.
             post(self._reports.stopped, f"has stopped: {error!r}")
             self._gather(batch, wait=False)
             self._abandon(batch, error, post)

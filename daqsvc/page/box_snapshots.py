@@ -23,7 +23,7 @@ AT = "@"
 MOST_OPEN = 4
 """Snapshots that are held in memory at a time."""
 LINGER_S = 5.0
-"""How long one is still played when nobody looks any more."""
+"""How long one is still played after the last viewer has gone."""
 MOST_LISTED = 500
 
 

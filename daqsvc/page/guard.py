@@ -67,7 +67,7 @@ class Guarded:
 
 
 class Admitted:
-    """Has nobody come further who is not known; says who it is as ``request.state.person``.
+    """Refuses whoever is not known; puts who it is into ``request.state.person``.
 
     Args:
         app: what answers.

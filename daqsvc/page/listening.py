@@ -95,7 +95,7 @@ class Listening(ABC):
             except (OSError, asyncio.IncompleteReadError, *NOT_OURS) as error:
                 self.why_not = self.in_words(error)
                 if isinstance(error, NOT_OURS):
-                    self._has_begun.set()  # it has answered: nobody need wait for what it refuses
+                    self._has_begun.set()  # it has answered: waiting for what it refuses has no use
             if not self.anew.is_set():
                 await asyncio.sleep(backoff.next_ns() / NS_PER_S)
 

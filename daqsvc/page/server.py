@@ -88,7 +88,7 @@ def application(
 
     Args:
         source: of the machines.
-        access: who may look, and who may act; None for anybody, and nobody.
+        access: who may look, and who may act; None: everybody may look, and nobody act.
         hosts: names that it goes by, beside those of this box for itself.
         tls: whether browsers reach it over TLS.
         documentation: the folder of its site; None if it is not here.

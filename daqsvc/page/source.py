@@ -45,8 +45,8 @@ ALARM_SCHEMA = "daqsvc.alarm/"
 MOST_LOOKED_AT = 20_000
 """Messages of the journal that are looked through for the events of one alarm."""
 LINGER_S = 60.0
-"""How long a machine is still listened to when nobody looks any more, without samples: a view that is opened
-next does not begin with nothing."""
+"""How long a machine is still listened to after the last viewer has gone, without samples. So a view
+that is opened next does not begin with nothing."""
 
 
 class BoxListening(Listening):

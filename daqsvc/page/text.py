@@ -53,7 +53,7 @@ def tile(status: Document) -> Document:
         {"alarm": one["alarm"], "first": one.get("first_out", False), "why": one["message"]} for one in alarms
     ]
     level, away = level_of(alarms), status.get("away", "")
-    # What may have changed since nobody tells is not normal.
+    # What may have changed since reports stopped is not normal.
     level = "unknown" if away and level == "normal" else level
     name = str(status["machine"])
     title = name.rpartition(BETWEEN)[2] or status.get("place", "")

@@ -114,7 +114,7 @@ class Output:
 
     @property
     def reason(self) -> str:
-        """Why it reaches nobody at present, for a person; empty if it does, or that is not known."""
+        """Why there is no connection at present, for people; empty if there is one or it is not known."""
         return self._reason
 
     @reason.setter
@@ -127,7 +127,7 @@ class Output:
 
     @property
     def away_s(self) -> float | None:
-        """For how long it has reached nobody, for whatever `reason`; None if it reaches somebody."""
+        """For how long there has been no connection, for any `reason`; None if there is one."""
         return None if self._away_since_s is None else time.monotonic() - self._away_since_s
 
     async def run(self) -> None:

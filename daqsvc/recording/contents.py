@@ -90,8 +90,8 @@ class Contents:
             says one for each.
         elsewhere: channels that are not among the entries, by their names.
         notes: what is wrong with the file, in sentences.
-        unread: entries that have their length and zeros for samples, as they are too large and nobody wants
-            them.
+        unread: entries that have their length and zeros for samples, as they are too large and are not
+            wanted.
     """
 
     entries: Mapping[str, NDArray[np.generic]]

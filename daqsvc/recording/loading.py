@@ -77,7 +77,7 @@ def load(
         about["texts"][STATED_START] = iso_ns(begins.latest_ns)
     del contents
     samples = begins.aligned(file, _together(columns, length, timing.rows, narrow=narrow))
-    if named:  # what nobody asked for may be anything, e.g. a time in nanoseconds
+    if named:  # what was not asked for may be anything, e.g. a time in nanoseconds
         _refuse_impossible(file, list(channels), samples)
     about["nan_count"], about["infinity_count"] = _count_bad(samples)
     return about, (samples,)

@@ -250,7 +250,7 @@ def _decided(kinds: Kinds, tables: Mapping[type[Section], Schema]) -> Schema:
     last: Schema = {}
     untold = [section for section in tables if all(value is None for value in told[section].values())]
     if fallback in untold:
-        # What has a key that tells another kind is of none that is known: nobody can say more of it.
+        # What has a key that tells another kind is of none that is known: no more is known of it.
         values = {name for tag in told.values() for name, value in tag.items() if value is not None}
         foreign = [{"required": [name]} for name in sorted(values - fallback.model_fields.keys())]
         last = {"if": {"anyOf": foreign}, "else": tables[fallback]} if foreign else tables[fallback]

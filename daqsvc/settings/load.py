@@ -203,7 +203,7 @@ class _Reading:
         return sorted(fatal, key=_place), sorted(warnings, key=_place)
 
     def _only_follows(self, path: KeyPath) -> bool:
-        """Whether nobody can tell what is wrong there before a plugin can be loaded; that is said itself."""
+        """Whether what is wrong there is unknown until a plugin can be loaded, which is reported itself."""
         with suppress(LookupError, TypeError):
             match path:
                 case ("streams", stream, "layout", *_):

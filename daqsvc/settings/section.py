@@ -100,7 +100,7 @@ class Section(BaseModel):
 
 
 class FrozenTables(dict[str, Any]):
-    """Tables by name that nobody can change: every plugin is given the same machine file."""
+    """Tables by name that cannot be changed: every plugin is given the same machine file."""
 
     def _refuse(self, *_: object, **__: object) -> NoReturn:
         raise TypeError("a machine file is not to be changed: whoever needs another one makes a copy")

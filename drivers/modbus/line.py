@@ -271,7 +271,7 @@ class UnitSilence:
 
 
 def _is_repeated(enquiry: Enquiry) -> bool:
-    """Whether it is asked again and again: nobody need ever write again."""
+    """Whether it is asked again and again: nothing need ever be written again."""
     return enquiry.function != WRITE_REGISTERS
 
 

@@ -104,7 +104,7 @@ class _TrendStream:
         self.own_runs = self._record.runs
         bare = replace(RunLimits.of(spec.layout), max_gap=0)
         self.bare_runs = plan_runs(map(run_of, spec.layout.channels), bare)
-        """As `own_runs`, but without any register that nobody wants."""
+        """As `own_runs`, but without any register that is not needed."""
         self._deliver = port.deliver
         self._period_ns = NS_PER_S / spec.rate_hz
         self._places: tuple[int, ...] = ()

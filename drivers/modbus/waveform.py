@@ -45,7 +45,7 @@ class _Ended(NamedTuple):
 
     @classmethod
     def between(cls, after_ns: int | None, by_ns: int) -> _Ended:
-        """It had not ended at ``after_ns`` (None: nobody looked), and had at ``by_ns``."""
+        """It had not ended at ``after_ns`` (None: not read), and had at ``by_ns``."""
         if after_ns is None:
             return cls(by_ns, math.inf)
         return cls((after_ns + by_ns) // 2, (by_ns - after_ns) / 2)

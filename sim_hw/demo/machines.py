@@ -155,7 +155,7 @@ def for_recording(
 
     Raises:
         DemoError: more channels than a frame has room for, or the service could not diagnose it; says so
-            in words of the recording, as nobody sees the machine file that is made of it.
+            in words of the recording, as the machine file that is made of it is not shown.
     """
     names = recording.names
     if len(names) > MOST_CHANNELS:

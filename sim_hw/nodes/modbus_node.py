@@ -160,7 +160,7 @@ class ModbusTcpServer:
         self.port = self._server.sockets[0].getsockname()[1]
 
     def start_at_once(self) -> None:
-        """As `start`, for callers that cannot wait; there is nobody to answer until the next turn or two."""
+        """As `start`, for callers that cannot wait; it does not answer until the next turn or two."""
         self._starting = asyncio.get_running_loop().create_task(self.start(), name="modbus-server-start")
 
     def stop(self) -> None:

@@ -52,9 +52,9 @@ def conduct(
     Args:
         file: the machine file that will be written.
         given: what was answered beforehand.
-        ask: asks a person; None where there is nobody.
+        ask: asks a person; None where there is none.
         say: tells that person why an answer is asked for again.
-        listen: looks at the bus as soon as it is known where it is; None if nobody wants that.
+        listen: reads the bus as soon as it is known where it is; None if that is not wanted.
         answered: called with each question after its answer; may raise `AnswerError`.
 
     Raises:
@@ -249,7 +249,7 @@ def _missing(question: Question) -> str:
 
 
 def _refuse_others(given: Given, interview: _Interview) -> None:
-    """What was given and nobody asked for is a slip of the pen, or of another bus."""
+    """An answer to no question is a slip of the pen, or is of another bus."""
     asked = interview.asked
     for key in given.texts:
         if key not in asked:

@@ -55,7 +55,7 @@ class AccessChoice:
         return is_loopback(self.host)
 
     def refuse_unsafe(self) -> None:
-        """Make sure that nobody gets to see or do what nobody has let them.
+        """Make sure that people see and do only what they have a right to.
 
         Raises:
             UnsafeError: somebody would.
@@ -114,7 +114,7 @@ class AccessChoice:
                 ) from None
         try:
             context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-            # Of a key with a passphrase nobody is asked for it: there may be no terminal.
+            # The passphrase of a key is not asked for: there may be no terminal.
             context.load_cert_chain(self.certificate, self.private_key, password=lambda: "")
         except (ssl.SSLError, ValueError, OSError) as error:
             raise UnsafeError(

@@ -36,11 +36,11 @@ class Access(Protocol):
     signs_in: bool
 
     def person(self, request: HTTPConnection) -> Person | None:
-        """Who asks; None for nobody who is known."""
+        """Who asks; None if that is not known."""
         ...
 
     def why_not(self, request: HTTPConnection) -> str:
-        """Why nobody is known, and the remedy."""
+        """Why it is not known who asks, and the remedy."""
         ...
 
 

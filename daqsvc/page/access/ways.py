@@ -36,7 +36,7 @@ class OpenHere:
     """Anybody on this box may look; who has the operator's key, which is made again at each start, may act.
 
     Args:
-        key: lets whoever has it act; empty for nobody.
+        key: lets whoever has it act; empty if nobody may act.
     """
 
     signs_in = False

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 LINGER_S = 5.0
-"""How long a machine is still listened to when nobody looks any more."""
+"""How long a machine is still listened to after the last viewer has gone."""
 BEGIN_S = 3.0
 """How long the broker is waited for at first."""
 LOOK_S = 0.05
@@ -156,7 +156,7 @@ class PlantSource:
     async def close(self) -> None:
         """Listen no more."""
         if self._running is not None:
-            self._running.cancel()  # at first: nobody waits for a broker that does not answer
+            self._running.cancel()  # at first: without waiting for a broker that does not answer
         await self._listenings.close()
         if self._running is not None:
             await asyncio.wait({self._running})

@@ -180,7 +180,7 @@ class Discovery:
             "device_class": "enum",
             "options": [level.label for level in Level],
             "state_topic": self.topics.summary(self.watched.machine),
-            # The level of an alarm that is covered, or that nobody can judge, is not "normal" but unknown.
+            # The level of an alarm that is covered, or that cannot be judged, is not "normal" but unknown.
             "value_template": _pick("alarms", alarm, "level", default="problem"),
         }
 

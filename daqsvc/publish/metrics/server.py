@@ -48,7 +48,7 @@ class MetricsServer(ThreadingHTTPServer):
         unhealthy: says why the service is not healthy; nothing if it is.
 
     Raises:
-        OSError: nobody can listen there.
+        OSError: it is not possible to listen there.
     """
 
     daemon_threads = True

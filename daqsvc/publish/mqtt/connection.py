@@ -50,7 +50,7 @@ INCOMING: Final = 64
 """Messages from the broker that may wait to be examined; a flood of them is dropped and counted."""
 
 FLOOD_PER_S: Final = 10_000
-"""Packets a second that nobody waits for; a broker that sends more waits in its socket, not in our memory."""
+"""Packets a second that were not asked for; a broker that sends more waits in its socket, not in memory."""
 
 OWED: Final = 1000
 """Acknowledgements that may wait to be sent before nothing more is read."""
@@ -187,7 +187,7 @@ class Connection:
         self._overdue: asyncio.TimerHandle | None = None
         self._grants: dict[int, asyncio.Future[list[ReasonCode]]] = {}
         self._queue: asyncio.Queue[Incoming] = asyncio.Queue(most_waiting)
-        # Futures hold what went wrong as a result: one that nobody asks for is no complaint of asyncio's.
+        # Futures hold what went wrong as a result: asyncio must not complain about one that is not read.
         self._consent: asyncio.Future[Exception | None] = self._loop.create_future()
         self._ended: asyncio.Future[Exception | None] = self._loop.create_future()
         self._abandoned = False
@@ -449,7 +449,7 @@ class Connection:
         properties = (
             _properties(PacketTypes.CONNECT, MaximumPacketSize=LARGEST_PACKET) if self.is_mqtt5 else None
         )
-        # Said unless something else is known: whatever ends the thread, nobody waits for it in vain.
+        # Said unless something else is known: whatever ends the thread, no waiting is in vain.
         error: Exception | None = OSError("the thread that connects was lost")
         try:
             self._client.connect(*self._address, properties=properties)
@@ -467,7 +467,7 @@ class Connection:
             try:
                 self._loop.call_soon_threadsafe(self._settle, reached, error)
             except RuntimeError:
-                # A closed loop means that the process ends and nobody waits for the connection any more.
+                # A closed loop means that the process ends and the connection is not waited for any more.
                 self._shut()
 
     def _settle(self, reached: asyncio.Future[Exception | None], error: Exception | None) -> None:

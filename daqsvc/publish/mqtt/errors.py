@@ -197,7 +197,7 @@ def _coded(error: MqttCodeError) -> str:
 
 
 class Faults:
-    """What went wrong that nobody has thought of.
+    """What went wrong unexpectedly.
 
     Attributes:
         count: how often.

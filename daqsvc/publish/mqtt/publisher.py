@@ -67,7 +67,7 @@ SUSPICIOUS_LOSSES = 3
 """Connections in a row that broke soon after they were made, from which on a rival is likely."""
 
 TAKEN_OVER_S = 60.0
-"""Least wait after another client has come with the same client id: two that fight help nobody."""
+"""Least wait after another client has come with the same client id: two that alternate are of no use."""
 
 GOODBYE_S = 0.3
 """What saying goodbye may take of the time to stop."""

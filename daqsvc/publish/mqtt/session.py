@@ -226,7 +226,7 @@ class Session:
             for task in done:
                 task.result()
                 if task in deliveries and not self._stopping.is_set():
-                    # With the connection up and nothing going out, nobody would notice.
+                    # With the connection up and nothing going out, it would not be noticed.
                     raise RuntimeError(f"{task.get_name()} has ended by itself")
 
     async def _hand_over(

@@ -3,7 +3,7 @@
 What goes to the broker is collected, so that the packets of one turn of the event loop leave together.
 
 The library takes what a broker sends on trust: packets of up to 256 MiB, messages of QoS 2 that it keeps
-until they are released, kinds of packets that nobody asked for. Here, each packet's fixed header (MQTT 5
+until they are released, kinds of packets that were not asked for. Here, each packet's fixed header (MQTT 5
 and 3.1.1, section 2.1) is read first. What no broker may send ends the connection with a sentence.
 """
 

@@ -114,7 +114,7 @@ class PageOutput(Output):
         environment = {name: value for name, value in os.environ.items() if name not in NOT_THEIRS}
         process = await asyncio.create_subprocess_exec(
             *self._command,
-            stdin=asyncio.subprocess.PIPE,  # it ends when nobody holds the other end any more
+            stdin=asyncio.subprocess.PIPE,  # it ends when the other end is closed
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.PIPE,
             env=environment,

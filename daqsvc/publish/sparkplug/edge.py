@@ -1,6 +1,6 @@
 """The edge node at work: connects, waits for its host, tells births, alarms and figures, and leaves in order.
 
-Sparkplug's data have QoS 0, which nobody acknowledges. So after alarms the node asks the broker something
+Sparkplug's data have QoS 0, which is not acknowledged. So after alarms the node asks the broker something
 harmless and waits for the answer: brokers work off a connection in order, so then they have the alarms too.
 Only what a broker has acknowledged is not sent again, as history, after the next connection.
 """

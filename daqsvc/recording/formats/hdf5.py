@@ -107,7 +107,7 @@ class _Tree:
         return Contents(entries, rates_hz=rates_hz, times=times, units=units, unread=frozenset(stand_ins))
 
     def _too_large(self, sets: Mapping[str, Any], wanted: Collection[str]) -> set[str]:
-        """Of the data sets that nobody wants the largest, so that the others fit in the budget."""
+        """The largest of the data sets that are not wanted, so that the others fit in the budget."""
         kept = {
             name
             for name in sets

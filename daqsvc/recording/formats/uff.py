@@ -118,7 +118,7 @@ def _check_ends(path: Path) -> None:
 
 
 def _without_abscissa(one: dict[str, Any]) -> dict[str, Any]:
-    """Without the column of even steps, which nobody needs."""
+    """Without the column of even steps, which is not needed."""
     if int(one["abscissa_spacing"]) == 1:
         one.pop("x", None)
     return one
