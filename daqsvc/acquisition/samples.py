@@ -104,7 +104,8 @@ class Window:
         skipped: samples between the previous window and this one that the detector was too slow
             for (they were overwritten), or that were withheld from it; 0 in normal operation.
         snapshot: whether the samples are one block that was taken by itself. Between it and the window
-            before, nothing was sampled: nothing is missing there, nothing goes on, and the time may be of any length.
+            before, nothing was sampled: nothing is missing there, nothing goes on, and the time may be of
+            any length.
         breaks: absolute indices, rising, of samples whose distance to the one before is a guess
             (`Quality.PLACE_ESTIMATED`). One among samples that were skipped is at the first sample.
     """
