@@ -6,20 +6,18 @@ or added move the frames behind them. A check that most of them pass is proof.
 
 from __future__ import annotations
 
-import binascii
 from collections import Counter
 from dataclasses import dataclass, field
-from functools import reduce
-from operator import xor
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from cobs import cobs
 
 from drivers.counter_search import counter_between
+from drivers.serial.checksums import CHECKSUMS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Iterator
 
     from numpy.typing import NDArray
 
@@ -34,7 +32,6 @@ _CONSTANT = 0.95
 _MOST_LAGS = 12
 _MOST_ANCHORS = 3
 _MOST_CHECKED = 64
-_FIRST_CHECKED = 12
 _LEAST_PASSING = {1: 0.8, 2: 0.5}
 """Share of the frames that must pass a check, by its bytes: by chance, one in 256 or one in 65536 does."""
 _ORDERS: tuple[Literal["big", "little"], ...] = ("big", "little")
@@ -94,44 +91,9 @@ class BinaryFrames:
         return (base + (0.2 if self.counter is not None else 0.0)) * self.coverage * self.passing
 
 
-# Checks at the end of a frame: bytes, and the sum of what is before it.
-def _reflected(polynomial: int, initial: int) -> Callable[[bytes], int]:
-    """A CRC-16 that takes the least significant bit first."""
-    table = []
-    for byte in range(256):
-        crc = byte
-        for _ in range(8):
-            crc = crc >> 1 ^ polynomial if crc & 1 else crc >> 1
-        table.append(crc)
-    return lambda data: reduce(lambda crc, byte: crc >> 8 ^ table[(crc ^ byte) & 0xFF], data, initial)
-
-
-def _crc8(data: bytes) -> int:
-    """CRC-8/SMBUS: polynomial 0x07."""
-    crc = 0
-    for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = (crc << 1 ^ 0x07) & 0xFF if crc & 0x80 else crc << 1
-    return crc
-
-
-CHECKS: Mapping[str, tuple[int, Callable[[bytes], int]]] = {
-    "ibm-3740": (2, lambda data: binascii.crc_hqx(data, 0xFFFF)),
-    "xmodem": (2, lambda data: binascii.crc_hqx(data, 0)),
-    "modbus": (2, _reflected(0xA001, 0xFFFF)),
-    "arc": (2, _reflected(0xA001, 0)),
-    "kermit": (2, _reflected(0x8408, 0)),
-    "crc-8": (1, _crc8),
-    "sum-8": (1, lambda data: sum(data) & 0xFF),
-    "xor-8": (1, lambda data: reduce(xor, data, 0)),
-}
-"""By name: bytes, and what they hold; the first two are those that the driver checks."""
-
-
 @dataclass(frozen=True, slots=True)
 class _Check:
-    """A check at the end of frames: its name in `CHECKS`, byte order, and the first byte that it covers."""
+    """A checksum at the end of frames: name in `CHECKSUMS`, byte order, and the first byte that it covers."""
 
     name: str = ""
     order: Literal["big", "little"] = "big"
@@ -140,38 +102,48 @@ class _Check:
     @property
     def size(self) -> int:
         """How many bytes it takes."""
-        return CHECKS[self.name][0] if self.name else 0
+        return CHECKSUMS[self.name].size if self.name else 0
 
     def passed(self, frames: NDArray[np.uint8]) -> NDArray[np.bool_]:
         """Which frames (uint8 ``[n, length]``) pass it, bool ``[n]``; all, if it is none."""
         if not self.name:
             return np.ones(len(frames), np.bool_)
-        size, check = CHECKS[self.name]
-        ends = (frame.tobytes() for frame in frames)
-        return np.array(
-            [check(one[self.begin : -size]) == int.from_bytes(one[-size:], self.order) for one in ends], bool
-        )
+        expected = CHECKSUMS[self.name].of(frames[:, self.begin : -self.size])
+        passed: NDArray[np.bool_] = expected == _numbers(frames[:, -self.size :], self.order)
+        return passed
+
+
+def _numbers(ends: NDArray[np.uint8], order: Literal["big", "little"]) -> NDArray[np.int64]:
+    """The last bytes of frames, uint8 ``[n, 1 or 2]``, as numbers, int64 ``[n]``."""
+    wide = ends.astype(np.int64)
+    if order == "little":
+        wide = wide[:, ::-1]
+    numbers: NDArray[np.int64] = wide[:, 0] if wide.shape[1] == 1 else 256 * wide[:, 0] + wide[:, 1]
+    return numbers
 
 
 def _check_of(frames: NDArray[np.uint8], sync: int) -> _Check | None:
     """The check that most frames pass; None if there is none."""
     frames = frames[:_MOST_CHECKED]
-    if len(np.unique(frames, axis=0)) < 3:
+    if _kinds(frames) < 3:
         return None
-    for name, (size, _) in CHECKS.items():
+    for name, checksum in CHECKSUMS.items():
+        size = checksum.size
         for begin in dict.fromkeys((sync, 0)):
             if frames.shape[1] - begin <= size:
                 continue
+            expected = checksum.of(frames[:, begin:-size])
             for order in _ORDERS[:size]:
-                check = _Check(name, order, begin)
-                if not check.passed(frames[:_FIRST_CHECKED]).any():
-                    continue
-                passed = check.passed(frames)
+                passed = expected == _numbers(frames[:, -size:], order)
                 # Frames that are all alike say nothing: what they end with may be a constant.
-                kinds = len(np.unique(frames[passed], axis=0))
-                if passed.mean() >= _LEAST_PASSING[size] and kinds >= 3:
-                    return check
+                if passed.mean() >= _LEAST_PASSING[size] and _kinds(frames[passed]) >= 3:
+                    return _Check(name, order, begin)
     return None
+
+
+def _kinds(frames: NDArray[np.uint8]) -> int:
+    """How many different frames there are of uint8 ``[n, length]``."""
+    return len({frame.tobytes() for frame in frames})
 
 
 @dataclass(slots=True)
