@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from drivers import questions as q
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
+from drivers.sniffing import WAVEFORM_HZ
 from drivers.toml_lines import entry
 
 if TYPE_CHECKING:
@@ -21,8 +22,6 @@ if TYPE_CHECKING:
 
 BUS, STREAM = "main", "device"
 """Names of the only bus and the only stream of the file."""
-WAVEFORM_HZ = 100.0
-"""Rate from which on samples are usually a waveform; below it, values that the device measures itself."""
 _BY_ID = Path("/dev/serial/by-id")
 
 SHARED = {

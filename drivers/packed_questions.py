@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from drivers import questions as q
-from drivers.bus_questions import WAVEFORM_HZ, BusQuestions, by_name
+from drivers.bus_questions import BusQuestions, by_name
 from drivers.questions import NONE, Answers, Question, Topic
+from drivers.sniffing import WAVEFORM_HZ
 from drivers.toml_lines import array, behind, entry, toml
 
 if TYPE_CHECKING:

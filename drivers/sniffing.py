@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 LONGEST_UNIT = 16
 """Letters that the unit of a sensor may have."""
+WAVEFORM_HZ = 100.0
+"""Rate from which on samples are usually a waveform; below it, values that the device measures itself."""
 
 
 class SniffError(Exception):
@@ -111,19 +113,24 @@ def table_name(text: str, otherwise: str) -> str:
     return re.sub(r"[^A-Za-z0-9_]+", "-", text).strip("-")[:40] or otherwise
 
 
-def sensor_lines(stream: str, channels: Mapping[str, str], taken: set[str]) -> list[str]:
+def sensor_lines(
+    stream: str, channels: Mapping[str, str], taken: set[str], rate_hz: float = math.inf
+) -> list[str]:
     """A table ``[[sensors]]`` for each channel of a stream, of the type that its unit is usual for.
 
     Args:
         stream: its name.
         channels: the unit of each channel; ``1`` where none is known.
         taken: names of sensors that there are; the new ones are added.
+        rate_hz: samples per second; of a velocity, below `WAVEFORM_HZ`, they are levels, no vibration.
     """
     lines: list[str] = []
     for channel, text in channels.items():
         known = unit_of(text)
         unit = text.strip() if known is None else known.name
         kind = {"g": "accelerometer", "m/s2": "accelerometer", "mm/s": "velocity"}.get(unit, "trend")
+        if kind == "velocity" and rate_hz < WAVEFORM_HZ:
+            kind = "trend"
         if kind == "trend":
             unit = text.strip()
         if not (0 < len(unit) <= LONGEST_UNIT and unit.isprintable()):

@@ -216,7 +216,7 @@ def _database(file: Path, at: KeyPath) -> Database | Finding:
                 code=DBC_FILE,
             )
         return Finding(here, f"{file} {error}", remedy, code=DBC_FILE)
-    text = data.decode("cp1252", "replace")
+    text = _text(data)
     try:
         _see_sizes(text)
         database = load_string(text, "dbc")
@@ -231,6 +231,14 @@ def _database(file: Path, at: KeyPath) -> Database | Finding:
     if not isinstance(database, can.Database):
         return Finding(here, f"{file} describes no CAN messages", "give another DBC file", code=DBC_FILE)
     return database
+
+
+def _text(data: bytes) -> str:
+    """The text of a DBC file: cp1252 by the format, UTF-8 where an editor has saved it so."""
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("cp1252", "replace")
 
 
 def _see_sizes(text: str) -> None:

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from drivers import packed_questions as packed
 from drivers import questions as q
-from drivers.bus_questions import BUS, WAVEFORM_HZ, BusQuestions, Heard, by_name, is_count
+from drivers.bus_questions import BUS, BusQuestions, Heard, by_name, is_count
 from drivers.can.sniff import CanSniffer
 from drivers.questions import NONE, Answers, Question, Topic
-from drivers.sniffing import NothingFoundError, SniffError, sniffed, usual_rate
+from drivers.sniffing import WAVEFORM_HZ, NothingFoundError, SniffError, sniffed, usual_rate
 from drivers.toml_lines import Hexadecimal, array, behind, entry, toml
 
 if TYPE_CHECKING:

@@ -563,6 +563,7 @@ class _Report(NamedTuple):
                 {s.name: s.unit for s in channels if s.unit}
                 or dict.fromkeys((s.name for s in channels), "1"),
                 sensors,
+                rate_hz,
             ),
         ]
 

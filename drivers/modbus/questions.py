@@ -8,10 +8,10 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from drivers import questions as q
-from drivers.bus_questions import BUS, WAVEFORM_HZ, BusQuestions, Heard, only_port
+from drivers.bus_questions import BUS, BusQuestions, Heard, only_port
 from drivers.modbus.sniff import ModbusSniffer
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
-from drivers.sniffing import NothingFoundError, SniffError, sniffed
+from drivers.sniffing import WAVEFORM_HZ, NothingFoundError, SniffError, sniffed
 from drivers.toml_lines import array, entry
 
 if TYPE_CHECKING:

@@ -158,6 +158,7 @@ class DelimitedFraming(ABC):
         """See `Framing.restart`; the next piece may be the end of one that began before."""
         self._rest = np.empty(0, np.uint8)
         self._cut_off = True
+        self._endless = False
         self._astray = False
 
     def cut(self, data: bytes, arrivals_of: ArrivalsOf = in_place) -> DecodedBatch:
@@ -166,6 +167,9 @@ class DelimitedFraming(ABC):
         kept = self._rest
         pieces, cut_off = self._split(data, batch)
         overlong = batch.notes["frames_malformed"] > 0
+        if overlong and not self._told:
+            batch.malformed, batch.remedy = self._why_no_end((kept.tobytes() + data)[: self._longest])
+            self._told = True
         if cut_off and not self._whole:
             batch.note("bytes_garbage", int((pieces.lengths[:1] + 1).sum()))
             pieces, cut_off = pieces.keep(slice(1, None)), False
@@ -201,6 +205,13 @@ class DelimitedFraming(ABC):
         shown = f"{begin}{' ...' if len(piece) > SHOWN_BYTES else ''}"
         return NoFrame(f"the first has {len(piece)} bytes: {shown}")
 
+    def _why_no_end(self, begin: bytes) -> NoFrame:
+        """What bytes are that have no delimiter within the longest frame, and what is wrong with them."""
+        shown = begin[:SHOWN_BYTES].hex(" ")
+        return NoFrame(
+            f"no {self._delimiter:#04x}, which ends a frame, in {self._longest} bytes: {shown} ..."
+        )
+
     @abstractmethod
     def _sort(self, pieces: Pieces, batch: DecodedBatch, arrivals_of: ArrivalsOf) -> NDArray[np.bool_]:
         """Put the frames in pieces, none of them empty, into ``batch``.
@@ -222,11 +233,12 @@ class DelimitedFraming(ABC):
         self._rest = buffer[starts[-1] :].copy()
         cut_off = self._cut_off
         self._cut_off = cut_off and not len(ends)
+        self._endless &= not len(ends)
         if len(self._rest) > self._longest:
             batch.note("bytes_garbage", len(self._rest))
-            batch.note("frames_malformed", int(not self._cut_off))
+            batch.note("frames_malformed", int(not self._endless))
             self._rest = self._rest[:0]
-            self._cut_off = True
+            self._cut_off = self._endless = True
         stops = ends - 1
         for byte in self._padding:
             while (padded := (stops > starts[:-1]) & (buffer[stops - 1] == byte)).any():

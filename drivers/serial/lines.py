@@ -52,6 +52,8 @@ TIME_COUNTER_BITS = 32
 LATEST_S = 1e12
 """A device's time in s that is later than this is no time."""
 
+_NAMES_OF_ENDS = {NEWLINE: "line feed", RETURN: "carriage return"}
+
 SHOWN_CHARACTERS = 80
 """Characters that are shown of what is no line."""
 _NUMBER = {
@@ -339,6 +341,15 @@ class LineFraming(DelimitedFraming):
             return NoFrame(f"{said}: of no stream", "correct prefix and separator of the layout")
         why, remedy = self._codecs[name].why_not(fields[1:])
         return NoFrame(f"{said}: {why}", remedy)
+
+    def _why_no_end(self, begin: bytes) -> NoFrame:
+        shown = begin[:SHOWN_CHARACTERS].decode("ascii", "backslashreplace")
+        here = _NAMES_OF_ENDS.get(self._end[-1:], self._end.decode())
+        why = f'no {here}, which ends a line, in {LONGEST_LINE} bytes, which begin with "{shown}..."'
+        other = next((end for end in (NEWLINE, RETURN) if end in begin), None)
+        if other is None:
+            return NoFrame(why)
+        return NoFrame(why, f"write delimiter = {json.dumps(other.decode())} in the table of the bus")
 
     def _sort(self, pieces: Pieces, batch: DecodedBatch, arrivals_of: ArrivalsOf) -> NDArray[np.bool_]:
         intact = np.ones(len(pieces.ends), np.bool_)

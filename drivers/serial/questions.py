@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from drivers import packed_questions as packed
@@ -30,6 +31,14 @@ _FRAMINGS = {
     "sync": "binary frames of one length, each behind a sync word",
 }
 _CRCS = {"ibm-3740": "begins with 0xffff", "xmodem": "begins with 0", "none": "frames have none"}
+_ENDS = {
+    "lf": "line feed, with a carriage return before it or not",
+    "cr": "carriage return",
+    ";": "semicolon",
+}
+_DELIMITERS = {"lf": "\n", "cr": "\r", ";": ";"}
+_UNNAMED = re.compile(r"c\d+")
+"""As the sniffer calls columns that have no header."""
 _RATES_HZ = (12_800.0, 2560.0, 1280.0, 640.0, 100.0, 10.0, 1.0, 0.1)
 _LONGEST_PAYLOAD = 4096
 _LONGEST_SYNC_WORD = 8
@@ -61,6 +70,9 @@ class SerialQuestions(BusQuestions):
         **packed.TOPICS,
         "prefix": Topic(
             "Word that each line begins with", "e.g. $ACC; none if the first column is a number."
+        ),
+        "line-end": Topic(
+            "What ends a line?", "LF, with CR before it or not, is usual; some devices send CR alone."
         ),
         "separator": Topic("Character between columns", "A comma, semicolon, blank or tab."),
         "decimal": Topic("Decimal mark of the numbers", 'A comma, where a device writes "0,25".'),
@@ -106,6 +118,7 @@ class SerialQuestions(BusQuestions):
 
     def _ask_lines(self, answers: Answers) -> Iterator[Question]:
         yield self.ask("prefix", q.text_or_none, NONE)
+        yield self.choose("line-end", _ENDS, "lf", quiet=True)
         yield self.ask("separator", _character, ",", quiet=True)
         if answers["separator"] != ",":
             marks = {".": "as in 0.25", ",": "as in 0,25"}
@@ -127,8 +140,11 @@ class SerialQuestions(BusQuestions):
 
     def guess(self, answers: Answers, channel: str) -> tuple[str, str | None]:
         """See `BusQuestions.guess`."""
-        lines = answers["framing"] == "lines"
-        return super().guess(answers, channel) if lines else packed.guess(answers, channel)
+        if answers["framing"] != "lines":
+            return packed.guess(answers, channel)
+        kind, unit = super().guess(answers, channel)
+        # A column without a name may be anything: limits of vibration are not for it.
+        return kind, "1" if unit is None and _UNNAMED.fullmatch(channel) else unit
 
     def in_volts(self, answers: Answers) -> bool:
         """See `BusQuestions.in_volts`."""
@@ -171,6 +187,8 @@ class SerialQuestions(BusQuestions):
     def _lines(self, answers: Answers) -> Iterator[str]:
         checks = 'behind a * at the end of a line: "none", "xor", "crc16"'
         yield entry("checksum", answers["checksum"], checks)
+        if answers["line-end"] != "lf":
+            yield entry("delimiter", _DELIMITERS[answers["line-end"]], "what ends a line")
         yield ""
         yield from self.stream(answers, "lines a second")
         if answers["prefix"] is not None:
@@ -235,6 +253,10 @@ def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
     if found["lines_damaged"]:
         yield f"  {found['lines_damaged']} of {found['lines_heard']} lines are damaged"
     yield from (f"  {one}" for one in found["lines"][:_SHOWN_LINES])
+    if found["other_prefixes"]:
+        others = ", ".join(found["other_prefixes"])
+        yield f"  Lines that begin with {others} come, too. The file reads one kind of line; add a stream for"
+        yield "  each other one, as daqsvc sniff serial writes it."
 
 
 def _proposals(found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
@@ -247,6 +269,7 @@ def _proposals(found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
     named = {unused(table_name(one["name"], "column"), taken): one for one in found["columns"]}
     proposed |= {
         "prefix": found["prefix"] or NONE,
+        "line-end": next(name for name, end in _DELIMITERS.items() if end == found["delimiter"]),
         "separator": {"\t": r"\t"}.get(found["separator"], found["separator"] or ","),
         "decimal": found["decimal"],
         "checksum": found["checksum"],

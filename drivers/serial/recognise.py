@@ -67,7 +67,10 @@ def recognised(data: bytes, line_errors: int = 0) -> Recognised:
     printable = sum(byte in _TEXT for byte in text) / len(text)
     candidates = [Recognised(0.3 * printable**2, None, None, printable)]
     if printable >= _LEAST_PRINTABLE and (lines := text_lines(text)) is not None:
-        regular = 1 - len(lines.damaged) / len(lines.lines)
+        damaged, heard = (
+            sum(map(len, each)) for each in zip(*((k.damaged, k.lines) for k in lines.kinds), strict=True)
+        )
+        regular = 1 - damaged / heard
         score = (0.6 + 0.35 * regular) * printable + 0.05 * (lines.checksum in {"xor", "crc16"})
         candidates.append(Recognised(min(score, 1.0), lines, parity, printable))
     candidates += [

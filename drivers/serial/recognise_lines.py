@@ -9,7 +9,7 @@ from __future__ import annotations
 import binascii
 import re
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from operator import xor
 from typing import TYPE_CHECKING
@@ -29,6 +29,9 @@ _LEAST_STEPS = 5
 _MOST_RESETS = 2
 _WRAP = 256
 """What counters wrap at is a multiple of it."""
+_MOST_KINDS = 16
+_LEAST_SHARE = 0.02
+"""Of the lines begin with a word that is no accident."""
 _ENDS = 5
 """Lines at each end by which the growth of a column is judged."""
 _NUMBER = {
@@ -38,6 +41,7 @@ _NUMBER = {
 """A number, by decimal mark."""
 _CHECKSUM = re.compile(r"\*([0-9A-Fa-f]{4}|[0-9A-Fa-f]{2})$")
 _PREFIX = re.compile(r"[!$]?[A-Za-z_-][A-Za-z0-9_-]{0,14}")
+_NO_NUMBER = frozenset({"nan", "inf", "-inf", "null", "none", "err", "error", "na", "n-a", "ovl", "ol"})
 _PRINTABLE = re.compile(r"[\t -~]*")
 _SUMS: Mapping[int, tuple[str, Callable[[bytes], int]]] = {
     2: ("xor", lambda text: reduce(xor, text, 0)),
@@ -76,7 +80,7 @@ class TextLines:
     """Lines of text.
 
     Attributes:
-        lines: whole lines, oldest first, without their ends.
+        lines: whole lines of this kind, oldest first, without their ends.
         delimiter: what ends one; a carriage return before a line feed is none of it.
         separator: between columns; empty if there is one column.
         decimal: decimal mark of the numbers.
@@ -86,6 +90,7 @@ class TextLines:
         header: whether the first line names the columns.
         damaged: lines that are not like most: other columns, no number where most have one, bytes that are
             no text, or a wrong checksum.
+        others: lines of other kinds on the same port, each with another prefix, the most frequent first.
     """
 
     lines: Sequence[str]
@@ -97,6 +102,12 @@ class TextLines:
     columns: Sequence[Column]
     header: bool
     damaged: Sequence[str]
+    others: Sequence[TextLines] = ()
+
+    @property
+    def kinds(self) -> Sequence[TextLines]:
+        """All kinds of lines on the port, this one first."""
+        return (self, *self.others)
 
 
 def text_lines(data: bytes) -> TextLines | None:
@@ -108,8 +119,43 @@ def text_lines(data: bytes) -> TextLines | None:
         if len(lines) >= _LEAST_LINES:
             if first.startswith(b"#") or _is_header(_text(first), lines[0]):
                 lines = [_text(first), *lines]
-            return _columns_of(lines, delimiter.decode())
+            return _kinds_of(lines, delimiter.decode())
     return None
+
+
+def _kinds_of(lines: Sequence[str], delimiter: str) -> TextLines:
+    """Lines by the word that they begin with, where there are several of them."""
+    separator, _ = _marks_of(lines[1:] or lines)
+    words = (
+        [line.split(separator)[0].strip() if separator in line else "" for line in lines] if separator else []
+    )
+    least = max(_LEAST_LINES, _LEAST_SHARE * len(lines))
+    frequent = [
+        word for word, times in Counter(words).most_common(_MOST_KINDS) if times >= least and _is_word(word)
+    ]
+    if len(frequent) < 2 or sum(word in frequent for word in words) < MAJORITY * len(lines):
+        return _columns_of(lines, delimiter)
+    kinds = [
+        _columns_of([line for line, word in zip(lines, words, strict=True) if word == one], delimiter)
+        for one in frequent
+    ]
+    strange = [line for line, word in zip(lines, words, strict=True) if word not in frequent]
+    first = kinds[0]
+    return replace(
+        first,
+        lines=[*first.lines, *strange],
+        damaged=[*first.damaged, *strange],
+        others=kinds[1:],
+    )
+
+
+def _is_word(field: str) -> bool:
+    """Whether a first column can name a kind of line: a word, and not what devices write for no number."""
+    return (
+        _PREFIX.fullmatch(field) is not None
+        and field.lower() not in _NO_NUMBER
+        and not set(field) <= set("-_")
+    )
 
 
 def _text(piece: bytes) -> str:

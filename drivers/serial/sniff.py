@@ -261,20 +261,27 @@ class _Report(NamedTuple):
         bits = 7 if self.best.found.parity else 8
         return f"{bits}{self._parity[0].upper()}1"
 
-    @property
-    def _rate_hz(self) -> float | None:
-        """Lines or frames a second; None where it cannot be known."""
+    def _rate_hz(self, what: TextLines | BinaryFrames | None) -> float | None:
+        """Lines of one kind, or frames, a second; None where it cannot be known."""
         from drivers.serial.recognise_lines import TextLines  # noqa: PLC0415 - only for who listens
 
-        heard, what = self.best.heard, self._what
+        heard = self.best.heard
         seconds = heard.last_s - heard.first_s
         if seconds <= 0 or what is None:
             return None
         if isinstance(what, TextLines):
-            per_frame = len(heard.data) / max(1, heard.data.count(what.delimiter.encode()))
+            count = heard.data.count(what.delimiter.encode()) * self._share(what)
+            per_frame = len(heard.data) / max(1, count)
         else:
             per_frame = what.bytes_per_frame
         return max(heard.received - per_frame, 0) / per_frame / seconds or None
+
+    def _share(self, what: TextLines) -> float:
+        """How many of the lines are of one kind."""
+        from drivers.serial.recognise_lines import TextLines  # noqa: PLC0415 - only for who listens
+
+        of_all = self._what.kinds if isinstance(self._what, TextLines) else [what]
+        return len(what.lines) / sum(len(kind.lines) for kind in of_all)
 
     def _problem(self) -> str:
         from drivers.serial.recognise import LEAST_BYTES  # noqa: PLC0415 - only for who listens
@@ -334,7 +341,10 @@ class _Report(NamedTuple):
         yield f"The first bytes:\n{dump(begin)}"
         what = self._what
         if isinstance(what, TextLines):
-            yield from self._lines(what)
+            if what.others:
+                yield f"{len(what.kinds)} kinds of lines, by their first column: {_prefixes(what)}"
+            for kind in what.kinds:
+                yield from self._lines(kind)
         elif what is not None:
             yield self._frames(what)
 
@@ -350,7 +360,8 @@ class _Report(NamedTuple):
         if what.damaged:
             example = quoted(_printable(what.damaged[0][:_WIDEST]))
             words.append(f"{len(what.damaged)} of {len(what.lines)} lines are damaged, e.g. {example}")
-        rate = "" if self._rate_hz is None else f", {self._rate_hz:.4g} lines/s"
+        rate_hz = self._rate_hz(what)
+        rate = "" if rate_hz is None else f", {rate_hz:.4g} lines/s"
         yield f"Lines of text{rate}: {'; '.join(words)}"
         counter, time_column = _counter(what), self._time(what)
         rows = []
@@ -364,15 +375,16 @@ class _Report(NamedTuple):
         """The column that has the device's time, if none counts."""
         if _counter(what) is not None:
             return None
-        growing = [one for one in what.columns if one.grows and self._time_unit(one) is not None]
+        growing = [one for one in what.columns if one.grows and self._time_unit(what, one) is not None]
         return growing[0] if growing else None
 
-    def _time_unit(self, column: Column) -> str | None:
+    def _time_unit(self, what: TextLines, column: Column) -> str | None:
         """The unit in which a column grows by as much as lines take; None if there is none."""
-        if self._rate_hz is None:
+        rate_hz = self._rate_hz(what)
+        if rate_hz is None:
             return None
         for unit, per_s in (("s", 1.0), ("ms", 1e3), ("us", 1e6)):
-            if 0.8 < column.per_line * self._rate_hz / per_s < 1.25:
+            if 0.8 < column.per_line * rate_hz / per_s < 1.25:
                 return unit
         return None
 
@@ -380,7 +392,8 @@ class _Report(NamedTuple):
         name = "COBS frames"
         if what.framing == "sync":
             name = f"Frames behind the sync word {what.sync.hex(' ')}"
-        rate = "" if self._rate_hz is None else f", {self._rate_hz:.4g} frames/s"
+        rate_hz = self._rate_hz(what)
+        rate = "" if rate_hz is None else f", {rate_hz:.4g} frames/s"
         check = "no check that is known"
         if what.crc:
             order = f", {what.crc_order} endian" if what.crc_bytes > 1 else ""
@@ -412,7 +425,7 @@ class _Report(NamedTuple):
             "score": round(self.best.found.score, 3),
             "tried": [{"baud": one.baud, "score": round(one.found.score, 3)} for one in self.tried],
             "first_bytes": heard.data[: _ROW * _SHOWN_ROWS].hex(),
-            "rate_hz": self._rate_hz,
+            "rate_hz": self._rate_hz(what),
             "framing": None,
         }
         if isinstance(what, TextLines):
@@ -432,11 +445,12 @@ class _Report(NamedTuple):
                         "min": one.least,
                         "max": one.most,
                         "counts": one is counter,
-                        "time_unit": self._time_unit(one) if one is time_column else None,
+                        "time_unit": self._time_unit(what, one) if one is time_column else None,
                     }
                     for one in what.columns
                 ],
                 "lines": list(what.lines[:_SHOWN_LINES]),
+                "other_prefixes": [one.prefix for one in what.others],
                 "lines_heard": len(what.lines),
                 "lines_damaged": len(what.damaged),
             }
@@ -481,20 +495,28 @@ class _Report(NamedTuple):
             yield f"checksum = {quoted(what.checksum)}"
         if what.delimiter != "\n":
             yield f"delimiter = {quoted(what.delimiter)}"
-        yield ""
+        sensors: set[str] = set()
+        for kind in what.kinds:
+            yield ""
+            stream = table_name(kind.prefix.lower(), "lines") if what.others else "lines"
+            yield from self._stream(kind, bus, stream, sensors)
+
+    def _stream(self, what: TextLines, bus: str, stream: str, sensors: set[str]) -> Iterator[str]:
         counter, time_column = _counter(what), self._time(what)
         numbers = [one for one in what.columns if one.numeric and one not in {counter, time_column}]
-        place = counter or time_column
-        if place is None or not numbers or self._rate_hz is None:
+        place, rate_hz = counter or time_column, self._rate_hz(what)
+        if place is None or not numbers or rate_hz is None:
+            if what.prefix:
+                yield f"# Lines that begin with {what.prefix}:"
             yield "# A stream needs a column that counts lines, or one with the device's time, and a column"
             yield "# of numbers beside it; have the device send them (docs/serial.md)."
             return
         names = _names(what.columns)
-        yield "[streams.lines]"
+        yield f"[streams.{stream}]"
         yield f"bus = {quoted(bus)}"
-        yield f"rate_hz = {rounded_rate(self._rate_hz)}    # as measured; see the device's manual"
+        yield f"rate_hz = {rounded_rate(rate_hz)}    # as measured; see the device's manual"
         yield ""
-        yield "[streams.lines.layout]"
+        yield f"[streams.{stream}.layout]"
         if what.prefix:
             yield f"prefix = {quoted(what.prefix)}"
         yield f"line = [{', '.join(quoted(name) for name in names.values())}]"
@@ -507,10 +529,10 @@ class _Report(NamedTuple):
             table = f"{{ column = {quoted(names[counter])}, bits = {bits} }}"
             yield f"counter = {table}    # as far as it was seen; see the manual"
         else:
-            unit = self._time_unit(place)
+            unit = self._time_unit(what, place)
             yield f'time = {{ column = {quoted(names[place])}, unit = "{unit}" }}'
         yield f"channels = [{', '.join(f'{{ name = {quoted(names[one])} }}' for one in numbers)}]"
-        yield from sensor_lines("lines", {names[one]: "1" for one in numbers}, set())
+        yield from sensor_lines(stream, {names[one]: "1" for one in numbers}, sensors)
 
     def _frames_tables(self, what: BinaryFrames, bus: str) -> Iterator[str]:
         yield f"framing = {quoted(what.framing)}"
@@ -523,14 +545,15 @@ class _Report(NamedTuple):
         payload = what.payload_length + (0 if driver_checks else what.crc_bytes)
         yield ""
         counter, packed = what.counter, _packed(what)
-        if counter is None or packed is None or self._rate_hz is None:
+        rate_hz = self._rate_hz(what)
+        if counter is None or packed is None or rate_hz is None:
             yield f"# A stream needs a counter: none was found in the {payload} bytes of payload, or nothing"
             yield "# behind it. See the manual of the device (docs/serial.md)."
             return
         samples = packed.samples_per_frame
         yield "[streams.frames]"
         yield f"bus = {quoted(bus)}"
-        yield f"rate_hz = {rounded_rate(self._rate_hz * samples)}    # as measured; see the device's manual"
+        yield f"rate_hz = {rounded_rate(rate_hz * samples)}    # as measured; see the device's manual"
         yield ""
         yield "[streams.frames.layout]    # what is behind the counter is a guess: see the device's manual"
         yield f"payload_length = {payload}"
@@ -583,6 +606,11 @@ def _tried_row(one: Tried) -> Sequence[str]:
 def _counter(what: TextLines) -> Column | None:
     """The column that counts lines: whole numbers, always by 1."""
     return next((one for one in what.columns if one.numeric and one.step == 1 and one.least >= 0), None)
+
+
+def _prefixes(what: TextLines) -> str:
+    """The words by which kinds of lines are told apart."""
+    return ", ".join(kind.prefix for kind in what.kinds)
 
 
 def _names(columns: Sequence[Column]) -> dict[Column, str]:

@@ -16,6 +16,7 @@ from support.paths import ROOT
 from drivers.base import StreamSpec
 from drivers.can.batches import CanBatch, FrameDemultiplexer
 from drivers.can.dbc import layout_from_dbc, selecting_values
+from drivers.can.dbc import messages_of as database_messages
 from drivers.frames import LayoutError
 
 if TYPE_CHECKING:
@@ -157,3 +158,15 @@ def test_signals_of_different_pages_are_no_stream(paged: Path) -> None:
     (message,) = messages_of(paged)
     signals = {signal.name: signal for signal in message.signals}
     assert selecting_values(signals, ["Nested"]) == {"Deeper": {6, 7}, "Page": {4}}
+
+
+@pytest.mark.parametrize("encoding", ["cp1252", "utf-8", "utf-8-sig"])
+def test_units_are_read_as_the_file_was_saved(tmp_path: Path, encoding: str) -> None:
+    path = tmp_path / "units.dbc"
+    path.write_bytes(
+        'VERSION ""\n\nBU_: A\n\nBO_ 256 Temp: 8 A\n SG_ T : 0|16@1- (0.1,0) [-40|150] "°C" A\n'.encode(
+            encoding
+        )
+    )
+    [message] = database_messages(path)
+    assert [signal.unit for signal in message.signals] == ["°C"]

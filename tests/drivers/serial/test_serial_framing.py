@@ -181,3 +181,28 @@ def test_garbage_without_end_is_counted_and_not_kept(kind: str, filler: bytes) -
     found = [framing.cut(b"\r\n\0"), framing.cut(b"".join(frames))]
     assert len(numbers(found, kind)) >= FRAMES - 1
     assert sum(part.notes["resyncs"] for part in found) == 1
+
+
+@pytest.mark.parametrize(
+    ("kind", "sent", "shown", "remedy"),
+    [
+        (
+            "lines",
+            b"1,2.5\r",
+            'no line feed, which ends a line, in 1024 bytes, which begin with "1,2.5',
+            "\\r",
+        ),
+        ("lines", b"\xff", "no line feed, which ends a line", ""),
+        ("cobs", b"\x07", "no 0x00, which ends a frame", ""),
+    ],
+)
+def test_bytes_in_which_no_frame_ends_are_told_once_with_what_to_write(
+    kind: str, sent: bytes, shown: str, remedy: str
+) -> None:
+    framing, _ = make(kind, ("a",))
+    found = [framing.cut(sent * 500) for _ in range(20)]
+    told = [(one.malformed, one.remedy) for one in found if one.malformed]
+    assert len(told) == 1
+    assert shown in told[0][0]
+    assert (f'write delimiter = "{remedy}"' in told[0][1]) == bool(remedy)
+    assert sum(one.notes["frames_malformed"] for one in found) == 1

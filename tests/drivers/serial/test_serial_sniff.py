@@ -20,6 +20,8 @@ from support.waiting import PATIENCE_S
 
 from daqsvc.cli import main
 from drivers.serial import questions, sniff
+from drivers.serial.recognise import recognised
+from drivers.serial.recognise_lines import TextLines
 from sim_hw.nodes.serial_node import PseudoTerminal
 
 if TYPE_CHECKING:
@@ -127,6 +129,57 @@ def test_decimal_commas_are_told_and_can_be_read(
         assert (layout["separator"], layout["decimal"]) == (";", ",")
         assert layout["counter"]["column"] == "c1"
         assert [one["name"] for one in layout["channels"]] == ["c2", "c3"]
+
+
+def test_two_machines_on_one_port_are_two_kinds_of_lines(
+    cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 0.6)
+
+    def both(number: int) -> bytes:
+        turn = number // 2
+        return b"K2;%d;7.9\n" % turn if number % 2 else b"K1;%d;3.5;41.0\n" % turn
+
+    with talking(cable, both):
+        assert main(["sniff", "serial", f"{cable.path}", "--seconds", "0.6"]) == 0
+        said = capsys.readouterr().out
+        found = figures(cable, capsys)
+        new_layout = new(cable, tmp_path / "new.toml")["streams"]["device"]["layout"]
+    heard = capsys.readouterr().out
+    assert "2 kinds of lines, by their first column: K" in said
+    assert "are damaged" not in said
+    streams = check(tmp_path, found["machine_file"], capsys)["streams"]
+    assert {name: one["layout"]["prefix"] for name, one in streams.items()} == {"k1": "K1", "k2": "K2"}
+    assert [len(streams[name]["layout"]["channels"]) for name in ("k1", "k2")] == [2, 1]
+    rates = [one["rate_hz"] for one in streams.values()]
+    assert max(rates) < 1.1 * min(rates)
+    assert new_layout["prefix"] in {"K1", "K2"}
+    assert "come, too. The file reads one kind of line" in heard
+
+
+def test_words_for_no_number_are_no_kinds_of_lines() -> None:
+    what = recognised(b"".join(b"%s,%d,2\n" % ((b"nan", b"---")[k % 2], k) for k in range(40))).what
+    assert isinstance(what, TextLines)
+    assert not what.others
+
+
+def test_what_ends_a_line_is_in_the_file_of_new(
+    cable: PseudoTerminal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 0.6)
+    with talking(cable, lambda number: b"%d,2.5\r" % number):
+        file = new(cable, tmp_path / "new.toml")
+    assert file["buses"]["main"]["delimiter"] == "\r"
+
+
+def test_columns_without_a_name_get_no_limits_of_vibration(
+    cable: PseudoTerminal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 0.6)
+    with talking(cable, lambda number: b"%d,58.5\n" % number):
+        file = new(cable, tmp_path / "new.toml", "--rate", "10")
+    assert [one["unit"] for one in file["sensors"]] == ["1"]
+    assert not any("zones" in one for one in file.get("alarms", []))
 
 
 def test_damaged_lines_are_counted_and_a_stream_is_proposed(
