@@ -162,7 +162,15 @@ def levels() -> Figure:
     for name, color in (("rms.alert", OTHERS[2]), ("rms.danger", FAULTY)):
         limit = stated[-1].thresholds[name]
         below.axhline(limit, color=color, linestyle="--", linewidth=1.2)
-        below.text(at[0], limit + 1.5, f"{name.removeprefix('rms.')} {limit:g} um", color=color, fontsize=8.5)
+        below.annotate(
+            f"{name.removeprefix('rms.')} {limit:g} um",
+            (at[0], limit),
+            (0.0, 3.0),
+            textcoords="offset points",
+            va="bottom",
+            color=color,
+            fontsize=8.5,
+        )
     below.set_ylabel("RMS, um")
     below.set_ylim(0.0, 1.25 * max(rms))
     below.set_xlabel("s; the colour of a point is the severity that is stated")
@@ -277,7 +285,8 @@ def bearing() -> Figure:
             axes, race_test(samples[end - span : end, 0], rate_hz, speed_rpm, bearing_orders("6205-2RS"))
         )
     healthy.set_ylabel("modulation of the envelope")
-    healthy.legend(loc="upper right", frameon=True, framealpha=1.0, edgecolor="none")
+    # Above the axes: within them it would cover lines.
+    healthy.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=3, borderpad=0.0, columnspacing=1.2)
     probabilities(
         below, [one.end_index / rate_hz for one in watched.stated], watched.stated, probable(watched.stated)
     )

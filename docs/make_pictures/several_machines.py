@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+
 from make_pictures.style import FAULTY, HEALTHY, new
 
 if TYPE_CHECKING:
@@ -51,11 +53,14 @@ def picture() -> Figure:
     figure = new(2.6)
     for panel, axes in zip(PANELS, figure.subplots(1, len(PANELS)), strict=True):
         axes.plot(machines, [row[panel.column] for row in rows], "o-", color=HEALTHY, label="measured")
-        axes.plot(machines[:: len(machines) - 1], panel.most, "--", color=FAULTY, label=panel.limit)
+        limits = np.interp(machines, machines[:: len(machines) - 1], panel.most)
+        axes.plot(machines, limits, "--", color=FAULTY, label=panel.limit)
         axes.set_title(panel.title)
         axes.set_xlabel("machines in one service")
-        axes.set_xticks(machines)
-        axes.set_xlim(0.0, 1.05 * machines[-1])
+        # Each count is four times the one before: evenly spaced, their labels do not touch.
+        axes.set_xscale("log")
+        axes.set_xticks(machines, [f"{count:g}" for count in machines])
+        axes.minorticks_off()
         axes.set_ylim(0.0, 1.4 * max(*panel.most, *(row[panel.column] for row in rows)))
         axes.legend(loc="upper left", fontsize=8)
     return figure
