@@ -11,9 +11,12 @@ from typing import TYPE_CHECKING
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.alarms.codes import code_of_alarm
+from daqsvc.alarms.events import EventKind
 from daqsvc.alarms.states import Level
+from daqsvc.errors.alarms import ALARM_STANDS
 from daqsvc.errors.code import coded
 from daqsvc.errors.service import TOO_SLOW
+from daqsvc.notice import NOTICE
 
 if TYPE_CHECKING:
     from daqsvc.acquisition.clock import Clock
@@ -24,6 +27,19 @@ logger = logging.getLogger(__name__)
 LINES = 100
 LINE_EVERY_NS = NS_PER_S // 5
 """Events that are logged one by one; one more is allowed each time this period passes."""
+
+
+_EASES = frozenset(
+    {
+        EventKind.ACKNOWLEDGED,
+        EventKind.BYPASSED,
+        EventKind.LOWERED,
+        EventKind.QUIET,
+        EventKind.RESET,
+        EventKind.SHELVED,
+    }
+)
+"""Events that call for nobody although the condition stands: a person has seen to it, or it is less bad."""
 
 
 class AlarmLog:
@@ -47,12 +63,12 @@ class AlarmLog:
             self._left_out += 1
             return
         self._left -= 1
-        # Where only warnings are shown, who has read that an alarm stands reads that it is over, too.
-        is_quiet = event.from_level is event.to_level is Level.NORMAL
-        loud = logging.INFO if is_quiet else logging.WARNING
         name = f"{event.alarm} of {event.identity.machine}" if self._of_several else event.alarm
-        code = code_of_alarm(event.alarm, event.cause.quality) if event.to_level else None
-        logger.log(loud, "alarm %s %s: %s", name, event.kind, event.message, extra=coded(code))
+        code = None if event.to_level is Level.NORMAL else code_of_alarm(event.alarm, event.cause.quality)
+        level = _level(event)
+        if level == logging.WARNING:
+            code = code or ALARM_STANDS
+        logger.log(level, "alarm %s %s: %s", name, event.kind, event.message, extra=coded(code))
 
     def sum_up(self) -> None:
         """Say how many events were only counted since the last time; about once a second."""
@@ -70,3 +86,10 @@ class AlarmLog:
         self._left = min(self._left + earned, LINES)
         self._earned_ns = now_ns - rest_ns
         return self._left > 0
+
+
+def _level(event: AlarmEvent) -> int:
+    """Of its line: who has read that an alarm stands also reads, by default, that it is over."""
+    if event.from_level is event.to_level is Level.NORMAL:
+        return logging.INFO
+    return NOTICE if event.to_level is Level.NORMAL or event.kind in _EASES else logging.WARNING

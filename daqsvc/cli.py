@@ -43,6 +43,7 @@ from daqsvc.commands.status import StatusCommand
 from daqsvc.commands.trend import TrendCommand
 from daqsvc.errors.code import with_code
 from daqsvc.errors.command_line import INTERRUPTED, LEFT_OUT, OUTPUT_CUT
+from daqsvc.notice import NOTICE
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -183,7 +184,14 @@ class _JournalFormatter(_OneLine):
         return _with_level(super().format(record), record.levelno)
 
 
-_PRIORITIES = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (0, 7))
+_PRIORITIES = (
+    (logging.CRITICAL, 2),
+    (logging.ERROR, 3),
+    (logging.WARNING, 4),
+    (NOTICE, 5),
+    (logging.INFO, 6),
+    (0, 7),
+)
 """Priorities of syslog(3) from these levels on."""
 
 
@@ -203,7 +211,7 @@ def start_logging(*, verbose: bool, handler: logging.Handler | None = None) -> N
     if "JOURNAL_STREAM" not in os.environ:
         text = f"%(asctime)s {text}"
     handler.setFormatter(_JournalFormatter(text) if _is_journal() else _OneLine(text))
-    logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, handlers=[handler])
+    logging.basicConfig(level=logging.INFO if verbose else NOTICE, handlers=[handler])
     logging.getLogger("can").setLevel(logging.ERROR)
 
 
@@ -216,7 +224,7 @@ def commands() -> dict[str, Command]:
         "snapshot": SnapshotCommand(load),
         "replay": ReplayCommand(load, kernel_cache.prepare),
         "status": StatusCommand(load),
-        "page": PageCommand(load),
+        "page": PageCommand(load, start_logging),
         "account": AccountCommand(),
         "trend": TrendCommand(load),
         "alarms": AlarmsCommand(load),

@@ -40,6 +40,7 @@ from daqsvc.alarms.commands import (
 from daqsvc.errors.code import coded, with_code
 from daqsvc.errors.command_line import NO_SERVICE, NO_SUCH_MACHINE, NOT_ASKED
 from daqsvc.errors.service import CONTROL_SOCKET, PART_FAILED, RELOAD_REFUSED
+from daqsvc.notice import notice
 from daqsvc.outbox.files import is_possessed, is_read_only
 from daqsvc.outbox.reading import JOURNAL_NAME
 from daqsvc.publish.looking import Looking
@@ -390,7 +391,7 @@ class ControlServer:
                         await asyncio.sleep(backoff.next_ns() / NS_PER_S)
                         continue
                     if is_reported:
-                        log.warning("commands are taken at %s now", self.path)
+                        notice(log, "commands are taken at %s now", self.path)
                     backoff.reset()
                 await asyncio.sleep(LOOK_S)
                 if not await asyncio.to_thread(_is_at, self.path, self._inode):

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from daqsvc.errors.code import coded
 from daqsvc.errors.service import KERNELS
+from daqsvc.notice import notice
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -64,7 +65,11 @@ def say_compiling() -> None:
     # A line beside the results of a verb that has no log is for a person who waits at a terminal.
     if first is not None and (logging.root.handlers or sys.stderr.isatty()) and first():
         when = "first start only; " if _Compiling.kept else ""
-        log.warning("compiling kernels for this processor (%stakes up to a minute)", when)
+        text = f"compiling kernels for this processor ({when}takes up to a minute)"
+        if logging.root.handlers:
+            notice(log, "%s", text)
+        else:
+            print(text, file=sys.stderr)  # noqa: T201 - for a person
 
 
 def say_not_kept(error: OSError) -> None:

@@ -26,6 +26,7 @@ from daqsvc.errors.code import coded
 from daqsvc.errors.command_line import NOT_ASKED
 from daqsvc.errors.service import SNAPSHOT_LOST
 from daqsvc.machine_facts import fault_names, machine_values, stream_facts
+from daqsvc.notice import notice
 from daqsvc.publish.payloads import alarm_document, statement_document
 from daqsvc.settings.registry import configured
 from daqsvc.settings.speed_signals import RPM, speed_signals
@@ -734,7 +735,7 @@ class MachineRecorder:
         self.counters.snapshots += 1
         if not self._is_well:
             self._is_well = True
-            log.warning("snapshots of %s are written again", self._identity.machine)
+            notice(log, "snapshots of %s are written again", self._identity.machine)
         snapshot.answer(path)
 
     async def _give_up(self, snapshot: _Open, error: Exception) -> None:

@@ -29,6 +29,7 @@ from daqsvc.errors.code import coded
 from daqsvc.errors.command_line import COMMAND_REFUSED, NO_SUCH_MACHINE
 from daqsvc.errors.service import CONTROL_SOCKET, TOO_SLOW
 from daqsvc.machine_watch import MachineWatch
+from daqsvc.notice import notice
 from daqsvc.outbox.files import make_directory
 from daqsvc.outbox.limits import OutboxLimits
 from daqsvc.publish.looking import Looking
@@ -446,7 +447,7 @@ class Service:
                 raise ReloadTooLateError
             going_on.result()
             for line in found.lines():
-                logger.warning("reloaded: %s", line)
+                notice(logger, "reloaded: %s", line)
             return found.lines()
 
     async def _make(self, box: Box, found: Changes) -> Made:

@@ -19,6 +19,7 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.link import Backoff, SaidOnce
 from daqsvc.errors.code import coded
 from daqsvc.errors.service import ESSENTIAL_LOST, PART_FAILED, PART_STALLED, STOPPED_HARD
+from daqsvc.notice import notice
 from daqsvc.settings.failures import BrokenContractError, ExitRaisedError, cause_of, error_text, in_words
 from daqsvc.threads import kept_waiting_s, where_is
 
@@ -326,7 +327,7 @@ class StallWatch:
             before = self._parts.get(name)
             if before is None or step is None or step != before.step:
                 if before is not None and before.said:
-                    logger.warning("%s works again", name)
+                    notice(logger, "%s works again", name)
                 self._parts[name] = _Standstill(step, waited_s=waited_s)
                 continue
             before.still_s += max(0.0, passed_s - max(0.0, waited_s - before.waited_s))

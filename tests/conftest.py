@@ -83,13 +83,13 @@ async def _no_leaked_tasks() -> AsyncIterator[None]:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Generator[None]:
-    """A test that is marked with ``gives`` makes lines of the log with these codes, or fails."""
+    """Warnings have codes, and a test that is marked with ``gives`` makes lines with these, or fails."""
     mark = item.get_closest_marker("gives")
-    if mark is None:
-        return (yield)
+    wanted = set() if mark is None else {*mark.args}
     with codes_logged() as codes:
         outcome = yield
-    assert {*mark.args} <= codes, f"no line of the log has {', '.join(sorted({*mark.args} - codes))}"
+    assert wanted <= codes.given, f"no line of the log has {', '.join(sorted(wanted - codes.given))}"
+    assert not codes.lacking, f"lines of the log from WARNING on have no code: {codes.lacking}"
     return outcome
 
 

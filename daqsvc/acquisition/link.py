@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Literal
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.errors.buses import DRIVER_FAILED, LEFT_OUT_AT_START, LINK_LOST
 from daqsvc.errors.code import coded
+from daqsvc.notice import notice
 from daqsvc.settings.failures import cause_of, in_words
 
 if TYPE_CHECKING:
@@ -159,7 +160,7 @@ class Link:
     def up(self) -> None:
         """The link works."""
         if self._said_down:
-            logger.warning("%s is back" if self._ever_up else "%s is there now", self.name)
+            notice(logger, "%s is back" if self._ever_up else "%s is there now", self.name)
         elif self.state == "down":
             logger.info("%s is up", self.name)
         self._sparing.may_take_back()

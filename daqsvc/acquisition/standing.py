@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.errors.buses import NOT_BELIEVED
 from daqsvc.errors.code import coded
+from daqsvc.notice import notice
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -113,4 +114,4 @@ class StreamStanding:
                 )
         elif self._logged:
             self._logged = False
-            logger.warning("stream %r: its samples can be judged by again", self._stream)
+            notice(logger, "stream %r: its samples can be judged by again", self._stream)

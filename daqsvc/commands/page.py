@@ -14,7 +14,7 @@ from daqsvc.errors.command_line import EXTRA_MISSING
 from daqsvc.settings.addresses import MOST_PORT, Address, address_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from daqsvc.commands.machine_files import Load
     from daqsvc.page.access.choice import AccessChoice
@@ -29,6 +29,7 @@ class PageCommand:
 
     Args:
         load: reads a machine file; None after its errors have been printed.
+        start_logging: of the command line.
     """
 
     help = "show the machines of this box in a browser"
@@ -39,8 +40,9 @@ class PageCommand:
         "open it to others. Needs the extra 'page'."
     )
 
-    def __init__(self, load: Load) -> None:
+    def __init__(self, load: Load, start_logging: Callable[..., None]) -> None:
         self._load = load
+        self._start_logging = start_logging
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `daqsvc.cli.Command.add_arguments`."""
@@ -94,6 +96,7 @@ class PageCommand:
         except ModuleNotFoundError as error:
             what = f"{error.name} is missing: install it with pip install 'daqsvc[page]'"
             return complain("daqsvc page", what, EXTRA_MISSING)
+        self._start_logging(verbose=False)
         listen = arguments.listen or Address(LOOPBACK, PORT if arguments.port is None else arguments.port)
         try:
             choice, with_parent = _access_choice(arguments, listen.host), arguments.with_parent

@@ -19,6 +19,7 @@ from daqsvc.commands import early_signals
 from daqsvc.commands.arguments import EXIT_HUNG, EXIT_STUCK
 from daqsvc.errors.code import coded
 from daqsvc.errors.service import PART_FAILED, PART_STALLED, STOPPED_HARD
+from daqsvc.notice import notice
 from daqsvc.threads import where_is
 
 if TYPE_CHECKING:
@@ -210,7 +211,7 @@ class ProcessGuard:
         if number in {signal.SIGTERM, signal.SIGINT}:
             self._ask_to_stop("")
         elif number in USER_SIGNALS:
-            log.warning("%s is ignored: it means nothing to the service", signal.Signals(number).name)
+            notice(log, "%s is ignored: it means nothing to the service", signal.Signals(number).name)
         elif number == signal.SIGHUP:
             if any(_is_gone(fd) for fd in self._terminals):
                 self.lose_terminal("the terminal is gone")
@@ -224,13 +225,13 @@ class ProcessGuard:
             with contextlib.suppress(RuntimeError):  # the loop is closed already
                 self._loop.call_soon_threadsafe(self._reload)
         elif is_first:
-            log.warning("SIGHUP: the service starts; it reads its machine files again when it is ready")
+            notice(log, "SIGHUP: the service starts; it reads its machine files again when it is ready")
 
     def _ask_to_stop(self, why: str) -> None:
         if self._turns_stopping is not None:
             return
         if why:
-            log.warning("%s", why)
+            notice(log, "%s", why)
         self.stopping()
         if self._loop is None or self._stop is None:
             # Nothing is open yet that would have to be closed.

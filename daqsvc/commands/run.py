@@ -22,6 +22,7 @@ from daqsvc.commands.start_memory import give_back, share_heaps
 from daqsvc.commands.store_argument import StoreNotFoundError, files_by_identity, store_directory
 from daqsvc.errors.code import coded
 from daqsvc.errors.service import ESSENTIAL_LOST, RELOAD_REFUSED
+from daqsvc.notice import notice
 from daqsvc.threads import call_in_thread
 
 if TYPE_CHECKING:
@@ -98,7 +99,7 @@ class RunCommand:
             "-v",
             "--verbose",
             action="store_true",
-            help="also log what goes well, not only warnings and errors",
+            help="also log what goes well, not only notices, warnings and errors",
         )
 
     def run(self, arguments: argparse.Namespace) -> int:
@@ -252,7 +253,7 @@ class _Reloader:
             self._asked = False
             try:
                 if not await self._service.reload():
-                    log.warning("SIGHUP: the machine files have not changed")
+                    notice(log, "SIGHUP: the machine files have not changed")
             except ReloadTooLateError:
                 log.info("SIGHUP is ignored: the service ends")
                 return

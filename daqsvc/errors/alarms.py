@@ -159,3 +159,12 @@ CANNOT_JUDGE = Code(
     _PAGE,
     "alarm housing cannot be judged: levels measures rms, peak, not 'crest'; correct the alarm's measure",
 )
+ALARM_STANDS = Code(
+    "A17",
+    "An alarm of the machine stands",
+    "A value is beyond a setpoint of the machine file, or a detector has found a fault. The message says "
+    "which. The service itself works as it should.",
+    "Look at the machine. daqsvc alarms shows all alarms; daqsvc ack NAME acknowledges this one.",
+    "commands.md",
+    "alarm probe-x raised: probe-x alert: rms of probe-x is 36.2 um, alert limit 35 um",
+)

@@ -219,3 +219,11 @@ DATABASE_AWAY = Code(
     "postgresql.md",
     "PostgreSQL is away, and nothing is acknowledged: the database system is shutting down",
 )
+PAGE_SAYS = Code(
+    "O25",
+    "The process of the page reports something",
+    "The page runs in a process of its own. What this prints is in the log of the service, behind 'page:'.",
+    "Do as the message says. The service and its alarms do not depend on the page.",
+    "page.md",
+    "page: WARNING:  Invalid HTTP request received.",
+)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from daqsvc.errors.code import coded
 from daqsvc.errors.service import DISK_REFUSES, JOURNAL_DAMAGED
+from daqsvc.notice import notice
 from daqsvc.outbox.ballast import Ballast
 from daqsvc.outbox.files import (
     FileError,
@@ -245,7 +246,7 @@ class Journal:
             self._was_ahead = self._mark.is_ahead
         aside = self._renewal.finish()
         if aside is not None:
-            log.warning("outbox %s: the saving of what was left of %s is finished", self.path, aside)
+            notice(log, "outbox %s: the saving of what was left of %s is finished", self.path, aside)
         untold = self._renewal.untold()
         self.quarantined, self.vanished = untold.quarantined, untold.vanished
         self._log_copy.copy()
@@ -313,7 +314,7 @@ class Journal:
             self._next = max(self._next, max(row[0] for row in rows) + 1)
             self.quarantined += 1
             self._renewal.remember(JournalDamage(self.quarantined, self.vanished))
-            log.warning("outbox %s: %d messages were saved from %s", self.path, len(rows), aside)
+            notice(log, "outbox %s: %d messages were saved from %s", self.path, len(rows), aside)
 
     def _prove(self) -> None:
         """Have all that can be read in the database itself, synced: only then may it be published.

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from daqsvc.errors.code import with_code
 from daqsvc.errors.service import UNUSABLE_STORE
+from daqsvc.notice import notice
 from daqsvc.outbox.files import read_whole, replace_durably
 from daqsvc.outbox.messages import StorePathError
 
@@ -111,7 +112,7 @@ def take_store(store: Path, files: Mapping[Identity, Path], *, on_purpose: bool)
             raise StoreOfAnotherFileError(with_code(in_words(store, identity, file, other), UNUSABLE_STORE))
         before = noted.get(identity.machine)
         if before is not None and (other is not None or not before.exists()):
-            log.warning("the store %s was that of %s; now it is that of %s", store, before, file.absolute())
+            notice(log, "the store %s was that of %s; now it is that of %s", store, before, file.absolute())
 
 
 def in_words(store: Path, identity: Identity, file: Path, other: Path) -> str:

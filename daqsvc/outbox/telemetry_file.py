@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from daqsvc.errors.code import coded
 from daqsvc.errors.outputs import MESSAGE_DROPPED
 from daqsvc.errors.service import DISK_REFUSES, JOURNAL_DAMAGED
+from daqsvc.notice import notice
 from daqsvc.outbox.files import (
     FileError,
     NewerFileError,
@@ -357,7 +358,7 @@ class TelemetryFile:
             memory.close()
             self._counters.in_memory = 0
             self._reported = ""
-            log.warning("telemetry file %s can be used again", self._path)
+            notice(log, "telemetry file %s can be used again", self._path)
         self._counters.depth = len(rows)
 
     def _open_connection(self) -> sqlite3.Connection:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
 
 from daqsvc.errors.code import coded
 from daqsvc.errors.service import DISK_REFUSES, JOURNAL_DAMAGED
+from daqsvc.notice import notice
 from daqsvc.outbox.files import FileError, is_corrupt
 from daqsvc.outbox.messages import Draft, OutboxAwayError, OutboxError, OutboxMessage
 from daqsvc.supervision import Progress
@@ -302,7 +303,7 @@ class JournalWriter:
                     post(self._reports.backed)
                 if reported is not None:
                     reported = None
-                    log.warning("outbox %s can be used again", self._journal.path)
+                    notice(log, "outbox %s can be used again", self._journal.path)
                 retry_s, failed_reads = RETRY_FIRST_S, 0
                 if self._closing.is_set() and self._work.empty():
                     return

@@ -22,6 +22,7 @@ from daqsvc.acquisition.link import Link
 from daqsvc.errors.buses import BUFFER_FULL, BUS_ERRORS, DRIVER_FAILED, NO_FRAME
 from daqsvc.errors.code import coded
 from daqsvc.errors.service import STOPPED_HARD
+from daqsvc.notice import notice
 from drivers.can.adapter import open_adapter
 from drivers.can.batches import BusOffError, FrameDemultiplexer
 from drivers.can.errors import BUS_OFF_REASON, EXPLAINED, CanCounters, ErrorCounts
@@ -378,6 +379,11 @@ class CanDriver:
         )
 
     def _say_once(self, key: str, code: Code | None, message: str, *arguments: object) -> None:
-        if key not in self._said:
-            self._said.add(key)
+        """Log a fault once, by its code; None is for good news."""
+        if key in self._said:
+            return
+        self._said.add(key)
+        if code is None:
+            notice(logger, message, *arguments)
+        else:
             logger.warning(message, *arguments, extra=coded(code))

@@ -22,6 +22,7 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.link import OFTEN, Sparing
 from daqsvc.errors.buses import NO_ANSWER
 from daqsvc.errors.code import coded
+from daqsvc.notice import notice
 from drivers.modbus.replies import (
     GATEWAY_CODES,
     READ_FIFO,
@@ -266,7 +267,7 @@ class UnitSilence:
         sparing = self._sparing.get((self._unit, silence.enquiry))
         if sparing is None or not sparing.may_take_back():
             return False
-        logger.warning(message, *arguments)
+        notice(logger, message, *arguments)
         return True
 
 

@@ -14,6 +14,7 @@ from daqsvc.acquisition.assembler import StreamAssembler, StreamCounters
 from daqsvc.acquisition.clock_line import clock_line
 from daqsvc.acquisition.samples import SampleBlock
 from daqsvc.acquisition.timebase import TimeBase
+from daqsvc.notice import NOTICE
 
 pytestmark = pytest.mark.property
 RATE_HZ = 1000.0
@@ -140,7 +141,7 @@ def test_no_arrivals_keep_the_line_from_being_laid(seed, n, counts, times) -> No
 
 @pytest.mark.gives("B38")
 def test_a_counter_that_stands_still_is_said_and_its_stream_set_aside(caplog) -> None:
-    caplog.set_level(logging.WARNING)
+    caplog.set_level(NOTICE)
     blocks: list[SampleBlock] = []
     unit = StreamAssembler(
         "s", 1000.0, counter_bits=16, samples_per_frame=10, counts_per_frame=1, deliver=blocks.append
@@ -186,7 +187,7 @@ FLOOD = "more than 4 times as many frames"
     ],
 )
 def test_another_trouble_takes_over_from_a_counter_that_stood_still(caplog, counter, per_s, words) -> None:
-    caplog.set_level(logging.WARNING)
+    caplog.set_level(NOTICE)
     told: list[str] = []
     unit = StreamAssembler(
         "s",

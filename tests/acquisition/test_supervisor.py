@@ -7,6 +7,7 @@ import random
 from typing import TYPE_CHECKING
 
 from daqsvc.acquisition.link import Backoff, Link
+from daqsvc.notice import NOTICE
 
 if TYPE_CHECKING:
     import pytest
@@ -54,7 +55,7 @@ def test_a_link_that_comes_and_goes_does_not_fill_the_log(
         now_s[0] += 0.1
     assert link.losses == 100
     often = "; if this repeats, it is logged three times a minute at most"
-    said = [r.message for r in caplog.records if r.levelno >= logging.WARNING]
+    said = [r.message for r in caplog.records if r.levelno >= NOTICE]
     assert [text for text in said if text != "bus is back"] == [
         "bus is lost: half a frame; it is being tried again",
         "bus is lost: half a frame; it is being tried again",

@@ -14,7 +14,7 @@ from daqsvc.alarms.setpoints import Setpoint
 from daqsvc.alarms.states import Level
 
 
-@pytest.mark.gives("S11")
+@pytest.mark.gives("A17", "S11")
 def test_a_flood_is_counted_once_a_second_and_what_comes_after_it_is_named(caplog):
     caplog.set_level(logging.INFO, "daqsvc.alarm_log")
     rig = AlarmRig(LevelRule("vibration-x", "probe-x", "rms", Setpoint(alert=4.0)))
@@ -38,7 +38,7 @@ def test_a_flood_is_counted_once_a_second_and_what_comes_after_it_is_named(caplo
     log.say(returned)
     log.say(returned)
     (record,) = caplog.records
-    assert (record.levelname, returned.message in record.getMessage()) == ("WARNING", True)
+    assert (record.levelname, returned.message in record.getMessage()) == ("NOTICE", True)
     rig.clock.t_ns += LINE_EVERY_NS
     caplog.clear()
     log.say(dataclasses.replace(returned, from_level=Level.NORMAL))
@@ -48,3 +48,21 @@ def test_a_flood_is_counted_once_a_second_and_what_comes_after_it_is_named(caplo
     for _ in range(2 * LINES):
         log.say(raised)
     assert len(caplog.records) == LINES, "what is not needed is not saved up"
+
+
+def test_what_calls_for_a_person_is_a_warning_and_what_a_person_did_is_none(caplog):
+    rig = AlarmRig(LevelRule("vibration-x", "probe-x", "rms", Setpoint(alert=4.0, danger=8.0)))
+    log = AlarmLog(rig.clock)
+    (raised,), (escalated,) = rig.rms(5.0), rig.rms(9.0)
+    acknowledged = rig.acknowledge("vibration-x")
+    (lowered,) = rig.rms(5.0)
+    (returned,) = rig.rms(1.0)
+    for event in (raised, escalated, acknowledged, lowered, returned):
+        log.say(event)
+    assert [(record.levelname, f"{record.code}") for record in caplog.records] == [
+        ("WARNING", "A17"),
+        ("WARNING", "A17"),
+        ("NOTICE", "None"),
+        ("NOTICE", "None"),
+        ("NOTICE", "None"),
+    ]

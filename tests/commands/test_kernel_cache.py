@@ -130,7 +130,7 @@ def test_that_kernels_are_compiled_is_said_once_and_only_if_none_are_kept(tmp_pa
     (tmp_path / "two.py").write_text(kernels)
     use = (
         "import logging, sys; from daqsvc import kernel_cache\n"
-        "logging.basicConfig(format='%(message)s')\n"
+        "logging.basicConfig(format='%(message)s', level='NOTICE')\n"
         "kernel_cache.prepare()\n"
         "import two; two.f(1.0), two.g(1.0)\n"
     )

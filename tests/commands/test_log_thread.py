@@ -17,6 +17,7 @@ from daqsvc.cli import load, start_logging
 from daqsvc.commands import log_thread
 from daqsvc.commands.log_flood import LogFlood
 from daqsvc.commands.log_thread import LogThread
+from daqsvc.notice import NOTICE
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -88,7 +89,14 @@ def test_a_flood_does_not_reach_the_reader(pipe: tuple[int, int]) -> None:
 
 @pytest.mark.parametrize(
     ("level", "priority"),
-    [(logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (logging.DEBUG, 7)],
+    [
+        (logging.CRITICAL, 2),
+        (logging.ERROR, 3),
+        (logging.WARNING, 4),
+        (NOTICE, 5),
+        (logging.INFO, 6),
+        (logging.DEBUG, 7),
+    ],
 )
 def test_the_journal_is_told_the_level_of_each_line(
     level: int,

@@ -51,6 +51,7 @@ NO_FAULT = {
     "daqsvc/commands/reload.py": {"run"},  # lines of the service, which have their codes
     "daqsvc/commands/sniff.py": {"_tell"},  # progress
     "daqsvc/commands/store_argument.py": {"_of_file"},  # goes on with what was said before
+    "daqsvc/kernel_cache.py": {"say_compiling"},  # progress
     "daqsvc/reference/__main__.py": {"main"},  # what a developer is told who makes the pages
     "sim_hw/bus_socket.py": {"run_hub"},  # progress
     "sim_hw/demo/command.py": {"_say"},  # warnings, and all goes on

@@ -1,4 +1,4 @@
-"""Every line of the log about a fault has a code, as a field of its record and at its end."""
+"""Every line of the log from WARNING on has a code, as a field of its record and at its end."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import pytest
 from errors.test_errors_name_codes import FILES
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.reasoncodes import ReasonCode
+from support.given_codes import Codes
 from support.paths import ROOT
 
 from daqsvc.acquisition.link import Link
@@ -19,6 +20,7 @@ from daqsvc.alarms.codes import OF_SERVICE, code_of_alarm
 from daqsvc.cli import start_logging
 from daqsvc.errors.buses import LINK_LOST
 from daqsvc.errors.code import coded
+from daqsvc.notice import NOTICE, notice
 from daqsvc.publish.mqtt.errors import MqttCodeError, Outage, TakenOverError
 from daqsvc.reference.alarms import OWN
 
@@ -27,39 +29,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 LEVELS = {"warning", "warn", "error", "exception", "critical", "fatal"}
-QUIET = {"logging.DEBUG", "logging.INFO"}
-
-NO_FAULT = {
-    "daqsvc/acquisition/link.py": {"'%s is back' if self._ever_up else '%s is there now'"},
-    "daqsvc/acquisition/standing.py": {"'stream %r: its samples can be judged by again'"},
-    "daqsvc/commands/process_guard.py": {
-        "'%s is ignored: it means nothing to the service'",
-        "'SIGHUP: the service starts; it reads its machine files again when it is ready'",
-        "'%s'",  # why it was asked to stop
-    },
-    "daqsvc/commands/run.py": {"'SIGHUP: the machine files have not changed'"},
-    "daqsvc/control.py": {"'commands are taken at %s now'"},
-    "daqsvc/kernel_cache.py": {"'compiling kernels for this processor (%stakes up to a minute)'"},
-    "daqsvc/outbox/journal.py": {
-        "'outbox %s: %d messages were saved from %s'",
-        "'outbox %s: the saving of what was left of %s is finished'",
-    },
-    "daqsvc/outbox/machine_files.py": {"'the store %s was that of %s; now it is that of %s'"},  # on purpose
-    "daqsvc/outbox/telemetry_file.py": {"'telemetry file %s can be used again'"},
-    "daqsvc/outbox/writer.py": {"'outbox %s can be used again'"},
-    "daqsvc/page/plant/link.py": {"'MQTT broker %s is back'"},
-    "daqsvc/publish/mqtt/publisher.py": {"'MQTT broker %s is back'"},
-    "daqsvc/publish/page/output.py": {"'page: %s'"},  # what another process says, with its codes
-    "daqsvc/publish/sparkplug/edge.py": {"'Sparkplug is connected to broker %s:%d'"},
-    "daqsvc/publish/sparkplug/host.py": {
-        "'Sparkplug: primary host %s is online; births, alarms and figures go out'"
-    },
-    "daqsvc/recorder.py": {"'snapshots of %s are written again'"},
-    "daqsvc/service.py": {"'reloaded: %s'"},
-    "daqsvc/supervision.py": {"'%s works again'"},
-    "drivers/modbus/line.py": {"message"},  # that a unit is back
-}
-"""The lines about no fault: something is back, or was asked for."""
+QUIET = {"logging.DEBUG", "logging.INFO", "NOTICE"}
 
 
 def lines(text: str) -> Iterator[tuple[ast.Call, ast.expr]]:
@@ -90,8 +60,7 @@ def without_code(text: str) -> set[str]:
 
 @pytest.mark.parametrize("file", SERVICE, ids=lambda file: str(file.relative_to(ROOT)))
 def test_a_line_about_a_fault_names_a_code(file: Path) -> None:
-    place = str(file.relative_to(ROOT))
-    assert without_code(file.read_text(encoding="utf-8")) == NO_FAULT.get(place, set())
+    assert without_code(file.read_text(encoding="utf-8")) == set(), "good news have a level: daqsvc.notice"
 
 
 @pytest.mark.parametrize(
@@ -108,6 +77,8 @@ def test_a_line_about_a_fault_names_a_code(file: Path) -> None:
         ("log.log(level, 'away', extra=coded(LINK_LOST))", False),
         ("log.warning('away', extra=coded(LINK_LOST))", False),
         ("log.log(logging.INFO, 'back')", False),
+        ("log.log(NOTICE, 'back')", False),
+        ("notice(log, 'back')", False),
         ("log.info('back')", False),
         ("task.exception()", False),
         ("self._parser.error('which has a code by itself')", False),
@@ -121,11 +92,44 @@ def test_the_code_is_a_field_of_the_record_and_ends_the_line(caplog: pytest.LogC
     handler = logging.StreamHandler(io.StringIO())
     start_logging(verbose=False, handler=handler)
     logging.getLogger("test").warning("%s is away", "can0", extra=coded(LINK_LOST))
-    logging.getLogger("test").warning("all is well")
+    notice(logging.getLogger("test"), "%s is back", "can0")
     coded_one, plain = caplog.records
     assert coded_one.__dict__["code"] is LINK_LOST
     assert handler.format(coded_one).endswith("WARNING can0 is away [B29]")
-    assert handler.format(plain).endswith("WARNING all is well")
+    assert handler.format(plain).endswith("NOTICE can0 is back")
+
+
+@pytest.mark.parametrize(("verbose", "shown"), [(False, NOTICE), (True, logging.INFO)])
+def test_good_news_are_shown_by_default(
+    *, verbose: bool, shown: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = logging.getLogger()
+    monkeypatch.setattr(root, "handlers", [])
+    monkeypatch.setattr(root, "level", root.level)
+    start_logging(verbose=verbose, handler=logging.NullHandler())
+    assert root.level == shown
+    assert logging.INFO < NOTICE < logging.WARNING
+    assert logging.getLevelName(NOTICE) == "NOTICE"
+
+
+def test_good_news_are_of_the_module_that_has_them(caplog: pytest.LogCaptureFixture) -> None:
+    notice(logging.getLogger("test"), "%s is back", "can0")
+    (record,) = caplog.records
+    assert (record.levelno, record.getMessage(), record.pathname) == (NOTICE, "can0 is back", __file__)
+
+
+def test_a_warning_without_a_code_is_found() -> None:
+    codes = Codes()
+    for name, level, code in (
+        ("daqsvc.test", logging.WARNING, None),
+        ("drivers.test", logging.ERROR, None),
+        ("daqsvc.test", logging.WARNING, LINK_LOST),
+        ("daqsvc.test", NOTICE, None),
+        ("another", logging.WARNING, None),
+    ):
+        line = {"name": name, "levelno": level, "levelname": logging.getLevelName(level), "msg": "away"}
+        codes.handle(logging.makeLogRecord(line | coded(code)))
+    assert codes.lacking == ["WARNING away", "ERROR away"]
 
 
 def codes_of_faults(caplog: pytest.LogCaptureFixture) -> list[str]:

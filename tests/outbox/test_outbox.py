@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
-import logging
 import sqlite3
 import subprocess
 import sys
@@ -18,6 +17,7 @@ from support.waiting import eventually
 
 import daqsvc
 from daqsvc.acquisition.clock import SystemClock
+from daqsvc.notice import NOTICE
 from daqsvc.outbox.journal import TRIM_EVERY, Journal
 from daqsvc.outbox.messages import NewerOutboxError, StorePathError
 from daqsvc.outbox.sequence import STEP, UNRECORDED
@@ -153,7 +153,7 @@ async def test_a_full_disk_is_reported_once_and_nothing_is_lost(tmp_path, connec
     before = await outbox.append(TOPIC, payload, retain=False)
     pages = disk.execute("PRAGMA page_count").fetchone()[0]
     disk.execute(f"PRAGMA max_page_count = {pages}")
-    with caplog.at_level(logging.WARNING):
+    with caplog.at_level(NOTICE):
         waiting = [outbox.submit(TOPIC, lambda n: b"x" * 20_000, retain=False) for _ in range(3)]
         await eventually(lambda: outbox.counters.write_errors >= 2, "the write has failed twice")
         assert outbox.counters.waiting == 3

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import random
 import shutil
 import tempfile
@@ -16,6 +15,7 @@ from hypothesis import strategies as st
 from support.examples import examples
 
 from daqsvc.acquisition.clock import SystemClock
+from daqsvc.notice import NOTICE
 from daqsvc.outbox.messages import OutboxError
 from daqsvc.outbox.reading import JOURNAL_NAME, read_journal
 from daqsvc.outbox.salvage import readable
@@ -223,7 +223,7 @@ async def spoilt(stores, seed, caplog):
         found = {message.sequence for message in pending[:-1]}
         wanted = unsent if whole else {row[0] for row in readable_rows if not row[4] and row[0] in unsent}
         assert wanted <= found, f"seed {seed}: {[path.name for path in hit]}"
-        told = [r.getMessage() for r in caplog.records[before:] if r.levelno >= logging.WARNING]
+        told = [r.getMessage() for r in caplog.records[before:] if r.levelno >= NOTICE]
         if not unsent <= found:
             # With both marks and the log gone, nothing knows that there was more; the marks are told of.
             marks = {f"{JOURNAL_NAME}.sequence", f"{JOURNAL_NAME}.sequence.twin"} <= {p.name for p in hit}

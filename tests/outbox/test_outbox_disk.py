@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import os
 import subprocess
 
@@ -12,6 +11,7 @@ import pytest
 from support.waiting import eventually
 
 from daqsvc.acquisition.clock import SystemClock
+from daqsvc.notice import NOTICE
 from daqsvc.outbox import telemetry_file
 from daqsvc.outbox.limits import MIB
 from daqsvc.outbox.store import Outbox, OutboxError, OutboxLimits
@@ -192,7 +192,7 @@ async def test_telemetry_goes_on_in_memory_and_comes_back(disk, monkeypatch, cap
     assert [m.number for m in back] == [1, 2, 3]
     assert counted.in_memory == 0
     assert counted.dropped == 0
-    said = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
+    said = [record.getMessage() for record in caplog.records if record.levelno >= NOTICE]
     assert len(said) == 2
     assert "is nearly full" in said[0]
     assert "can be used again" in said[1]

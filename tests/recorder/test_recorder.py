@@ -415,7 +415,7 @@ async def test_a_continuous_recording_goes_on_when_the_disk_does(
     assert held(broken)[3].ends_early
     assert [held(path)[3] for path in whole] == [Damage()] * len(whole)
     assert whole
-    assert [record.levelname for record in caplog.records] == ["ERROR", "WARNING"]
+    assert [record.levelname for record in caplog.records] == ["ERROR", "NOTICE"]
 
 
 async def test_continuous_files_are_deleted_before_those_of_alarms(tmp_path: Path) -> None:
@@ -533,7 +533,7 @@ async def test_an_alarm_that_the_disk_refuses_costs_no_file_that_was_over(
     assert begin_s == pytest.approx(at_s - 4.0, abs=0.3)
     assert end_s == pytest.approx(at_s + 1.0, abs=0.3)
     said = [(record.levelname, "another one begun" in record.message) for record in caplog.records]
-    assert said == [("ERROR", True), ("WARNING", False)]
+    assert said == [("ERROR", True), ("NOTICE", False)]
 
 
 async def test_a_file_that_goes_on_stays_as_it_is_on_a_disk_that_takes_nothing(

@@ -1,4 +1,4 @@
-"""The codes that lines of the log have while a test runs: what the mark ``gives`` holds a test to."""
+"""The codes of the lines of the log while a test runs: which it has given, and which lines have none."""
 
 from __future__ import annotations
 
@@ -13,24 +13,38 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 
-class _Listening(logging.Handler):
+OURS = ("daqsvc", "drivers")
+"""The packages whose lines have codes, by the names of their loggers."""
+
+
+class Codes(logging.Handler):
+    """Looks at the lines of the log.
+
+    Attributes:
+        given: the codes that lines have had.
+        lacking: the lines from WARNING on that have had none.
+    """
+
     def __init__(self) -> None:
         super().__init__()
-        self.codes: set[str] = set()
+        self.given: set[str] = set()
+        self.lacking: list[str] = []
 
     def emit(self, record: logging.LogRecord) -> None:
         """See `logging.Handler.emit`."""
         if (code := record.__dict__.get("code")) is not None:
-            self.codes.add(f"{code}")
+            self.given.add(f"{code}")
+        elif record.levelno >= logging.WARNING and record.name.partition(".")[0] in OURS:
+            self.lacking.append(f"{record.levelname} {record.getMessage()}")
 
 
 @contextlib.contextmanager
-def codes_logged() -> Iterator[set[str]]:
+def codes_logged() -> Iterator[Codes]:
     """Those of this process, from now on."""
-    listening = _Listening()
+    listening = Codes()
     logging.getLogger().addHandler(listening)
     try:
-        yield listening.codes
+        yield listening
     finally:
         logging.getLogger().removeHandler(listening)
 

@@ -14,6 +14,7 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.link import Backoff
 from daqsvc.errors.code import coded
 from daqsvc.errors.outputs import NOT_SHOWN
+from daqsvc.notice import notice
 from daqsvc.publish.mqtt.connection import Connection
 from daqsvc.publish.mqtt.credentials import read_credentials
 from daqsvc.publish.mqtt.errors import MqttError, NoConsentError, Outage, in_words
@@ -134,7 +135,7 @@ class BrokerLink:
         self.why_not = ""
         if self._outage.is_told:
             self._outage.end()
-            log.warning("MQTT broker %s is back", self.name)
+            notice(log, "MQTT broker %s is back", self.name)
 
     async def _serve(self, connection: Connection) -> None:
         hearing = asyncio.create_task(self._hear_boxes(connection), name="listen to boxes")

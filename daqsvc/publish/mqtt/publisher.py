@@ -20,6 +20,7 @@ from daqsvc.errors.outputs import (
     CREDENTIAL_OPEN,
     TOPIC_REFUSED,
 )
+from daqsvc.notice import notice
 from daqsvc.outbox.messages import OutboxError
 from daqsvc.publish.mqtt.commands import CommandIntake
 from daqsvc.publish.mqtt.conditions import NS_PER_DAY, BrokerCheck, BrokerVitals
@@ -299,7 +300,7 @@ class MqttPublisher(Output):
             )  # it has been said that this goes on
         elif self._outage.is_told:
             self._outage.end()
-            log.warning("MQTT broker %s is back", self._name)
+            notice(log, "MQTT broker %s is back", self._name)
         else:
             log.info("connected to MQTT broker %s", self._name)
 
@@ -449,7 +450,7 @@ class MqttPublisher(Output):
         self._has_ever_lasted = True
         if self._outage.is_told:  # `_connected` did not believe that it would last
             self._outage.end()
-            log.warning("MQTT broker %s is back", self._name)
+            notice(log, "MQTT broker %s is back", self._name)
         connection.widen(IN_FLIGHT)
 
     def _suspect(self, connection: Connection) -> None:

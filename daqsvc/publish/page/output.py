@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import logging
 import os
+import re
 import sys
 from collections import deque
 from typing import TYPE_CHECKING, Any
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.link import Backoff
 from daqsvc.errors.code import coded
-from daqsvc.errors.outputs import PAGE_ENDED
+from daqsvc.errors.outputs import PAGE_ENDED, PAGE_SAYS
 from daqsvc.publish.output import Output
 
 if TYPE_CHECKING:
@@ -152,10 +153,24 @@ class PageOutput(Output):
 async def _log_what_it_says(stderr: asyncio.StreamReader, last: deque[str]) -> None:
     count = 0
     async for line in _lines(stderr):
-        last.append(line.removeprefix("daqsvc page: "))
+        level, text = _of_log(line)
+        last.append(text.removeprefix("daqsvc page: "))
         count += 1
         if count <= MOST_LINES:
-            log.warning("page: %s", line)
+            log.log(level, "page: %s", text, extra=coded(PAGE_SAYS if level >= logging.WARNING else None))
+
+
+_LOG_LINE = re.compile(r"(?:[-0-9]{10} [:,0-9]{8,12} )?(?P<level>[A-Z]+) (?P<text>.*)")
+"""What `daqsvc.cli.start_logging` writes there."""
+
+
+def _of_log(line: str) -> tuple[int, str]:
+    """The level and the message of a line of its log; of any other a warning, and all of it."""
+    found = _LOG_LINE.fullmatch(line)
+    level = None if found is None else logging.getLevelNamesMapping().get(found["level"])
+    if found is None or level is None:
+        return logging.WARNING, line
+    return level, found["text"]
 
 
 async def _lines(stream: asyncio.StreamReader) -> AsyncIterator[str]:

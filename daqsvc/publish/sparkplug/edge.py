@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import daqsvc
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.link import Backoff
+from daqsvc.notice import notice
 from daqsvc.publish.mqtt.connection import Connection, Will
 from daqsvc.publish.mqtt.credentials import read_credentials
 from daqsvc.publish.mqtt.delivery import IN_FLIGHT
@@ -217,7 +218,7 @@ class SparkplugEdge(Output):
         self.counters.connections += 1
         self.counters.connected = True
         if self._outage.is_told:
-            log.warning("Sparkplug is connected to broker %s:%d", server.host, server.port)
+            notice(log, "Sparkplug is connected to broker %s:%d", server.host, server.port)
         self._outage.end()
         session = EdgeSession(
             connection,

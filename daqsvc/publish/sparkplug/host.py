@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from daqsvc.errors.code import coded
 from daqsvc.errors.outputs import HOST_MISSING
+from daqsvc.notice import notice
 from daqsvc.publish.sparkplug.codec import PayloadError
 from daqsvc.publish.sparkplug.node import NAMESPACE
 
@@ -91,4 +92,4 @@ class HostReports:
         """Say that the host is there, if it was said to be missing."""
         if self._said:
             self._said.clear()
-            log.warning("Sparkplug: primary host %s is online; births, alarms and figures go out", host_id)
+            notice(log, "Sparkplug: primary host %s is online; births, alarms and figures go out", host_id)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from typing import TYPE_CHECKING, Any
 
 import can
@@ -14,6 +13,7 @@ from support.clocks import QuickClock, SettableClock
 from support.running_drivers import begun
 from support.waiting import eventually
 
+from daqsvc.notice import NOTICE
 from drivers.base import BusPort, DeviceAbsentError, StreamSpec
 from drivers.can.driver import CanDriver
 from drivers.frames import FrameLayout
@@ -102,7 +102,7 @@ async def test_what_is_no_sample_is_counted_and_said_once(caplog: pytest.LogCapt
         can.Message(arbitration_id=4, is_error_frame=True),
         message(1, data=bytes(64)),  # CRC wrong
     ]
-    with caplog.at_level(logging.WARNING):
+    with caplog.at_level(NOTICE):
         async with begun(driver):
             for k, stray in enumerate(strays):
                 FaultyBus.inbox.put(stray)
@@ -163,7 +163,7 @@ async def test_a_lost_bus_is_opened_again_and_its_loss_counted(
 ) -> None:
     blocks: list[SampleBlock] = []
     driver = CanDriver(FAULTY, port(blocks))
-    with caplog.at_level(logging.WARNING):
+    with caplog.at_level(NOTICE):
         async with begun(driver):
             for frame in range(5):
                 FaultyBus.inbox.put(message(frame))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,6 +12,7 @@ from support.running_drivers import CountingDevice, running
 from support.waiting import eventually
 
 from daqsvc.acquisition.clock import SystemClock
+from daqsvc.notice import NOTICE
 from drivers.base import BusPort, StreamSpec
 from drivers.can.batches import ERROR
 from drivers.can.driver import CanDriver
@@ -73,7 +73,7 @@ async def test_bus_off_takes_the_link_down_until_the_controller_is_back(
     bus: StandInBus, restart: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
     driver = driver_on(bus, [])
-    with caplog.at_level(logging.WARNING):
+    with caplog.at_level(NOTICE):
         async with running(driver):
             bus.send([frame_bytes(ERROR | 0x204, b"\0\x20\0\0\0\0\x80\x07")] * 2)
             await eventually(lambda: driver.counters.controller_state == "error-passive")
@@ -125,7 +125,7 @@ async def test_frames_that_the_kernel_dropped_are_counted_and_said_once(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     driver = driver_on(StandInBus(), [])
-    with caplog.at_level(logging.WARNING):
+    with caplog.at_level(NOTICE):
         driver.accept(DecodedBatch(notes={"frames_overrun": 3}))
         driver.accept(DecodedBatch(notes={"frames_overrun": 4}))
     assert driver.counters.frames_overrun == 7

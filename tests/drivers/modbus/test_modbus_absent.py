@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-import logging
 import math
 import struct
 
@@ -22,6 +21,7 @@ from support.modbus_layouts import (
 )
 from support.modbus_lines import Rig, options_of, responding, simulate
 
+from daqsvc.notice import NOTICE
 from sim_hw.nodes.modbus_node import PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit, store_for
 
@@ -60,7 +60,7 @@ def test_what_is_no_number_is_missing_and_counted(way, caplog):
                     await asyncio.sleep(0.1)
             await asyncio.sleep(3.0)
 
-    with caplog.at_level(logging.WARNING):
+    with caplog.at_level(NOTICE):
         simulate(main)
     with np.errstate(over="ignore"):
         told = np.array(SENT).astype(np.float32)

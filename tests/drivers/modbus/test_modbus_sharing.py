@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 
 import numpy as np
 import pytest
@@ -14,6 +13,7 @@ from support.examples import examples
 from support.modbus_layouts import register, registers_layout
 from support.modbus_lines import Rig, options_of, responding, simulate
 
+from daqsvc.notice import NOTICE
 from drivers.modbus.registers import RegisterRecord, RegisterRun, shared_runs
 from sim_hw.nodes.modbus_node import PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit
@@ -145,7 +145,7 @@ def test_a_request_that_fails_costs_a_sample_of_those_in_it_and_of_nobody_else()
 
 def test_a_unit_that_has_not_what_lies_between_is_asked_by_stream(caplog):
     streams = {"one": (trend([16]), 10.0), "other": (trend([20]), 10.0)}
-    with caplog.at_level(logging.WARNING):
+    with caplog.at_level(NOTICE):
         rig = watched(streams, without_register(18), 3.0)
     assert rig.driver.counters.exceptions == {"illegal data address": 1}
     for name, value in (("one", 1016), ("other", 1020)):
@@ -161,7 +161,7 @@ def test_a_unit_that_has_not_what_lies_between_is_asked_by_stream(caplog):
 
 def test_a_unit_that_has_not_what_lies_between_the_registers_of_one_stream_is_asked_for_less(caplog):
     streams = {"pump": (trend([16, 20, 22]), 10.0)}
-    with caplog.at_level(logging.WARNING):
+    with caplog.at_level(NOTICE):
         rig = watched(streams, without_register(18), 3.0)
     assert rig.driver.counters.exceptions == {"illegal data address": 1}
     assert (rig.samples("pump") == [1016, 1020, 1022]).all()
@@ -176,7 +176,7 @@ def test_a_unit_that_has_not_what_lies_between_the_registers_of_one_stream_is_as
 
 def test_a_register_of_its_own_that_is_refused_is_named_alone(caplog):
     streams = {"pump": (trend([16, 18]), 1.0)}
-    with caplog.at_level(logging.WARNING):
+    with caplog.at_level(NOTICE):
         rig = watched(streams, without_register(18), 30.0)
     assert rig.counters("pump").samples_received == 0
     assert caplog.records[-1].message.startswith(
@@ -204,7 +204,7 @@ def test_streams_that_were_parted_are_tried_together_again():
 
 def test_who_is_refused_for_good_is_named_alone_and_costs_the_others_nothing(caplog):
     streams = {name: (trend([at]), 1.0) for name, at in (("a", 16), ("b", 18), ("c", 20))}
-    with caplog.at_level(logging.WARNING):
+    with caplog.at_level(NOTICE):
         rig = watched(streams, without_register(18), 1000.0)
     for name in ("a", "c"):
         assert rig.counters(name).samples_lost == 0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-import logging
 import random
 from types import SimpleNamespace
 
@@ -19,6 +18,7 @@ from support.modbus_lines import Rig, options_of, responding, simulate
 
 from daqsvc.acquisition import link as supervision
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.notice import NOTICE
 from drivers.modbus.line import Enquiry, RetryPolicy, UnitSetAsideError, UnitSilence
 from drivers.modbus.replies import READ_FIFO, REMEDIES, WRITE_REGISTERS, ModbusCounters
 from sim_hw.nodes.modbus_node import PlannedReply
@@ -119,7 +119,7 @@ def test_a_unit_lives_while_it_answers_anything(fault, demote_after, caplog):
         async with responding(unit_side, plan, serial=False), rig.running():
             await asyncio.sleep(300.5)
 
-    with caplog.at_level(logging.WARNING):
+    with caplog.at_level(NOTICE):
         simulate(main)
     counters = rig.driver.counters
     assert rig.counters("good").samples_lost == 0
@@ -232,7 +232,7 @@ def test_each_refusal_is_told_once_with_what_to_do_about_it(caplog):
         async with responding(unit_side, lambda *_: PlannedReply(), serial=False), rig.running():
             await asyncio.sleep(10.0)
 
-    with caplog.at_level(logging.WARNING):
+    with caplog.at_level(NOTICE):
         simulate(main)
     begin = "stream 'a': unit 1 refuses function 3: {} (register 3), which is counted from now on; {}"
     assert [record.message for record in caplog.records if "refuses" in record.message] == [
@@ -263,7 +263,7 @@ def test_what_is_wrong_with_a_reply_is_told_in_words(fault, words, caplog):
         async with responding(units(), lambda *_: PlannedReply(fault), serial=False), rig.running():
             await asyncio.sleep(1.0)
 
-    with caplog.at_level(logging.WARNING):
+    with caplog.at_level(NOTICE):
         simulate(main)
     assert words in caplog.text
 

@@ -19,6 +19,7 @@ from support.machine_files import MACHINES
 from support.waiting import PATIENCE_S, eventually
 
 from daqsvc.acquisition.clock import DrivenClock
+from daqsvc.notice import NOTICE
 from daqsvc.settings import parse_machine_file
 from drivers.base import BusPort, StreamSpec
 from drivers.make import bus_drivers, stream_layout
@@ -132,7 +133,7 @@ async def test_what_is_wrong_is_said_once_with_its_remedy(tmp_path: Path, caplog
                 os.write(cable.fd, b"half a line\n1,1\n#\n2,2\nwhat?\n3,3\n")
                 await eventually(lambda: driver.counters.frames_malformed == 2, "all is read")
             await eventually(lambda: driver.link.state == "down", "the plug is pulled")
-    said = [record.message for record in caplog.records if record.levelno >= logging.WARNING]
+    said = [record.message for record in caplog.records if record.levelno >= NOTICE]
     assert len(said) == 4
     assert f"there is no {tmp_path / 'port'}; plug the device in, or correct port" in said[0]
     assert said[1].endswith("is there now")

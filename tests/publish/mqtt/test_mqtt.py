@@ -17,6 +17,7 @@ from daqsvc.acquisition.clock import SystemClock
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.manager import AlarmManager, DiagnosisRule
 from daqsvc.diagnosis.record import Diagnosis
+from daqsvc.notice import NOTICE
 from daqsvc.outbox.store import Outbox
 from daqsvc.publish.mqtt.connection import Connection
 from daqsvc.publish.payloads import AlarmPayload, AvailabilityPayload, alarm_payload, status_payload
@@ -222,7 +223,7 @@ async def test_a_broker_that_forgets_everything_costs_nothing(tmp_path, outbox, 
             async with Consumer(mosquitto.port) as later:
                 await eventually(lambda: len(later.on("/alarms/")) == 2, "both retained states are back")
                 assert sorted(ids(later.on("/alarms/"))) == sorted([quiet.ids[-1], service.ids[-1]])
-    lost, *still, back = (r.getMessage() for r in caplog.records if r.levelno >= logging.WARNING)
+    lost, *still, back = (r.getMessage() for r in caplog.records if r.levelno >= NOTICE)
     assert "is away" in lost
     assert all("is still away" in reason for reason in still)
     assert len({lost, *still}) == 1 + len(still), "each reason once"

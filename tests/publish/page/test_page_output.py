@@ -86,6 +86,36 @@ async def test_a_page_has_the_time_of_the_stop_to_end(
     assert "started again" not in caplog.text
 
 
+@pytest.mark.gives("O25")
+async def test_lines_of_its_log_keep_their_level(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    page = (
+        "import logging, sys\n"
+        "from daqsvc.cli import start_logging\n"
+        "from daqsvc.errors.code import coded\n"
+        "from daqsvc.errors.outputs import BROKER_AWAY\n"
+        "from daqsvc.notice import notice\n"
+        "start_logging(verbose=False)\n"
+        "log = logging.getLogger('page')\n"
+        "log.error('the broker is away', extra=coded(BROKER_AWAY))\n"
+        "notice(log, 'the broker is back')\n"
+        "log.info('all is well')\n"
+        "print('odd', file=sys.stderr)\n"
+    )
+    output = PageOutput([], "nowhere", tmp_path)
+    output._command = (sys.executable, "-c", page)
+    running = asyncio.create_task(output.run())
+    await eventually(lambda: output.reason, "it has ended")
+    await output.stop(PATIENCE_S)
+    await running
+    said = [(one.levelname, one.getMessage()) for one in caplog.records if "page: " in one.getMessage()]
+    assert said == [
+        ("ERROR", "page: the broker is away [O09]"),
+        ("NOTICE", "page: the broker is back"),
+        ("WARNING", "page: odd"),
+    ]
+    assert output.reason == "odd"
+
+
 async def test_a_page_that_does_not_end_is_killed_at_the_deadline(tmp_path: Path) -> None:
     deaf = (
         "import signal\n"

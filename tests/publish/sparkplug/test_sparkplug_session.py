@@ -20,6 +20,7 @@ from support.sparkplug_edge import (
 from support.sparkplug_host import Host
 from support.waiting import eventually
 
+from daqsvc.notice import NOTICE
 from daqsvc.publish.sparkplug import session
 
 pytestmark = [pytest.mark.integration, pytest.mark.mosquitto]
@@ -174,7 +175,7 @@ async def test_a_host_that_is_there_at_once_and_a_broker_that_comes_late_are_sai
         host.say_state(online=True, timestamp=1000)
         async with edge_node(outbox, tmp_path, dead, mosquitto.port, primary_host="scada"):
             await born(host)
-    assert [record.getMessage() for record in caplog.records if record.levelname == "WARNING"] == [
+    assert [record.getMessage() for record in caplog.records if record.levelno >= NOTICE] == [
         f"Sparkplug broker 127.0.0.1:{dead} is away: nothing listens there; trying again until one is there",
         f"Sparkplug is connected to broker 127.0.0.1:{mosquitto.port}",
     ]
