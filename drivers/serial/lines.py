@@ -10,7 +10,6 @@ from __future__ import annotations
 import binascii
 import json
 import math
-import re
 from functools import reduce
 from operator import xor
 from typing import TYPE_CHECKING, Literal, NamedTuple
@@ -30,6 +29,7 @@ from drivers.serial.line_kernels import (
     count_stamps,
     read_lines,
 )
+from drivers.serial.line_numbers import ABSENT, NUMBER
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -56,11 +56,6 @@ _NAMES_OF_ENDS = {NEWLINE: "line feed", RETURN: "carriage return"}
 
 SHOWN_CHARACTERS = 80
 """Characters that are shown of what is no line."""
-_NUMBER = {
-    mark: re.compile(rf" *[+-]?(\d+{re.escape(mark)}?\d*|{re.escape(mark)}\d+)([eE][+-]?\d+)? *")
-    for mark in (".", ",")
-}
-"""A number, by decimal mark."""
 _PRINTABLE = frozenset(range(0x20, 0x7F)) | {0x09}
 
 DIGITS: Mapping[Checksum, int] = {"xor": 2, "crc16": 4}
@@ -142,7 +137,7 @@ class LineCodec:
         for k in np.flatnonzero(states == HARD).tolist():
             text = buffer[starts[k] : stops[k]].tobytes().decode("ascii", "replace")
             fields = [one.replace(layout.decimal, ".") for one in text.split(layout.separator)]
-            values[k] = [float(fields[pick + bool(layout.prefix)]) for pick in self._picks.tolist()]
+            values[k] = [_value(fields[pick + bool(layout.prefix)]) for pick in self._picks.tolist()]
         places = values[:, 0]
         if self._units_per_s is None:
             fits = (places >= 0) & (places < self._counts)
@@ -163,7 +158,8 @@ class LineCodec:
             return NoFrame(why, self._other_columns(len(fields) - len(columns)))
         for name in (self._place, *self._layout.channel_names):
             text = fields[columns.index(name)]
-            if not _NUMBER[decimal].fullmatch(text):
+            absent = name != self._place and ABSENT.fullmatch(text)
+            if not absent and not NUMBER[decimal].fullmatch(text):
                 return NoFrame(f"column {name} is {text!r}, no number", self._other_number(text))
         place = fields[columns.index(self._place)].replace(decimal, ".")
         if self._units_per_s is not None:
@@ -181,7 +177,7 @@ class LineCodec:
     def _other_number(self, text: str) -> str:
         """What to do if all lines have such a text where a number should be."""
         other = "." if self._layout.decimal == "," else ","
-        if other != self._layout.separator and _NUMBER[other].fullmatch(text):
+        if other != self._layout.separator and NUMBER[other].fullmatch(text):
             return f"write decimal = {json.dumps(other)} in the layout"
         return "put the names in line in the order in which the device sends its columns"
 
@@ -215,6 +211,11 @@ class LineCodec:
         first = layout.prefix is not None
         numbers = [one.replace(".", layout.decimal) for one in fields[first:]]
         return layout.separator.join(fields[:first] + numbers).encode("ascii")
+
+
+def _value(field: str) -> float:
+    """The number of a field that the kernels have found to be one, or absent."""
+    return math.nan if not field.strip(" -") else float(field)
 
 
 class DeviceTime:

@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drivers.serial.line_numbers import ABSENT, NUMBER
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
@@ -34,11 +36,6 @@ _LEAST_SHARE = 0.02
 """Of the lines begin with a word that is no accident."""
 _ENDS = 5
 """Lines at each end by which the growth of a column is judged."""
-_NUMBER = {
-    mark: re.compile(rf"\s*[+-]?(\d+{re.escape(mark)}?\d*|{re.escape(mark)}\d+)([eE][+-]?\d+)?\s*")
-    for mark in (".", ",")
-}
-"""A number, by decimal mark."""
 _CHECKSUM = re.compile(r"\*([0-9A-Fa-f]{4}|[0-9A-Fa-f]{2})$")
 _PREFIX = re.compile(r"[!$]?[A-Za-z_-][A-Za-z0-9_-]{0,14}")
 _NO_NUMBER = frozenset({"nan", "inf", "-inf", "null", "none", "err", "error", "na", "n-a", "ovl", "ol"})
@@ -56,7 +53,7 @@ class Column:
 
     Attributes:
         name: as the header has it, else ``c1``, ``c2`` ...
-        numeric: whether it is a number in all lines that are not damaged.
+        numeric: whether it is a number, or absent, in all lines that are not damaged.
         least: least value; 0 of a text.
         most: largest one.
         step: by how much it counts, if it is whole numbers that do; else 0.
@@ -169,7 +166,7 @@ def _is_header(first: str, second: str) -> bool:
     same = len(fields) == (len(second.split(separator)) if separator else 1)
     return (
         same
-        and not any(_NUMBER[decimal].fullmatch(one) for one in fields)
+        and not any(NUMBER[decimal].fullmatch(one) for one in fields)
         and not second.startswith(fields[0])
     )
 
@@ -188,14 +185,13 @@ def _marks_of(lines: Sequence[str]) -> tuple[str, str]:
             continue
         fields = [field for row in rows if len(row) == width for field in row]
         for decimal in (mark for mark in (".", ",") if mark != separator):
-            numbers = sum(_NUMBER[decimal].fullmatch(field) is not None for field in fields)
+            numbers = sum(NUMBER[decimal].fullmatch(field) is not None for field in fields)
             score = agreeing / len(lines) * (1 + numbers / len(fields))
             if score > most + 0.02:
                 best, most = (separator, decimal), score
     if not best[0]:
         alone = {
-            mark: sum(number.fullmatch(line) is not None for line in lines)
-            for mark, number in _NUMBER.items()
+            mark: sum(number.fullmatch(line) is not None for line in lines) for mark, number in NUMBER.items()
         }
         return "", max(alone, key=lambda mark: alone[mark])
     return best
@@ -209,7 +205,7 @@ def _columns_of(lines: Sequence[str], delimiter: str) -> TextLines:
         [field.strip() for field in line.split(separator)] if separator else [line.strip()] for line in plain
     ]
     width = Counter(len(row) for row in rows[1:] or rows).most_common(1)[0][0]
-    number = _NUMBER[decimal]
+    number = NUMBER[decimal]
     header = (
         len(rows[0]) == width
         and not any(number.fullmatch(one) for one in rows[0])
@@ -232,7 +228,11 @@ def _columns_of(lines: Sequence[str], delimiter: str) -> TextLines:
         sound[at] = (
             sound[at]
             and (not prefix or row[0] == prefix)
-            and all(number.fullmatch(row[first + k]) for k, is_number in enumerate(numeric) if is_number)
+            and all(
+                number.fullmatch(row[first + k]) or ABSENT.fullmatch(row[first + k])
+                for k, is_number in enumerate(numeric)
+                if is_number
+            )
         )
     places = np.flatnonzero(sound)
     columns = [
@@ -260,13 +260,15 @@ def _column(texts: Sequence[str], places: NDArray[np.int64], name: str, decimal:
     """One column.
 
     Args:
-        texts: its fields, of the lines that are not damaged.
+        texts: its fields, of the lines that are not damaged; a number may be absent in some.
         places: int64 ``[n]``, which lines those are.
         name: of the column.
         decimal: decimal mark of the numbers; empty if it is text.
     """
-    if not texts or not decimal:
+    if not decimal or all(map(ABSENT.fullmatch, texts)):
         return Column(name, numeric=False, last=texts[-1] if texts else "")
+    there = [k for k, text in enumerate(texts) if not ABSENT.fullmatch(text)]
+    texts, places = [texts[k] for k in there], places[there]
     values = np.array([float(text.replace(decimal, ".")) for text in texts])
     whole = all(text.isdigit() for text in texts)
     rises = np.diff(values) >= 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import binascii
 import functools
 import operator
+import re
 
 import numpy as np
 import pytest
@@ -49,14 +50,25 @@ def number(text: str, kind: type) -> float | None:
         return None
 
 
-@given(st.lists(st.tuples(NUMBERS, st.sampled_from(["", "?", "1.5"]), NUMBERS), min_size=1, max_size=8))
+def value(text: str) -> float | None:
+    """The same, but NaN of what states that there is no value."""
+    return np.nan if re.fullmatch(" *(-*|[nN][aA][nN]) *", text) else number(text, float)
+
+
+ABSENT = st.sampled_from(["", " ", "-", "----", " -- ", "nan", "NaN"])
+
+
+@given(
+    st.lists(st.tuples(NUMBERS, st.sampled_from(["", "?", "1.5"]), NUMBERS | ABSENT), min_size=1, max_size=8)
+)
 @example([("1", "", " 1. "), ("1", "", ".5e+01"), ("1", "", "."), ("1", "", "1e"), ("1", "", "1 2")])
+@example([("1", "", text) for text in ("", "----", "nan", "na", "- -", "nann", "x")])
 @example([("1", "", "9007199254740993"), ("1", "", "1e23"), ("1", "", "1e999"), ("1", "", "-0")])
 @example([(counter, "", "1") for counter in (" 7 ", "+7", "-0", "7.", "7e0", "", "9" * 30)])
 def test_numbers_are_those_of_python_to_the_last_bit(rows: list[tuple[str, str, str]]) -> None:
     stream = codec(channels=[{"name": "x", "scale": 0.1, "offset": -3.0}])
     lines = stream.read(pieces([",".join(row).encode() for row in rows]))
-    counters, values = [number(row[0], int) for row in rows], [number(row[2], float) for row in rows]
+    counters, values = [number(row[0], int) for row in rows], [value(row[2]) for row in rows]
     good = [
         counter is not None and 0 <= counter < 2**32 and value is not None
         for counter, value in zip(counters, values, strict=True)
@@ -114,7 +126,8 @@ def test_a_line_belongs_to_the_stream_that_its_first_field_names(texts: list[str
     assert lines.good.tolist() == [
         text.split(",")[0] == "a"
         and len(text.split(",")) == 4
-        and all(number(text.split(",")[k], int) is not None for k in (1, 3))
+        and number(text.split(",")[1], int) is not None
+        and value(text.split(",")[3]) is not None
         for text in texts
     ]
 
@@ -145,3 +158,11 @@ def test_counts_do_not_depend_on_how_stamps_come_in(stamps: list[float], rate_hz
     apart = DeviceTime(rate_hz)
     counts = [int(apart.count(times_s[k : k + 1])[0]) for k in range(len(stamps))]
     assert DeviceTime(rate_hz).count(times_s).tolist() == counts
+
+
+def test_a_value_that_is_absent_costs_no_other_of_its_line() -> None:
+    stream = codec(columns=("seq", "x", "y"), channels=("x", "y"))
+    # The second is left to Python for its many digits.
+    lines = stream.read(pieces([b"1,----,2.5", b"2,,0.30000000000000000001", b"----,1,2"]))
+    assert lines.good.tolist() == [True, True, False]
+    np.testing.assert_array_equal(lines.samples[:, 0], np.float32([[np.nan, 2.5], [np.nan, 0.3]]))
