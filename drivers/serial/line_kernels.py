@@ -251,8 +251,8 @@ def read_lines(
         counted: whether the first of those must be an integer.
 
     Returns:
-        int8 ``[n]``, `OTHER`, `BAD`, `READ` or `HARD`; float64 ``[n, p]``, the numbers where it is `READ`; NaN
-        where the device has none. The first of them must be there.
+        int8 ``[n]``, `OTHER`, `BAD`, `READ` or `HARD`; float64 ``[n, p]``, the numbers where it is `READ`;
+        NaN where the device has none. The first of them must be there.
     """
     states = np.empty(len(starts), np.int8)
     values = np.zeros((len(starts), len(picks)), np.float64)
