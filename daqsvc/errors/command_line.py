@@ -147,7 +147,8 @@ CANNOT_LISTEN = Code(
     "C17",
     "The page cannot listen at this address",
     "Another program listens there, the address is none of this box, or this user may not use the port.",
-    "Name another port with --port, or another address with --listen.",
+    "Name another port with --port, or another address with --listen. For the page of a service, write "
+    "another listen in [page] of the machine file.",
     "page.md",
     "daqsvc page: cannot listen at 127.0.0.1:8420: Address already in use; give another --port",
 )

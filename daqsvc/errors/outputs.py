@@ -24,9 +24,10 @@ CREDENTIAL_OPEN = Code(
 )
 UNENCRYPTED = Code(
     "O03",
-    "It would go over the network unencrypted",
+    "It would go unencrypted",
     "mqtt:// has no encryption and does not verify the broker. Others on the network can read or forge it.",
-    "Write mqtts:// in the URL. insecure = true accepts the risk where a network is closed.",
+    "Write mqtts:// in the URL. insecure = true accepts the risk where a network is closed, or for a broker "
+    "on this box.",
     _PAGE,
     example='machine.toml:140: mqtt.url = "mqtt://broker.example:8883": would go over the network '
     "unencrypted, and to whoever answers. Remedy: write mqtts://, or insecure = true if you accept "
@@ -114,7 +115,7 @@ TOPIC_REFUSED = Code(
     "This client may connect, but not write or read the topic, or the message is too large for the broker.",
     "Allow the topic to this client in the access list of the broker, or raise its limit of size.",
     "mqtt.md",
-    "MQTT broker 10.0.0.1:8883 refuses an alarm message on daqsvc/lab/edge-1/pump/alarm/housing: not "
+    "MQTT broker 10.0.0.1:8883 refuses an alarm message on daqsvc/lab/edge-1/pump/alarms/housing: not "
     "authorized",
 )
 CLIENT_ID_TAKEN = Code(

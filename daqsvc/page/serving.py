@@ -29,6 +29,12 @@ REMEDIES = {
     errno.EACCES: "give a --port from 1024 on",
     errno.EADDRNOTAVAIL: "give an address of this machine as --listen",
 }
+OF_THE_FILE = {
+    errno.EADDRINUSE: "end what listens there, or write another listen in [page]",
+    errno.EACCES: "write a port from 1024 on as listen in [page]",
+    errno.EADDRNOTAVAIL: "write an address of this machine as listen in [page]",
+}
+"""The same where a service starts the page: its machine file has the address, and nobody gives options."""
 END_S = 1
 """How long browsers that listen are waited for at the end."""
 
@@ -90,7 +96,7 @@ def serve(
         what: the same in words.
         port: where it listens; 0 for one that is free.
         choice: who may look, who may act, and the host where it listens.
-        with_parent: whether it ends, too, when its standard input does.
+        with_parent: whether a service has started it: it ends, too, when its standard input does.
 
     Raises:
         PortError: it cannot listen there.
@@ -102,7 +108,10 @@ def serve(
     try:
         listening = _listening(choice.host, port)
     except OSError as error:
-        remedy = REMEDIES.get(error.errno or 0, "give another --listen")
+        remedies, otherwise = REMEDIES, "give another --listen"
+        if with_parent:
+            remedies, otherwise = OF_THE_FILE, "write another listen in [page]"
+        remedy = remedies.get(error.errno or 0, otherwise)
         why = os.strerror(error.errno) if error.errno and error.errno > 0 else error.strerror or f"{error}"
         in_use = error.errno == errno.EADDRINUSE
         raise (PortInUseError if in_use else PortError)(

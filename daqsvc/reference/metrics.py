@@ -6,6 +6,8 @@ import time
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
+from prometheus_client import ProcessCollector
+
 from daqsvc.diagnosis.reading import Reading
 from daqsvc.publish.metrics.families import health_metric, machine_metrics, reading_metrics, service_metrics
 from daqsvc.reference.markdown import code, page, table
@@ -40,6 +42,7 @@ def _made() -> Iterator[Metric]:
     said: Any = SimpleNamespace(quality="good", statistics={"rms": 1.0}, probabilities={})
     yield from reading_metrics("machine", [reading], {"levels/probe-x": (said, time.time())})
     yield health_metric("machine", is_healthy=True)
+    yield from ProcessCollector(registry=None).collect()
 
 
 def gaps() -> Iterator[str]:

@@ -217,12 +217,13 @@ def check_counter(stream: Stream, message: DbcMessage | None, at: KeyPath) -> It
         )
         return
     step = facts.samples_per_frame if facts.counts_samples else 1
+    or_frames = ', or count "frames"' if step > 1 else ""
     if step >= 2 ** (facts.counter_bits - 2):
         yield Finding(
             (*at, "layout", "counter"),
             f"a counter of {facts.counter_bits} bits cannot tell frames of {step} samples apart: it wraps "
             "within four of them",
-            'have the device send a wider counter, or count "frames"',
+            f"have the device send a wider counter{or_frames}",
             code=UNFIT_COUNTER,
         )
         return
@@ -233,7 +234,7 @@ def check_counter(stream: Stream, message: DbcMessage | None, at: KeyPath) -> It
             (*at, "layout", "counter"),
             f"a counter of {facts.counter_bits} bits wraps every {wrap_s * 1e3:.3g} ms at "
             f"{stream.rate_hz:g} Hz: the loss in a longer gap is estimated from the host clock",
-            'have the device send a wider counter, or count "frames"',
+            f"have the device send a wider counter{or_frames}",
             fatal=False,
             code=UNFIT_COUNTER,
         )

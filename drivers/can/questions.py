@@ -91,9 +91,9 @@ class _CanQuestions(BusQuestions):
         yield self.ask("channel", q.line, "can0")
 
     def _bit_rates(self, answers: Answers, *, fd: bool) -> Iterator[Question]:
-        yield self.ask("bitrate", q.whole, "500000")
+        yield self.ask("bitrate", q.bit_rate, "500000")
         if fd:
-            yield self.ask("data-bitrate", q.whole, f"{max(2_000_000, answers['bitrate'])}")
+            yield self.ask("data-bitrate", q.bit_rate, f"{max(2_000_000, answers['bitrate'])}")
 
     def _bus(self, answers: Answers) -> Iterator[str]:
         rate, channel = answers["bitrate"], answers["channel"]

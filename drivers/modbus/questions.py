@@ -346,7 +346,7 @@ class RtuQuestions(_ModbusQuestions):
     def _line(self, answers: Answers) -> Iterator[Question]:
         del answers
         yield self.ask("port", q.line, only_port())
-        yield self.ask("baud", q.whole, "19200")
+        yield self.ask("baud", q.bit_rate, "19200")
         yield self.choose("parity", dict.fromkeys(("none", "even", "odd"), ""), "even")
 
     def _sniffed_as(self, answers: Answers) -> Sequence[str]:

@@ -102,7 +102,7 @@ class SerialQuestions(BusQuestions):
         """See `BusQuestions.questions`."""
         del folder
         yield self.ask("port", q.line, only_port())
-        yield self.ask("baud", q.whole, "115200")
+        yield self.ask("baud", q.bit_rate, "115200")
         yield self.ask("character", q.exactly(_KINDS), "8N1", choices=_KINDS, quiet=True)
         yield self.choose("framing", _FRAMINGS, "lines")
         yield from (self._ask_lines if answers["framing"] == "lines" else self._ask_frames)(answers)

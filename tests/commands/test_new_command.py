@@ -26,6 +26,7 @@ from daqsvc.commands.new.machine_text import machine_text, questions
 from daqsvc.commands.new.topics import all_topics
 from daqsvc.settings import load_machine_file
 from drivers.bus_questions import Heard
+from drivers.questions import bit_rate
 
 if TYPE_CHECKING:
     from drivers.bus_questions import BusQuestions
@@ -500,6 +501,26 @@ def test_a_number_of_the_manual_is_asked_again_with_the_address_that_it_means():
     assert answers["sensor.a.address"] == 30_001
     assert len(said) == 1
     assert asked(["30000"], "modbus-tcp")[1] == []
+
+
+@pytest.mark.parametrize(
+    ("text", "rate"),
+    [("500k", 500_000), ("1M", 1_000_000), ("33.3 kbit/s", 33_300), ("83333", 83_333), ("125 kBit", 125_000)],
+)
+def test_a_bit_rate_may_be_written_as_it_is_said(text, rate):
+    assert bit_rate(text) == rate
+
+
+@pytest.mark.parametrize("text", ["fast", "0.5", "-1", "500 kHz", "0x10"])
+def test_what_is_no_bit_rate_is_told_how_one_is_written(text):
+    with pytest.raises(ValueError, match=r"; write (it in bit/s, )?e.g. 500000 or 500k$"):
+        bit_rate(text)
+
+
+def test_a_can_bus_is_asked_for_its_bit_rate_as_it_is_said(tmp_path):
+    file = tmp_path / "m.toml"
+    assert main(["new", "--yes", "--bus=can", "--bitrate=250k", f"{file}"]) == 0
+    assert "\nbitrate = 250000" in file.read_text()
 
 
 def test_names_without_commas_are_told_of(capsys):

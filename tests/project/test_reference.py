@@ -137,6 +137,11 @@ def test_a_metric_without_help_is_a_gap(monkeypatch):
     assert gaps_of(metrics).startswith("metric daqsvc_healthy has no help text")
 
 
+def test_metrics_of_the_process_are_listed_with_its_own(made):
+    for name in ("process_open_fds", "process_resident_memory_bytes", "process_cpu_seconds_total"):
+        assert f'<a id="{name}"></a>' in made["metrics.md"]
+
+
 def test_a_topic_or_a_field_that_nothing_describes_is_a_gap(monkeypatch):
     monkeypatch.setattr(Topics, "weather", "daqsvc/weather", raising=False)
     monkeypatch.setattr(AlarmPayload.model_fields["message"], "description", None)

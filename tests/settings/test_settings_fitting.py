@@ -5,6 +5,8 @@ from __future__ import annotations
 import pytest
 from support.machine_files import LAVAL, MOTOR, TRIAXIAL, only_problem, parsed, problems_of
 
+from drivers.can.checks import check_counter
+
 MOTOR_PEAK_ALARM = """[[alarms]]
 name = "drive-end-peak"
 sensor = "accel-de"
@@ -322,3 +324,23 @@ def test_a_bus_without_time_for_its_frames_is_refused():
     assert len(found) == 1
     assert "would take it 1," in found[0].message
     assert "faster bus" in found[0].remedy
+
+
+@pytest.mark.parametrize(
+    ("counts", "samples", "remedy"),
+    [
+        ("samples", 10, 'have the device send a wider counter, or count "frames"'),
+        ("frames", 10, "have the device send a wider counter"),
+        ("samples", 1, "have the device send a wider counter"),
+    ],
+)
+def test_frames_are_counted_only_where_that_makes_a_counter_last(counts, samples, remedy):
+    machine = parsed(
+        LAVAL,
+        ('bits = 16, counts = "samples"', f'bits = 8, counts = "{counts}"'),
+        ("samples_per_frame = 10", f"samples_per_frame = {samples}"),
+    )
+    fast = machine.streams["shaft"].model_copy(update={"rate_hz": 1e5})
+    [finding] = check_counter(fast, None, ())
+    assert "wraps every" in finding.message
+    assert finding.remedy == remedy

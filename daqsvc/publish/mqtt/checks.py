@@ -85,10 +85,15 @@ def _first_line_bytes(path: Path) -> int:
 
 def _transport(mqtt: Mqtt) -> Iterator[Finding]:
     if not mqtt.tls and not mqtt.insecure:
+        stays = is_loopback(mqtt.host)
         yield Finding(
             ("mqtt", "url"),
-            "would go over the network unencrypted, and to whoever answers",
-            "write mqtts://, or insecure = true if you accept that",
+            "would go unencrypted, and to whoever listens at that port of this box"
+            if stays
+            else "would go over the network unencrypted, and to whoever answers",
+            "write insecure = true, as it does not leave this box, or mqtts://"
+            if stays
+            else "write mqtts://, or insecure = true if you accept that",
             code=UNENCRYPTED,
         )
     if mqtt.tls and mqtt.insecure:

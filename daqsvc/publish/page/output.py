@@ -57,6 +57,7 @@ class PageOutput(Output):
         self._starts = 0
         self._is_up = False
         self._process: asyncio.subprocess.Process | None = None
+        self._said_before: frozenset[str] = frozenset()
         self._stopping = asyncio.Event()
         self._end_s = END_S
         self._ended = asyncio.Event()
@@ -129,7 +130,7 @@ class PageOutput(Output):
         try:
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(self._hear(process.stdout))
-                tasks.create_task(_log_what_it_says(process.stderr, last))
+                tasks.create_task(self._log_what_it_says(process.stderr, last))
                 ending = tasks.create_task(self._end_if_stopped(process))
                 await process.wait()
                 ending.cancel()
@@ -149,15 +150,20 @@ class PageOutput(Output):
                 self._is_up, self.reason = True, ""
                 log.info("%s", line)
 
-
-async def _log_what_it_says(stderr: asyncio.StreamReader, last: deque[str]) -> None:
-    count = 0
-    async for line in _lines(stderr):
-        level, text = _of_log(line)
-        last.append(text.removeprefix("daqsvc page: "))
-        count += 1
-        if count <= MOST_LINES:
-            log.log(level, "page: %s", text, extra=coded(PAGE_SAYS if level >= logging.WARNING else None))
+    async def _log_what_it_says(self, stderr: asyncio.StreamReader, last: deque[str]) -> None:
+        """Log it, but for why it ends, which is logged once, and what a start that failed has said before."""
+        lines: list[str] = []
+        async for line in _lines(stderr):
+            level, text = _of_log(line)
+            why = text.removeprefix("daqsvc page: ")
+            last.append(why)
+            if why == text and len(lines) < MOST_LINES:
+                lines.append(text)
+                if text not in self._said_before:
+                    log.log(
+                        level, "page: %s", text, extra=coded(PAGE_SAYS if level >= logging.WARNING else None)
+                    )
+        self._said_before = frozenset() if self._is_up else frozenset(lines)
 
 
 _LOG_LINE = re.compile(r"(?:[-0-9]{10} [:,0-9]{8,12} )?(?P<level>[A-Z]+) (?P<text>.*)")

@@ -110,6 +110,9 @@ def test_plaintext_needs_to_be_meant():
     problem, _ = only_problem(LAVAL, (URL, 'url = "mqtt://localhost"'))
     assert problem.key == "mqtt.url"
     assert "insecure = true" in problem.remedy
+    assert "network" not in problem.message, "it stays on this box"
+    problem, _ = only_problem(LAVAL, (URL, 'url = "mqtt://broker.example"'))
+    assert "over the network" in problem.message
 
 
 def test_what_would_go_unencrypted_to_another_host_is_warned_of():

@@ -169,10 +169,27 @@ async def test_a_port_that_is_taken_is_said_and_taken_later(
         keeping = asyncio.create_task(output.run())
         await eventually(lambda: output.reason, "it says why")
         assert f"cannot listen at 127.0.0.1:{port}: Address already in use" in output.reason
+        assert "write another listen in [page]" in output.reason
+        assert "--port" not in output.reason, "nobody who starts a service has given one"
     await eventually(lambda: output.figures()["up"] == 1, "it listens")
     keeping.cancel()
     await asyncio.wait({keeping})
     assert "is started again: cannot listen" in caplog.text
+    assert caplog.text.count("cannot listen") == 1
+
+
+async def test_what_each_start_says_in_the_same_words_is_said_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    output = PageOutput([], "nowhere", tmp_path)
+    says = "import sys\nsys.exit('the disk is old\\ndaqsvc page: no picture of it')"
+    output._command = (sys.executable, "-c", says)
+    async with kept(output):
+        await eventually(lambda: output.figures()["starts"] == 4, "it is started again and again")
+    assert [record.getMessage() for record in caplog.records] == [
+        "page: the disk is old",
+        "the page at nowhere has ended, and is started again: no picture of it",
+    ]
 
 
 async def test_a_page_ends_with_a_service_that_is_killed(tmp_path: Path) -> None:
