@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from drivers import packed_questions as packed
 from drivers import questions as q
 from drivers.bus_questions import BUS, BusQuestions, Heard, by_name, is_count
-from drivers.can.sniff import CanSniffer
+from drivers.can.sniff import CanSniffer, of_one_channel
 from drivers.questions import NONE, Answers, Question, Topic
 from drivers.sniffing import WAVEFORM_HZ, NothingFoundError, SniffError, sniffed, usual_rate
 from drivers.toml_lines import Hexadecimal, array, behind, entry, toml
@@ -335,6 +335,7 @@ class DbcQuestions(_CanQuestions):
         else:
             counter = toml({"signal": answers["counter"], "counts": "frames"})
             yield behind(f"counter = {counter}", "grows by 1 with each frame: losses are counted by it")
+        yield from of_one_channel(answers["signals"])
         named = zip(self.channels(answers), answers["signals"], strict=True)
         yield from array("channels", [{"name": name, "signals": [signal]} for name, signal in named])
 

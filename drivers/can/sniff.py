@@ -557,7 +557,7 @@ class _Report(NamedTuple):
             *(f"  {{ name = {quoted(s.name)}, signals = [{quoted(s.name)}] }}," for s in channels),
             "]",
             *(f"# {s.name} is left out: {_why_left_out(s)}" for s in measured if s not in channels),
-            *_of_one_channel(channels),
+            *of_one_channel([signal.name for signal in channels]),
             *sensor_lines(
                 name,
                 {s.name: s.unit for s in channels if s.unit}
@@ -574,16 +574,16 @@ def _why_left_out(signal: SignalTraffic) -> str:
     )
 
 
-def _of_one_channel(signals: Sequence[SignalTraffic]) -> Iterator[str]:
-    """Signals that may be the samples of one channel in a frame: names that end in 0, 1 and so on."""
-    stems: dict[str, list[SignalTraffic]] = {}
-    for signal in signals:
-        if match := re.fullmatch(r"(.*[^0-9_])_?(\d+)", signal.name):
-            stems.setdefault(match[1], []).append(signal)
+def of_one_channel(signals: Sequence[str]) -> Iterator[str]:
+    """A comment on signals that may be samples of one channel in a frame: names ending in 0, 1 and so on."""
+    stems: dict[str, list[str]] = {}
+    for name in signals:
+        if match := re.fullmatch(r"(.*[^0-9_])_?(\d+)", name):
+            stems.setdefault(match[1], []).append(name)
     for stem, of_one in stems.items():
-        first, *_ = numbers = [int(re.sub(r".*[^0-9]", "", signal.name)) for signal in of_one]
+        first, *_ = numbers = [int(re.sub(r".*[^0-9]", "", name)) for name in of_one]
         if len(of_one) > 1 and first < 2 and numbers == list(range(first, first + len(numbers))):
-            channel = f"{{ name = {quoted(stem)}, signals = [{', '.join(quoted(s.name) for s in of_one)}] }}"
+            channel = f"{{ name = {quoted(stem)}, signals = [{', '.join(map(quoted, of_one))}] }}"
             yield f"# If these are samples of one channel: {channel}, and {len(of_one)} times the rate."
 
 

@@ -185,6 +185,14 @@ def test_new_offers_a_page_of_a_multiplexed_message_and_never_its_selector(tmp_p
     assert [channel["signals"] for channel in stream["layout"]["channels"]] == [["Temperature"]]
 
 
+def test_new_points_out_signals_that_may_be_samples_of_one_channel(tmp_path: Path) -> None:
+    dbc, file = tmp_path / "fan.dbc", tmp_path / "new.toml"
+    dbc.write_text(FAN)
+    assert main(["new", f"{file}", "--yes", "--bus=can-dbc", f"--dbc={dbc}"]) == 0
+    one = '{ name = "VibDE", signals = ["VibDE_0", "VibDE_1"] }, and 2 times the rate'
+    assert f"# If these are samples of one channel: {one}" in file.read_text("utf-8")
+
+
 @pytest.mark.usefixtures("hub")
 def test_without_a_dbc_file_the_proposal_has_the_bus_and_says_what_is_missing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
