@@ -318,7 +318,7 @@ NO_ANSWER = Code(
 REGISTER_REFUSED = Code(
     "B33",
     "A unit refuses a request",
-    "The unit answers with an exception: it has no such register or function, or cannot read so many at "
+    "The unit answers with an exception: it has no such register or function, or cannot read that many at "
     "once.",
     "Compare address, table and number of registers with the manual of the unit. See max_gap and forbidden.",
     "modbus.md",

@@ -97,7 +97,7 @@ CANNOT_READ = Code(
 THERE_ALREADY = Code(
     "C11",
     "The file is there already",
-    "No file is replaced unless the arguments say so.",
+    "No file is replaced unless the arguments ask for it.",
     "Give another name, or remove the file first. Some verbs replace it with --force.",
     _PAGE,
     "daqsvc example: pump.toml is there already; give another name",

@@ -36,7 +36,7 @@ WINDOW_TOO_SHORT = Code(
 BAND_TOO_HIGH = Code(
     "D04",
     "The band ends above half of the sampling rate",
-    "Samples tell nothing above half of their rate.",
+    "Samples show nothing above half of their rate.",
     "Sample faster, or end the band lower.",
     _PAGE,
     example="machine.toml:63: pipeline.levels.velocity_band_hz = [10.0, 500.0]: the band 10 Hz to 500 Hz "
@@ -142,7 +142,7 @@ NO_REVOLUTIONS = Code(
 )
 RACES_ALIKE = Code(
     "D15",
-    "The races cannot be told by two sensors",
+    "The races cannot be told apart by two sensors",
     "The two sensors are the same or sampled too slowly to show which race a shock comes from.",
     "Name a sensor that moves with the rotor, sample faster, or remove rotor_sensor.",
     "bearing.md",

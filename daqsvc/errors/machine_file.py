@@ -30,7 +30,7 @@ NOT_TOML = Code(
     "F03",
     "The file is not valid TOML",
     "The text breaks the rules of TOML at the line that is named. Usually a quote or a bracket is not "
-    "closed, or a text has no quotes. Or a key stands there twice, or a number has a decimal comma or a "
+    "closed, or a text has no quotes. Or a key is there twice, or a number has a decimal comma or a "
     "unit.",
     'Correct the line. Tables are written [name], values key = value, texts "in quotes", numbers 1.5.',
     _PAGE,
@@ -50,7 +50,7 @@ UNKNOWN_KEY = Code(
     "F05",
     "The key is unknown",
     "No table takes unknown keys, since a misspelt limit would have no effect. The key is misspelt, "
-    "stands in the wrong table, or belongs to another kind of this table.",
+    "is in the wrong table, or belongs to another kind of this table.",
     "Write the key that the message suggests, move the key to its table, or remove it.",
     _PAGE,
     example="machine.toml:38: streams.drive-end.layout.channels[0].register = 17: unknown key. Remedy: did "
@@ -98,7 +98,7 @@ NOT_ONE_OF = Code(
 BAD_NAME = Code(
     "F10",
     "The name has characters that no name can have",
-    "Names stand in topics of MQTT, in names of files and in log lines. So they have letters, digits, "
+    "Names become parts of topics of MQTT, in names of files and in log lines. So they have letters, digits, "
     "'_', '.' and '-' only.",
     "Write the name without spaces, umlauts and other signs. A description may have them.",
     _PAGE,
@@ -137,7 +137,7 @@ BAD_PATH = Code(
 BAD_ADDRESS = Code(
     "F14",
     "The address cannot be used",
-    "It is no name or address of a host, or no URL of a broker. Often a port stands in the host, or a "
+    "It is no name or address of a host, or no URL of a broker. Often a port is in the host, or a "
     "scheme such as http:// before it.",
     "Write it as in the example of the message, and the port in its own key where there is one.",
     _PAGE,
@@ -155,7 +155,7 @@ WRONG_ORDER = Code(
 )
 SECRET_IN_FILE = Code(
     "F16",
-    "A password stands in the machine file",
+    "A password is in the machine file",
     "A machine file is read by many, copied and sent to others. So it names a file that holds the password.",
     "Write the password into a file that only the service can read, name it in password_file, and change "
     "the password: it has been in a file that others can read.",
@@ -175,9 +175,9 @@ NO_SUCH_NAME = Code(
 )
 NAMED_TWICE = Code(
     "F18",
-    "A name, or what it stands for, is used twice",
+    "A name, or what it names, is used twice",
     "Two entries have one name, one entry is listed twice, or two claim the same channel or device.",
-    "Give each a name or a channel of its own.",
+    "Give each its own name or channel.",
     _PAGE,
     example='machine.toml:43: buses.can1.channel = "can0": belongs to bus "can0" already. Remedy: put all '
     "streams of the interface on one bus, or correct the channel",
@@ -245,7 +245,7 @@ TOO_MUCH_MEMORY = Code(
 VALUE_REFUSED = Code(
     "F25",
     "The value is refused",
-    "The model of this table refuses the value for a reason of its own, which the message gives.",
+    "The model of this table refuses the value; the message gives the reason.",
     "Do what the message says. A table of a plugin from outside is described by its package.",
     _PAGE,
     example='machine.toml:12: buses.logger.host = "127.0.0.1": is not valid: 127.0.0.1 is no address. '
@@ -254,7 +254,7 @@ VALUE_REFUSED = Code(
 NO_MACHINE_FILE = Code(
     "F26",
     "No machine file is in the directory",
-    "A directory stands for all *.toml files in it that do not begin with a dot.",
+    "A directory means all *.toml files in it that do not begin with a dot.",
     "Write a machine file there. daqsvc example shows some to begin with.",
     "several-machines.md",
     example="/etc/daqsvc/pumps: no machine file (*.toml) is in this directory. Remedy: copy an example into "
@@ -264,7 +264,7 @@ NOT_OF_ONE_BOX = Code(
     "F27",
     "The machine files do not fit each other",
     "One process watches all machines of a box. So site, box, buses of one name, the store and outputs "
-    "must be alike, and each machine needs a name of its own.",
+    "must be alike, and each machine needs its own name.",
     "Make the tables alike, or write them in one of the files only.",
     "several-machines.md",
     example='machine.toml:13: box = "edge-3": but pump.toml says "edge-1", and one process is one box. '
@@ -323,7 +323,7 @@ WRONG_SENSOR_TYPE = Code(
 SAMPLED_APART = Code(
     "F33",
     "Sensors that belong together come in different streams",
-    "What is compared sample by sample must be taken at the same instants. Streams have clocks of their own.",
+    "What is compared sample by sample must be taken at the same instants. Each stream has its own clock.",
     "Name sensors of one stream, or write [pipeline.alignment] where the message names it.",
     "alignment.md",
     example='machine.toml:117: pipeline.rotor_bank.probes[0] = "probe-x": is in stream "shaft", but '
@@ -333,7 +333,7 @@ SAMPLED_APART = Code(
 SAMPLED_TOO_SLOWLY = Code(
     "F34",
     "The sampling rate is too low",
-    "Samples tell nothing above half of their rate, and pulses or orders of the shaft need several "
+    "Samples show nothing above half of their rate, and pulses or orders of the shaft need several "
     "samples each revolution.",
     "Sample faster, or correct rate_hz, machine.speed_rpm or the frequencies that are asked for.",
     _PAGE,

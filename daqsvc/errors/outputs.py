@@ -46,8 +46,7 @@ OPEN_TO_NETWORK = Code(
 HOST_NAMES = Code(
     "O05",
     "It is not known by which names the page is opened",
-    "The page answers only requests to names that it knows. An address that stands for all of the box "
-    "names none.",
+    "The page answers only requests to names that it knows. An address that means all of the box names none.",
     "Write host_names with each name or address by which browsers open the page.",
     "page.md",
     example='machine.toml:151: page.listen = "0.0.0.0:8420": is every address of the box, and it is not '
@@ -56,7 +55,7 @@ HOST_NAMES = Code(
 )
 ONE_DEVICE = Code(
     "O06",
-    "One device of Sparkplug stands for several machines",
+    "One device of Sparkplug is named for several machines",
     "Each machine is a device of the edge node.",
     "Remove device: the name of each machine is its device id.",
     "sparkplug.md",
@@ -223,7 +222,7 @@ DATABASE_AWAY = Code(
 PAGE_SAYS = Code(
     "O25",
     "The process of the page reports something",
-    "The page runs in a process of its own. What this prints is in the log of the service, behind 'page:'.",
+    "The page runs in its own process. What this prints is in the log of the service, behind 'page:'.",
     "Do as the message says. The service and its alarms do not depend on the page.",
     "page.md",
     "page: WARNING:  Invalid HTTP request received.",

@@ -128,7 +128,7 @@ UNFIT_SAMPLES = Code(
 NOT_JUDGED = Code(
     "R15",
     "The recording cannot be judged",
-    "What it shows does not go with what was said of the machine: speed, keyphasor, length or state.",
+    "What it shows does not fit what was stated of the machine: speed, keyphasor, length or state.",
     "Do as the message says: correct the option, or record again.",
     _PAGE,
     "run.csv: not judged: run.csv has no channel for shaft-x of pump.toml; name its variable, e.g. --map "

@@ -29,7 +29,7 @@ STORE_IN_USE = Code(
     "S03",
     "Another service uses the store",
     "One service at a time may write the alarm journal of a store, and one runs there already.",
-    "Stop the other service, or give this one a store of its own.",
+    "Stop the other service, or give this one a separate store.",
     "outbox.md",
     "another daqsvc uses the store /var/lib/daqsvc; stop it if it watches the same machine, else give "
     "this one a directory of its own, e.g. /var/lib/daqsvc/NAME, in [store] of its machine file",

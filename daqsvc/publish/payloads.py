@@ -88,7 +88,7 @@ class _Statement(JsonPayload):
     statistics: dict[str, Number] = Field(description="what was measured, by name")
     units: dict[str, str] = Field(description="units of the statistics that have one")
     thresholds: dict[str, Number] = Field(
-        description="what the statistics and the evidence are held against, by name"
+        description="what the statistics and the evidence are compared with, by name"
     )
     evidence: dict[str, Number] = Field(description="log-likelihood ratios in nats")
     revolutions: Number = Field(description="shaft revolutions since the detector started")
@@ -162,7 +162,7 @@ class AlarmPayload(Stamped):
     )
     found: str = Field("", description="what is found, joined with what it is not told apart from by |")
     doubts: tuple[DoubtPayload, ...] = Field(
-        (), description="of a quality alarm: what is said against the sensor"
+        (), description="of a quality alarm: what is wrong with the sensor"
     )
     cause: CausePayload = Field(description="the statement of a detector behind the event")
 

@@ -132,7 +132,7 @@ class ServiceStatusPayload(Stamped):
     streams: dict[str, StreamPayload] = Field(description="the streams, by name")
     channels: tuple[ChannelPayload, ...] = Field(description="the channels with their newest samples")
     statements: tuple[StatementPayload, ...] = Field(description="what each detector has said last")
-    alarms: AlarmsPayload = Field(description="how the alarms stand")
+    alarms: AlarmsPayload = Field(description="the state of the alarms")
     outbox: OutboxPayload = Field(description="what waits for the broker and for the disk")
     outputs: dict[str, OutputPayload] = Field(description="by table; empty if the machine file has none")
     faults: dict[str, dict[str, dict[str, int]]] = Field(

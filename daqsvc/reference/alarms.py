@@ -115,7 +115,8 @@ def pages() -> dict[str, str]:
     }
 
 
-_ABOUT = """Names of alarms, states and events as they stand in messages, in the log and in `daqsvc
+_ABOUT = """Names of alarms, states and events as they are in messages, in the log and in `daqsvc
 alarms`. In the log each event is a line `alarm NAME KIND: MESSAGE`, e.g. `alarm rotor-fault escalated: ...`.
-KIND is one of the kinds below; the message says how the alarm stands after it. When exactly an alarm comes
-and goes: [alarms.md](../alarms.md); what to do about those of the service: [commands.md](../commands.md)."""
+KIND is one of the kinds below; the message states the condition of the alarm after it. When exactly an alarm
+becomes active and returns: [alarms.md](../alarms.md); what to do about those of the service:
+[commands.md](../commands.md)."""

@@ -185,7 +185,7 @@ def _drivers() -> int:
 
 
 _ABOUT = """Every figure below `figures` in the status message (topic `ROOT/SITE/BOX/status`,
-[payloads.md](payloads.md)), and in `daqsvc status --json`. `NAME` stands for the name of a stream, a bus, a
+[payloads.md](payloads.md)), and in `daqsvc status --json`. `NAME` is the name of a stream, a bus, a
 detector, a machine or a part of the service. Counts are since the start of the service. Those with a metric
 are a value of its label `cause` ([metrics.md](metrics.md)); `daqsvc status` lists those that are not 0.
 [status.md](../status.md) explains the rest. Where several machines are watched, `machines.NAME.alarms` has

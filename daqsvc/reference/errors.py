@@ -10,7 +10,7 @@ from daqsvc.reference.markdown import anchored, code, page
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-_ABOUT = """A message ends with a code, e.g. `[F01]`. It stands for one kind of mistake or fault, and is never
+_ABOUT = """A message ends with a code, e.g. `[F01]`. It means one kind of mistake or fault, and is never
 used for another. `daqsvc explain F01` prints what is written here. The message itself names the thing, its
 value and what to do; here is what leads to it. Messages of plugins that are not part of daqsvc may have no
 code, or one that begins with [two letters or more](../write-a-driver.md#codes-of-messages), which

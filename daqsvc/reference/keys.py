@@ -181,7 +181,7 @@ def pages() -> dict[str, str]:
 
 _READ = """Every key, with its type, unit, range, default and an example. A key is named by its path, with
 dots: `pipeline.rotor_bank.noise_um` is the key `noise_um` of the table `[pipeline.rotor_bank]`. `NAME`
-stands for a name that you choose: `buses.NAME.driver` is `buses.can0.driver` in your file. `[]` is one of
+is a name that you choose: `buses.NAME.driver` is `buses.can0.driver` in your file. `[]` is one of
 several tables: `sensors[].name` is the key `name` of each `[[sensors]]`. `daqsvc check` says what of a file
 cannot be used. Editors can show the same ([machine-file.md](../machine-file.md#in-an-editor))."""
 _HOW = "How to read this: [keys.md](keys.md)."
@@ -230,7 +230,7 @@ def _table_text(held: Table, found: Mapping[str, Table]) -> str:
             )
             rows.append((kind, ", ".join(map(code, by)), keys))
         parts.append("Several kinds of this table, with their keys; those in bold are required:")
-        parts.append(table(("kind", "told by", "keys"), rows))
+        parts.append(table(("kind", "recognised by", "keys"), rows))
     parts += [_key_text(held.path, name, variants, held.kinds) for name, variants in held.keys.items()]
     return "\n\n".join(parts)
 

@@ -344,14 +344,14 @@ def _sentence(text: str) -> str:
     return text.strip().partition("\n")[0]
 
 
-_TOPICS = """Words in capitals stand for names: `ROOT` is `topic_root` of `[mqtt]` (`daqsvc` by default),
+_TOPICS = """Words in capitals are names: `ROOT` is `topic_root` of `[mqtt]` (`daqsvc` by default),
 `SITE`, `BOX` and `MACHINE` are those of the machine file. A name of an alarm or a detector may hold a `/`.
 What a consumer can rely on, and examples of payloads: [mqtt.md](../mqtt.md)."""
-_PAYLOADS = """Every field of every payload. A field is named by its path, with dots; `[]` stands for each
+_PAYLOADS = """Every field of every payload. A field is named by its path, with dots; `[]` means each
 entry of a list, `NAME` for a name. Examples: [mqtt.md](../mqtt.md). Fields may be added within a version:
 ignore what you do not know."""
 _ENTITIES = """What a machine has in Home Assistant, where `[mqtt.home_assistant]` is in the machine file.
-Words in capitals stand for names; the id of an entity begins with `ROOT/SITE/BOX/MACHINE/`. More:
+Words in capitals are names; the id of an entity begins with `ROOT/SITE/BOX/MACHINE/`. More:
 [mqtt.md](../mqtt.md#home-assistant)."""
 _METRICS = """What a Sparkplug host sees, where `[mqtt.sparkplug]` is in the machine file. Words in capitals
-stand for names. More: [sparkplug.md](../sparkplug.md)."""
+are names. More: [sparkplug.md](../sparkplug.md)."""

@@ -80,4 +80,4 @@ def _title(text: str) -> str:
 
 
 _ABOUT = """What daqsvc has, from the code by `make reference`: every key, verb, option, counter, metric,
-topic and field, with the exact names as they stand in files and messages."""
+topic and field, with the exact names as they are in files and messages."""

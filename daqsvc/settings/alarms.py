@@ -35,7 +35,7 @@ class BaseAlarm(Section):
 class Setpoints(BaseAlarm):
     """Setpoints on a measure, in its unit (velocity RMS in mm/s)."""
 
-    measure: Annotated[Measure, Field(description="what is held against the setpoints", examples=["rms"])]
+    measure: Annotated[Measure, Field(description="what is compared with the setpoints", examples=["rms"])]
     alert: Quantity | None = Field(
         default=None, description="first setpoint, in the unit of the measure", examples=[40.0]
     )

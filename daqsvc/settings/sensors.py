@@ -75,7 +75,7 @@ class BaseSensor(Section):
             examples=[7.87],
         )
     )
-    zero_v: Volts = Field(default=0.0, description="voltage that stands for 0 in the physical unit")
+    zero_v: Volts = Field(default=0.0, description="voltage that means 0 in the physical unit")
 
     @property
     def gain(self) -> float:

@@ -44,7 +44,7 @@ class Zones(Section):
         examples=[2],
     )
     support: Literal["rigid", "flexible"] | None = Field(
-        default=None, description="how the machine stands, for velocities", examples=["rigid"]
+        default=None, description="how the machine is supported, for velocities", examples=["rigid"]
     )
     shaft: bool = Field(
         default=False,

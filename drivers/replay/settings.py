@@ -25,7 +25,7 @@ class ReplayBus(Bus):
     file: Annotated[
         FilePath,
         Field(
-            description="a CAN log (.log, .asc, .blf, .trc; .gz behind it if zipped) or a table of samples "
+            description="a CAN log (.log, .asc, .blf, .trc; .gz if zipped) or a table of samples "
             f"({TABLES}), relative to the machine file",
             examples=["run-up.blf"],
         ),

@@ -73,7 +73,7 @@ class SerialBus(Bus):
     parity: Literal["none", "even", "odd"] = Field(default="none", description="parity bit of each character")
     stop_bits: Literal[1, 2] = Field(default=1, description="stop bits of each character")
     flow_control: Literal["none", "rts-cts", "xon-xoff"] = Field(
-        default="none", description="whether and how the device is told to wait"
+        default="none", description="whether and how the device is made to wait"
     )
     low_latency: bool = Field(default=False, description="have the port's driver pass bytes on at once")
 

@@ -261,6 +261,6 @@ def test_the_figure_shows_where_the_test_holds_a_changed_machine_against_itself(
     assert 81 + 8 < first < 81 + 60
     assert last == 300
     _, lower = _innovations(subject).axes
-    assert "held against the changed machine" in lower.get_legend_handles_labels()[1]
+    assert "compared with the changed machine" in lower.get_legend_handles_labels()[1]
     healthy = analyse(recorded(Orbit(120)), SETUP)
     assert _new_references(replace(subject, analysis=healthy, trace=healthy.trace)) == []

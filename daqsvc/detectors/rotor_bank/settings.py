@@ -24,7 +24,7 @@ class Mode(Section):
     severity: Annotated[Severity, Field(description="how bad the mode is", examples=["alert"])]
     fault: Fault | None = Field(
         default=None,
-        description="the fault that the mode stands for; told by what differs from a healthy rotor if absent",
+        description="the fault that the mode models; if absent, what differs from a healthy rotor decides",
         examples=["damping_loss"],
     )
     damping_ratio: DampingRatio | None = Field(

@@ -323,7 +323,7 @@ def _innovations(subject: _Subject) -> Figure:
         label=f"threshold {subject.analysis.threshold_nats:.1f} nats",
     )
     for number, (first, last) in enumerate(_new_references(subject)):
-        label = "held against the changed machine" if number == 0 else None
+        label = "compared with the changed machine" if number == 0 else None
         lower.axvspan(first, last, color=_QUIET, alpha=0.2, linewidth=0, label=label)
     lower.set_yscale("log")
     lower.set_ylabel("evidence for a change in nats")

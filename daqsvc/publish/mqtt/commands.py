@@ -79,7 +79,7 @@ _EXPIRES = "how old the command may become, if less than the machine file allows
 
 
 class CommandPayload(CommandMessage):
-    """One command; what is asked, and of which machine, stands in the topic."""
+    """One command; the topic names what is asked, and the machine."""
 
     schema_: Literal["daqsvc.command/1"] = Field(alias="schema", description=SCHEMA_ABOUT)
     id: CommandId
@@ -89,7 +89,7 @@ class CommandPayload(CommandMessage):
     expires_s: ExpiresS | None = Field(default=None, description=_EXPIRES)
     duration_s: DurationS | None = Field(default=None, description="how long to shelve; for shelve only")
     occurrence: Annotated[Line, Field(min_length=1, max_length=64)] | None = Field(
-        default=None, description="refuse the command if another activation stands by now"
+        default=None, description="refuse the command if another activation is present by now"
     )
     reason: Reason = Field(default="", description="why")
     denied: Reason = Field(
@@ -99,14 +99,14 @@ class CommandPayload(CommandMessage):
 
 
 class SnapshotCommandPayload(JsonCommand):
-    """A wish for a snapshot; of which machine stands in the topic."""
+    """A request for a snapshot; the topic names the machine."""
 
     schema_: Literal["daqsvc.snapshot-command/1"] = Field(alias="schema", description=SCHEMA_ABOUT)
     id: CommandId
     by: Person = Field(description="who asks")
     issued_at: IssuedAt
     expires_s: ExpiresS | None = Field(default=None, description=_EXPIRES)
-    reason: Reason = Field(default="", description="why; it stands in the snapshot")
+    reason: Reason = Field(default="", description="why; the snapshot contains it")
 
 
 class ResponsePayload(Stamped):
