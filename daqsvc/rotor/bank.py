@@ -1,6 +1,6 @@
-"""The bank: observers of all modes side by side, and what they say about the machine.
+"""The bank: observers of all modes side by side, and what they state about the machine.
 
-What it says at the end of a block is taken down at once and worked out when somebody asks (`BankReport`).
+What it states at the end of a block is stored at once and computed when it is read (`BankReport`).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class BankReport:
-    """What a bank of M modes says at the end of a block.
+    """What a bank of M modes states at the end of a block.
 
     A bank makes one for every block, and few are read whole: it holds a copy of the bank's memory.
 
@@ -90,7 +90,7 @@ class BankReport:
 
     @property
     def group(self) -> tuple[int, ...]:
-        """Indices of the modes that cannot be told apart, the decision among them; empty if it stands alone.
+        """Indices of the modes that cannot be told apart, the decision among them; empty if it is alone.
 
         Either the evidence so far does not tell them apart, or their steady orbits are the same at this
         speed.
@@ -146,7 +146,7 @@ class ModelBank:
         duration: normalised time between samples, omega_s dt.
         rules: thresholds and the rule that declares.
         variance_factor: see `discretise`.
-        decision: index of the mode that is known to be true at the start; -1 to let the evidence tell.
+        decision: index of the mode that is known to be true at the start; -1 to let the evidence decide.
 
     Raises:
         ValueError: the modes or figures cannot make a bank.
@@ -199,7 +199,7 @@ class ModelBank:
     def reseed(self) -> None:
         """Start every observer again, for instance after a long gap; the decision is held.
 
-        The revolution that they need to find the machine is no evidence.
+        The revolution in which they settle is no evidence.
         """
         sweep.start_anew(self._memory.memory)
 
@@ -211,7 +211,7 @@ class ModelBank:
             angle_rad: shaft angle at the next sample.
 
         Raises:
-            ValueError: the shaft stands or turns the other way.
+            ValueError: the shaft stands still or turns the other way.
         """
         if speed * self.speed <= 0.0 or not math.isfinite(speed):
             raise ValueError(f"rotor bank: normalised speed {speed} is not one of a shaft that keeps turning")

@@ -40,7 +40,7 @@ COUPLED = np.dtype(
         ("reach_squared", np.float64), ("forgetting", np.float64),
     ]
 )  # fmt: skip
-"""What an observer of coupled axes has besides `discretise.OBSERVER`; of that, its orbit and contact hold."""
+"""What an observer of coupled axes adds to `discretise.OBSERVER`; of that, its orbit and contact hold."""
 
 _REACH_REVOLUTIONS = 3.0
 """Time for which the largest distance of an estimate from the centre is kept: a rub is once a revolution."""

@@ -106,7 +106,7 @@ def touches(coupling: Coupling, x: float, y: float) -> bool:
     """Whether a rub observer's estimate has come near the housing recently.
 
     The observer of a rub is noisy by design, so that it follows contacts that it does not know. It also
-    follows whatever else fits no mode; without contact that is no evidence of a rub.
+    follows anything else that fits no mode; without contact that is no evidence of a rub.
 
     Args:
         coupling: of the observer; how far it has been is kept in it.

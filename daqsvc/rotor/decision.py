@@ -1,6 +1,6 @@
 """Which mode the machine is in: two rules over the same observers.
 
-``cusum`` stands by a mode until another has gathered a threshold of evidence against it; this is the
+``cusum`` keeps a mode until another has gathered a threshold of evidence against it; this is the
 rule that may raise alarms. ``paper`` declares at a conditional probability of 0.9 and starts afresh;
 a posterior of 0.9 is an error of 10 % per declaration by construction, so it is shown and no more.
 """
@@ -93,7 +93,7 @@ class DecisionRules:
         samples a revolution and four modes, 0.02 false alarms in 1000 revolutions and 10,000 h make the
         defaults, 16 nats forward and 25 back.
 
-        The rate is a bound for a machine that is as its healthy mode says.
+        The rate is a bound for a machine that is as its healthy mode.
 
         Args:
             false_alarms_per_1000_rev: accepted on a healthy machine; None to leave ``threshold_nats``.

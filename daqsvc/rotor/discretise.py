@@ -154,7 +154,7 @@ def contact_substeps(rotor: NormalisedRotor, duration: float) -> int:
     step = _MAX_STEP_TIMES_CONTACT_FREQUENCY / contact_frequency
     if rotor.w:
         step = min(step, 2.0 * math.pi / abs(rotor.w) / _MIN_SUBSTEPS_PER_REV)
-    # The tolerance keeps 64 samples a revolution at 2 sub-steps, whatever the last bit says.
+    # The tolerance keeps 64 samples a revolution at 2 sub-steps, whatever the last bit is.
     return max(1, math.ceil(duration / step * (1.0 - 1e-9)))
 
 
@@ -258,7 +258,7 @@ def steady_evidence(observers: Observers, duration: float) -> Floats:
     """Nats a revolution that the steady orbit of the row's mode brings against the column's mode.
 
     It is the mean part of the log-likelihood ratio, from the difference of the orbits and of the rests as
-    the column's observer sees it. What differs in the spread of the innovations alone is left out: it says
+    the column's observer sees it. What differs in the spread of the innovations alone is left out: it shows
     more about the assumed noise than about the machine.
 
     Args:

@@ -1,8 +1,8 @@
 """Steady response of the Laval rotor to unbalance and to a force, with what is not known about it.
 
 In physical units, for the calibrated machine: omega_s and zeta are given with a tolerance, and whatever is
-predicted from them is averaged over that box (`LavalRotor.box`). The two modes that a run-up has shown stand
-beside them (`LavalRotor.two_modes`).
+predicted from them is averaged over that box (`LavalRotor.box`). A run-up's two modes are kept with
+them (`LavalRotor.two_modes`).
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def unbalance_response(speed: Floats | float, damping_ratio: Floats | float) -> 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LavalRotor:
-    """What is known about a rotor besides its recordings.
+    """What is known about a rotor beyond its recordings.
 
     Attributes:
         natural_frequency_hz: undamped natural frequency of the healthy shaft.

@@ -168,7 +168,7 @@ class NormalisedRotor:
 class TwoModes:
     """What makes a rotor differ from a Laval rotor, as its run-up shows it.
 
-    A shaft that is the same in all directions stands in series with supports that need not be: springs with
+    A shaft that is the same in all directions is in series with supports that need not be: springs with
     dampers beside them, both over the mean spring of the supports. Where the supports give way little, a
     damper that weakens also makes the machine softer, and a spring that weakens gives the damper more to do:
     both follow from the supports' part in the deflection.

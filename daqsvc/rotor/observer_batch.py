@@ -77,7 +77,7 @@ HEADER = np.dtype(
         ("usable_squared", np.float64), ("lead_limit", np.float64), ("first_threshold", np.float64),
         ("identity_nats", np.float64), ("settling_wait", np.int64), ("samples_per_rev", np.int64),
         ("odds_bar", np.float64), ("largest_total", np.float64), ("by_paper", np.int64),
-        # where the decision stands
+        # the state of the decision
         ("decision", np.int64), ("departed", np.int64), ("settling", np.int64), ("unusable", np.int64),
         ("paper_decision", np.int64), ("paper_leader", np.int64), ("paper_age", np.int64),
         ("paper_declarations", np.int64),
@@ -85,7 +85,7 @@ HEADER = np.dtype(
         ("changed_from", np.int64), ("changed_onset", np.int64),
     ],
 )  # fmt: skip
-"""What a bank knows besides its modes: an array of one."""
+"""What a bank knows in addition to its modes: an array of one."""
 
 PAIR = np.dtype([("threshold", np.float64), ("log_ratio", np.float64)])
 """Of one mode against another: nats that change the decision to the other, infinite where they look alike;
@@ -171,7 +171,7 @@ class BankMemory:
 
     @property
     def header(self) -> np.void:
-        """What is known besides the modes, one of `HEADER`."""
+        """What is known in addition to the modes, one of `HEADER`."""
         header: np.void = np.ndarray(1, HEADER, self.memory)[0]
         return header
 

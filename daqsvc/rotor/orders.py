@@ -111,7 +111,7 @@ OrderVerdict = Literal["normal", "unbalance", "damping_loss", "unmodelled", "sma
 
 _ANGLES = 2.0 * np.pi * np.arange(720) / 720
 _NOISE_LINES = 3
-"""Lines on either side of an order, one over the recording's length apart, that tell its noise."""
+"""Lines on either side of an order, one over the recording's length apart, that show its noise."""
 _VELOCITY = 1.0 / np.array(ORDERS, dtype=np.float64)[:, np.newaxis]
 """Acceleration to velocity, in units of the shaft speed."""
 
@@ -161,7 +161,7 @@ class OrderRules:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OrderChange:
-    """What two recordings say about a machine.
+    """What two recordings show about a machine.
 
     Attributes:
         verdict: the most likely member of ``group``.
@@ -243,7 +243,7 @@ def compare_orders(
     elif not large:
         group = ("small_change",)
     else:
-        # Vibration beside the orders says nothing of 1X.
+        # Vibration beside the orders shows nothing of 1X.
         group = _causes(evidence, rules, growth=growth if departed or grown else 1.0, grown=grown)
     return OrderChange(
         verdict=group[0],

@@ -2,7 +2,7 @@
 
 Loops over the members of a group become vector instructions; what is rare or branches (contact, a
 declaration, a lost observer, coupled axes) goes mode by mode. The CUSUM of log-likelihood ratios (Page 1954)
-stands by one mode; every other gathers evidence against that one since its own onset. As long as
+keeps one mode; every other gathers evidence against that one since its own onset. As long as
 nothing is declared, all modes are compared with all.
 
 numba's cache on disk looks at the file of a function alone: after a change in `kernels`, `coupled_kernels` or
@@ -188,7 +188,7 @@ def _set_paper(group: Group, member: int, state: State) -> None:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _width(group: int, count: int) -> int:
-    """Members of a group that are worth stepping."""
+    """Members of a group that have to be computed."""
     return min(WIDTH, (count - group * WIDTH + _REGISTER - 1) // _REGISTER * _REGISTER)
 
 

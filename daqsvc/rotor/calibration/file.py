@@ -389,7 +389,7 @@ def load_calibration(path: Path | str, speed_rpm: float | None = None) -> Calibr
 def load_healthy(
     path: Path | str, speed_rpm: float | None, clearance_um: float | None = None
 ) -> tuple[LavalRotor, tuple[Calibration, ...]]:
-    """What a file says about the healthy machine, at one speed or at any.
+    """What a file holds about the healthy machine, at one speed or at any.
 
     Args:
         path: the file.

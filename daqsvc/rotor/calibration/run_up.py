@@ -44,12 +44,12 @@ LEAST_SPEED_RATIO = 1.1
 _SAMPLES_PER_REVOLUTION = 48
 """More samples in the shortest revolution than this many are averaged: only the noise is in them."""
 _PIECES = 64
-"""Parts of the record whose scores say how the residual is coloured."""
+"""Parts of the record whose scores show how the residual is coloured."""
 _MOST_FREQUENCY_ERROR = 0.1
 """Relative uncertainty of the natural frequency from which on it was not seen."""
 _MOST_DAMPING_ERROR = 0.5
 _LEAST_NATS = 100.0
-"""Energy of the whirl over the noise of a sample below which there is no orbit to speak of."""
+"""Energy of the whirl over the noise of a sample below which there is no usable orbit."""
 _REVERSED = 2.0
 """Backward over forward 1X of an orbit that turns the wrong way."""
 _SURE = 2.0

@@ -2,7 +2,7 @@
 
 Where one Laval rotor does not explain a run-up, two coupled axes mostly do: supports softer in one direction
 part the critical speed in two, and so do gyroscopic moments; see `daqsvc.rotor.model`. What is fitted is 1X
-of every revolution, forward and backward: 17 figures, by least squares. The supports stand in series with the
+of every revolution, forward and backward: 17 figures, by least squares. The supports are in series with the
 shaft (`daqsvc.rotor.model.TwoModes`), which makes their part in it visible: their dampers stiffen the whirl.
 
 A speed that changes at the rate r turns the impulse response h of 1X into h exp(i r tau^2 / 2): ringing and a
@@ -51,7 +51,7 @@ They are: k; kappa; q; the supports' lag c; gamma; d; unbalance; higher modes; r
 beta. Complex ones are two.
 """
 _FLOOR = 0.003
-"""Part of the whirl that no such model is believed better than, nor a revolution of it."""
+"""Part of the whirl that no such model is taken to be better than, nor a revolution of it."""
 _WORTH = 100.0
 """Revolutions that count, however many there are: what the model misses is the same in all of them."""
 _MOST_POINTS = 200

@@ -176,7 +176,7 @@ def _move(
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What tells a changed rotor from the healthy one.
+    """How a changed rotor differs from the healthy one.
 
     Attributes:
         nats_per_rev: by a mode of the bank made for it, in the steady state.
@@ -195,7 +195,7 @@ def evidence_of(
     duration: float,
     variance_factor: float,
 ) -> Evidence:
-    """How a changed rotor stands out.
+    """How clearly a changed rotor is seen.
 
     Args:
         healthy: the healthy mode.

@@ -1,4 +1,4 @@
-"""What a linear bank will say about a rotor, computed instead of simulated.
+"""What a linear bank will state about a rotor, computed instead of simulated.
 
 A linear observer of mode i that watches a machine in mode j is a linear time-invariant system. Its
 innovation has a mean, driven by the difference of the two orbits through the observer's own closed
@@ -52,7 +52,7 @@ _Number = TypeVar("_Number", float, "Floats")
 
 
 class Axis:
-    """One axis of a rotor and of the observer that believes in it; all that pairs of modes share.
+    """One axis of a rotor and of the observer that models it; all that pairs of modes share.
 
     Args:
         mode: the mode; a rub observer is taken as it is inside the clearance, linear.
@@ -105,7 +105,7 @@ class Observation:
 
     Attributes:
         truth: the mode that the machine is in.
-        model: the mode that the observer believes in.
+        model: the mode that the observer models.
     """
 
     truth: Axis

@@ -147,7 +147,7 @@ FAULTS: tuple[Fault, ...] = ("unbalance", "damping_loss", "stiffness_loss", "sta
 VECTOR_THRESHOLD_NATS = 20.0
 """Departure test of the synchronous vector: about one false alarm in 10,000 revolutions."""
 _VECTOR_FLOOR = 0.002
-"""Part of |1X| that the synchronous vector's baseline is never believed better than."""
+"""Part of |1X| that the synchronous vector's baseline is never taken to be better than."""
 _LOG_TOLERANCE = 0.005
 
 
@@ -290,7 +290,7 @@ def _vector_evidence(before: Axis, changed: NormalisedRotor, calibration_rev: fl
 
 
 AMBIGUOUS_NATS_PER_REV = 0.1
-"""Below this the evidence of a hundred revolutions is no more than a doubt: two modes look the same."""
+"""Below this the evidence of a hundred revolutions is no more than a hint: two modes look the same."""
 OPEN_NATS_PER_REV = 1.0
 """From here on two modes are told apart within tens of revolutions."""
 
@@ -300,7 +300,7 @@ _SPEED_STEP = 0.01
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairEvidence:
-    """How well the truth stands out against one rival.
+    """How clearly the true mode differs from one rival.
 
     Attributes:
         truth: name of the mode that the machine is in.

@@ -88,7 +88,7 @@ class VectorDetectability:
         smallest_um: float64 ``[5]``, smallest visible change of each component, in the order of `HARMONICS`.
         faults: by kind.
         misfit_nats: how far a doubled unbalance lies from all that a loss of damping can do.
-        margin_nats: from which on the one is told from the other.
+        margin_nats: from which on the two are told apart.
         opens_at_rpm: nearest speed at which it is; None if it is at this speed, or nowhere near.
     """
 

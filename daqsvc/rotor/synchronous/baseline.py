@@ -1,4 +1,4 @@
-"""Calibration: the healthy machine's synchronous vector, its scatter, and whether it may be believed."""
+"""Calibration: the healthy machine's synchronous vector, its scatter, and whether it can be used."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 LEAST_REVOLUTIONS = 20
 SPEED_TOLERANCE = 0.05
-"""A baseline holds for speeds that differ by no more than this part: beyond, 1X itself is another."""
+"""A baseline holds for speeds that differ by no more than this part: beyond, 1X itself differs."""
 
 _VISIBLE_NATS = 20.0
 """Departure of about one false alarm in 10,000 revolutions."""
@@ -45,7 +45,7 @@ _EDGE_SAMPLES = 0.29
 _TURNING_LEAVES = 0.1
 """Part of 1X that may still move where turning is what it is."""
 _LEAST_NONSTATIONARITY = 0.15
-"""Relative change of what does not repeat that is worth a refusal."""
+"""Relative change of what does not repeat from which on a baseline is refused."""
 _LAVAL_ELLIPTICITY = 0.05
 _REVERSED = 2.0
 _DOUBLED = 5.0

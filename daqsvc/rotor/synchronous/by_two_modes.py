@@ -24,15 +24,15 @@ if TYPE_CHECKING:
 _LOSSES = np.geomspace(0.01, 1.5, 32)
 """1 / k - 1 of the static stiffness."""
 _SEEN = np.array([0.5, 0.7, 1.0, 1.4, 2.0])
-"""What the probes see the shaft sink by, over what the modes say: they need not stand where it sinks most."""
+"""What the probes see the shaft sink by, over what the modes predict: it may sink more elsewhere."""
 _FILM = 0.05
 """Above this stiffness across the deflection, over the static one, an oil film carries the shaft ..."""
 _ASIDE = np.exp(1j * np.radians([-40.0, -20.0, 0.0, 20.0, 40.0]))
-"""... so that its way down need not be the one that the modes say."""
+"""... so that its way down need not be the one that the modes predict."""
 _LEFT = np.linspace(0.05, 0.97, 32)
 """Parts of the damping that are left."""
 _TOLERANCES = np.array([0.1, 0.2, 0.4])
-"""How far a change may be from what the modes say of it, equally likely."""
+"""How far a change may be from what the modes predict, equally likely."""
 _BESIDE = 0.05
 """The least that such a component is off by, as a part of the largest."""
 _COMPONENTS = [DC, FORWARD, BACKWARD]

@@ -28,7 +28,7 @@ _LINEAR_2X = 0.003
 _FILLED = 0.9
 """Part of the clearance beyond which an orbit touches, whatever shape it has by then."""
 _BEYOND_1X = 0.02
-"""Part of the healthy whirl that must move besides forward 1X where the clearance is filled."""
+"""Part of the healthy whirl that must move in addition to forward 1X where the clearance is filled."""
 _ORBIT_POINTS = 64
 _VISIBLE = 3.0
 
@@ -46,7 +46,7 @@ def has_marks(change: Complexes, variance: Floats) -> bool:
 
 
 def marks_would_show(change: Complexes, variance: Floats) -> bool:
-    """Whether noise is low enough that the harmonics of a rub of this size would stand out.
+    """Whether noise is low enough that the harmonics of a rub of this size would be seen.
 
     Args:
         change: complex128 ``[5]``, um.

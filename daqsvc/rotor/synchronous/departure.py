@@ -120,12 +120,12 @@ class Spread:
 
 @dataclass(frozen=True, slots=True)
 class DepartureEvidence:
-    """What the departure test says after a revolution.
+    """What the departure test states after a revolution.
 
     Attributes:
         nats: T, the largest over the windows.
         energy_nats: the same of the non-harmonic energy.
-        window: revolutions in the window that says so.
+        window: revolutions in the window that shows it.
         departed: whether either is past its threshold.
     """
 

@@ -41,7 +41,7 @@ _CRACK_FACING = 0.85
 _RUB_FACING = 0.5
 _RUB_OUTWARDS = 0.2
 _PLACES = ((0, 0), (1, 2), (3, 4), (5, 6))
-"""Where the forward and the backward component of orders 0 to 3 stand in `WITH_THRICE`."""
+"""Where the forward and the backward component of orders 0 to 3 are in `WITH_THRICE`."""
 
 
 def rub_pulse(change: Complexes, variance: Floats, healthy: Healthy, position: Complexes) -> float:
@@ -60,7 +60,7 @@ def rub_pulse(change: Complexes, variance: Floats, healthy: Healthy, position: C
 
     def possible(force: Complexes) -> Flags:
         # The wall is where the whirl leads to, and not behind the centre, as a crack pulls. But only a
-        # drawing says where that centre is, and 3X tells a crack better.
+        # drawing shows where that centre is, and 3X shows a crack better.
         towards = _facing(-force, whirl) > _RUB_FACING
         return towards if len(change) > len(HARMONICS) else towards & (_facing(-force, place) > _RUB_OUTWARDS)
 

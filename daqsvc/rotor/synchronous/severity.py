@@ -1,4 +1,4 @@
-"""How large a fault is, in the figures of its own: what a name alone does not tell."""
+"""How large a fault is, in the figures of that fault: what a name alone does not show."""
 
 from __future__ import annotations
 

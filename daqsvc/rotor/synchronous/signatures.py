@@ -80,7 +80,7 @@ _FOLLOWS = np.array([0.1, 0.3])
 """Parts of a shift by which 1X may follow it where supports are stiffer the more they carry."""
 _FOLLOWING_NATS = 3.0
 _SINKS = np.geomspace(0.02, 1.5, 12)
-"""Parts of the sag that a shaft sinks by where no model tells how much of it is due to the softer part ..."""
+"""Parts of the sag that a shaft sinks by where no model gives how much of it is due to the softer part ..."""
 _SINKS_ASIDE = np.radians([-50.0, -25.0, 0.0, 25.0, 50.0])
 """... and angles off the vertical: an oil film gives way aside, too."""
 _SINKS_WITHIN = 0.25
@@ -94,7 +94,7 @@ _STIFFNESS_DAMPING = np.array([0.0, 1.8])
 _MOST_DAMPING = 1.6
 
 _BESIDES = 0.02
-"""Probability that a fault moves a rotor in another way than its two modes tell."""
+"""Probability that a fault moves a rotor in another way than its two modes predict."""
 
 _NO_CONTACT_NATS = 12.0
 """What a rub stays behind all others where its harmonics would be seen and are not."""
@@ -184,7 +184,7 @@ def _unbalance(change: Complexes, variance: Floats, healthy: Healthy) -> float:
 
 
 def _besides(told: float, free: float) -> float:
-    """Log likelihood of what the two modes tell, and of a shape that leaves open what they do not."""
+    """Log likelihood of what the two modes predict, and of a shape that leaves open what they do not."""
     return float(np.logaddexp(told + math.log1p(-_BESIDES), free + math.log(_BESIDES)))
 
 
@@ -256,13 +256,13 @@ def _sunk(change: complex, variance: float, healthy: Healthy) -> float:
 def _softer(change: Complexes, variance: Floats, healthy: Healthy, *, still: float) -> float:
     """Log density of mean position and forward 1X where some support gives way under the weight.
 
-    What the shaft sinks by tells how much lower its natural frequency is (Rayleigh's quotient, omega^2 = g
-    over the sag), up to the part that the probes see of it, and that how 1X turns. Or 1X does as it likes.
+    How far the shaft sinks shows how much lower its natural frequency is (Rayleigh's quotient, omega^2 = g
+    over the sag), up to the part that the probes see of it, and that how 1X turns. Or 1X moves in any way.
     """
     free = _free(change[FORWARD], variance[FORWARD], healthy.amplitude_um)
     if healthy.rotor.two_modes is None:
         free = np.logaddexp(still + math.log(_STILL_SHARE), free + math.log(1.0 - _STILL_SHARE))
-    # else the modes tell where 1X stays as it is
+    # else the modes show where 1X stays as it is
     untied = _sunk(change[DC], variance[DC], healthy) + free
     sag_um = healthy.rotor.sag_um
     if sag_um <= 0.0:
@@ -339,7 +339,7 @@ def _rub(
         return pulse, 0.0
     if marks_would_show(change, variance):
         return pulse, _NO_CONTACT_NATS
-    # Where the rotor's model holds, it says itself how a pulse moves the mean position and both senses of 1X.
+    # Where the rotor's model holds, it gives how a pulse moves the mean position and both senses of 1X.
     return pulse, 0.0 if healthy.modelled else _HIDDEN_CONTACT_NATS
 
 
@@ -357,7 +357,7 @@ _ENERGY_NATS = 12.0
 _MOST_ENERGY_NATS = 100.0
 _MISFIT = 0.005
 """Part of the evidence of a change that the shape of a rub's pulse may be off by: where no rotor model fits
-to the last digit, a few nats of thousands say nothing."""
+to the last digit, a few nats of thousands mean nothing."""
 _RIVALS = frozenset(("rub", "unmodelled"))
 TEMPERATURE = 3.0
 """What evidence is divided by before it is a probability: no machine is any signature's to the last digit, so
@@ -382,7 +382,7 @@ class NamingRules:
 
 @dataclass(frozen=True, slots=True)
 class Energy:
-    """What the non-harmonic energy says of a segment.
+    """What the non-harmonic energy shows of a segment.
 
     Attributes:
         excess: variance of the complex residual of a sample above the healthy one, um^2.
@@ -399,7 +399,7 @@ class Identification:
 
     Attributes:
         verdict: the name, or the most likely member of the group.
-        group: all that cannot be told apart, the most likely first; the verdict alone if it stands alone.
+        group: all that cannot be told apart, the most likely first; the verdict alone if there is no other.
         named: whether two evaluations in a row agreed on the group.
         evidence: nats of every hypothesis over "normal".
         probabilities: posterior of every verdict, hypotheses equally likely before.
@@ -441,7 +441,7 @@ def identify(
         previous: the evaluation before; a name takes two that agree.
         rules: margins.
         may_name: whether the rotor has settled enough for a name.
-        comparison: what the transient says of unbalance and loss of damping, if it was abrupt.
+        comparison: what the transient shows of unbalance and loss of damping, if it was abrupt.
         energy: of the present segment; motion that does not repeat with the shaft (whirl, repeated
             impacts) is what no linear fault makes.
     """
@@ -450,7 +450,7 @@ def identify(
     shaken = energy is not None and energy.nats > _ENERGY_NATS and energy.excess > least
     position = healthy.baseline + change[: len(healthy.baseline)]
     scores = likelihoods(change, variance, healthy.healthy, position, shaken=shaken)
-    # 3X says what a change is, not how large it is.
+    # 3X shows what a change is, not how large it is.
     change, variance = change[: len(healthy.baseline)], variance[: len(healthy.baseline)]
     model_holds = comparison is not None and comparison.holds(complex(change[1]))
     if comparison is not None and model_holds:
@@ -460,7 +460,7 @@ def identify(
     if energy is not None and shaken:
         square += energy.excess
         unexplained = min(energy.nats, _MOST_ENERGY_NATS)
-        # A rub shakes the rotor besides; but what leaves no mark of a rub on the vector is noise or whirl.
+        # A rub also shakes the rotor; but what leaves no mark of a rub on the vector is noise or whirl.
         explained = {"unmodelled"} if scores["rub"] < rules.margin_nats else {"unmodelled", "rub"}
         for name in scores.keys() - explained:
             scores[name] -= unexplained
@@ -480,7 +480,7 @@ def identify(
         set(previous.candidates) == set(candidates)
         or (model_holds and set(candidates) < set(previous.candidates))
     )
-    # That the machine may be healthy again is for the watch to decide; until then a name stands.
+    # That the machine may be healthy again is for the watch to decide; until then a name is kept.
     named = may_name and agreed and "normal" not in candidates
     group = candidates
     if previous is not None and previous.named and not named:

@@ -30,7 +30,7 @@ _LEAST_HUNTING = 1e-3
 _MOST_JITTER = 0.5
 """Part of its square that may change from one revolution to the next: a shaft hunts slowly, marks jitter."""
 _MODEL_DOUBT = 2.0
-"""Standard deviation of a slope that no rotor's figures tell, in parts of the one that they do."""
+"""Standard deviation of a slope that no figures of a rotor give, in parts of the one that they give."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -38,7 +38,7 @@ KNOWN_WITHIN = 0.05
 
 _ONSETS = np.arange(-2.5, 3.01, 0.125)
 _DAMPING_LEFT = np.geomspace(0.05, 0.97, 24)
-# What a loss of all damping in the bearings may do besides, in parts: to the frequency, to the modal mass.
+# What a loss of all damping in the bearings also does at most, in parts: to the frequency, to the modal mass.
 _FREQUENCY_SHIFT = np.array([-0.08, -0.04, 0.0, 0.02])
 _MASS_SHIFT = np.array([-0.15, -0.075, 0.0, 0.03])
 _GAIN_TOLERANCE = 0.05
@@ -65,7 +65,7 @@ class Transient:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """What the transient says.
+    """What the transient shows.
 
     Attributes:
         damping_nats: log-likelihood ratio of a loss of damping over an unbalance.

@@ -7,10 +7,10 @@ With z = x + iy and the shaft angle theta, the orbit of a revolution is fitted b
 Z_0 is where the shaft runs (gap voltage), Z_1 its forward 1X whirl, Z_-1 the backward part that makes the
 orbit an ellipse, Z_2 and Z_-2 what misalignment, cracks and rub add. What the five leave over is the
 non-harmonic energy: noise, and all that does not repeat with the shaft. Of that, 3X in both senses is kept
-besides: it says little of whether a machine has changed, and much of what a change is.
+too: it shows little of whether a machine has changed, and much of what a change is.
 
 The vector of the healthy machine (`Healthy`) and the densities by which hypotheses about its faults are
-compared stand here too.
+compared are here, too.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ WITH_THRICE = (*HARMONICS, 3, -3)
 _LEAST_SHARE = 0.75
 """Part of a revolution's samples that must be there."""
 _LEAST_SAMPLES_OF_3X = 16.0
-"""Samples in a revolution with which 3X stands well apart from the other components."""
+"""Samples in a revolution with which 3X is well separated from the other components."""
 _WORST_CONDITION = 2.5
 """Largest spread of the normal equations' eigenvalues: missing samples must not lie in one piece too long.
 
@@ -201,7 +201,7 @@ class Healthy:
 
     @property
     def modelled(self) -> bool:
-        """Whether a model holds that says how forces move it: one Laval rotor, or two modes of a run-up."""
+        """Whether a model holds that gives how forces move it: one Laval rotor, or two modes of a run-up."""
         return self.laval or self.rotor.two_modes is not None
 
     @property

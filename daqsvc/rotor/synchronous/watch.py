@@ -72,7 +72,7 @@ class JudgedRevolution:
 
 
 def scatter(rows: Sequence[JudgedRevolution]) -> Floats:
-    """Variance of the vectors, float64 ``[5]``; zero of too few to tell."""
+    """Variance of the vectors, float64 ``[5]``; zero if there are too few."""
     if len(rows) < _LEAST_ROWS:
         return np.zeros(5)
     vectors = np.array([row.vector for row in rows])
@@ -182,7 +182,7 @@ class WatchRules:
 
 @dataclass(frozen=True, slots=True)
 class WatchReport:
-    """What the watch says after a revolution.
+    """What the watch states after a revolution.
 
     Attributes:
         revolution: revolutions since the start, this one included.
@@ -443,7 +443,7 @@ class RotorWatch:
         spread = replace(spread, variance=np.maximum(spread.variance, scatter(rows)))
         apart = float(np.mean([row.revolution for row in rows])) - self._middle
         variance = spread.of_means(float(len(rows)), float(self._healthy.revolutions), speed, apart)
-        # Only the two modes of a run-up say how a force passes through the rotor at three times its speed.
+        # Only the two modes of a run-up show how a force passes through the rotor at three times its speed.
         now = thrice_of(rows) if self._healthy.rotor.two_modes is not None else None
         if now is not None and self._thrice is not None:
             change = np.append(change, now.mean - self._thrice.mean)
