@@ -123,7 +123,7 @@ class AlarmService:
         others: the alarms of each machine, if there are several.
         limits: how much the journal may keep.
         buses: by name, what can be watched of each bus.
-        bus_health: says how the buses stand.
+        bus_health: gives the state of the buses.
         supervisor: counts what outputs do wrong.
         stalls: finds the parts of the service that have stalled, for outputs that report it.
         heard: told, on the event loop, of each event that comes about.
@@ -709,7 +709,7 @@ class AlarmService:
             )
 
     def _of_outputs(self) -> Iterator[Condition]:
-        """How things stand with the outputs; what one that is no longer there has said stands no longer."""
+        """The state of the outputs; reports of an output that is no longer there are dropped."""
         raised = self.manager.conditions
         for path, output in self.outputs.items():
             with self._supervisor.sparing_others(

@@ -306,7 +306,7 @@ class ControlServer:
         waiting: how many alarm events the disk has not got yet.
         runtime: directory for the socket itself, e.g. systemd's ``$RUNTIME_DIRECTORY``; the store then has a
             link to it.
-        status: the line of JSON for who asks how a machine stands, or the only one; for one that is not
+        status: the line of JSON with the state of a machine, or of the only one; for one that is not
             watched, the names of those that are. None if that cannot be asked.
         reload: reads the machine files again, or only says what would change; a line for each change. None if
             it cannot be asked.
@@ -812,7 +812,7 @@ def ask_status(store: Path, machine: str | None = None, timeout_s: float = STATU
 
 
 def _status_of(store: Path, machine: str | None, timeout_s: float) -> dict[str, Any] | tuple[str, ...]:
-    """How a machine stands, or which ones there are, if that is none of them.
+    """The state of a machine, or which ones there are, if that is none of them.
 
     Raises:
         ControlError: see `ask_status`.

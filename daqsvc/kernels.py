@@ -1,6 +1,6 @@
 """What kernels are compiled by: Numba's ``njit``, and what is done about one that has to be compiled.
 
-That is said: it takes long. A process that asked for it (`daqsvc.kernel_compiler`) has another one compile
+That is logged: it takes long. A process that asked for it (`daqsvc.kernel_compiler`) has another one compile
 and loads what that has kept. Heavy to import: only modules with kernels do.
 """
 

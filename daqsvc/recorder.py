@@ -251,7 +251,7 @@ class _Open:
         """What waits, as far as an end; nothing waits then."""
         taken, self.waiting = self.waiting[:end], []
         self.came_bytes = self._held = 0
-        # Causes, and what detectors remembered, stand in no history: nothing would be found behind them.
+        # Causes, and what detectors remembered, are in no history: nothing would be found behind them.
         happened = (item for item in reversed(taken) if not isinstance(item.what, _Caused | _Remembered))
         self.last = next(happened, self.last)
         return taken

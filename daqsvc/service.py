@@ -239,7 +239,7 @@ class Service:
         )
 
     async def _status_line(self, machine: str | None) -> bytes | tuple[str, ...]:
-        """How a machine stands, or the only one; the names of all if there is no such machine."""
+        """The state of a machine, or of the only one; the names of all if there is no such machine."""
         if machine is None and len(self.reports) == 1:
             [machine] = self.reports
         report = self.reports.get(machine or "")
@@ -563,7 +563,7 @@ class Service:
             self._receivers[block.stream](block)
 
     def _stand(self, stream: str, standing: StreamState) -> None:
-        """Tell the machine of a stream how that stands."""
+        """Report the state of a stream to its machine."""
         one = self.streams[stream]
         one.watch.stand(one.name, standing)
 

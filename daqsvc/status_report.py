@@ -58,7 +58,7 @@ class _Seen(NamedTuple):
         now_ns: when, by the service's clock.
         figures: those of the status message.
         oldest_wall_ns: when the oldest event happened that waits for the broker; None if that is not known.
-        alarms: how each stands.
+        alarms: the state of each.
         newest: by stream, its newest sample ``[channels]`` and when that was taken; None before the first.
         latest: what each detector has said last.
         measured: the same, with figures.

@@ -107,7 +107,7 @@ def why_not_open(error: Exception, port: str, key: str) -> str:
 
 
 def _other_kind(port: str) -> str:
-    """What stands at a path where no device can be; empty if it may be one."""
+    """What is at a path where no device can be; empty if it may be one."""
     try:
         mode = os.stat(port).st_mode  # noqa: PTH116 - as above
     except (OSError, ValueError):

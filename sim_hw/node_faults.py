@@ -114,7 +114,7 @@ class Babble:
 
 
 BABBLER = -1
-"""Stands for the frame's number where a frame is a babbling node's."""
+"""In place of the frame's number where a frame is a babbling node's."""
 
 
 class CountRestart(IntEnum):

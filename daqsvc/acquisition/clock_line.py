@@ -86,7 +86,7 @@ def clock_line(
 
     Args:
         buckets: at least one; also as float64 ``[n, 5]``. Of those with the same sample count the earliest is
-            taken: a count that comes again says nothing of the clock.
+            taken: a count that comes again shows nothing of the clock.
         nominal_ns: nominal time between samples.
         slopes_ns: least and greatest slope, ns per sample beyond the nominal period.
 

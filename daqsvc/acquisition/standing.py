@@ -73,7 +73,7 @@ class StreamStanding:
         self._logged = False
 
     def update(self, doubt: str, now_ns: int, *, known: bool) -> None:
-        """Take in how the stream stands.
+        """Take in the state of the stream.
 
         Args:
             doubt: see `StreamState.doubt`.

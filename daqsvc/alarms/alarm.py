@@ -163,7 +163,7 @@ class Alarm:
 
     @property
     def status(self) -> AlarmStatus:
-        """How the alarm stands; of first-out it knows nothing."""
+        """The state of the alarm, without first-out."""
         return AlarmStatus(
             self._shown,
             self._level,

@@ -41,9 +41,9 @@ class AlarmCommand:
         alarm: name of the alarm, e.g. ``"rotor-fault"``.
         by: who asks.
         duration_s: how long to shelve, in seconds; None for every other verb.
-        occurrence: the activation that is meant; if another one stands by now, the command is refused.
+        occurrence: the activation that is meant; if another is active by now, the command is refused.
             None means whichever stands.
-        reason: why, in the person's words; it stands in the event and in the audit log.
+        reason: why, in the person's words; it is in the event and in the audit log.
         machine: whose alarm; None for the one machine that has an alarm of that name.
         denied: why the person may not ask for it, if that is known: then it is logged, and refused.
     """
@@ -72,7 +72,7 @@ class SnapshotRequest:
     Attributes:
         machine: of which machine.
         by: who asks.
-        reason: why, in the person's words; it stands in the snapshot and in the audit log.
+        reason: why, in the person's words; it is in the snapshot and in the audit log.
         verb: what is asked.
     """
 
@@ -83,7 +83,7 @@ class SnapshotRequest:
 
 
 def printable(text: str) -> str:
-    """Text that does to a terminal, or to the order of the letters about it, nothing but stand there.
+    """Text that changes nothing in a terminal, nor the order of the letters around it.
 
     Control characters (C0 and C1), line and paragraph separators and what turns the direction of writing are
     none (Unicode categories Other and Separator, but for the space).

@@ -36,7 +36,7 @@ class Condition(NamedTuple):
 
 
 def statement(machine: str, condition: str, level: Level, at: ClockReading) -> Diagnosis:
-    """The service's statement that ``condition`` stands at ``level``."""
+    """The service's statement that ``condition`` is active at ``level``."""
     return _statement(machine, condition, level, at)
 
 

@@ -121,7 +121,7 @@ class AlarmManager:
 
     @property
     def alarms(self) -> Mapping[str, AlarmStatus]:
-        """How every alarm stands at any time, by name.
+        """The state of every alarm at any time, by name.
 
         A quality alarm or a condition of the service appears when it is first raised, or acted on.
         """
@@ -163,7 +163,7 @@ class AlarmManager:
         return self._tell(self._timed(self._now()))
 
     def condition(self, name: str, level: Level, sentence: str) -> list[AlarmEvent]:
-        """A condition of the service itself stands at ``level``; an event only if that is new.
+        """A condition of the service itself is active at ``level``; an event only if that is new.
 
         Report it again at each evaluation, also when it is normal: until then a restart leaves it as it was.
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from daqsvc.diagnosis.record import Diagnosis
 
 _CAUSE = re.compile(r" \(.*\)")
-"""Why samples are missing, as it stands in what an alarm was raised by."""
+"""Why samples are missing, as it is written in the cause of an alarm."""
 
 PREFIXES = ("sensor-ok/", "detector-ok/")
 """How the names of quality alarms begin."""
@@ -64,7 +64,7 @@ class _Patience:
     """Weighs the partial statements of a detector against the good ones.
 
     A frame lost now and then makes one window in some dozen partial. Its values are held, which is enough: a
-    quality alarm with each of them would be a flood that says nothing. It is raised when they prevail.
+    quality alarm with each of them would be a useless flood. It is raised when they prevail.
     """
 
     def __init__(self, *, lasting: bool) -> None:
@@ -264,7 +264,7 @@ class SensorHealth:
         if not doubts:
             return
         worst = _worst(doubts)
-        # Of a detector that stands in the journal it is known what it doubts.
+        # For a detector in the journal it is known what it doubts.
         for detector in speakers.keys() - self._by_detector.keys():
             self._unheard.add(detector)
             sensors = tuple(speakers[detector])

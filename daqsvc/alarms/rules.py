@@ -94,7 +94,7 @@ class Watch(Protocol):
     """The memory of one rule."""
 
     def find(self, diagnosis: Diagnosis, circumstances: Circumstances) -> RuleFinding | None:
-        """What a good diagnosis says, or a partial one; None if it says nothing new and everything holds."""
+        """What a good diagnosis states, or a partial one; None if nothing is new and everything holds."""
         ...
 
     def hold(self, diagnosis: Diagnosis) -> None:

@@ -43,7 +43,7 @@ class StartUpSignal:
         )
 
     def note(self, diagnosis: Diagnosis) -> None:
-        """Take in a diagnosis; one of another detector, or without the measure, says nothing."""
+        """Take in a diagnosis; one of another detector, or without the measure, is left out."""
         start_up = self._start_up
         if start_up is None or diagnosis.detector != start_up.detector or diagnosis.quality == "not_ok":
             return

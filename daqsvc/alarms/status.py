@@ -1,4 +1,4 @@
-"""How an alarm stands, since when, and who asks something of it."""
+"""The state of an alarm, since when, and what is asked of people."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class HandlingRequest(NamedTuple):
 
 
 class AlarmStatus(NamedTuple):
-    """How an alarm stands, for a view.
+    """The state of an alarm, for a view.
 
     Attributes:
         state: what consumers see.

@@ -276,7 +276,7 @@ WINDOW_S = 0.5
 LEAST_WINDOWS = 8
 BANDS = 8
 LOWEST_HZ = 400.0
-"""Below lie the shaft's own orders: a change of these says nothing about the bearing."""
+"""Below lie the shaft's own orders: a change of these shows nothing about the bearing."""
 _WINDOWS_OF_SHORT = 16
 """A recording of less than as many windows is cut into so many shorter ones."""
 _LEAST_WINDOW_SAMPLES = 1024

@@ -32,7 +32,7 @@ _FINDINGS = {"raised", "escalated", "lowered", "changed", "recurred", "latched",
 
 
 class AlarmView(NamedTuple):
-    """How an alarm stands, and how that came about.
+    """The state of an alarm, and how it came about.
 
     Attributes:
         latest: its latest event.

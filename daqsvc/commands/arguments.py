@@ -165,7 +165,7 @@ def duration(text: str) -> float:
 
 
 def one_line(text: str) -> str:
-    """Text that can stand in a log."""
+    """Text that can be written in a log."""
     if not text.isprintable():
         raise argparse.ArgumentTypeError(f"{text!r} is not printable; write one line of plain text")
     return text

@@ -349,7 +349,7 @@ def _add_output(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_fleet(parser: argparse.ArgumentParser) -> None:
-    """What is said of the archive of a fleet."""
+    """What is stated of the archive of a fleet."""
     fleet = parser.add_argument_group("the archive of a fleet (docs/fleet.md)")
     fleet.add_argument(
         "--cluster",

@@ -296,7 +296,7 @@ async def _run_until_stopped(
         files: as they were named.
         store: directory of the journal.
         guard: of the process.
-        manager: the service manager, which hears how the service stands.
+        manager: the service manager, which receives the state of the service.
         let_go: releases the store, which the service takes itself.
 
     Raises:

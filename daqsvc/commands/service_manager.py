@@ -61,7 +61,7 @@ class ServiceManager:
     Attributes:
         is_ready: whether it knows that the service is ready.
         begun_s: when `starting` was called, by the monotonic clock; None if it was not.
-        is_overtold: whether other words stand in place of what the service waits for.
+        is_overtold: whether other words are shown in place of what the service waits for.
     """
 
     def __init__(self, address: str = "", watchdog_s: float | None = None) -> None:

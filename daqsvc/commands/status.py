@@ -132,7 +132,7 @@ class _Picture:
             _write(LEAVE)
 
     def show(self, text: str) -> None:
-        """Show how things stand."""
+        """Show the state of everything."""
         self._waits = False
         if self._is_live:
             self._draw(text)

@@ -22,7 +22,7 @@ def status_text(status: Document, width: int = 80, *, alarms_first: bool = False
     Args:
         status: what the service has answered.
         width: columns of the terminal.
-        alarms_first: whether alarms, outbox and broker stand above the rest, which a screen may not hold;
+        alarms_first: whether alarms, outbox and broker are above the rest, which a screen may not hold;
             else below, where the eye is after a command.
     """
     head = _filled(

@@ -123,7 +123,7 @@ def store_doubts(machine: MachineFile) -> Iterator[str]:
     try:
         store = machine.resolve(machine.store.directory)
         with as_owner_of(store):
-            # Names of its files, and what stands in them, the owner chooses.
+            # The owner chooses the names of its files, and what is in them.
             who, why = account(), harmless(unusable(store))
             was_read = _refuse_newer(store)
         if why and not was_read:
@@ -280,7 +280,7 @@ def _is_used(store: Path) -> bool:
     """Whether a service has a journal in a directory, or runs on it."""
     from daqsvc.control import SOCKET  # noqa: PLC0415 - as above
 
-    # A directory of somebody else says nothing.
+    # The directory of another account shows nothing.
     return any(os.path.lexists(store / name) for name in (JOURNAL, SOCKET))
 
 

@@ -478,7 +478,7 @@ def _plot(path: Path, shown: list[_ShownSeries]) -> None:
             axis.fill_between(times, trend.low, trend.high, alpha=0.2, color=line.get_color(), linewidth=0)
         axis.set_title(f"{machine}: {detector}", loc="left", fontsize=9)
         axis.set_ylabel(unit)
-        # Figures as they are, and not what they exceed a number by that stands above the axis.
+        # Figures as they are, and not the difference from a number above the axis.
         axis.ticklabel_format(axis="y", useOffset=False)
         axis.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
         axis.grid(alpha=0.3)

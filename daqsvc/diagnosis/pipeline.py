@@ -273,7 +273,7 @@ class Pipeline:
         patience: by stream, how long it may be silent; whatever is not named is fast.
         supervisor: keeps the detectors' tasks going; None for one of its own.
         fall_silent: called with the name and the standing of a stream in doubt of which nothing comes any
-            more; whoever tells the pipeline how streams stand passes it on. None: it is passed on at once.
+            more; who reports the state of streams passes it on. None: it is passed on at once.
         why_over: why nothing more can come of a stream, in a clause; empty if something may.
         why_silent: what the bus of a stream says of why nothing comes, in a clause; empty if nothing.
         make_reader: makes what hands the samples of a ring to a detector.
@@ -421,7 +421,7 @@ class Pipeline:
     async def _listen_for_silence(self) -> None:
         """Have detectors say, once, that their stream has fallen silent: a window never comes to say it.
 
-        It is said once more when only then the bus tells why nothing comes.
+        It is logged once more if the bus reports only then why nothing comes.
 
         Of a stream in doubt samples may not come as far as the ring; the doubt states that frames come.
 

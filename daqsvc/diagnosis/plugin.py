@@ -125,7 +125,7 @@ class DetectorPlugin(PipelineTable[SettingsT]):
         Args:
             machine: the machine file.
             settings: the table.
-            options: what is said of the recordings.
+            options: what is stated of the recordings.
 
         Returns:
             Unless overridden, one that condenses what the detectors of `build` say.

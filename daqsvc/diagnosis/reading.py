@@ -15,7 +15,7 @@ class Reading:
 
     Attributes:
         detector: whose statements.
-        kind: where it stands in them.
+        kind: where it is in them.
         key: its name there, e.g. ``"rms"`` or ``"F1"``.
         unit: its unit as in the statements, e.g. ``"um"``; empty for none.
         stale_s: age from which on a figure is no longer true.

@@ -51,7 +51,7 @@ _LONGEST_NAME = 40
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordingOptions:
-    """What is said of recordings beside the machine file.
+    """What is stated of recordings beside the machine file.
 
     Attributes:
         channels: which variable of a recording is which sensor or channel.
@@ -86,7 +86,7 @@ class Recorded:
     Attributes:
         machine: the machine file with the sensors that the recording has, and its rate for all streams.
         recording: its channels, by the names of the sensors.
-        options: what was said of it.
+        options: what was stated of it.
     """
 
     machine: MachineFile
@@ -198,7 +198,7 @@ class RecordedDetector(Hooks, Generic[SettingsT]):
     Args:
         machine: the machine file.
         given: the detector's table.
-        options: what is said of the recordings.
+        options: what is stated of the recordings.
 
     Attributes:
         part: what its verdicts are about; empty if it gives none. Of several detectors of one part the last

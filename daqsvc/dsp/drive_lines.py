@@ -35,13 +35,13 @@ _REACH_BINS = 1.5
 _SKIRT_BINS = (5, 12)
 """Bins from a line where only one that is smeared, as slip smears a bearing's, has much left ..."""
 _SHARP_DB = 6.0
-"""... and how far a narrow one stands above it."""
+"""... and how far a narrow one rises above it."""
 _LEAST_TEETH, _MOST_TEETH = 12, 120
 """Gears with fewer are rare, as their teeth are cut away at the foot."""
 TOP_ORDER = 2.0 * _MOST_TEETH + 4.0
 """The highest order that is examined: beside the second harmonic of a mesh."""
 _CARRIER_DB = 6.0
-"""How far a mesh and its second harmonic stand above the harmonics of the shaft beside them."""
+"""How far a mesh and its second harmonic rise above the harmonics of the shaft beside them."""
 _MESH_SHARE = 0.06
 """Of the signal's deviation that a mesh has at least: harmonics of a damaged race fall on whole orders by
 chance, and their neighbours look like sidebands then. Those of measured records had mostly up to .05."""

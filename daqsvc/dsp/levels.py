@@ -31,7 +31,7 @@ SURE = 4.0
 _LEAST_ERROR = 0.01
 """Share of the power that is never known better when anything is missing."""
 _LEAST_PAIRS = 0.02
-"""A lag of which a smaller share of pairs is there says nothing."""
+"""A lag of which a smaller share of pairs is there shows nothing."""
 _LEAST_LAG = 1e-3
 """Nor does one at which the taper leaves a smaller share of the power."""
 

@@ -102,7 +102,7 @@ def order_vectors(
 
     Raises:
         ValueError: a channel is dead, clipped or full of gaps, the recording has fewer than 8 revolutions
-            or fewer than 10 samples in each, or its harmonics stand at another speed.
+            or fewer than 10 samples in each, or its harmonics are those of another speed.
     """
     values = np.asarray(samples, dtype=np.float64)
     values = values[:, np.newaxis] if values.ndim == 1 else values

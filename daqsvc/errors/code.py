@@ -1,4 +1,4 @@
-"""What a code is, and where it stands in a message."""
+"""What a code is, and where it is in a message."""
 
 from __future__ import annotations
 

@@ -94,7 +94,7 @@ class Wanted:
     """How an archive is to be judged.
 
     Attributes:
-        options: what is said of all recordings.
+        options: what is stated of all recordings.
         limits: what reading one may take.
         verify: whether to look into files that by size and time are as they were.
         retry: whether to try again what could not be judged.

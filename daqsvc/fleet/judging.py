@@ -55,7 +55,7 @@ class RecordingBatch:
         description: its machine file and what lies beside it; empty if that is not to be used.
         machine_digest: of these; see `describe_machine`.
         wrong: why the machine file cannot be used, if that is known.
-        options: what is said of all recordings.
+        options: what is stated of all recordings.
         limits: what reading a recording may take.
         version: of daqsvc.
         recordings: to be judged.

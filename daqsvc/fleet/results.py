@@ -116,7 +116,7 @@ class Results:
             FleetError: a file is no table of results.
         """
         rows: list[Row] = []
-        for path in self._tables(folder):  # finished ones first: what was added later stands behind
+        for path in self._tables(folder):  # finished ones first: what was added later comes after
             rows += self._read(path, columns)
         rows.sort(key=lambda row: row["file"])
         return rows

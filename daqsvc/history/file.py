@@ -66,13 +66,13 @@ CREATE INDEX IF NOT EXISTS event_by_machine ON event (machine, wall_ns);
 
 
 class NewerHistoryError(Exception):
-    """The file was written by a newer version; the text says so."""
+    """The file was written by a newer version; the text states it."""
 
     code = NOTHING_RECORDED
 
 
 class EmptyHistoryError(Exception):
-    """The file holds no history, not even an empty one; the text says so."""
+    """The file holds no history, not even an empty one; the text states it."""
 
     code = NOTHING_RECORDED
 

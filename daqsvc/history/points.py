@@ -2,7 +2,7 @@
 
 A chunk is a span of points without gaps in its grid: where nothing was measured stands NaN. Values are
 rounded to `MANTISSA_BITS`, a relative error of at most 1 in 32,768, which halves what zlib leaves of noise.
-How many statements there were stands behind the values: so means of several points are those of all
+The number of statements follows the values: so means of several points are those of all
 statements. Versions that knew no such number wrote chunks without, and read over it.
 """
 

@@ -97,7 +97,7 @@ def order_detectors(
     Args:
         false_alarm_probability: of a recording of the unchanged machine, at most.
         machine: the machine, see `daqsvc.offline.machine_options.accelerometer_machine`.
-        options: what is said of the recordings; among that the healthy run.
+        options: what is stated of the recordings; among that the healthy run.
 
     Raises:
         ValueError: the healthy run cannot be used.

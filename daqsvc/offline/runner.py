@@ -93,7 +93,7 @@ class Runner:
 
     Args:
         make: makes the machine file, once a process.
-        options: what is said of the recordings.
+        options: what is stated of the recordings.
         detectors: makes the detectors; unless given, those of the machine file's tables.
         machine: the machine file, where it has been made in this process.
     """

@@ -31,7 +31,7 @@ _T = TypeVar("_T")
 log = logging.getLogger(__name__)
 
 MOST_OF_A_TOPIC = 1000
-"""Letters of one topic that are kept; beyond that the oldest are dropped, counted, and that is said."""
+"""Letters of one topic that are kept; beyond that the oldest are dropped, counted, and that is logged."""
 
 SCHEMA_VERSION = 0
 """What SQLite gives to a file without a version; changes of the table count from here."""

@@ -1,6 +1,6 @@
 """A copy of the write-ahead log that an unclean end has left, until nothing of it is known to be missing.
 
-When it opens the journal, SQLite cuts off what stands behind a wrong checksum, overwrites it or deletes the
+When it opens the journal, SQLite cuts off what follows a wrong checksum, overwrites it or deletes the
 log. What it takes over is in the journal afterwards, so that the log alone must be kept.
 """
 

@@ -1,4 +1,4 @@
-"""The messages that stand in pages of a write-ahead log or a database, whatever SQLite says of it.
+"""The messages in pages of a write-ahead log or a database, whatever SQLite reports of it.
 
 For SQLite a log ends before its first wrong checksum: one flipped bit takes all that was committed behind it.
 But messages have their own checksums. So the pages in the log are read one by one, and each message that

@@ -36,7 +36,7 @@ JOURNAL_NAME = "outbox.sqlite"
 ATTEMPTS, RETRY_S = 4, 0.05
 
 _MAGIC, _HEADER_BYTES, _USER_VERSION = b"SQLite format 3\0", 100, slice(60, 64)
-"""The header of a file of SQLite, and where the version of its tables stands in it."""
+"""The header of a file of SQLite, and where the version of its tables is in it."""
 
 _COLUMNS = "sequence, topic, payload, retain, sent, wall_ns, checksum"
 
@@ -238,7 +238,7 @@ def refuse_newer(path: Path) -> None:
 def refuse_newer_header(path: Path) -> None:
     """The same by the header of the file alone, and without SQLite: root may do so whoever owns the store.
 
-    What only stands in the write-ahead log is not seen, nor whether the number is damaged. In a process that
+    What is only in the write-ahead log is not seen, nor whether the number is damaged. In a process that
     has the journal open this would undo its locks.
 
     Raises:
@@ -272,7 +272,7 @@ def opened_to_read(path: Path) -> Iterator[sqlite3.Connection]:
     """A connection that leaves no trace.
 
     A service that runs, or was killed, leaves a write-ahead log and its index beside the journal: these are
-    read as they are. Without a log, all there is stands in the file itself. A log without an index (a copy, a
+    read as they are. Without a log, everything is in the file itself. A log without an index (a copy, a
     read-only file system) can only be read where an index can be made: in a copy.
 
     Raises:

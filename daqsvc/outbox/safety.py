@@ -120,7 +120,7 @@ def as_owner_of(store: Path) -> Iterator[None]:
 def _groups(owner: os.stat_result) -> tuple[int, list[int]]:
     """The group of who owns a directory, and all of his groups.
 
-    The directory's own group says nothing: after `chown USER` it is still root's.
+    The directory's own group shows nothing: after `chown USER` it is still root's.
     """
     try:
         entry = pwd.getpwuid(owner.st_uid)

@@ -83,7 +83,7 @@ def readable(path: Path, below: int = LARGEST) -> Iterator[Row]:
 
 
 def _page_by_page(path: Path, below: int) -> Iterator[Row]:
-    """What the pages hold. A message that stands in one as sent was marked after any other copy was made."""
+    """What the pages hold. A message that is in one as sent was marked after any other copy was made."""
     with path.open("rb") as file:
         if not os.fstat(file.fileno()).st_size:
             return

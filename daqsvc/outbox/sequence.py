@@ -86,7 +86,7 @@ class SequenceMark:
     """The side files.
 
     Args:
-        path: where the first one is; its twin stands beside it.
+        path: where the first one is; its twin is beside it.
     """
 
     def __init__(self, path: Path) -> None:

@@ -67,7 +67,7 @@ class Outbox:
 
     Args:
         path: the SQLite file of the alarms, e.g. ``/var/lib/daqsvc/outbox.sqlite``; that of telemetry
-            stands beside it, ``outbox-telemetry.sqlite``.
+            is beside it, ``outbox-telemetry.sqlite``.
         clock: the service's clock.
         limits: how much is kept.
 

@@ -24,7 +24,7 @@ class Fault(NamedTuple):
 
     Attributes:
         name: the same.
-        next_step: what to look at; ``{views}`` stands for what the page can show of its sensors.
+        next_step: what to look at; ``{views}`` is replaced by what the page can show of its sensors.
     """
 
     name: str

@@ -114,7 +114,7 @@ class BoxSource:
         self._listenings = Listenings(LINGER_S)
 
     async def statuses(self) -> list[Document]:
-        """How each machine stands that the service watches: `daqsvc.publish.service_status`.
+        """The state of each machine that the service watches: `daqsvc.publish.service_status`.
 
         Raises:
             OSError: it does not answer.

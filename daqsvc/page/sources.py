@@ -48,7 +48,7 @@ class MachineSource(Protocol):
     """Machines that can be shown."""
 
     async def statuses(self) -> list[dict[str, Any]]:
-        """How each machine stands: the names and alarms of `daqsvc.publish.service_status`.
+        """The state of each machine: the names and alarms of `daqsvc.publish.service_status`.
 
         Raises:
             OSError, ValueError: there is no answer.

@@ -1,4 +1,4 @@
-"""How a machine stands, in HTML that is put into the page as it is."""
+"""The state of a machine, in HTML that is put into the page as it is."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def alarm_list(known: Mapping[str, Document | None], machine: str) -> str:
 
 
 def _urgency(alarm: Document | None) -> tuple[int, int, int]:
-    """Where an alarm stands in the list: the smaller, the sooner."""
+    """The place of an alarm in the list: the smaller, the sooner."""
     if alarm is None:
         return 4, 0, 0
     state = str(alarm["state"])
@@ -133,7 +133,7 @@ def _what(event: Document) -> str:
 
 
 def _state(alarm: Document | None) -> str:
-    """How an alarm stands, with what covers it."""
+    """The state of an alarm, with what covers it."""
     if alarm is None or alarm["state"] == "normal":
         return "normal"
     words = [STATES.get(str(alarm["state"]), str(alarm["state"]))]
@@ -201,6 +201,6 @@ def row(*cells: str) -> str:
 
 
 def time_mark(wall_ns: int) -> str:
-    """A time that the browser shows in its own zone; UTC stands beside it."""
+    """A time that the browser shows in its own zone; UTC is beside it."""
     utc = iso_utc(wall_ns // NS_PER_S * NS_PER_S)
     return f'<time datetime="{utc}" title="{utc}">{utc}</time>'

@@ -148,7 +148,7 @@ class Output:
         return {}
 
     def conditions(self, raised: frozenset[str]) -> Iterable[Condition]:
-        """How things stand with it, as far as that is known; each is an alarm. Asked for once a second.
+        """Its state, as far as that is known; each is an alarm. Asked for once a second.
 
         Args:
             raised: names of conditions that were ever reported, also before a restart.

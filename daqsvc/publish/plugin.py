@@ -26,7 +26,7 @@ class OutputPlugin(OutputTable[SettingsT]):
     Importing one must be cheap: what takes time is imported when the output is made.
 
     Attributes:
-        status_key: where its figures stand in the status; empty for nowhere.
+        status_key: where its figures are in the status; empty for nowhere.
         outdated: by how the names of its conditions begin, what is said of those of an earlier run once the
             machine file has no such table any more.
     """

@@ -111,7 +111,7 @@ class OutboxPayload(JsonPayload):
 
 
 class OutputPayload(JsonPayload):
-    """How an output stands."""
+    """The state of an output."""
 
     connected: bool | None = Field(description="null for one that has no connection")
     reason: str = Field("", description="why it reaches nobody at present; empty if it does")

@@ -23,7 +23,7 @@ class CommandTopic:
 
     Attributes:
         machine: the machine that is meant, in one part.
-        verb: what is asked; with ``/`` in it if something stands below a verb.
+        verb: what is asked; with ``/`` in it if something is below a verb.
         is_answer: whether it is where an answer goes, of whichever client.
     """
 
@@ -153,7 +153,7 @@ class BoxTopic:
     Attributes:
         site: of the box.
         box: its name.
-        rest: what stands below it, e.g. ``("laval-rig", "alarms", "rotor-fault")``; an alarm's or a
+        rest: what is below it, e.g. ``("laval-rig", "alarms", "rotor-fault")``; an alarm's or a
             detector's name in one part, whatever it holds.
     """
 
@@ -174,7 +174,7 @@ def box_topic(root: str, topic: str) -> BoxTopic | None:
 
 
 def is_one_part(name: str) -> bool:
-    """Whether a name can stand in a topic, as one part of it."""
+    """Whether a name can be used in a topic, as one part of it."""
     return "/" not in name and _NAME.fullmatch(name) is not None
 
 

@@ -304,7 +304,7 @@ def _is_named(name: str) -> bool:
 
 
 def _read(contents: Contents, name: str) -> _TimeColumn | None:
-    """What a column says if it is one of time; None if it says nothing."""
+    """What a column states if it is one of time; None if it states nothing."""
     values = contents.entries[name]
     with np.errstate(invalid="ignore"):  # infinities make NaN
         seconds, unit, unit_is_named = _seconds(contents, name)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from daqsvc.settings.section import Section
 
 NAME = "NAME"
-"""Stands for the name that a file gives a bus or a stream."""
+"""In place of the name that a file gives a bus or a stream."""
 _NAME_PATTERN = r"^\.*[A-Za-z0-9_-][A-Za-z0-9_.-]*$"
 
 
@@ -28,7 +28,7 @@ class Variant:
     """A key as one kind of table has it.
 
     Attributes:
-        kind: what such a table is called, or what it stands in; empty if there is one kind only.
+        kind: what such a table is called, or what contains it; empty if there is one kind only.
         path: of the table.
         name: the last part of the key.
         field: as its model declares it.
@@ -74,7 +74,7 @@ class Variant:
 
     @property
     def is_table(self) -> bool:
-        """Whether keys stand below it."""
+        """Whether keys are below it."""
         return _holds_tables(self.schema)
 
     def row(self) -> tuple[str, ...]:
@@ -88,11 +88,11 @@ class Variant:
 
 @dataclass
 class Table:
-    """All kinds of tables that stand at one place of the file.
+    """All kinds of tables that can be at one place of the file.
 
     Attributes:
         path: the place, as people write it.
-        kinds: those that can stand there, each with what it is called, or what it stands in.
+        kinds: those that can be there, each with what it is called, or what contains it.
         keys: what each of them knows, by key.
     """
 
@@ -258,7 +258,7 @@ def _key_text(path: str, name: str, variants: Sequence[Variant], kinds: Sequence
 
 
 def kind_of_value(schema: Mapping[str, Any]) -> str:
-    """What stands there, in words."""
+    """What is there, in words."""
     if "const" in schema:
         return code(toml(schema["const"]))
     if "enum" in schema:

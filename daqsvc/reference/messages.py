@@ -117,7 +117,7 @@ class Field(NamedTuple):
     """A field of a payload.
 
     Attributes:
-        path: its name, with those of what it stands in.
+        path: its name, with those of what contains it.
         kind: its type in words.
         about: what it is.
     """

@@ -106,7 +106,7 @@ class Address(NamedTuple):
 
 
 def address_of(text: str) -> Address | None:
-    """The address that ``HOST:PORT`` names; None if it is none. A host of colons stands in brackets."""
+    """The address that ``HOST:PORT`` names; None if it is none. A host with colons is in brackets."""
     host, _, port = text.rpartition(":")
     bare = host.removeprefix("[").removesuffix("]")
     if (":" in bare) != (host != bare) or not is_host(bare):

@@ -103,7 +103,7 @@ def meant_key(word: str, free: Collection[str]) -> str | None:
 
     Args:
         word: a key that is not known.
-        free: the keys that could stand in its place.
+        free: the keys that could be in its place.
     """
     plain = word.lower().replace("-", "_").replace(" ", "_")
     if plain in free:

@@ -120,7 +120,7 @@ def import_failure(error: BaseException, module: str) -> Failure:
 
 
 def cause_of(error: BaseException) -> Hashable:
-    """Alike for errors that are said once: of a plugin from outside by kind and place, else by the words."""
+    """Alike for errors that are logged once: of outside plugins by kind and place, else by the words."""
     foreign = foreign_failure(error)
     return in_words(error) if foreign is None else foreign.cause
 

@@ -38,7 +38,7 @@ class Hooks:
     __slots__ = ()
     __hooks__: ClassVar[frozenset[str]] = frozenset()
     __table__: ClassVar[str] = ""
-    """Where it stands in a machine file, if it has one table only."""
+    """Where it is in a machine file, if it has one table only."""
 
     if not TYPE_CHECKING:  # a type checker must go on refusing attributes that do not exist
 

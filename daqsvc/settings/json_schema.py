@@ -148,7 +148,7 @@ def _value(declared: Any) -> Schema:
 
 
 def _bounded(schema: Schema, declared: Any) -> Schema:
-    """With the bounds of a number that stand behind a validator of ours, where pydantic does not see them."""
+    """With the bounds of a number that follow a validator of ours, where pydantic does not see them."""
     if schema.get("type") not in {"number", "integer"}:
         return schema
     marks = getattr(declared, "__metadata__", ())

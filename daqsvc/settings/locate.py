@@ -68,7 +68,7 @@ def locate(text: str, *, most_depth: int = 100, most_values: int = 1_000_000) ->
 
     Returns:
         For each key path its spot: of a value the line of its key (of an array element, of the element),
-        of a table the line where it is first mentioned. The empty path stands for the whole, at line 1.
+        of a table the line where it is first mentioned. The empty path means the whole, at line 1.
 
     Raises:
         TooMuchError: the text goes beyond these limits.

@@ -43,7 +43,7 @@ class PipelineTable(DetectorKind[SettingsT]):
 
         Args:
             settings: the table, or what is valid of it.
-            at: where the alarm stands in the file.
+            at: where the alarm is in the file.
         """
         del settings, at
         return iter(())
@@ -133,7 +133,7 @@ class BusTable(DriverKind):
             draft: the machine file, or what is valid of it.
             stream: the stream, or what is valid of it.
             facts: what was read from the files that its layout names; None if nothing is known.
-            at: where the stream stands in the file.
+            at: where the stream is in the file.
         """
         del facts
         yield self._fits(draft, stream, at)

@@ -68,7 +68,7 @@ def kinds_of(declared: Any) -> Kinds | None:
 
 
 def declared_at(root: type[Section], document: Any, path: KeyPath) -> Any:
-    """The declared type of what stands at ``path``; None if the models know nothing there."""
+    """The declared type of what is at ``path``; None if the models know nothing there."""
     declared: Any = root
     for depth, step in enumerate(path):
         value = value_at(document, path[:depth])

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pydantic import GetCoreSchemaHandler
 
 Name = Annotated[str, Field(pattern=r"^\.*[A-Za-z0-9_-][A-Za-z0-9_.-]*$", max_length=64)]
-"""A name that can stand in an MQTT topic, a file name and a log line as it is; not ``.`` or ``..``."""
+"""A name that can be used in an MQTT topic, a file name and a log line as it is; not ``.`` or ``..``."""
 
 
 def _printable(text: str) -> str:

@@ -167,7 +167,7 @@ class TrendValue(BaseSensor):
 
 
 class _UntypedSensor(BaseSensor, extra="ignore"):
-    """Stands for a sensor whose type is missing or unknown: the keys that depend on it go unchecked."""
+    """In place of a sensor whose type is missing or unknown: the keys that depend on it go unchecked."""
 
     type: Annotated[
         Literal["proximity", "accelerometer", "velocity", "keyphasor", "trend"],

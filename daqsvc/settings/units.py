@@ -82,7 +82,7 @@ _BY_SPELLING = {
     for quantity, name, factor, spellings in _UNITS
     for spelling in spellings.split()
 }
-# How a level was made says nothing of its unit: "mm/s RMS", "um p-p".
+# How a level was made shows nothing of its unit: "mm/s RMS", "um p-p".
 _QUALIFIER = re.compile(r"[_ ]*\(?(?:rms|pk-?pk|p-?p|pp|0-?p|0-?pk|peak|pk)\)?$", re.IGNORECASE)
 _DROPPED = re.compile(r"[\s^*()\[\]{}·⋅]+")
 _SECONDS = re.compile(r"(?<![a-z])seconds?|(?<![a-z])sec(?![a-z])")

@@ -372,7 +372,7 @@ _HOST_AND_PORT = re.compile(r"(\[[^\]]*\]|[^:\[\]]+):(\d+)")
 
 
 def _host_and_port(text: str) -> tuple[str, str]:
-    """The host and the port of an address, as the sniffer takes it too; 502 if no port stands there."""
+    """The host and the port of an address, as the sniffer takes it too; 502 if there is no port."""
     both = _HOST_AND_PORT.fullmatch(text)
     return (text, "502") if both is None else (both[1].strip("[]"), both[2])
 

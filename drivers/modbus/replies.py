@@ -159,7 +159,7 @@ def register_bytes(pdu: bytes) -> bytes:
 
 
 def judge_tcp(data: bytes, expected: ExpectedReply | None) -> ReplyVerdict:  # noqa: PLR0911 - one for each fault
-    """What stands at the head of the bytes received over TCP (MBAP frames)."""
+    """What is at the head of the bytes received over TCP (MBAP frames)."""
     if len(data) < MBAP_BYTES:
         return ReplyVerdict()
     transaction, protocol, length, unit = _MBAP.unpack_from(data)
@@ -185,7 +185,7 @@ def judge_tcp(data: bytes, expected: ExpectedReply | None) -> ReplyVerdict:  # n
 def judge_rtu(  # noqa: PLR0911 - one for each fault
     data: bytes, expected: ExpectedReply, crc_of: Callable[[bytes], int]
 ) -> ReplyVerdict:
-    """What stands at the head of the bytes received on a serial line.
+    """What is at the head of the bytes received on a serial line.
 
     Args:
         data: all that was received since the request and is not done with.

@@ -83,7 +83,7 @@ class ChannelChoice:
     def of(self, messages: Sequence[can.Message]) -> list[int]:
         """Which of the messages to take: those of the chosen channel, and those whose channel is not named.
 
-        Other channels are said once each.
+        Other channels are logged once each.
         """
         names = [None if message.channel is None else str(message.channel) for message in messages]
         named = dict.fromkeys(name for name in names if name is not None)

@@ -233,7 +233,7 @@ class SyncFraming(_BinaryFraming):
 
     The sync word may turn up inside a frame or in garbage, so a frame counts only if its CRC matches, or,
     where there is none, once the next sync word stands right behind it. After garbage every sync word is
-    tried in turn: one that was none delays what follows by a frame at most, and costs nothing. What stands
+    tried in turn: one that was none delays what follows by a frame at most, and costs nothing. What is
     in the place of a frame, behind a sync word, and is none, is a corrupt frame.
 
     Args:

@@ -203,7 +203,7 @@ class Hunted(NamedTuple):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _stands_at(buffer: Bytes, word: Bytes, at: int) -> bool:
-    """Whether a word stands in the buffer, whole, at a place."""
+    """Whether a word is in the buffer, whole, at a place."""
     if not 0 <= at <= len(buffer) - len(word):
         return False
     for k in range(len(word)):  # noqa: SIM110 - numba

@@ -185,7 +185,7 @@ class View:
     def _health(self) -> Group:
         if self._status is None:
             return Group(Text("waiting for the first status", style="dim"))
-        # Lines short enough for a narrow terminal, so that what stands below them stays in sight.
+        # Lines short enough for a narrow terminal, so that what is below them stays in sight.
         lines: list[Text] = []
         for name, stream in self._status["streams"].items():
             lost = stream["samples_lost"]

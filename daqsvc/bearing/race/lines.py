@@ -191,7 +191,7 @@ class ModulationDepth:
         return np.asarray(kept / HANN_NOISE_BANDWIDTH, dtype=np.float64)
 
     def mirrored(self, order: float) -> float:
-        """What stands on the far side of the nearest harmonic of the shaft over what stands on the near one.
+        """What is on the far side of the nearest harmonic of the shaft over what is on the near side.
 
         Args:
             order: of a line; compared is what is within twice its distance from that harmonic, or `SMEAR`.

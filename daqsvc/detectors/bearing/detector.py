@@ -341,7 +341,7 @@ class BearingDetector:
         finding = find(races, change, self.rules.false_alarm_probability, directions) if races else None
         reason = "; ".join(why for _, why in unfit)
         if unfit and (finding is None or finding.verdict in SOUND):
-            # What one bearing does not show says nothing about another that cannot be seen.
+            # What one bearing does not show is no evidence about another that cannot be seen.
             return Evaluation(races, changes, unfit[0][0], reason, finding, directions)
         return Evaluation(races, changes, "good", reason, finding, directions)
 

@@ -165,7 +165,7 @@ def _of_the_shaft(draft: MachineFile, levels: Levels, asked: _Asked) -> Iterator
     """A revolution has samples enough, and a phase has its mark."""
     slow = [one for sensor in asked.sensors for one in _samples_per_revolution(draft, sensor, asked.at)]
     if slow:
-        # Of the phase beside an amplitude the same is said once.
+        # Of the phase beside an amplitude the same is reported once.
         yield from slow[:1] if asked.at[-1] != "phase" else []
         return
     if asked.measure not in PHASES:

@@ -67,7 +67,7 @@ def check_bank_alarm(bank: RotorBank, at: KeyPath) -> Iterator[Finding]:
 
     Args:
         bank: the rotor bank.
-        at: where the alarm stands in the file.
+        at: where the alarm is in the file.
     """
     if bank.rule == "paper":
         yield Finding(

@@ -81,7 +81,7 @@ class RotorBankDetector:
         rub_process_noise: that of the rub observers; large, so that they follow what they do not know.
         rules: decision rule and thresholds.
         calibrate_revolutions: healthy revolutions at the start over which unbalance and static position are
-            measured, to stand in every mode in place of the stated ones; 0 to trust what is stated.
+            measured, used in every mode in place of the stated ones; 0 to trust what is stated.
         ac_coupled: whether the probes show no static position.
         name: name of the detector.
 
@@ -192,7 +192,7 @@ class RotorBankDetector:
 
     @property
     def bank_modes(self) -> tuple[BankMode, ...]:
-        """The models behind the modes, healthy first, as they stand by now."""
+        """The models behind the modes, healthy first, as they are now."""
         return self._bank_modes
 
     @property

@@ -557,7 +557,7 @@ def declared_at(
 
 def _alarm(places: Places, segment: Sequence[WatchReport], last: Identification | None = None) -> RotorAlarm:
     looks = [report.identification for report in segment if report.looked and report.identification]
-    # A name is kept through one evaluation that sees a healthy machine: it says nothing of the fault.
+    # A name is kept through one evaluation that sees a healthy machine: it shows nothing of the fault.
     faulty = [look for look in looks if look.verdict != "normal" and "normal" not in look.candidates]
     seen = last or (faulty[-1] if faulty else None)
     return RotorAlarm(

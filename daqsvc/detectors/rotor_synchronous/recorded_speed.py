@@ -47,7 +47,7 @@ _HYSTERESIS = 0.2
 """Of the keyphasor's range from low to high."""
 _LEAST_PULSES = 4
 _OFF_NOMINAL = 0.02
-"""Share by which the keyphasor's speed may differ from the stated one until that is said."""
+"""Share by which the keyphasor's speed may differ from the stated one until that is reported."""
 _ROUNDING = 0.5
 """Part of a revolution that the interpolation of the first and the last pulse may cost."""
 

@@ -1,7 +1,7 @@
 """What is wrong with samples: clipped, stuck, missing, outliers, wrong unit, wrong rate.
 
 A module for each question. What watches a machine and what reads a recording ask the same functions, with the
-same limits; where the limits differ, the reason stands beside them.
+same limits; where the limits differ, the reason is beside them.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ OFFSET_NOTE = "the channel has an offset"
 GAP_TAPER_S = 2e-3
 """A channel that breaks off makes noise of its own: it fades out before, and in behind."""
 BRIDGED = 4
-"""A longer bridge over missing samples leaves a hole in the envelope, which says nothing of the machine."""
+"""A longer bridge over missing samples leaves a hole in the envelope, which shows nothing of the machine."""
 LEAST_REVOLUTIONS = 25.0
 LEAST_BAND = 3.0
 """Top of the analysed band over its bottom, at least."""

@@ -44,7 +44,7 @@ class ClippedError(UnfitError):
         thing: what is clipped.
         value: what was found.
         remedy: what to do about it.
-        samples: how many samples stand at the ends.
+        samples: how many samples are at the ends.
     """
 
     def __init__(self, thing: str, value: str, remedy: str, samples: int) -> None:
@@ -114,7 +114,7 @@ def refuse_clipped(signal: Floats) -> None:
 
 
 def clipped_share(signal: Floats) -> float:
-    """Share of samples that stand at a limit: more of them than just short of it.
+    """Share of samples that are at a limit: more of them than just short of it.
 
     It finds fewer clipped samples than `refuse_clipped` needs, where the converter is fine. So it is asked
     after that, of a channel that was put right.

@@ -2,7 +2,7 @@
 
 Above the edge of a low-pass, or above half the rate that a record was first sampled with, there is next to
 nothing. That shows as a level that falls by far more, within less than an octave, than structures make it
-fall. What lies beyond says nothing of the machine and dilutes what does.
+fall. What lies beyond shows nothing of the machine and dilutes what does.
 """
 
 from __future__ import annotations

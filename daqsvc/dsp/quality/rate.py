@@ -118,7 +118,7 @@ def rate_of_stamps(seconds: Floats, *, surely_time: bool) -> StampedRate | None:
         off = np.abs(steps / period - counts)
         short = counts <= SHORT_GAP
         is_gap = (counts > 1) & (~short | (off <= MOST_OFF_GRID))
-        # A clock that is set back says nothing of what is missing there.
+        # A clock that is set back shows nothing of what is missing there.
         known = ones | is_gap | (steps < 0.0)
         if not surely_time or ones.mean() < LEAST_UNBROKEN or not known.all():
             return _mean_rate(seconds) if surely_time else None

@@ -42,7 +42,7 @@ _FIGURES = re.compile(r"[-+]?\d[\d.]*(?:e[-+]?\d+)?")
 
 
 OFF_STATED = 0.015
-"""Share by which the speed may differ from the stated one until that is said; it is stated to 1 %."""
+"""Share by which the speed may differ from the stated one until that is reported; it is stated to 1 %."""
 
 
 def off_stated_speed(seen_rpm: float, stated_rpm: float) -> str:
@@ -50,7 +50,7 @@ def off_stated_speed(seen_rpm: float, stated_rpm: float) -> str:
 
     Args:
         seen_rpm: by harmonics that stand out clearly.
-        stated_rpm: what was said of the machine.
+        stated_rpm: what was stated of the machine.
     """
     off = abs(seen_rpm / stated_rpm) - 1.0
     if abs(off) <= OFF_STATED:

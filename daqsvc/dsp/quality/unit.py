@@ -1,6 +1,6 @@
 """Units of recordings, and whether samples can be in the one that they are said to be in, by their size.
 
-This is asked of recordings only. Live a sensor's unit stands in the machine file, where `daqsvc check` shows
+This is asked of recordings only. Live, a sensor's unit is in the machine file, where `daqsvc check` shows
 what becomes of it, and a machine that stands still is as quiet as one in a wrong unit. What no sensor
 measures in any unit is refused live as well (`beyond_any_unit`), before arithmetic with it overflows.
 """

@@ -29,7 +29,7 @@ WEIGHTS = np.where(HARMONICS < 4, 1.0, 0.5)
 CAP_NATS = 4.0
 """Most that one harmonic counts: a strong line that is not the shaft's must not decide alone."""
 ENVELOPE_WEIGHT = 0.5
-"""What the envelope's lines count against the signal's: those of the bearing stand there, too."""
+"""What the envelope's lines count against the signal's: those of the bearing are there, too."""
 MAINS_HZ = (50.0, 60.0)
 MAINS_BINS = 2.0
 """How far the skirt of a line of the mains reaches."""

@@ -144,7 +144,7 @@ class EdgeFinder:
             return []
         signal = self._sign * np.where(np.isfinite(samples), samples, np.nan)
         before = np.concatenate(([self._last], signal[:-1])) if len(signal) else signal
-        # +1 past the threshold, -1 back past the hysteresis, 0 says nothing: carry the last word on.
+        # +1 past the threshold, -1 back past the hysteresis, 0 shows nothing: carry the last word on.
         word = (signal >= self._threshold).astype(np.int8) - (signal < self._rearm).astype(np.int8)
         spoken = np.flatnonzero(word)
         previous = np.concatenate(([-1 if self._armed else 1], word[spoken]))

@@ -217,7 +217,7 @@ def _fit_line(z: Complexes, valid: NDArray[np.bool_], lowest: float, highest: fl
         if leverage == 0.0:
             return None
         step = float(np.sum(slope.conj() * residual).real) / leverage
-        # Half the width of the line at most: beyond, the slope says nothing.
+        # Half the width of the line at most: beyond, the slope shows nothing.
         frequency += min(max(step, -0.5 / n), 0.5 / n)
         if abs(step) * n < 1e-9:
             break

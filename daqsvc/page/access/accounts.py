@@ -53,7 +53,7 @@ class Account(NamedTuple):
     Attributes:
         name: its name.
         role: what it may do.
-        line: as it stands in the file; another one if anything of it is another.
+        line: as it is in the file; a different one if any part of it differs.
     """
 
     name: str
@@ -70,7 +70,7 @@ class Account(NamedTuple):
 
 
 class AccountsFile:
-    """The accounts in a file, as they stand there at any moment.
+    """The accounts in a file, as they are there at any moment.
 
     Args:
         path: the file.

@@ -14,7 +14,7 @@ class Person(NamedTuple):
     """Who asks.
 
     Attributes:
-        name: by which it stands in the audit log.
+        name: under which it is in the audit log.
         role: what this person may do.
         session: what the tokens of this person's forms are bound to.
         can_sign_out: whether the page has signed this person in.

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
 OTHERS = {"commands", "home_assistant", "sparkplug", "live", "telemetry_expiry_s"}
-"""What the table says of a box may stand there, so that a machine file will do; it is not examined."""
+"""What the table states of a box may be there, so that a machine file will do; it is not examined."""
 
 
 class PlantFileError(Exception):

@@ -1,4 +1,4 @@
-"""All views of a machine, in the order in which they stand on the page."""
+"""All views of a machine, in the order in which the page shows them."""
 
 from __future__ import annotations
 

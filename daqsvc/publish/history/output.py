@@ -52,7 +52,7 @@ LEAST_WAITING = 20_000
 EVENTS_AT_ONCE = 500
 LEAST_WAIT_S = 1.0
 OVER_S = 2.0
-"""A second is over so long after it, even if the detector says nothing more."""
+"""A second is over so long after it, even if the detector states nothing more."""
 PAUSE_S = 0.02
 """Between the figures that are packed: there is no hurry, and others have something to do."""
 END_S = 0.5

@@ -265,7 +265,7 @@ def _pick(*keys: str, as_json: bool = False, default: str = "") -> str:
 
 
 def _in_words(alarm: str) -> str:
-    """What an alarm is called where *problem* stands beside it."""
+    """What an alarm is called where *problem* is beside it."""
     for prefix, what in _ABOUT.items():
         if alarm.startswith(prefix):
             return f"{alarm.removeprefix(prefix)} {what}"

@@ -1,6 +1,6 @@
 """What Home Assistant got and stays retained at the broker, remembered over restarts.
 
-A machine that is taken out of the machine file, renamed or told under another prefix would stand there as it
+A machine that is taken out of the machine file, renamed or sent under another prefix would stay there as it
 was last seen, healthy for ever.
 """
 
@@ -93,7 +93,7 @@ class LeftOver(MqttLink):
         """Store what is sent from now on, and what could not be removed; blocks.
 
         Returns:
-            Whether it is written; that it is not is said once.
+            Whether it is written; that it is not is logged once.
         """
         topics = self.now | set(left_over)
         if topics == self._read():

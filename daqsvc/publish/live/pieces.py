@@ -18,7 +18,7 @@ FASTEST = 1
 
 
 class BrokenFeedError(ValueError):
-    """A piece is missing, or is none; the text says so."""
+    """A piece is missing, or is none; the text states it."""
 
 
 class Packer:

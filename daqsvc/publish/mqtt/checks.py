@@ -128,7 +128,7 @@ def _credentials(mqtt: Mqtt) -> Iterator[Finding]:
     keys = [key for key in ("password_file", "password_credential") if getattr(mqtt, key) is not None]
     if not keys:
         return
-    host = mqtt.host  # not usable if the user stands in the url: that has been said, with what to do
+    host = mqtt.host  # not usable if the user is in the url: that was reported, with what to do
     if mqtt.username is None:
         yield Finding(
             ("mqtt", keys[0]),

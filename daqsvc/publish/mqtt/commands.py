@@ -1,7 +1,7 @@
 """Commands from the broker: examined, authorised, carried out by somebody else, answered.
 
 Whoever may publish below ``<box>/<machine>/commands/<verb>`` may ask for that; which verbs are taken at all
-stands in the machine file. So the broker's access list says who, and the box says what.
+is in the machine file. So the broker's access list decides who, and the box what.
 """
 
 from __future__ import annotations

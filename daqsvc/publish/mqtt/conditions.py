@@ -69,7 +69,7 @@ class BrokerCheck:
             if not (name == BROKER and vitals.has_expired):
                 yield self._certificate(name, end_ns - vitals.wall_ns, end_ns)
         if vitals.has_expired:
-            # What it showed when it was last verified says nothing of what it shows now.
+            # The certificate that was last verified need not be the present one.
             sentence = "the broker is refused: its certificate, or one behind it, has expired; renew it there"
             yield Condition(f"{CERTIFICATE}{BROKER}", Level.DANGER, sentence)
         if vitals.connected:

@@ -53,7 +53,7 @@ class MqttLink:
 
 @contract
 class MqttLinkPlugin(OutputPlugin[SettingsT]):
-    """An output whose table stands below ``[mqtt]`` and that speaks over that connection."""
+    """An output whose table is below ``[mqtt]`` and that uses that connection."""
 
     @may_raise(AssemblyError)
     def link(self, settings: SettingsT | None, mqtt: Mqtt, port: OutputPort) -> MqttLink | None:

@@ -127,7 +127,7 @@ FILES = ("password_file", "ca_file", "cert_file", "key_file")
 class Mqtt(Section):
     """The broker that alarms and diagnoses go to.
 
-    A password or key never stands in the machine file, only the name of the file or of the systemd credential
+    A password or key is never in the machine file, only the name of the file or of the systemd credential
     that holds it.
     """
 

@@ -44,7 +44,7 @@ READERS: Mapping[str, Callable[[Path, Budget], Contents]] = {
 
 
 CAN_LOGS = (".blf", ".asc", ".log", ".trc")
-"""How the names of CAN logs end; ``.gz`` may stand behind."""
+"""How the names of CAN logs end; ``.gz`` may follow."""
 
 _LONGEST_REASON = 300
 

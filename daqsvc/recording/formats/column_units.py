@@ -77,7 +77,7 @@ def without_brackets(cell: str) -> str:
 
 
 def is_unit(cell: str) -> bool:
-    """Whether a cell may stand in a row of units: a unit, how a date is written, or nothing."""
+    """Whether a cell may be in a row of units: a unit, how a date is written, or nothing."""
     text = without_brackets(cell)
     return not text or text in _IN_ROWS or _means_unit(text)
 
@@ -100,7 +100,7 @@ def is_surely_unit(cell: str) -> bool:
 def unit_in_name(name: str) -> tuple[str, str]:
     """A name without the unit in brackets behind it, and that unit; empty if there is none.
 
-    Of a column of time the unit may also stand behind ``in`` or ``/``, as in ``Zeit in ms``.
+    Of a column of time the unit may also follow ``in`` or ``/``, as in ``Zeit in ms``.
     """
     if len(name) > LONGEST_TEXT:
         return name, ""

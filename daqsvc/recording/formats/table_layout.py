@@ -225,7 +225,7 @@ def _heading(rows: Sequence[Sequence[str]], first: int, width: int) -> _Heading:
     if len(upper) >= width and not any(map(_is_moment, upper[:width])):
         if _is_units_below(lower, upper[:width]):
             return _Heading(above - 1, above)
-        # What stands below names that tell the time is said of the columns in other words.
+        # What is below names of the time describes the columns in other words.
         if (
             all(upper[:width])
             and any(map(_tells_time, upper[:width]))
@@ -275,7 +275,7 @@ def _tells_time(name: str) -> bool:
 
 
 def _is_moment(cell: str) -> bool:
-    """Whether a cell is a date or a time of the day, as it stands in lines about a measurement."""
+    """Whether a cell is a date or a time of the day, as it is in lines about a measurement."""
     return format_of([cell]) is not None
 
 
@@ -319,7 +319,7 @@ def _sniff(lines: Sequence[str]) -> tuple[str | None, bool]:
 
 
 def _has_decimal_comma(rows: Sequence[Sequence[str]], delimiter: str | None) -> bool:
-    """Whether there is one in a line as long as the last one; whole numbers may stand in some."""
+    """Whether there is one in a line as long as the last one; whole numbers may be in some."""
     return delimiter not in {None, ","} and any(
         "," in cell and is_number(cell, decimal_comma=True)
         for row in rows

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 PCM = 1
 FLOAT = 3
 EXTENSIBLE = 0xFFFE
-"""The format itself stands in the first two bytes of the sub-format's GUID."""
+"""The format itself is in the first two bytes of the sub-format's GUID."""
 SUBFORMAT_AT = 24
 
 ENCODINGS = {PCM: (8, 16, 24, 32), FLOAT: (32, 64)}

@@ -162,7 +162,7 @@ def joined_times(pieces: Sequence[WrittenTimes], form: TimeFormat, length: int) 
     zoned = [piece.zoned for piece in pieces if piece.zoned is not None]
     if len(zoned) < len(pieces):
         return ColumnTimes(times, is_dated)
-    # A zone that some rows name and others do not says nothing of these.
+    # A zone that some rows name and others do not shows nothing of these.
     if (np.concatenate(zoned)[:length] | np.isnat(times)).all():
         times = times - np.concatenate(offsets_ns)[:length].astype("timedelta64[ns]")
     return ColumnTimes(times, is_dated)
