@@ -1,9 +1,9 @@
-"""What is known of a hit beforehand: its spectrum, frames of the residual, and whether these show bursts.
+"""What is known of an impact beforehand: its spectrum, frames of the residual, and whether these show bursts.
 
 A race is named by which side the excess is on, and any excess is on some side: a noisier sensor, a changed
-gain and steady forces look like one race or the other, too. But they are stationary, and hits are not. In
-frames as short as a hit, the energies of stationary Gaussian noise scatter in a known way, whatever its level
-and spectrum. Those of hits scatter more, for some frames hold one and others do not.
+gain and steady forces look like one race or the other, too. But they are stationary, and impacts are not. In
+frames as short as an impact, the energies of stationary Gaussian noise scatter in a known way, whatever its
+level and spectrum. Those of impacts scatter more, for some frames hold one and others do not.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class HealthySpectrum:
 
 
 def power(frequency_hz: Floats, corner_hz: float) -> Floats:
-    """Power spectrum of the dips of a hit in the residual, up to its size.
+    """Power spectrum of the dips of an impact in the residual, up to its size.
 
     Args:
         frequency_hz: float64 ``[n]``.
@@ -144,8 +144,8 @@ def covariance(frames: Complexes) -> Complexes:
 
 
 STEADY = 2.0
-"""Scatter of the energies over that of stationary noise, below which there are no hits. Half a second of it
-has 0.8 to 1.3, a fault at -5 dB 5 and more."""
+"""Scatter of the energies over that of stationary noise, below which there are no impacts. Half a second of
+it has 0.8 to 1.3, a fault at -5 dB 5 and more."""
 _LEAST_FRAMES = 32
 
 

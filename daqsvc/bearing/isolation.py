@@ -1,13 +1,13 @@
-"""Which race, by likelihood: every hit is asked which race explains it better.
+"""Which race, by likelihood: which race explains every impact better.
 
-The residual is cut into frames about as long as one hit. In frame t and line f of its spectrum, the healthy
-machine has the covariance S_0(f); a hit of race i adds a s(f) M_i(f). There a is the size of the hit, s the
-spectrum of a short dip, and M_i the second moment of the race's answer over models that are wrong by the
-stated mismatch. Lines in which the two races look alike to such models then have no weight. The logarithm
-of the likelihood, each race at its best a, gives for each frame a ratio d of inner over outer race in nats,
-of which what noise alone does is taken off. Under a fault of one race all frames that decide are of one
-side; a ball hits the races in turn, and they are of both. So the rule is one of ratio again: that of the
-evidence for the inner race to that for either.
+The residual is cut into frames about as long as one impact. In frame t and line f of its spectrum, the
+healthy machine has the covariance S_0(f); an impact of race i adds a s(f) M_i(f). There a is the size of the
+impact, s the spectrum of a short dip, and M_i the second moment of the race's answer over models that are
+wrong by the stated mismatch. Lines in which the two races look alike to such models then have no weight. The
+logarithm of the likelihood, each race at its best a, gives for each frame a ratio d of inner over outer race
+in nats, of which what noise alone does is taken off. Under a fault of one race all frames that decide are of
+one side; a ball strikes the races in turn, and they are of both. So the rule is one of ratio again: that of
+the evidence for the inner race to that for either.
 
 Against energies of the two components this gains much where the races look nearly alike: the noises of the
 two components are then nearly one, and cancel in d.
@@ -30,15 +30,15 @@ if TYPE_CHECKING:
     from daqsvc.bearing.sliding_mode import Race
 
 FRAME_S = 128 / 48_000
-"""Length of a frame: a hit, and little of the next."""
+"""Length of a frame: an impact, and little of the next."""
 LOWEST_PER_BALL_MODE, LOWEST_TELLING_HZ = 0.2, 600.0
 """Lines below this share of the rolling elements' mode cannot tell the races apart."""
 HIGHEST_PER_NYQUIST = 2.0 / 3.0
 STANDS_OUT_NATS = 4.0
-"""A frame counts as a hit if it is so much likelier with one than without."""
+"""A frame counts as an impact if it is this much likelier with one than without."""
 OF_THE_LARGE = 0.1
-"""And at least by this share of what the large hits are: the ringing after a hit, which a slightly wrong
-model leaves, looks like small hits of the other race."""
+"""And at least by this share of what the large impacts are: the ringing after an impact, which a slightly
+wrong model leaves, looks like small impacts of the other race."""
 DECIDES_NATS = 2.0
 """Taken off the ratio of every frame: noise alone makes frames lean to either side by as much."""
 OUTER_BELOW, INNER_ABOVE = 0.32, 0.93
@@ -60,9 +60,9 @@ class Isolation:
         verdict: the faulty part; ``"ball"`` is also what inner and outer race together look like, and
             ``"inner_or_outer"`` says that the evidence does not decide.
         group: the parts that the evidence leaves possible, the verdict first.
-        inner_nats: evidence of the frames that are likelier to be hits of the inner race.
+        inner_nats: evidence of the frames that are likelier to be impacts of the inner race.
         outer_nats: evidence of the others.
-        hits: frames in which a hit stands out.
+        hits: frames in which an impact stands out.
     """
 
     verdict: Race | Literal["inner_or_outer"]
@@ -178,7 +178,7 @@ class IsolationRule:
         return Isolation(verdict, (verdict, *others), inner, outer, hits)
 
     def _evidence(self, spectra: Complexes) -> tuple[float, float, int]:
-        """Nats for the inner and for the outer race, and the number of hits."""
+        """Nats for the inner and for the outer race, and the number of impacts."""
         if not len(spectra) or not len(self.lines_hz):
             return 0.0, 0.0, 0
         cross = spectra[..., 0].conj() * spectra[..., 1]
@@ -196,7 +196,7 @@ class IsolationRule:
 
 
 def short_lines(rate_hz: float) -> tuple[int, Floats, impact.Mask]:
-    """See `impact.frame_lines`, of frames as long as a hit."""
+    """See `impact.frame_lines`, of frames as long as an impact."""
     return impact.frame_lines(rate_hz, FRAME_S, HIGHEST_PER_NYQUIST)
 
 
@@ -207,7 +207,7 @@ def _lowest_hz(model: BearingModel) -> float:
 def _moments(
     model: BearingModel, frequency_hz: Floats, mismatch: float, rng: np.random.Generator
 ) -> Complexes:
-    """Second moments of what a unit hit of either race looks like, complex128 ``[race, f, 2, 2]``."""
+    """Second moments of what a unit impact of either race looks like, complex128 ``[race, f, 2, 2]``."""
     nominal = np.linalg.inv(model.fault_transfer_by_stiffness(frequency_hz))
     moments = np.zeros((2, len(frequency_hz), 2, 2), dtype=np.complex128)
     figures = asdict(model.parameters)

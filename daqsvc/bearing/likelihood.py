@@ -1,10 +1,10 @@
 """Detection on the total residual: a generalised likelihood ratio after Whittle.
 
 On the healthy machine the residual is a stationary Gaussian process with the covariance S_0(f), learnt from a
-record of it. Hits add their energy: in every line along the direction in which displacements of the races
+record of it. Impacts add their energy: in every line along the direction in which displacements of the races
 stand out best against S_0, with the spectrum s(f) of a short dip, and of unknown size a. Let e(t, f) be the
 whitened energy of frame t in that direction, 1 on average on the healthy machine, and l(f) the ratio of s to
-the noise there. A frame that holds a hit is then likelier by
+the noise there. A frame that holds an impact is then likelier by
 
     L(t, a) = sum over f of  e a l / (1 + a l) - ln(1 + a l)
 
@@ -13,7 +13,7 @@ their own pace. With p the share of frames that do, the logarithm of the likelih
 
     max over a of  sum over t of  ln(1 - p + p exp L(t, a))
 
-Where hits come in bursts it is larger than that of the mean energy, and in steady noise it is not. The
+Where impacts come in bursts it is larger than that of the mean energy, and in steady noise it is not. The
 limit is the quantile at the stated rate of false alarms, by a seeded simulation of Gaussian frames that are
 compared with a healthy machine learnt from as many frames as this one.
 """
@@ -40,7 +40,7 @@ FRAME_S = 384 / 48_000
 HIGHEST_PER_NYQUIST = 0.85
 LEAST_FRAMES = 24
 STRUCK = 0.3
-"""Share of the frames that hold a hit, if there are any."""
+"""Share of the frames that hold an impact, if there are any."""
 DRAWN_FRAMES = 200_000
 """In all the windows that the limit is simulated with."""
 _TAIL = 0.05
@@ -49,7 +49,7 @@ _EXACT_FRAMES, _PER_OCTAVE = 256, 16
 """Longer windows share a limit with those that are at most a sixteenth of an octave longer."""
 _FRAMES_AT_A_TIME = 128
 _COUNTS = 1e-3
-"""Lines in which hits show less against the noise than by this share of the best decide nothing."""
+"""Lines in which impacts show less against the noise than by this share of the best decide nothing."""
 _SIZES = 10.0 ** np.arange(-3.0, 3.0, 0.25)
 _LARGEST_NATS = 500.0
 _BEFORE = 3.0 - math.sqrt(8.0)

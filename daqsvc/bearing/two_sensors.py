@@ -30,12 +30,12 @@ class TwoSensorFinding:
     """What a window says.
 
     Attributes:
-        verdict: ``"normal"`` if nothing is detected, ``"changed"`` if what is detected does not come in hits,
-            else that of the isolation.
+        verdict: ``"normal"`` if nothing is detected, ``"changed"`` if what is detected does not come in
+            impacts, else that of the isolation.
         group: parts that cannot be told apart, the verdict among them unless it is ``"inner_or_outer"``.
         detection: of a change in the total residual.
         bursts: how much more the energy scatters than that of steady noise; NaN if nothing is detected.
-        isolation: which race, by the likelihood of its hits; None if there are none.
+        isolation: which race, by the likelihood of its impacts; None if there are none.
         energies: of the sliding units.
         ratio_db: of those energies, see `RatioRule.ratio_db`; NaN if nothing is detected.
         units: which race that ratio says, for corroboration; None if nothing is detected.

@@ -72,7 +72,7 @@ def levels(samples: NDArray[np.float32]) -> SignalLevels:
 def kurtosis(samples: NDArray[np.float32]) -> float:
     """Fourth standardised moment of the samples that are there: 3 of Gaussian noise, 1.5 of a sine.
 
-    A bearing that knocks raises it long before the RMS (Dyer and Stewart 1978). It is no excess: 3 is not
+    A bearing with impacts raises it long before the RMS (Dyer and Stewart 1978). It is no excess: 3 is not
     taken off.
 
     Args:

@@ -89,8 +89,8 @@ class Scales:
 
     Args:
         square: view of the squared envelope.
-        log: view of its logarithm. What fools the one does not fool the other: a few hard knocks are nothing
-            to the logarithm, a faint steady modulation nothing to the square.
+        log: view of its logarithm. What fools the one does not fool the other: a few strong transients are
+            nothing to the logarithm, a faint steady modulation nothing to the square.
         bearing: fault orders.
         shaft: rate of the shaft.
         revolutions: of the shaft in the record.
@@ -396,7 +396,7 @@ def _passed(part: Part, e: PartEvidence, rules: RaceRules, ease: float = 1.0) ->
     depth_limit = rules.ball_depth_limit if part == "ball" else rules.depth_limit
     least = min(e.z / e.z_limit, e.depth / depth_limit, e.severity / (ease * e.limit))
     if e.steadiness_limit > 0.0:
-        # Squared: between knocks and strikes this ratio spans far less than the others do.
+        # Squared: between transients and strikes this ratio spans far less than the others do.
         least = min(least, (e.steadiness / e.steadiness_limit) ** 2)
     return max(0.0, least)
 

@@ -38,7 +38,7 @@ class PartEvidence:
             included.
         depth: size: root sum of squares of the modulation indices of its lines in the whitened envelope.
         steadiness: depth in the logarithm of the envelope over depth in its square: small if a few hard
-            knocks make the lines, as a rub or a loose part does, and not strike after strike.
+            transients make the lines, as a rub or a loose part does, and not strike after strike.
         severity: ``z * depth``, what the rule weighs parts by.
         z_limit: the significance from which the part may be named.
         steadiness_limit: the steadiness from which a race may be named; 0 for a ball.
@@ -167,8 +167,8 @@ class RaceRules:
         depth_limit: least size of a race's lines.
         ball_depth_limit: least size of a ball's lines.
         steadiness_limit: least steadiness of a race's lines.
-        steady_z: significance in 75 revolutions that many strikes reach and some knocks do not; beyond it the
-            limit of steadiness falls in proportion.
+        steady_z: significance in 75 revolutions that many strikes reach and some transients do not; beyond it
+            the limit of steadiness falls in proportion.
         ball_weight: what a ball's severity counts against a race's.
         group_factor: parts whose weights are within this factor cannot be told apart.
         both_factor: factor by which two parts must pass their limits, each by lines that the other does not

@@ -30,11 +30,11 @@ class Direction:
 
     Attributes:
         detected: whether the residual is not the healthy machine's.
-        group: parts that the evidence leaves possible, the likeliest first; empty if there are no hits.
+        group: parts that the evidence leaves possible, the likeliest first; empty if there are no impacts.
         change_nats: logarithm of the likelihood ratio of a fault.
         limit_nats: from which it is detected.
-        inner_nats: evidence of the hits that are the inner race's.
-        outer_nats: evidence of the hits that are the outer race's.
+        inner_nats: evidence of the impacts that are the inner race's.
+        outer_nats: evidence of the impacts that are the outer race's.
         bursts: how much more the energy scatters than that of steady noise; NaN if nothing was suspected.
         ratio_db: energy of the inner race's displacement over the outer race's by the sliding units; NaN if
             neither stands out.

@@ -106,9 +106,9 @@ def thresholds_of(evaluated: Evaluation, where: str) -> dict[str, float]:
 
 
 def evidence_of(evaluated: Evaluation, where: str) -> dict[str, float]:
-    """Log-likelihood ratio of each part in nats: of its lines against noise, or of its hits if that is more.
+    """Log-likelihood ratio of each part in nats: of its lines against noise, or, if more, of its impacts.
 
-    A ball's hits are those of both races: the fewer of them are evidence for it.
+    A ball's impacts are those of both races: the fewer of them are evidence for it.
     """
     if where not in evaluated.races:
         return {}

@@ -6,8 +6,8 @@ two accelerometers, where a bearing has them.
 
 Lines and direction join so. Lines that stand out name a part by themselves. The direction settles which race
 if they leave it open, and contradicts them if it is sure of the other race: the verdict is then
-``inner_or_outer``. Where no lines stand out the direction names the part that is hit, or leaves it open; if
-nothing is hit, for the change is steady, the machine has ``changed``.
+``inner_or_outer``. Where no lines stand out the direction names the part that is struck, or leaves it open;
+if nothing is struck, for the change is steady, the machine has ``changed``.
 
 It takes several evaluations to confirm a fault, and more to withdraw it.
 """

@@ -1,7 +1,7 @@
 """Whether the channel of an accelerometer is fit for the tests of a bearing; put right where that is honest.
 
-Missing samples and drop-outs are bridged, wrong samples and steps taken out, knocks faded out, a wandering
-mean followed. Each repair is said, with its place. A channel without defects comes back as it is.
+Missing samples and drop-outs are bridged, wrong samples and steps taken out, transients faded out, a
+wandering mean followed. Each repair is said, with its place. A channel without defects comes back as it is.
 """
 
 from __future__ import annotations
@@ -162,7 +162,7 @@ def _interpolated(x: Real, good: NDArray[np.bool_]) -> Real:
 
 
 PASSES = 4
-"""A loud knock hides what is wrong beside it."""
+"""A loud transient hides what is wrong beside it."""
 WANDERING_DEVIATIONS = 1.0
 """Range of the mean of single revolutions over the deviation within them, from which on it is followed."""
 MOST_BLANKED = 0.2

@@ -1,4 +1,4 @@
-"""Outliers of an accelerometer's channel: single wrong samples, steps, and knocks from outside.
+"""Outliers of an accelerometer's channel: single wrong samples, steps, and transients from outside.
 
 The tests of a bearing give every frequency of their band one voice. An event that is small beside the
 vibration as a whole can yet be louder than all of the bands where the machine is quiet, and then its phases
@@ -8,7 +8,7 @@ that no single event bends (`Prewhitening`).
 No housing moves from one sample to the next as a wrong sample does: it, and a step of the supply, have a
 shape of their own in the whitened channel, which is known exactly. What has that shape and nothing else is
 estimated by least squares and subtracted (`despiked`); a strike in the bearing rings on and does not have it.
-A knock is much louder than anything that the machine does every revolution (`find_transients`).
+A transient is much louder than anything that the machine does every revolution (`find_transients`).
 """
 
 from __future__ import annotations
@@ -102,7 +102,8 @@ ROUNDS = 12
 """One event can hide another."""
 REST_SHARE = 0.06
 """What is left of an event over what the shape explains, at most; strikes of measured bearings leave 0.57 and
-more. What is in doubt is a knock, if it is loud: less of the channel is left then, and nothing invented."""
+more. What is in doubt is a transient, if it is loud: less of the channel is left then, and nothing
+invented."""
 LOOKED_AT = 1 / 4
 """How far around an event its rest is looked for, as a share of the kernel's half."""
 NORMAL_SQUARE_MEDIAN = 0.455
@@ -253,7 +254,7 @@ class _Shapes:
 
 
 LOUD_DEVIATIONS, LOUD_FACTOR = 15.0, 4.0
-"""An event is a knock beyond so many deviations and so many times what the machine shows by itself ..."""
+"""An event is a transient beyond this many deviations and this many times what the machine itself shows ..."""
 DOMINANT_DEVIATIONS, DOMINANT_FACTOR = 8.0, 2.5
 DOMINANT_SHARE = 0.25
 """... or beyond these, if so much of the fourth power of the whole channel is its alone: the noise of the
@@ -261,17 +262,17 @@ squared envelope's spectrum comes of it then."""
 USUAL_QUANTILE = 0.75
 """What the machine shows by itself: a quarter of all revolutions show as much or more."""
 RUNG_DOWN = 1.5
-"""Level over the machine's own loudest down to which a knock rings."""
+"""Level over the machine's own loudest down to which a transient rings."""
 LEVEL_S = 2e-3
 EVENT_S = 5e-3
 TAPER_S = 1e-3
 
 
 def find_transients(signal: Real, rate_hz: float, revolution: int) -> list[Stretch]:
-    """Where somebody knocks.
+    """Where transients from outside are.
 
     Strikes of a damaged bearing, and rubs, come back in every revolution or every few of them: they set the
-    level that a knock is compared with.
+    level that a transient is compared with.
 
     Args:
         signal: ``[n]``, without mean, of about unit deviation between its events.
