@@ -254,7 +254,7 @@ class _Shapes:
 
 
 LOUD_DEVIATIONS, LOUD_FACTOR = 15.0, 4.0
-"""An event is a transient beyond this many deviations and this many times what the machine itself shows ..."""
+"""An event is a transient beyond this many deviations and this many times what the machine shows ..."""
 DOMINANT_DEVIATIONS, DOMINANT_FACTOR = 8.0, 2.5
 DOMINANT_SHARE = 0.25
 """... or beyond these, if so much of the fourth power of the whole channel is its alone: the noise of the
