@@ -114,7 +114,12 @@ def table_name(text: str, otherwise: str) -> str:
 
 
 def sensor_lines(
-    stream: str, channels: Mapping[str, str], taken: set[str], rate_hz: float = math.inf
+    stream: str,
+    channels: Mapping[str, str],
+    taken: set[str],
+    rate_hz: float = math.inf,
+    *,
+    by_stream: bool = False,
 ) -> list[str]:
     """A table ``[[sensors]]`` for each channel of a stream, of the type that its unit is usual for.
 
@@ -123,8 +128,10 @@ def sensor_lines(
         channels: the unit of each channel; ``1`` where none is known.
         taken: names of sensors that there are; the new ones are added.
         rate_hz: samples per second; of a velocity, below `WAVEFORM_HZ`, they are levels, no vibration.
+        by_stream: whether a sensor is named after its stream, too, as others have channels of the same names.
     """
     lines: list[str] = []
+    before = f"{stream}-" if by_stream else ""
     for channel, text in channels.items():
         known = unit_of(text)
         unit = text.strip() if known is None else known.name
@@ -138,7 +145,7 @@ def sensor_lines(
         lines += [
             "",
             "[[sensors]]",
-            f"name = {quoted(unused(table_name(channel.lower(), 'sensor'), taken))}",
+            f"name = {quoted(unused(table_name(f'{before}{channel.lower()}', 'sensor'), taken))}",
             f"type = {quoted(kind)}",
             f"stream = {quoted(stream)}",
             f"channel = {quoted(channel)}",

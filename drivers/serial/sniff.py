@@ -45,6 +45,7 @@ _SHOWN_LINES = 8
 _SHOWN_ROWS = 8
 _ROW = 16
 _WIDEST = 100
+_PER_S = {"s": 1.0, "ms": 1e3, "us": 1e6}
 _WHOLE = 0.995
 """Share of the bytes in frames from which on the rest is not worth a word."""
 BY_ID = Path("/dev/serial/by-id")
@@ -276,6 +277,14 @@ class _Report(NamedTuple):
             per_frame = what.bytes_per_frame
         return max(heard.received - per_frame, 0) / per_frame / seconds or None
 
+    def _sampling_hz(self, what: TextLines) -> float | None:
+        """Lines of one kind a second by the device's own clock, where it sends one, else as they came."""
+        column = self._time(what)
+        unit = None if column is None else self._time_unit(what, column)
+        if column is None or unit is None:
+            return self._rate_hz(what)
+        return _PER_S[unit] / column.per_line
+
     def _share(self, what: TextLines) -> float:
         """How many of the lines are of one kind."""
         from drivers.serial.recognise_lines import TextLines  # noqa: PLC0415 - only for who listens
@@ -383,7 +392,7 @@ class _Report(NamedTuple):
         rate_hz = self._rate_hz(what)
         if rate_hz is None:
             return None
-        for unit, per_s in (("s", 1.0), ("ms", 1e3), ("us", 1e6)):
+        for unit, per_s in _PER_S.items():
             if 0.8 < column.per_line * rate_hz / per_s < 1.25:
                 return unit
         return None
@@ -425,7 +434,7 @@ class _Report(NamedTuple):
             "score": round(self.best.found.score, 3),
             "tried": [{"baud": one.baud, "score": round(one.found.score, 3)} for one in self.tried],
             "first_bytes": heard.data[: _ROW * _SHOWN_ROWS].hex(),
-            "rate_hz": self._rate_hz(what),
+            "rate_hz": self._sampling_hz(what) if isinstance(what, TextLines) else self._rate_hz(what),
             "framing": None,
         }
         if isinstance(what, TextLines):
@@ -504,7 +513,7 @@ class _Report(NamedTuple):
     def _stream(self, what: TextLines, bus: str, stream: str, sensors: set[str]) -> Iterator[str]:
         counter, time_column = _counter(what), self._time(what)
         numbers = [one for one in what.columns if one.numeric and one not in {counter, time_column}]
-        place, rate_hz = counter or time_column, self._rate_hz(what)
+        place, rate_hz = counter or time_column, self._sampling_hz(what)
         if place is None or not numbers or rate_hz is None:
             if what.prefix:
                 yield f"# Lines that begin with {what.prefix}:"
@@ -532,7 +541,8 @@ class _Report(NamedTuple):
             unit = self._time_unit(what, place)
             yield f'time = {{ column = {quoted(names[place])}, unit = "{unit}" }}'
         yield f"channels = [{', '.join(f'{{ name = {quoted(names[one])} }}' for one in numbers)}]"
-        yield from sensor_lines(stream, {names[one]: "1" for one in numbers}, sensors)
+        channels = {names[one]: "1" for one in numbers}
+        yield from sensor_lines(stream, channels, sensors, by_stream=bool(what.prefix) and stream != "lines")
 
     def _frames_tables(self, what: BinaryFrames, bus: str) -> Iterator[str]:
         yield f"framing = {quoted(what.framing)}"

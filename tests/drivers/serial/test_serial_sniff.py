@@ -151,10 +151,21 @@ def test_two_machines_on_one_port_are_two_kinds_of_lines(
     streams = check(tmp_path, found["machine_file"], capsys)["streams"]
     assert {name: one["layout"]["prefix"] for name, one in streams.items()} == {"k1": "K1", "k2": "K2"}
     assert [len(streams[name]["layout"]["channels"]) for name in ("k1", "k2")] == [2, 1]
+    sensors = tomllib.loads(found["machine_file"])["sensors"]
+    assert {one["name"] for one in sensors} == {"k1-c2", "k1-c3", "k2-c2"}
     rates = [one["rate_hz"] for one in streams.values()]
     assert max(rates) < 1.1 * min(rates)
     assert new_layout["prefix"] in {"K1", "K2"}
     assert "come, too. The file reads one kind of line" in heard
+
+
+def test_the_rate_is_that_of_the_clock_of_the_device_where_it_sends_one() -> None:
+    data = b"".join(b"%d;1.5\n" % (251 * number) for number in range(40))
+    # Few lines in little time: by their arrival the rate is 4 % off.
+    heard = sniff.Heard(data, len(data), 0.0, 10.2, 0)
+    found = sniff._Report("ttyUSB0", [], sniff.Tried(9600, "none", heard, recognised(data)), True).sniffed()
+    assert found.figures["rate_hz"] == pytest.approx(1000 / 251, rel=1e-6)
+    assert tomllib.loads(found.fragment)["streams"]["lines"]["rate_hz"] == pytest.approx(3.98)
 
 
 def test_words_for_no_number_are_no_kinds_of_lines() -> None:
