@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import json
 import re
 import signal
@@ -13,70 +12,19 @@ import time
 import can
 import numpy as np
 import pytest
-from support.orbit_files import RATE_HZ, SPEED_RPM, UNBALANCE, Orbit
-from support.paths import ROOT
+from support.orbit_files import RATE_HZ, UNBALANCE, Orbit
+from support.orbit_logs import EPOCH_S, frames, machine_file, signals, write
 
-from daqsvc.settings import load_machine_file
-from drivers.can.plugin import frame_layout
 from sim_hw.bus_socket import UnixBus
 from sim_hw.bus_socket_hub import Hub
 
 pytestmark = pytest.mark.integration
-CONFIG = ROOT / "config" / "machines"
-EPOCH_S = 1_700_000_000.0
 ENDINGS = [".blf", ".asc", ".log", ".log.gz"]
-
-
-def machine_file(path, name="rotor-synchronous.toml", rate_hz=RATE_HZ):
-    """An example machine that turns as the orbits do."""
-    text = (CONFIG / name).read_text()
-    for key, value in {"speed_rpm": SPEED_RPM, "natural_frequency_hz": 60.0, "clearance_um": 200.0}.items():
-        text = re.sub(rf"^{key} = [\d.]+", f"{key} = {value}", text, flags=re.MULTILINE)
-    text = re.sub(r"^rate_hz = 1600.0", f"rate_hz = {rate_hz}", text, flags=re.MULTILINE)
-    path.write_text(text)
-    return path
 
 
 @pytest.fixture
 def machine(tmp_path):
     return machine_file(tmp_path / "machine.toml")
-
-
-def frames(machine, stream, samples, delay_s=0.0, channel=None, first=0):
-    """The frames that carry samples in the units of the sensors; and the samples as they carry them."""
-    layout = frame_layout(load_machine_file(machine), stream)
-    rate_hz = load_machine_file(machine).streams[stream].rate_hz
-    n = layout.samples_per_frame
-    blocks = samples[: len(samples) // n * n].reshape(-1, n, samples.shape[1]).astype(np.float32)
-    counters = (first + np.arange(len(blocks)) * n) % 2**16
-    payloads = layout.encode(counters, blocks)
-    sent = [
-        can.Message(
-            timestamp=EPOCH_S + delay_s + (first + (k + 1) * n) / rate_hz,
-            arbitration_id=layout.frame_id,
-            is_extended_id=False,
-            is_fd=True,
-            channel=channel,
-            data=payload.tobytes(),
-        )
-        for k, payload in enumerate(payloads)
-    ]
-    return sent, layout.decode(payloads).samples.reshape(-1, samples.shape[1]).astype(float)
-
-
-def write(path, messages):
-    plain = path.with_suffix("") if path.suffix == ".gz" else path
-    with can.Logger(plain) as logger:
-        for message in messages:
-            logger.on_message_received(message)
-    if plain != path:
-        path.write_bytes(gzip.compress(plain.read_bytes()))
-        plain.unlink()
-    return path
-
-
-def signals(orbit):
-    return np.column_stack([orbit.x, orbit.y, orbit.keyphasor])
 
 
 def save_table(path, samples):
