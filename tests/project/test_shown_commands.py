@@ -9,63 +9,56 @@ import contextlib
 import os
 import pty
 import re
-import shlex
 import shutil
 import signal
+import ssl
 import subprocess
 import sys
 import tempfile
 import time
+import urllib.request
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
-import numpy as np
 import pytest
-from offline.test_analyze_can_logs import frames, machine_file, signals, write
 from project.test_quoted_messages import texts
 from project.test_quoted_messages import words as words_of
-from project.test_snippets import ALL, simple
-from scipy.io import savemat
-from support.bearing_signals import INNER, RATE_HZ, healthy, knocks
-from support.fleet_archives import add_machine, add_recordings
-from support.machine_files import MACHINES
-from support.orbit_files import Orbit
+from support.page_folder import ACCOUNTS, CALIBRATED_LIVE, HEALTHY_PUMP, copy, fill
 from support.paths import ROOT
 from support.ports import free_port
-from support.run_ups import RATE_HZ as RUN_UP_HZ
-from support.run_ups import record
-from support.waiting import PATIENCE_S
+from support.shown_devices import READY
+from support.shown_lines import Shown, shown_lines
+from support.shown_output import differs, shape
+from support.sim_processes import process
+from support.waiting import PATIENCE_S, eventually_blocking
 
-from sim_hw.plants import rotor as plant
+from daqsvc.acquisition.samples import SampleBlock
+from daqsvc.confined.limits import ResourceLimits
+from daqsvc.snapshots.reading import read_snapshot
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping, Sequence
 
-pytestmark = [pytest.mark.integration, pytest.mark.long]
+pytestmark = [pytest.mark.integration, pytest.mark.long, pytest.mark.timeout(1200)]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": f"{ROOT}", "COLUMNS": "80"}
-SOCKET = "control.sock"
-GOES_ON = {"run": SOCKET, "page": "Ctrl-C ends it", "sim": "", "record": "", "status --watch": "BUS"}
-"""Verbs that go on until Ctrl-C: what they show first; "" for those that are stopped two seconds after."""
-TYPED = {"new": "\n", "account": "a long password\n"}
-"""Verbs that ask, and what is typed each time."""
-NOT_HERE = {
-    "daqsvc calibrate run-up.npz steady.npz ": "needs both of one machine: tests/offline/test_calibrate.py",
-    "daqsvc analyze monday.npz --probes x,y --keyphasor kph --calibration ": "needs that calibration",
-    "daqsvc export 2026": "needs a snapshot: tests/offline/test_export.py",
-    "daqsvc replay 2026": "needs a snapshot: tests/snapshots/test_as_recording.py",
-    "daqsvc page --snapshot ": "needs snapshots: tests/page/test_snapshots_page.py",
-    "daqsvc page ": "goes on: tests/page/test_page_server.py, docs/tutorials",
-    "daqsvc calibrate machine.toml --live": "needs a healthy machine: tests/offline/test_calibrate.py",
-    "daqsvc calibrate MACHINE.toml --live": "needs a healthy machine: tests/offline/test_calibrate.py",
-    "daqsvc new --listen": "needs a device: tests/commands/test_new_kinds.py",
-    "daqsvc sniff serial ": "needs a port: tests/drivers/serial/test_serial_sniff.py",
-    "daqsvc sniff modbus ": "needs a device at port 502: tests/drivers/modbus/test_modbus_sniff.py",
-    "daqsvc page pump.toml --listen ": "needs that address, and a certificate: tests/page/test_access.py",
-    "daqsvc sniff can ": "SocketCAN, of the kernel: tests/hil/test_vcan_sniff.py",
+AT = re.compile(r"https?://[^;\s]+")
+SAYS = {"page": "Ctrl-C ends it", "sim": "playing", "status --watch": "BUS"}
+"""Verbs that go on until Ctrl-C, and what they say when they have begun."""
+MAKES = {"run": "control.sock", "record": "run-up.blf"}
+"""Others, and what they then have made."""
+TYPED = {
+    "new": {},
+    "new --listen": {"What do the samples come over?": "serial", "Which serial port?": "/dev/ttyUSB0"},
+    "account": {"": "a long password"},
 }
-"""How lines begin that cannot be run, and why; all else is run."""
+"""Verbs that ask, and what is typed, by words of the question; Enter alone for all others."""
+MOST_QUESTIONS = 60
+NOT_HERE = {
+    "daqsvc sniff can ": "tests/hil/test_vcan_shown.py::test_what_docs_sniff_shows_of_can_runs",
+}
+"""How lines begin that need what this computer may not have, and the test that runs them where it is."""
 STANDS_FOR = {
-    "/etc/daqsvc/page.accounts": "page.accounts",
+    f"/etc/daqsvc/{ACCOUNTS}": ACCOUNTS,
     "/etc/daqsvc": "etc",
     "/archive-results": "archive-results",
     "/archive": "archive",
@@ -78,6 +71,8 @@ STANDS_FOR = {
 IN_PLACE = [
     ("README.md", "monday/*.csv", {"monday/*.csv": "monday/table.csv"}),
     ("README.md", "bearing.toml", {"monday.npz": "healthy.npz"}),
+    # The lines below it go on with the file of the line before.
+    ("README.md", "--live", {"machine.toml": CALIBRATED_LIVE, "pump.toml": "live.toml"}),
     ("docs/analyze.md", "DE_time", {"RECORDING...": "105.mat"}),
     ("docs/analyze.md", "de,fe", {"RECORDING...": "105.npz"}),
     (
@@ -90,7 +85,7 @@ IN_PLACE = [
     ("docs/calibration.md", "healthy.npz", {"MACHINE.toml": "bearing.toml"}),
     ("docs/calibration.md", "monday.npz", {"MACHINE.toml": "bearing.toml", "monday.npz": "healthy.npz"}),
     ("docs/calibration.md", "--probes", {"RECORDING...": "run-up.npz"}),
-    ("docs/calibration.md", "--live", {"MACHINE.toml": "machine.toml"}),
+    ("docs/calibration.md", "--live", {"MACHINE.toml": CALIBRATED_LIVE, "FILE": "live.toml"}),
     ("docs/calibration.md", "", {"MACHINE.toml": "orbit.toml", "RECORDING...": "run-up.blf"}),
     ("docs/export.md", "blf", {"machine.toml": "orbit.toml"}),
     ("docs/order-change.md", "", {"TODAY.csv": "axes.npz", "HEALTHY.csv": "axes.npz"}),
@@ -98,235 +93,102 @@ IN_PLACE = [
     ("", "", {"RECORDING...": "run.npz", "MACHINE.toml": "machine.toml", "FILE": "out.toml"}),
 ]
 """By page and a part of the line: files that are there under another name."""
-SHARED_BUS = "/tmp/daqsvc-can0"  # noqa: S108 - as it is in the file
-RIG = (MACHINES / "virtual-rig.toml").read_text("utf-8")
+SHOWN = shown_lines()
+LIVE = {"status", "alarms", "ack", "reset", "reload", "snapshot", "trend", "record"}
+BY_WORDS = {"status", "alarms", "trend", "reload"}
+"""Verbs whose tables depend on the hour: of these, words are compared, and titles of columns."""
 
 
-def machine(home: Path, name: str, bus: str) -> str:
-    """The rig of the virtual bus, with a name and a bus of its own, and no broker."""
-    text = RIG[: RIG.index("[mqtt]")].replace("virtual-rig", name).replace(SHARED_BUS, f"{home}/{bus}")
-    return text.replace("can0]", f"{bus}]").replace('bus = "can0"', f'bus = "{bus}"')
+def is_live(one: Shown) -> bool:
+    """Whether a line needs a service that runs, or what it has recorded."""
+    of_service = one.words[0] == "page" and "--plant" not in one.words
+    return one.words[0] in LIVE or of_service or any("alarm.mcap" in word for word in one.words)
 
 
-MORE = """
-[store]
-directory = "{home}/store"
-
-[recorder]
-before_s = 2.0
-after_s = 1.0
-
-[history]
-"""
+def pages(lines: Sequence[Shown]) -> list[str]:
+    return [*dict.fromkeys(one.page for one in lines)]
 
 
 @pytest.fixture(scope="module")
 def home() -> Iterator[Path]:
-    """A folder with machine files and recordings under the names that the pages give them."""
+    """A folder with all that the lines name; each test has a copy beside it."""
     made = Path(tempfile.mkdtemp(prefix="pages-"))  # a short path, as sockets lie in it
-    (made / "config").symlink_to(ROOT / "config")
-    plant_files = made / "etc/plant"
-    plant_files.mkdir(parents=True)
-    pump = machine(made, "pump", "can0") + MORE.format(home=made)
-    for name in ("machine.toml", "pump.toml", "etc/plant/pump.toml", "etc/pump.toml"):
-        (made / name).write_text(pump)
-    for name in ("fan.toml", "etc/plant/fan.toml"):
-        (made / name).write_text(machine(made, "fan", "can1"))
-    (made / "broken.toml").write_text(
-        re.sub(
-            "(?m)^damping_ratio = 0.18", 'damping_ratio = "lots"', (MACHINES / "laval-rig.toml").read_text()
-        )
-    )
-    (made / "plant.toml").write_text(f'[mqtt]\nurl = "mqtt://127.0.0.1:{free_port()}"\ninsecure = true\n')
-    _recordings(made)
-    yield made
+    (made / "all").mkdir()
+    fill(made / "all")
+    yield made / "all"
     shutil.rmtree(made)
 
 
-def _recordings(made: Path) -> None:
-    changed = [plant.Change(70.0, plant.PlantParameters(damping_ratio=0.10))]
-    motion = plant.simulate(plant.PlantParameters(), changed, revolutions=140.0, samples_per_rev=64.0)
-    x, y = motion.in_um(100.0)
-    np.savez(made / "run.npz", x=x, y=y, fs=5111.0 / 60.0 * 64.0)
-    up, angle = record(noise_um=0.5)
-    kph = plant.keyphasor_voltage(angle / (2.0 * np.pi))
-    for name in ("run-up", "monday"):
-        np.savez(made / f"{name}.npz", x=up[:, 0], y=up[:, 1], kph=kph, fs=RUN_UP_HZ)
-    good, other = healthy(10.0, 1), healthy(10.0, 4)
-    bad = healthy(10.0, 2) + knocks(10.0, INNER, 3)
-    for number in ("105", "130"):
-        savemat(made / f"{number}.mat", {f"X{number}_DE_time": bad})
-    savemat(made / "97.mat", {"X097_DE_time": good})
-    np.savez(made / "105.npz", de=bad, fe=other, fs=RATE_HZ)
-    np.savez(
-        made / "healthy.npz", **{"accel-de": good, "accel-fe": other, "de": good, "fe": other}, fs=RATE_HZ
-    )
-    t = np.arange(40_000) / 20_000.0
-    axes = {
-        name: size * np.sin(2 * np.pi * 30.0 * t) + np.random.default_rng(size).normal(0, 0.1, len(t))
-        for name, size in zip("XYZ", (1, 2, 3), strict=True)
-    }
-    np.savez(made / "axes.npz", **axes, fs=20_000.0)
-    still, angle = record(noise_um=0.5, speeds_hz=(50.0, 50.0))
-    kph = plant.keyphasor_voltage(angle / (2.0 * np.pi))
-    np.savez(made / "steady.npz", x=still[:, 0], y=still[:, 1], kph=kph, fs=RUN_UP_HZ)
-    orbit(made)
-    archive(made)
-    t = np.arange(3000) / 640.0
-    turns = np.column_stack(
-        [
-            10 * np.cos(2 * np.pi * 10 * t),
-            10 * np.sin(2 * np.pi * 10 * t) - 10.0,
-            plant.keyphasor_voltage(10 * t),
-        ]
-    )
-    np.savetxt(
-        made / "monday" / "table.csv",
-        np.column_stack([t, turns]),
-        delimiter=",",
-        header="time (s),ch1,ch2,ch3",
-        comments="",
-    )
-    bearing = (MACHINES / "bearing.toml").read_text("utf-8")
-    (made / "bearing.toml").write_text(re.sub("rate_hz = 25[_]?600.0", "rate_hz = 12000.0", bearing))
+@pytest.mark.parametrize("page", pages([one for one in SHOWN if not is_live(one)]))
+def test_what_a_page_shows_runs(page: str, home: Path) -> None:
+    """One line after the other, as some need what one before has made."""
+    folder = home.with_name(re.sub(r"\W", "-", page))
+    copy(home, folder)
+    lines = [one for one in SHOWN if one.page == page and not is_live(one)]
+    assert not (found := complaints(lines, folder)), "\n".join(found)
 
 
-def orbit(made: Path) -> None:
-    """A machine file, and a CAN log of its bus."""
-    file = machine_file(made / "orbit.toml")
-    sent, _ = frames(file, "shaft", signals(Orbit(300)), channel="can0")
-    write(made / "run-up.blf", sent)
-    (made / "monday").mkdir()
-    write(made / "monday" / "can0.blf", sent)
-
-
-def archive(made: Path) -> None:
-    """An archive of a fleet of one machine."""
-    recordings = add_machine(made / "archive", "pump-1")
-    add_recordings(recordings, 3, changed_from=2)
-    (made / "faults.csv").write_text("machine,fault,first,last\npump-1,unbalance,2026-03-03,2026-03-03\n")
-
-
-@pytest.fixture(scope="module")
-def service(home: Path) -> Iterator[Path]:
-    """The one service of all pages, with two machines, and what its sensors send."""
-    assert run(["check", "etc/plant"], home).returncode == 0
+def test_what_is_shown_of_a_service_runs(home: Path) -> None:
+    """In one test, so that one service runs, whatever tests run beside: two machines, and their sensors."""
+    folder = home.with_name("service")
+    copy(home, folder)
+    assert run(["check", "etc/plant"], folder).returncode == 0
     with contextlib.ExitStack() as running:
         for words in (
             ["run", "etc/plant"],
             ["sim", "etc/plant/pump.toml", "--duration", "900"],
             ["sim", "etc/plant/fan.toml", "--scenario", "healthy", "--duration", "900"],
         ):
-            running.enter_context(process(words, home))
+            running.enter_context(beside(words, folder))
         until = time.monotonic() + 3 * PATIENCE_S
-        while (said := run(["alarms", "pump.toml"], home)) and "rotor-fault" not in said.stdout:
+        while (said := run(["alarms", "pump.toml"], folder)) and "rotor-fault" not in said.stdout:
             assert time.monotonic() < until, said
             time.sleep(1.0)
-        yield home
+        found = complaints([one for one in SHOWN if is_live(one)], folder)
+    assert not found, "\n".join(found)
 
 
-@contextlib.contextmanager
-def process(words: list[str], folder: Path) -> Iterator[subprocess.Popen[str]]:
-    """A command that goes on; it is killed at the end if it has not ended."""
-    running = subprocess.Popen(
-        [sys.executable, "-m", "daqsvc", *words],
-        cwd=folder, env=ENVIRONMENT, text=True, stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-    )  # fmt: skip
-    try:
-        yield running
-    finally:
-        if running.poll() is None:
-            running.kill()
-        running.communicate()
+def test_lines_that_are_not_run_here_are_run_there() -> None:
+    for begin, place in NOT_HERE.items():
+        file, _, name = place.partition("::")
+        assert [one for one in SHOWN if one.line.startswith(begin)], begin
+        assert f"\ndef {name}(" in (ROOT / file).read_text("utf-8")
 
 
-def in_terminal(words: list[str], folder: Path, typed: str) -> tuple[int, str]:
-    """A command that asks; what is typed is there from the start."""
-    leader, follower = pty.openpty()
-    running = subprocess.Popen(
-        [sys.executable, "-m", "daqsvc", *words],
-        cwd=folder, env=ENVIRONMENT, stdin=follower, stdout=follower, stderr=follower, start_new_session=True,
-    )  # fmt: skip
-    os.close(follower)
-    output = b""
-    while True:
-        try:
-            output += (part := os.read(leader, 65_536))
-        except OSError:
-            break
-        if part.rstrip().endswith((b":", b"]:", b"more:")) or b"Once more" in part:
-            os.write(leader, typed.encode())
-    os.close(leader)
-    return running.wait(PATIENCE_S), output.decode()
+def complaints(lines: Sequence[Shown], folder: Path) -> list[str]:
+    """What is wrong with lines, run one after the other."""
+    return [
+        f"{one.page}: {one.line}: {wrong}"
+        for one in lines
+        if not one.line.startswith(tuple(NOT_HERE)) and (wrong := complaint(one, folder))
+    ]
 
 
-def run(words: list[str], folder: Path, typed: str = "") -> subprocess.CompletedProcess[str]:
-    """A command that ends by itself."""
-    return subprocess.run(
-        [sys.executable, "-m", "daqsvc", *words],
-        cwd=folder, env=ENVIRONMENT, text=True, input=typed, check=False, timeout=PATIENCE_S,
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-    )  # fmt: skip
-
-
-class Shown(NamedTuple):
-    """A line that a page shows, and what is below it.
-
-    Attributes:
-        page: the page, from the root of the repository.
-        words: the command, without ``daqsvc``.
-        output: what is shown as its output; None if nothing is.
-    """
-
-    page: str
-    words: list[str]
-    output: str | None
-
-    @property
-    def line(self) -> str:
-        return shlex.join(["daqsvc", *self.words])
-
-
-def ours(page: str, command: str, output: str | None) -> Iterator[Shown]:
-    for one in simple(command):
-        rest = one[1:] if one[0] == "sudo" else one
-        if rest[0].rpartition("/")[2] == "daqsvc":
-            yield Shown(page, rest[1:], output)
-
-
-def shown() -> Iterator[Shown]:
-    """All lines, in the order of the pages."""
-    for number, block in enumerate(ALL):
-        page = f"{block.page.relative_to(ROOT)}"
-        if page == "docs/reference/verbs.md" or block.language not in {"sh", ""}:
-            continue
-        if block.language == "sh":
-            below = ALL[number + 1] if number + 1 < len(ALL) else block
-            is_output = below.page == block.page and below.language == "" and not below.commands
-            for place, command in enumerate(block.commands):
-                follows = is_output and place == 0 and below.line - block.line < 14
-                yield from ours(page, command, below.text if follows else None)
-        elif block.text.startswith("daqsvc "):
-            yield from ours(page, block.text.strip(), None)
-        else:
-            for part in re.split(r"(?m)^\$ ", block.text)[1:]:
-                command, _, output = part.partition("\n")
-                yield from ours(page, re.sub(r"\s+#\s.*", "", command), output)
-
-
-SHOWN = list(shown())
-LIVE = {"status", "alarms", "ack", "reset", "reload", "snapshot", "trend"}
-
-
-def is_live(one: Shown) -> bool:
-    return (
-        one.words[0] in LIVE
-        or "--live" in one.words
-        or one.words[0] == "record"
-        or (one.words[0] == "page" and "--plant" not in one.words)
-        or any("alarm.mcap" in word for word in one.words)
-    )
+def complaint(one: Shown, folder: Path) -> str:
+    """What is wrong with a line, as it runs; "" if nothing is."""
+    words = arranged(one)
+    if one.output and "lots" in one.output:
+        words = ["check", "broken.toml"]
+    if "--out" in words:
+        (folder / words[words.index("--out") + 1]).unlink(missing_ok=True)
+    if words[0] == "run":
+        shutil.rmtree(folder / "store", ignore_errors=True)
+    with surroundings(one, folder) as instead:
+        code, output = done([put_in(word, instead) for word in words], folder, instead)
+    for place, what in instead.items():
+        output = output.replace(what, place) if place.startswith("/") else output
+    output = output.replace("broken.toml", "machine.toml").replace(f"{folder}/store", "/var/lib/daqsvc/pump")
+    if "nothing to acknowledge" in output and one.page == "docs/several-machines.md":
+        return ""  # README has acknowledged it before
+    if code != (2 if "broken.toml" in words else "refused" in (one.output or "")):
+        return f"exit code {code}: {output}"
+    if words == ["new", "--listen"] and "Found, and proposed below" not in output:
+        return f"it has not heard the device: {output}"
+    if one.output is None or "--json" in words:
+        return ""
+    if one.words[0] in BY_WORDS:
+        return differs_in_words(one.output, output)
+    return differs(one.output, output)
 
 
 def arranged(one: Shown) -> list[str]:
@@ -340,105 +202,190 @@ def there(one: Shown, word: str) -> str:
     for page, part, names in IN_PLACE:
         if page in one.page and part in one.line and word in names:
             return names[word]
-    for place, instead in STANDS_FOR.items():
+    return put_in(word, STANDS_FOR)
+
+
+def put_in(word: str, instead: Mapping[str, str]) -> str:
+    """A word with what stands for its begin."""
+    for place, what in instead.items():
         if word.startswith(place):
-            return instead + word.removeprefix(place)
+            return what + word.removeprefix(place)
     return word
 
 
-@pytest.mark.parametrize(
-    "one", [one for one in SHOWN if not is_live(one)], ids=lambda one: f"{one.page} {one.line}"
-)
-def test_what_is_shown_runs(one: Shown, home: Path) -> None:
-    if reason := not_here(one):
-        pytest.skip(reason)
-    folder = of_page(home, one.page)
-    assert complaint(one, arranged(one), folder) == ""
+@contextlib.contextmanager
+def surroundings(one: Shown, folder: Path) -> Iterator[dict[str, str]]:
+    """What a line needs besides files, for as long as it runs; and by words of the line, what is there."""
+    verb = one.words[0]
+    with contextlib.ExitStack() as running:
+        if verb == "new":
+            shutil.rmtree(folder / "new", ignore_errors=True)
+            (folder / "new").mkdir()  # it would ask whether to write over a file
+        if verb == "sniff" or "--listen" in one.words[:2]:
+            link, port = folder / "new/ttyUSB0" if verb == "new" else folder / "ttyUSB0", free_port()
+            running.enter_context(devices(link, port))
+            yield {"/dev/ttyUSB0": f"{link}", "192.0.2.10": f"127.0.0.1:{port}"}
+        elif "--live" in one.words:
+            sim = running.enter_context(beside(["sim", CALIBRATED_LIVE, "--scenario", HEALTHY_PUMP], folder))
+            until_line(sim, "playing")
+            yield {}
+        elif "alarm.mcap" in one.line:
+            yield {next(word for word in one.words if "alarm.mcap" in word): f"{snapshot(folder)}"}
+        else:
+            yield {}
 
 
-@pytest.mark.timeout(1200)
-def test_what_is_shown_of_a_service_runs(service: Path) -> None:
-    """In one test, so that one service runs, whatever tests run beside."""
-    complaints = [
-        f"{one.page}: {one.line}: {wrong}"
-        for one in filter(is_live, SHOWN)
-        if not not_here(one) and (wrong := complaint(one, arranged(one), service))
-    ]
-    assert complaints == []
+@contextlib.contextmanager
+def devices(link: Path, port: int) -> Iterator[None]:
+    """A serial device behind a link, and a Modbus server at a port."""
+    command = [sys.executable, "-m", "support.shown_devices", f"{link}", f"{port}"]
+    environment = {**ENVIRONMENT, "PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"}
+    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as running:
+        assert running.stdout is not None
+        try:
+            assert running.stdout.readline().strip() == READY
+            yield
+        finally:
+            running.kill()
 
 
-def not_here(one: Shown) -> str:
-    """Why a line cannot be run; "" if it can."""
-    return next((why for begin, why in NOT_HERE.items() if one.line.startswith(begin)), "")
+def snapshot(folder: Path) -> Path:
+    """A snapshot around an alarm, as soon as one is finished; beside it one by another name."""
+    made: list[Path] = []
+
+    def there_is_one() -> bool:
+        made[:] = filter(has_samples, (folder / "store").rglob("*-alarm.mcap"))
+        return bool(made)
+
+    eventually_blocking(there_is_one, "there is a snapshot with samples")
+    shutil.copy(made[0], folder / "healthy.mcap")
+    return made[0]
 
 
-def complaint(one: Shown, words: list[str], folder: Path) -> str:
-    """What is wrong with a line, as it runs; "" if nothing is."""
-    if one.output and "lots" in one.output:
-        words = ["check", "broken.toml"]
-    if "--out" in words:
-        (folder / words[words.index("--out") + 1]).unlink(missing_ok=True)
-    if words[0] == "run":
-        shutil.rmtree(folder / "store", ignore_errors=True)
-    verb = "status --watch" if "--watch" in words else words[0]
+def has_samples(file: Path) -> bool:
+    """Whether a snapshot is finished, and not of an alarm from before the first sample."""
+    if not file.read_bytes().endswith(b"\x89MCAP0\r\n"):
+        return False
+    return any(isinstance(entry.what, SampleBlock) for entry in read_snapshot(file, ResourceLimits()).entries)
+
+
+def done(words: list[str], folder: Path, instead: Mapping[str, str]) -> tuple[int, str]:
+    """The exit code of a command, and what it has shown; one that goes on is ended by Ctrl-C."""
+    option = next((option for option in ("--watch", "--listen") if option in words), "")
+    verb = f"{words[0]} {option}" if f"{words[0]} {option}" in {*TYPED, *SAYS} else words[0]
     if verb in TYPED:
-        code, output = in_terminal(words, folder, TYPED[verb])
-    elif verb in GOES_ON:
-        code, output = until_shown(words, folder, GOES_ON[verb])
+        typed = {question: put_in(answer, instead) for question, answer in TYPED[verb].items()}
+        return in_terminal(words, folder / "new" if words[0] == "new" else folder, typed)
+    if verb == "page":
+        return page(words, folder)
+    if verb in SAYS or verb in MAKES:
+        return goes_on(words, folder, verb)
+    ended = run(words, folder)
+    return ended.returncode, ended.stdout
+
+
+def run(words: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
+    """A command that ends by itself."""
+    return subprocess.run(
+        [sys.executable, "-m", "daqsvc", *words],
+        cwd=folder, env=ENVIRONMENT, text=True, check=False, timeout=PATIENCE_S,
+        stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+    )  # fmt: skip
+
+
+def beside(words: list[str], folder: Path) -> contextlib.AbstractContextManager[subprocess.Popen[str]]:
+    """A command that goes on; what it says on stderr is with the rest."""
+    return process(*words, cwd=folder, env=ENVIRONMENT, stdin=subprocess.DEVNULL, stderr=subprocess.STDOUT)
+
+
+def until_line(running: subprocess.Popen[str], text: str) -> str:
+    """All that a command shows, up to the line with a text, or up to its end."""
+    assert running.stdout is not None
+    output = ""
+    while line := running.stdout.readline():
+        output += line
+        if text in line:
+            break
+    return output
+
+
+def interrupted(running: subprocess.Popen[str], output: str) -> tuple[int, str]:
+    """Press Ctrl-C; returns the exit code, and all that came."""
+    if running.poll() is None:
+        running.send_signal(signal.SIGINT)
+    rest, _ = running.communicate(timeout=PATIENCE_S)
+    return running.returncode, output + rest
+
+
+def goes_on(words: list[str], folder: Path, verb: str) -> tuple[int, str]:
+    """Start a command that goes on, and press Ctrl-C when it has begun."""
+    with beside(words, folder) as running:
+        if verb in SAYS:
+            return interrupted(running, until_line(running, SAYS[verb]))
+
+        def has_begun() -> bool:
+            made = [file for file in folder.rglob(MAKES[verb]) if file.is_socket() or file.stat().st_size]
+            return bool(made) or running.poll() is not None
+
+        eventually_blocking(has_begun, f"{verb} has made {MAKES[verb]}")
+        return interrupted(running, "")
+
+
+def page(words: list[str], folder: Path) -> tuple[int, str]:
+    """Start the page at a free port, open it, and press Ctrl-C."""
+    port = f"{free_port()}"
+    if "--listen" in words:
+        words = [word.replace("192.0.2.7:8420", f"127.0.0.1:{port}") for word in words]
     else:
-        done = run(words, folder)
-        code, output = done.returncode, done.stdout
-    if "nothing to acknowledge" in output and one.page == "docs/several-machines.md":
-        return ""  # README has acknowledged it before
-    if code != (2 if "broken.toml" in words else "refused" in (one.output or "")):
-        return f"exit code {code}: {output}"
-    if one.output is None or "--json" in words:
-        return ""
-    output = output.replace("broken.toml", "machine.toml")
-    return differs(one.output, output, by_words=one.words[0] in BY_WORDS)
+        words = [*words, "--port", port]
+    with beside(words, folder) as running:
+        output = until_line(running, SAYS["page"])
+        if (at := AT.search(output)) is not None:
+            assert ("/sign-in" in opened(at[0], folder / "box7.pem")) == ("--accounts" in words)
+        return interrupted(running, output)
 
 
-BY_WORDS = {"status", "alarms", "trend", "reload"}
-"""Verbs whose tables depend on the hour: of these, words are compared, and titles of columns."""
+def opened(address: str, certificate: Path) -> str:
+    """The address of what a browser gets at one; it trusts a certificate."""
+    trust = ssl.create_default_context(cafile=certificate) if address.startswith("https:") else None
+    asked = urllib.request.Request(address, headers={"Accept": "text/html"})  # noqa: S310 - of HTTP
+    with urllib.request.urlopen(asked, timeout=PATIENCE_S, context=trust) as answer:  # noqa: S310
+        assert "</html>" in answer.read().decode()
+        return str(answer.url)
 
 
-def shape(line: str) -> str:
-    """A line with every figure alike."""
-    line = re.sub(r"(?<![A-Za-z])[-+]?\d[\d,.]*(?:e[-+]?\d+)?", "#", line.strip())
-    return re.sub(r"\s+", " ", line)
+def in_terminal(words: list[str], folder: Path, typed: Mapping[str, str]) -> tuple[int, str]:
+    """A command that asks."""
+    leader, follower = pty.openpty()
+    running = subprocess.Popen(
+        [sys.executable, "-m", "daqsvc", *words],
+        cwd=folder, env=ENVIRONMENT, stdin=follower, stdout=follower, stderr=follower, start_new_session=True,
+    )  # fmt: skip
+    os.close(follower)
+    shown = [""]
+    while len(shown) < MOST_QUESTIONS:
+        try:
+            shown[-1] += os.read(leader, 65_536).decode()
+        except OSError:  # it has ended
+            break
+        if shown[-1].endswith(": "):
+            answer = next((answer for question, answer in typed.items() if question in shown[-1]), "")
+            os.write(leader, f"{answer}\n".encode())
+            shown.append("")
+    os.close(leader)
+    return running.wait(PATIENCE_S), "".join(shown)
 
 
-def differs(shown: str, output: str, *, by_words: bool) -> str:
-    """The first that a page shows and that did not come; "" if all did."""
-    if by_words:
-        said = {word for text, _ in texts() for word in text} | set(words_of(output))
-        for line in shown.splitlines():
-            if (
-                line.isupper()
-                and "#" not in shape(line)
-                and shape(line) not in map(shape, output.splitlines())
-            ):
-                return line
-        return next(
-            (word for word in words_of(shown) if re.fullmatch("[a-z]{4,}", word) and word not in said), ""
-        )
-    expected = [shape(line) for line in shown.splitlines() if line.strip()]
-    came = [shape(line) for line in output.splitlines() if line.strip()]
-    for begin in range(len(came)):
-        at, missing = begin, ""
-        for number, line in enumerate(expected):
-            if line == "...":
-                continue
-            if number and expected[number - 1] == "...":
-                while at < len(came) and came[at] != line:
-                    at += 1
-            if at >= len(came) or not re.fullmatch(re.escape(line).replace(r"\.\.\.", ".*"), came[at]):
-                missing = line
-                break
-            at += 1
-        if not missing:
-            return ""
-    return f"{shown!r} is not in {output!r}"
+def differs_in_words(shown: str, output: str) -> str:
+    """The first word or row of titles that is shown, and neither came nor is in the source; "" if all are."""
+    said = {word for text, _ in texts() for word in text} | set(words_of(output))
+    came = {shape(line) for line in output.splitlines()}
+    for line in map(shape, shown.splitlines()):
+        if line.isupper() and "#" not in line and line not in came:
+            return line
+    return next(
+        (word for word in words_of(shown) if re.fullmatch("[a-z]{4,}", word) and word not in said), ""
+    )
 
 
 @pytest.mark.parametrize(
@@ -450,50 +397,4 @@ def differs(shown: str, output: str, *, by_words: bool) -> str:
     ],
 )
 def test_other_output_than_shown_is_found(shown: str, output: str, *, same: bool) -> None:
-    assert (differs(shown, output, by_words=False) == "") is same
-
-
-def of_page(home: Path, page: str) -> Path:
-    """A folder with all that there is, for the lines of one page."""
-    folder = home / re.sub(r"\W", "-", page)
-    if not folder.exists():
-        folder.mkdir()
-        for file in home.iterdir():
-            if file.suffix == ".toml":
-                (folder / file.name).write_text(file.read_text().replace(f"{home}/", f"{folder}/"))
-            elif file.suffix in {".npz", ".mat", ".blf", ".csv", ".mcap"} or file.name in {
-                "config",
-                "archive",
-                "monday",
-            }:
-                (folder / file.name).symlink_to(file)
-        (folder / "etc").mkdir()
-        (folder / "etc/plant").mkdir()
-        for name in ("pump", "fan"):
-            shutil.copy(folder / f"{name}.toml", folder / "etc/plant")
-    return folder
-
-
-def until_shown(words: list[str], folder: Path, text: str) -> tuple[int, str]:
-    """Start a command that goes on, and press Ctrl-C; returns the exit code, and what it showed."""
-    with process(words, folder) as running:
-        assert running.stdout is not None
-        output = ""
-        if text == SOCKET:
-            until = time.monotonic() + PATIENCE_S
-            while running.poll() is None and not list(folder.rglob(text)):
-                assert time.monotonic() < until
-                time.sleep(0.2)
-        elif not text:
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                running.wait(2.0)
-        else:
-            while line := running.stdout.readline():
-                output += line
-                if text in line:
-                    break
-            time.sleep(1.0)  # what it shows may be there a little before it takes signals
-        if running.poll() is None:
-            running.send_signal(signal.SIGINT)
-        rest, _ = running.communicate(timeout=PATIENCE_S)
-        return running.returncode, output + rest
+    assert (differs(shown, output) == "") is same

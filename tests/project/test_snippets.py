@@ -18,31 +18,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jsonschema
-import numpy as np
 import pytest
-from scipy.io import savemat
-from support.bearing_signals import INNER, RATE_HZ, healthy, knocks
+from support.bearing_signals import healthy
 from support.machine_files import MACHINES
+from support.page_folder import fill
 from support.paths import ROOT
-from support.run_ups import RATE_HZ as RUN_UP_HZ
-from support.run_ups import record
-from support.snippets import PAGES, Snippet, completed, snippets
+from support.snippets import Snippet, completed, documented, simple
 
-from daqsvc.cli import _chosen, commands, main, parser
+from daqsvc.cli import _chosen, commands, parser
 from daqsvc.settings import MachineFileError
 from daqsvc.settings.load import machine_file_of
-from sim_hw.plants import rotor as plant
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
 pytestmark = pytest.mark.integration
-ALL = [
-    snippet
-    for page in PAGES
-    if not page.is_relative_to(ROOT / "docs" / "tutorials")
-    for snippet in snippets(page)
-]
+ALL = documented()
 EXAMPLES = {path.read_text("utf-8").strip() for path in (ROOT / "docs").glob("example_*/*") if path.is_file()}
 """Files that pages show; their own tests install and run them."""
 TESTED = {
@@ -59,8 +50,6 @@ REMARKS = {"", "text", "{include}"}
 """What a terminal shows, of which the commands are checked; and what only the site reads."""
 ELSEWHERE = {"sql", "yaml"}
 """Languages of other programs."""
-RUNNING = {"analyze", "calibrate", "check", "detectability", "example", "export"}
-"""Verbs that end by themselves and need no service; of these all lines run whose files `folder` has."""
 PROGRAMS = {
     *("daqsvc", "make", "pip", "python", "python3", "python3.11", "git"),
     *("apt", "apt-get", "systemctl", "systemd-sysusers", "ip", "candump", "mosquitto_sub", "psql", "dask"),
@@ -138,27 +127,7 @@ def test_json_is_what_its_schema_says(snippet: Snippet) -> None:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Recordings and machine files under the names that the pages give them."""
     made = tmp_path_factory.mktemp("snippets")
-    (made / "config").symlink_to(ROOT / "config")
-    changed = [plant.Change(70.0, plant.PlantParameters(damping_ratio=0.10))]
-    motion = plant.simulate(plant.PlantParameters(), changed, revolutions=140.0, samples_per_rev=64.0)
-    x, y = motion.in_um(100.0)
-    np.savez(made / "run.npz", x=x, y=y, fs=5111.0 / 60.0 * 64.0)
-    up, angle = record(noise_um=0.5)
-    np.savez(
-        made / "run-up.npz", x=up[:, 0], y=up[:, 1], kph=plant.keyphasor_voltage(angle / (2.0 * np.pi)),
-        fs=RUN_UP_HZ,
-    )  # fmt: skip
-    good = healthy(10.0, 1)
-    bad = healthy(10.0, 2) + knocks(10.0, INNER, 3)
-    for number in ("105", "130"):
-        savemat(made / f"{number}.mat", {f"X{number}_DE_time": bad})
-    np.savez(made / "105.npz", de=bad, fs=RATE_HZ)
-    np.savez(made / "healthy.npz", **{"accel-de": good, "accel-fe": healthy(10.0, 4)}, fs=RATE_HZ)
-    for name in ("machine", "pump"):
-        (made / f"{name}.toml").write_text((MACHINES / "laval-rig.toml").read_text("utf-8"))
-    # A second machine of the same box: on another interface, and [mqtt] and [store] stand in the first file.
-    text = (MACHINES / "bearing.toml").read_text("utf-8").replace("edge-3", "edge-1").replace("can0", "can1")
-    (made / "fan.toml").write_text(re.sub(r"(?ms)^\[(?:mqtt|store)\]$.*?(?=^\[|\Z)", "", text))
+    fill(made)
     return made
 
 
@@ -179,22 +148,6 @@ def test_python_runs(snippet: Snippet, folder: Path, monkeypatch: pytest.MonkeyP
     file.write_text(snippet.text)
     # What the text of a page says that there is.
     runpy.run_path(f"{file}", init_globals={"samples": healthy(10.0, 2, rate_hz=25_600.0)})
-
-
-def simple(command: str) -> Iterator[list[str]]:
-    """The simple commands of a line, each as its words, without redirection and variables that are set."""
-    lexer = shlex.shlex(command, posix=True, punctuation_chars="();<>|&")
-    lexer.whitespace_split = True
-    words: list[str] = []
-    for word in [*lexer, ";"]:
-        if set(word) <= set("();|&"):
-            while words and re.match(r"\w+=", words[0]):
-                del words[0]
-            if words:
-                yield words
-            words = []
-        else:
-            words.append(word)
 
 
 def shown(language: str) -> Iterator[tuple[str, list[str]]]:
@@ -236,38 +189,3 @@ def test_targets_of_make_and_files_of_the_repository_are_there() -> None:
         # In a value of ARGS, too.
         for path in re.findall(r"(?:^|[ =])((?:config|tests|requirements)[\w./@-]+)", " ".join(words)):
             assert (ROOT / path).exists(), (name, path)
-
-
-def can_run(words: list[str], folder: Path) -> bool:
-    """Whether a line is one for `folder`: it names files that are there, and nothing of another computer."""
-    if words[0] not in RUNNING or any(word.startswith("/") or "://" in word for word in words):
-        return False
-    if any(word.endswith("...") or word in {"FILE", "MACHINE.toml"} for word in words):
-        return False
-    before = ["", *words]
-    files = [
-        word
-        for option, word in zip(before, words, strict=False)
-        if re.search(r"\.\w{2,5}$|/$", word) and option not in {"--out", "--to", "--plot"} and "=" not in word
-    ]
-    no_files = words[0] == "example" or files
-    return bool(no_files) and all((folder / file).exists() for file in files) and "--live" not in words
-
-
-@pytest.mark.long
-def test_lines_that_can_run_do(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(folder)
-    ran = []
-    for name, words in OURS:
-        line = chosen(words)
-        if not can_run(line, folder):
-            continue
-        if line[0] == "example" and "--out" in line:
-            (folder / line[-1]).unlink(missing_ok=True)  # it writes over nothing
-        with contextlib.suppress(SystemExit):  # after --schema
-            code = main(line)
-            assert code == 0, (name, shlex.join(line), capsys.readouterr().err)
-        ran.append(line[0])
-    assert set(ran) == RUNNING

@@ -56,14 +56,11 @@ rate_hz = 400.0
 
 
 @contextlib.contextmanager
-def process(verb: str, *arguments: object) -> Iterator[subprocess.Popen[str]]:
-    """A ``daqsvc`` that is ended with the test, however that ends."""
-    running = subprocess.Popen(
-        [sys.executable, "-m", "daqsvc", verb, *map(str, arguments)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+def process(verb: str, *arguments: object, **options: Any) -> Iterator[subprocess.Popen[str]]:
+    """A ``daqsvc`` that is ended with the test, however that ends; ``options`` are those of `Popen`."""
+    piped = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    command = [sys.executable, "-m", "daqsvc", verb, *map(str, arguments)]
+    running: subprocess.Popen[str] = subprocess.Popen(command, **(piped | options))
     try:
         yield running
     finally:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 import re
+import shlex
 import textwrap
 from collections import Counter
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from support.paths import ROOT
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
     from pathlib import Path
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -71,6 +72,28 @@ def snippets(page: Path) -> list[Snippet]:
         )
         for block in _BLOCK.finditer(text)
     ]
+
+
+def documented() -> list[Snippet]:
+    """The blocks of all pages but docs/tutorials, which has a reader of its own."""
+    tutorials = ROOT / "docs" / "tutorials"
+    return [one for page in PAGES if not page.is_relative_to(tutorials) for one in snippets(page)]
+
+
+def simple(command: str) -> Iterator[list[str]]:
+    """The simple commands of a line, each as its words, without redirection and variables that are set."""
+    lexer = shlex.shlex(command, posix=True, punctuation_chars="();<>|&")
+    lexer.whitespace_split = True
+    words: list[str] = []
+    for word in [*lexer, ";"]:
+        if set(word) <= set("();|&"):
+            while words and re.match(r"\w+=", words[0]):
+                del words[0]
+            if words:
+                yield words
+            words = []
+        else:
+            words.append(word)
 
 
 def completed(machine: Mapping[str, Any], part: Mapping[str, Any]) -> dict[str, Any]:
