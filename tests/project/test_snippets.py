@@ -21,8 +21,9 @@ import jsonschema
 import pytest
 from support.bearing_signals import healthy
 from support.machine_files import MACHINES
-from support.page_folder import fill
+from support.page_folder import SHARED_BUS, fill
 from support.paths import ROOT
+from support.sim_processes import process
 from support.snippets import Snippet, completed, documented, simple
 
 from daqsvc.cli import _chosen, commands, parser
@@ -142,12 +143,21 @@ def test_python_is_whole(snippet: Snippet) -> None:
     [one for one in ALL if one.language == "python" and not one.why_not_run],
     ids=lambda one: one.name,
 )
-def test_python_runs(snippet: Snippet, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_python_runs(
+    snippet: Snippet, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.chdir(folder)
+    text = snippet.text.replace(SHARED_BUS, f"{folder}/can0")
     file = folder / "snippet.py"
-    file.write_text(snippet.text)
-    # What the text of a page says that there is.
-    runpy.run_path(f"{file}", init_globals={"samples": healthy(10.0, 2, rate_hz=25_600.0)})
+    file.write_text(text)
+    with contextlib.ExitStack() as running:
+        if text != snippet.text:
+            sim = running.enter_context(process("sim", "machine.toml", "--scenario", "healthy"))
+            assert sim.stderr is not None
+            assert "playing" in sim.stderr.readline()
+        # What the text of a page says that there is.
+        runpy.run_path(f"{file}", init_globals={"samples": healthy(10.0, 2, rate_hz=25_600.0)})
+    assert capsys.readouterr().out != "None\n", "no frame has come"
 
 
 def shown(language: str) -> Iterator[tuple[str, list[str]]]:

@@ -28,11 +28,12 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 ACCOUNTS = "page.accounts"
+SHARED_BUS = "/tmp/daqsvc-can0"  # noqa: S108 - as it is in the file
+"""The virtual bus of the pages; the folder has one of its own."""
 CALIBRATED_LIVE = "feed-pump.toml"
 """A machine that is calibrated while it runs."""
 HEALTHY_PUMP = "healthy-pump.toml"
 """The scenario of that machine."""
-_SHARED_BUS = "/tmp/daqsvc-can0"  # noqa: S108 - as it is in the file
 _RIG = (MACHINES / "virtual-rig.toml").read_text("utf-8")
 _MORE = """
 [store]
@@ -104,7 +105,7 @@ def _machine_files(made: Path) -> None:
 
 def _rig(home: Path, name: str, bus: str) -> str:
     """The rig of the virtual bus, with a name and a bus of its own, and no broker."""
-    text = _RIG[: _RIG.index("[mqtt]")].replace("virtual-rig", name).replace(_SHARED_BUS, f"{home}/{bus}")
+    text = _RIG[: _RIG.index("[mqtt]")].replace("virtual-rig", name).replace(SHARED_BUS, f"{home}/{bus}")
     return text.replace("can0]", f"{bus}]").replace('bus = "can0"', f'bus = "{bus}"')
 
 
