@@ -16,8 +16,10 @@ from support.example_packages import DETECTOR, DOCS, DRIVER, installed, lines_of
 from support.live_service import running, watch_of
 from support.machine_files import problems_of
 from support.machine_mutations import toml
+from support.snippets import snippets
 from support.waiting import eventually
 
+from daqsvc.api import Device
 from daqsvc.settings import describe, load_machine_file, parse_machine_file, registry
 from daqsvc.settings.packing import PackedLayout
 from drivers.make import stream_layout
@@ -133,6 +135,18 @@ def test_a_second_stream_is_too_much_for_it() -> None:
     assert "buses.logger: has several streams. Remedy: give it exactly one" in str(
         problems_of(both, MACHINE)[0]
     )
+
+
+def test_a_device_as_the_page_shows_it_belongs_to_one_bus_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    [part] = [one for one in snippets(DOCS / "write-a-driver.md") if one.why_not_run]
+    made: dict[str, Any] = {"Device": Device}
+    exec(part.text, made)  # noqa: S102 - of our own page
+    monkeypatch.setattr("tcp_frames.LoggerBus.device", made["device"])
+    other = MACHINE.read_text().partition("[buses.logger]")[2].partition("[streams")[0]
+    text = f"{MACHINE.read_text()}\n[buses.other]{other}"
+    [problem] = problems_of(text, MACHINE)
+    assert problem.key == "buses.other.tcp_port"
+    assert 'belongs to bus "logger" already. Remedy: give each bus its own port' in str(problem)
 
 
 class _Unfinished(DriverPlugin[Any]):
