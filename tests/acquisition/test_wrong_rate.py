@@ -101,6 +101,7 @@ def test_it_is_over_when_the_device_has_the_rate_again() -> None:
     assert stream.unit.counters.samples_lost == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("hz", [500.0, 2000.0])
 def test_a_device_that_changes_its_rate_while_it_is_watched_is_found_out(hz: float) -> None:
     stream = Stream()

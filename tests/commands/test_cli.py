@@ -144,6 +144,7 @@ def test_the_parts_of_a_stop_add_up_to_what_is_promised() -> None:
     assert process_guard.STOP_TURNS * process_guard.TURN_S + process_guard.CLOSE_S <= PROMISED_S + 1e-9
 
 
+@pytest.mark.long
 def test_run_says_which_device_is_absent_where_that_is_an_error(tmp_path: Path) -> None:
     text = (CONFIG / "laval-rig.toml").read_text()
     text = re.sub(r'^channel = "can0"', 'channel = "no-such-can"\nstart = "error"', text, flags=re.MULTILINE)

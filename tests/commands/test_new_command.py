@@ -106,6 +106,7 @@ def strategy(question: Question) -> st.SearchStrategy[str]:
     return NAMES if topic == "name" and "." in question.key else FREE[topic]
 
 
+@pytest.mark.long
 @settings(
     max_examples=examples(90),
     deadline=None,
@@ -190,6 +191,7 @@ NEEDED_OF = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", grid(), ids=lambda case: " ".join(case.values()))
 def test_without_a_terminal_options_and_defaults_make_a_file_without_warnings(tmp_path, capsys, case):
     file = tmp_path / "m.toml"

@@ -59,6 +59,7 @@ async def test_what_the_start_has_made_is_not_looked_through_for_garbage_again(m
     assert len(reloads) == 1, "SIGHUP is obeyed when the service is ready"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("journal", ["", "1:2"])
 async def test_without_v_a_person_sees_that_it_watches_and_that_samples_come(journal, monkeypatch, tmp_path):
     if journal:

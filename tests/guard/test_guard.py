@@ -97,6 +97,7 @@ def copy(tmp_path):
     return Path(shutil.copytree(FOLDER, tmp_path / "golden"))
 
 
+@pytest.mark.long
 def test_a_changed_key_is_caught_shown_and_taken(copy):
     text = (copy / "schemas.txt").read_text(encoding="utf-8")
     (copy / "schemas.txt").write_text(text.replace('"wall_ns"', '"wall_time_ns"', 1), encoding="utf-8")

@@ -31,6 +31,7 @@ channels = [{ name = "x2", type = "int16", scale = 0.001 }]
 [pipeline.rotor_bank]"""
 
 
+@pytest.mark.long
 def test_a_bank_with_probes_in_two_streams_says_what_it_says_of_one(
     analyze: Callable[..., Any], tmp_path: Path
 ) -> None:

@@ -94,6 +94,7 @@ def test_a_stated_speed_that_the_harmonics_show_to_be_wrong_is_noted(
         assert noted == ([note] if off else [])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("part", ["normal", "inner"])
 def test_what_is_too_long_to_be_judged_at_one_go_is_watched(
     verb: Run, tmp_path: Path, files: dict[str, Path], monkeypatch: pytest.MonkeyPatch, part: str
@@ -422,6 +423,7 @@ def test_what_calibrate_wrote_is_the_healthy_machine(verb: Run, tmp_path: Path) 
     assert "was learnt at 12000 Hz, and the samples to be judged come at 10000 Hz" in found["refused"]
 
 
+@pytest.mark.long
 def test_what_calibrate_wrote_by_options_is_read_by_options(verb: Run, tmp_path: Path) -> None:
     samples = {name: healthy(10.0, seed) for name, seed in (("de", 41), ("fe", 42))}
     loud = {name: x + 0.1 * np.random.default_rng(44).standard_normal(len(x)) for name, x in samples.items()}

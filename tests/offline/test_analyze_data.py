@@ -121,6 +121,7 @@ def with_run_up(path):
     return path
 
 
+@pytest.mark.long
 def test_at_another_speed_the_rotor_of_the_run_up_serves_and_the_baseline_is_learnt(tmp_path):
     path = with_run_up(tmp_path / "both.toml")
     rotor, baselines = load_healthy(path, 2000.0)

@@ -58,6 +58,7 @@ def test_figures_of_a_rotor(analyze, drawn, tmp_path, name):
         assert_whole(figure)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("has_mean", first_of(True, False))
 def test_the_legend_of_innovations_names_lines_that_are_there(analyze, drawn, tmp_path, has_mean):
     orbit = Orbit(400, change=UNBALANCE)

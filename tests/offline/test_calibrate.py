@@ -171,6 +171,7 @@ def test_a_person_reads_what_was_found_and_what_cannot_be_told_apart(tmp_path: P
     assert tomllib.loads(out.read_text())["written"].endswith("Z")
 
 
+@pytest.mark.long
 def test_an_even_sweep_needs_no_keyphasor(tmp_path: Path, capsys) -> None:
     xy, _ = record(5.0)
     recording = save(tmp_path / "up.npz", np.column_stack((xy, xy[:, 0])), RATE_HZ)
@@ -185,6 +186,7 @@ def test_an_even_sweep_needs_no_keyphasor(tmp_path: Path, capsys) -> None:
     assert "1X at 9000 rpm cannot be predicted: the run-up went from" in json.loads(said)["refused"]
 
 
+@pytest.mark.long
 def test_no_speed_is_predicted_for_a_machine_that_is_no_laval_rotor(tmp_path: Path, capsys) -> None:
     samples = with_marks(*record(5.0, stiffness_y=0.8))
     recording = save(tmp_path / "up.npz", samples, RATE_HZ)
@@ -233,6 +235,7 @@ def test_refuses_what_cannot_be_the_healthy_machine(tmp_path: Path, capsys) -> N
     assert "the shaft turns at 1800." in refused(capsys, tmp_path, good, *fixed)
 
 
+@pytest.mark.long
 def test_refuses_two_recordings_of_one_kind(tmp_path: Path, capsys) -> None:
     one, two = (save(tmp_path / f"{i}.npz", steady(30.0), RATE_HZ) for i in range(2))
     code, said, _ = calibrate(capsys, one, two, *OPTIONS, *ROTOR, "--json")

@@ -132,6 +132,7 @@ def test_streams_of_several_rates_are_in_one_file(gapped, tmp_path, capsys, suff
         assert oil.start_ns == pytest.approx(START_NS + 25_000_000, abs=100)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("suffix", [".parquet", ".csv", ".wav"])
 def test_streams_of_several_rates_are_a_file_each(gapped, tmp_path, capsys, suffix):
     snapshot, fast, slow = gapped

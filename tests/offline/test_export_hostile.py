@@ -147,6 +147,7 @@ def test_names_are_made_unique():
 # Begins, rates, names and counts.
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("suffix", SUFFIXES)
 @pytest.mark.parametrize("year", ["9999-12-31", "0001-01-01", "2262-02-01", "1677-12-01"])
 def test_a_begin_of_no_such_year_is_left_out(tmp_path, capsys, suffix, year):
@@ -208,6 +209,7 @@ REFUSED = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("suffix", SUFFIXES)
 @pytest.mark.parametrize("what", WRITTEN)
 def test_what_a_snapshot_may_say_is_written(tmp_path, capsys, monkeypatch, what, suffix):
@@ -227,6 +229,7 @@ def test_what_a_snapshot_may_say_is_written(tmp_path, capsys, monkeypatch, what,
             assert stream.names == ("x", "x_2")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("what", REFUSED)
 def test_what_no_format_can_say_is_refused(tmp_path, capsys, monkeypatch, what):
     source = write_hostile(tmp_path / "in.mcap", REFUSED[what], monkeypatch)

@@ -131,6 +131,7 @@ def test_calibrate_learns_from_it_as_from_its_samples(verb, machine, ending, tmp
     assert json.dumps(of_log).replace(source.name, table.name) == json.dumps(of_table)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("suffix", [".parquet", ".mf4"])
 @pytest.mark.usefixtures("_elsewhere")
 def test_export_writes_its_samples_and_its_begin(machine, recorded, tmp_path, suffix):

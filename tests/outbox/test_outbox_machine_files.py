@@ -114,6 +114,7 @@ def test_a_disk_that_takes_no_note_is_no_fault(tmp_path: Path, caplog: pytest.Lo
     assert "is not written" in caplog.text
 
 
+@pytest.mark.long
 def test_run_refuses_check_and_new_warn_and_the_note_is_made_by_a_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

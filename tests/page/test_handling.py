@@ -187,6 +187,7 @@ async def test_the_operators_address_lets_who_has_it_act(tmp_path: Path) -> None
         assert "operator" in (await client.get("/")).text
 
 
+@pytest.mark.long
 async def test_who_is_removed_hears_no_more(tmp_path: Path) -> None:
     async with handled_rig(tmp_path, "page-removed") as (_, client, _):
         await client.sign_in("bob")

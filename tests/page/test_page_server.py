@@ -32,6 +32,7 @@ def ask(
         connection.close()
 
 
+@pytest.mark.long
 async def test_strangers_are_not_answered(tmp_path: Path) -> None:
     async with page_served("--store", tmp_path) as (address, process):
         status, text, headers = await asyncio.to_thread(ask, address, "/")

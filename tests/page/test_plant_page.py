@@ -99,6 +99,7 @@ async def test_a_plant_shows_a_box_and_its_waveforms_while_somebody_looks(
         assert live_pieces(mosquitto) == sent > 5
 
 
+@pytest.mark.long
 async def test_without_a_table_for_it_alarms_and_diagnoses_are_shown_and_it_says_so(
     tmp_path: Path, mosquitto: Mosquitto
 ) -> None:
@@ -116,6 +117,7 @@ async def test_without_a_table_for_it_alarms_and_diagnoses_are_shown_and_it_says
         assert live_pieces(mosquitto) == 0
 
 
+@pytest.mark.long
 async def test_a_viewer_too_many_is_told_so_and_has_its_turn_later(
     tmp_path: Path, mosquitto: Mosquitto
 ) -> None:
@@ -141,6 +143,7 @@ async def test_a_viewer_too_many_is_told_so_and_has_its_turn_later(
         await refused.wait_for(state="detached", timeout=PATIENCE_MS)
 
 
+@pytest.mark.long
 async def test_a_box_and_a_broker_that_go_are_plain_to_see_and_come_back(
     tmp_path: Path, mosquitto: Mosquitto
 ) -> None:
@@ -168,6 +171,7 @@ async def test_a_box_and_a_broker_that_go_are_plain_to_see_and_come_back(
         assert await page.locator(".tile .level").inner_text() == "unknown"
 
 
+@pytest.mark.long
 async def test_an_operator_acknowledges_over_the_broker_and_a_viewer_is_written_down(
     tmp_path: Path, mosquitto: Mosquitto
 ) -> None:

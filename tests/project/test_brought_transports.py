@@ -27,6 +27,7 @@ TRANSPORTS = {Brought.name: Brought}
 """
 
 
+@pytest.mark.long
 def test_a_transport_from_outside_goes_through_the_suite(tmp_path: Path) -> None:
     (tmp_path / "brought_transport.py").write_text(MODULE)
     which = "brought and (delivered_in_its_place or absent_at_start)"

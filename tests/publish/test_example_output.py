@@ -125,6 +125,7 @@ class Broken(Output):
         return fail
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("is_made", [True, False])
 async def test_one_that_fails_in_everything_ends_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, *, is_made: bool

@@ -55,6 +55,7 @@ def leads(
     return {name: scores[fault] - score for name, score in scores.items() if name != fault}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("speed_hz", SPEEDS_HZ)
 def test_softer_supports_are_no_load(speed_hz):
     after = vector_of(MACHINE.softened(0.6), speed_hz)

@@ -51,6 +51,7 @@ def off(machine: Machine, speed_hz: float, **fault: object) -> float:
     ) / math.hypot(abs(forward), abs(backward))
 
 
+@pytest.mark.long
 def test_one_laval_rotor_does_not_explain_what_two_modes_do():
     nearest, fit = fitted(*run_up(MACHINE, 8.0, 50.0, 25.0))
     assert not nearest.laval
@@ -75,6 +76,7 @@ def test_the_figures_are_those_of_the_machine(noise_um):
     assert abs(fit.eccentricity_um) == pytest.approx(abs(MACHINE.eccentricity_um), rel=0.03)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("speed_hz", [20.0, 28.0, 38.0])
 def test_orbits_of_derived_faults_come_true(speed_hz):
     assert off(MACHINE, speed_hz) < 0.02
@@ -118,6 +120,7 @@ def test_a_shaft_that_turns_clockwise_has_the_mirrored_orbit():
             assert mirrored == pytest.approx(-np.conj(z), abs=1e-9)
 
 
+@pytest.mark.long
 def test_a_laval_rotor_is_one_of_two_modes():
     alike = Machine(supports=(3.0, 3.0))
     nearest, fit = fitted(*run_up(alike, 8.0, 50.0, 25.0))
@@ -127,6 +130,7 @@ def test_a_laval_rotor_is_one_of_two_modes():
     assert abs(fit.modes.runout_um[1]) < 0.2
 
 
+@pytest.mark.long
 def test_what_no_two_modes_make_is_said():
     position, angle = run_up(MACHINE, 8.0, 50.0, 25.0)
     strange = position + 30.0 * np.exp(1j * (angle + 3.0 * np.sin(angle / 40.0)))

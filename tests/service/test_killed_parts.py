@@ -250,6 +250,7 @@ async def test_each_thread_in_turn(error: type[BaseException], tmp_path: Path, m
         assert len(done) > 6
 
 
+@pytest.mark.long
 async def test_without_the_writer_of_its_journal_the_service_ends(
     tmp_path: Path, mosquitto: Mosquitto
 ) -> None:

@@ -151,6 +151,7 @@ def closed(tmp_path: Path) -> bool:
     return (store / "outbox.sqlite").exists() and not (store / "outbox.sqlite-wal").exists()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("hangs", ["loop", *(_long(name) for name in ("task", "busy loop", "thread"))])
 def test_a_stop_is_obeyed_whatever_hangs_and_the_journal_is_closed(hangs: str, tmp_path: Path) -> None:
     with service(tmp_path, FAULTS[hangs], process_guard.STOP_TURNS) as process:
@@ -193,6 +194,7 @@ def test_the_guard_and_the_log_outlive_what_kills_their_threads(tmp_path: Path) 
     assert said.splitlines()[-1].endswith("stopped")
 
 
+@pytest.mark.long
 def test_a_call_that_hangs_in_a_thread_does_not_delay_the_end(tmp_path: Path) -> None:
     fault = (
         "from daqsvc.self_check import SelfCheck\nSelfCheck.free_bytes = lambda self: time.sleep(60)\n"
@@ -205,6 +207,7 @@ def test_a_call_that_hangs_in_a_thread_does_not_delay_the_end(tmp_path: Path) ->
     assert closed(tmp_path)
 
 
+@pytest.mark.long
 def test_an_event_loop_that_stands_still_ends_the_process(tmp_path: Path) -> None:
     with service(tmp_path, f"process_guard.STUCK_TURNS = 10\n{FAULTS['loop']}") as process:
         let_hang(tmp_path)
@@ -250,6 +253,7 @@ LOSSES = {
 }
 
 
+@pytest.mark.long
 def test_a_store_of_a_newer_version_is_refused_for_good(tmp_path: Path) -> None:
     store = tmp_path / "store"
     store.mkdir(mode=0o700)
@@ -262,6 +266,7 @@ def test_a_store_of_a_newer_version_is_refused_for_good(tmp_path: Path) -> None:
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("why", first_of(*LOSSES))
 def test_what_cannot_be_started_again_ends_the_process_with_its_own_code(why: str, tmp_path: Path) -> None:
     with service(tmp_path, LOSSES[why]) as process:
@@ -270,6 +275,7 @@ def test_what_cannot_be_started_again_ends_the_process_with_its_own_code(why: st
     assert re.search(rf"{re.escape(why)} \[S\d\d\]$", said), said
 
 
+@pytest.mark.long
 def test_a_task_of_a_plugin_that_exits_ends_nothing(tmp_path: Path) -> None:
     fault = "async def leave(): sys.exit(0)\nwhen_asked(lambda: asyncio.create_task(leave()))"
     with service(tmp_path, fault) as process:
@@ -285,6 +291,7 @@ def test_a_task_of_a_plugin_that_exits_ends_nothing(tmp_path: Path) -> None:
     assert closed(tmp_path)
 
 
+@pytest.mark.long
 def test_signals_that_do_not_stop_the_service_are_said(tmp_path: Path) -> None:
     with service(tmp_path) as process:
         for _ in range(2):
@@ -331,6 +338,7 @@ def on_a_terminal(tmp_path: Path, *, nohup: bool = False) -> Iterator[tuple[subp
         process.wait()
 
 
+@pytest.mark.long
 def test_a_terminal_that_goes_away_stops_the_service_in_order(tmp_path: Path) -> None:
     with on_a_terminal(tmp_path) as (process, master):
         os.close(master)
@@ -349,6 +357,7 @@ def test_a_service_that_is_to_outlive_its_terminal_does(tmp_path: Path) -> None:
     assert closed(tmp_path)
 
 
+@pytest.mark.long
 def test_a_log_that_nobody_reads_any_more_stops_the_service_in_order(tmp_path: Path) -> None:
     with service(tmp_path) as process:
         assert process.stderr is not None
@@ -411,6 +420,7 @@ def disk_of_its_own(tmp_path: Path) -> Iterator[tuple[Path, str]]:
         subprocess.run(["umount", "--lazy", store], check=True)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("failure", ["Read-only file system", _long("Input/output error")])
 def test_a_store_that_fails_does_not_spoil_the_end(failure: str, tmp_path: Path) -> None:
     with disk_of_its_own(tmp_path) as (store, device), service(tmp_path) as process:

@@ -184,6 +184,7 @@ def log_of(tmp_path: Path) -> str:
     return (tmp_path / "log").read_text()
 
 
+@pytest.mark.long
 def test_it_is_ready_when_what_it_must_have_delivers_and_tells_how_it_stands(tmp_path: Path) -> None:
     with (
         NotifySocket(None) as systemd,

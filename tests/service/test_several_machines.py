@@ -292,6 +292,7 @@ async def test_two_machines_are_read_through_one_gateway(tmp_path: Path) -> None
         server.stop()
 
 
+@pytest.mark.long
 async def test_every_output_tells_of_every_machine(tmp_path: Path) -> None:
     port = free_port()
     with running_mosquitto(tmp_path) as broker:

@@ -152,6 +152,7 @@ async def test_an_alarm_leaves_a_snapshot_that_replays_to_the_same_alarm(tmp_pat
     assert changed.notes[0].startswith("other limits came into force at 20")
 
 
+@pytest.mark.long
 async def test_alarms_of_a_device_that_comes_and_goes_are_the_same_again(tmp_path: Path) -> None:
     machine, samples = recorded_rig("snapshot-silence", before_s=3.0, after_s=0.5)
     async with recording(machine, tmp_path / "store") as (service, clock):

@@ -65,6 +65,7 @@ def audited(store: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (store / "audit.jsonl").read_text().splitlines()]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("protocol", ["5", "3.1.1"])
 async def test_a_snapshot_is_answered_with_its_file(tmp_path: Path, protocol: str) -> None:
     bus = f"mqtt-snapshot-{protocol}"

@@ -193,6 +193,7 @@ async def test_the_newest_sample_is_the_last_that_the_figures_count(
         assert channel(status, "probe-x")["value"] == 10.0
 
 
+@pytest.mark.long
 async def test_all_is_told_that_the_service_knows(tmp_path: Path) -> None:
     broker, store = free_port(), tmp_path / "store"
     async with running(rig(port=broker), store) as service:

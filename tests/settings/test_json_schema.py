@@ -113,6 +113,7 @@ def test_a_slip_is_underlined_where_it_is(old, new, place):
     assert place in underlined(tomllib.loads(text.replace(old, new, 1)))
 
 
+@pytest.mark.long
 def test_it_underlines_what_the_models_refuse_and_nothing_else():
     """Every key of every kind of table misspelt, of another type, beyond its bounds, and left out."""
     texts = {file.name: file.read_text(encoding="utf-8") for file in (*MACHINES.glob("*.toml"), *SPECIMENS)}

@@ -48,6 +48,7 @@ async def test_the_demo_says_where_its_page_is_and_takes_it_along() -> None:
         await asyncio.to_thread(get, told["address"])
 
 
+@pytest.mark.long
 async def test_what_is_played_again_loses_nothing_and_ends_when_it_is_enough() -> None:
     parser = argparse.ArgumentParser()
     DemoCommand().add_arguments(parser)

@@ -149,6 +149,7 @@ def test_large_innovations_are_danger_until_they_are_clearly_less(learnt) -> Non
     assert (milder[-1].decision, milder[-1].severity) == ("outer", "alert")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("spoil", "quality", "words"),
     [
@@ -234,6 +235,7 @@ def pair():
     return {"healthy": run("healthy", 12.5), "inner": run("inner", 7.5), "outer": run("outer", 7.5)}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("fault", "sign"), first_of(("inner", 1.0), ("outer", -1.0)))
 def test_two_accelerometers_tell_the_race_where_the_lines_do_not(pair, fault, sign) -> None:
     """The bearing is another one than the file says: its lines are not found, and the direction decides."""

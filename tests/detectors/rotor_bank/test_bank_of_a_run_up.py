@@ -97,6 +97,7 @@ def said_of(machine, parts, seed=0):
     return detector, said
 
 
+@pytest.mark.long
 def test_the_run_up_is_in_the_file(calibrated):
     record = load_record(calibrated / "rotor.toml")
     assert record.two_modes is not None
@@ -163,6 +164,7 @@ def test_a_file_that_is_not_there_is_said(tmp_path):
         RotorBankPlugin().check_files(machine, settings_of(machine))
 
 
+@pytest.mark.long
 def test_what_can_be_told_apart_is_known_beforehand(calibrated, capsys):
     machine_of(calibrated)
     assert main(["detectability", str(calibrated / "machine.toml"), "--json"]) == 0

@@ -350,6 +350,7 @@ def new(tmp_path: Path, *more: str) -> dict[str, Any]:
     return tomllib.loads(file.read_text("utf-8"))
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("hub")
 def test_new_proposes_the_frames_that_it_hears(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

@@ -105,6 +105,7 @@ def test_two_temperatures_side_by_side_are_no_count() -> None:
     assert chosen([first, second, {200: 544, 201: 479}]) == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("amplitude", "step"), [(250, 0.15), (3000, 0.4), (12_000, 0.05)])
 @pytest.mark.parametrize("moves", [True, False])
 def test_samples_of_a_waveform_stay_what_they_are(amplitude: float, step: float, *, moves: bool) -> None:

@@ -406,6 +406,7 @@ def new(tmp_path: Path, target: str, *more: str) -> dict[str, Any]:
     return tomllib.loads(file.read_text("utf-8"))
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("_few_registers")
 def test_new_proposes_the_registers_that_it_finds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     unit = pump()
@@ -432,6 +433,7 @@ def test_new_proposes_the_registers_that_it_finds(tmp_path: Path, capsys: pytest
     assert all(pdu[0] in {3, 4} for pdu in unit.asked)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("_few_registers")
 def test_new_asks_the_other_units_where_none_of_the_first_answers(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

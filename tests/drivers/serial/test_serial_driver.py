@@ -269,6 +269,7 @@ async def test_reading_goes_on_while_a_batch_is_cut_and_all_is_told_in_order(tmp
     assert sum(len(block.samples) for block in blocks) == 2
 
 
+@pytest.mark.long
 def test_overtaken_lines_and_numbers_beyond_all_bounds_cost_no_sample(tmp_path: Path) -> None:
     stamped = line_layout(("t", "x"), ("x",), time="t", unit="ms")
     specs = [StreamSpec("x", stamped, 100.0)]

@@ -79,6 +79,7 @@ def scores(data: bytes, baud: int, gap_bits: int) -> dict[int, float]:
     return found
 
 
+@pytest.mark.long
 @settings(max_examples=examples(45), deadline=None)
 @given(
     kind=st.sampled_from(sorted(SENT)),
@@ -97,6 +98,7 @@ def test_the_rate_of_the_sender_is_the_best_of_all(
     assert max(score for rate, score in found.items() if rate != baud) < 0.8, found
 
 
+@pytest.mark.long
 @settings(max_examples=examples(45), deadline=None)
 @given(
     kind=st.sampled_from(sorted(SENT)),
@@ -112,6 +114,7 @@ def test_the_bytes_alone_tell_the_rate_where_the_port_counts_no_errors(
     assert max(found, key=lambda rate: found[rate]) == baud, found
 
 
+@pytest.mark.long
 @settings(max_examples=examples(60), deadline=None)
 @given(
     channels=st.integers(1, 9),
@@ -161,6 +164,7 @@ def test_a_line_with_another_number_of_columns_is_counted() -> None:
     assert (len(what.columns), what.damaged) == (3, ["5,1"])
 
 
+@pytest.mark.long
 @settings(max_examples=examples(40), deadline=None)
 @given(
     crc=st.sampled_from([name for name, what in CHECKSUMS.items() if what.size == 2]),
@@ -198,6 +202,7 @@ def test_frames_without_a_check_are_found_and_are_less_sure() -> None:
     assert 0.5 < found.score < 0.9
 
 
+@pytest.mark.long
 @settings(max_examples=examples(30), deadline=None)
 @given(channels=st.integers(1, 12), begin=st.integers(0, 40), seed=st.integers(0, 1000))
 def test_cobs_frames_are_found(channels: int, begin: int, seed: int) -> None:
@@ -240,6 +245,7 @@ def damaged(rng: np.random.Generator, sent: bytes) -> bytes:
     return sent[:at] + bytes([sent[at] ^ 1 << int(rng.integers(8))]) + sent[at + 1 :]
 
 
+@pytest.mark.long
 @settings(max_examples=examples(60), deadline=None)
 @given(
     crc=st.sampled_from(["ibm-3740", "xmodem", "modbus"]),
@@ -274,6 +280,7 @@ def test_frames_are_found_with_a_fifth_of_them_damaged_and_stray_bytes_behind_an
     assert what.bytes_per_frame == pytest.approx(what.length + between / 150, rel=0.06)
 
 
+@pytest.mark.long
 @settings(max_examples=examples(60), deadline=None)
 @given(
     bad_percent=st.integers(0, 10),

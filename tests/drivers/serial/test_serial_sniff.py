@@ -100,6 +100,7 @@ def test_lines_are_shown_with_their_columns(
     assert 'framing = "lines"' in said.out
 
 
+@pytest.mark.long
 def test_what_it_proposes_for_lines_passes_check(
     cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -114,6 +115,7 @@ def test_what_it_proposes_for_lines_passes_check(
     assert stream["rate_hz"] == pytest.approx(found["rate_hz"], rel=0.006)
 
 
+@pytest.mark.long
 def test_decimal_commas_are_told_and_can_be_read(
     cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -193,6 +195,7 @@ def test_columns_without_a_name_get_no_limits_of_vibration(
     assert not any("zones" in one for one in file.get("alarms", []))
 
 
+@pytest.mark.long
 def test_damaged_lines_are_counted_and_a_stream_is_proposed(
     cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -208,6 +211,7 @@ def test_damaged_lines_are_counted_and_a_stream_is_proposed(
     assert stream["layout"]["counter"]["column"] == "c1"
 
 
+@pytest.mark.long
 def test_the_share_of_frames_that_pass_is_told(
     cable: PseudoTerminal, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -350,6 +354,7 @@ def test_a_port_that_is_busy_absent_or_not_ours_is_one_line(
     assert "your user" in words
 
 
+@pytest.mark.long
 def test_ctrl_c_ends_it_early_and_shows_what_came(cable: PseudoTerminal) -> None:
     command = [sys.executable, "-m", "daqsvc", "sniff", "serial", f"{cable.path}", "--json"]
     with talking(cable, line):

@@ -131,6 +131,7 @@ async def rogue_broker(outbox, caplog, monkeypatch, protocol, packets):
     assert figures["commands"]["malformed"] > 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("protocol", first_of("5", "3.1.1"))
 async def test_a_rogue_broker_costs_connections_and_nothing_else(outbox, caplog, monkeypatch, protocol):
     await rogue_broker(outbox, caplog, monkeypatch, protocol, 2000)
@@ -187,6 +188,7 @@ async def rogue_client(mosquitto, outbox, caplog, protocol, messages):
     assert figures["commands"]["stale"] > 0
 
 
+@pytest.mark.long
 @pytest.mark.mosquitto
 @pytest.mark.parametrize("protocol", first_of("5", "3.1.1"))
 async def test_a_rogue_client_moves_counters_and_nothing_else(mosquitto, outbox, caplog, protocol):

@@ -60,6 +60,7 @@ def rig(port):
     )
 
 
+@pytest.mark.long
 @pytest.mark.mosquitto
 async def test_all_that_a_service_says_and_hears_is_as_the_schemas_promise(tmp_path):
     t_s = np.arange(3 * 640) / 640.0

@@ -74,6 +74,7 @@ async def test_a_broker_that_cannot_prove_itself_is_refused(tmp_path, outbox, ca
             assert publisher.counters.connections == 0
 
 
+@pytest.mark.long
 async def test_the_reason_why_a_broker_does_not_come_back_is_told_when_it_changes(tmp_path, outbox, caplog):
     """It goes, comes back with the certificate of another host, then with one that has expired."""
     ca = authority(tmp_path, "ca")

@@ -212,6 +212,7 @@ def test_every_event_stands_once_whatever_falls_over(tmp_path, broker, postgres,
     assert rows(postgres, "SELECT count(*) FROM daqsvc.rejected") == [(0,)]
 
 
+@pytest.mark.long
 def test_nothing_is_acknowledged_before_it_is_committed(tmp_path, broker, postgres, ingesters):
     """What an ingester holds while PostgreSQL is away comes again after it was killed."""
     log = tmp_path / "mosquitto.log"
@@ -285,6 +286,7 @@ def test_telemetry_the_present_state_and_what_is_rejected(tmp_path, broker, post
             reader.execute("DELETE FROM daqsvc.alarm_events")
 
 
+@pytest.mark.long
 def test_each_unusable_message_stands_once_however_many_get_it(tmp_path, broker, postgres, ingesters):
     with psycopg.connect(postgres.url, autocommit=True) as owner:
         # Of a version in which each stood there more than once.
@@ -349,6 +351,7 @@ def test_a_mistake_of_its_command_line_is_one_sentence(tmp_path, arguments, envi
     assert re.search(r" \[C(01|02|10)\]\n$", done.stderr)
 
 
+@pytest.mark.long
 def test_a_broker_that_goes_and_comes_is_one_line_each(broker):
     broker.shut_down()
     command = [sys.executable, FOLDER / "ingest.py", "--port", str(broker.port), "--id", "ingest-1"]

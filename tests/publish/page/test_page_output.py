@@ -143,6 +143,7 @@ async def test_a_page_that_waits_to_start_again_ends_at_once(tmp_path: Path) -> 
     await running
 
 
+@pytest.mark.long
 @pytest.mark.gives("O19")
 async def test_a_page_that_is_killed_comes_back(tmp_path: Path) -> None:
     port = free_port()
@@ -160,6 +161,7 @@ async def test_a_page_that_is_killed_comes_back(tmp_path: Path) -> None:
         os.kill(first, 0)
 
 
+@pytest.mark.long
 async def test_a_port_that_is_taken_is_said_and_taken_later(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -49,6 +49,7 @@ async def test_tck_id_principles_birth_certificates_order(mosquitto, outbox, tmp
         assert [message.kind for message in host.messages][:2] == ["NBIRTH", "DBIRTH"]
 
 
+@pytest.mark.long
 async def test_tck_id_payloads_nbirth_seq_and_every_later_number(mosquitto, outbox, tmp_path) -> None:
     machine = Machine(outbox)
     async with Host(mosquitto.port) as host, edge_node(outbox, tmp_path, mosquitto.port):
