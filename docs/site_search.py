@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from pathlib import Path
+from textwrap import shorten
 from typing import TYPE_CHECKING, Any
 
 from docutils import nodes
@@ -80,7 +81,7 @@ def _write_index(app: Sphinx, failure: Exception | None) -> None:
             for word, times in Counter(words).items():
                 terms.setdefault(word, []).append((len(found), times))
             lengths.append(len(words))
-            found.append((number, anchor, title, text[:_EXCERPT]))
+            found.append((number, anchor, title, shorten(text, _EXCERPT, placeholder=" ...")))
     index = {"pages": pages, "titles": titles, "entries": found, "lengths": lengths, "terms": terms}
     text = json.dumps(index, ensure_ascii=False, separators=(",", ":"), sort_keys=True)
     (Path(app.outdir) / "_static" / INDEX).write_text(f"const SITE_INDEX = {text};\n", encoding="utf-8")
