@@ -108,6 +108,9 @@ def meant_key(word: str, free: Collection[str]) -> str | None:
     plain = word.lower().replace("-", "_").replace(" ", "_")
     if plain in free:
         return plain
+    several = next((name for name in free if name in {f"{plain}s", f"{plain}es"}), None)
+    if several is not None:
+        return several
     called = next((name for name in _KEYS.get(plain, ()) if name in free), None)
     if called is not None:
         return called

@@ -7,6 +7,8 @@ import re
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 
+from pydantic import ValidationError
+
 from daqsvc.errors.machine_file import (
     BAD_NAME,
     BAD_TEXT,
@@ -21,8 +23,19 @@ from daqsvc.errors.machine_file import (
 )
 from daqsvc.settings.aliases import meant_key
 from daqsvc.settings.registry import first_detector
-from daqsvc.settings.schema import declared_at, homes_of, kinds_of, section_of, value_at
+from daqsvc.settings.schema import (
+    adapter,
+    declared_at,
+    homes_of,
+    is_table,
+    kinds_of,
+    may_be_table,
+    plural_of,
+    section_of,
+    value_at,
+)
 from daqsvc.settings.section import NamesDetector
+from daqsvc.settings.written_numbers import as_toml, number_meant
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -34,8 +47,8 @@ if TYPE_CHECKING:
     from daqsvc.settings.problems import KeyPath
     from daqsvc.settings.section import Section
 
-_TRUE_WORDS = {"1", "on", "true", "y", "yes"}
-_FALSE_WORDS = {"0", "off", "false", "n", "no"}
+_TRUE_WORDS = {"1", "on", "true", "y", "yes", "ja", "j", "oui", "si"}
+_FALSE_WORDS = {"0", "off", "false", "n", "no", "nein", "non"}
 _MOST_IN_A_ROW = 4
 """Values that belong together, e.g. the two ends of a range; whatever may be longer is a list."""
 _SECRET = re.compile(r"pass|secret|token|credential", re.IGNORECASE)
@@ -84,7 +97,12 @@ def is_secret(path: KeyPath) -> bool:
 
 def suggested_key(section: type[Section], table: Mapping[str, Any], key: str) -> str | None:
     """The key of ``section`` that an unknown ``key`` was probably meant to be."""
-    return meant_key(key, [name for name in section.model_fields if name not in table])
+    free = [name for name in section.model_fields if name not in table]
+    if plural_of(section, key, table.get(key)) is not None:
+        return next((name for name in free if name in {f"{key}s", f"{key}es"}), None)
+    if is_table(table.get(key)):
+        free = [name for name in free if may_be_table(section, name)]
+    return meant_key(key, free)
 
 
 def _shown(limit: float) -> str:
@@ -147,9 +165,14 @@ class ErrorFormatter:
                 "does not belong into a machine file",
                 "write it into a file that only the service can read and name that in password_file",
             )
+        several = plural_of(section, key, value_at(self._document, path))
+        if several is not None:
+            header = dotted((*path[:-1], several))
+            is_array = isinstance(value_at(self._document, path), list)
+            return "unknown key", f"write [[{header}]]" if is_array else f"write [{header}.NAME]"
         if meant is not None:
             return "unknown key", f"did you mean {meant}?"
-        homes = homes_of(self._root, key)
+        homes = homes_of(self._root, key, self._document)
         if homes:
             return "unknown key", f"move it to {' or '.join(homes)}, where it belongs"
         free = sorted(name for name in section.model_fields if name not in table)
@@ -172,13 +195,13 @@ class ErrorFormatter:
                 return "must be a whole number", f"take the quotes away: {self._key(path)} = {value}"
         if isinstance(value, float) and value.is_integer():
             return "must be a whole number", f"write {self._key(path)} = {int(value)}"
-        return "must be a whole number", self._write_example(path)
+        return "must be a whole number", self._write_meant(path, value, whole=True)
 
     def _float_type(self, path: KeyPath, _context: Mapping[str, Any]) -> tuple[str, str]:
         value = value_at(self._document, path)
         if isinstance(value, str) and re.fullmatch(r"[+-]?\d+(\.\d+)?([eE][+-]?\d+)?", value.strip()):
             return "must be a number", f"take the quotes away: {self._key(path)} = {value.strip()}"
-        return "must be a number", self._write_example(path)
+        return "must be a number", self._write_meant(path, value, whole=False)
 
     def _finite_number(self, path: KeyPath, _context: Mapping[str, Any]) -> tuple[str, str]:
         return "must be a finite number", self._write_example(path)
@@ -320,6 +343,19 @@ class ErrorFormatter:
         key = dotted(path[names[-1] : names[-1] + 1])
         about = f" ({field.description})" if field is not None and field.description else ""
         return f"write {key} = {example}{about}" if example else f"correct {key}{about}"
+
+    def _write_meant(self, path: KeyPath, value: object, *, whole: bool) -> str:
+        """The number that a text begins with, if it is a valid one; else an example."""
+        meant = number_meant(value, str(path[-1])) if isinstance(value, str) else None
+        if meant is None or isinstance(path[-1], int) or (whole and not meant.is_integer()):
+            return self._write_example(path)
+        try:
+            adapter(declared_at(self._root, self._document, path)).validate_python(
+                int(meant) if whole else meant
+            )
+        except ValidationError:
+            return self._write_example(path)
+        return f"write {self._key(path)} = {as_toml(meant, whole=whole)}, a number alone"
 
     def _add(self, path: KeyPath) -> str:
         """How to add what is missing at ``path``, or to make a table of it."""

@@ -110,10 +110,48 @@ def forget_homes() -> None:
     _homes.cache_clear()
 
 
-def homes_of(root: type[Section], key: str) -> tuple[str, ...]:
-    """The tables that can hold a key, as people write them; none where there are many or none."""
+def homes_of(root: type[Section], key: str, document: Any) -> tuple[str, ...]:
+    """The tables of a document that can hold a key, as people write them; none where there are many kinds."""
     places = _homes(root).get(key, ())
-    return tuple(f"[{place}]" for place in places) if len(places) <= _MOST_HOMES else ()
+    if len(places) > _MOST_HOMES:
+        return ()
+    return tuple(f"[{place}]" for place in places if _has_table(document, place.strip("[]").split(".")))
+
+
+def _has_table(document: Any, names: list[str]) -> bool:
+    """Whether a document has a table, with any name in place of ``NAME``."""
+    if isinstance(document, list):
+        return any(_has_table(item, names) for item in document)
+    if not names or not isinstance(document, dict):
+        return not names and isinstance(document, dict)
+    name, *others = names
+    below = document.values() if name == "NAME" else (document[name],) if name in document else ()
+    return any(_has_table(item, others) for item in below)
+
+
+def is_table(value: object) -> bool:
+    """Whether a value is a table, or an array of tables."""
+    return isinstance(value, dict) or (
+        isinstance(value, list) and bool(value) and all(isinstance(item, dict) for item in value)
+    )
+
+
+def may_be_table(section: type[Section], name: str) -> bool:
+    """Whether a key of a section holds a table, several of them, or one with free keys."""
+    declared = field_type(section.model_fields[name])
+    bare = bare_type(declared)
+    element = element_type(declared)
+    tables = element is not None and (kinds_of(element) is not None or is_section(bare_type(element)))
+    return kinds_of(declared) is not None or is_section(bare) or get_origin(bare) is dict or tables
+
+
+def plural_of(section: type[Section], key: str, value: object) -> str | None:
+    """The key of several tables that was meant by a table whose name lacks its ``s``; None if none was."""
+    name = next((name for name in section.model_fields if name in {f"{key}s", f"{key}es"}), None)
+    if name is None or not is_table(value):
+        return None
+    element = element_type(field_type(section.model_fields[name]))
+    return name if section_of(element, {}) is not None else None
 
 
 def only_follows(error: ErrorDetails, document: Any) -> bool:

@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import re
 import tomllib
+from itertools import takewhile
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.errors.machine_file import NOT_TOML, NOT_UTF8, TOO_LARGE
 from daqsvc.settings.error_messages import dotted
 from daqsvc.settings.locate import Spot, TooMuchError, locate
+from daqsvc.settings.written_numbers import number_meant
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from daqsvc.errors.code import Code
@@ -169,6 +171,8 @@ def _syntax_error(text: str, reason: str) -> TomlTextError:
         line = int(place[1]) if place[1] else text.rstrip("\n").count("\n") + 1
         where = f"column {place[2]}" if place[2] else "the end of the file"
         reason = f"{reason}, at {where}"
+    if line is not None and (twice := _twice(text, line, reason)) is not None:
+        return TomlTextError(f"is not valid TOML: {twice[0]}", twice[1], NOT_TOML, line)
     opened = None if line is None else _left_open(text, line, reason)
     remedy = _remedy_in(text, line) if opened is None else f"close the bracket of line {opened}"
     return TomlTextError(f"is not valid TOML: {reason}", remedy, NOT_TOML, line)
@@ -178,13 +182,20 @@ _TOKENS = re.compile(
     r"\"\"\".*?\"\"\"|'''.*?'''|\"(?:[^\"\\\n]|\\.)*\"|'[^'\n]*'|#[^\n]*|[\[\]{}]", re.DOTALL
 )
 """Texts and comments, in which brackets mean nothing, and brackets."""
+_CURLY = "\u201c\u201d\u201e\u201f\u00ab\u00bb\u2018\u2019\u201a\u2039\u203a"
+"""Quotes that word processors and web pages put in place of straight ones."""
 _KEY, _END = r"^\s*(?P<key>[\w.-]+)", r"\s*(?:#.*)?$"
 _SLIPS = tuple(
     (re.compile(f"{_KEY}{pattern}{_END}"), remedy)
     for pattern, remedy in (
         (r"\s*=\s*(?P<whole>[+-]?\d+),(?P<part>\d+)", "write {key} = {whole}.{part}, with a decimal point"),
         (r"\s*=\s*(?P<word>True|False)", "write {key} = {lower}: TOML has true and false in lower case"),
-        (r"\s*=\s*(?P<number>[+-]?\d[\d_.]*)\s*[^\W\d][^\s#]*", "write {key} = {number}, without a unit"),
+        (
+            rf"\s*=\s*[{_CURLY}\"'](?P<word>[^{_CURLY}\"'#]*)[{_CURLY}\"']",
+            'write {key} = "{word}", with straight quotes',
+        ),
+        (r"\s*=\s*(?P<word>(?i:ja|yes|on|oui|si))", "write {key} = true: TOML has true and false"),
+        (r"\s*=\s*(?P<word>(?i:nein|no|off|non))", "write {key} = false: TOML has true and false"),
         (r"\s*=\s*(?P<word>[^\W\d][^\s\"'#=\[\]{{}},]*)", 'write {key} = "{word}", with quotes'),
         (
             r"\s*:\s*(?P<word>[^\W\d][^\s\"'#=\[\]{{}},]*)",
@@ -221,8 +232,108 @@ def _left_open(text: str, line: int, reason: str) -> int | None:
 def _remedy_in(text: str, line: int | None) -> str:
     """What to write in place of the line that is no TOML."""
     wrong = "" if line is None else text.split("\n")[line - 1]
+    number = _number_in(wrong)
+    if number is not None:
+        return number
+    if (path := _BACKSLASHES.search(wrong)) is not None and "'" not in path["word"]:
+        return f"write {path['key']} = '{path['word']}', in single quotes: there a backslash is only itself"
     for slip, remedy in _SLIPS:
         if (found := slip.match(wrong)) is not None:
             words = found.groupdict()
             return remedy.format(**words, lower=words.get("word", "").lower())
+    if (curly := re.search(f"[{_CURLY}]", _TEXTS.sub("", wrong))) is not None:
+        return f'write straight quotes (") in place of {curly[0]}'
     return "correct the TOML there: text stands in quotes, tables are [name], values are key = value"
+
+
+_BACKSLASHES = re.compile(r"(?P<key>[\w.-]+)\s*=\s*\"(?P<word>[^\"\\]*\\[^\"]*)\"")
+_TEXTS = re.compile(r"\"(?:[^\"\\]|\\.)*\"|'[^']*'|#.*")
+_THOUSANDS = re.compile(
+    r"(?P<key>[\w-]+)\s*=\s*(?P<whole>[+-]?\d{1,3}(?:(?P<mark>[., ])\d{3})(?:(?P=mark)\d{3})*)"
+    r"(?:(?P<point>[.,])(?P<part>\d+))?(?=\s*(?:[,}\]]|$))"
+)
+_COMMA = re.compile(r"(?P<key>[\w-]+)\s*=\s*(?P<whole>[+-]?\d+),(?P<part>\d+)(?=\s*[,}\]])")
+_UNIT = re.compile(
+    r"^\s*(?P<key>[\w.-]+)\s*=\s*(?P<text>(?P<number>[+-]?\d[\d_]*(?:\.\d+)?)\s*(?:[^\W\d][^\s#]*|\d[NEO]\d))\s*$"
+)
+
+
+def _number_in(line: str) -> str | None:
+    """What to write for a number with a comma, marks between thousands, or a unit; None if there is none."""
+    bare = _TEXTS.sub(lambda text: " " * len(text[0]), line)
+    for found in _THOUSANDS.finditer(bare):
+        if found["point"] != found["mark"] and (
+            found["point"] or bare[found.start("whole") :].count(found["mark"]) > 1 or found["mark"] == " "
+        ):
+            digits = found["whole"].replace(found["mark"], "")
+            digits += f".{found['part']}" if found["part"] else ""
+            return f"write {found['key']} = {digits}, without marks between thousands"
+    if (found_comma := _COMMA.search(bare)) is not None:
+        return (
+            f"write {found_comma['key']} = {found_comma['whole']}.{found_comma['part']}, with a decimal point"
+        )
+    if (united := _UNIT.match(bare)) is not None:
+        key = united["key"].rpartition(".")[2]
+        meant, written = number_meant(united["text"], key), float(united["number"].replace("_", ""))
+        same = meant is None or meant == written
+        return f"write {united['key']} = {united['number'] if same else f'{meant:.12g}'}, without a unit"
+    return None
+
+
+_HEADER_NAME = re.compile(r"\s*(?P<open>\[\[?)\s*(?P<name>[^\[\]]+?)\s*\]")
+_ENTRY = re.compile(r"""\s*(?P<key>[\w.-]+|"[^"]*"|'[^']*')\s*=""")
+
+
+def _twice(text: str, line: int, reason: str) -> tuple[str, str] | None:
+    """Message and remedy about a key or a table that is written twice; None if none is."""
+    inline = re.match(r"Duplicate inline table key '(.+)'", reason)
+    if inline is not None:
+        return f"{inline[1]} is written twice between the same braces", "remove one of the two"
+    if not reason.startswith(("Cannot overwrite a value", "Cannot declare", "Cannot mutate")):
+        return None
+    lines = text.split("\n")
+    header, entry = _HEADER_NAME.match(lines[line - 1]), _ENTRY.match(lines[line - 1])
+    if header is not None:
+        return _table_twice(lines, line, header)
+    if entry is None:
+        return None
+    above = list(
+        takewhile(lambda number: _HEADER_NAME.match(lines[number - 1]) is None, range(line - 1, 0, -1))
+    )
+    key = entry["key"].strip("\"'")
+    first = next(
+        (
+            number
+            for number in above
+            if (other := _ENTRY.match(lines[number - 1])) is not None and other["key"].strip("\"'") == key
+        ),
+        None,
+    )
+    if first is None:
+        return f"{key} is a table already, or a value where a table is to be", "remove one of the two"
+    return f"{key} is written twice: in line {first}, and here", "remove one of the two lines"
+
+
+def _table_twice(lines: Sequence[str], line: int, header: re.Match[str]) -> tuple[str, str]:
+    """Message and remedy about the table of a line, whose name has been used before."""
+    name, is_one = header["name"], header["open"] == "["
+    for number, before in enumerate(lines[: line - 1], 1):
+        other = _HEADER_NAME.match(before)
+        if other is None or other["name"] != name:
+            continue
+        if (other["open"] == "[") == is_one:
+            return (
+                f"table [{name}] is written twice: in line {number}, and here",
+                "move what it holds to the first one, or give it another name",
+            )
+        single, several = (line, number) if is_one else (number, line)
+        return (
+            f"line {several} has a table [[{name}]], one of several, but line {single} has [{name}]",
+            f"write [[{name}]] in line {single}, too"
+            if name.endswith("s")
+            else f"write [{name}], and only once",
+        )
+    return (
+        f"{name} is there already, as a value or as a table within another one",
+        "move what it holds there, or remove one of the two",
+    )

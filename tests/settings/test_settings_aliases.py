@@ -71,6 +71,43 @@ def test_a_key_in_the_wrong_table_is_shown_its_place(path, old, new, home):
     assert problem.remedy == f"move it to {home}, where it belongs"
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "remedy"),
+    [
+        ("[[alarms]]", "[[alarm]]", "write [[alarms]]"),
+        ("[[sensors]]", "[[sensor]]", "write [[sensors]]"),
+        ("[buses.can0]", "[bus.can0]", "write [buses.NAME]"),
+        ("[streams.shaft]", "[stream.other]\n[streams.shaft]", "write [streams.NAME]"),
+    ],
+)
+def test_a_table_without_its_s_is_told_the_header_that_was_meant(old, new, remedy):
+    text = LAVAL.read_text(encoding="utf-8").replace(old, new, 1)
+    problem = next(one for one in problems_of(text, LAVAL) if one.message == "unknown key")
+    assert problem.remedy == remedy
+    assert not [one for one in problems_of(text, LAVAL) if "alarm_handling" in one.remedy]
+
+
+def test_a_table_within_a_table_is_told_its_whole_header():
+    text = (MACHINES / "bearing.toml").read_text(encoding="utf-8")
+    text = text.replace("[[pipeline.bearing.bearings]]", "[[pipeline.bearing.bearing]]", 1)
+    problem = next(one for one in problems_of(text, LAVAL) if one.message == "unknown key")
+    assert problem.remedy == "write [[pipeline.bearing.bearings]]"
+    (problem,) = problems_of(
+        text.replace("[[pipeline.bearing.bearing]]", "[[pipeline.bearing.bearings]]").replace(
+            "[pipeline.levels]", "[pipeline.level]"
+        ),
+        LAVAL,
+    )
+    assert problem.remedy == "did you mean levels?"
+
+
+def test_a_key_is_not_sent_to_a_table_that_the_file_does_not_have():
+    text = LAVAL.read_text(encoding="utf-8") + '\n[recorder]\nfolder = "/data"\n'
+    (problem,) = problems_of(text, LAVAL)
+    assert problem.key == "recorder.folder"
+    assert problem.remedy.startswith("remove it; possible here: ")
+
+
 def test_every_word_leads_to_a_key_that_there_is():
     keys = set(_homes(machine_file_model()))
     assert {key for meant in _WORDS for key in meant} <= keys

@@ -330,8 +330,8 @@ def test_a_password_in_an_address_that_is_none():
     ("text", "line", "words"),
     [
         ("a = 1\nb 2\n", 2, "column 3"),
-        ("a = 1\na = 2\n", 2, "overwrite"),
-        ("a = 1\na = 2", 2, "overwrite a value, at column 6"),
+        ("a = 1\na = 2\n", 2, "a is written twice: in line 1"),
+        ("a = 1\na = 2", 2, "a is written twice: in line 1"),
         ("a = 1\nb = [1,\n", 2, "end of the file"),
         ("a = " + "[" * 100_000, 1, "nested too deeply"),
         ("a = 1\nb = " + "9" * 5000, 2, "hundreds of digits"),
@@ -342,6 +342,62 @@ def test_broken_toml(text, line, words):
     (problem,) = problems_of(text)
     assert problem.line == line
     assert words in problem.message
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "remedy"),
+    [
+        ('[x]\n"a" = 1\nb = 2\na = 3\n', 4, "remove one of the two lines"),
+        ("[x]\na = 1\n[y]\n[x]\nb = 2\n", 4, "move what it holds to the first one, or give it another name"),
+        ("[[alarms]]\na = 1\n[alarms]\n", 3, "write [[alarms]] in line 3, too"),
+        ("[alarms]\na = 1\n[[alarms]]\n", 3, "write [[alarms]] in line 1, too"),
+        ("[[machine]]\na = 1\n[machine]\n", 3, "write [machine], and only once"),
+        ("x = [{ a = 1, a = 2 }]\n", 1, "remove one of the two"),
+        ("[a.b]\n[a]\nb = 1\n", 3, "remove one of the two"),
+        ('x = [\n{ name = "1,5", scale = 0,0001 },\n]\n', 2, "write scale = 0.0001, with a decimal point"),
+        ("rate_hz = 1.000,0\n", 1, "write rate_hz = 1000.0, without marks between thousands"),
+        ("rate_hz = 1,000.5 # Hz\n", 1, "write rate_hz = 1000.5, without marks between thousands"),
+        ("rate_hz = 12 000\n", 1, "write rate_hz = 12000, without marks between thousands"),
+        ("site = \u201clab\u201d\n", 1, 'write site = "lab", with straight quotes'),
+        ("site = \u201elab\u201c # in Ulm\n", 1, 'write site = "lab", with straight quotes'),
+        ('site = "lab\u201d\n', 1, 'write site = "lab", with straight quotes'),
+        ("x = { a = \u00abb\u00bb }\n", 1, 'write straight quotes (") in place of \u00ab'),
+        (
+            'file = "C:\\temp\\x.dbc"\n',
+            1,
+            "write file = 'C:\\temp\\x.dbc', in single quotes: there a backslash is only itself",
+        ),
+        ("bitrate = 250k\n", 1, "write bitrate = 250000, without a unit"),
+        ("bitrate = 1 Mbit/s\n", 1, "write bitrate = 1000000, without a unit"),
+        ("baud = 115200 8N1\n", 1, "write baud = 115200, without a unit"),
+        ("on_delay_s = 300 ms\n", 1, "write on_delay_s = 0.3, without a unit"),
+        ("latching = ja\n", 1, "write latching = true: TOML has true and false"),
+        ("latching = No\n", 1, "write latching = false: TOML has true and false"),
+    ],
+)
+def test_a_slip_in_the_toml_is_told_what_to_write(text, line, remedy):
+    (problem,) = problems_of(text)
+    assert (problem.line, problem.remedy) == (line, remedy)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "remedy"),
+    [
+        ("speed_rpm = 600.0", 'speed_rpm = "990 rpm"', "write speed_rpm = 990.0, a number alone"),
+        ("speed_rpm = 600.0", 'speed_rpm = "16.5 Hz"', "write speed_rpm = 990.0, a number alone"),
+        ("on_delay_s = 1.0", 'on_delay_s = "3 s"', "write on_delay_s = 3.0, a number alone"),
+        ("on_delay_s = 1.0", 'on_delay_s = "250 ms"', "write on_delay_s = 0.25, a number alone"),
+        ("bitrate = 500_000", 'bitrate = "250k"', "write bitrate = 250000, a number alone"),
+        ("bitrate = 500_000", 'bitrate = "1 MBit/s"', "write bitrate = 1000000, a number alone"),
+        ("bitrate = 500_000", 'bitrate = "250000 8N1"', "write bitrate = 250000, a number alone"),
+        ("bitrate = 500_000", 'bitrate = "250 of these"', "write bitrate = 500000 (bit rate of the bus)"),
+        ("length = 64", 'length = "12.5 bytes"', "write length = 64"),
+        ("fd = true", 'fd = "nein"', "write fd = false"),
+    ],
+)
+def test_a_remedy_keeps_the_number_of_the_user_where_it_can_be(old, new, remedy):
+    problem, _ = only_problem(LAVAL, (old, new))
+    assert problem.remedy.startswith(remedy)
 
 
 def test_files_that_cannot_be_read(tmp_path):

@@ -1,0 +1,48 @@
+"""The number that somebody meant who wrote a unit behind it, or ``k`` for a thousand."""
+
+from __future__ import annotations
+
+import re
+
+_NUMBER = re.compile(r"(?P<number>[+-]?\d[\d_]*(?:[.,]\d+)?(?:[eE][+-]?\d+)?)\s*(?P<unit>[^\s#]*)")
+_PREFIXED = re.compile(r"(?P<prefix>[kKM])(?:bit(?:/s)?|bps|Bd|Baud|Hz|S/s|sps)?", re.IGNORECASE)
+_RATE = re.compile(r"baud|bitrate|hz|rate|length|size|samples")
+_PREFIXES = {"k": 1e3, "K": 1e3, "M": 1e6}
+_OTHER_UNITS = {
+    ("_s", "ms"): 1e-3,
+    ("_s", "min"): 60.0,
+    ("_s", "h"): 3600.0,
+    ("_ms", "s"): 1e3,
+    ("_ms", "us"): 1e-3,
+    ("_rpm", "hz"): 60.0,
+}
+"""What a number is multiplied by where the key ends with one unit, and another one is written."""
+
+
+def number_meant(text: str, key: str) -> float | None:
+    """The number that begins a text, in the unit of its key.
+
+    Args:
+        text: e.g. ``990 rpm``, ``250k`` or ``115200 8N1``.
+        key: name of the key, which ends with its unit if it has one.
+
+    Returns:
+        None if the text does not begin with a number, or it is not clear which one is meant.
+    """
+    found = _NUMBER.match(text.strip())
+    if found is None or text.strip()[found.end("number") :][:1] in {".", ",", ":", "-"}:
+        return None
+    value = float(found["number"].replace("_", "").replace(",", "."))
+    unit = found["unit"]
+    prefixed = _PREFIXED.fullmatch(unit)
+    if prefixed is not None and _RATE.search(key):
+        return value * _PREFIXES.get(prefixed["prefix"], 1.0)
+    for (ending, other), factor in _OTHER_UNITS.items():
+        if key.endswith(ending) and unit.lower() == other:
+            return value * factor
+    return value
+
+
+def as_toml(value: float, *, whole: bool) -> str:
+    """A number as it is written in a machine file; a whole one has no decimal point."""
+    return f"{value:.0f}" if whole else repr(float(f"{value:.12g}"))
