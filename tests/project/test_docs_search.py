@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 pytestmark = [pytest.mark.integration, pytest.mark.long, pytest.mark.sources]
 GOLDEN = ROOT / "tests" / "guard" / "golden"
+FIRST_THREE = "query => siteSearch(query).slice(0, 3).map(([page, , anchor]) => `${page}.html${anchor}`)"
 MESSAGE = re.compile(r"^! machines/(.+ \[([A-Z]\d\d)\])$", re.MULTILINE)
 
 
@@ -31,20 +32,23 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 async def searched(site: Path, queries: Sequence[str]) -> list[list[str]]:
-    """The addresses of the first three results of each query, without a server: the site is read as files."""
-    found = []
+    """The addresses of the first three results of each query, without a server: the site is read as files.
+
+    The first query goes through the page, the others only through its script, which takes less time.
+    """
     async with browsing() as browser:
         page = await (await browser.new_context()).new_page()
         wrong: list[str] = []
         page.on("console", lambda said: wrong.append(said.text) if said.type == "error" else None)
         page.on("pageerror", lambda error: wrong.append(f"{error}"))
-        for query in queries:
-            await page.goto(f"{(site / 'search.html').as_uri()}?q={quote(query)}")
-            await page.wait_for_function(
-                "document.querySelector('#search-results h2').innerText == 'Search Results'"
-            )
-            links = await page.locator("#search-results li > a").all()
-            found.append([f"{await link.get_attribute('href')}" for link in links[:3]])
+        await page.goto(f"{(site / 'search.html').as_uri()}?q={quote(queries[0])}")
+        await page.wait_for_function(
+            "document.querySelector('#search-results h2').innerText == 'Search Results'"
+        )
+        links = await page.locator("#search-results li > a").all()
+        shown = [f"{await link.get_attribute('href')}" for link in links[:3]]
+        found: list[list[str]] = [await page.evaluate(FIRST_THREE, query) for query in queries]
+        assert found[0] == shown
         assert wrong == []
     return found
 
