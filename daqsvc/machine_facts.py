@@ -1,7 +1,8 @@
-"""What others get to know about a machine: its streams, and the machine file that is in force."""
+"""What others get to know about a machine: its streams, the machine file in force, files that it names."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 from typing import TYPE_CHECKING, Any
@@ -12,12 +13,19 @@ from daqsvc.settings.hooks import PluginFailedError
 from daqsvc.settings.models import MachineFile
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
 
     from daqsvc.settings.streams import Grid
 
 
 log = logging.getLogger(__name__)
+
+LONGEST_FILE = 16_000_000
+"""Bytes of a file that goes along with a machine file."""
+_TABLES = ("pipeline", "streams")
+"""Whose values may be paths: calibrations of detectors, DBC files of layouts."""
+_SUFFIXES = (".toml", ".dbc")
 
 
 def machine_values(machine: MachineFile) -> dict[str, Any]:
@@ -29,6 +37,46 @@ def machine_values(machine: MachineFile) -> dict[str, Any]:
         )
     )
     return values
+
+
+def with_paths(values: dict[str, Any], change: Callable[[str], str]) -> dict[str, Any]:
+    """The values of a machine file with other paths of the files that it names.
+
+    Args:
+        values: see `machine_values`.
+        change: makes of each path the other one.
+    """
+    return {key: _with_paths(one, change) if key in _TABLES else one for key, one in values.items()}
+
+
+def _with_paths(value: Any, change: Callable[[str], str]) -> Any:
+    if isinstance(value, dict):
+        return {key: _with_paths(one, change) for key, one in value.items()}
+    if isinstance(value, list):
+        return [_with_paths(one, change) for one in value]
+    is_path = isinstance(value, str) and value.lower().endswith(_SUFFIXES)
+    return change(value) if is_path else value
+
+
+def files_named(values: dict[str, Any], folder: Path) -> dict[str, bytes]:
+    """By path as written the content of each file that a machine file names; blocks.
+
+    Files that cannot be read, or have more than `LONGEST_FILE` bytes, are left out.
+
+    Args:
+        values: see `machine_values`.
+        folder: where relative paths start.
+    """
+    files: dict[str, bytes] = {}
+
+    def read(path: str) -> str:
+        with contextlib.suppress(OSError):
+            if (whole := folder / path).stat().st_size <= LONGEST_FILE:
+                files[path] = whole.read_bytes()
+        return path
+
+    with_paths(values, read)
+    return files
 
 
 def fault_names(machine: MachineFile) -> dict[str, dict[str, str]]:

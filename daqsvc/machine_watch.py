@@ -42,6 +42,7 @@ class MachineWatch:
         stream_silent: says of a stream what its bus knows of why nothing comes; empty if nothing.
         kernels: threads that its detectors compute in.
         make_reader: makes what hands the samples of a ring to a detector.
+        listens: whether its pipeline finds out by itself that a stream is silent.
 
     Attributes:
         machine: as given.
@@ -69,6 +70,8 @@ class MachineWatch:
         stream_silent: Callable[[str], str],
         kernels: KernelThreads,
         make_reader: Callable[[SampleRing], RingReader] = RingReader,
+        *,
+        listens: bool = True,
     ) -> None:
         self.machine = machine
         self.store = store
@@ -104,6 +107,7 @@ class MachineWatch:
             make_reader=make_reader,
             on_read=self._on_read,
             on_processed=self._on_processed,
+            listens=listens,
         )
 
     def deliver(self, block: SampleBlock) -> None:

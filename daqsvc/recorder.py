@@ -13,7 +13,7 @@ import logging
 import math
 from collections import deque
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, get_args
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias, get_args
 
 from daqsvc import __version__
 from daqsvc.acquisition.clock import NS_PER_S, iso_utc
@@ -25,7 +25,7 @@ from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.errors.code import coded
 from daqsvc.errors.command_line import NOT_ASKED
 from daqsvc.errors.service import SNAPSHOT_LOST
-from daqsvc.machine_facts import fault_names, machine_values, stream_facts
+from daqsvc.machine_facts import fault_names, files_named, machine_values, stream_facts
 from daqsvc.notice import notice
 from daqsvc.publish.payloads import alarm_document, statement_document
 from daqsvc.settings.registry import configured
@@ -49,7 +49,7 @@ from daqsvc.snapshots.folder import SnapshotFolder
 from daqsvc.snapshots.speed_steps import SpeedSteps
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Sequence
     from pathlib import Path
 
     from daqsvc.acquisition.clock import Clock
@@ -85,8 +85,6 @@ MOST_MEMORY_BYTES = 16_000_000
 """What is kept of what one detector remembered, at most; the newest is kept however large it is."""
 MOST_ASKED = 16
 """People who wait for a snapshot at a time."""
-LONGEST_FILE = 16_000_000
-"""Of a file that goes into a snapshot."""
 PATIENCE_NS = 5 * NS_PER_S
 """How much longer a snapshot lasts, at most, for detectors to state what they find in its samples."""
 HOLD_NS = 2 * MEMORY_EVERY_NS + SPARE_NS
@@ -899,10 +897,7 @@ class MachineRecorder:
         files = {MACHINE_JSON: json.dumps(values, indent=1).encode()}
         if machine.text:
             files[MACHINE_TOML] = machine.text.encode()
-        for path in _paths(values):
-            with contextlib.suppress(OSError):
-                if (whole := machine.path.parent / path).stat().st_size <= LONGEST_FILE:
-                    files[f"{FILES}{path}"] = whole.read_bytes()
+        files |= {f"{FILES}{path}": data for path, data in files_named(values, machine.path.parent).items()}
         for key, _, _ in configured(machine.pipeline):
             with contextlib.suppress(OSError):
                 files[f"{STORE}{key}.toml"] = (self._store / f"{key}.toml").read_bytes()
@@ -970,24 +965,6 @@ class MachineRecorder:
             case _Caused(kind, words):
                 noted = Noted(CAUSES, {"kind": kind, "cause": words})
         return Entry(item.at_ns, noted)
-
-
-def _paths(values: Any) -> Iterator[str]:
-    """The files that tables of detectors and layouts of streams name."""
-    for table in (values.get("pipeline", {}), values.get("streams", {})):
-        yield from _texts(table)
-
-
-def _texts(value: Any) -> Iterator[str]:
-    """Texts that look like the path of a file."""
-    if isinstance(value, dict):
-        for one in value.values():
-            yield from _texts(one)
-    elif isinstance(value, list):
-        for one in value:
-            yield from _texts(one)
-    elif isinstance(value, str) and value.lower().endswith((".toml", ".dbc")):
-        yield value
 
 
 def _first_after(history: Sequence[_Item], memory: _Remembered) -> int | None:

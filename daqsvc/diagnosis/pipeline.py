@@ -279,6 +279,7 @@ class Pipeline:
         make_reader: makes what hands the samples of a ring to a detector.
         on_read: called on the event loop with a detector's name and each window that is read for it.
         on_processed: called, on the thread that computes, with a detector and each window it has processed.
+        listens: whether to find out that a stream is silent; else whoever knows calls `fell_silent`.
     """
 
     def __init__(
@@ -297,7 +298,10 @@ class Pipeline:
         make_reader: Callable[[SampleRing], RingReader] = RingReader,
         on_read: Callable[[str, Window], None] = lambda _detector, _window: None,
         on_processed: Callable[[Detector, Window], None] = lambda _detector, _window: None,
+        *,
+        listens: bool = True,
     ) -> None:
+        self._listens = listens
         self._on_read = on_read
         self._on_processed = on_processed
         self.counters = {detector.name: DetectorCounters() for detector in detectors}
@@ -360,6 +364,20 @@ class Pipeline:
         elif standing.proven:
             self._let_go(stream)
 
+    def fell_silent(self, stream: str, t_ns: int) -> None:
+        """Take in that a stream is silent; call on the event loop.
+
+        What its detectors find in samples from before that is not reported any more. A stream in doubt stays
+        as it stands.
+
+        Args:
+            stream: its name.
+            t_ns: when that was noticed.
+        """
+        if not self._standings[stream].doubt:
+            self._let_go(stream)
+            self._silent_until_ns[stream] = t_ns
+
     def _say_doubt(self, stream: str, doubt: str) -> None:
         now_ns = self._clock.monotonic_ns()
         for detector in self.detectors:
@@ -402,7 +420,7 @@ class Pipeline:
         """
         self._kernels.enter()
         keep = self._supervisor.keep
-        listening = keep("silence", self._listen_for_silence)
+        listening = [keep("silence", self._listen_for_silence)] if self._listens else []
         following = [
             keep(_part(d), partial(self._follow, d), may_end=partial(_is_closed, self._rings[d.stream]))
             for d in self.detectors
@@ -412,11 +430,11 @@ class Pipeline:
             while not all(ring.is_closed for ring in self._rings.values()):  # some of them are not followed
                 await self._clock.sleep_ns(LOOK_NS)
         finally:
-            for part in (listening, *following):
+            for part in (*listening, *following):
                 part.stop()
             # A cancelled task may have left a kernel running; nothing is left behind, nor the loop held up.
             await asyncio.shield(self._kernels.leave(self._under_way.values()))
-            await over([listening, *following])
+            await over([*listening, *following])
 
     async def _listen_for_silence(self) -> None:
         """Have detectors say, once, that their stream has fallen silent: a window never comes to say it.
@@ -469,8 +487,7 @@ class Pipeline:
             # What the stream was doubted for is no longer what is wrong.
             self._fall_silent(stream, StreamState(reason, standing.proven, silent=True))
             return over or why
-        self._let_go(stream)
-        self._silent_until_ns[stream] = now_ns
+        self.fell_silent(stream, now_ns)
         if not any(detector.stream == stream for detector in self.detectors):
             logger.warning("%s; no detector reads them", reason, extra=coded(NO_DETECTOR))
         for detector in self.detectors:

@@ -2,8 +2,8 @@
 
 The buses are replaced, and the hands that give samples to detectors: these give the windows that were given
 then. So every detector computes the same numbers from the same samples in the same portions. It begins with
-what it remembered then, if the snapshot has that, else again. That nothing came is heard as it was said then:
-no sample tells when.
+what it remembered then, if the snapshot has that, else again. That nothing came is heard as it was said then,
+and at that time: no sample tells when.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import json
 import time
 from collections import Counter, deque
 from dataclasses import dataclass, field
+from hashlib import sha256
 from typing import TYPE_CHECKING, NoReturn
 
 from pydantic_core import to_json
@@ -30,7 +31,7 @@ from daqsvc.diagnosis.memory import DetectorMemory, MemoryNotFittingError, put
 from daqsvc.diagnosis.pipeline import THREADS, KernelThreads, kernel_failed
 from daqsvc.diagnosis.statements import said_of_silence
 from daqsvc.errors.recordings import NOT_REPLAYABLE
-from daqsvc.machine_facts import machine_values
+from daqsvc.machine_facts import files_named, machine_values, with_paths
 from daqsvc.machine_watch import MachineWatch
 from daqsvc.publish.payloads import (
     alarm_document,
@@ -44,7 +45,7 @@ from daqsvc.snapshots.contents import ALARMS, DIAGNOSES, FILES, MACHINE_JSON, ST
 from daqsvc.supervision import Supervisor
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterable, Sequence
+    from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
     from pathlib import Path
 
     from daqsvc.acquisition.ring import SampleRing
@@ -55,11 +56,12 @@ if TYPE_CHECKING:
     from daqsvc.snapshots.contents import Document, Noted, Snapshot
 
 STEP_NS = NS_PER_S // 4
-"""The clock goes on in steps of this length, so that silence is noticed as it was."""
+"""The clock goes on in steps of this length, so that alarms see in time what time alone brings."""
 LONGEST_GAP_NS = 3600 * NS_PER_S
 """Between two entries of a snapshot: what is longer is damage."""
 ALARM_TICK_NS = NS_PER_S
 _LONGEST_REASON = 200
+_NOT_REMEMBERED = "the snapshot does not have what it remembered"
 _LISTED = 5
 """Names that are said one by one."""
 _TURNS = 4
@@ -162,21 +164,57 @@ def machine_of(snapshot: Snapshot, directory: Path) -> MachineFile:
     Raises:
         ReplayError: it has none, or none that can be used.
     """
+    laid: dict[str, str] = {}
+    lacking: list[str] = []
+
+    def here(path: str) -> str:
+        if path not in laid:
+            lacking.append(path)
+        return laid.get(path, path)
+
     try:
-        text = snapshot.files[MACHINE_JSON].decode()
-        for name, data in snapshot.files.items():
-            if name.startswith(FILES):
-                # Wherever it was then: here it lies among the others.
-                number = f"{len(list(directory.iterdir()))}-{name.rpartition('/')[2]}"
-                (directory / number).write_bytes(data)
-                text = text.replace(json.dumps(name.removeprefix(FILES)), json.dumps(number))
-        values = json.loads(text)
+        for path, data in _files(snapshot).items():
+            # Wherever it was then: here it lies among the others.
+            laid[path] = f"{len(laid)}-{path.rpartition('/')[2]}"
+            (directory / laid[path]).write_bytes(data)
+        values = with_paths(json.loads(snapshot.files[MACHINE_JSON]), here)
         return machine_file_of(values, directory / MACHINE_JSON)
     except MachineFileError as error:
         problem = error.problems[0]
+        if any(f"{directory / path}" in problem.message for path in lacking):
+            raise ReplayError(
+                f"does not have {_listed(lacking)}, which could not be read when it was written: "
+                "name the machine file behind it, in a folder that has this file"
+            ) from None
         raise ReplayError(f"has a machine file that cannot be used here: {problem.message}") from None
     except (*_NOT_OURS, OSError):
         raise ReplayError("has no machine file that can be used: name one behind it") from None
+
+
+def _files(snapshot: Snapshot) -> dict[str, bytes]:
+    """By path as the machine file has it, the content of each file that it names."""
+    files = snapshot.files
+    return {name.removeprefix(FILES): data for name, data in files.items() if name.startswith(FILES)}
+
+
+def _why_anew(snapshot: Snapshot, machine: MachineFile) -> str:
+    """Why no detector can go on with what it remembered; empty if it can.
+
+    A machine file is the same, wherever it lies, if its values are, and what is in the files that it names.
+    """
+    version = snapshot.about["version"]
+    if version != __version__:
+        return f"the snapshot is of daqsvc {version!s:.60}, and this is {__version__}"
+    then, now = json.loads(snapshot.files.get(MACHINE_JSON, b"{}")), machine_values(machine)
+    files = files_named(now, machine.path.parent)
+    if _with_contents(then, _files(snapshot)) == _with_contents(now, files):
+        return ""
+    return "the machine file, or a file that it names, is not the one in the snapshot"
+
+
+def _with_contents(values: Document, files: Mapping[str, bytes]) -> Document:
+    """The values of a machine file, with what is in each file that it names in place of its path."""
+    return with_paths(values, lambda path: sha256(files[path]).hexdigest() if path in files else path)
 
 
 class Pace:
@@ -253,17 +291,11 @@ class Replay:
                 )
             self._from_start = set(about["streams"] if about["from_start"] else ())
             self._from_start |= set(about.get("streams_from_start", ()))
-            self._is_same = about["version"] == __version__ and machine_values(named) == json.loads(
-                snapshot.files.get(MACHINE_JSON, b"null")
-            )
+            self._why_anew = _why_anew(snapshot, named)
         except _NOT_OURS as error:
             _refuse(error)
+        self._is_same = not self._why_anew
         self._memories = self._found_memories() if self._is_same else {}
-        self._why_anew = (
-            "the snapshot does not have what it remembered"
-            if self._is_same
-            else "the snapshot is of another version of daqsvc, or of another machine file"
-        )
         self._clock = DrivenClock(self._begin_ns, self._begin_ns + self._wall_ns)
         self._supervisor = Supervisor()
         self._readers: dict[str, GivenWindows] = {}
@@ -379,6 +411,7 @@ class Replay:
                 lambda _stream: "",
                 KernelThreads(THREADS, kernel_failed(self._supervisor)),
                 GivenWindows,
+                listens=False,
             )
             misfit = self._remind(watch)
             if not misfit:
@@ -403,7 +436,7 @@ class Replay:
                 self._since[detector.name] = end_index
                 self._result.anew.pop(detector.name, None)
             elif not (detector.stream in self._from_start and self._is_same):
-                self._result.anew[detector.name] = self._why_anew
+                self._result.anew[detector.name] = self._why_anew or _NOT_REMEMBERED
         return ""
 
     def _found_memories(self) -> dict[str, tuple[int, DetectorMemory]]:
@@ -496,13 +529,21 @@ class Replay:
     def _hear(self, statement: Document) -> None:
         """Have the alarms hear what was said then, if it is not said again."""
         is_silence = _is_silence(statement)
-        if not is_silence and (self._is_replayed(statement) or not self._is_same):
+        if is_silence:
+            self._see_silence(statement)
+        elif self._is_replayed(statement) or not self._is_same:
             return
         diagnosis = recorded_statement(statement)
         events = self._alarms.take(diagnosis)
         if is_silence:
             self._result.statements.append(diagnosis)
             self._take(events)
+
+    def _see_silence(self, statement: Document) -> None:
+        """Have the pipeline know since when a stream is silent."""
+        if statement["sensors"]:  # those of a detector that has failed name none
+            stream = self._readers[self._names[statement["detector"]]].ring.stream
+            self._watch.pipeline.fell_silent(stream, int(statement["monotonic_ns"]))
 
     def _go_on_from(self, event: AlarmEvent) -> None:
         """Have an alarm stand as it did then, where what was heard is not enough for it to."""
@@ -577,9 +618,7 @@ class Replay:
 
     def _tell_of_others(self, others: dict[str, Counter[str]]) -> None:
         if of_service := others[ALARMS].pop(SERVICE, 0):
-            self._result.notes.append(
-                f"alarm events of the service itself are not judged again: {of_service}"
-            )
+            self._result.notes.append(f"alarm events of the service itself are not compared: {of_service}")
         for topic, words in ((DIAGNOSES, "statements"), (ALARMS, "alarm events")):
             if counts := others[topic]:
                 self._result.notes.append(
@@ -602,7 +641,8 @@ class Replay:
             for event in self._result.alarms
             if not event.by and _comparable(statement_document(event.cause)) not in later
         ]
-        _hold(self._result.alarmed, alarmed, [alarm_document(one) for one in of_data])
+        alarmed_now = filter(self._is_judged, map(alarm_document, of_data))
+        _hold(self._result.alarmed, alarmed, list(alarmed_now))
 
     def _is_replayed(self, document: Document) -> bool:
         """Whether a statement of then rests on samples that were judged again."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from support.machine_files import TRIAXIAL
 from support.paths import ROOT
 from support.recorded_rig import recorded_rig
 
@@ -57,6 +58,16 @@ async def test_it_is_refused(about: dict[str, Any], files: dict[str, bytes] | No
     with pytest.raises(ReplayError) as caught:
         await replay(Snapshot({**ABOUT, **about}, there), None, tmp_path)
     assert "\n" not in f"{caught.value}"
+
+
+async def test_a_snapshot_without_the_dbc_asks_for_a_machine_file_that_has_it(tmp_path: Path) -> None:
+    values = machine_values(load_machine_file(TRIAXIAL))
+    with pytest.raises(ReplayError) as caught:
+        await replay(Snapshot(ABOUT, {MACHINE_JSON: json.dumps(values).encode()}), None, tmp_path)
+    assert f"{caught.value}" == (
+        "does not have ../devices/triaxial-accelerometer.dbc, which could not be read when it was written: "
+        "name the machine file behind it, in a folder that has this file"
+    )
 
 
 FACTS = {"rate_hz": 640.0, "channels": ["x"], "sensors": ["probe-x"], "units": ["um"]}

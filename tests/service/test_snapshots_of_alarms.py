@@ -185,7 +185,7 @@ async def test_what_the_service_says_of_itself_is_not_judged_again(tmp_path: Pat
         path = await asked
     replayed = await again(read_snapshot(path, ResourceLimits()), tmp_path / "replay")
     assert replayed.is_equal, replayed.alarmed
-    assert replayed.notes == ["alarm events of the service itself are not judged again: 2"]
+    assert replayed.notes == ["alarm events of the service itself are not compared: 2"]
 
 
 @pytest.mark.long

@@ -70,19 +70,29 @@ def recorder_of(service: Service) -> MachineRecorder:
     return recorder
 
 
-async def play(service: Service, clock: DrivenClock, samples: Samples) -> None:
-    """Play samples on the bus of a service, as fast as it goes."""
+async def play(service: Service, clock: DrivenClock, samples: Samples, first_index: int = 0) -> None:
+    """Play samples of the one stream of a service on its bus, as fast as it goes.
+
+    Args:
+        service: that watches the machine.
+        clock: of the service.
+        samples: ``[n, channels]``.
+        first_index: what the device has counted before.
+    """
     machine = watch_of(service).machine
+    [(name, stream)] = machine.streams.items()
     channel = machine.buses["can0"].model_dump()["channel"]
     with can.Bus(interface="virtual", channel=channel, protocol=can.CanProtocol.CAN_FD) as bus:
-        node = CanNode(bus, frame_layout(machine, "shaft"), samples, RATE_HZ)
-        counters = service.drivers[0].streams["shaft"][0]
+        layout = frame_layout(machine, name)
+        node = CanNode(bus, layout, samples, stream.rate_hz, first_index=first_index)
+        counters = service.drivers[0].streams[name][0]
+        frames_before = counters.frames_received
         recorder = recorder_of(service)
 
         def backlog() -> int:
             if recorder.is_writing:
                 return len(samples)  # driven time waits for the disk, as real time has no need to
-            on_the_way = node.frames_sent - counters.frames_received
+            on_the_way = node.frames_sent + frames_before - counters.frames_received
             return on_the_way * node.samples_per_frame + watch_of(service).pipeline.behind_samples
 
         blocks = [detector.block for detector in watch_of(service).pipeline.detectors]
