@@ -137,6 +137,7 @@ class Service:
             if there are none.
         on_reload: called with True when a reload begins to change something, and with False when it is over.
         files: what is read again, as it was named.
+        close_s: what the journal may take to close at the end.
 
     Raises:
         AssemblyError: the machine file asks for a driver that is not installed.
@@ -153,6 +154,7 @@ class Service:
         read_again: Callable[[], Box] | None = None,
         on_reload: Callable[[bool], None] = lambda _: None,
         files: Sequence[Path] = (),
+        close_s: float = CLOSE_S,
     ) -> None:
         self.box = box
         self.clock: Clock = clock or SystemClock()
@@ -162,6 +164,7 @@ class Service:
         self._store = store
         self._read_again = read_again
         self._on_ending = on_ending
+        self._close_s = close_s
         self._on_reload = on_reload
         self._reloading = asyncio.Lock()
         self._is_ending = False
@@ -293,7 +296,7 @@ class Service:
                 starting.cancel()
                 await asyncio.wait({starting}, timeout=DRAIN_S)
                 await self.control.close()
-                await self.alarms.close(CLOSE_S)
+                await self.alarms.close(self._close_s)
 
     async def _start(self) -> None:
         await self.alarms.open()

@@ -10,6 +10,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,6 +18,8 @@ import pytest
 from rich.console import Console
 from support.examples import first_of
 
+from daqsvc import service as service_module
+from daqsvc.outbox.journal import Journal
 from daqsvc.service import Service
 from sim_hw.demo import broker, session
 from sim_hw.demo.broker import EmbeddedBroker
@@ -58,6 +61,24 @@ def demo(*arguments: str, **options: Any) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "daqsvc", "demo", *arguments]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     return subprocess.Popen(command, text=True, **{**pipes, **options})
+
+
+async def test_it_removes_the_store_when_the_disk_has_taken_everything(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    close, closed = Journal.close, []
+
+    def late(journal: Journal) -> None:
+        time.sleep(2 * service_module.CLOSE_S)  # longer than a service waits that is to stop at once
+        close(journal)
+        closed.append(journal)
+
+    monkeypatch.setattr(Journal, "close", late)
+    script = recorded(tmp_path, 5.0)
+    outcome = await DemoSession(script, speed=1000, broker_url=None, on_message=lambda _: None).run()
+    assert outcome.complete
+    assert closed, "the folder is removed before the journal is closed"
+    assert "did not close" not in caplog.text
 
 
 # What a person types wrong.
