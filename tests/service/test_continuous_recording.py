@@ -49,6 +49,7 @@ async def test_files_join_over_an_alarm_and_each_is_judged_again_as_it_was(
         replayed = await replay(snapshot, None, folder)
         assert not replayed.anew
         equal += replayed.said.equal
-        assert replayed.is_equal, (path, replayed.said.changed[:1], replayed.alarmed)
+        # A short file, as the last one may be, has no statement, and nothing was compared.
+        assert replayed.is_equal or not replayed.is_compared, (path, replayed.said, replayed.alarmed)
     assert end_index == PLAYED
     assert equal > 20
