@@ -16,6 +16,7 @@ import numpy as np
 
 from daqsvc.bearing.model import BearingModel
 from daqsvc.bearing.residual import ORDER
+from daqsvc.rounding import rounded_up
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -109,7 +110,7 @@ def healthy_spectrum(
     if len(learnt) < least:
         raise ValueError(
             f"bearing {purpose}: {len(residual) / rate_hz:.2f} s of healthy residual; "
-            f"{(least + 1) * frame / 2.0 / rate_hz:.2f} s or more without gaps are needed"
+            f"{rounded_up(((least - 1) * (frame // 2) + frame) / rate_hz)} s or more without gaps are needed"
         )
     return HealthySpectrum(covariance(learnt), len(learnt))
 

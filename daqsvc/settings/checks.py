@@ -25,6 +25,7 @@ from daqsvc.errors.machine_file import (
     TOO_MUCH_MEMORY,
     UNUSED_BUS,
 )
+from daqsvc.rounding import rounded_down
 from daqsvc.settings.alarm_checks import alarm_checks
 from daqsvc.settings.error_messages import dotted
 from daqsvc.settings.failures import BrokenContractError
@@ -39,7 +40,6 @@ from daqsvc.settings.plugins import (
 from daqsvc.settings.problems import Finding, choice, unique
 from daqsvc.settings.registry import broken_drivers
 from daqsvc.settings.rotor_physics import physics_checks
-from daqsvc.settings.rounding import rounded_down
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.sensor_checks import (
     check_alarm_reach,

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from support.machine_files import LAVAL, MACHINES, changed
 from support.paths import ROOT
 
+from daqsvc.rounding import rounded_down, rounded_up
 from daqsvc.settings import MachineFileError, parse_machine_file
-from daqsvc.settings.rounding import rounded_down, rounded_up
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -53,6 +53,7 @@ from daqsvc.dsp.quality import UnfitError
 from daqsvc.dsp.quality.accelerometers import LEAST_BAND, checked
 from daqsvc.dsp.quality.occupied import occupied_top_hz
 from daqsvc.dsp.speed.harmonics import NEAR, REMEDY, shaft_rate, slow_series
+from daqsvc.rounding import rounded_up
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -236,7 +237,7 @@ def _measured(
         raise UnfitError(
             "channel",
             f"has {_empty_above(top_hz, rate_hz)}, which leaves the band {rules.low_hz:g} to {top_hz:.0f} Hz",
-            f"record up to {least_hz:.0f} Hz or more",
+            f"record up to {rounded_up(least_hz, 4)} Hz or more",
         )
     del channel
     length = scipy.fft.prev_fast_len(len(sound.values), real=True)

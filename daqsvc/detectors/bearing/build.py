@@ -21,8 +21,8 @@ from daqsvc.dsp.quality.unit import M_S2_PER_UNIT
 from daqsvc.dsp.speed.keyphasor import KeyphasorProbe
 from daqsvc.errors.code import coded
 from daqsvc.errors.detectors import HEALTHY_STATE
+from daqsvc.rounding import rounded_up
 from daqsvc.settings.models import Keyphasor
-from daqsvc.settings.rounding import rounded_up
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -18,8 +18,8 @@ from daqsvc.errors.machine_file import (
     SAMPLED_TOO_SLOWLY,
     WRONG_SENSOR_TYPE,
 )
+from daqsvc.rounding import rounded_up
 from daqsvc.settings.problems import Finding, choice, unique
-from daqsvc.settings.rounding import rounded_up
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

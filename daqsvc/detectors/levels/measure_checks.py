@@ -16,6 +16,7 @@ from daqsvc.errors.machine_file import (
     SAMPLED_TOO_SLOWLY,
     WRONG_SENSOR_TYPE,
 )
+from daqsvc.rounding import rounded_up
 from daqsvc.settings.measures import (
     OF_THE_SHAFT,
     PHASE_OF,
@@ -28,7 +29,6 @@ from daqsvc.settings.measures import (
 )
 from daqsvc.settings.models import LevelAlarm, SetpointAlarm
 from daqsvc.settings.problems import Finding, choice
-from daqsvc.settings.rounding import rounded_up
 from daqsvc.settings.section import UnusableValueError
 
 if TYPE_CHECKING:

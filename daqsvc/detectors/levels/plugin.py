@@ -16,6 +16,7 @@ from daqsvc.diagnosis.reading import STALE_S, Reading
 from daqsvc.diagnosis.snapshots import at_once, patience
 from daqsvc.errors.detectors import BAND_TOO_HIGH, WINDOW_TOO_SHORT
 from daqsvc.errors.machine_file import NO_EFFECT, RING_TOO_SHORT
+from daqsvc.rounding import rounded_up
 from daqsvc.settings.measures import PHASE_OF, PHASES, UNITS, VELOCITIES
 from daqsvc.settings.models import (
     Accelerometer,
@@ -27,7 +28,6 @@ from daqsvc.settings.models import (
     VelocitySensor,
 )
 from daqsvc.settings.problems import Finding
-from daqsvc.settings.rounding import rounded_up
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping

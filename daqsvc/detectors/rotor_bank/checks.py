@@ -22,9 +22,9 @@ from daqsvc.errors.detectors import (
     NOISE_TOO_LARGE,
 )
 from daqsvc.errors.machine_file import CONTRADICTION, SAMPLED_TOO_SLOWLY
+from daqsvc.rounding import rounded_up
 from daqsvc.settings.problems import Finding, unique
 from daqsvc.settings.rotor_physics import rest_um, whirl_um
-from daqsvc.settings.rounding import rounded_up
 from daqsvc.settings.section import UnusableValueError
 
 if TYPE_CHECKING:

@@ -10,8 +10,8 @@ from daqsvc.diagnosis.plugin import Detectability, DetectorPlugin, UnfitOptionEr
 from daqsvc.diagnosis.reading import Reading
 from daqsvc.errors.detectors import CALIBRATION_FILE, NEEDS_KEYPHASOR
 from daqsvc.errors.machine_file import NO_EFFECT, SAMPLED_TOO_SLOWLY
+from daqsvc.rounding import rounded_up
 from daqsvc.settings.problems import AssemblyError, Finding
-from daqsvc.settings.rounding import rounded_up
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

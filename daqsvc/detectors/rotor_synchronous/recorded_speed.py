@@ -17,7 +17,7 @@ from daqsvc.dsp.speed.orbit import AT_THE_EDGE, estimate_speed, refuse_elsewhere
 from daqsvc.dsp.speed.steadiness import Trend, trend_of_orbit, trend_of_pulses
 from daqsvc.rotor.synchronous.baseline import LEAST_REVOLUTIONS
 from daqsvc.rotor.synchronous.watch import WatchRules
-from daqsvc.settings.rounding import rounded_up
+from daqsvc.rounding import rounded_up
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -19,6 +19,7 @@ from daqsvc.dsp.quality.missing import ACCELEROMETER_SHARE
 from daqsvc.dsp.quality.outliers import Prewhitening, blanked, despiked, find_transients, merged, runs
 from daqsvc.dsp.quality.stuck import DEAD_SHARE, dropouts
 from daqsvc.dsp.quality.unit import refuse_beyond_any_unit, refuse_still
+from daqsvc.rounding import rounded_up
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -81,7 +82,7 @@ def checked(samples: Real, rate_hz: float, speed_rpm: float, band_hz: tuple[floa
         raise UnfitError(
             "sample rate",
             f"is {rate_hz:g} Hz, which leaves the band {low_hz:g} to {top_hz:g} Hz",
-            f"sample with {LEAST_BAND * low_hz / 0.48:.0f} Hz or more",
+            f"sample with {rounded_up(LEAST_BAND * low_hz / 0.48, 4)} Hz or more",
         )
     revolutions = len(x) / rate_hz * speed_rpm / 60.0
     if revolutions < LEAST_REVOLUTIONS:
