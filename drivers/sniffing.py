@@ -45,7 +45,15 @@ class SniffError(Exception):
 
 
 class NothingFoundError(SniffError):
-    """The bus was examined, and nothing of use was on it."""
+    """The bus was examined, and nothing of use was on it.
+
+    Attributes:
+        figures: what was found all the same; see `Sniffed`.
+    """
+
+    def __init__(self, message: str, figures: Mapping[str, Any] | None = None) -> None:
+        super().__init__(message)
+        self.figures: Mapping[str, Any] = figures or {}
 
 
 class SniffTable(NamedTuple):
@@ -206,5 +214,5 @@ def sniffed(
     sniffer.add_arguments(parser)
     found = sniffer.sniff(parser.parse_args(words), stop, tell)
     if found.problem:
-        raise NothingFoundError(found.problem)
+        raise NothingFoundError(found.problem, found.figures)
     return found.figures

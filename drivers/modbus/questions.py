@@ -83,10 +83,17 @@ class _ModbusQuestions(BusQuestions):
         words = self._sniffed_as(answers)
         try:
             found = sniffed(ModbusSniffer(), ["--units", _UNITS[0], *words], stop, tell)
-        except NothingFoundError:
+        except NothingFoundError as error:
+            if error.figures.get("units"):
+                return _without_registers(error.figures)
             if stop.is_set():
                 raise
-            found = sniffed(ModbusSniffer(), ["--units", _UNITS[1], *words], stop, tell)
+            try:
+                found = sniffed(ModbusSniffer(), ["--units", _UNITS[1], *words], stop, tell)
+            except NothingFoundError as other:
+                if other.figures.get("units"):
+                    return _without_registers(other.figures)
+                raise
         except SniffError as error:
             raise SniffError(f"{error}".replace("TARGET", "its address")) from error
         return Heard(list(_in_words(found)), lambda so_far: self._proposals(found, so_far))
@@ -439,6 +446,31 @@ def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
             yield f"  {address}: {value}{meant}{moves}"
         if len(shown) > _SHOWN:
             yield f"  ... and {len(shown) - _SHOWN} more: daqsvc sniff modbus shows them"
+
+
+def _without_registers(found: Mapping[str, Any]) -> Heard:
+    """Units that answer, although none of the registers that were asked for is there."""
+    from drivers.modbus.scan import ILLEGAL_FUNCTION  # noqa: PLC0415 - only for who listens
+
+    first, last = found["units_asked"]
+    lines = [f"units that answer: {', '.join(map(str, found['units']))} (units {first} to {last} were asked)"]
+    proposed = {"unit": f"{found['units'][0]}"}
+    by_unit: dict[int, list[str]] = {}
+    for table in found["tables"]:
+        name, unit = _TABLES[table["function"]], table["unit"]
+        tables = by_unit.setdefault(unit, [])
+        if any(code == ILLEGAL_FUNCTION for _, code in table["refused"]):
+            lines.append(f"unit {unit} has no {name} registers: it refuses function {table['function']}")
+        elif table["asked"]:
+            tables.append(name)
+            asked = " to ".join(map(str, table["asked"]))
+            lines.append(f"unit {unit} answers for {name} registers, but has none of {asked}: see its manual")
+
+    def proposals(so_far: Answers) -> dict[str, str]:
+        tables = by_unit.get(so_far.get("unit", found["units"][0]), [])
+        return proposed | ({"table": tables[0]} if tables else {})
+
+    return Heard(lines, proposals)
 
 
 def _doubt(address: int | None) -> tuple[str, str] | None:

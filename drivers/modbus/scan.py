@@ -42,6 +42,14 @@ LAST_REGISTER = 65_535
 TABLES = {3: "holding", 4: "input"}
 
 
+def units_in_words(units: Sequence[int]) -> str:
+    """Some units for a person, in order: ``unit 3``, ``units 1 to 5`` or ``units 5, 17``."""
+    if len(units) == 1:
+        return f"unit {units[0]}"
+    in_a_row = units[-1] - units[0] == len(units) - 1
+    return f"units {units[0]} to {units[-1]}" if in_a_row else f"units {', '.join(map(str, units))}"
+
+
 @dataclass(slots=True)
 class FoundTable:
     """What one function reads of a unit.
@@ -114,6 +122,7 @@ class Scan:
     Attributes:
         requests: how many were made.
         first_unit: the first unit that is asked.
+        to_ask: all of them.
         asked: the last one that was; None if none was.
         searched: whether all were asked, or the answers tell that the others need not be.
         units: those that answered, in order.
@@ -130,6 +139,7 @@ class Scan:
     tell: Callable[[str], None]
     requests: int = 0
     first_unit: int = 0
+    to_ask: Sequence[int] = ()
     asked: int | None = None
     searched: bool = False
     units: list[int] = field(default_factory=list)
@@ -188,7 +198,7 @@ class Scan:
             await self._close()
 
     async def _find(self, units: Sequence[int], function: int, address: int) -> None:
-        self.first_unit = units[0]
+        self.first_unit, self.to_ask = units[0], units
         for tried, unit in enumerate(units, 1):
             if self.stop.is_set():
                 return

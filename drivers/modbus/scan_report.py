@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from drivers.modbus.readings import chosen, is_signed, readings
 from drivers.modbus.replies import EXCEPTIONS
-from drivers.modbus.scan import ILLEGAL_FUNCTION, LAST_REGISTER
+from drivers.modbus.scan import ILLEGAL_FUNCTION, LAST_REGISTER, units_in_words
 from drivers.modbus.settings import ModbusTcpBus
 from drivers.sniffing import Sniffed, SniffTable, quoted, sensor_lines
 
@@ -78,7 +78,8 @@ class ScanReport:
         first, last = self._scan.first_unit, self._scan.asked
         if last is None:
             return "none was asked"
-        return f"unit {first} was asked" if first == last else f"units {first} to {last} were asked"
+        units = [unit for unit in self._scan.to_ask if first <= unit <= last]
+        return f"{units_in_words(units)} {'was' if first == last else 'were'} asked"
 
     def _to_check(self) -> str:
         """What there is to see to if nobody answers."""
@@ -122,11 +123,12 @@ class ScanReport:
             return
         none = "none" if table.complete else "none so far"
         runs = f"{len(table.first)} at {_runs(table.first)}" if table.first else none
-        yield "\n".join([f"{name}: {runs}", *self._range(table)])
+        lines = [f"{name}: {runs}", *self._range(table)]
         for address, code in table.refused.items():
-            yield f"{name}: refused from {address} on: exception {code}, {EXCEPTIONS.get(code, 'unknown')}"
+            lines.append(f"refused from {address} on: exception {code}, {EXCEPTIONS.get(code, 'unknown')}")
         if table.silent:
-            yield f"{name}: no reply to requests from {', '.join(map(str, table.silent))} on"
+            lines.append(f"no reply to requests from {', '.join(map(str, table.silent))} on")
+        yield "\n".join(lines)
         if table.first:
             yield SniffTable(
                 ("address", "hex", "uint16", "int16", "moves", "may be"),

@@ -45,7 +45,7 @@ class ModbusSniffer(Sniffer):
             "--units",
             default=UNITS,
             metavar="A-B",
-            help=f"addresses of units to try, e.g. 1-10 (default: {UNITS})",
+            help=f"addresses of units to try, e.g. 1-10 or 5,17 (default: {UNITS})",
         )
         parser.add_argument(
             "--registers",
@@ -97,18 +97,17 @@ class ModbusSniffer(Sniffer):
         """See `drivers.sniffing.Sniffer.sniff`."""
         from daqsvc.acquisition.clock import SystemClock  # noqa: PLC0415 - only for who scans
         from drivers.modbus.replies import LineLostError  # noqa: PLC0415
-        from drivers.modbus.scan import Scan  # noqa: PLC0415
+        from drivers.modbus.scan import Scan, units_in_words  # noqa: PLC0415
         from drivers.modbus.scan_report import ScanReport  # noqa: PLC0415
 
-        first_unit, last_unit = _range(arguments.units, "--units", 255)
+        units = _units(arguments.units)
         begin, end, note = _registers(arguments.registers or REGISTERS)
         if not 0 <= arguments.pause_ms <= 10_000:
             raise SniffError(f"--pause-ms {arguments.pause_ms:g}: give 0 to 10000 ms", usage=True)
         bus = _bus(arguments)
         functions = _FUNCTIONS[arguments.function]
-        units = range(first_unit, last_unit + 1)
         scan = Scan(bus, SystemClock(), stop, arguments.pause_ms / 1000, tell)
-        asked = f"unit {first_unit}" if len(units) == 1 else f"units {first_unit} to {last_unit}"
+        asked = units_in_words(units)
         tell(
             f"asking {bus.where} for {asked}, at most {math.ceil(scan.longest_s(len(units)))} s; then for "
             f"registers {begin} to {end} of each one that answers; Ctrl-C ends it early"
@@ -156,6 +155,19 @@ def _registers(text: str) -> tuple[int, int, str]:
     if end <= _LAST_REGISTER:
         return begin, end, note
     raise SniffError(note or _no_range("--registers", text, _LAST_REGISTER), usage=True)
+
+
+def _units(text: str) -> list[int]:
+    """Addresses of ``A-B``, ``A``, or several of them with commas between.
+
+    Raises:
+        SniffError: they are none.
+    """
+    units: set[int] = set()
+    for part in text.split(","):
+        first, last = _range(part.strip(), "--units", 255)
+        units.update(range(first, last + 1))
+    return sorted(units)
 
 
 def _range(text: str, option: str, most: int) -> tuple[int, int]:

@@ -444,6 +444,38 @@ def test_new_asks_the_other_units_where_none_of_the_first_answers(
     assert "units that answer: 4" in capsys.readouterr().out
 
 
+class InputOnly(ModbusUnit):
+    """A unit without holding registers, and with input registers beyond those that are asked."""
+
+    def answer(self, pdu: bytes) -> bytes:
+        return bytes([pdu[0] | 0x80, 2 if pdu[0] == 4 else 1])
+
+
+@pytest.mark.usefixtures("_few_registers")
+def test_new_proposes_the_unit_and_the_table_of_a_device_whose_registers_are_elsewhere(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for units in (("3-5", "6-7"), ("3-4", "5-6")):
+        monkeypatch.setattr(questions, "_UNITS", units)
+        with tcp({5: InputOnly()}) as target:
+            layout = new(tmp_path, target)["streams"]["device"]["layout"]
+        assert (layout["unit"], layout["table"]) == (5, "input")
+        said = capsys.readouterr().out
+        assert "Nothing was found" not in said
+        assert "unit 5 has no holding registers: it refuses function 3" in said
+        assert "unit 5 answers for input registers, but has none of 0 to 45: see its manual" in said
+
+
+def test_units_may_be_a_list(capsys: pytest.CaptureFixture[str]) -> None:
+    with tcp({3: pump(), 5: InputOnly(), 17: pump()}) as target:
+        assert main(words(target, "--units", "5, 17", "--registers", "0-3", "--function", "both")) == 0
+    shown = capsys.readouterr()
+    assert "for units 5, 17, at most" in shown.err
+    assert "units that answer: 5, 17 (units 5, 17 were asked)" in shown.out
+    assert shown.out.count("Unit 5, holding registers (function 3)") == 1
+    assert "Unit 5, holding registers (function 3): none\nrefused from 0 on: exception 1" in shown.out
+
+
 @pytest.mark.usefixtures("_few_registers")
 def test_new_says_what_to_do_when_nobody_answers_and_goes_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
