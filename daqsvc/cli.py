@@ -22,7 +22,7 @@ from daqsvc import kernel_cache
 from daqsvc.commands.account import AccountCommand
 from daqsvc.commands.alarms import AlarmsCommand, alarm_verbs
 from daqsvc.commands.analyze import AnalyzeCommand
-from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, ArgumentParser
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, ArgumentParser, is_path
 from daqsvc.commands.calibrate import CalibrateCommand
 from daqsvc.commands.complaint import complain
 from daqsvc.commands.detectability import DetectabilityCommand
@@ -265,6 +265,9 @@ def parser(known: dict[str, Command]) -> argparse.ArgumentParser:
     return root
 
 
+_ONE_FILE = "one file of the service is enough, or the directory of them"
+
+
 def _chosen(root: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:
     """The arguments, those of a verb that takes files with options between them too.
 
@@ -277,6 +280,8 @@ def _chosen(root: argparse.ArgumentParser, arguments: Sequence[str] | None) -> a
         root.error("argument FILE: must not be empty")
     if any(one.startswith("-") for one in rest):
         root.parse_args(arguments)  # says what is wrong
+    elif (alarms := getattr(chosen, "alarms", None)) is not None:
+        _take_words(root, chosen, [*alarms, *rest])
     elif rest and files is not None:
         chosen.files = [*files, *(rest if isinstance(files[0], str) else map(Path, rest))]
     elif len(rest) == 1 and {"file", "store"} <= vars(chosen).keys() and chosen.file is None:
@@ -284,13 +289,21 @@ def _chosen(root: argparse.ArgumentParser, arguments: Sequence[str] | None) -> a
             root.error("argument FILE: not allowed with argument --store")
         chosen.file = Path(rest[0])
     elif rest and getattr(chosen, "file", None) is not None and "store" in chosen:
-        root.error(
-            f"unrecognized arguments: {' '.join(rest)}: one file of the service is enough, or the directory "
-            "of them"
-        )
+        root.error(f"unrecognized arguments: {' '.join(rest)}: {_ONE_FILE}")
     elif rest:
         root.parse_args(arguments)  # as above
     return chosen
+
+
+def _take_words(root: argparse.ArgumentParser, chosen: argparse.Namespace, words: Sequence[str]) -> None:
+    """Take the alarms of a verb, and FILE, which may be anywhere behind the first of them."""
+    paths = [word for word in words[1:] if is_path(word)]
+    if paths and chosen.store is not None:
+        root.error("argument FILE: not allowed with argument --store")
+    if len(paths) > 1:
+        root.error(f"unrecognized arguments: {' '.join(paths[1:])}: {_ONE_FILE}")
+    chosen.alarms = [word for word in words if word not in paths]
+    chosen.file = Path(paths[0]) if paths else None
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

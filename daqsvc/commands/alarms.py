@@ -17,14 +17,14 @@ from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, alarm_id
 from daqsvc.commands.complaint import complain
 from daqsvc.commands.store_argument import BadFileError, StoreNotFoundError, add_store, chosen_store
 from daqsvc.errors.code import with_code
-from daqsvc.errors.command_line import COMMAND_REFUSED, NO_SUCH_ALARM, NO_SUCH_MACHINE
+from daqsvc.errors.command_line import COMMAND_REFUSED, NO_SUCH_MACHINE
 from daqsvc.errors.service import JOURNAL_BEHIND
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
+    from daqsvc.commands.alarm_targets import Target
     from daqsvc.commands.machine_files import Load
     from daqsvc.commands.store_argument import ChosenStore
     from daqsvc.errors.code import Code
@@ -176,18 +176,8 @@ def _doubt(store: Path) -> str:
     )
 
 
-LEAST_ID = 4
-"""Letters that the beginning of an occurrence's id must have to be one."""
-
-
-class NoSuchAlarmError(Exception):
-    """What was named is not exactly one alarm; the text says what there is."""
-
-    code = NO_SUCH_ALARM
-
-
 class AlarmVerb:
-    """One verb for one alarm, carried out by the service that runs.
+    """One verb for one alarm or several, carried out by the service that runs.
 
     Args:
         verb: the `daqsvc.alarms.commands.Verb` by its value.
@@ -200,7 +190,7 @@ class AlarmVerb:
         self.help = help_line
         self.description = (
             f"{description} The running service does this and writes it to its audit log. Exit code: 0 if "
-            "that is on disk, 1 if it is refused or no service runs."
+            "that is on disk for every alarm, 1 if it is refused for any, or no service runs."
         )
         self._verb = verb
         self._load = load
@@ -208,10 +198,12 @@ class AlarmVerb:
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `daqsvc.cli.Command.add_arguments`."""
         parser.add_argument(
-            "alarm",
+            "alarms",
             type=alarm_id,
+            nargs="+",
             metavar="ID",
-            help="name of the alarm, or the first four or more characters of its ID in daqsvc alarms",
+            help="name of the alarm, the first four or more characters of its ID in daqsvc alarms, or a "
+            "pattern such as 'fan.*' of alarms that are not normal",
         )
         if self._verb == "shelve":
             parser.add_argument(
@@ -235,50 +227,76 @@ class AlarmVerb:
             metavar="TEXT",
             help="the reason, for the audit log and the alarm's event",
         )
-        parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
+        parser.add_argument(
+            "--json", action="store_true", help="print one JSON object per alarm instead of text"
+        )
         add_store(parser)
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `daqsvc.cli.Command.run`."""
-        from daqsvc.alarms.commands import AlarmCommand, Verb  # noqa: PLC0415 - each verb imports only what it needs
-        from daqsvc.commands.tables import harmless  # noqa: PLC0415
-        from daqsvc.control import ControlError, ask, request_of  # noqa: PLC0415
+        from daqsvc.alarms.commands import Verb  # noqa: PLC0415 - each verb imports only what it needs
+        from daqsvc.commands.alarm_targets import NoSuchAlarmError, meant  # noqa: PLC0415
+        from daqsvc.control import ControlError  # noqa: PLC0415
         from daqsvc.outbox.messages import OutboxError  # noqa: PLC0415
 
         name = arguments.verb
         try:
             store, asked, _ = chosen_store(arguments, self._load)
-            alarm, occurrence, machine = _meant(store, arguments.alarm)
-            machine = asked or machine
-            request = request_of(
-                AlarmCommand(
-                    verb=Verb(self._verb),
-                    alarm=alarm,
-                    by=arguments.by or user_name(),
-                    occurrence=occurrence,
-                    duration_s=getattr(arguments, "duration_s", None),
-                    reason=arguments.reason,
-                ),
-                machine,
-            )
-            outcome = ask(store, request)
+            targets = meant(store, arguments.alarms, Verb(self._verb), asked)
         except BadFileError:
             return EXIT_USAGE
-        except (StoreNotFoundError, NoSuchAlarmError, OutboxError, ControlError) as error:
+        except (StoreNotFoundError, NoSuchAlarmError, OutboxError) as error:
             return _complain(name, error, error.code)
+        several = len({one.machine for one in targets if one.machine}) > 1
+        code = EXIT_OK
+        for n, target in enumerate(targets):
+            try:
+                code = max(code, self._ask(store, target, arguments, several=several))
+            except ControlError as error:
+                left = ", ".join(one.alarm for one in targets[n + 1 :])
+                return _complain(name, f"{error}; not asked for then: {left}" if left else error, error.code)
+        return code
+
+    def _ask(self, store: Path, target: Target, arguments: argparse.Namespace, *, several: bool) -> int:
+        """Have the service do it to one alarm, and say what came of it; the exit code.
+
+        Raises:
+            ControlError: the service cannot be asked.
+        """
+        from daqsvc.alarms.commands import AlarmCommand, Verb  # noqa: PLC0415 - as above
+        from daqsvc.commands.tables import harmless  # noqa: PLC0415
+        from daqsvc.control import ask, request_of  # noqa: PLC0415
+
+        alarm, occurrence, machine = target
+        request = request_of(
+            AlarmCommand(
+                verb=Verb(self._verb),
+                alarm=alarm,
+                by=arguments.by or user_name(),
+                occurrence=occurrence,
+                duration_s=getattr(arguments, "duration_s", None),
+                reason=arguments.reason,
+            ),
+            machine,
+        )
+        outcome = ask(store, request)
         if arguments.json:
-            answer = {"verb": self._verb, "alarm": alarm, "occurrence": occurrence, "by": request.by}
+            answer = {"verb": self._verb, "alarm": alarm, "machine": machine, "occurrence": occurrence}
             came = {
+                "by": request.by,
                 "accepted": outcome.accepted,
                 "reason": outcome.reason,
                 "code": outcome.code,
                 "events": list(outcome.events),
             }
-            print(json.dumps(answer | came))  # noqa: T201 - this is what the verb is for
+            print(json.dumps(answer | came), flush=True)  # noqa: T201 - this is what the verb is for
         elif outcome.accepted:
-            print(with_code(harmless(f"{alarm}: {outcome.reason or _DONE[self._verb]}"), outcome.code))  # noqa: T201
+            which = f"{alarm} of {machine}" if several and machine else alarm
+            said = harmless(f"{which}: {outcome.reason or _DONE[self._verb]}")
+            print(with_code(said, outcome.code), flush=True)  # noqa: T201
         else:
-            _complain(name, f"refused: {outcome.reason}", outcome.code or COMMAND_REFUSED)
+            of = f" {machine}:" if several and machine else ""
+            _complain(arguments.verb, f"refused:{of} {outcome.reason}", outcome.code or COMMAND_REFUSED)
         # Accepted with a reason: the disk has not got it yet.
         return EXIT_OK if outcome.accepted and not outcome.reason else EXIT_FAILED
 
@@ -291,38 +309,38 @@ def alarm_verbs(load: Load) -> dict[str, AlarmVerb]:
             (
                 "ack",
                 "acknowledge",
-                "acknowledge an alarm: somebody has seen it",
-                "Acknowledge an alarm: somebody has seen it.",
+                "acknowledge alarms: somebody has seen them",
+                "Acknowledge alarms: somebody has seen them.",
             ),
             (
                 "reset",
                 "reset",
-                "reset a latched alarm whose condition is no longer present",
-                "Reset a latched alarm to normal. It is refused while the condition is still present.",
+                "reset latched alarms whose condition is no longer present",
+                "Reset latched alarms to normal. It is refused while the condition is still present.",
             ),
             (
                 "shelve",
                 "shelve",
-                "suppress an alarm for a stated time",
-                "Suppress an alarm for a stated time. After that it shows its present state again.",
+                "suppress alarms for a stated time",
+                "Suppress alarms for a stated time. After that they show their present states again.",
             ),
             (
                 "unshelve",
                 "unshelve",
-                "end the shelving of an alarm at once",
-                "End the shelving of an alarm at once.",
+                "end the shelving of alarms at once",
+                "End the shelving of alarms at once.",
             ),
             (
                 "bypass",
                 "bypass",
-                "take an alarm out of service until daqsvc unbypass",
-                "Take an alarm out of service until it is put back with daqsvc unbypass.",
+                "take alarms out of service until daqsvc unbypass",
+                "Take alarms out of service until they are put back with daqsvc unbypass.",
             ),
             (
                 "unbypass",
                 "unbypass",
-                "put an alarm back into service",
-                "Put an alarm back into service.",
+                "put alarms back into service",
+                "Put alarms back into service.",
             ),
         )
     }
@@ -346,33 +364,3 @@ _DONE = {
     "bypass": "out of service",
     "unbypass": "back in service",
 }
-
-
-def _meant(store: Path, words: str) -> tuple[str, str | None, str | None]:
-    """Alarm, occurrence and machine that a person means; the latter two None if the alarm is named.
-
-    Raises:
-        NoSuchAlarmError: it begins the ids of several occurrences.
-        OutboxError: there is no journal, or it cannot be read.
-    """
-    from daqsvc.commands.alarm_journal import current  # noqa: PLC0415
-
-    events = current(store)
-    if any(event["alarm"] == words for event in events):
-        return words, None, None
-    meant = _begun_by(events, words)
-    if len(meant) > 1:
-        raise NoSuchAlarmError(
-            f"{words!r} begins the ids of {', '.join(event['alarm'] for event in meant)}: "
-            "write more of the id, or the alarm's name"
-        )
-    if meant:
-        return meant[0]["alarm"], meant[0]["occurrence"], meant[0]["machine"]
-    # An alarm that was never raised has no event yet: the service knows whether there is one.
-    return words, None, None
-
-
-def _begun_by(events: Sequence[Mapping[str, Any]], words: str) -> list[Mapping[str, Any]]:
-    if len(words) < LEAST_ID:
-        return []
-    return [event for event in events if (event["occurrence"] or "").startswith(words)]

@@ -180,6 +180,19 @@ def alarm_id(text: str) -> str:
     return text
 
 
+def is_path(word: str) -> bool:
+    """Whether a word among alarms is a machine file, or a folder of them.
+
+    It is if it ends with ``.toml`` or begins as no name does, or if there is a file or folder of this name.
+    """
+    if word.endswith(".toml") or word.startswith(("/", "./", "../", "~")):
+        return True
+    try:
+        return Path(word).exists()
+    except OSError:
+        return False  # too long, for instance
+
+
 def channel_names(text: str) -> tuple[str, ...]:
     """``NAME,...``: one or more channels."""
     names = tuple(name.strip() for name in text.split(","))

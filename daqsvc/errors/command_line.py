@@ -42,7 +42,8 @@ NO_SUCH_MACHINE = Code(
 NO_SUCH_ALARM = Code(
     "C05",
     "It is not known which alarm is meant",
-    "No alarm has this name, several machines have one, or what was written begins the ids of several.",
+    "No alarm has this name, several machines have one, what was written begins the ids of several, or no "
+    "alarm that a pattern matches waits for the command.",
     "Write the name of the alarm, or more of its id; with several machines the machine, too. daqsvc alarms "
     "lists them.",
     "alarms.md",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import os
 import re
@@ -26,6 +27,7 @@ from daqsvc.control import ControlServer
 from daqsvc.outbox.store import Outbox
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Mapping
     from pathlib import Path
 
 pytestmark = pytest.mark.integration
@@ -130,6 +132,7 @@ async def test_a_day_in_the_life_of_a_latching_alarm(tmp_path: Path) -> None:
             assert outcome(out) == {
                 "verb": "shelve",
                 "alarm": "shaking",
+                "machine": None,
                 "occurrence": None,
                 "by": "Bob",
                 "accepted": True,
@@ -337,7 +340,8 @@ async def test_what_cannot_be_meant_is_never_asked(arguments: list[str], why: st
 )
 def test_the_words_of_a_verb_may_stand_in_any_order(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
     root = cli.parser(cli.commands())
-    words = ["plant"] if verb in {"alarms", "status"} else ["hot", "plant"]
+    several = verb not in {"alarms", "status"}
+    words = ["hot", "plant.toml"] if several else ["plant.toml"]
     options = [["--machine", "pump"], ["--json"], *([["--for", "1h"]] if verb == "shelve" else [])]
     parts = [(0, words[:1]), *((1, words[1:]) for _ in words[1:]), *((2, one) for one in options)]
     for order in permutations(parts):
@@ -345,16 +349,124 @@ def test_the_words_of_a_verb_may_stand_in_any_order(verb: str, capsys: pytest.Ca
         if [kind for kind, _ in order if kind < 2] != sorted(kind for kind, _ in order if kind < 2):
             continue
         chosen = cli._chosen(root, [verb, *line])
-        assert (f"{chosen.file}", chosen.machine, getattr(chosen, "alarm", "hot")) == ("plant", "pump", "hot")
+        assert (f"{chosen.file}", chosen.machine) == ("plant.toml", "pump")
+        assert getattr(chosen, "alarms", ["hot"]) == ["hot"]
     for wrong, why in (
-        ([*words, "--json", "more"], "unrecognized arguments: more"),
+        ([*words, "--json", "more.toml"], "unrecognized arguments: more.toml"),
         (["--bogus", *words], "unrecognized arguments: --bogus"),
-        ([*words[:-1], "--store", "here", "--json", "plant"], "not allowed with argument"),
+        ([*words[:-1], "--store", "here", "--json", "plant.toml"], "not allowed with argument"),
     ):
         with pytest.raises(SystemExit) as ended:
             cli._chosen(root, [verb, *(["--for", "1h"] if verb == "shelve" else []), *wrong])
         assert ended.value.code == 2
         assert why in capsys.readouterr().err
+
+
+def test_the_machine_file_may_be_anywhere_behind_the_first_alarm(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "plant").mkdir()
+    root = cli.parser(cli.commands())
+    for words, alarms, file in (
+        (["hot", "cold"], ["hot", "cold"], None),
+        (["hot", "cold", "pump.toml"], ["hot", "cold"], "pump.toml"),
+        (["hot", "pump.toml", "--by", "ann", "cold"], ["hot", "cold"], "pump.toml"),
+        (["hot", "--by", "ann", "cold", "plant"], ["hot", "cold"], "plant"),
+        (["plant"], ["plant"], None),
+        (["hot", "/etc/daqsvc/absent"], ["hot"], "/etc/daqsvc/absent"),
+        (["sensor-ok/hot", "sensor-ok/*"], ["sensor-ok/hot", "sensor-ok/*"], None),
+        (["hot", "x" * 300], ["hot", "x" * 300], None),
+    ):
+        chosen = cli._chosen(root, ["ack", *words])
+        assert (chosen.alarms, chosen.file and f"{chosen.file}") == (alarms, file)
+
+
+FANS = (
+    {"alarm": "fan.a"},
+    {"alarm": "fan.b", "state": "active_acknowledged", "occurrence": "1d8c0000-b"},
+    {"alarm": "fan.c", "state": "latched_unacknowledged", "occurrence": "2d8c0000-c"},
+    {"alarm": "fan.d", "state": "normal", "level": "normal", "occurrence": None},
+    {"alarm": "fan.a", "machine": "pump", "occurrence": "3d8c0000-a"},
+    {"alarm": "pump", "machine": "pump", "state": "shelved", "occurrence": "4d8c0000-p"},
+)
+
+
+@contextlib.asynccontextmanager
+async def taking_commands(store: Path, refused: Mapping[str, str]) -> AsyncIterator[list[AlarmCommand]]:
+    """A service on the store that refuses what concerns some alarms; the commands that it has had."""
+    commands: list[AlarmCommand] = []
+
+    async def execute(command: AlarmCommand, source: str) -> CommandOutcome:
+        commands.append(command)
+        if command.alarm in refused:
+            return CommandOutcome(accepted=False, reason=refused[command.alarm], code="C08")
+        return CommandOutcome(accepted=True, reason="")
+
+    server = ControlServer(store, ("motor", "pump"), execute)
+    await server.open()
+    try:
+        yield commands
+    finally:
+        await server.close()
+
+
+async def test_a_pattern_means_what_waits_for_it_of_every_machine(tmp_path: Path) -> None:
+    await write_journal(tmp_path, *FANS)
+    async with taking_commands(tmp_path, {}) as commands:
+        code, out, err = await daqsvc("ack", "fan.*", "--store", tmp_path)
+        assert (code, err) == (0, "")
+        assert sorted(out.splitlines()) == [
+            "fan.a of motor: acknowledged",
+            "fan.a of pump: acknowledged",
+            "fan.c of motor: acknowledged",
+        ]
+        assert all(command.occurrence for command in commands), "what comes meanwhile nobody has seen"
+        commands.clear()
+        code, out, err = await daqsvc("ack", "fan.[ab]", "--store", tmp_path, "--machine", "motor")
+        assert (code, out, err) == (0, "fan.a: acknowledged\n", "")
+        assert [(one.alarm, one.machine) for one in commands] == [("fan.a", "motor")]
+
+
+async def test_each_of_several_alarms_is_asked_for_once_and_all_must_go(tmp_path: Path) -> None:
+    await write_journal(tmp_path, *FANS)
+    refused = {"fan.d": "cannot acknowledge fan.d: there is nothing to acknowledge: it is normal"}
+    async with taking_commands(tmp_path, refused) as commands:
+        words = ("fan.d", "fan.c", "2d8c", "fan.c", "never-raised")
+        code, out, err = await daqsvc("ack", *words, "--store", tmp_path)
+        assert code == 1
+        assert out == "fan.c: acknowledged\nnever-raised: acknowledged\n"
+        assert err == f"daqsvc ack: refused: {refused['fan.d']} [C08]\n"
+        assert [(one.alarm, one.occurrence) for one in commands] == [
+            ("fan.d", None),
+            ("fan.c", None),
+            ("never-raised", None),
+        ]
+        code, out, _ = await daqsvc("ack", "fan.d", "fan.c", "--store", tmp_path, "--json")
+        assert code == 1
+        assert [(one["alarm"], one["accepted"]) for one in map(json.loads, out.splitlines())] == [
+            ("fan.d", False),
+            ("fan.c", True),
+        ]
+
+
+async def test_a_pattern_that_means_nothing_names_what_there_is_and_nothing_is_done(tmp_path: Path) -> None:
+    await write_journal(tmp_path, *FANS)
+    async with taking_commands(tmp_path, {}) as commands:
+        code, out, err = await daqsvc("reset", "fan.a", "fan.[ab]", "--store", tmp_path, "--machine", "motor")
+        assert (code, out, commands) == (1, "", [])
+        assert "no alarm that 'fan.[ab]' matches is one to reset; these are not normal: fan.a (active" in err
+        assert "fan.c (latched unacknowledged). A pattern means" in err
+        assert err.endswith("[C05]\n")
+        assert "fan.d" not in err
+
+
+async def test_what_is_not_asked_for_as_the_service_has_gone_is_named(tmp_path: Path) -> None:
+    await write_journal(tmp_path, *FANS)
+    code, out, err = await daqsvc("ack", "fan.a", "fan.c", "pump", "--store", tmp_path)
+    assert (code, out) == (1, "")
+    assert "no daqsvc runs on the store" in err
+    assert err.endswith("; not asked for then: fan.c, pump [C06]\n")
 
 
 async def test_what_the_disk_has_not_got_is_told(tmp_path: Path) -> None:
