@@ -6,8 +6,10 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, NamedTuple
 
+from daqsvc.alarms.states import AlarmState
+
 if TYPE_CHECKING:
-    from daqsvc.alarms.states import AlarmState, Level
+    from daqsvc.alarms.states import Level
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.dsp.quality import Quality
 
@@ -59,7 +61,8 @@ class EventKind(StrEnum):
 
 
 ANNUNCIATIONS = frozenset({EventKind.RAISED, EventKind.ESCALATED, EventKind.RECURRED})
-"""Events that call for a person: what chatter and floods are counted by."""
+"""Events by which an alarm calls for a person, unless something covers it: what chatter is counted by."""
+_UNCOVERED = frozenset({EventKind.UNSHELVED, EventKind.UNBYPASSED, EventKind.UNSUPPRESSED})
 
 
 class Doubt(NamedTuple):
@@ -132,6 +135,17 @@ class AlarmEvent:
     chattering: bool = False
     finding: str = ""
     doubts: tuple[Doubt, ...] = ()
+
+    @property
+    def calls(self) -> bool:
+        """Whether the alarm calls for a person by it, as ISA-18.2 counts annunciations.
+
+        A covered alarm does not: it is neither seen nor heard. When its cover ends, it does if it is
+        active and nobody has acknowledged it.
+        """
+        if self.kind in _UNCOVERED:
+            return self.to_state is AlarmState.ACTIVE_UNACKNOWLEDGED
+        return self.kind in ANNUNCIATIONS and not self.holds
 
     @property
     def own_state(self) -> AlarmState:

@@ -24,7 +24,8 @@ class FloodWatch:
 
     Args:
         handling: says how many alarms may call for a person within which time (ISA-18.2 and EEMUA 191 say 10
-            in 10 minutes). One more is a flood, which ends when there are fewer than half as many.
+            in 10 minutes). One more is a flood, which ends when there are fewer than half as many. Alarms
+            about sensors and the service count, too: a person has to attend to each. Covered ones do not.
     """
 
     def __init__(self, handling: AlarmHandling) -> None:

@@ -94,7 +94,8 @@ class AlarmCounters:
 
     Attributes:
         events: all events.
-        annunciations: those that call for a person: raised, escalated, recurred.
+        annunciations: those that call for a person: raised, escalated, recurred, or no longer covered and
+            not acknowledged. A covered alarm calls for nobody.
         chattering: how often an alarm began to chatter.
         floods: how often alarms came faster than a person can attend to.
         commands: what people asked for and got.

@@ -20,7 +20,7 @@ from daqsvc.alarms.conditions import (
     statement,
     unjudged,
 )
-from daqsvc.alarms.events import ANNUNCIATIONS, AlarmEvent, Doubt, EventKind, Identity
+from daqsvc.alarms.events import AlarmEvent, Doubt, EventKind, Identity
 from daqsvc.alarms.expected import Expected
 from daqsvc.alarms.flood import FirstOut, FloodWatch, where_to_look
 from daqsvc.alarms.handling import CALM, AlarmCounters, ShelvingEnds, shelving_ns
@@ -317,7 +317,7 @@ class AlarmManager:
     def _marked(self, event: AlarmEvent) -> AlarmEvent:
         self.counters.events += 1
         self.counters.chattering += event.kind is EventKind.CHATTERING
-        if event.kind in ANNUNCIATIONS and event.alarm != ALARM_FLOOD:
+        if event.calls and event.alarm != ALARM_FLOOD:
             self.counters.annunciations += 1
             self._flood.called(self._clock.monotonic_ns())
         self._count(event.from_state, event.to_state)

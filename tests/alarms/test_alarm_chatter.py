@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import pytest
 from support.alarm_rig import AlarmRig, alarm_handling, kinds
 
+from daqsvc.alarms.commands import Verb
 from daqsvc.alarms.rules import LevelRule
 from daqsvc.alarms.setpoints import Setpoint
 from daqsvc.alarms.states import AlarmState, Level
@@ -111,6 +113,41 @@ def test_a_flood_is_an_alarm_of_its_own_counted_and_nothing_is_dropped():
     (over,) = rig.tick(0.5)
     assert (over.alarm, over.kind.value) == ("alarm-flood", "returned")
     assert "only 2 alarms in the last 10 min" in over.message
+
+
+def test_a_covered_alarm_calls_for_nobody_and_is_no_part_of_a_flood():
+    rules = [LevelRule(f"v{i}", f"p{i}", "rms", Setpoint(alert=40.0)) for i in range(8)]
+    rig = AlarmRig(*rules, handling=alarm_handling(flood=(5, 600)))
+    rig.shelve("v0", 300.0)
+    rig.ask(Verb.BYPASS, "v1")
+    for i in range(7):
+        (event,) = rig.rms(50.0, sensor=f"p{i}")
+        assert (event.alarm, event.kind.value) == (f"v{i}", "raised")
+    assert rig.manager.counters.annunciations == 5
+    assert kinds(rig.tick(300.0)) == [("v0", "unshelved"), ("alarm-flood", "raised")], "it is seen now"
+    assert rig.manager.counters.annunciations == 6
+
+
+@pytest.mark.parametrize("acknowledged", [False, True])
+def test_an_alarm_that_comes_out_of_its_cover_calls_if_nobody_has_acknowledged_it(*, acknowledged):
+    rig = AlarmRig(LEVEL, handling=alarm_handling(flood=(5, 600)))
+    rig.rms(50.0)
+    if acknowledged:
+        rig.acknowledge("vibration-x")
+    rig.shelve("vibration-x", 60.0)
+    rig.ask(Verb.UNSHELVE, "vibration-x")
+    assert rig.manager.counters.annunciations == (1 if acknowledged else 2)
+
+
+def test_each_sensor_calls_once_whatever_else_is_said_against_it():
+    rig = AlarmRig(LEVEL, handling=alarm_handling(flood=(5, 600)))
+    for n in range(40):
+        rig.rms(0.0, "missing" if n % 3 else "not_ok", reason=f"reason {n % 5}", seconds=20.0)
+    assert {event.kind.value for event in rig.events if event.alarm == "sensor-ok/probe-x"} == {
+        "raised",
+        "changed",
+    }
+    assert (rig.manager.counters.annunciations, rig.manager.counters.floods) == (1, 0)
 
 
 def test_a_flood_points_to_the_alarm_that_is_first_out():

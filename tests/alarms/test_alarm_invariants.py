@@ -101,7 +101,7 @@ class Alarms(RuleBasedStateMachine):
             before = self.told.get(event.alarm)
             self.told[event.alarm] = event
             self.told_at[event.alarm] = self.settings_of_the_wall
-            if event.kind in ANNUNCIATIONS and event.alarm != "alarm-flood":
+            if event.kind in ANNUNCIATIONS and not event.holds and event.alarm != "alarm-flood":
                 self.called_ns.append(self.clock.monotonic_ns())
             self.follows(event, before)
 
