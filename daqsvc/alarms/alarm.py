@@ -219,6 +219,8 @@ class Alarm:
         self.doubts = self._told_doubts = self._seen_doubts = event.doubts
         if event.kind in FINDINGS:
             self._last_message = event.message
+        elif event.found:
+            self._last_message = event.found
         elif sentence:
             self._last_message = self._saying(event.to_level, sentence)
         self._chatter.resume(chattering=event.chattering)
@@ -546,6 +548,7 @@ class Alarm:
             chattering=self._chatter.chattering,
             finding=self._finding,
             doubts=self.doubts,
+            found="" if kind in FINDINGS else self._last_message,
         )
 
 

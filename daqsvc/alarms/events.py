@@ -110,6 +110,8 @@ class AlarmEvent:
         chattering: whether its returns are held back because it becomes active and returns too often.
         finding: what is found, where a level can have several causes (`Finding.identity`).
         doubts: of a quality alarm, what is said against the sensor.
+        found: the message of the last event that said what is found; empty if this one's message says that,
+            or if it is not known.
 
     The last event of an alarm holds all that a restart needs to know about it.
     """
@@ -135,6 +137,7 @@ class AlarmEvent:
     chattering: bool = False
     finding: str = ""
     doubts: tuple[Doubt, ...] = ()
+    found: str = ""
 
     @property
     def calls(self) -> bool:

@@ -68,7 +68,7 @@ _TURNS = 4
 """Of the event loop, after which whoever woke has done what there was to do."""
 _NOT_OURS = (KeyError, ValueError, TypeError, AttributeError, RecursionError, OverflowError)
 """What comes of a document that this program has not written."""
-_NOT_COMPARED = ("time", "wall_ns", "id", "sequence", "occurrence", "code")
+_NOT_COMPARED = ("time", "wall_ns", "id", "sequence", "occurrence", "code", "found_message")
 """Of an alarm event: its label of wall time, what is new each time, and what earlier versions did not say."""
 
 

@@ -227,7 +227,8 @@ class MachineLive:
 
     def told_of(self, alarm: Document) -> str:
         """What was found last of an alarm, as far as it was received, and what was done about it since."""
-        found, message = self._found.get(alarm["alarm"], ""), str(alarm["message"])
+        found = str(alarm.get("found_message") or self._found.get(alarm["alarm"], ""))
+        message = str(alarm["message"])
         return message if not found or found == message else f"{found}; {message}"
 
     def go_on_from(self, before: MachineLive) -> None:

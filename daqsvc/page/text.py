@@ -101,7 +101,7 @@ def alarm_list(known: Mapping[str, Document | None], machine: str) -> str:
             f'<a href="{there}{quote(name, safe="")}">{escape(name)}</a>' + _first(one),
             escape(_state(one)),
             "" if one is None else time_mark(one["wall_ns"]),
-            "" if one is None else _what(one),
+            "" if one is None else _stands(one),
         )
         for name, one in sorted(known.items(), key=lambda item: _urgency(item[1]))
     )
@@ -123,6 +123,12 @@ def _urgency(alarm: Document | None) -> tuple[int, int, int]:
 
 def _first(alarm: Document | None) -> str:
     return ' <span class="first">first</span>' if alarm is not None and alarm["first_out"] else ""
+
+
+def _stands(latest: Document) -> str:
+    """What was found last, and what was done about it since, by the last event of an alarm."""
+    found = str(latest.get("found_message", ""))
+    return f"{escape(found)}; {_what(latest)}" if found else _what(latest)
 
 
 def _what(event: Document) -> str:

@@ -161,6 +161,11 @@ class AlarmPayload(Stamped):
         default=False, description="whether it is raised and returns so often that returns are held back"
     )
     found: str = Field("", description="what is found, joined with what it is not told apart from by |")
+    found_message: str = Field(
+        "",
+        description="message of the last event that said what is found; empty if this one's message does, or "
+        "if that is not known",
+    )
     doubts: tuple[DoubtPayload, ...] = Field(
         (), description="of a quality alarm: what is wrong with the sensor"
     )
@@ -235,6 +240,7 @@ def _alarm(event: AlarmEvent, sequence: int, series: str) -> dict[str, Any]:
         "first_out": event.first_out,
         "chattering": event.chattering,
         "found": event.finding,
+        "found_message": event.found,
         "doubts": [doubt._asdict() for doubt in event.doubts],
         "cause": _statement(event.cause) | {"monotonic_ns": event.cause.t_ns},
     }
@@ -289,6 +295,7 @@ def alarm_event(payload: bytes) -> AlarmEvent:
         chattering=message.chattering,
         finding=message.found,
         doubts=tuple(Doubt(**dict(doubt)) for doubt in message.doubts),
+        found=message.found_message,
     )
 
 

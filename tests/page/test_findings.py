@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import pytest
+from support.alarm_rig import AlarmRig
 from support.machine_files import LAVAL, parsed
 from test_views import about
 
+from daqsvc.alarms.commands import Verb
+from daqsvc.alarms.rules import LevelRule
+from daqsvc.alarms.setpoints import Setpoint
 from daqsvc.machine_facts import fault_names
 from daqsvc.page.findings import FAULTS, SOUND, finding_rows, sentence
 from daqsvc.page.machine_live import MachineLive
-from daqsvc.page.text import alarm_rows
-
-if TYPE_CHECKING:
-    import pytest
+from daqsvc.page.text import alarm_list, alarm_rows
+from daqsvc.publish.payloads import alarm_document
 
 NAMES = {"rotor-bank": {"N": "normal", "F1": "damping_loss", "F1L2": "damping_loss", "F1L3": "rub"}}
 
@@ -182,3 +185,21 @@ def test_the_cause_of_an_alarm_is_shown_after_it_was_acknowledged() -> None:
     done = {"kind": "acknowledged", "state": "active_acknowledged", "message": "v acknowledged by ann"}
     live.hear({"alarm": raised | done})
     assert "v alert: 3 mm/s; v acknowledged by ann" in alarm_rows(live)
+
+
+@pytest.mark.parametrize("verb", [Verb.ACKNOWLEDGE, Verb.SHELVE, Verb.BYPASS])
+def test_after_a_restart_of_the_service_it_still_says_what_was_found(verb: Verb) -> None:
+    rig = AlarmRig(LevelRule("v", "probe-x", "rms", Setpoint(alert=40.0)))
+    rig.rms(50.0)
+    rig.ask(verb, "v", duration_s=60.0 if verb is Verb.SHELVE else None)
+    found = "v alert: rms of probe-x is 50 um, alert limit 40 um"
+    before = rig.status("v").told
+    assert before.startswith(f"{found}; v ")
+    after = rig.restarted({"levels/probe-x": ("probe-x",)})
+    assert after.status("v").told == before
+    latest = alarm_document(after.events[-1])
+    live = MachineLive(about() | {"alarms": [latest]})
+    assert before in alarm_rows(live)
+    assert before in alarm_list(live.all_alarms(), "rig")
+    (returned,) = after.rms(0.0)
+    assert alarm_document(returned)["found_message"] == "", "its message says it"

@@ -92,6 +92,7 @@ def test_an_alarm_says_everything_that_the_event_knows():
         "first_out": False,
         "chattering": False,
         "found": "",
+        "found_message": "",
         "doubts": [],
     }
     assert cause["probabilities"] == {"N": 0.02, "F1": 0.98}
@@ -111,6 +112,7 @@ def test_what_goes_to_the_disk_is_the_payload_though_nothing_validates_it():
         covered=AlarmState.ACTIVE_UNACKNOWLEDGED,
         shelved_until_wall_ns=1_800_000_000_000_000_000,
         by='A. "B"',
+        found="rotor-fault alert: rotor-bank finds F1",
         doubts=doubts,
         cause=replace(
             CAUSE,
