@@ -1,8 +1,8 @@
-"""The alarm service: diagnoses and commands in; alarms on disk and at the broker out.
+"""The alarm service: diagnoses in; alarms on disk and at the broker out.
 
 Everything that must not be lost passes here and nowhere else: an event leaves the alarm manager, gets its
-number and its place on disk from the outbox, and is published from there. It knows nothing of buses,
-samples or detectors, so it can be tried by itself.
+number and its place on disk from the outbox, and is published from there. What people ask for goes the same
+way (`daqsvc.alarm_commands`). It knows nothing of buses, samples or detectors, so it can be tried by itself.
 """
 
 from __future__ import annotations
@@ -12,26 +12,19 @@ import contextlib
 import itertools
 import json
 import logging
-from collections import Counter, deque
-from dataclasses import dataclass, replace
+from collections import Counter
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.alarm_commands import CommandExecutor
 from daqsvc.alarm_log import AlarmLog
 from daqsvc.alarms.commands import CommandOutcome
 from daqsvc.alarms.conditions import Condition
-from daqsvc.alarms.states import (
-    AlarmState,
-    CommandNotAllowedError,
-    Level,
-    UnknownAlarmError,
-    UnknownMachineError,
-)
-from daqsvc.audit import AuditError, AuditLog, Refusals
-from daqsvc.control import SnapshotNotMadeError
+from daqsvc.alarms.states import AlarmState, Level
+from daqsvc.audit import AuditLog
 from daqsvc.errors.code import coded
-from daqsvc.errors.command_line import COMMAND_REFUSED, NOT_ASKED
-from daqsvc.errors.service import DISK_REFUSES, JOURNAL_BEHIND, NOT_REMEMBERED, PART_FAILED
+from daqsvc.errors.service import DISK_REFUSES, NOT_REMEMBERED, PART_FAILED
 from daqsvc.outbox.limits import OutboxLimits
 from daqsvc.outbox.messages import OutboxError, event_id
 from daqsvc.outbox.store import Outbox
@@ -46,12 +39,11 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daqsvc.acquisition.clock import Clock
-    from daqsvc.alarms.commands import AlarmCommand, SnapshotRequest
+    from daqsvc.alarms.commands import AlarmCommand, CommandOutcome, SnapshotRequest
     from daqsvc.alarms.events import AlarmEvent
     from daqsvc.alarms.manager import AlarmManager
     from daqsvc.control import TakeSnapshot
     from daqsvc.diagnosis.record import Diagnosis
-    from daqsvc.errors.code import Code
     from daqsvc.outbox.messages import OutboxMessage
     from daqsvc.publish.looking import Look
     from daqsvc.publish.output import Output
@@ -64,35 +56,10 @@ REFUSED_TICKS = 60
 """How often the number of refused commands that are only counted is logged."""
 DISK_TICKS = 10
 """The disk fills slowly, and asking it may take long."""
-COMMIT_S = 5.0
-"""How long an answer waits for the disk before it says that the disk has not got it yet."""
-MOST_COMMANDS = 64
-MOST_SNAPSHOTS = 6
-"""That others may have made of one machine in `SNAPSHOTS_NS`: files of older ones go for newer ones."""
-SNAPSHOTS_NS = 600 * NS_PER_S
-"""Commands that may wait at a time; further ones are refused."""
 GRACE_S = 0.1
 """What outputs may take beyond their deadline before they are left behind."""
 FORGOTTEN = "the journal was damaged and its state is lost; it begins again"
 UNJOURNALLED = "the service ended while the journal could not be written; it begins again"
-STOPPING = "the service is stopping; ask again when it runs"
-
-
-@dataclass(slots=True)
-class CommandCounters:
-    """What became of people's commands, from wherever they came; every figure only grows.
-
-    Attributes:
-        accepted: carried out.
-        refused: refused, for whatever reason.
-        unwritten: of those refused, because the audit log could not be written.
-        unanswered_in_log: carried out or refused, but the audit log could not take the outcome.
-    """
-
-    accepted: int = 0
-    refused: int = 0
-    unwritten: int = 0
-    unanswered_in_log: int = 0
 
 
 class MadeOutputs(NamedTuple):
@@ -157,8 +124,17 @@ class AlarmService:
         """By machine."""
         self.outbox = Outbox(store / "outbox.sqlite", clock, limits)
         self.audit = AuditLog(store / "audit.jsonl", clock, limits.audit_max_bytes)
-        self._refusals = Refusals(clock)
-        self.commands = CommandCounters()
+        self._executor = CommandExecutor(
+            self.managers,
+            lambda: self.manager,
+            self.audit,
+            clock,
+            post=self._post,
+            id_of=lambda number: event_id(self.outbox.series, number),
+            watch=self._watch,
+            snapshot=snapshot,
+        )
+        self.commands = self._executor.counters
         asked = outputs or OutputSet(machines={name: Watched(name) for name in self.managers})
         self.topics = Topics(asked.topic_root, identity.site, identity.box)
         self._witness = self.topics.alarm(identity.machine, JOURNAL)
@@ -185,9 +161,6 @@ class AlarmService:
         self._clock = clock
         self._supervisor = supervisor or Supervisor()
         self._heard = heard
-        self._snapshot = snapshot
-        self._snapshots: dict[str, deque[int]] = {}
-        """By machine, when others had some made recently, monotonic."""
         self._log = AlarmLog(clock, of_several=len(self.managers) > 1)
         self._conditions_of_outputs = asked.conditions
         self._conditions = [*conditions(buses or {}), *asked.conditions]
@@ -205,9 +178,6 @@ class AlarmService:
         self._is_in_step = True
         self._catching_up = False
         self._damage_seen = 0
-        self._one_at_a_time = asyncio.Lock()
-        self._commands_waiting = 0
-        self._stopping = False
 
     async def open(self) -> None:
         """Open the journal.
@@ -441,7 +411,7 @@ class AlarmService:
                 await self._look_at_disk()
             was_backed = is_backed
             if tick % REFUSED_TICKS == 0:
-                await self._tell_refused()
+                await self._executor.tell_refused()
             for _ in self._tick_by_machine():
                 await asyncio.sleep(0)
             await self._clock.sleep_ns(TICK_NS)
@@ -480,53 +450,12 @@ class AlarmService:
             self._post(event)
 
     async def execute(self, command: AlarmCommand, source: str) -> CommandOutcome:
-        """Carry out a person's command, one after the other: recorded, carried out, committed, answered.
-
-        A command that has begun is carried out to its end, even if its answer is not waited for any more.
-
-        Args:
-            command: what is asked; whoever calls has made sure that it may be asked.
-            source: the way it came, for the audit log.
-
-        Returns:
-            What came of it; if it was carried out, its events are on disk.
-        """
-        if self._stopping:
-            return self._refuse(STOPPING, NOT_ASKED)
-        if self._commands_waiting >= MOST_COMMANDS:
-            return self._refuse(
-                f"{MOST_COMMANDS} commands wait for the disk already; ask again later", NOT_ASKED
-            )
-        self._commands_waiting += 1
-        work = asyncio.create_task(self._carry_out(command, source), name=f"command {command.verb}")
-        self._watch(work)
-        return await asyncio.shield(work)
+        """See `CommandExecutor.execute`."""
+        return await self._executor.execute(command, source)
 
     async def take_snapshot(self, command: SnapshotRequest, source: str) -> CommandOutcome:
-        """Have a snapshot made for a person: written down, made, answered once it is complete.
-
-        Commands to alarms do not wait for it.
-
-        Args:
-            command: what is asked; whoever calls has made sure that it may be asked.
-            source: the way it came, for the audit log.
-        """
-        if self._stopping:
-            return self._refuse(STOPPING, NOT_ASKED)
-        now_ns = self._clock.monotonic_ns()
-        lately = self._snapshots.setdefault(command.machine, deque(maxlen=MOST_SNAPSHOTS))
-        if len(lately) == MOST_SNAPSHOTS and now_ns - lately[0] < SNAPSHOTS_NS:
-            # Nor is that written down: it may be a flood.
-            refusal = (
-                f"{MOST_SNAPSHOTS} snapshots of {command.machine} were asked for within "
-                f"{SNAPSHOTS_NS // NS_PER_S} s; ask again later, or at the box"
-            )
-            self._refusals.count(command, source, refusal)
-            return self._refuse(refusal, NOT_ASKED)
-        lately.append(now_ns)
-        work = asyncio.create_task(self._made_snapshot(command, source), name="command snapshot")
-        self._watch(work)
-        return await asyncio.shield(work)
+        """See `CommandExecutor.take_snapshot`."""
+        return await self._executor.take_snapshot(command, source)
 
     def figures(self) -> dict[str, Any]:
         """How many alarms stand, are covered or unacknowledged by now, and what has happened so far."""
@@ -554,8 +483,8 @@ class AlarmService:
 
     async def settle(self, timeout_s: float) -> None:
         """Take no more commands, and wait until what is under way is on disk, at most so long."""
-        self._stopping = True
-        telling = asyncio.create_task(self._tell_refused(), name="refused commands")
+        self._executor.stop()
+        telling = asyncio.create_task(self._executor.tell_refused(), name="refused commands")
         await asyncio.wait({telling, *self._under_way}, timeout=timeout_s)
 
     async def stop(self, deadline_s: float) -> None:
@@ -576,137 +505,6 @@ class AlarmService:
     async def close(self, timeout_s: float) -> None:
         """Close the journal; see `Outbox.close`."""
         await self.outbox.close(timeout_s)
-
-    async def _carry_out(self, command: AlarmCommand, source: str) -> CommandOutcome:
-        try:
-            async with self._one_at_a_time:
-                if self._stopping:
-                    return self._refuse(STOPPING, NOT_ASKED)
-                refusal = self._refused(command) if self._refusals.flooding else None
-                if refusal is not None:
-                    self._refusals.count(command, source, refusal.reason)
-                    return refusal
-                entry = await self.audit.asked(command, source)
-                outcome = await self._outcome(command)
-                if not outcome.accepted:
-                    self._refusals.written()
-                await self._write_down(entry, command, source, outcome)
-                return outcome
-        except AuditError as error:
-            logger.error(  # noqa: TRY400 - the message says it all
-                "a command to %s %s was refused: %s",
-                command.verb,
-                command.alarm,
-                error,
-                extra=coded(DISK_REFUSES),
-            )
-            self.commands.unwritten += 1
-            return self._refuse(f"{error}", DISK_REFUSES)
-        finally:
-            self._commands_waiting -= 1
-
-    async def _made_snapshot(self, command: SnapshotRequest, source: str) -> CommandOutcome:
-        try:
-            if self._refusals.flooding:
-                # What has not been recorded is not done, and a flood is not recorded.
-                refusal = "too many commands were refused lately; ask again in a minute, or at the box"
-                self._refusals.count(command, source, refusal)
-                return self._refuse(refusal, NOT_ASKED)
-            entry = await self.audit.asked(command, source)
-            outcome = await self._snapshot_outcome(command, source)
-            if not outcome.accepted:
-                self._refusals.written()
-            await self._write_down(entry, command, source, outcome)
-        except AuditError as error:
-            logger.error(  # noqa: TRY400 - the message says it all
-                "a snapshot of %s was refused: %s", command.machine, error, extra=coded(DISK_REFUSES)
-            )
-            self.commands.unwritten += 1
-            return self._refuse(f"{error}", DISK_REFUSES)
-        else:
-            return outcome
-
-    async def _snapshot_outcome(self, command: SnapshotRequest, source: str) -> CommandOutcome:
-        if self._snapshot is None:
-            return self._refuse("this service makes no snapshots", COMMAND_REFUSED)
-        why = f": {command.reason}" if command.reason else ""
-        try:
-            path = await self._snapshot(command.machine, f"asked for by {command.by} ({source}){why}")
-        except SnapshotNotMadeError as refused:
-            return self._refuse(f"{refused}", refused.code)
-        self.commands.accepted += 1
-        return CommandOutcome(accepted=True, path=path)
-
-    def _manager_of(self, command: AlarmCommand) -> AlarmManager:
-        """The alarms that a command is about.
-
-        Raises:
-            CommandNotAllowedError: there is no such machine, or several have an alarm of that name.
-        """
-        if command.machine is not None:
-            if (manager := self.managers.get(command.machine)) is not None:
-                return manager
-            there_are = ", ".join(sorted(self.managers))
-            raise UnknownMachineError(f"no machine is named {command.machine!r}; there are: {there_are}")
-        having = [one for one in self.managers.values() if one.knows(command.alarm)]
-        if len(having) > 1:
-            names = ", ".join(one.identity.machine for one in having)
-            raise UnknownAlarmError(
-                f"{names} each have an alarm {command.alarm!r}: name the machine as well (--machine)"
-            )
-        return having[0] if having else self.manager
-
-    def _refused(self, command: AlarmCommand) -> CommandOutcome | None:
-        """What comes of a command that would be refused now; None if it would not."""
-        if command.denied:
-            return self._refuse(command.denied, COMMAND_REFUSED)
-        try:
-            refusal = self._manager_of(command).refusal(command)
-        except CommandNotAllowedError as error:
-            refusal = error
-        return None if refusal is None else self._refuse(f"{refusal}", refusal.code)
-
-    async def _outcome(self, command: AlarmCommand) -> CommandOutcome:
-        if command.denied:
-            return self._refuse(command.denied, COMMAND_REFUSED)
-        try:
-            events = self._manager_of(command).execute(command)
-        except CommandNotAllowedError as refusal:
-            return self._refuse(f"{refusal}", refusal.code)
-        self.commands.accepted += 1
-        committed = [self._post(event) for event in events]
-        if committed:
-            await asyncio.wait(committed, timeout=COMMIT_S)
-        reason = _not_on_disk(committed)
-        return CommandOutcome(
-            accepted=True,
-            reason=reason,
-            code=JOURNAL_BEHIND.id if reason else None,
-            events=tuple(event_id(self.outbox.series, number) for number in _sequences(committed)),
-        )
-
-    async def _write_down(
-        self, entry: str, command: AlarmCommand | SnapshotRequest, source: str, outcome: CommandOutcome
-    ) -> None:
-        """Write down what came of a command: too late to take it back if that fails."""
-        try:
-            await self.audit.answered(entry, command, source, outcome)
-        except AuditError as error:
-            self.commands.unanswered_in_log += 1
-            logger.error(  # noqa: TRY400 - the message says it all
-                "the result of command %s is not in the log: %s", entry, error, extra=coded(DISK_REFUSES)
-            )
-
-    async def _tell_refused(self) -> None:
-        """Write down how many commands were refused in a flood of them."""
-        try:
-            await self.audit.refused(self._refusals)
-        except AuditError as error:
-            logger.error(  # noqa: TRY400 - the message says it all
-                "refused commands that were counted are not in the log yet: %s",
-                error,
-                extra=coded(DISK_REFUSES),
-            )
 
     def _of_outputs(self) -> Iterator[Condition]:
         """The state of the outputs; reports of an output that is no longer there are dropped."""
@@ -752,10 +550,6 @@ class AlarmService:
                     extra=coded(DISK_REFUSES),
                 )
             self._free_bytes = None
-
-    def _refuse(self, reason: str, code: Code) -> CommandOutcome:
-        self.commands.refused += 1
-        return CommandOutcome(accepted=False, reason=reason, code=code.id)
 
     def _post(self, event: AlarmEvent) -> asyncio.Future[int]:
         self._log.say(event)
@@ -806,17 +600,3 @@ async def _stop(output: Output, deadline_s: float) -> None:
 def _moment(event: AlarmEvent) -> tuple[object, ...]:
     """What tells an event from others of its alarm, in memory and read back alike."""
     return event.t_ns, event.wall_ns, event.kind, event.to_state, event.to_level
-
-
-def _sequences(committed: Sequence[asyncio.Future[int]]) -> list[int]:
-    return [one.result() for one in committed if one.done() and one.exception() is None]
-
-
-def _not_on_disk(committed: Sequence[asyncio.Future[int]]) -> str:
-    """Why what was done may be undone by a restart; empty if it cannot."""
-    if all(one.done() and one.exception() is None for one in committed):
-        return ""
-    errors = [f"{one.exception()}" for one in committed if one.done() and one.exception() is not None]
-    return "done, but the journal cannot be written yet, and a restart before it can will undo it: " + (
-        "; ".join(errors) or "the event waits in memory; the alarm store/journal has the remedy"
-    )

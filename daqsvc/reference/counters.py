@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from daqsvc.acquisition.alignment_source import SourceCounters
 from daqsvc.acquisition.assembler import StreamCounters
-from daqsvc.alarm_service import CommandCounters
+from daqsvc.alarm_commands import CommandCounters
 from daqsvc.alarms.handling import AlarmCounters
 from daqsvc.control import ControlCounters
 from daqsvc.diagnosis.pipeline import DetectorCounters

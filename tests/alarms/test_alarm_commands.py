@@ -18,7 +18,7 @@ from support.live_service import running
 from support.mqtt_publishing import mqtt, outputs
 from support.waiting import eventually
 
-from daqsvc import alarm_service, audit
+from daqsvc import alarm_commands, audit
 from daqsvc.acquisition.clock import DrivenClock
 from daqsvc.alarms.commands import AlarmCommand, CommandOutcome, Verb
 from daqsvc.alarms.events import Identity
@@ -175,11 +175,10 @@ async def test_a_command_whose_outcome_cannot_be_written_down_has_been_obeyed_an
 async def test_an_event_that_the_disk_does_not_take_is_not_called_committed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(alarm_service, "COMMIT_S", 0.2)
+    monkeypatch.setattr(alarm_commands, "COMMIT_S", 0.2)
     async with desk_in(tmp_path) as desk:
         find(desk, "alert")
-        await desk.settle(5.0)
-        desk._stopping = False
+        await eventually(lambda: desk.outbox.counters.waiting == 0, "it is on disk")
         write = Journal.write
 
         def full(*_: object) -> None:
@@ -254,7 +253,7 @@ async def test_a_flood_of_refused_commands_is_summed_up_and_hides_nothing_that_w
 async def test_more_commands_than_can_wait_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(alarm_service, "MOST_COMMANDS", 2)
+    monkeypatch.setattr(alarm_commands, "MOST_COMMANDS", 2)
     async with desk_in(tmp_path) as desk:
         outcomes = await asyncio.gather(*(desk.execute(ACK, "test") for _ in range(5)))
         assert sum("wait for the disk already" in outcome.reason for outcome in outcomes) == 3

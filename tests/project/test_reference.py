@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 from support.paths import ROOT
 
-from daqsvc.alarm_service import CommandCounters
+from daqsvc.alarm_commands import CommandCounters
 from daqsvc.commands.status import StatusCommand
 from daqsvc.publish.payloads import AlarmPayload
 from daqsvc.publish.topics import Topics

@@ -16,7 +16,7 @@ from support.mqtt_publishing import commands, mqtt, say
 from support.recorded_rig import recorded_rig
 from support.waiting import eventually
 
-from daqsvc.alarm_service import MOST_SNAPSHOTS
+from daqsvc.alarm_commands import MOST_SNAPSHOTS
 from daqsvc.confined.limits import ResourceLimits
 from daqsvc.snapshots.reading import read_snapshot
 
