@@ -424,3 +424,14 @@ LINE_SETTINGS = Code(
     "serial.md",
     "/run/line is a pseudo-terminal, which passes whole bytes only: it is opened without parity",
 )
+NO_VALUE_MARK = Code(
+    "B45",
+    "A mark for no value would be a value",
+    "Many Modbus devices write 0x8000 into an int16, or 0xFFFF into a uint16, when they have no value, e.g. "
+    "of a broken sensor. Without ok_between it is taken for one.",
+    "Write ok_between with what the sensor can measure.",
+    "modbus.md",
+    example="machine.toml:73: sensors[2]: has no ok_between: 0x8000 in its int16, by which many devices mean "
+    "that they have no value, would be -1638.4 degC. Remedy: write ok_between with what it can measure, e.g. "
+    "ok_between = [-40.0, 150.0]",
+)

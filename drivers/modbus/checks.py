@@ -14,6 +14,7 @@ from daqsvc.errors.buses import (
     FORBIDDEN_REGISTERS,
     MANUALS_NUMBER,
     NO_ROOM_FOR_REGISTERS,
+    NO_VALUE_MARK,
     REGISTERS_OVERLAP,
     UNIT_ADDRESS,
     WRITE_NOT_ALLOWED,
@@ -23,6 +24,7 @@ from daqsvc.errors.machine_file import WRONG_ORDER
 from daqsvc.settings.buses import BUSY
 from daqsvc.settings.problems import Finding
 from daqsvc.settings.section import UnusableValueError
+from daqsvc.settings.sensors import TrendValue
 from drivers.modbus.load import USUAL_ANSWER_S, line_load
 from drivers.modbus.settings import (
     FIFO_REGISTERS,
@@ -115,6 +117,36 @@ def check_line_load(draft: MachineFile) -> Iterator[Finding]:
                     fatal=False,
                     code=BUS_TOO_SLOW,
                 )
+
+
+def check_no_value(draft: MachineFile) -> Iterator[Finding]:
+    """What devices write where they have no value is not taken for one.
+
+    SunSpec, and many devices beside it, mark so a value that is "not implemented".
+    """
+    for index, sensor in enumerate(draft.sensors):
+        with suppress(UnusableValueError):
+            if not isinstance(sensor, TrendValue) or sensor.ok_between is not None:
+                continue
+            layout = draft.streams[sensor.stream].layout if sensor.stream in draft.streams else None
+            channels = layout.channels if isinstance(layout, RegistersLayout) else ()
+            channel = next((one for one in channels if one.name == sensor.channel), None)
+            if channel is None or channel.type not in _NO_VALUE or channel.bits or channel.scale == 1.0:
+                continue
+            raw = _NO_VALUE[channel.type]
+            value = (raw * channel.scale + channel.offset) * sensor.gain + sensor.shift
+            yield Finding(
+                ("sensors", index),
+                f"has no ok_between: 0x{raw & 0xFFFF:04X} in its {channel.type}, by which many devices mean "
+                f"that they have no value, would be {value:.6g} {sensor.unit}",
+                "write ok_between with what it can measure, e.g. ok_between = [-40.0, 150.0]",
+                fatal=False,
+                code=NO_VALUE_MARK,
+            )
+
+
+_NO_VALUE = {"int16": -32_768, "uint16": 65_535}
+"""By the type of a register, the mark for no value."""
 
 
 def _check_bits(layout: ModbusLayout, path: KeyPath) -> Iterator[Finding]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from daqsvc.settings.buses import percent
-from drivers.modbus.checks import check_line_load, check_modbus, check_writes_and_samples
+from drivers.modbus.checks import check_line_load, check_modbus, check_no_value, check_writes_and_samples
 from drivers.modbus.load import line_load
 from drivers.modbus.settings import WAYS, ModbusRtuBus, ModbusTcpBus, RegistersLayout
 from drivers.plugin import DriverPlugin, in_units
@@ -42,6 +42,7 @@ class ModbusPlugin(DriverPlugin["ModbusBus"]):
         """See `BusTable.checks`."""
         del facts
         yield check_line_load(draft)
+        yield check_no_value(draft)
         yield check_writes_and_samples(draft)
 
     def stream_checks(

@@ -42,6 +42,11 @@ GIVEN: list[tuple[str, Path, list[tuple[str, str]]]] = [
     ("B18", MODBUS, [('name = "t", address = 0,', 'name = "t", address = 100,')]),
     ("B21", MODBUS, [("bits = [0, 12], scale = 0.1", "bits = [30, 12], scale = 0.1")]),
     ("B26", MODBUS, [('name = "t", address = 0,', 'name = "t", address = 40018,')]),
+    (
+        "B45",
+        MACHINES / "modbus-vibration-temperature.toml",
+        [('"degC"\nok_between = [-40.0, 105.0]', '"degC"')],
+    ),
     ("B24", SERIAL, [('"/dev/serial/by-id/usb-a"', '"/dev/ttyUSB0"')]),
     ("D10", LAVAL, [("noise_um = 2.0", "noise_um = 200.0")]),
     (

@@ -271,3 +271,33 @@ def test_a_gap_voltage_needs_a_sensitivity():
     )
     assert problem.key == "alarms[3].measure"
     assert 'is not known: "probe-x" has no sensitivity_mv_per_unit' in problem.message
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        (
+            '"degC"\nok_between = [-40.0, 105.0]',
+            '"degC"',
+            "0x8000 in its int16, by which many devices mean that ",
+        ),
+        (
+            '"mm/s"\nok_between = [0.0, 65.0]\n\n[[sensors]]\nname = "de-t',
+            '"mm/s"\n\n[[sensors]]\nname = "de-t',
+            "0xFFFF",
+        ),
+    ],
+)
+def test_a_mark_for_no_value_that_would_be_a_value_is_warned_of(old, new, words):
+    (warning,) = parsed(PUMP, (old, new)).warnings
+    assert words in warning.message
+    assert warning.message.endswith(("would be -1638.4 degC", "would be 65.535 mm/s"))
+    assert "write ok_between" in warning.remedy
+
+
+def test_a_count_and_a_number_of_32_bits_have_no_such_mark():
+    bare = ('"degC"\nok_between = [-40.0, 105.0]', '"degC"')
+    raw = ('address = 19, type = "int16", scale = 0.05', 'address = 19, type = "int16"')
+    assert parsed(PUMP, bare, raw).warnings == ()
+    real = ('address = 19, type = "int16", scale = 0.05', 'address = 65, type = "float32", scale = 0.05')
+    assert "no ok_between" not in "".join(one.message for one in parsed(PUMP, bare, real).warnings)
