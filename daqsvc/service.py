@@ -137,7 +137,7 @@ class Service:
             if there are none.
         on_reload: called with True when a reload begins to change something, and with False when it is over.
         files: what is read again, as it was named.
-        close_s: what the journal may take to close at the end.
+        end_patience: factor on what each part may take to end; 1 for the two seconds that are promised.
 
     Raises:
         AssemblyError: the machine file asks for a driver that is not installed.
@@ -154,7 +154,7 @@ class Service:
         read_again: Callable[[], Box] | None = None,
         on_reload: Callable[[bool], None] = lambda _: None,
         files: Sequence[Path] = (),
-        close_s: float = CLOSE_S,
+        end_patience: float = 1.0,
     ) -> None:
         self.box = box
         self.clock: Clock = clock or SystemClock()
@@ -164,7 +164,7 @@ class Service:
         self._store = store
         self._read_again = read_again
         self._on_ending = on_ending
-        self._close_s = close_s
+        self._end_patience = end_patience
         self._on_reload = on_reload
         self._reloading = asyncio.Lock()
         self._is_ending = False
@@ -296,7 +296,7 @@ class Service:
                 starting.cancel()
                 await asyncio.wait({starting}, timeout=DRAIN_S)
                 await self.control.close()
-                await self.alarms.close(self._close_s)
+                await self.alarms.close(CLOSE_S * self._end_patience)
 
     async def _start(self) -> None:
         await self.alarms.open()
@@ -341,7 +341,7 @@ class Service:
         finally:
             self._on_ending()
             self._is_ending = True
-            left = _Deadline(STOP_S)
+            left = _Deadline(STOP_S, self._end_patience)
             if parts.reload is not None:
                 parts.reload.cancel()
                 await asyncio.wait({parts.reload}, timeout=left.most(DRAIN_S))
@@ -808,11 +808,13 @@ class _Deadline:
 
     Args:
         seconds: for all of them.
+        patience: factor on this and on what each of them may take.
     """
 
-    def __init__(self, seconds: float) -> None:
-        self._until_s = asyncio.get_running_loop().time() + seconds
+    def __init__(self, seconds: float, patience: float) -> None:
+        self._patience = patience
+        self._until_s = asyncio.get_running_loop().time() + patience * seconds
 
     def most(self, seconds: float) -> float:
         """So long, or what is left of it."""
-        return max(0.0, min(seconds, self._until_s - asyncio.get_running_loop().time()))
+        return max(0.0, min(self._patience * seconds, self._until_s - asyncio.get_running_loop().time()))

@@ -143,8 +143,8 @@ LINK_UP_S = 20.0
 KERNELS_S = 300.0
 """What a slow box may take to compile the kernels, at the first run."""
 LAST_FRAMES_S = 5.0
-CLOSE_S = 60.0
-"""What the journal may take to close on a busy computer: its folder is removed then."""
+END_PATIENCE = 50.0
+"""How many times as long as on a box the service may take to end: the computer of a demo may be busy."""
 
 
 @dataclass(frozen=True)
@@ -333,7 +333,7 @@ class DemoSession:
 
     async def _serve(self, machine: MachineFile, store: Path) -> None:
         clock = SystemClock() if self.speed == 1 else DrivenClock()
-        service = self.service = Service(Box.single(machine), store, clock, close_s=CLOSE_S)
+        service = self.service = Service(Box.single(machine), store, clock, end_patience=END_PATIENCE)
         stop = asyncio.Event()
         async with _task(service.run(stop)) as running:
             await _first(service.ready.wait(), running, "the service did not start", KERNELS_S)

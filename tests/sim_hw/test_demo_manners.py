@@ -29,9 +29,10 @@ from sim_hw.demo.session import DemoSession, Script
 from sim_hw.demo.view import View, _PipeConsole
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
     from pathlib import Path
 
+    from daqsvc.supervision import Part
     from sim_hw.demo.session import Received
 
 pytestmark = pytest.mark.integration
@@ -74,9 +75,18 @@ async def test_it_removes_the_store_when_the_disk_has_taken_everything(
         closed.append(journal)
 
     monkeypatch.setattr(Journal, "close", late)
+    stop_all, patience_s = service_module.stop_all, []
+
+    async def stopping(parts: Iterable[Part], seconds: float) -> None:
+        patience_s.append(seconds)
+        await stop_all(parts, seconds)
+
+    monkeypatch.setattr(service_module, "stop_all", stopping)
     script = recorded(tmp_path, 5.0)
     outcome = await DemoSession(script, speed=1000, broker_url=None, on_message=lambda _: None).run()
     assert outcome.complete
+    # A detector may still compute: a thread that is left behind could end the process with a crash.
+    assert min(patience_s) > 5.0
     assert closed, "the folder is removed before the journal is closed"
     assert "did not close" not in caplog.text
 
