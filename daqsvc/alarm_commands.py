@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 COMMIT_S = 5.0
-"""How long an answer waits for the disk before it says that the disk has not got it yet."""
+"""How long an answer waits for the disk before it states that the disk has not got it yet."""
 MOST_COMMANDS = 64
 """Commands that may wait at a time; further ones are refused."""
 MOST_SNAPSHOTS = 6
@@ -163,7 +163,7 @@ class CommandExecutor:
         try:
             await self._audit.refused(self._refusals)
         except AuditError as error:
-            logger.error(  # noqa: TRY400 - the message says it all
+            logger.error(  # noqa: TRY400 - the message is enough
                 "refused commands that were counted are not in the log yet: %s",
                 error,
                 extra=coded(DISK_REFUSES),
@@ -185,7 +185,7 @@ class CommandExecutor:
                 await self._write_down(entry, command, source, outcome)
                 return outcome
         except AuditError as error:
-            logger.error(  # noqa: TRY400 - the message says it all
+            logger.error(  # noqa: TRY400 - the message is enough
                 "a command to %s %s was refused: %s",
                 command.verb,
                 command.alarm,
@@ -210,7 +210,7 @@ class CommandExecutor:
                 self._refusals.written()
             await self._write_down(entry, command, source, outcome)
         except AuditError as error:
-            logger.error(  # noqa: TRY400 - the message says it all
+            logger.error(  # noqa: TRY400 - the message is enough
                 "a snapshot of %s was refused: %s", command.machine, error, extra=coded(DISK_REFUSES)
             )
             self.counters.unwritten += 1
@@ -285,7 +285,7 @@ class CommandExecutor:
             await self._audit.answered(entry, command, source, outcome)
         except AuditError as error:
             self.counters.unanswered_in_log += 1
-            logger.error(  # noqa: TRY400 - the message says it all
+            logger.error(  # noqa: TRY400 - the message is enough
                 "the result of command %s is not in the log: %s", entry, error, extra=coded(DISK_REFUSES)
             )
 

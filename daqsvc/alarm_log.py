@@ -1,7 +1,7 @@
 """Alarm events in the log of the service: each, until they come faster than anybody reads.
 
 A line for each event of a flood would fill the log of the system, and a log that is written to slowly would
-hold up the event loop. All events are in the journal, whatever the log says.
+hold up the event loop. All events are in the journal, whatever the log states.
 """
 
 from __future__ import annotations

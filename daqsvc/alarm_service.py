@@ -380,7 +380,7 @@ class AlarmService:
         """Bring journal and alarms into step again.
 
         What the alarms have done since counts. An alarm that has done nothing takes over what the journal
-        says, if that could not be asked before; the journal receives what it has lost.
+        states, if that could not be asked before; the journal receives what it has lost.
         """
         damage = self._damage()
         before = dict(self._newest)
@@ -544,7 +544,7 @@ class AlarmService:
             self._free_bytes = await asyncio.to_thread(self._self_check.free_bytes)
         except OSError as error:
             if self._free_bytes is not None:
-                logger.error(  # noqa: TRY400 - the message says it all
+                logger.error(  # noqa: TRY400 - the message is enough
                     "it is not known how full the disk of the journal is: %s",
                     error,
                     extra=coded(DISK_REFUSES),

@@ -60,7 +60,7 @@ class Command(Protocol):
     help: str
     """One line for the list of verbs."""
     description: str
-    """What ``daqsvc VERB --help`` says first."""
+    """What ``daqsvc VERB --help`` reports first."""
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """Declare the arguments; heavy imports belong into `run`."""
@@ -279,7 +279,7 @@ def _chosen(root: argparse.ArgumentParser, arguments: Sequence[str] | None) -> a
     if "" in rest and not any(one.startswith("-") for one in rest):
         root.error("argument FILE: must not be empty")
     if any(one.startswith("-") for one in rest):
-        root.parse_args(arguments)  # says what is wrong
+        root.parse_args(arguments)  # states what is wrong
     elif (alarms := getattr(chosen, "alarms", None)) is not None:
         _take_words(root, chosen, [*alarms, *rest])
     elif rest and files is not None:

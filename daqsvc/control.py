@@ -220,7 +220,7 @@ class TakeSnapshot(Protocol):
 
 
 class SnapshotNotMadeError(Exception):
-    """No snapshot was made; the text says why.
+    """No snapshot was made; the text states why.
 
     Attributes:
         code: of that.
@@ -308,8 +308,8 @@ class ControlServer:
             link to it.
         status: the line of JSON with the state of a machine, or of the only one; for one that is not
             watched, the names of those that are. None if that cannot be asked.
-        reload: reads the machine files again, or only says what would change; a line for each change. None if
-            it cannot be asked.
+        reload: reads the machine files again, or only shows what would change; a line for each change. None
+            if it cannot be asked.
         files: what it reads then.
         snapshot: makes a snapshot. None if that cannot be asked.
         look: begins to send what happens. None if that cannot be asked.
@@ -382,7 +382,7 @@ class ControlServer:
                         await self.open()
                     except ControlError as error:
                         if self._refused != known:
-                            log.error(  # noqa: TRY400 - the message says it all
+                            log.error(  # noqa: TRY400 - the message is enough
                                 "no commands on this box until this is corrected: %s",
                                 error,
                                 extra=coded(CONTROL_SOCKET),
@@ -414,7 +414,7 @@ class ControlServer:
         except (ControlError, OSError) as error:
             why = f"{error}" if isinstance(error, ControlError) else error.strerror or f"{error}"
             if why != self._refused:
-                log.error(  # noqa: TRY400  the message says it all
+                log.error(  # noqa: TRY400  the message is enough
                     "the control socket has no link %s any more, by which commands on this box find it, and "
                     "none can be made: %s; that is tried again every %g s",
                     link,
@@ -575,7 +575,7 @@ class ControlServer:
             return
         client.looks = True
         writer.transport.set_write_buffer_limits(high=LIVE_PIECE_BYTES)
-        # Whatever the client still says: it is heard only that it goes.
+        # Whatever the client still states: it is heard only that it goes.
         gone = asyncio.create_task(_until_end(reader), name="one who looks on goes")
         telling: asyncio.Future[bytes] | None = None
         try:
@@ -660,7 +660,7 @@ async def _snapshot_answer(snapshot: TakeSnapshot, line: bytes, source: str) -> 
 
 
 class RequestError(ValueError):
-    """A line is no request; the text is one sentence that says why."""
+    """A line is no request; the text is one sentence that states why."""
 
     code = NOT_ASKED
 
@@ -675,7 +675,7 @@ def parse_request(line: bytes, machines: Collection[str]) -> ControlRequest:
     """The request in a line to the service that watches ``machines``.
 
     Raises:
-        RequestError: it is none; the text is one sentence that says why.
+        RequestError: it is none; the text is one sentence that states why.
     """
     if len(line) > LONGEST_LINE:
         raise RequestError(f"the request is longer than {LONGEST_LINE} bytes")
@@ -788,7 +788,7 @@ def ask_snapshot(store: Path, machine: str | None = None) -> SnapshotAnswer:
 
 
 def ask_status(store: Path, machine: str | None = None, timeout_s: float = STATUS_S) -> list[dict[str, Any]]:
-    """The state of everything by the service that runs on a store, as it says; blocks.
+    """The state of everything by the service that runs on a store, as it states; blocks.
 
     Args:
         store: the store's directory.
@@ -910,7 +910,7 @@ async def _next_line(reader: asyncio.StreamReader) -> bytes | None:
 
 
 async def _until_end(reader: asyncio.StreamReader) -> None:
-    """Wait until a client says no more, or has gone."""
+    """Wait until a client states no more, or has gone."""
     with contextlib.suppress(ConnectionError):
         while await reader.read(LONGEST_LINE):
             pass

@@ -33,13 +33,13 @@ class _Odd(NamedTuple):
 
 
 class DriverReports:
-    """Counters, streams and link of a driver; what is not as its contract says is left out, and said once.
+    """Counters, streams and link of a driver; what is not as its contract reports is left out, and said once.
 
     Args:
         name: of its bus in the machine file.
         driver: the driver.
         streams: names of its streams in the machine file.
-        supervisor: says what is not as it should be.
+        supervisor: states what is not as it should be.
     """
 
     def __init__(self, name: str, driver: Driver, streams: Collection[str], supervisor: Supervisor) -> None:

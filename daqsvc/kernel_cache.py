@@ -33,7 +33,7 @@ SERVICE = Path("/var/cache/daqsvc")
 
 
 class _UnusableError(Exception):
-    """A place cannot be used; says why."""
+    """A place cannot be used; states why."""
 
 
 def prepare(*, say: bool = True, first: Callable[[], bool] = lambda: True) -> None:

@@ -87,7 +87,7 @@ def fault_names(machine: MachineFile) -> dict[str, dict[str, str]]:
             told = plugin.faults(machine, settings)
             named |= {str(detector): {**faults} for detector, faults in told.items()}
         except PluginFailedError as failed:
-            log.error(  # noqa: TRY400 - the message says it all
+            log.error(  # noqa: TRY400 - the message is enough
                 "%s", failed.followed_by("; its decisions are shown as they are"), extra=coded(failed.code)
             )
     return named

@@ -38,8 +38,8 @@ class MachineWatch:
         clock: the service's clock.
         report: takes what the detectors say.
         supervisor: keeps its parts going.
-        bus_over: says of a bus why nothing more can come from it; empty if something can.
-        stream_silent: says of a stream what its bus knows of why nothing comes; empty if nothing.
+        bus_over: states about a bus why nothing more can come from it; empty if something can.
+        stream_silent: states about a stream what its bus knows of why nothing comes; empty if nothing.
         kernels: threads that its detectors compute in.
         make_reader: makes what hands the samples of a ring to a detector.
         listens: whether its pipeline finds out by itself that a stream is silent.

@@ -106,7 +106,7 @@ ENDS = "nothing more is recorded: the service ends, or goes on by another machin
 
 
 class SnapshotRefusedError(Exception):
-    """A snapshot that was asked for is not made; the text says why."""
+    """A snapshot that was asked for is not made; the text states why."""
 
     code = NOT_ASKED
 

@@ -103,7 +103,7 @@ def conditions(buses: Mapping[str, Collection[str]] = MappingProxyType({})) -> l
 
 
 class SelfCheck:
-    """Remembers what was seen before, and says the present state.
+    """Remembers what was seen before, and states the present state.
 
     What is not known yet is not said to be normal: an alarm that stood before a restart would return, and
     come again. What happens now and then is known once it was watched for `QUIET_NS`.

@@ -141,7 +141,7 @@ class Service:
 
     Raises:
         AssemblyError: the machine file asks for a driver that is not installed.
-        LayoutError: a DBC file does not hold what the machine file says.
+        LayoutError: a DBC file does not hold what the machine file states.
     """
 
     def __init__(
@@ -311,7 +311,7 @@ class Service:
             await self.control.open()
         except ControlError as error:
             # Watching the machine matters more than being told what to do.
-            logger.error(  # noqa: TRY400 - the message says it all
+            logger.error(  # noqa: TRY400 - the message is enough
                 "no commands on this box until this is corrected: %s", error, extra=coded(CONTROL_SOCKET)
             )
 
@@ -619,7 +619,7 @@ class Service:
         """The buses that keep the service from being ready, and what each is waited for.
 
         One with ``start = "error"`` must deliver samples. Any other must have been tried once, for then the
-        service goes on without it as the machine file says.
+        service goes on without it as the machine file states.
 
         Args:
             patient: whether to wait for the latter at all.

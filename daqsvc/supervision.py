@@ -38,7 +38,7 @@ OTHERS = "event loop"
 
 
 class EssentialLostError(Exception):
-    """Something without which the service is useless is gone for good; the text says what, and why."""
+    """Something without which the service is useless is gone for good; the text states what, and why."""
 
     code = ESSENTIAL_LOST
 
@@ -293,7 +293,7 @@ class _Standstill:
 
 
 class StallWatch:
-    """Finds parts that have something to do and get nowhere, for all who act on that, and says each once.
+    """Finds parts that have something to do and get nowhere, for all who act on that, and states each once.
 
     Time is counted from look to look, and without what a part's thread has waited for a processor. Where
     the whole process runs slowly, or not at all for a while, no part of it has stalled.

@@ -31,7 +31,7 @@ ControllerState = Literal["error-active", "error-warning", "error-passive", "bus
 
 
 class DeviceAbsentError(Exception):
-    """The device is not there at start, and the machine file says that this is an error."""
+    """The device is not there at start, and the machine file states that this is an error."""
 
     code = DEVICE_ABSENT
 

@@ -106,10 +106,10 @@ class BusQuestions(ABC):
             answers: as far as `listens_behind`.
             folder: of the machine file, where relative paths start.
             stop: set when the person has waited enough; look at it every 0.2 s or so.
-            tell: says one line while it goes on.
+            tell: states one line while it goes on.
 
         Raises:
-            SniffError: nothing was found; says what to do.
+            SniffError: nothing was found; states what to do.
         """
         raise NotImplementedError
 

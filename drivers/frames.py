@@ -132,7 +132,7 @@ class FrameLayout:
         selectors: which frames of the id have this layout, where not all of them do.
         any_priority: whether the id is one of SAE J1939, whose three highest bits are only a priority.
         valid_raw: by channel, the least and the largest raw value that is a measurement; with any other the
-            device says that it has none. Channels that are not named have `j1939_valid_raw` if the id is one
+            device shows that it has none. Channels that are not named have `j1939_valid_raw` if the id is one
             of SAE J1939, else nothing but measurements.
     """
 
@@ -327,7 +327,7 @@ class FrameLayout:
                 physical units in one pass, where NumPy takes four; None to leave it to NumPy.
 
         Returns:
-            Samples that are NaN where the device says that it has no value (`valid_raw`).
+            Samples that are NaN where the device states that it has no value (`valid_raw`).
         """
         n = len(payloads)
         if scaling is not None and len(self._sample_groups) == 1 and self._raw_values.all_measured:
@@ -386,7 +386,7 @@ class FrameLayout:
 
         Raises:
             LayoutError: a value does not fit its field (and ``clip`` is False), or is NaN and no raw value of
-                the field says so.
+                the field states it.
         """
         n = len(first_index)
         raw = ((np.asarray(samples, np.float64) - self.offset) / self.scale).reshape(n, -1)

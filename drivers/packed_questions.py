@@ -131,7 +131,7 @@ def frame_proposals(length: int, counter: Mapping[str, Any] | None, answers: Ans
     """
     fits = {}
     if "first-byte" in answers and (most := _most_samples(answers, length)) >= 1:
-        # A counter of samples says how many of them are in a frame.
+        # A counter of samples states how many of them are in a frame.
         step = 1 if counter is None else counter["step"]
         fits["samples-per-frame"] = f"{step if step > 1 else most}"
     if counter is None:

@@ -43,7 +43,7 @@ class DriverPlugin(BusTable, Generic[BusT]):
 
         Raises:
             AssemblyError: no driver decodes this layout.
-            LayoutError: a file that it names does not hold what the machine file says.
+            LayoutError: a file that it names does not hold what the machine file states.
         """
         layout = machine.streams[stream].layout
         if not isinstance(layout, PackedLayout):

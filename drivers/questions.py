@@ -48,7 +48,7 @@ class Question:
         choices: what may be answered, with what each means; empty if it is free.
         doubt: why a value is most likely a mistake, and what to offer instead; None if it is none. Whoever
             types it again means it.
-        quiet: whether the default is taken without asking, unless an option says something else.
+        quiet: whether the default is taken without asking, unless an option states something else.
     """
 
     key: str
@@ -171,7 +171,7 @@ def whole(text: str) -> int:
 
 
 def bit_rate(text: str) -> int:
-    """A bit rate in bit/s; ``500k`` and ``1M`` are those that everybody says."""
+    """A bit rate in bit/s; ``500k`` and ``1M`` are those that everybody states."""
     found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([kM]?)(?:bit/s|bps|bit|bd|baud)?", text.strip(), re.IGNORECASE)
     if found is None:
         raise ValueError(f'"{text}" is not a bit rate; write it in bit/s, e.g. 500000 or 500k')

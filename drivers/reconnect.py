@@ -53,7 +53,7 @@ class Attempt(NamedTuple):
 
 
 class CannotOpenError(Exception):
-    """The link cannot be opened; says why, and what to do about it."""
+    """The link cannot be opened; states why, and what to do about it."""
 
 
 async def run_with_reconnect(
@@ -68,7 +68,7 @@ async def run_with_reconnect(
     once, also if this is called again.
 
     Args:
-        link: its state; `attempt` says when it is up.
+        link: its state; `attempt` states when it is up.
         port: what to do if the device is absent at first, and the clock.
         attempt: opens the link and uses it until it is lost; None if there is nothing more to come. It may
             raise `CannotOpenError`, but must not put the link down: that is said here, where it is known

@@ -1,6 +1,6 @@
 """What a driver brings to ``daqsvc sniff``: what is on a bus of its kind, without a machine file.
 
-A sniffer listens or asks, and says what it found: for a person, for a program, and as tables of a machine
+A sniffer listens or asks, and states what it found: for a person, for a program, and as tables of a machine
 file to begin with. Those of this tree are named in `daqsvc.commands.sniff`; its own package registers
 one by entry point in the group ``daqsvc.sniffers``, under the name of its driver.
 """
@@ -104,7 +104,7 @@ class Sniffer(ABC):
         Args:
             arguments: as parsed.
             stop: set when the person has seen enough; what was found so far is still returned.
-            tell: says one line while it goes on.
+            tell: states one line while it goes on.
 
         Raises:
             SniffError: nothing can be seen at all.
@@ -207,7 +207,7 @@ def sniffed(
     """The figures of what a sniffer finds, with arguments as they would be typed.
 
     Raises:
-        SniffError: nothing can be seen; says what to do.
+        SniffError: nothing can be seen; states what to do.
         NothingFoundError: nothing was there; the same holds.
     """
     parser = _Words(add_help=False)

@@ -38,7 +38,7 @@ class StreamDriver(ABC):
     Attributes:
         name: of the bus in the machine file.
         port: what was given: `read` takes the streams from ``port.streams``, the time from ``port.clock``.
-        link: whether the device is there: `read` says ``link.up()``, and why it is lost by what it returns.
+        link: whether the device is there: `read` states ``link.up()``, and why it is lost by what it returns.
         counters: what is no frame of a stream: `read` adds to ``counters.frames_unknown``. A frame of a
             stream that is too short or too long goes to ``streams[name][0].frames_wrong_length``. All else
             (losses, repeats, checksums) is counted by `take`.

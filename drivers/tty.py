@@ -79,7 +79,7 @@ def is_pseudo_terminal(port: str | Path) -> bool:
     """Whether a path leads to a pseudo-terminal; False if there is nothing."""
     try:
         status = os.stat(port)  # noqa: PTH116 - a path or an URL, as pyserial takes it
-    except (OSError, ValueError):  # whoever opens it says what is wrong with it
+    except (OSError, ValueError):  # whoever opens it states what is wrong with it
         return False
     return stat.S_ISCHR(status.st_mode) and os.major(status.st_rdev) in PSEUDO_TERMINAL_MAJORS
 

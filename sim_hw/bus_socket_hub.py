@@ -134,7 +134,7 @@ def pack_lost(frames: int) -> bytes:
 
 
 def unpack_lost(packet: bytes) -> int:
-    """How many frames a notice says were lost; 0 if the packet is none."""
+    """How many frames a notice states were lost; 0 if the packet is none."""
     if len(packet) != _LOST.size:
         return 0
     mark, frames = _LOST.unpack(packet)
@@ -166,7 +166,7 @@ BACKLOG = 64
 
 
 class HubError(OSError):
-    """A hub cannot be started at a path; says why and what to do."""
+    """A hub cannot be started at a path; states why and what to do."""
 
     code = SIMULATION
 

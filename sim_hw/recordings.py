@@ -30,7 +30,7 @@ def load_played(
         path: a file, a CAN log, or a folder of CAN logs.
         channels: see `load_recording`; not of a CAN log.
         rate_hz: the same; of a CAN log it must be that of the machine file.
-        machine: says how the frames of a CAN log are laid out.
+        machine: states how the frames of a CAN log are laid out.
         remedy: how that is given where it is missing.
 
     Raises:

@@ -521,7 +521,7 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
         name_or_path: one of `builtin_scenarios`, or the path of a TOML file.
 
     Raises:
-        ScenarioError: there is no such scenario, or the file is not one; says all that is wrong.
+        ScenarioError: there is no such scenario, or the file is not one; states all that is wrong.
     """
     return _understood(Scenario, _table(name_or_path), name_or_path)
 

@@ -286,7 +286,7 @@ def _is_scenario(path: Path) -> bool:
     try:
         return "plant" in read_toml(path)
     except (OSError, TomlFileError):
-        return False  # the reader of machine files says what is wrong with it
+        return False  # the reader of machine files states what is wrong with it
 
 
 def _port(text: str) -> int:

@@ -1,7 +1,7 @@
 """The devices that ``daqsvc sim`` puts on a bus, by the driver that reads it.
 
 Another kind registers by entry point in the group ``daqsvc.sim_nodes``, under the name that the machine file
-says in ``driver = "..."``: a callable that takes a `NodeOrder` and returns a `SimNode` that is ready to play.
+states in ``driver = "..."``: a callable that takes a `NodeOrder` and returns a `SimNode` ready to play.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 
 class NodeError(Exception):
-    """A node cannot be put on its bus; says why and what to do."""
+    """A node cannot be put on its bus; states why and what to do."""
 
     code = SIMULATION
 

@@ -30,7 +30,7 @@ _PER_M_S2 = {"m/s2": 1.0, "g": 1.0 / G_M_S2}
 
 
 class SignalError(ValueError):
-    """What is to be played has nothing for a sensor; says which, and what there is."""
+    """What is to be played has nothing for a sensor; states which, and what there is."""
 
     code = SIMULATION
 
@@ -39,7 +39,7 @@ class Signals(Protocol):
     """A source of samples for any sensor that it knows."""
 
     def of(self, sensor: BaseSensor, rate_hz: float) -> NDArray[np.float64]:
-        """What a sensor says: float64 ``[n]`` in the sensor's unit.
+        """What a sensor states: float64 ``[n]`` in the sensor's unit.
 
         Raises:
             SignalError: there is nothing for this sensor.

@@ -1,7 +1,7 @@
 """From decoded frames to blocks: in order, each sample once, every loss counted.
 
 One assembler serves one stream. It places frames by the time base, puts overtaken frames back in
-order within the reorder window, drops repeats, and hands over blocks whose `lost_before` says exactly
+order within the reorder window, drops repeats, and hands over blocks whose `lost_before` states exactly
 what is missing.
 """
 
@@ -54,7 +54,7 @@ class StreamCounters:
         frames_late: of those, arriving after their samples had been declared lost.
         frames_rejected: of those, with a counter that fits nothing.
         frames_set_aside: of those, come while the stream could not be placed: its counter stood still or made
-            no sense, or far more frames came than the file says.
+            no sense, or far more frames came than the file states.
         frames_wrong_length: frames of the stream's id that are shorter or longer than its layout.
         samples_received: samples handed on.
         samples_lost: samples declared missing, by the device's counter, or by time if it sends none.
@@ -446,7 +446,7 @@ def _joined(parts: list[Frames]) -> Frames:
 def note_received(counters: StreamCounters, stream: str, samples: Samples) -> Samples:
     """Count samples that are handed on, and what in them is absent; the first such is logged.
 
-    A value is absent if the device says that it has none (NaN), or if it is infinite. An overflow on the
+    A value is absent if the device states that it has none (NaN), or if it is infinite. An overflow on the
     device, or a number too large for a float32, leaves such a value; it is no measurement.
 
     Args:
@@ -455,7 +455,7 @@ def note_received(counters: StreamCounters, stream: str, samples: Samples) -> Sa
         samples: float32 ``[n, channels]``.
 
     Returns:
-        The samples with NaN for what is absent; the same array if it says so already.
+        The samples with NaN for what is absent; the same array if it states it already.
     """
     counters.samples_received += len(samples)
     there = np.isfinite(samples)

@@ -1,6 +1,6 @@
 """Unwrapping a device's sample counter, and telling a wrap from a loss from a restart.
 
-The counter says where a frame belongs; the time of arrival only decides what the counter cannot: how
+The counter states where a frame belongs; the time of arrival only decides what the counter cannot: how
 often it wrapped during an outage, and whether it was restarted.
 
 Samples may arrive late, but never early. So a counter that is ahead of the clock was restarted; one that is

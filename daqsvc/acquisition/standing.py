@@ -51,7 +51,7 @@ def tell_nobody(stream: str, standing: StreamState) -> None:
 
 
 def cause_of(doubt: str) -> str:
-    """What a doubt says but for its figures, by which the same trouble may differ each time."""
+    """What a doubt reports but for its figures, by which the same trouble may differ each time."""
     return _FIGURE.split(doubt, maxsplit=1)[0].strip()
 
 

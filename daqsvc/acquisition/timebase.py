@@ -4,7 +4,7 @@ Frames arrive late, never early: the bus, the kernel and the scheduler add delay
 So the truth lies along the lower edge of the cloud of arrivals. The estimator keeps the earliest
 arrival of every tenth of a second and supports a line under them where it fits the whole window best
 (`daqsvc.acquisition.clock_line`). Jitter of 10 ms then moves the estimate by far less than a millisecond,
-and the estimate says how far off it may be. The constant part of the delay cannot be seen from one side and
+and the estimate states how far off it may be. The constant part of the delay cannot be seen from one side and
 stays in.
 
 Where all arrivals contradict the line it was wrong, or the device's clock has stepped, and the line begins
@@ -12,7 +12,7 @@ again: at once when they are early, for nothing comes before its time; after som
 and do not catch up, for they may have been delayed.
 
 A device whose clock is off by more than 5 % has another rate than the nominal one. The line then follows the
-rate that it has, and `TimeBase.rate_doubt` says so.
+rate that it has, and `TimeBase.rate_doubt` states it.
 """
 
 from __future__ import annotations

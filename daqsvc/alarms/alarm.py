@@ -36,11 +36,11 @@ class ChatterWatch:
     """Counts how often one alarm is raised, by the time of the data.
 
     A chattering alarm, which nobody can read, is neither dropped nor cleared: it stays active, at its worst
-    level, and says so, until its level has stood still for a while. Its many comings and goings are then one
-    occurrence.
+    level, and states it, until its level has stood still for a while. Its many comings and goings are then
+    one occurrence.
 
     Args:
-        handling: says how often it may be raised, escalated or recur within which time; once more is chatter,
+        handling: how often it may be raised, escalated or recur within which time; once more is chatter,
             until its level has stood still for long enough. Time over which no data came does not count.
     """
 
@@ -114,7 +114,7 @@ FINDINGS = frozenset(
         EventKind.RETURNED,
     }
 )
-"""Events whose message says what is found."""
+"""Events whose message states what is found."""
 
 _FIGURE = re.compile(r"[-+]?\d[\d.,]*(e[-+]?\d+)?")
 
@@ -127,7 +127,7 @@ class Alarm:
         name: name of the alarm.
         latching: whether it outlives its condition until it is reset.
         new_occurrence: gives an id that was never used before.
-        handling: says from when on it chatters.
+        handling: states from when on it chatters.
     """
 
     def __init__(
@@ -228,7 +228,7 @@ class Alarm:
 
     @property
     def found(self) -> str:
-        """The message that says what is found by now; empty if that is not known."""
+        """The message that states what is found by now; empty if that is not known."""
         return self._last_message
 
     @property
@@ -309,7 +309,7 @@ class Alarm:
         not_ok, told_not_ok = (
             {d.detector for d in those if d.not_ok} for those in (self.doubts, self._told_doubts)
         )
-        # The next good statement after a restart also says that no detector lacks samples any more.
+        # The next good statement after a restart also states that no detector lacks samples any more.
         if not_ok == told_not_ok:
             return []
         # A sensor that flickers must not be an event each time; that it was not OK is on the safe side.

@@ -140,7 +140,7 @@ class CommandMessage(JsonCommand):
         reason: str
 
     def command(self, verb: Verb, machine: str | None = None) -> AlarmCommand:
-        """What it asks for by ``verb``, of a machine if it says of which."""
+        """What it asks for by ``verb``, of a machine if it states of which."""
         return AlarmCommand(
             verb=verb,
             alarm=self.alarm,
@@ -156,7 +156,7 @@ def faults_of(error: ValidationError, whole: str) -> list[str]:
     """What is wrong with a command, each with its key.
 
     Args:
-        error: what `JsonCommand` says.
+        error: what `JsonCommand` states.
         whole: what the command as a whole is called.
     """
     return [

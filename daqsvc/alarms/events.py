@@ -66,7 +66,7 @@ _UNCOVERED = frozenset({EventKind.UNSHELVED, EventKind.UNBYPASSED, EventKind.UNS
 
 
 class Doubt(NamedTuple):
-    """What one detector has against a sensor, until it says good.
+    """What one detector has against a sensor, until it states good.
 
     Attributes:
         detector: name of the detector.
@@ -110,7 +110,7 @@ class AlarmEvent:
         chattering: whether its returns are held back because it becomes active and returns too often.
         finding: what is found, where a level can have several causes (`Finding.identity`).
         doubts: of a quality alarm, what is said against the sensor.
-        found: the message of the last event that said what is found; empty if this one's message says that,
+        found: the message of the last event that said what is found; empty if this one's message states that,
             or if it is not known.
 
     The last event of an alarm holds all that a restart needs to know about it.

@@ -17,7 +17,7 @@ class Expected:
     """Names of the alarms that can come without a rule of the machine file.
 
     Args:
-        handling: says whether there can be a flood, and a start-up that lasts too long.
+        handling: states whether there can be a flood, and a start-up that lasts too long.
     """
 
     def __init__(self, handling: AlarmHandling) -> None:

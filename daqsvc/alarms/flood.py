@@ -23,7 +23,7 @@ class FloodWatch:
     """Counts the alarms that call for a person. A flood is reported; no alarm is dropped.
 
     Args:
-        handling: says how many alarms may call for a person within which time (ISA-18.2 and EEMUA 191 say 10
+        handling: shows how many alarms may call for a person within which time (ISA-18.2 and EEMUA 191 say 10
             in 10 minutes). One more is a flood, which ends when there are fewer than half as many. Alarms
             about sensors and the service count, too: a person has to attend to each. Covered ones do not.
     """
@@ -51,7 +51,7 @@ class FloodWatch:
 
         Args:
             now_ns: monotonic time.
-            advice: where to look first, as `where_to_look` says it; asked for when a flood begins.
+            advice: where to look first, as `where_to_look` states it; asked for when a flood begins.
         """
         if not self._most:
             return None
@@ -100,7 +100,7 @@ _SET_ASIDE = frozenset({AlarmState.SHELVED, AlarmState.OUT_OF_SERVICE})
 
 
 class FirstOut:
-    """Follows the events of all alarms and says which of a group came first, until that is normal again.
+    """Follows the events of all alarms and states which of a group came first, until that is normal again.
 
     An alarm stands from its raise until it is normal, reset and acknowledged. One that a person has shelved
     or taken out of service does not stand; one that is suppressed by a bad sensor does. While any alarm of a

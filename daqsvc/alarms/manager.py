@@ -56,7 +56,7 @@ class AlarmManager:
     ``detector-ok/<detector>``.
 
     - Not OK suppresses every alarm that rests on the sensor, until a good statement comes.
-    - Missing holds every state. It never clears anything. Where a statement says between what bounds its
+    - Missing holds every state. It never clears anything. Where a statement states between what bounds its
       values lie all the same, they may raise an alarm.
     - Shelved and out of service cover an alarm. Its state still changes behind the cover, with events.
 
@@ -181,7 +181,7 @@ class AlarmManager:
         """Do what a person asks.
 
         Raises:
-            CommandNotAllowedError: there is no such alarm, or its state does not allow it; the text says why.
+            CommandNotAllowedError: there is none, or its state does not allow it; the text states why.
         """
         try:
             alarm = self._named(command.alarm)
@@ -216,7 +216,7 @@ class AlarmManager:
 
         Every alarm takes over its state, level, occurrence and holds, and holds them until a good diagnosis
         comes, which continues the occurrence or returns it. A suppression holds until whoever asked for
-        it says good. Shelving goes on by the wall clock, but not for longer than was left. Delays begin
+        it states good. Shelving goes on by the wall clock, but not for longer than was left. Delays begin
         again.
 
         Args:

@@ -120,17 +120,17 @@ class SensorHealth:
 
     Missing samples do not take back that a sensor was not OK; a partial statement does, which has seen at
     least half of them. It raises its own doubt when such statements prevail, and upholds one that
-    samples are missing. A detector that says what share of its samples is missing, and that could not judge
+    samples are missing. A detector that states what share of its samples is missing, and that could not judge
     them, is good again only when that has lasted for some seconds.
     """
 
     def __init__(self) -> None:
         self._patience: dict[str, _Patience] = {}
         self._shortage: defaultdict[str, _Shortage] = defaultdict(_Shortage)
-        # When the restart was over which a detector lacked samples, until it says what share is missing.
+        # When the restart was over which a detector lacked samples, until it states what share is missing.
         self._lacked_at_restart: dict[str, int] = {}
         self._by_detector: dict[str, tuple[str, Doubt]] = {}
-        # Why there are no samples by which to judge, by detector, until it says good.
+        # Why there are no samples by which to judge, by detector, until it states good.
         self._causes: dict[str, str] = {}
         # By detector, the stream that it cannot judge by.
         self._unjudged: dict[str, str] = {}
@@ -242,7 +242,7 @@ class SensorHealth:
             self._unheard.discard(detector)
 
     def not_ok(self) -> list[tuple[str, Doubt]]:
-        """Who has found sensors not OK, each with the quality alarm that says so."""
+        """Who has found sensors not OK, each with the quality alarm that states it."""
         return [(name, doubt) for name, doubt in self._by_detector.values() if doubt.not_ok]
 
     def excuse(self, detector: str) -> None:
@@ -306,8 +306,8 @@ class SensorHealth:
     def silences(self, rule: Rule, sensors: frozenset[str]) -> str | None:
         """Why the alarm of ``rule`` is suppressed while it rests on ``sensors``; None if it is not.
 
-        Its own detector says that a sensor is not OK, without saying which, or more of its sensors are blamed
-        than it can spare.
+        Its own detector shows that a sensor is not OK, without saying which, or more of its sensors are
+        blamed than it can spare.
         """
         if self._unsettled.get(rule.alarm):
             return "a sensor was not OK before the restart"
@@ -347,7 +347,7 @@ class SensorHealth:
 
 
 def in_words(name: str, doubts: Sequence[Doubt]) -> str:
-    """What the quality alarm ``name`` says of its subject while there are ``doubts``."""
+    """What the quality alarm ``name`` states of its subject while there are ``doubts``."""
     worst = _worst(doubts)
     what = "not OK"
     if worst.quality == "missing":

@@ -83,7 +83,7 @@ class Circumstances(NamedTuple):
 
     Attributes:
         starting: whether the machine starts up.
-        not_ok: sensors that somebody says are not OK.
+        not_ok: sensors that somebody states are not OK.
     """
 
     starting: bool = False
@@ -285,7 +285,7 @@ def _finite(nats: float) -> float | None:
 
 
 class MeasureWatch:
-    """A measure of one sensor against a setpoint; says once if its detector does not have the measure.
+    """A measure of one sensor against a setpoint; states once if its detector does not have the measure.
 
     Args:
         alarm: name of the alarm.
@@ -307,7 +307,7 @@ class MeasureWatch:
         """The level and the value; None, and everything holds, without the measure.
 
         Of a value of which only bounds are known: a level that has risen to where the value is for sure, with
-        the bound that says so. None if it has not.
+        the bound that states it. None if it has not.
         """
         value = diagnosis.statistics.get(self._measure)
         factor = self._trip_multiply if circumstances.starting else 1.0
@@ -336,7 +336,7 @@ class MeasureWatch:
         return None
 
     def sure(self, bounds: tuple[float, float]) -> tuple[Level, float]:
-        """The level at which a value between bounds is for sure, and the bound that says so."""
+        """The level at which a value between bounds is for sure, and the bound that states it."""
         return self.monitor.sure(*bounds), self._nearer(bounds)
 
     def _nearer(self, bounds: tuple[float, float]) -> float:
@@ -422,7 +422,7 @@ class _LevelWatch:
         diagnosis: Diagnosis,
         circumstances: Circumstances,
     ) -> RuleFinding | None:
-        """What the worse of both measures says; None where that one is not known: it holds then."""
+        """What the worse of both measures states; None where that one is not known: it holds then."""
         other = beside.find(diagnosis, circumstances)
         level = max(self._watch.monitor.level, beside.monitor.level)
         if finding is not None and finding[0] is level:
@@ -481,7 +481,7 @@ class _DecisionWatch:
         if diagnosis.where:
             sentence += f" at {diagnosis.where}"
         probability = diagnosis.probabilities.get(decision, 0.0)
-        if probability > 0.5:  # a smaller one says less than the words
+        if probability > 0.5:  # a smaller one states less than the words
             sentence += ", p > 0.999" if probability > SURE else f", p = {probability:.3f}"
         if evidence is not None:
             sentence += f", evidence {evidence:.3g} nats"

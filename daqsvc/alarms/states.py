@@ -157,7 +157,7 @@ def moves(*, latching: bool) -> Mapping[tuple[AlarmState, Stimulus], AlarmState]
 def transition(state: AlarmState, stimulus: Stimulus, *, latching: bool) -> AlarmState:
     """The state after a stimulus.
 
-    What the data says never fails: a condition that stands already, or has gone already, moves nothing.
+    What the data reports never fails: a condition that stands already, or has gone already, moves nothing.
 
     Args:
         state: the alarm's own state, not one of the holds.

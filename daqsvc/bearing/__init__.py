@@ -1,1 +1,1 @@
-"""Rolling bearings: their model, their kinematics, and what measured vibration says of their state."""
+"""Rolling bearings: their model, their kinematics, and what measured vibration states of their state."""

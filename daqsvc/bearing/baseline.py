@@ -176,7 +176,7 @@ Positive = Annotated[float, Field(gt=0)]
 
 
 class BaselineFileError(ValueError):
-    """A file with a healthy machine cannot be read, used or written; the message says why and what to do."""
+    """A file with a healthy machine cannot be read, used or written; the message shows why and what to do."""
 
     code = CALIBRATION_FILE
 

@@ -54,11 +54,11 @@ _SMALLEST = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Isolation:
-    """What a window says of a fault that has been detected.
+    """What a window states about a fault that has been detected.
 
     Attributes:
         verdict: the faulty part; ``"ball"`` is also what inner and outer race together look like, and
-            ``"inner_or_outer"`` says that the evidence does not decide.
+            ``"inner_or_outer"`` states that the evidence does not decide.
         group: the parts that the evidence leaves possible, the verdict first.
         inner_nats: evidence of the frames that are likelier to be impacts of the inner race.
         outer_nats: evidence of the others.

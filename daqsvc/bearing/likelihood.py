@@ -58,7 +58,7 @@ _BEFORE = 3.0 - math.sqrt(8.0)
 
 @dataclass(frozen=True, slots=True)
 class Detection:
-    """What the likelihood ratio says of a window.
+    """What the likelihood ratio states about a window.
 
     Attributes:
         detected: whether the statistic is above the limit.

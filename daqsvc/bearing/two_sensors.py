@@ -27,7 +27,7 @@ UNITS_CORNER_PER_BALL_MODE = 0.25
 
 @dataclass(frozen=True, slots=True)
 class TwoSensorFinding:
-    """What a window says.
+    """What a window states.
 
     Attributes:
         verdict: ``"normal"`` if nothing is detected, ``"changed"`` if what is detected does not come in
@@ -38,7 +38,7 @@ class TwoSensorFinding:
         isolation: which race, by the likelihood of its impacts; None if there are none.
         energies: of the sliding units.
         ratio_db: of those energies, see `RatioRule.ratio_db`; NaN if nothing is detected.
-        units: which race that ratio says, for corroboration; None if nothing is detected.
+        units: which race that ratio states, for corroboration; None if nothing is detected.
     """
 
     verdict: Race | Literal["normal", "changed", "inner_or_outer"]

@@ -34,11 +34,11 @@ _OF_PATTERN = {
     Verb.BYPASS: _NOT_NORMAL - {AlarmState.OUT_OF_SERVICE},
     Verb.UNBYPASS: {AlarmState.OUT_OF_SERVICE},
 }
-"""The states of the alarms that a pattern means: the others a verb would leave as they are."""
+"""The states about the alarms that a pattern means: the others a verb would leave as they are."""
 
 
 class NoSuchAlarmError(Exception):
-    """What was written means no alarm, or it is not known which one; the text says what there is."""
+    """What was written means no alarm, or it is not known which one; the text states what there is."""
 
     code = NO_SUCH_ALARM
 

@@ -1,6 +1,6 @@
 """The verbs about alarms.
 
-``daqsvc alarms`` says from the journal their states and what has happened. What people do with them goes to
+``daqsvc alarms`` states from the journal their states and what has happened. What people do with them goes to
 the service that runs: ``ack``, ``reset``, ``shelve``, ``bypass``, and their undoing.
 """
 
@@ -109,7 +109,7 @@ def _complain(verb: str, what: object, code: Code | str) -> int:
 
 
 class NoSuchMachineError(Exception):
-    """The machine that was named is not among those of the store; the text says which are."""
+    """The machine that was named is not among those of the store; the text states which are."""
 
     code = NO_SUCH_MACHINE
 
@@ -182,7 +182,7 @@ class AlarmVerb:
     Args:
         verb: the `daqsvc.alarms.commands.Verb` by its value.
         help_line: one line for the list of verbs.
-        description: what ``--help`` says first.
+        description: what ``--help`` reports first.
         load: reads a machine file; None after its errors have been printed.
     """
 

@@ -81,7 +81,7 @@ LONGEST_S = 366 * 86_400
 
 @dataclass(frozen=True, slots=True)
 class SpeedOption:
-    """What ``--speed-rpm`` says.
+    """What ``--speed-rpm`` states.
 
     Attributes:
         rpm: the speed, negative if clockwise.
@@ -236,7 +236,7 @@ def memory_limit(text: str) -> int:
 
 
 def add_max_memory(add: Callable[..., argparse.Action]) -> None:
-    """The option ``--max-memory``; what it says goes to `daqsvc.recording.recording.set_memory`.
+    """The option ``--max-memory``; what it reports goes to `daqsvc.recording.recording.set_memory`.
 
     Args:
         add: ``add_argument`` of the group that takes it.

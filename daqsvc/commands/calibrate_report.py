@@ -1,4 +1,4 @@
-"""What ``daqsvc calibrate`` says of what it found."""
+"""What ``daqsvc calibrate`` states of what it found."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _OF_CRITICAL = (0.5, 0.7, 0.95, 1.0)
 
 
 def speeds_to_predict(fit: RunUpFit, asked: Sequence[float] | None) -> tuple[float, ...]:
-    """Speeds in rpm at which the run-up says something; those asked for, or parts of the critical one."""
+    """Speeds in rpm at which the run-up states something; those asked for, or parts of the critical one."""
     if not fit.laval:
         return ()
     if asked is not None:

@@ -1,4 +1,4 @@
-"""How a verb says on stderr what went wrong: in one line, with the code of its kind at the end."""
+"""How a verb states on stderr what went wrong: in one line, with the code of its kind at the end."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 EXIT_INTERRUPTED = 128 + signal.SIGINT
-"""What a shell says of a program that SIGINT has ended."""
+"""What a shell states about a program that SIGINT has ended."""
 
 _came: set[int] = set()
 """Signals that have no handler yet."""
@@ -24,7 +24,7 @@ def ignore_until_heard(arguments: Sequence[str]) -> None:
     """From here on, let a SIGHUP that asks the service for a reload not end it, nor SIGUSR1 and SIGUSR2.
 
     Whoever starts and reloads it in one go is too quick for its own handler (`ProcessGuard`), which takes
-    over what came (`take_hang_up`). A handler, and not SIG_IGN: that says that the service is to outlive its
+    over what came (`take_hang_up`). A handler, and not SIG_IGN: that shows that the service is to outlive its
     terminal.
 
     Args:

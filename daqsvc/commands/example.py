@@ -126,7 +126,7 @@ def _copy(example: Example, out: Path) -> int:
         for path, text in files.items():
             with path.open("x", encoding="utf-8") as file:
                 file.write(text)
-            print(path)  # noqa: T201 - says what was written
+            print(path)  # noqa: T201 - states what was written
     except FileExistsError:
         return _is_there(path)
     except OSError as error:

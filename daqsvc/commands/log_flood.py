@@ -26,9 +26,9 @@ class _Window:
 
 
 class LogFlood:
-    """Lets 20 lines a minute of each cause into the log, and says that there were more.
+    """Lets 20 lines a minute of each cause into the log, and states that there were more.
 
-    What goes and comes back says so sparingly by itself; this is for unexpected floods. The cause is
+    What goes and comes back states it sparingly by itself; this is for unexpected floods. The cause is
     the text of the line before its figures are filled in, with the first of them: mostly the name of a thing.
 
     Args:

@@ -46,7 +46,7 @@ def load_machines(paths: Sequence[Path], load: Load) -> tuple[Box | None, list[M
         return _box(paths, machines) if len(machines) == len(read) else None, machines
     except MachineFileError as error:
         for problem in error.problems:
-            log.error("%s", problem, extra=coded(problem.code))  # noqa: TRY400 - the message says it all
+            log.error("%s", problem, extra=coded(problem.code))  # noqa: TRY400 - the message is enough
         return None, machines
 
 

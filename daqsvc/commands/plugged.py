@@ -19,7 +19,7 @@ T = TypeVar("T")
 def plugged(group: str, base: type[T], what: str) -> dict[str, T]:
     """What packages register in a group of entry points, by name, one made of each.
 
-    What cannot be made is left out, and stderr says so: no package may take the others along.
+    What cannot be made is left out, and stderr states it: no package may take the others along.
 
     Args:
         group: of entry points.

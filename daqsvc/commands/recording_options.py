@@ -479,7 +479,7 @@ def _add_bearing(add: Callable[..., argparse.Action]) -> None:
 
 
 def _add_rotor(add: Callable[..., argparse.Action], *, speed_help: str, help_more: str = "") -> None:
-    """Probes, speed and rotor, which a machine file says otherwise.
+    """Probes, speed and rotor, which a machine file states otherwise.
 
     Args:
         add: ``add_argument`` of the group that takes the options.

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 milestones = logging.getLogger(f"{__name__}.milestones")
-"""What is logged without ``-v``, too: a service that says nothing leaves a person in doubt."""
+"""What is logged without ``-v``, too: a service that states nothing leaves a person in doubt."""
 
 LOOK_S = 0.2
 """How often is looked whether samples of all streams have come."""
@@ -150,7 +150,7 @@ def _run(
         is_named = store is not None
         store = store or store_directory(box)
         # What comes next may compile kernels, on a small box for minutes: meanwhile the store is held, which
-        # says to others that a service starts.
+        # states to others that a service starts.
         refuse_store(store)
         with contextlib.ExitStack() as held:
             # What the disk cannot do now, it may by the time the journal is opened.
@@ -259,7 +259,7 @@ class _Reloader:
                 return
             except ReloadRefusedError as refused:
                 for reason in refused.reasons:
-                    log.error(  # noqa: TRY400 - the message says it all
+                    log.error(  # noqa: TRY400 - the message is enough
                         "SIGHUP is refused, and the service goes on as before: %s",
                         reason,
                         extra=coded(RELOAD_REFUSED),

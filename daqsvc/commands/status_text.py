@@ -70,7 +70,7 @@ def _alarms_and_outputs(status: Document, width: int) -> Iterator[str]:
 
 
 def _standing(alarms: Sequence[Document], width: int) -> str:
-    """A line for each alarm, and what it says below."""
+    """A line for each alarm, and what it reports below."""
     rows = [[one["level"], _alarm_state(one), one["alarm"], _ago(one["age_s"])] for one in alarms]
     title, *lines = aligned(["LEVEL", "STATE", "ALARM", "CHANGED"], rows).splitlines()
     told = [title]

@@ -28,7 +28,7 @@ JOURNAL = "outbox.sqlite"
 
 
 class StoreNotFoundError(Exception):
-    """No store, or more than one; the text says what to do."""
+    """No store, or more than one; the text states what to do."""
 
     code = NO_STORE
 
@@ -57,7 +57,7 @@ def store_directory(box: Box) -> Path:
     The machine file's own word first, then systemd's, then the user's state directory (XDG).
 
     Raises:
-        StoreNotFoundError: none of these says anything.
+        StoreNotFoundError: none of these states anything.
     """
     own = box.own
     if own.store is not None:

@@ -53,11 +53,11 @@ EXTRAS = {"parquet": ("pyarrow", "parquet"), "plot": ("matplotlib", "plot")}
 """By option, the library that it needs, and the extra that brings it."""
 PICTURES = (".png", ".svg", ".pdf")
 OF_STDOUT = {errno.EPIPE, errno.ENOSPC, errno.EIO}
-"""What `daqsvc.cli.main` says of standard output in its own words."""
+"""What `daqsvc.cli.main` states of standard output in its own words."""
 
 
 class NoTrendError(Exception):
-    """There is nothing to show, or no place for it; the text says why, and what to do."""
+    """There is nothing to show, or no place for it; the text states why, and what to do."""
 
     def __init__(self, message: str, code: Code = NOTHING_RECORDED) -> None:
         super().__init__(message)

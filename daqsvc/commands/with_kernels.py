@@ -16,7 +16,7 @@ class VerbWithKernels:
 
     Args:
         load: reads a machine file; None after its errors have been printed.
-        prepare_kernel_cache: says where compiled kernels are kept.
+        prepare_kernel_cache: states where compiled kernels are kept.
     """
 
     def __init__(

@@ -28,7 +28,7 @@ def load_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, budget: Budget
         budget: of the file; what the array takes is counted.
 
     Raises:
-        ValueError: it is no array, or not as large as it says.
+        ValueError: it is no array, or not as large as it states.
         TooLargeError: it is larger than it may be.
         zipfile.BadZipFile, zlib.error, EOFError: it is damaged.
     """

@@ -27,7 +27,7 @@ _BYTES_PER_CPU_S = 2e6
 
 
 class TooLargeError(ValueError):
-    """A file holds, or says that it holds, more than may be read; the message says how much."""
+    """A file holds, or states that it holds, more than may be read; the message states how much."""
 
 
 def default_memory_bytes() -> int:
@@ -100,7 +100,7 @@ class Budget:
             raise TooLargeError(self._why("unpacks to more than", self.most_bytes))
 
     def check_declared(self, count: float) -> None:
-        """Look at what a file says that it holds, in bytes, before any of it is unpacked.
+        """Look at what a file states that it holds, in bytes, before any of it is unpacked.
 
         Raises:
             TooLargeError: that is too much.

@@ -63,7 +63,7 @@ class RaisedThereError(Exception):
 
     Attributes:
         kind: name of the error's class.
-        message: what it says.
+        message: what it states.
         code: the code of its kind (`daqsvc.errors`); empty if it has none.
     """
 
@@ -263,10 +263,10 @@ def _receive(
 
 
 def _take(running: _Running, into: bytearray | memoryview, until: float) -> bytearray | memoryview:
-    """Fill a buffer with what the process says.
+    """Fill a buffer with what the process states.
 
     Raises:
-        ConfinedError: it has ended, or says nothing.
+        ConfinedError: it has ended, or states nothing.
     """
     left = memoryview(into)
     poll = select.poll()

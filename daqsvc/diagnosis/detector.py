@@ -35,7 +35,7 @@ class Detector(Protocol):
     def process(self, window: Window) -> Sequence[Diagnosis]:
         """Take in a window and say what is worth saying (often nothing).
 
-        Must not raise on bad data (NaN, infinities, dead or clipped sensors): it says so in a
+        Must not raise on bad data (NaN, infinities, dead or clipped sensors): it states it in a
         `Diagnosis` whose ``quality`` is not good, and holds its decision.
         """
         ...

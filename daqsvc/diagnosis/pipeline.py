@@ -275,7 +275,7 @@ class Pipeline:
         fall_silent: called with the name and the standing of a stream in doubt of which nothing comes any
             more; who reports the state of streams passes it on. None: it is passed on at once.
         why_over: why nothing more can come of a stream, in a clause; empty if something may.
-        why_silent: what the bus of a stream says of why nothing comes, in a clause; empty if nothing.
+        why_silent: what the bus of a stream states of why nothing comes, in a clause; empty if nothing.
         make_reader: makes what hands the samples of a ring to a detector.
         on_read: called on the event loop with a detector's name and each window that is read for it.
         on_processed: called, on the thread that computes, with a detector and each window it has processed.
@@ -587,7 +587,7 @@ class Pipeline:
                 raise BrokenContractError(detector.process, words)
 
     def _process(self, detector: Detector, window: Window) -> Sequence[Diagnosis]:
-        """What a detector says of a window; on a kernel thread.
+        """What a detector states about a window; on a kernel thread.
 
         One that raises has judged nothing: what it said before is held, and nothing is said of its sensors.
         """
@@ -620,7 +620,7 @@ class Pipeline:
 
 
 def kernel_failed(supervisor: Supervisor) -> Callable[[BaseException], None]:
-    """What counts and says that a thread of `KernelThreads` was interrupted."""
+    """What counts and states that a thread of `KernelThreads` was interrupted."""
     return lambda error: supervisor.failed("kernel thread", error, "it goes on")
 
 

@@ -49,7 +49,7 @@ class Detectability(NamedTuple):
 
 
 class UnfitOptionError(ValueError):
-    """An option has no meaning for this detector; the message says what to do."""
+    """An option has no meaning for this detector; the message states what to do."""
 
     code = ARGUMENTS
 
@@ -131,7 +131,7 @@ class DetectorPlugin(PipelineTable[SettingsT]):
             Unless overridden, one that condenses what the detectors of `build` say.
 
         Raises:
-            ValueError: what the table or the options name cannot be used; the message says what to do.
+            ValueError: what the table or the options name cannot be used; the message states what to do.
         """
         from daqsvc.diagnosis.recorded import RecordedLive  # noqa: PLC0415 - NumPy, which `check` need not
 
@@ -151,7 +151,7 @@ class DetectorPlugin(PipelineTable[SettingsT]):
         Raises:
             UnfitOptionError: an option has no meaning here.
             AssemblyError: no detector can be made of the table.
-            ValueError: something is not known, or cannot be used; the message says what to do.
+            ValueError: something is not known, or cannot be used; the message states what to do.
         """
         raise NotImplementedError
 

@@ -1,4 +1,4 @@
-"""What a detector says: an immutable record with its evidence."""
+"""What a detector states: an immutable record with its evidence."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Diagnosis:
         evidence: log-likelihood ratios in nats, by name.
         revolutions: shaft revolutions since the detector started, where it follows the shaft.
         quality: ``"good"``; ``"missing"`` if too many samples of the window are missing, or nothing can be
-            judged by the stream (another rate than the file says, a counter that stands still);
+            judged by the stream (another rate than the file states, a counter that stands still);
             ``"not_ok"`` if a sensor is outside its OK limits, dead or clipped. Unless it is good,
             ``decision`` is held from before: missing data never clears anything. Only where ``bounds`` show
             that it must be worse whatever is missing it may rise.
@@ -86,7 +86,7 @@ def silence_reason(stream: str, silence_s: float, why: str = "") -> str:
     Args:
         stream: its name.
         silence_s: how long nothing has come of it.
-        why: what its bus says of that, in a clause; empty if it says nothing.
+        why: what its bus states of that, in a clause; empty if it states nothing.
     """
     if why:
         return f"no samples of stream {stream!r}: {why}"

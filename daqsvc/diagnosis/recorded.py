@@ -1,4 +1,4 @@
-"""What a detector says of a whole recording: what it is given, its statements condensed, its verdict."""
+"""What a detector states about a whole recording: what it is given, its statements condensed, its verdict."""
 
 from __future__ import annotations
 
@@ -55,11 +55,11 @@ class RecordingOptions:
 
     Attributes:
         channels: which variable of a recording is which sensor or channel.
-        rate_hz: sampling rate; None: what the recording says.
+        rate_hz: sampling rate; None: what the recording states.
         unit: unit of the samples in the recording; None: those of the sensors.
         calibration: file with the healthy machine, in place of what the machine file names.
         in_memory: whether the machine file was made of options: its sensors are then called in the file as
-            ``channels`` says, or as they are, and a figure that the recording has to tell is NaN.
+            ``channels`` states, or as they are, and a figure that the recording has to tell is NaN.
         patterns: whether a channel may be named by a pattern, or by what its name in the file ends with.
         speed_step_rpm: step of the stated speed's last digit, which it is rounded to; 0: it is exact.
         healthy: a recording of the healthy machine that others are compared with; None without one.
@@ -140,13 +140,13 @@ class Blocks:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict(ABC):
-    """What a recording says about a part of a machine; each detector that gives one adds what it rests on.
+    """What a recording reports about a part of a machine; each detector that gives one adds what it rests on.
 
     Attributes:
         recording: name of the recording.
         quality: what is known against its samples.
         refused: why it cannot be judged; None if it can.
-        code: of the kind of reason; None where `NOT_JUDGED` says it, and for one that was judged.
+        code: of the kind of reason; None where `NOT_JUDGED` states it, and for one that was judged.
     """
 
     part: ClassVar[str]
@@ -259,7 +259,7 @@ class RecordedDetector(Hooks, Generic[SettingsT]):
             progress: told the samples done and to do, now and then.
 
         Raises:
-            ValueError: it cannot be judged; the message says why.
+            ValueError: it cannot be judged; the message states why.
             AssemblyError: the detector cannot be made.
         """
         raise NotImplementedError
@@ -401,7 +401,7 @@ class Statements:
 
 
 def statements_of(detector: Detector, recorded: Recorded) -> tuple[Statements, ...]:
-    """What a new detector says of a recording, apart by whom it is about.
+    """What a new detector states about a recording, apart by whom it is about.
 
     Args:
         detector: of ``recorded.machine``.
@@ -449,7 +449,7 @@ def listen(
         blocks: how many blocks are handed over at a time.
 
     Yields:
-        What it says.
+        What it states.
     """
     period_ns = NS_PER_S / rate_hz
     length = detector.block * max(1, min(blocks, _MOST_ROWS // detector.block))

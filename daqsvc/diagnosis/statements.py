@@ -26,7 +26,7 @@ MOST_FIGURES = 1000
 MOST_CHARACTERS = 200
 """Length of a name, a unit and a decision at most."""
 MOST_WORDS = 2000
-"""Characters of a reason, and of what an exception of a detector says, at most."""
+"""Characters of a reason, and of what an exception of a detector reports, at most."""
 _AHEAD_NS = NS_PER_S
 """How far the time of a statement may be ahead of the last sample of its window."""
 _QUALITIES = get_args(Quality)
@@ -37,7 +37,7 @@ _BEHIND_NS = 3600 * NS_PER_S
 
 
 def said_of_window(detector: Detector, window: Window) -> Sequence[Diagnosis]:
-    """What a detector says of a window.
+    """What a detector states about a window.
 
     Raises:
         BrokenContractError: these are no statements, or they cannot be sent.
@@ -48,7 +48,7 @@ def said_of_window(detector: Detector, window: Window) -> Sequence[Diagnosis]:
 
 
 def said_of_silence(detector: Detector, silence_s: float, t_ns: int) -> Sequence[Diagnosis]:
-    """What a detector says of a silence.
+    """What a detector states about a silence.
 
     Raises:
         BrokenContractError: these are no statements, or they cannot be sent.
@@ -90,11 +90,11 @@ def asked(hook: Callable[..., T], *of: Any) -> T:
 
 
 def _words(error: BaseException) -> str | None:
-    """What an exception of a detector says; None if it cannot be said, sent or written down."""
+    """What an exception of a detector states; None if it cannot be said, sent or written down."""
     try:
         words = str(error)
         return words if is_text(words, MOST_WORDS) else None
-    except BaseException:  # noqa: BLE001 - that is what None says
+    except BaseException:  # noqa: BLE001 - that is what None reports
         return None
 
 

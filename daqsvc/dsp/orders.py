@@ -57,7 +57,7 @@ class OrderVectors:
         speed_rpm: shaft speed by the harmonics.
         speed_uncertainty_rpm: its standard deviation.
         speed_seen: whether any order stands out of the noise; otherwise ``speed_rpm`` is a guess within the
-            search and the uncertainty says so.
+            search and the uncertainty states it.
         nominal_rpm: the speed that was stated.
         revolutions_per_block: shaft revolutions in a block.
         motor_hz: of a motor's line so near to an order that it was taken out of it; None if there is none.

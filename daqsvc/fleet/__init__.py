@@ -4,6 +4,6 @@ from daqsvc.errors.command_line import ARCHIVE
 
 
 class FleetError(Exception):
-    """An archive, a cluster or a table of results cannot be used; the text says why, and what to do."""
+    """An archive, a cluster or a table of results cannot be used; the text states why, and what to do."""
 
     code = ARCHIVE

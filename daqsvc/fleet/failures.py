@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 _OF_CONTENT = {errno.EINVAL, errno.EOVERFLOW, errno.ERANGE, errno.EDOM, errno.EILSEQ, errno.EFBIG}
-"""What the system says of a place that a damaged file names."""
+"""What the system states about a place that a damaged file names."""
 _OWN_FAULTS = ("SIGSEGV", "SIGABRT", "SIGFPE", "SIGILL")
 """Ends of a process that the bytes it reads bring about; any other comes from outside."""
 _KILLED = "SIGKILL"

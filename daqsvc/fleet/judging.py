@@ -38,7 +38,7 @@ _PIECE_BYTES = 1 << 22
 _MOST_FILES = 1000
 _LONGEST_REASON = 2000
 _MOST_ENCODED = 4
-"""Text needs so many bytes for each that it says, at most: a larger file than this cannot be read."""
+"""Text needs so many bytes for each that it states, at most: a larger file than this cannot be read."""
 
 
 class OtherVersionError(Exception):
@@ -209,7 +209,7 @@ def _judge(batch: RecordingBatch, folder: Path) -> Judged:
 
 
 def _add_judgement(row: Row, runner: PatientRunner, path: Path, places: tuple[Archive, Path, Path]) -> None:
-    """Fill in what the runner says; without a digest if another run may get further with the same bytes."""
+    """Fill in what the runner states; without a digest if another run may get further with the same bytes."""
     found = dict(row)
     try:
         analysis = runner.judge(str(path), None).json
@@ -310,7 +310,7 @@ def _runner(archive: Archive, batch: RecordingBatch) -> PatientRunner:
     Raises:
         Exception: the machine file cannot be read or used.
     """
-    # Machines may have equal files, and what a runner says names the machine.
+    # Machines may have equal files, and what a runner reports names the machine.
     key = (batch.machine_digest, batch.machine)
     kept = _runners.get(key)
     if kept is None:

@@ -1,4 +1,4 @@
-"""What a table of results says of a fleet: what changed, what was missed, what false alarms cost.
+"""What a table of results states about a fleet: what changed, what was missed, what false alarms cost.
 
 A recording *alarms* if its verdict, or that of its bearings, is not ``normal``. Where it has neither, as of a
 machine with levels only, the most severe statement of its detectors counts. Alarming recordings of a machine
@@ -38,7 +38,7 @@ _Key: TypeAlias = "tuple[Any, ...]"
 
 
 class TruthError(FleetError):
-    """A table of known faults says what cannot be, or names what the results do not have."""
+    """A table of known faults states what cannot be, or names what the results do not have."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -379,7 +379,7 @@ def machine_report(
 
 
 def verdict_of(row: Mapping[str, Any]) -> str:
-    """What a recording says of its machine: of rotor and bearings the one that is not normal, or both.
+    """What a recording states of its machine: of rotor and bearings the one that is not normal, or both.
 
     Of a machine without such verdicts, as one with levels only: the most severe statement, ``alert`` or
     ``danger``.

@@ -59,7 +59,7 @@ async def calibrate_live(
     Raises:
         NotCalibratableError: the machine is not steady, not healthy as far as can be seen, or silent.
         AssemblyError: no driver of that name is installed.
-        DeviceAbsentError: the bus is absent and the machine file says that this is an error.
+        DeviceAbsentError: the bus is absent and the machine file states that this is an error.
     """
     listener = _Listener(machine, clock, revolutions)
     tasks = [asyncio.create_task(listener.pipeline.run(), name="pipeline")]

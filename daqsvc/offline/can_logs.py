@@ -73,17 +73,17 @@ def load_can_log(
 
     The frames go through the decoders and assemblers of the live service, and streams that the detectors take
     together through its grid. A recording has one rate: streams of others are left out, and `Recording.notes`
-    says so; it also says what of a log is damaged.
+    states it; it also states what of a log is damaged.
 
     Args:
         machine: the machine file.
         path: the log or folder.
-        rate_hz: what the user says of the rate.
+        rate_hz: what the user states about the rate.
         watched: sensors whose verdict needs all samples at one rate; unless there are any, all sensors.
 
     Raises:
         RecordingError: it cannot be read, holds no samples of the machine, or not at the rates that the
-            machine file says.
+            machine file states.
     """
     playing = _played(machine, path)
     return _recording(machine, path, playing, rate_hz, watched)
@@ -295,7 +295,7 @@ class _Playing:
         return f", but frames of {', '.join(ids)}" if ids else ""
 
     def check_rates(self) -> None:
-        """See whether samples come as fast as the machine file says.
+        """See whether samples come as fast as the machine file states.
 
         Raises:
             RecordingError: they do not.

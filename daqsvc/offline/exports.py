@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from daqsvc.snapshots.contents import Document, Snapshot
 
 ABOUT_MACHINE: tuple[str, ...] = ("site", "box", "machine")
-"""What a snapshot says of where it is from."""
+"""What a snapshot states of where it is from."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +79,7 @@ def _read(
     channels: Mapping[str, str],
     rate_hz: float | None,
 ) -> Exported:
-    """What a recording holds, as it says itself; see `read_streams`.
+    """What a recording holds, as it states itself; see `read_streams`.
 
     Raises:
         ExportUsageError: names for its channels do not fit.
@@ -154,7 +154,7 @@ def _stream(name: str, facts: Document, blocks: list[SampleBlock], wall_ns: Any)
 def _of_table(
     recording: str, machine: MachineFile | None, channels: Mapping[str, str], rate_hz: float | None
 ) -> tuple[list[RecordedStream], list[str]]:
-    """A file of another kind; by a machine file, its sensors have their names, and units if it says none."""
+    """A file of another kind; by a machine file, its sensors have their names, and units if it has none."""
     wanted, units = dict(channels), {}
     if machine is not None:
         there = list_channels(recording)

@@ -133,7 +133,7 @@ class OrderSetup:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OrderVerdict(Verdict):
-    """What a recording says about a machine whose healthy run is known; see `Verdict`.
+    """What a recording reports about a machine whose healthy run is known; see `Verdict`.
 
     Attributes:
         baseline: name of the healthy one.

@@ -683,7 +683,7 @@ def _names(detector: Detector, t_ns: int) -> set[str]:
 
 
 def _is_silence(statement: Document) -> bool:
-    """Whether a statement says that nothing came: it rests on no samples."""
+    """Whether a statement states that nothing came: it rests on no samples."""
     window = statement.get("window")
     return (
         isinstance(window, dict)

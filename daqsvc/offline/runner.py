@@ -87,7 +87,7 @@ class Outcome:
 class Runner:
     """Judges recordings of one machine. In another process it is made there, machine file and all.
 
-    A sensor's samples are the variable that ``options.channels`` says, else the one with the sensor's name,
+    A sensor's samples are the variable that ``options.channels`` states, else the one with the sensor's name,
     else the one with its channel's name. Detectors whose sensors the recording lacks are left out. The
     recording's sampling rate replaces that of the streams.
 
@@ -355,7 +355,7 @@ class Runner:
         if missing or not columns:
             missing = missing or [sensor.name for sensor in self.machine.sensors]
             lacking = [sensor for sensor in self.machine.sensors if sensor.name in missing]
-            # A variable of that name may be there and be no channel: then the reader says why.
+            # A variable of that name may be there and be no channel: then the reader states why.
             list_channels(recording, [name for sensor in lacking for name in (sensor.name, sensor.channel)])
             raise RefusedError(
                 f"{recording} has no channel for {', '.join(missing)} of {self.machine.path}; name its "
@@ -481,7 +481,7 @@ def _prepare(judge: Judge, limits: ResourceLimits, compiling: Lock) -> None:
     Args:
         judge: judges the recordings.
         limits: of reading them.
-        compiling: the process that acquires it says that kernels are compiled.
+        compiling: the process that acquires it states that kernels are compiled.
     """
     _judges.append(judge)
     signal.signal(signal.SIGINT, signal.SIG_IGN)

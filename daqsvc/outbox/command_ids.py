@@ -216,7 +216,7 @@ def _line(key: tuple[str, str], until_ns: int) -> bytes:
 
 
 def _parsed(line: bytes) -> tuple[tuple[str, str], int] | None:
-    """What a line says; None if it is cut or damaged."""
+    """What a line states; None if it is cut or damaged."""
     text, _, check = line.rpartition(b" ")
     parts = text.split(b" ")
     if len(parts) != 3 or check != b"%08x" % zlib.crc32(text):

@@ -418,7 +418,7 @@ def delete(path: Path) -> None:
 
 
 def is_corrupt(error: Exception) -> bool:
-    """Whether an error says that the file itself is broken, rather than the disk full or busy.
+    """Whether an error states that the file itself is broken, rather than the disk full or busy.
 
     All statements of the outbox are constants, so one that a file does not understand, or whose constraints
     it violates, is a sign of damage as well. So does one whose message Python cannot decode.
@@ -429,17 +429,17 @@ def is_corrupt(error: Exception) -> bool:
 
 
 def may_pass(error: Exception) -> bool:
-    """Whether an error says that the disk is full, takes no writes or fails, rather than what to correct."""
+    """Whether an error shows that the disk is full, takes no writes or fails, rather than what to correct."""
     return _primary_code(error) in _MAY_PASS or getattr(error, "errno", None) in _MAY_PASS_TOO
 
 
 def is_full(error: Exception) -> bool:
-    """Whether an error says that there is no room left on the disk."""
+    """Whether an error states that there is no room left on the disk."""
     return _primary_code(error) == sqlite3.SQLITE_FULL or getattr(error, "errno", None) in _NO_ROOM
 
 
 def corruption(verdict: str) -> sqlite3.DatabaseError:
-    """The error that says that a file is corrupt."""
+    """The error that states that a file is corrupt."""
     error = sqlite3.DatabaseError(verdict)
     error.sqlite_errorcode = sqlite3.SQLITE_CORRUPT
     return error

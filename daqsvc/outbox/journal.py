@@ -768,7 +768,7 @@ class Journal:
         self._mark.close()
         if self._lock is not None:
             lock, self._lock = self._lock, None
-            with contextlib.suppress(OSError):  # the system takes the lock back, whatever it says
+            with contextlib.suppress(OSError):  # the system takes the lock back, whatever it states
                 lock.close()
 
     def _close_view(self) -> None:

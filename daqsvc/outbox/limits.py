@@ -48,7 +48,7 @@ class OutboxLimits:
 
     @classmethod
     def of(cls, store: Store | None) -> OutboxLimits:
-        """As the machine file says; what it leaves out has the usual limits."""
+        """As the machine file states; what it leaves out has the usual limits."""
         if store is None:
             return cls()
         return cls(

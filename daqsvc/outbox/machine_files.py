@@ -32,7 +32,7 @@ _MOST_BYTES = 1 << 20
 
 
 class StoreOfAnotherFileError(StorePathError):
-    """The store is that of another machine file with the same names; says which, and the remedy."""
+    """The store is that of another machine file with the same names; states which, and the remedy."""
 
 
 def noted_files(store: Path) -> dict[str, Path]:

@@ -87,7 +87,7 @@ def read_journal(store: Path, *, history: int = 100) -> JournalView:
         history: how many messages of the past at most.
 
     Raises:
-        OutboxError: there is none, or it cannot be read; the text says what to do.
+        OutboxError: there is none, or it cannot be read; the text states what to do.
     """
     return _read(store / JOURNAL_NAME, lambda connection: _view(connection, history))
 
@@ -140,7 +140,7 @@ def _read(path: Path, query: Callable[[sqlite3.Connection], _T]) -> _T:
     """What a query finds in the journal, all of it at one moment.
 
     Raises:
-        OutboxError: there is no journal, or it cannot be read; the text says what to do.
+        OutboxError: there is no journal, or it cannot be read; the text states what to do.
     """
     try:
         return _tried(path, query)

@@ -99,7 +99,7 @@ def as_owner_of(store: Path) -> Iterator[None]:
     try:
         owner = store.stat()
     except OSError:
-        owner = None  # whoever goes on says what is wrong with it
+        owner = None  # whoever goes on states what is wrong with it
     if owner is None or owner.st_uid == 0 or os.geteuid() != 0:
         yield
         return
@@ -137,7 +137,7 @@ def refuse_unsafe(store: Path) -> None:
         store: its directory, which exists.
 
     Raises:
-        StoreRefusedError: somebody can, or has; or this account may not look. The text says what to do.
+        StoreRefusedError: somebody can, or has; or this account may not look. The text states what to do.
         OSError: it cannot be examined.
     """
     _refuse_path(store)
@@ -157,7 +157,7 @@ def refuse_unwritable(store: Path) -> None:
     """Make sure that this account may write in a store; a file system that is read-only may come back.
 
     Raises:
-        StoreRefusedError: it may not; the text says what to do.
+        StoreRefusedError: it may not; the text states what to do.
         OSError: it cannot be examined.
     """
     if is_read_only(store) or os.access(store, os.R_OK | os.W_OK | os.X_OK, effective_ids=True):
@@ -181,7 +181,7 @@ def refuse_unopenable(store: Path) -> None:
     Without its journal the service would run all the same, as on a disk that fails, and lose what it held.
 
     Raises:
-        StoreRefusedError: it may not; the text says what to do.
+        StoreRefusedError: it may not; the text states what to do.
         OSError: it cannot be examined.
     """
     writable = 0 if is_read_only(store) else os.W_OK
@@ -219,7 +219,7 @@ def refuse_link(path: Path) -> None:
     """Make sure that a file is none of another place or kind, if it is there at all.
 
     Raises:
-        StoreRefusedError: it is; the text says what to do.
+        StoreRefusedError: it is; the text states what to do.
         OSError: it cannot be examined.
     """
     try:

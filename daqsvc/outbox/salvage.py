@@ -41,7 +41,7 @@ def readable(path: Path, below: int = LARGEST) -> Iterator[Row]:
     """The rows of ``messages`` that can be read and have kept their checksum.
 
     The table is read from both ends, and what lies between two bad pages number by number. No checksum covers
-    whether a message is sent: one that the row or the index takes for unsent, or that says neither, is sent
+    whether a message is sent: one that the row or the index takes for unsent, or that states neither, is sent
     again. One of which it is not known whether it is retained, is. If SQLite finds nothing at all, since the
     first page is lost or the table's own, the pages are read one by one.
 

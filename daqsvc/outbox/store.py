@@ -1,4 +1,4 @@
-"""The outbox: alarms are on disk before anybody says that they are, and stay until the broker has them.
+"""The outbox: alarms are on disk before anybody states that they are, and stay until the broker has them.
 
 Telemetry is the lower class: it goes to a separate file, unsynced, and may be dropped (see
 `outbox.telemetry`).
@@ -108,12 +108,12 @@ class Outbox:
         """Open the files, check them, and start their writers.
 
         A disk that is full, takes no writes or fails is no reason not to start: messages wait in memory
-        until the journal can be opened; `OutboxCounters.shut` says so.
+        until the journal can be opened; `OutboxCounters.shut` states it.
 
         Raises:
             OutboxError: the directory or the alarms' file cannot be used, and that will not pass by itself.
         """
-        # In a directory that this account may not search, the writer says what is wrong.
+        # In a directory that this account may not search, the writer states what is wrong.
         is_new = not await asyncio.to_thread(os.path.lexists, self._journal.path)
         begun_ns = self._clock.wall_ns()
         opened, self._ended = self._writer.start()
@@ -294,7 +294,7 @@ class Outbox:
         try:
             await asyncio.wait_for(asyncio.shield(self._ended), timeout_s)
         except TimeoutError:
-            log.error(  # noqa: TRY400  the message says it all
+            log.error(  # noqa: TRY400  the message is enough
                 "outbox %s did not close within %.1f s; %d messages may not be on disk",
                 self._journal.path,
                 timeout_s,

@@ -132,7 +132,7 @@ def bring_up_to_date(connection: sqlite3.Connection, version: int, wall_ns: int)
 
 
 def sound_row(raw: tuple[object, ...], unsent: set[int]) -> Row | None:
-    """What a row says; None if it has changed on the disk.
+    """What a row states; None if it has changed on the disk.
 
     Args:
         raw: its columns as they were read, text as bytes.

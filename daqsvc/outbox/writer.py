@@ -444,7 +444,7 @@ class JournalWriter:
                 return self._journal.make_room()
         except FileError as again:
             if not self._journal.is_short_of_room(again):
-                log.error(  # noqa: TRY400 - the message says it all
+                log.error(  # noqa: TRY400 - the message is enough
                     "outbox %s cannot be recovered: %s",
                     self._journal.path,
                     again,
@@ -499,7 +499,7 @@ def _named(topics: Counter[str]) -> str:
 
 
 def _cause(error: Exception) -> Exception:
-    """What the system or SQLite says, rather than what is made of it for a person."""
+    """What the system or SQLite reports, rather than what is made of it for a person."""
     return error.__cause__ if isinstance(error.__cause__, Exception) else error
 
 

@@ -84,7 +84,7 @@ def chart(
         y: its left one.
         theme: its colours.
         height: in pixels; the width follows the window.
-        tips: what the cursor says of a point, by Bokeh's notation.
+        tips: what the cursor states about a point, by Bokeh's notation.
         is_round: a length along x is as long along y.
     """
     options: dict[str, Any] = {}

@@ -100,7 +100,7 @@ def _names_files(values: object) -> bool:
 
 
 async def _asked(values: Path, folder: str, *, is_here: bool) -> Detectable:
-    """What the verb says."""
+    """What the verb states."""
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "daqsvc", "detectability", f"{values}", "--values-in", folder),
         stdin=asyncio.subprocess.DEVNULL,

@@ -1,6 +1,6 @@
 """What stands before every page: who asks is known, and nothing is changed for another site.
 
-A request that changes something is a form of this page: a browser says where it comes from (Fetch Metadata,
+A request that changes something is a form of this page: a browser states where it comes from (Fetch Metadata,
 or the Origin header), and it has the token that its person's forms have.
 """
 
@@ -40,7 +40,7 @@ MOST_FIELDS = 20
 
 
 class FormError(Exception):
-    """What was sent is no form of this page; the text says why."""
+    """What was sent is no form of this page; the text states why."""
 
 
 class Guarded:
@@ -140,7 +140,7 @@ class Forms:
 
 
 def _is_of_this_page(request: Request) -> bool:
-    """Whether a browser says that a form comes from a page of this server."""
+    """Whether a browser states that a form comes from a page of this server."""
     site = request.headers.get("sec-fetch-site")
     if site is not None and site != "same-origin":
         return False

@@ -187,7 +187,7 @@ class MachineLive:
 
     @property
     def speed_rpm(self) -> float:
-        """The speed as it was measured, or as the machine file says."""
+        """The speed as it was measured, or as the machine file states."""
         measured = self.measured_rpm
         return float(self.values["machine"].get("speed_rpm", 0.0)) if measured is None else measured
 

@@ -38,7 +38,7 @@ PAUSE_S = 3.0
 
 
 class NoPictureError(Exception):
-    """A snapshot that cannot be shown; the text says why."""
+    """A snapshot that cannot be shown; the text states why."""
 
     code = NOT_REPLAYABLE
 

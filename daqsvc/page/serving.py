@@ -40,7 +40,7 @@ END_S = 1
 
 
 class PortError(Exception):
-    """The page cannot listen; the text says where, why and the remedy."""
+    """The page cannot listen; the text states where, why and the remedy."""
 
     code = CANNOT_LISTEN
 
@@ -50,7 +50,7 @@ class PortInUseError(PortError):
 
 
 class _Server(uvicorn.Server):
-    """Ends at once, as browsers listen for as long as they are let; says where it is when it answers."""
+    """Ends at once, as browsers listen for as long as they are let; states where it is when it answers."""
 
     def __init__(self, config: uvicorn.Config, app: Starlette, where: Sequence[str]) -> None:
         super().__init__(config)
@@ -89,7 +89,7 @@ def serve(
     *,
     with_parent: bool = False,
 ) -> None:
-    """Serve the page of a service, or of snapshots, until SIGINT or SIGTERM; says where.
+    """Serve the page of a service, or of snapshots, until SIGINT or SIGTERM; states where.
 
     Args:
         source: of what is shown.

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class NotToldError(OSError):
-    """What is asked for is not to be had here; the text, for a person, says why."""
+    """What is asked for is not to be had here; the text, for a person, states why."""
 
 
 class Heard(Protocol):

@@ -178,7 +178,7 @@ def event_rows(events: Iterable[Document]) -> str:
 
 
 def machine_rows(live: MachineLive) -> str:
-    """What each detector says, and what each channel measures."""
+    """What each detector reports, and what each channel measures."""
     rows = []
     for one in sorted([*live.latest.values()], key=lambda said: str(said["detector"])):
         figures = ", ".join(

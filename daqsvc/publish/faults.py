@@ -58,7 +58,7 @@ def fault_counts(figures: Mapping[str, Any]) -> Iterator[FaultCount]:
 
 
 def _total(count: object) -> int | None:
-    """A count, or all of those that one is parted into, e.g. refusals by what the unit says; else None."""
+    """A count, or all of those that one is parted into, e.g. refusals by what the unit states; else None."""
     parts = list(count.values()) if isinstance(count, Mapping) else [count]
     whole = [int(part) for part in parts if isinstance(part, Integral)]
     return sum(whole) if len(whole) == len(parts) else None

@@ -40,7 +40,7 @@ class Watched:
         findings: the detectors whose decision is shown.
         rests_on: by alarm, the alarms about sensors and detectors that say whether it can be judged at all.
         buses: names of the buses that it is watched over.
-        rates_hz: by the name that a stream has in the status, what its machine file says.
+        rates_hz: by the name that a stream has in the status, what its machine file states.
     """
 
     machine: str
@@ -87,7 +87,7 @@ class OutputPort:
         snapshots: has snapshots of machines made for people; as above.
         look: begins a feed of live data of a machine; None if there is none.
         earlier: what a broker is asked for before anything is sent to it; None for nothing.
-        progress: says how far each part of the service has come that can stall.
+        progress: states how far each part of the service has come that can stall.
         stalls: finds those that have.
     """
 

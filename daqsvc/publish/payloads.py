@@ -352,7 +352,7 @@ def status_payload(
 def availability_payload(
     site: str, box: str, state: Literal["online", "offline"], reason: str, clock: Clock
 ) -> AvailabilityPayload:
-    """The payload that says whether the box is there, and why."""
+    """The payload that states whether the box is there, and why."""
     return AvailabilityPayload(**stamp_now(site, box, clock), state=state, reason=reason)
 
 

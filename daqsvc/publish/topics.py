@@ -19,7 +19,7 @@ _NAME = re.compile(r"[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*")
 
 @dataclass(frozen=True, slots=True)
 class CommandTopic:
-    """What a topic below the commands of a box says.
+    """What a topic below the commands of a box states.
 
     Attributes:
         machine: the machine that is meant, in one part.
@@ -107,7 +107,7 @@ class Topics:
         return f"{self.base}/+/{COMMANDS}/+/+/#"
 
     def command_of(self, topic: str) -> CommandTopic | None:
-        """What a topic says that `commands` or `below_commands` matches; None for every other one.
+        """What a topic states that `commands` or `below_commands` matches; None for every other one.
 
         The one place where a topic from outside is taken apart.
         """
@@ -125,7 +125,7 @@ class Topics:
         return f"{self.base}/+/{LIVE}/+/{REQUEST}"
 
     def live_request_of(self, topic: str) -> LiveTopic | None:
-        """What a topic says that `live_requests` matches; None for every other one."""
+        """What a topic states that `live_requests` matches; None for every other one."""
         below = f"{self.base}/"
         parts = topic.removeprefix(below).split("/")
         if not topic.startswith(below) or len(parts) != 4 or (parts[1], parts[3]) != (LIVE, REQUEST):
@@ -148,7 +148,7 @@ class Topics:
 
 @dataclass(frozen=True, slots=True)
 class BoxTopic:
-    """What the topic of a box says to who listens to many.
+    """What the topic of a box reports to who listens to many.
 
     Attributes:
         site: of the box.
@@ -163,7 +163,7 @@ class BoxTopic:
 
 
 def box_topic(root: str, topic: str) -> BoxTopic | None:
-    """What a topic below a root says; None if it is none of a box."""
+    """What a topic below a root states; None if it is none of a box."""
     if not topic.startswith(f"{root}/"):
         return None
     site, box, *rest = [*topic.removeprefix(f"{root}/").split("/", 4), "", ""][:5]

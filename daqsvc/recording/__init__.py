@@ -22,4 +22,4 @@ class RecordingError(ValueError):
 
 
 class NamesError(RecordingError):
-    """Channels cannot be called so; says why, and what to do."""
+    """Channels cannot be called so; states why, and what to do."""

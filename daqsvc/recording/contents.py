@@ -87,7 +87,7 @@ class Contents:
         times: for single channels the entry that holds the time of each sample, in seconds or as dates.
         units: of single channels, as the file spells them.
         starts_ns: wall time of the first sample of single channels, ns since the Unix epoch, where the file
-            says one for each.
+            states one for each.
         elsewhere: channels that are not among the entries, by their names.
         notes: what is wrong with the file, in sentences.
         unread: entries that have their length and zeros for samples, as they are too large and are not
@@ -139,7 +139,7 @@ class Contents:
         }
 
     def listing(self) -> str:
-        """What the file holds, in words, but for what it says of its rate and begin."""
+        """What the file holds, in words, but for what it states of its rate and begin."""
         lines = [
             _told(name, values)
             for name, values in self.entries.items()

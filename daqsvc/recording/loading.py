@@ -99,7 +99,7 @@ def load_all(
 
     Returns:
         ``streams``, for each its ``name`` (empty if the file has none), ``names``, ``units``, ``rate_hz`` and
-        ``start_ns`` (None if the file says none); ``notes`` on what is wrong; and the samples of each.
+        ``start_ns`` (None if the file states none); ``notes`` on what is wrong; and the samples of each.
 
     Raises:
         NamesError: see there.
@@ -178,16 +178,16 @@ def _groups(path: Path, contents: Contents) -> dict[str, list[str]]:
         label = label or (f"{rate_hz:g}-hz" if rate_hz else f"{length}-samples") if len(found) > 1 else label
         groups[label if label not in groups else f"{label}-{len(groups) + 1}"] = there
     if not groups:
-        _longest(path, contents)  # says what there is instead
+        _longest(path, contents)  # states what there is instead
         raise RecordingError(f"{path} holds no channel; it holds {contents.listing()}", NO_SUCH_CHANNEL)
     return groups
 
 
 def _start_ns(contents: Contents, members: Sequence[str], length: int) -> int | None:
-    """Wall time of the first sample: by a column of dates, or by what the file says of its begin.
+    """Wall time of the first sample: by a column of dates, or by what the file states of its begin.
 
-    Where it says one for each stream, that of these channels and no other; but for the groups of an MDF file
-    that have no time, which begin with the file.
+    Where it states one for each stream, that of these channels and no other; but for the groups of an MDF
+    file that have no time, which begin with the file.
     """
     if contents.starts_ns and (members[0] in contents.starts_ns or not contents.times):
         return contents.starts_ns.get(members[0])

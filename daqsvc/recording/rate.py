@@ -61,12 +61,12 @@ class Timing:
 
 @dataclass(frozen=True, slots=True)
 class _TimeColumn:
-    """A column of time, and what it says.
+    """A column of time, and what it states.
 
     Attributes:
         name: of the column.
         unit: it was read in, in words.
-        unit_is_named: whether the file says that.
+        unit_is_named: whether the file states that.
         stamps: what its stamps say.
     """
 
@@ -115,7 +115,7 @@ def timing_of(
         path: the file, for messages.
         contents: what it holds.
         length: samples of a channel.
-        given_hz: what the user says; it never contradicts what the file says, where that says one thing.
+        given_hz: what the user states; it never contradicts what the file states, where that is one thing.
         channels: the channels themselves, by their names in the file.
 
     Raises:
@@ -160,7 +160,7 @@ def timing_of(
 def place_at(
     path: Path, contents: Contents, length: int, rate_hz: float, channels: Collection[str] = ()
 ) -> tuple[NDArray[np.int64] | None, tuple[str, ...]]:
-    """Where samples have their places that are taken at a rate, whatever the file says about it.
+    """Where samples have their places that are taken at a rate, whatever the file states about it.
 
     Args:
         path: the file, for messages.
@@ -189,7 +189,7 @@ def place_at(
 
 
 def _stated(contents: Contents, channels: Collection[str]) -> dict[str, float]:
-    """What the file says outright: for all that it holds, and for the channels."""
+    """What the file states outright: for all that it holds, and for the channels."""
     stated = {
         name: value for name, value in contents.scalars().items() if last_part(name).lower() in RATE_NAMES
     }
@@ -204,7 +204,7 @@ def _refuse_contradictions(
 ) -> None:
     """Refuse a rate that contradicts the file, and a file that contradicts itself.
 
-    Of a file that says several things one that is given chooses.
+    Of a file that states several things one that is given chooses.
 
     Raises:
         RecordingError: they do.

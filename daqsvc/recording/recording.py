@@ -76,7 +76,7 @@ def set_limits(limits: ResourceLimits) -> None:
 
 
 def set_memory(memory_bytes: int | None) -> None:
-    """What ``--max-memory`` says; None leaves it as it is."""
+    """What ``--max-memory`` states; None leaves it as it is."""
     if memory_bytes is not None:
         set_limits(ResourceLimits(memory_bytes))
 
@@ -110,9 +110,9 @@ def load_recording(
         channels: what each channel is called from now on, and what it is called in the file. Unless
             given: every channel in the file that is as long as the longest one, under its own name; a
             column of time is none.
-        rate_hz: samples per second. Unless given: what the file says under one of `rate.RATE_NAMES`, or
+        rate_hz: samples per second. Unless given: what the file states under one of `rate.RATE_NAMES`, or
             else what follows from a column of time, even steps provided (`rate.time_column`). A rate that
-            contradicts what the file says is refused.
+            contradicts what the file states is refused.
         narrow: for who looks at the samples piece by piece: they stay in float32 where that holds each as it
             is in the file, and in a file if they are many (`daqsvc.confined.spilled`). Who asks for it
             calculates with them in float64 all the same.
@@ -195,7 +195,7 @@ def load_streams(
     Returns:
         For each stream its samples, float64 ``[n, channels]`` in the units of the file, and notes as in
         `Recording`. Samples that are missing by a column of time are NaN. Where the file tells another rate
-        a note says so.
+        a note states it.
 
     Raises:
         RecordingError: see `load_recording`; but for the rate.

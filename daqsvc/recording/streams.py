@@ -36,7 +36,7 @@ _WRITTEN = re.compile(
 
 
 class LongGapsError(Exception):
-    """A stream lacks so many samples that its gaps are no gaps any more; says how many."""
+    """A stream lacks so many samples that its gaps are no gaps any more; states how many."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class RecordedStream:
 
     Attributes:
         name: of the stream.
-        rate_hz: samples per second, as the machine file or the recording says.
+        rate_hz: samples per second, as the machine file or the recording states.
         names: of the channels: those of the sensors where there are any.
         units: of the channels; empty where none is stated.
         samples: float ``[n, channels]`` in these units; NaN where samples are missing.

@@ -95,7 +95,7 @@ _ATTRIBUTE = re.compile(r"^    (\w+): ")
 
 
 def attributes(kind: type[Any]) -> dict[str, str]:
-    """What the docstring of a class, or of one that it derives from, says of each attribute."""
+    """What the docstring of a class, or of one that it derives from, states of each attribute."""
     words: dict[str, str] = {}
     for base in reversed(kind.__mro__):
         _, _, listed = inspect.cleandoc(base.__doc__ or "").partition("Attributes:\n")

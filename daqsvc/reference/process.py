@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class ExitCode(NamedTuple):
-    """What an exit code says.
+    """What an exit code states.
 
     Attributes:
         name: of the constant in `daqsvc.commands`.

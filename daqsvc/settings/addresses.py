@@ -101,7 +101,7 @@ class Address(NamedTuple):
 
     @property
     def is_local(self) -> bool:
-        """Whether only this machine reaches it, as far as its name says."""
+        """Whether only this machine reaches it, as far as its name states."""
         return is_loopback(self.host)
 
 

@@ -38,7 +38,7 @@ class Device(NamedTuple):
 class Bus(Hooks, Section):
     """A bus; each driver has its own kind, or several, with its options as fields.
 
-    `kind` says what it is called in messages, e.g. ``"a CAN bus"``.
+    `kind` states what it is called in messages, e.g. ``"a CAN bus"``.
     """
 
     driver: Annotated[

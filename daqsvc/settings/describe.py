@@ -42,7 +42,7 @@ def describe(
         machine: the machine file.
         doubts: what is to be warned of beside its own warnings.
         own: the box with its outputs and its store (`daqsvc.box.Box.own`), if others share these.
-        store: where the store is, in words; left out, as [store] says.
+        store: where the store is, in words; left out, as [store] states.
     """
     blocks = [
         _facts(_identity(machine)),
@@ -99,7 +99,7 @@ def _bus(machine: MachineFile, name: str) -> str:
 
 
 def _words(say: Callable[[], str]) -> str:
-    """What a plugin says of its table; if that fails, why."""
+    """What a plugin states of its table; if that fails, why."""
     try:
         return one_line(str(say()))
     except PluginFailedError as failed:

@@ -134,7 +134,7 @@ class ErrorFormatter:
         say: Callable[[KeyPath, Mapping[str, Any]], tuple[str, str]]
         say = getattr(self, f"_{error['type']}", self._other)
         message, remedy = say(path, context)
-        # Of a validator that raises a ValueError pydantic says "Value error, " before its words.
+        # Of a validator that raises a ValueError pydantic states "Value error, " before its words.
         message = message or f"is not valid: {str(context.get('error', '')) or error['msg']}"
         return message, remedy, code
 

@@ -20,7 +20,7 @@ _ROOT = Path(__file__).parents[2]
 
 
 class BrokenContractError(TypeError):
-    """Code of a plugin has not raised, but done something else than its contract says.
+    """Code of a plugin has not raised, but done something else than its contract states.
 
     Args:
         hook: the function, method or property; None for the one that was asked.
@@ -144,7 +144,7 @@ def in_words(error: BaseException) -> str:
 
 
 def said_by(error: BaseException) -> str:
-    """What an error says; empty if that fails, too."""
+    """What an error states; empty if that fails, too."""
     try:
         return f"{error}"
     except Exception:  # noqa: BLE001 - the words of an error must not be another one
@@ -161,7 +161,7 @@ def one_line(text: str) -> str:
 
 
 def error_text(error: BaseException) -> str:
-    """The kind of an error and what it says, on one line."""
+    """The kind of an error and what it reports, on one line."""
     said = one_line(said_by(error))
     name = "" if isinstance(error, BrokenContractError | ExitRaisedError) else type(error).__name__
     return ": ".join(word for word in (name, said) if word)

@@ -33,7 +33,7 @@ _collected: ContextVar[list[PluginFailedError] | None] = ContextVar("collected",
 
 
 class Hooks:
-    """Base of all that plugins derive from; `contract` says which of its methods and properties are hooks."""
+    """Base of all that plugins derive from; `contract` lists its methods and properties that are hooks."""
 
     __slots__ = ()
     __hooks__: ClassVar[frozenset[str]] = frozenset()
@@ -56,7 +56,7 @@ class Hooks:
 
 
 class _Declared(NamedTuple):
-    """What a contract says of a hook.
+    """What a contract states about a hook.
 
     Attributes:
         is_property: whether it is no method.
@@ -135,7 +135,7 @@ def brought_by(plugin: Hooks, package: str, table: str) -> None:
 
 
 def see_declared(kind: Any) -> None:
-    """See that the attributes of a class are what its contract says, and its hooks are methods.
+    """See that the attributes of a class are what its contract reports, and its hooks are methods.
 
     Raises:
         TypeError: something is not.
@@ -187,7 +187,7 @@ def _checked(by: Hooks, name: str, got: Any, verb: str, wanted: Any = None) -> A
     """An answer as it is.
 
     Raises:
-        BrokenContractError: it is not what the contract says.
+        BrokenContractError: it is not what the contract states.
     """
     answer = shown(wanted) if wanted else _declared(by, name).answer
     words = misfit(got, wanted or _declared(by, name).wanted)

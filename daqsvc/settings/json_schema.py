@@ -1,8 +1,8 @@
 """The JSON Schema of a machine file, for editors: what they complete, explain and underline.
 
 It is made from the models of daqsvc and of all plugins that are installed, so it knows their keys, too. It
-is of draft 7, which editors of TOML understand best, and says what is valid of each value by itself: whether
-values fit each other, only `daqsvc check` says.
+is of draft 7, which editors of TOML understand best, and shows what is valid of each value by itself: whether
+values fit each other, only `daqsvc check` states.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def key_schema(name: str, field: FieldInfo) -> Schema:
     """What is valid of one key, and what a person should know about it.
 
     Args:
-        name: the key; its end says the unit.
+        name: the key; its end states the unit.
         field: as the model declares it.
     """
     schema = _value(field_type(field))

@@ -90,7 +90,7 @@ ValidRaw = Annotated[
     AfterValidator(_ordered_raw),
     Field(strict=False),
 ]
-"""Raw values that are measurements; any other says that the device has none."""
+"""Raw values that are measurements; any other states that the device has none."""
 
 
 class PackedCounter(Section):
@@ -256,7 +256,7 @@ def packed_range(channels: tuple[Channel, ...], name: str) -> WireRange | None:
 
 
 class _Counted(Protocol):
-    """A layout that says whether its frames have a counter."""
+    """A layout that states whether its frames have a counter."""
 
     @property
     def counter(self) -> object | None:
@@ -347,7 +347,7 @@ def valid_raw(channels: Sequence[Channel], at: KeyPath) -> Iterator[Finding]:
 
 
 def counted(layout: _Counted, at: KeyPath) -> Iterator[Finding]:
-    """Whoever goes without a counter says so."""
+    """Whoever goes without a counter states it."""
     if layout.counter is None and not layout.no_counter:
         yield Finding(
             (*at, "counter"),

@@ -26,10 +26,10 @@ SettingsT = TypeVar("SettingsT", bound=Section)
 
 @contract
 class PipelineTable(DetectorKind[SettingsT]):
-    """What a detector says of its table in ``[pipeline]``; `daqsvc.diagnosis.plugin` adds the detector."""
+    """What a detector states of its table in ``[pipeline]``; `daqsvc.diagnosis.plugin` adds the detector."""
 
     def checks(self, draft: MachineFile, settings: SettingsT) -> Iterator[Iterator[Finding]]:
-        """Every check of what the table says, and of what it asks of other tables.
+        """Every check of what the table reports, and of what it asks of other tables.
 
         Args:
             draft: the machine file, or what is valid of it.
@@ -61,7 +61,7 @@ class PipelineTable(DetectorKind[SettingsT]):
 
 @contract
 class OutputTable(OutputKind[SettingsT]):
-    """What an output says of its table; `daqsvc.publish.plugin` adds the output.
+    """What an output states of its table; `daqsvc.publish.plugin` adds the output.
 
     Attributes:
         label: what `daqsvc check` writes before its words; an output below another adds its words to those.
@@ -72,7 +72,7 @@ class OutputTable(OutputKind[SettingsT]):
     absent: ClassVar[str] = ""
 
     def checks(self, draft: MachineFile, settings: SettingsT) -> Iterator[Iterator[Finding]]:
-        """Every check of what the table says, and of what it asks of other tables.
+        """Every check of what the table reports, and of what it asks of other tables.
 
         Args:
             draft: the machine file, or what is valid of it.
@@ -82,7 +82,7 @@ class OutputTable(OutputKind[SettingsT]):
         return iter(())
 
     def several_checks(self, settings: SettingsT) -> Iterator[Finding]:
-        """Every check of what the table says where one process watches several machines."""
+        """Every check of what the table states where one process watches several machines."""
         del settings
         return iter(())
 
@@ -112,7 +112,7 @@ class StreamWords(NamedTuple):
 
 @contract
 class BusTable(DriverKind):
-    """What a driver says of its buses and layouts; `drivers.plugin` adds the driver."""
+    """What a driver states of its buses and layouts; `drivers.plugin` adds the driver."""
 
     def checks(self, draft: MachineFile, facts: Mapping[str, Any]) -> Iterator[Iterator[Finding]]:
         """Every check of the driver's buses and layouts as a whole.

@@ -51,7 +51,7 @@ SettingsT = TypeVar("SettingsT", bound=Section)
 
 @contract
 class DetectorKind(Hooks, Generic[SettingsT]):
-    """What a detector says of its table in ``[pipeline]`` to have it read; `PipelineTable` adds to it.
+    """What a detector states of its table in ``[pipeline]`` to have it read; `PipelineTable` adds to it.
 
     Attributes:
         settings: the table.
@@ -80,7 +80,7 @@ class DetectorKind(Hooks, Generic[SettingsT]):
 
 @contract
 class OutputKind(Hooks, Generic[SettingsT]):
-    """What an output says of its table in the machine file to have it read; `OutputTable` adds to it.
+    """What an output states of its table in the machine file to have it read; `OutputTable` adds to it.
 
     Attributes:
         settings: the table.
@@ -95,7 +95,7 @@ class OutputKind(Hooks, Generic[SettingsT]):
 
 @contract
 class DriverKind(Hooks):
-    """What a driver says of its buses and layouts to have them read; `BusTable` adds to it.
+    """What a driver states of its buses and layouts to have them read; `BusTable` adds to it.
 
     Attributes:
         buses: the kinds of its table in ``[buses]``.

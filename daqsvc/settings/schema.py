@@ -178,7 +178,7 @@ def valid_part(section: type[Section], table: Mapping[str, Any]) -> Section:
                 unusable.append(name)
     part = section.model_construct(**values)
     for name in unusable:
-        part.__dict__.pop(name, None)  # the default is not what the file says
+        part.__dict__.pop(name, None)  # the default is not what the file states
     return part
 
 

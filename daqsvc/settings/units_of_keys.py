@@ -1,4 +1,4 @@
-"""The unit of a key, which the end of its name says."""
+"""The unit of a key, which the end of its name states."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _WHOLE = {"baud": "bit/s", "bitrate": "bit/s", "data_bitrate": "bit/s"}
 
 
 def unit_of_key(name: str) -> str | None:
-    """The unit of a key's value, e.g. ``ms`` of ``reorder_window_ms``; None if its name says none."""
+    """The unit of a key's value, e.g. ``ms`` of ``reorder_window_ms``; None if its name states none."""
     if name in _WHOLE:
         return _WHOLE[name]
     return next((unit for end, unit in _UNITS.items() if name.endswith(end)), None)

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.samples import SampleBlock
 
 SCHEMA = "daqsvc.snapshot/1"
-"""What the first message of a snapshot says that it is."""
+"""What the first message of a snapshot states that it is."""
 SUFFIX = ".mcap"
 """How its name ends."""
 

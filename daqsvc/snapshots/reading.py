@@ -36,7 +36,7 @@ _REMEDY = "it may be damaged: copy it again, or give another one"
 
 
 class SnapshotError(Exception):
-    """A snapshot that cannot be read; says the file, the reason and the remedy."""
+    """A snapshot that cannot be read; states the file, the reason and the remedy."""
 
     code = SNAPSHOT
 

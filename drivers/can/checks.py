@@ -1,4 +1,4 @@
-"""Whether what a machine file says of CAN buses and of the frames on them fits together."""
+"""Whether what a machine file states of CAN buses and of the frames on them fits together."""
 
 from __future__ import annotations
 

@@ -133,7 +133,7 @@ class MessageTraffic:
         length: bytes that the DBC file gives it.
         ids: ids that came, with their flags; several where SAE J1939 messages come with several priorities.
         frames: frames that came.
-        short: those of them that are shorter than the DBC file says; they are left out.
+        short: those of them that are shorter than the DBC file states; they are left out.
         signals: those that came, and those that did not.
         unusable: why a signal cannot be read.
     """

@@ -192,7 +192,7 @@ class CanDriver:
         bus: its table in the machine file.
         port: streams, clock and where to deliver.
         open_source: opens the bus; called on a thread.
-        logs: where the bus is recorded, if not where its table says.
+        logs: where the bus is recorded, if not where its table states.
     """
 
     def __init__(

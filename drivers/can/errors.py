@@ -121,7 +121,7 @@ class CanCounters(BusCounters):
 
 @dataclass(frozen=True, slots=True)
 class ErrorCounts:
-    """What a run of error frames says.
+    """What a run of error frames states.
 
     Attributes:
         counts: what to add to which counter of `CanCounters`.

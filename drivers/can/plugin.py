@@ -158,7 +158,7 @@ def frame_layout(machine: MachineFile, stream: str) -> FrameLayout:
 
     Raises:
         AssemblyError: the stream does not come in CAN frames.
-        LayoutError: the DBC file does not hold what the machine file says.
+        LayoutError: the DBC file does not hold what the machine file states.
     """
     layout = machine.streams[stream].layout
     if isinstance(layout, DbcLayout):

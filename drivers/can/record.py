@@ -272,7 +272,7 @@ def recorder_of(
         port: its name and the clock.
         link_name: what a person calls it.
         counters: where recorded frames are counted.
-        logs: where the recording goes, if not where the table says.
+        logs: where the recording goes, if not where the table states.
     """
     if logs is None:
         if bus.record is None:

@@ -1,8 +1,8 @@
 """The files of a CAN recording: what is in them, their names, how large they grow, what is removed.
 
 Frames go in, what is to be appended to a file comes out. ASC and BLF are written by python-can. A candump log
-is written here: python-can's writer leaves out what an error frame says and how much a remote frame asks for,
-and takes longer.
+is written here: python-can's writer leaves out what an error frame states and how much a remote frame asks
+for, and takes longer.
 """
 
 from __future__ import annotations
@@ -285,7 +285,7 @@ class OneLog:
     """One file of any size; should the disk refuse it for a while, it goes on as ``NAME-2``, and so on.
 
     Args:
-        path: the file; its ending says the format.
+        path: the file; its ending states the format.
 
     Raises:
         ValueError: the ending is that of no format.

@@ -116,7 +116,7 @@ class CanSniffer(Sniffer):
 
 
 class _KernelFacts(NamedTuple):
-    """What the kernel says of an interface: its bit rates, where it is a real one."""
+    """What the kernel states of an interface: its bit rates, where it is a real one."""
 
     bitrate: int | None = None
     data_bitrate: int | None = None
@@ -187,7 +187,7 @@ def _opened(bus: CanBus, clock: Any) -> CanSource:
     """The open bus.
 
     Raises:
-        SniffError: it cannot be opened; says what to do.
+        SniffError: it cannot be opened; states what to do.
     """
     if bus.interface == "socketcan":
         from drivers.can.batches import IdMatch  # noqa: PLC0415 - only for who listens
@@ -207,7 +207,7 @@ def _opened(bus: CanBus, clock: Any) -> CanSource:
         raise SniffError(
             f"--interface {bus.interface}: python-can knows no such interface. Remedy: {remedy}", usage=True
         )
-    # python-can logs which optional parts are missing, beside the error that says what is wrong.
+    # python-can logs which optional parts are missing, beside the error that states what is wrong.
     logging.getLogger("can").addHandler(logging.NullHandler())
     # Between programs FD frames cost nothing; whether they are there is what somebody wants to know.
     opened = bus.model_copy(update={"fd": True}) if bus.interface in _BETWEEN_PROGRAMS else bus

@@ -144,7 +144,7 @@ class SocketCan:
             overrun=overrun,
             malformed=malformed,
             drained_ns=asked_ns if drained else None,
-            # Not every kernel sets the flag that says FD; the size says it in any.
+            # Not every kernel sets the flag that states FD; the size states it in any.
             fd_flags=np.where(is_fd, rows[:, 5] & _FD_FLAGS | FD, 0) if is_fd.any() else None,
         )
 
@@ -192,7 +192,7 @@ def open_socketcan(
         matches: ids that some stream has.
         clock: clock of the arrival times.
         recorded: whether the bus is recorded: what is read of it then does not depend on what the streams
-            are, unless its table says so.
+            are, unless its table states it.
 
     Raises:
         OSError: the kernel has no CAN, or the interface is absent or down.
@@ -224,7 +224,7 @@ def open_socketcan(
 def dropped_frames(sock: socket.socket) -> int:
     """Frames that the kernel has dropped on a socket so far, modulo 2^32.
 
-    A frame that is received says how many were dropped before it; this says it when none follows.
+    A frame that is received states how many were dropped before it; this states it when none follows.
     """
     return _memory_of(sock)[8]
 
@@ -311,7 +311,7 @@ _MMSGHDR = np.dtype(
 
 
 class Stamps(NamedTuple):
-    """What the kernel says about received datagrams.
+    """What the kernel reports about received datagrams.
 
     Attributes:
         software_ns: int64 ``[n]``, when the kernel took each in, on CLOCK_REALTIME; 0 where it does not say.
@@ -405,7 +405,7 @@ class DatagramBuffer:
         """
         lengths = self._control_lengths[: self._used]
         if (lengths == _AFTER_STAMP).all() and (self._kinds[: self._used] == _STAMP_ALONE).all():
-            # So nearly every batch is: what it says lies in one place, and what it does not say nowhere.
+            # So nearly every batch is: what it reports lies in one place, and what it does not say nowhere.
             return Stamps(self._time(16), np.zeros(self._used, np.int64), None)
         stamped = self._is(0, SO_TIMESTAMPNS, lengths)
         software = np.where(stamped, self._time(16), 0)
@@ -419,7 +419,7 @@ class DatagramBuffer:
         for offset in (0, _AFTER_STAMP, _AFTER_HARDWARE_STAMP):
             if longest < offset + 20:
                 break
-            # The figure grows from datagram to datagram: the last one that carries it says it all.
+            # The figure grows from datagram to datagram: the last one that carries it states it all.
             telling = np.flatnonzero(self._is(offset, SO_RXQ_OVFL, lengths))
             if len(telling):
                 value = int(self._control[telling[-1], offset + 16 : offset + 20].view(np.uint32)[0])

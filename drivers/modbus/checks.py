@@ -1,4 +1,4 @@
-"""Whether what a machine file says of Modbus lines and of the layouts on them fits together.
+"""Whether what a machine file states of Modbus lines and of the layouts on them fits together.
 
 No two numbers are in one register, and nothing is written among samples.
 """

@@ -207,7 +207,7 @@ class ModbusWire(ModbusProtocol):
         port = getattr(self.transport, "sync_serial", None)
         if port is None:
             return
-        with contextlib.suppress(OSError, termios.error):  # a port that is gone: sending says so
+        with contextlib.suppress(OSError, termios.error):  # a port that is gone: sending states it
             if port.in_waiting:
                 port.reset_input_buffer()
                 self._counters.note("unasked")

@@ -49,7 +49,7 @@ CountedT = TypeVar("CountedT", FifoLayout, RingLayout)
 
 
 class SampleClock:
-    """What the host clock says of a device's count.
+    """What the host clock states about a device's count.
 
     Args:
         rate_hz: nominal sampling rate.

@@ -69,7 +69,7 @@ FAULTY: dict[Fault, str] = {
 """What a unit answers with, in words."""
 
 GATEWAY_CODES = frozenset({10, 11})
-"""Exceptions by which a gateway says that the unit behind it is silent."""
+"""Exceptions by which a gateway states that the unit behind it is silent."""
 
 _MBAP = struct.Struct(">HHHB")
 MBAP_BYTES = _MBAP.size

@@ -37,7 +37,7 @@ class DeviceRingReader(CountedReader[RingLayout]):
 
     What was written between two readings of the counter is read, and the reading after that tells
     whether any of it may have been overwritten meanwhile. A request that fails is repeated at the next
-    reading: only what the device has overwritten is lost, and the counter says how much that is.
+    reading: only what the device has overwritten is lost, and the counter states how much that is.
 
     No single reading is believed. A counter does not go back: one that was damaged on its way is above the
     next one, or below the one before. A counter that has begun again is so at the next reading, too, and

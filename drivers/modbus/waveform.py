@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 IDS = 65_535
-"""How many ids there are: they run from 1 to this, and again from 1; 0 says that there is no block."""
+"""How many ids there are: they run from 1 to this, and again from 1; 0 states that there is no block."""
 
 NO_BLOCK = 0
 

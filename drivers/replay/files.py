@@ -32,7 +32,7 @@ TABLE_COUNTER_BITS = 32
 
 
 class RecordedLogError(Exception):
-    """A recording cannot be read, or no longer; says the file, the reason and the remedy."""
+    """A recording cannot be read, or no longer; states the file, the reason and the remedy."""
 
     code = NOT_PLAYABLE
 
@@ -144,5 +144,5 @@ class SampleTable:
 
 
 def words(error: BaseException) -> str:
-    """What an error says, or its name if it says nothing."""
+    """What an error reports, or its name if it states nothing."""
     return f"{error}" or type(error).__name__

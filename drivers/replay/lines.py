@@ -151,7 +151,7 @@ def whole(message: can.Message) -> can.Message:
     """A message, if it is one that can have been on a bus.
 
     Raises:
-        ValueError: its time stamp is beyond all times, or it has more or fewer bytes than it says.
+        ValueError: its time stamp is beyond all times, or it has more or fewer bytes than it states.
     """
     if not abs(message.timestamp) < LATEST_S:
         raise ValueError(f"a time stamp of {message.timestamp:.10g} s, which is no time")

@@ -1,4 +1,4 @@
-"""Whether what a machine file says of serial ports and of the layouts on them fits together."""
+"""Whether what a machine file states of serial ports and of the layouts on them fits together."""
 
 from __future__ import annotations
 

@@ -87,7 +87,7 @@ class Lines(NamedTuple):
 
 
 class LineCodec:
-    """The numbers of a line, read and written as the layout of its stream says.
+    """The numbers of a line, read and written as the layout of its stream states.
 
     Args:
         layout: which column is what; its scale and offset lead to the physical units.

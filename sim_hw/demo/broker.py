@@ -71,7 +71,7 @@ class EmbeddedBroker:
 
     @property
     def url(self) -> str:
-        """Where to reach it, as a machine file says it."""
+        """Where to reach it, as a machine file states it."""
         return f"mqtt://{_LOOPBACK}:{self.port}"
 
     async def __aenter__(self) -> Self:

@@ -349,7 +349,7 @@ def _from_recording(arguments: argparse.Namespace) -> Script:
     bearing = None
     if arguments.bearing is not None:
         bearing = PlayedBearing(arguments.bearing, arguments.speed_rpm)
-    # Made once before anything is started: it says what is wrong with the recording.
+    # Made once before anything is started: it states what is wrong with the recording.
     for_recording(recording, unit, limits, "mqtt://127.0.0.1:1883", bearing)
     return Script(
         title=f"{recording.source.name}: {', '.join(recording.names)} at {recording.rate_hz:g} Hz",

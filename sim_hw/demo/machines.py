@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 class DemoError(Exception):
-    """The demo cannot run; the message says why and what to do."""
+    """The demo cannot run; the message states why and what to do."""
 
     code = SIMULATION
 
@@ -154,7 +154,7 @@ def for_recording(
         bearing: what the channels are watched for; None: no bearing.
 
     Raises:
-        DemoError: more channels than a frame has room for, or the service could not diagnose it; says so
+        DemoError: more channels than a frame has room for, or the service could not diagnose it; states it
             in words of the recording, as the machine file that is made of it is not shown.
     """
     names = recording.names

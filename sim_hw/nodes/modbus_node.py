@@ -63,7 +63,7 @@ class PlannedReply:
 
 
 FaultPlan: TypeAlias = "Callable[[int, bytes], PlannedReply]"
-"""Says what becomes of the reply, from the unit and the PDU of the request."""
+"""States what becomes of the reply, from the unit and the PDU of the request."""
 
 
 def _sound(unit: int, pdu: bytes) -> PlannedReply:

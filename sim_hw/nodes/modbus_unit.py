@@ -1,4 +1,4 @@
-"""A unit on a Modbus line: its registers, and samples that it hands out as a layout says."""
+"""A unit on a Modbus line: its registers, and samples that it hands out as a layout states."""
 
 from __future__ import annotations
 
@@ -266,7 +266,7 @@ class WaveformStore:
 
 
 def store_for(unit: ModbusUnit, layout: ModbusLayout) -> SampleStore:
-    """A store of samples in a unit, as a layout says."""
+    """A store of samples in a unit, as a layout states."""
     if isinstance(layout, RegistersLayout):
         return TrendStore(unit, layout)
     if isinstance(layout, FifoLayout):

@@ -253,7 +253,7 @@ class PlannedNode(ABC):
         """Offer a frame until the link takes it; False if the link is lost, and the frame with it.
 
         Args:
-            take: says why the frame is refused for now, or nothing if it is taken; raises `LinkLostError`.
+            take: states why the frame is refused for now, or nothing if it is taken; raises `LinkLostError`.
 
         Raises:
             TimeoutError: it was refused for ``give_up_s``.

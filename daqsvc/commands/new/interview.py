@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class AnswerError(Exception):
-    """An answer that was given beforehand cannot be used, or is missing; says which option it is."""
+    """An answer that was given beforehand cannot be used, or is missing; states which option it is."""
 
     code = ANSWER
 

@@ -299,7 +299,7 @@ def _keep(path: Path, baseline: BearingBaseline) -> None:
     try:
         save_bearing_baseline(baseline, path)
     except BaselineFileError as error:
-        log.error(  # noqa: TRY400 - the message says it all
+        log.error(  # noqa: TRY400 - the message is enough
             "the healthy state of the bearings will be lost at the next restart: %s",
             error,
             extra=coded(HEALTHY_STATE),

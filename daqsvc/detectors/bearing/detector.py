@@ -134,11 +134,11 @@ SAME_SPEED = 0.05
 
 
 class BearingDetector:
-    """Says whether a rolling bearing is damaged, and which part of it; see `Detector`.
+    """States whether a rolling bearing is damaged, and which part of it; see `Detector`.
 
     Every 2.5 s the last ten seconds are evaluated (`RaceWatch`), each bearing by the accelerometer on its
     housing; the bearing that shows most decides. What the healthy machine's own vibration cannot predict
-    says whether anything has changed. The first seconds, or a baseline of an earlier time, are the healthy
+    states whether anything has changed. The first seconds, or a baseline of an earlier time, are the healthy
     machine; seconds that show a fault or are not steady are not taken for it, and the reason is said.
 
     Decisions are ``undetermined``, ``normal``, ``changed``, ``inner``, ``outer``, ``ball`` and
@@ -148,7 +148,7 @@ class BearingDetector:
     An evaluation with missing samples, a dead or clipped accelerometer, or a machine at rest clears
     nothing. The decision is held and the reason stated, unless another bearing shows a fault.
 
-    A bearing with two accelerometers is also watched by direction (`RaceDirection`); `find` says how that
+    A bearing with two accelerometers is also watched by direction (`RaceDirection`); `find` states how that
     joins what the lines say. With a keyphasor the lines are looked for at the measured speed. Where that
     leaves the tolerance of the race test, the evidence begins again; at another speed than the healthy
     machine's nothing is compared with it. Neither clears anything.

@@ -111,7 +111,7 @@ _OTHER: Mapping[RaceWord, RaceWord] = {"inner": "outer", "outer": "inner"}
 
 
 def _corroborated(verdict: RaceVerdict, direction: Direction) -> tuple[RaceWord, tuple[str, ...]]:
-    """A verdict by lines, with what the direction says of the races: it settles a doubt, or raises one."""
+    """A verdict by lines, with what the direction shows about the races: it settles a doubt or raises one."""
     race = direction.group[0]
     if len(direction.group) == 1 and race in _OTHER:
         if verdict.verdict == "inner_or_outer":
@@ -156,7 +156,7 @@ class ConfirmedState:
 
     @classmethod
     def of(cls, finding: BearingFinding) -> ConfirmedState:
-        """What a finding says by itself."""
+        """What a finding states by itself."""
         group = finding.group if len(finding.group) > 1 else ()
         where = "" if finding.verdict in SOUND else finding.where
         return cls(finding.verdict, group, where)

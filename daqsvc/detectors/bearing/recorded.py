@@ -205,7 +205,7 @@ def _draw(verdict: BearingVerdict, prefix: str) -> None:
 def _watched_against(
     recorded: Recorded, settings: Bearing, setup: BearingSetup, baseline: BearingBaseline | None = None
 ) -> BearingVerdict:
-    """What the live detector says of a recording whose healthy machine, if any, is known."""
+    """What the live detector states about a recording whose healthy machine, if any, is known."""
     detector = bearing_detector(recorded.machine, settings, None, healthy=baseline)
     diagnoses, looks = _watched(detector, recorded)
     return _concluded(setup, recorded.recording, detector, diagnoses, looks)

@@ -13,7 +13,7 @@ BEARING = "bearing"
 """Name of the bearings' detector."""
 
 WINDOW_S = 2.5
-"""Time that the race test evaluates at once; `daqsvc.bearing.race.judge` says why."""
+"""Time that the race test evaluates at once; `daqsvc.bearing.race.judge` states why."""
 
 Order = Annotated[float, Field(ge=0.01, le=1000)]
 MassKg = Annotated[float, Field(ge=1e-6, le=1e6)]

@@ -48,7 +48,7 @@ class BearingSetup:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BearingVerdict(Verdict):
-    """What a recording says about a machine's bearings; see `Verdict`.
+    """What a recording reports about a machine's bearings; see `Verdict`.
 
     Attributes:
         baseline: name of the healthy run; None without one.
@@ -115,7 +115,7 @@ class BearingVerdict(Verdict):
         return document
 
     def _channel(self, name: str) -> dict[str, Any]:
-        """What one channel says by itself."""
+        """What one channel states by itself."""
         return {"bearing": self._bearing(name), **self._judged(name)}
 
     def _bearing(self, name: str) -> dict[str, Any]:

@@ -113,7 +113,7 @@ class LevelChannel:
 
 
 class _Measured(NamedTuple):
-    """What a window says of one sensor.
+    """What a window states of one sensor.
 
     Attributes:
         statistics: its measures.

@@ -137,7 +137,7 @@ def rotor_modes(machine: MachineFile, bank: RotorBank, rotor: RotorParameters) -
     Args:
         machine: the machine file.
         bank: its rotor bank.
-        rotor: what `healthy_rotor` says of it.
+        rotor: what `healthy_rotor` states about it.
     """
     stated = machine.machine.rotor
     assert stated is not None  # noqa: S101 - see `healthy_rotor`

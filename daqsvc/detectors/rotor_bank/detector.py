@@ -51,7 +51,7 @@ _BLIND_REVOLUTIONS = 3.0
 class RotorBankDetector:
     """Diagnoses a rotor by the bank of the paper; see `Detector`.
 
-    Says one `Diagnosis` a revolution, and one at once for every change of the declared mode. The
+    Reports one `Diagnosis` a revolution, and one at once for every change of the declared mode. The
     probabilities in it are those of the rule that decides: under ``cusum`` the posterior odds of the
     evidence ``lead_M``. Under ``paper``, and while nothing is declared yet, the paper's conditional
     probabilities, which are always there as statistics ``paper.M`` too. The

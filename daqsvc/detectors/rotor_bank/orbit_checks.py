@@ -36,7 +36,7 @@ _UNSTEADY = 0.3
 
 
 class OrbitWatch:
-    """Fits the orbit revolution by revolution and says what cannot be true of it.
+    """Fits the orbit revolution by revolution and states what cannot be true of it.
 
     Args:
         noise: standard deviation of the measured position, in clearances.

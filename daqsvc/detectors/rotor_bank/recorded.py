@@ -65,7 +65,7 @@ def _draw(recording: Recording, statements: Statements, modes: tuple[str, ...], 
 
 
 def bank_verdict(recording: Recording, statements: Statements, faults: Mapping[str, str]) -> RotorVerdict:
-    """What a recording says about a rotor by its bank alone.
+    """What a recording reports about a rotor by its bank alone.
 
     Modes become the faults that they represent; levels of one fault are one verdict.
 

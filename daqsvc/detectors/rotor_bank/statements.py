@@ -1,4 +1,4 @@
-"""What a rotor bank says to the alarms: a `Diagnosis` of its report, and one of its silence."""
+"""What a rotor bank reports to the alarms: a `Diagnosis` of its report, and one of its silence."""
 
 from __future__ import annotations
 

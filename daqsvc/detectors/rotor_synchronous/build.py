@@ -79,7 +79,7 @@ def rotor_synchronous(
     Args:
         machine: the machine file.
         settings: its calibrated rotor.
-        known: what `healthy_rotor` says of it.
+        known: what `healthy_rotor` states about it.
         store: directory of the state that survives restarts; None to begin without any and leave none.
     """
     rotor, baselines = known
@@ -114,7 +114,7 @@ def rotor_synchronous(
 
 
 def _kept_calibration(path: Path, speed_rpm: float, rotor: LavalRotor) -> Calibration | None:
-    """The healthy state that was measured before a restart, with what the file says of the rotor now."""
+    """The healthy state that was measured before a restart, with what the file states about the rotor now."""
     if not os.path.lexists(path):  # also if it cannot be read: the outbox reports that
         return None
     try:
@@ -129,7 +129,7 @@ def _keep_calibration(path: Path, calibration: Calibration) -> None:
     try:
         save_calibration(calibration, path, source="the running service")
     except CalibrationFileError as error:
-        log.error(  # noqa: TRY400 - the message says it all
+        log.error(  # noqa: TRY400 - the message is enough
             "the healthy state of the rotor will be lost at the next restart: %s",
             error,
             extra=coded(HEALTHY_STATE),

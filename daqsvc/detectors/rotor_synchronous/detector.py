@@ -61,7 +61,7 @@ _REACH = 256
 
 
 class RotorSynchronousDetector:
-    """Says whether a rotor has changed since it was calibrated, and to what; see `Detector`.
+    """States whether a rotor has changed since it was calibrated, and to what; see `Detector`.
 
     The first revolutions, or a calibration of an earlier time, are the healthy machine. Each later one is
     compared with them: a change is declared at once, as decision ``departure``, and named when the rotor has

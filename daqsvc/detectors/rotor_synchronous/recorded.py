@@ -157,7 +157,7 @@ def _setup(machine: MachineFile, settings: RotorSynchronous, options: RecordingO
 
 @dataclass(slots=True)
 class _Watched:
-    """What the detector says of every revolution that it could fit."""
+    """What the detector states of every revolution that it could fit."""
 
     reports: list[WatchReport] = field(default_factory=list)
     vectors: list[SynchronousVectors] = field(default_factory=list)

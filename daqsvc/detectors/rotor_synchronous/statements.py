@@ -1,4 +1,4 @@
-"""What the watch of a calibrated rotor says, as diagnoses: when it is worth saying, and in which words."""
+"""What the watch of a calibrated rotor reports, as diagnoses: when it is worth saying, and in which words."""
 
 from __future__ import annotations
 

@@ -130,7 +130,7 @@ class Trace:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RotorVerdict(Verdict):
-    """What a recording says about a rotor; see `Verdict`.
+    """What a recording reports about a rotor; see `Verdict`.
 
     Attributes:
         verdict: the fault, the most likely one of ``group``; None if refused.

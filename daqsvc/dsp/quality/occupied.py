@@ -1,4 +1,4 @@
-"""Up to which frequency a record holds anything: it may be low-passed, or sampled more slowly than it says.
+"""Up to which frequency a record holds anything: it may be low-passed, or sampled more slowly than it states.
 
 Above the edge of a low-pass, or above half the rate that a record was first sampled with, there is next to
 nothing. That shows as a level that falls by far more, within less than an octave, than structures make it

@@ -1,6 +1,6 @@
 """Whether a revolution is sound, at a glance: what watches a shaft asks it forty times a second.
 
-`daqsvc.dsp.quality.probes` finds out what is wrong with a revolution, and says it. Nearly none has anything
+`daqsvc.dsp.quality.probes` finds out what is wrong with a revolution, and states it. Nearly none has anything
 wrong with it, and that is seen in one pass over its samples.
 """
 

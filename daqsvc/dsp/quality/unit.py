@@ -83,7 +83,7 @@ def beyond_any_unit(signal: NDArray[np.floating]) -> str:
     Args:
         signal: ``[n]``; what is not finite does not count.
     """
-    # It costs a third of what says where, and leaves nothing to say of nearly every signal.
+    # It costs a third of what states where, and leaves nothing to say of nearly every signal.
     if within_some_unit(signal):
         return ""
     far = (signal > MOST_IN_ANY_UNIT) | (signal < -MOST_IN_ANY_UNIT)
@@ -205,7 +205,7 @@ def accelerometer_quality(names: Sequence[str], samples: Floats, unit: Accelerat
         if not np.isfinite(rms):
             continue
         if swing == 0.0:
-            continue  # dead: the race test says so; the rounding of its mean is no vibration
+            continue  # dead: the race test states it; the rounding of its mean is no vibration
         m_s2 = rms * M_S2_PER_UNIT.get(unit, float("nan"))
         if m_s2 < _LEAST_M_S2 or m_s2 > _MOST_M_S2:
             quality = quality.with_problem(

@@ -1,10 +1,10 @@
 """Orbits cut into whole shaft revolutions, with the shaft angle of every sample.
 
-What is measured once a revolution needs whole revolutions: the keyphasor says where they begin, or a known
+What is measured once a revolution needs whole revolutions: the keyphasor states where they begin, or a known
 speed, or the orbit itself. A revolution is the half-open interval between two marks of angle zero and may
 last a non-integer number of samples; a sample belongs to the revolution that its time lies in.
 
-A pulse with flanks shorter than the sampling interval says only between which two samples its edge lies.
+A pulse with flanks shorter than the sampling interval states only between which two samples its edge lies.
 Half way between them is wrong by up to half a sample, 3 degrees at 64 samples a revolution, and jumps by a
 whole one from one revolution to another. The last edges together say more: of all constant speeds that put
 each of them between its own two samples, the middle one places the newest (`SteadyEdges`).

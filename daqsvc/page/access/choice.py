@@ -33,7 +33,7 @@ class AccessChoice:
         certificate: of TLS, with those that lead to a root that browsers know; None for no TLS.
         private_key: that belongs to it.
         accounts: see `daqsvc.page.access.accounts`; None for no accounts.
-        user_header: in which a reverse proxy says who asks; empty for none.
+        user_header: in which a reverse proxy states who asks; empty for none.
         proxies: addresses of the proxies.
         operators: users of the proxy that may handle alarms.
         operator_link: whether whoever has an address that is made at the start may handle alarms.

@@ -29,7 +29,7 @@ MOST_AT_ONCE = 2
 
 
 class SignInError(Exception):
-    """Nobody was signed in; the text says why, as far as a stranger may know it."""
+    """Nobody was signed in; the text states why, as far as a stranger may know it."""
 
 
 class OpenHere:

@@ -40,7 +40,7 @@ MOST_PIECES = 1000
 
 
 class BrokerAwayError(OSError):
-    """There is no connection to the broker; the text says why."""
+    """There is no connection to the broker; the text states why."""
 
 
 class BrokerLink:
@@ -108,7 +108,7 @@ class BrokerLink:
             mqtt.port,
             in_flight=IN_FLIGHT,
             mqtt5=self._mqtt5,
-            # No two pages end each other's connections, whatever the file says of a box.
+            # No two pages end each other's connections, whatever the file states about a box.
             identifier=f"daqsvc-{self.looker}",
             username=mqtt.username,
             password=password,

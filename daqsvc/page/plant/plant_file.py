@@ -1,4 +1,4 @@
-"""The file that says over which broker the boxes of a plant are heard: a table ``[mqtt]``, as theirs."""
+"""The file that states over which broker the boxes of a plant are heard: a table ``[mqtt]``, as theirs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
 OTHERS = {"commands", "home_assistant", "sparkplug", "live", "telemetry_expiry_s"}
-"""What the table states of a box may be there, so that a machine file will do; it is not examined."""
+"""What the table states about a box may be there, so that a machine file will do; it is not examined."""
 
 
 class PlantFileError(Exception):

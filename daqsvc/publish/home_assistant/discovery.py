@@ -76,7 +76,7 @@ class Discovery:
 
     @property
     def birth_topic(self) -> str:
-        """Where Home Assistant says that it has started."""
+        """Where Home Assistant states that it has started."""
         return f"{self.settings.prefix}/status"
 
     def payload(self) -> dict[str, Any]:

@@ -71,7 +71,7 @@ class HomeAssistantLink(MqttLink):
             device.note(message)
 
     def report(self, diagnosis: Diagnosis) -> None:
-        """Take in what a detector says."""
+        """Take in what a detector states."""
         if diagnosis.machine in self._devices:
             self._devices[diagnosis.machine].report(diagnosis)
 
@@ -148,7 +148,7 @@ class MachineDevice:
             )
 
     def report(self, diagnosis: Diagnosis) -> None:
-        """Take in what a detector says."""
+        """Take in what a detector states."""
         self._readings.note(diagnosis)
 
     def take(self, message: Incoming) -> bool:

@@ -98,7 +98,7 @@ class Readings:
             self._shown.setdefault(reading.detector, _Shown()).readings.append(reading)
 
     def note(self, diagnosis: Diagnosis) -> None:
-        """Take in what a detector says."""
+        """Take in what a detector states."""
         if (shown := self._shown.get(diagnosis.detector)) is not None:
             shown.latest = diagnosis
 

@@ -72,7 +72,7 @@ def machine_metrics(machine: str, figures: Figures, rates_hz: Mapping[str, float
     Args:
         machine: name of the machine.
         figures: as in `StatusPayload`, by the names of its machine file.
-        rates_hz: by stream, what the machine file says.
+        rates_hz: by stream, what the machine file states.
     """
     make = _Maker(machine)
     yield from _streams(make, figures["streams"], rates_hz)
@@ -139,7 +139,7 @@ def reading_metrics(
 
 
 def health_metric(machine: str, *, is_healthy: bool) -> Metric:
-    """What ``/healthz`` says, as a metric."""
+    """What ``/healthz`` reports, as a metric."""
     words = "Whether acquisition, detectors and outbox work, as /healthz states."
     return _Maker(machine).gauge("healthy", words, {(): float(is_healthy)})
 

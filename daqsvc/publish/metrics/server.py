@@ -45,7 +45,7 @@ class MetricsServer(ThreadingHTTPServer):
     Args:
         address: where to listen.
         registry: the metrics.
-        unhealthy: says why the service is not healthy; nothing if it is.
+        unhealthy: states why the service is not healthy; nothing if it is.
 
     Raises:
         OSError: it is not possible to listen there.

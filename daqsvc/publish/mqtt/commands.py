@@ -126,7 +126,7 @@ class ResponsePayload(Stamped):
 
 
 class CommandRefusedError(Exception):
-    """A command that is not even examined by the alarms; the text says why.
+    """A command that is not even examined by the alarms; the text states why.
 
     Attributes:
         code: of that.
@@ -218,7 +218,7 @@ class CommandIntake:
         return topic is not None and not topic.is_answer and topic.verb == MachineVerb.SNAPSHOT
 
     async def take(self, message: Incoming) -> Answer | None:
-        """Carry out the command of a message, or refuse it; the answer says which.
+        """Carry out the command of a message, or refuse it; the answer states which.
 
         Returns:
             The answer; None if the message is no command to this box, or the answer to one.

@@ -54,7 +54,7 @@ class BrokerVitals:
 
 
 class BrokerCheck:
-    """Remembers which certificates are about to end, and says the present state with the broker.
+    """Remembers which certificates are about to end, and states the present state with the broker.
 
     What is not known yet is not said to be normal: an alarm that stood before a restart would return, and
     come again.

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from paho.mqtt.client import MQTTMessage
     from paho.mqtt.reasoncodes import ReasonCode
 
-# paho tells about every broken connection; the publisher says once, in its own words, what matters of it.
+# paho tells about every broken connection; the publisher states once, in its own words, what matters of it.
 # Left without a log unless somebody has asked for it: paho calls it twice for each message.
 _LIBRARY_LOG = logging.getLogger(f"{__name__}.library")
 _LIBRARY_LOG.setLevel(logging.CRITICAL)
@@ -56,7 +56,7 @@ OWED: Final = 1000
 """Acknowledgements that may wait to be sent before nothing more is read."""
 
 RECEIVE_MAXIMUM: Final = 65_535
-"""Messages that a broker takes at a time unless it says another number."""
+"""Messages that a broker takes at a time unless it states another number."""
 
 UNANSWERED: Final = 100
 """Messages that a broker may leave without a PUBACK, though it answers others, before the connection is
@@ -523,7 +523,7 @@ class Connection:
         try:
             wire.flush()
         except OSError:
-            while self._fd is not None:  # the library finds the connection broken, and says so in its way
+            while self._fd is not None:  # the library finds the connection broken, and states it in its way
                 self._guarded(self._client.loop_read)
             return
         if wire.unsent:

@@ -174,7 +174,7 @@ def tls_context(ca_file: Path | None) -> ssl.SSLContext:
         raise OSError(f"ca_file {ca_file} holds no certificate in PEM: {error}") from error
     except OSError as error:
         raise OSError(f"ca_file {ca_file} cannot be read: {error.strerror or error}") from error
-    # A certificate without alternative names says of no host that it is its own (RFC 9525, section 6.3).
+    # A certificate without alternative names states of no host that it is its own (RFC 9525, section 6.3).
     context.hostname_checks_common_name = False
     return context
 

@@ -119,7 +119,7 @@ class Delivery:
                 try:
                     await self._try_topic(topic)
                 except OutboxError as error:
-                    log.error("%s; tried again in %g s", error, TRY_AGAIN_S, extra=coded(TOPIC_REFUSED))  # noqa: TRY400  the message says it
+                    log.error("%s; tried again in %g s", error, TRY_AGAIN_S, extra=coded(TOPIC_REFUSED))  # noqa: TRY400 - one line
             self._read_again()
             await asyncio.sleep(TRY_AGAIN_S)
 
@@ -167,7 +167,7 @@ class Delivery:
                 return "kept"
             await self._letters.overtake(message)
         except OutboxError as error:
-            log.error(  # noqa: TRY400 - the message says it all
+            log.error(  # noqa: TRY400 - the message is enough
                 "%s; the message on %s waits in the journal", error, message.topic, extra=coded(TOPIC_REFUSED)
             )
             return self._leave(message)

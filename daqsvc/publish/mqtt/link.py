@@ -43,7 +43,7 @@ class MqttLink:
         """Take in an alarm's message that the broker has."""
 
     def report(self, diagnosis: Diagnosis) -> None:
-        """Take in what a detector says; never waits."""
+        """Take in what a detector states; never waits."""
 
     def take(self, message: Incoming) -> bool:
         """Take in a message from the broker; whether it was meant for this link."""

@@ -172,7 +172,7 @@ class MqttPublisher(Output):
         )
 
     def report(self, diagnosis: Diagnosis) -> None:
-        """Publish what a detector says, and pass it on to those who look at figures now and then."""
+        """Publish what a detector reports, and pass it on to those who look at figures now and then."""
         identity = Identity(self.topics.site, self.topics.box, diagnosis.machine)
         payload = diagnosis_payload(identity, diagnosis, self._clock).to_json()
         self.telemetry(f"{diagnosis.machine}/diagnosis/{diagnosis.detector}", payload)
@@ -340,7 +340,7 @@ class MqttPublisher(Output):
             )
         except PublishRefusedError as error:
             if not self._not_available:
-                log.error(  # noqa: TRY400  the message says it all
+                log.error(  # noqa: TRY400  the message is enough
                     "MQTT broker %s refuses the box's availability on %s: %s; everything else goes on",
                     self._name,
                     self.topics.availability,
@@ -494,7 +494,7 @@ class MqttPublisher(Output):
             self._backoff.reset()
 
     async def _say_goodbye(self, connection: Connection) -> None:
-        """Publish that the box goes offline; if that fails, the last will says so."""
+        """Publish that the box goes offline; if that fails, the last will states it."""
         offline = self._availability("offline", "stopped")
         try:
             async with asyncio.timeout(max(self._left_s(), GOODBYE_S / 2)):

@@ -330,7 +330,7 @@ class Session:
         self._lasting.discard(lasting)
         error = None if lasting.cancelled() else lasting.exception()
         if isinstance(error, MqttError) and self._intake is not None:
-            # The connection is lost, or the broker silent: whoever delivers alarms says so.
+            # The connection is lost, or the broker silent: whoever delivers alarms states it.
             self._intake.counters.unanswered += 1
         elif isinstance(error, Exception):
             self._faults.note("an answer did not reach the broker", error)

@@ -1,6 +1,6 @@
 """Which MQTT version a broker speaks: found out once, remembered over restarts.
 
-A broker that does not know MQTT 5 says so, closes the connection or, misled by the longer packet, waits for
+A broker that does not know MQTT 5 states it, closes the connection or, misled by the longer packet, waits for
 more of it, in which case only time tells.
 """
 

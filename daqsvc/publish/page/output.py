@@ -28,7 +28,7 @@ NOT_THEIRS = ("NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC", "LISTEN_FDS", "L
 WELL_S = 60.0
 """A page that has run for so long has earned a quick restart."""
 MOST_LINES = 20
-"""Of what one page's process says that go into the log."""
+"""Of what one page's process states that go into the log."""
 LONGEST_LINE = 500
 END_S = 0.2
 """How long it is waited for when the service does not say how long it may take; then it is killed."""
@@ -144,7 +144,7 @@ class PageOutput(Output):
         await _end(process, self._end_s)
 
     async def _hear(self, stdout: asyncio.StreamReader) -> None:
-        """Its first line says that it listens."""
+        """Its first line states that it listens."""
         async for line in _lines(stdout):
             if not self._is_up:
                 self._is_up, self.reason = True, ""

@@ -77,7 +77,7 @@ class Metric:
         alias: number that represents the name after a birth; None for none.
         timestamp_ms: when the value was taken, UTC, ms since 1970.
         datatype: how the value is written; after reading, None where the sender left it out.
-        value: None says that there is none now. Read without a datatype, an integer is unsigned.
+        value: None states that there is none now. Read without a datatype, an integer is unsigned.
         historical: whether the value is of the past and leaves the present one alone.
         properties: what belongs to the value, e.g. its unit, as text.
     """

@@ -26,7 +26,7 @@ class PrimaryHost:
 
     Attributes:
         host_id: id of the host application.
-        online: what its newest message says; None before the first.
+        online: what its newest message states; None before the first.
     """
 
     host_id: str
@@ -77,7 +77,7 @@ class PrimaryHost:
 
 
 class HostReports:
-    """What the log says of the primary host, over all sessions: that it is missing, and that it is there."""
+    """What the log shows about the primary host over all sessions: that it is missing, or there."""
 
     def __init__(self) -> None:
         self._said: set[str] = set()

@@ -1,4 +1,4 @@
-"""What an edge node says, and in which order; without a broker, a clock or a disk.
+"""What an edge node reports, and in which order; without a broker, a clock or a disk.
 
 The rules of Sparkplug 3.0 for the order of births, data and deaths are kept here and nowhere else: a message
 that would break them cannot be made.

@@ -214,7 +214,7 @@ class EdgeSession:
         listening: asyncio.Task[None],
         stopped: asyncio.Task[Any],
     ) -> None:
-        """Until the primary host says that it is online at this broker, or stopped.
+        """Until the primary host states that it is online at this broker, or stopped.
 
         Raises:
             HostAwayError: it is not, and there are other brokers to try.
@@ -405,7 +405,7 @@ class EdgeSession:
         self._told[device] = _values(present)
 
     def _hear(self, message: Incoming) -> bool:
-        """Take in what a host says; whether it asks for new births."""
+        """Take in what a host states; whether it asks for new births."""
         topic, payload = message.topic, message.payload
         try:
             if self._host is not None and topic in self._host.topics:

@@ -1,4 +1,4 @@
-"""The formats of recordings, a module each; a file's suffix says which it is."""
+"""The formats of recordings, a module each; a file's suffix states which it is."""
 
 from __future__ import annotations
 

@@ -165,7 +165,7 @@ class _DelimitedTable:
             del units[name]
             seconds = np.asarray(values, np.float64) * unit.factor if unit.factor != 1.0 else values
             called = f"{bare} [{unit.name}]"
-            if own and is_time_name(name):  # as in time_ms, which says it by itself
+            if own and is_time_name(name):  # as in time_ms, which states it by itself
                 yield name, values
             elif called not in entries:
                 yield called, seconds
@@ -388,7 +388,7 @@ _GZIP_TRAILER_BYTES = 8
 
 
 class TextFile:
-    """A text file in UTF-16 (if a byte order mark says so), UTF-8, or else Latin-1.
+    """A text file in UTF-16 (if a byte order mark states it), UTF-8, or else Latin-1.
 
     Args:
         path: the file; gzipped if it ends in ``.gz``.
@@ -422,7 +422,7 @@ class TextFile:
 
         Raises:
             UnicodeDecodeError: it is not in UTF-8.
-            RecordingError: it is not in UTF-16 though it says so.
+            RecordingError: it is not in UTF-16 though it states it.
             TooLargeError: it unpacks to too much.
         """
         with self._open() as file:
@@ -450,7 +450,7 @@ class TextFile:
 
 
 def _declared_bytes(path: Path) -> int:
-    """What a gzip file says at its end that it unpacks to."""
+    """What a gzip file states at its end that it unpacks to."""
     with path.open("rb") as file:
         size = file.seek(0, io.SEEK_END)
         if size <= _GZIP_TRAILER_BYTES:

@@ -1,4 +1,4 @@
-"""HDF5 files: a data set is a channel, by its path; nothing in the format says which are."""
+"""HDF5 files: a data set is a channel, by its path; nothing in the format states which are."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ class _Tree:
         return unread
 
     def _rate_hz(self, data: Any, said: Mapping[str, float | str]) -> float | None:
-        """What a data set, or the groups that it lies in, says of its rate; the root is valid for all."""
+        """What a data set, or the groups that it lies in, states of its rate; the root is valid for all."""
         for attributes in (said, *map(_attributes, self._groups(data))):
             for key, value in attributes.items():
                 if isinstance(value, float) and key.lower() in RATE_NAMES:

@@ -231,7 +231,7 @@ def _check_array(element: _Element, order: str) -> None:
 
 
 def _arrays_inside(array_class: int, own: list[_Element], order: str) -> int:
-    """How many arrays a cell, struct or object says that it holds."""
+    """How many arrays a cell, struct or object states that it holds."""
     if array_class in {FUNCTION, OPAQUE}:
         return 1
     if array_class not in {CELL, STRUCT, OBJECT}:

@@ -37,7 +37,7 @@ _ITEM_BYTES = 8
 
 
 def read_tdms(path: Path, budget: Budget) -> Contents:
-    """All channels, scaled as the file says, by their names; the file's properties as scalars and texts."""
+    """All channels, scaled as the file states, by their names; the file's properties as scalars and texts."""
     nptdms = needed(path, "nptdms", "nptdms")
     _check_segments(path, budget.file_bytes)
     # Open, as by its name the library would look for an index beside it, which may be of another file.

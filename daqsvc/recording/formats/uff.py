@@ -45,7 +45,7 @@ _STEP_DIGITS = 6
 """Of the time between two samples in an ASCII file: E13.5."""
 
 EXACT = re.compile(rf"(?:{STATED_START} = (\S+), )?{STATED_RATE} = ([\d.e+-]+)")
-"""What `daqsvc export` says in the fourth header line: begin and rate with all their digits."""
+"""What `daqsvc export` states in the fourth header line: begin and rate with all their digits."""
 
 _MARK = re.compile(rb"    -1(?=[\r\n]| {74}|\Z)")
 """The line that begins a data set, and the one that ends it, as pyuff finds them."""

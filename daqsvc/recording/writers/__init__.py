@@ -1,4 +1,4 @@
-"""Writers of recordings in the formats of other tools, a module each; the suffix says which it is."""
+"""Writers of recordings in the formats of other tools, a module each; the suffix states which it is."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ LONGEST_REASON = 300
 
 
 class ExportUsageError(Exception):
-    """Nothing can be written there, or not in this format; says why, and what to do."""
+    """Nothing can be written there, or not in this format; states why, and what to do."""
 
     def __init__(self, message: str, code: Code) -> None:
         super().__init__(message)
@@ -185,7 +185,7 @@ def _write(
             NOT_HELD,
         ) from None
     except Exception as error:
-        # What names, rates and times a format cannot hold its library says in words of its own.
+        # What names, rates and times a format cannot hold its library states in words of its own.
         why = " ".join(str(error).split())[:LONGEST_REASON] or type(error).__name__
         raise RecordingError(
             f"{target.name} cannot hold this recording: {why}; write another format", NOT_HELD

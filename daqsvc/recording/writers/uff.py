@@ -98,7 +98,7 @@ def write_uff(path: Path, streams: Sequence[RecordedStream], about: Mapping[str,
             try:
                 file.write_sets(data_set, "add")
             except Exception as error:
-                # pyuff says of whatever goes wrong that it went wrong.
+                # pyuff states of whatever goes wrong that it went wrong.
                 if isinstance(error.__context__, OSError):
                     raise error.__context__ from None
                 raise

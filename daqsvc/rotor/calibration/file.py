@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 class CalibrationFileError(ValueError):
-    """A calibration file cannot be read, used or written; the message says why and what to do."""
+    """A calibration file cannot be read, used or written; the message states why and what to do."""
 
     code = CALIBRATION_FILE
 

@@ -54,7 +54,7 @@ _LEAST_WHIRL = 3.0
 
 
 class NotCalibratableError(ValueError):
-    """The data cannot be the healthy baseline; the message says why and what to do."""
+    """The data cannot be the healthy baseline; the message states why and what to do."""
 
     code = NOT_HEALTHY
 

@@ -2,7 +2,7 @@
 
 A Laval rotor answers such a fault by one line in the plane of forward 1X. Real supports part the mode in two,
 take a share of the deflection only, and make the shaft whirl backward, too. `daqsvc.rotor.model.TwoModes`
-says how mean position, forward and backward 1X move together: what fits all three is no coincidence.
+states how mean position, forward and backward 1X move together: what fits all three is no coincidence.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A calibrated rotor under watch: departure at once, identity after settling, the healthy state again.
 
 The machine's life is a chain of segments, each a stretch in which it does not change. A departure test runs
-on the segment. When it says that the machine has changed, a new segment begins at the estimated onset, and
+on the segment. When it states that the machine has changed, a new segment begins at the estimated onset, and
 the segment's mean is identified against the healthy baseline at growing intervals (`LOOKS`). Names within the
 first revolutions are those of the transient.
 """

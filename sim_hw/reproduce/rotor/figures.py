@@ -176,7 +176,7 @@ def probabilities(figure: Figure, experiment: RotorExperiment, modes: tuple[str,
 def _saw_teeth(experiment: RotorExperiment, mode: int) -> tuple[Floats, Floats]:
     """Normalised time and probability of a mode, with a tooth's tip at the threshold where it is declared.
 
-    The bank says a probability after its reset; just before it, that of the declared mode had
+    The bank states a probability after its reset; just before it, that of the declared mode had
     passed the threshold.
     """
     tips = np.flatnonzero(experiment.trace.declared == mode)
