@@ -38,8 +38,8 @@ class MachineWatch:
         clock: the service's clock.
         report: takes what the detectors say.
         supervisor: keeps its parts going.
-        bus_over: states about a bus why nothing more can come from it; empty if something can.
-        stream_silent: states about a stream what its bus knows of why nothing comes; empty if nothing.
+        bus_over: why nothing more can come from a bus; empty if something can.
+        stream_silent: why nothing comes of a stream, as far as its bus knows; empty if it does not.
         kernels: threads that its detectors compute in.
         make_reader: makes what hands the samples of a ring to a detector.
         listens: whether its pipeline finds out by itself that a stream is silent.

@@ -34,7 +34,7 @@ _OF_PATTERN = {
     Verb.BYPASS: _NOT_NORMAL - {AlarmState.OUT_OF_SERVICE},
     Verb.UNBYPASS: {AlarmState.OUT_OF_SERVICE},
 }
-"""The states about the alarms that a pattern means: the others a verb would leave as they are."""
+"""The states of the alarms that a pattern means: the others a verb would leave as they are."""
 
 
 class NoSuchAlarmError(Exception):

@@ -93,7 +93,7 @@ class StandingAlarmPayload(JsonPayload):
 
 
 class AlarmsPayload(JsonPayload):
-    """The states about the alarms."""
+    """The states of the alarms."""
 
     by_state: dict[str, int] = Field(description="how many are in each state, normal included")
     standing: tuple[StandingAlarmPayload, ...] = Field(description="those not normal, the worst first")

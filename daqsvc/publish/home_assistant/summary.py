@@ -108,7 +108,7 @@ class Summary:
         return True
 
     def to_json(self, clock: Clock) -> bytes:
-        """The states about the alarms now: a `SummaryPayload` as UTF-8 JSON."""
+        """The states of the alarms now: a `SummaryPayload` as UTF-8 JSON."""
         stamp = stamp_now(self._topics.site, self._topics.box, clock)
         empty = SummaryPayload(**stamp, machine=self._machine, alarms={}).to_json()
         return empty.removesuffix(_NO_ALARMS) + b'"alarms":{' + b",".join(self._alarms.values()) + b"}}"
