@@ -101,7 +101,9 @@ def why_not_open(error: Exception, port: str, key: str) -> str:
         return f"permission denied; {_remedy_of_owner(port)}"
     if number == errno.EPERM:
         return "not permitted: a sandbox keeps it away; allow it by DeviceAllow= in a drop-in of the unit"
-    if kind := _other_kind(port):
+    # pyserial has the number of this one in its text only.
+    no_terminal = os.strerror(errno.ENOTTY) in f"{error}"
+    if kind := _other_kind(port) or "another device" * no_terminal:
         return f"{port} is no serial port ({kind}); plug the device in, or correct {key}"
     return f"{error}" or type(error).__name__
 

@@ -126,3 +126,10 @@ def test_what_is_no_serial_port_is_said_with_the_remedy(tmp_path):
             serial.Serial(str(port))
         said = why_not_open(refused.value, str(port), "port")
         assert said == f"{port} is no serial port ({kind}); plug the device in, or correct port"
+
+
+def test_a_device_that_is_no_serial_port_is_named() -> None:
+    with pytest.raises(serial.SerialException) as refused:
+        serial.Serial("/dev/null")
+    said = why_not_open(refused.value, "/dev/null", "port")
+    assert said == "/dev/null is no serial port (another device); plug the device in, or correct port"
