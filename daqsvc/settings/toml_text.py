@@ -194,8 +194,8 @@ _SLIPS = tuple(
             rf"\s*=\s*[{_CURLY}\"'](?P<word>[^{_CURLY}\"'#]*)[{_CURLY}\"']",
             'write {key} = "{word}", with straight quotes',
         ),
-        (r"\s*=\s*(?P<word>(?i:ja|yes|on|oui|si))", "write {key} = true: TOML has true and false"),
-        (r"\s*=\s*(?P<word>(?i:nein|no|off|non))", "write {key} = false: TOML has true and false"),
+        (r"\s*=\s*(?P<word>(?i:ja|yes|on|oui|si))", 'write {key} = true, or "{word}" if it is a text'),
+        (r"\s*=\s*(?P<word>(?i:nein|no|off|non))", 'write {key} = false, or "{word}" if it is a text'),
         (r"\s*=\s*(?P<word>[^\W\d][^\s\"'#=\[\]{{}},]*)", 'write {key} = "{word}", with quotes'),
         (
             r"\s*:\s*(?P<word>[^\W\d][^\s\"'#=\[\]{{}},]*)",

@@ -371,8 +371,8 @@ def test_broken_toml(text, line, words):
         ("bitrate = 1 Mbit/s\n", 1, "write bitrate = 1000000, without a unit"),
         ("baud = 115200 8N1\n", 1, "write baud = 115200, without a unit"),
         ("on_delay_s = 300 ms\n", 1, "write on_delay_s = 0.3, without a unit"),
-        ("latching = ja\n", 1, "write latching = true: TOML has true and false"),
-        ("latching = No\n", 1, "write latching = false: TOML has true and false"),
+        ("latching = ja\n", 1, 'write latching = true, or "ja" if it is a text'),
+        ("latching = No\n", 1, 'write latching = false, or "No" if it is a text'),
     ],
 )
 def test_a_slip_in_the_toml_is_told_what_to_write(text, line, remedy):
