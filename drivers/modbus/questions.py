@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-REGISTERS = ("uint16", "int16", "uint32", "int32", "float32", "float64")
+REGISTERS = ("uint16", "int16", "uint32", "int32", "float32", "uint64", "int64", "float64")
 _OF_SAMPLES = REGISTERS[:5]
 _WAYS = {
     "values": "levels that the device measures itself",

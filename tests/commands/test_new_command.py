@@ -176,6 +176,8 @@ def grid() -> list[dict[str, str]]:
             case["alert"] = "2.5"
     cases += [{"bus": "modbus-tcp", "host": "::1", "way": "waveform", "sensor.x.bearing": "6205-2RS"}]
     cases += [{"bus": "serial", "port": "/dev/ttyS0", "framing": framing} for framing in ("cobs", "sync")]
+    wide = {"channels": "x", "sensor.x.register-type": "uint64", "sensor.x.unit": "kWh"}
+    cases += [{"bus": "modbus-tcp", "host": "::1", "limits": "none", **wide}]
     cases += [{"bus": "modbus-tcp", "host": "::1", "way": way} for way in ("ring", "fifo")]
     cases += [{"bus": "modbus-rtu", "port": "/dev/ttyS0", "way": way} for way in ("ring", "fifo")]
     cases += [{"bus": "modbus-tcp", "host": "::1", "way": "fifo", "acknowledge": "700"}]
