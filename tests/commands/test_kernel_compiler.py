@@ -33,7 +33,8 @@ def when_called(x):
 USE = """
 import logging, os, resource, sys
 from daqsvc import kernel_cache, kernel_compiler
-logging.basicConfig(format="%(message)s")
+from daqsvc.notice import NOTICE
+logging.basicConfig(format="%(message)s", level=NOTICE)
 kernel_cache.prepare()
 compiler = kernel_compiler.compile_apart()
 {fault}
