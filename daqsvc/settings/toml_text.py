@@ -232,6 +232,8 @@ def _left_open(text: str, line: int, reason: str) -> int | None:
 def _remedy_in(text: str, line: int | None) -> str:
     """What to write in place of the line that is no TOML."""
     wrong = "" if line is None else text.split("\n")[line - 1]
+    if len(wrong) > _LONGEST_SLIP:
+        wrong = ""
     number = _number_in(wrong)
     if number is not None:
         return number
@@ -246,6 +248,8 @@ def _remedy_in(text: str, line: int | None) -> str:
     return "correct the TOML there: text stands in quotes, tables are [name], values are key = value"
 
 
+_LONGEST_SLIP = 1000
+"""Characters of a line that a person may have written; the search in a longer one could take minutes."""
 _BACKSLASHES = re.compile(r"(?P<key>[\w.-]+)\s*=\s*\"(?P<word>[^\"\\]*\\[^\"]*)\"")
 _TEXTS = re.compile(r"\"(?:[^\"\\]|\\.)*\"|'[^']*'|#.*")
 _THOUSANDS = re.compile(
