@@ -67,10 +67,8 @@ def recognised(data: bytes, line_errors: int = 0) -> Recognised:
     printable = sum(byte in _TEXT for byte in text) / len(text)
     candidates = [Recognised(0.3 * printable**2, None, None, printable)]
     if printable >= _LEAST_PRINTABLE and (lines := text_lines(text)) is not None:
-        damaged, heard = (
-            sum(map(len, each)) for each in zip(*((k.damaged, k.lines) for k in lines.kinds), strict=True)
-        )
-        regular = 1 - damaged / heard
+        damaged = sum(len(kind.damaged) for kind in lines.kinds)
+        regular = 1 - damaged / sum(len(kind.lines) for kind in lines.kinds)
         score = (0.6 + 0.35 * regular) * printable + 0.05 * (lines.checksum in {"xor", "crc16"})
         candidates.append(Recognised(min(score, 1.0), lines, parity, printable))
     candidates += [

@@ -38,7 +38,8 @@ _ENDS = 5
 """Lines at each end by which the growth of a column is judged."""
 _CHECKSUM = re.compile(r"\*([0-9A-Fa-f]{4}|[0-9A-Fa-f]{2})$")
 _PREFIX = re.compile(r"[!$]?[A-Za-z_-][A-Za-z0-9_-]{0,14}")
-_NO_NUMBER = frozenset({"nan", "inf", "-inf", "null", "none", "err", "error", "na", "n-a", "ovl", "ol"})
+_NO_NUMBER = frozenset({"inf", "-inf", "null", "none", "err", "error", "na", "n-a", "ovl", "ol"})
+"""Words in place of a number, beside those that are `ABSENT` for the driver, too."""
 _PRINTABLE = re.compile(r"[\t -~]*")
 _SUMS: Mapping[int, tuple[str, Callable[[bytes], int]]] = {
     2: ("xor", lambda text: reduce(xor, text, 0)),
@@ -148,11 +149,8 @@ def _kinds_of(lines: Sequence[str], delimiter: str) -> TextLines:
 
 def _is_word(field: str) -> bool:
     """Whether a first column can name a kind of line: a word, and not what devices write for no number."""
-    return (
-        _PREFIX.fullmatch(field) is not None
-        and field.lower() not in _NO_NUMBER
-        and not set(field) <= set("-_")
-    )
+    no_number = ABSENT.fullmatch(field) is not None or field.lower() in _NO_NUMBER
+    return _PREFIX.fullmatch(field) is not None and not no_number
 
 
 def _text(piece: bytes) -> str:
