@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import pty
 import shutil
@@ -210,6 +211,23 @@ def test_without_a_terminal_options_and_defaults_make_a_file_without_warnings(tm
     verbs = [line.split()[1] for line in said.partition("Next:")[2].splitlines() if line.strip()]
     assert verbs == ["check", "run", "sim" if case["bus"] == "virtual" else "status"]
     assert main(["check", f"{file}"]) == 0
+
+
+def test_the_first_line_names_the_schema_that_the_file_itself_says_how_to_make(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["new", "m.toml", "--yes"]) == 0
+    text = Path("m.toml").read_text()
+    named = Path(text.partition("\n")[0].removeprefix("#:schema "))
+    command = next(line[1:].split() for line in text.splitlines() if "check --schema" in line)
+    assert command == ["daqsvc", "check", "--schema", ">", named.name]
+    assert named.parent == Path()  # beside the machine file, found without a network
+    capsys.readouterr()
+    with pytest.raises(SystemExit):
+        main(command[1:3])
+    from jsonschema import Draft7Validator  # slow to import
+
+    Draft7Validator(json.loads(capsys.readouterr().out)).validate(tomllib.loads(text))
+    assert load_machine_file(Path("m.toml")).warnings == ()
 
 
 def test_answers_of_a_file_are_those_of_the_options(tmp_path, capsys):

@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+SCHEMA_FILE = "machine.schema.json"
+"""Beside the machine file, so that it is found without a network, wherever daqsvc is installed."""
+SCHEMA_COMMAND = f"daqsvc check --schema > {SCHEMA_FILE}"
+
 
 def questions(answers: Answers, folder: Path) -> Iterator[Question]:
     """The questions, each as the answers before make it.
@@ -68,11 +72,16 @@ def machine_text(answers: Answers, file: str) -> str:
 
 
 def _head(answers: Answers, file: str) -> Iterator[str]:
+    # Editors look for this comment at the very top.
+    yield f"#:schema ./{SCHEMA_FILE}"
     yield f"# {answers['name']}: a machine file of daqsvc, made by daqsvc new."
     yield "#"
     yield f"#   daqsvc check {file}    says what it understood, or everything that is wrong"
     yield f"#   daqsvc run {file}      watches the machine; while it runs, after a change here:"
     yield f"#   daqsvc reload {file}   takes the change over"
+    yield "#"
+    yield "# The first line is for editors. They help with keys and values if the file that it names exists:"
+    yield f"#   {SCHEMA_COMMAND}"
     yield "#"
     yield "# Change first: the sensors (sensitivities, places), then the limits of the alarms."
     yield "# Units are part of every name. Relative paths start at the folder of this file."
