@@ -46,7 +46,7 @@ from daqsvc.errors.command_line import INTERRUPTED, LEFT_OUT, OUTPUT_CUT
 from daqsvc.notice import NOTICE
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from daqsvc.box import Box
     from daqsvc.settings import MachineFile
@@ -249,8 +249,8 @@ def commands() -> dict[str, Command]:
     return known
 
 
-def parser(known: dict[str, Command]) -> argparse.ArgumentParser:
-    """The whole command line."""
+def parser(known: Mapping[str, Command]) -> argparse.ArgumentParser:
+    """The command line with these verbs."""
     root = ArgumentParser(
         prog="daqsvc",
         description="Real-time data acquisition and model-based fault diagnosis for rotating machines.",
@@ -265,10 +265,19 @@ def parser(known: dict[str, Command]) -> argparse.ArgumentParser:
     return root
 
 
+def _meant(known: Mapping[str, Command], words: Sequence[str]) -> Mapping[str, Command]:
+    """The verb that the words begin with; all verbs if they begin with another word.
+
+    What the arguments of the others need would take most of the time of a short verb.
+    """
+    verb = words[0] if words else None
+    return {verb: known[verb]} if verb in known else known
+
+
 _ONE_FILE = "one file of the service is enough, or the directory of them"
 
 
-def _chosen(root: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:
+def _chosen(root: argparse.ArgumentParser, arguments: Sequence[str]) -> argparse.Namespace:
     """The arguments, those of a verb that takes files with options between them too.
 
     argparse takes the words of a verb in one piece, where a FILE that may be left out ends up empty before an
@@ -308,13 +317,14 @@ def _take_words(root: argparse.ArgumentParser, chosen: argparse.Namespace, words
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of the console script; returns the exit code."""
-    early_signals.ignore_until_heard(sys.argv[1:] if arguments is None else arguments)
+    words = sys.argv[1:] if arguments is None else arguments
+    early_signals.ignore_until_heard(words)
     if arguments is None:
         # Before it ends, the interpreter takes its handlers back, and a late SIGHUP would end the process.
-        atexit.register(_ignore_from_here, sys.argv[1:])
+        atexit.register(_ignore_from_here, words)
     try:
         early_signals.imported()
-        chosen = _chosen(parser(commands()), arguments)
+        chosen = _chosen(parser(_meant(commands(), words)), words)
         command: Command = chosen.command
         code = command.run(chosen)
         sys.stdout.flush()

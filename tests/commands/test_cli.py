@@ -16,6 +16,7 @@ from support.ports import free_port
 from daqsvc import service as service_module
 from daqsvc.cli import main
 from daqsvc.commands import process_guard
+from daqsvc.commands.sniff import SniffCommand
 
 pytestmark = pytest.mark.integration
 CONFIG = ROOT / "config" / "machines"
@@ -100,6 +101,16 @@ def test_help_reads_well(verb: list[str], capsys: pytest.CaptureFixture[str]) ->
     assert out.startswith("usage: daqsvc")
     for line in out.splitlines():
         assert len(line) <= 100
+
+
+def test_a_verb_does_not_wait_for_the_arguments_of_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+    monkeypatch.setattr(SniffCommand, "add_arguments", lambda *_: asked.append("sniff"))
+    assert main(["explain", "F01"]) == 0
+    assert asked == []
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    assert asked == ["sniff"]
 
 
 def test_the_readme_names_every_verb() -> None:

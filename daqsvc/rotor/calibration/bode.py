@@ -19,7 +19,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from daqsvc.rotor.calibration.run_up import forcing_of, whirl_by_unbalance
 from daqsvc.rotor.laval import unbalance_response
@@ -166,6 +165,8 @@ def _fit(speed_rpm: Floats, vectors: Complexes, response: Response, count: int) 
         np.array([value for place in chosen for value in (place, math.log(_FIRST_DAMPING))])
         for chosen in itertools.combinations(places, count)
     ]
+    from scipy.optimize import least_squares  # noqa: PLC0415 - slow to import, and the service fits nothing
+
     # Only the best of the starts are worth a search.
     starts.sort(key=lambda logs: float(np.sum(residual(logs) ** 2)))
     margin = math.log(1.2)

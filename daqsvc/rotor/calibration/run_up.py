@@ -22,7 +22,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from daqsvc.dsp.speed.revolutions import Revolutions
 from daqsvc.rotor.laval import LavalRotor, unbalance_response
@@ -152,6 +151,7 @@ def _starts(vectors: SynchronousVectors, rate_hz: float) -> list[tuple[float, fl
 
 def _search(model: Chirp, starts: list[tuple[float, float]]) -> tuple[float, float]:
     """Natural frequency in rad/s and damping ratio with the least residual."""
+    from scipy.optimize import least_squares  # noqa: PLC0415 - slow to import, and the service fits nothing
 
     def residual(logs: Floats) -> Floats:
         _, left, _ = model.solve(math.exp(logs[0]), math.exp(logs[1]))

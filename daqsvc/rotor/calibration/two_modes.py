@@ -21,7 +21,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from daqsvc.rotor.model import RotorParameters, TwoModes, series_stiffness
 from daqsvc.rotor.synchronous.baseline import LEAST_REVOLUTIONS, NotCalibratableError
@@ -199,6 +198,8 @@ def fit_two_modes(
     def left(figures: Floats) -> Floats:
         misfit = ((_orbits(figures, w, w_rate) - orbit) / scale).ravel()
         return np.concatenate((misfit.real, misfit.imag, (figures - _USUAL) / _PRIORS))
+
+    from scipy.optimize import least_squares  # noqa: PLC0415 - slow to import, and the service fits nothing
 
     low, high = np.full(len(_USUAL), -np.inf), np.full(len(_USUAL), np.inf)
     low[0], high[0] = 0.4, 2.5
