@@ -105,6 +105,14 @@ def suggested_key(section: type[Section], table: Mapping[str, Any], key: str) ->
     return meant_key(key, free)
 
 
+def table_beside(section: type[Section], table: Mapping[str, Any], key: str, value: object) -> str | None:
+    """The table of ``section`` that an unknown table ``key`` belongs to, which ``table`` has as well."""
+    if not is_table(value):
+        return None
+    here = [name for name in table if name in section.model_fields and is_table(table[name])]
+    return meant_key(key, here)
+
+
 def _shown(limit: float) -> str:
     return f"{limit:g}" if abs(limit) < 1_000_000 else f"{limit:,.0f}"
 
@@ -170,6 +178,8 @@ class ErrorFormatter:
             header = dotted((*path[:-1], several))
             is_array = isinstance(value_at(self._document, path), list)
             return "unknown key", f"write [[{header}]]" if is_array else f"write [{header}.NAME]"
+        if meant is None and not is_secret(path):
+            meant = table_beside(section, table, key, table[key])
         if meant is not None:
             return "unknown key", f"did you mean {meant}?"
         homes = homes_of(self._root, key, self._document)

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from daqsvc.errors.machine_file import PLUGIN_FAILED, UNKNOWN_KEY
 from daqsvc.settings.checks import check, failure
-from daqsvc.settings.error_messages import ErrorFormatter, dotted, is_secret, suggested_key
+from daqsvc.settings.error_messages import ErrorFormatter, dotted, is_secret, suggested_key, table_beside
 from daqsvc.settings.failures import one_line
 from daqsvc.settings.files import UnreadableFileError, read_bounded
 from daqsvc.settings.hooks import collecting
@@ -28,7 +28,7 @@ from daqsvc.settings.registry import (
     detector_tables,
     driver_of_layout,
 )
-from daqsvc.settings.schema import declared_at, only_follows, section_of, valid_part, value_at
+from daqsvc.settings.schema import declared_at, is_table, only_follows, section_of, valid_part, value_at
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.toml_text import MOST_BYTES, TomlTextError, decoded, parse
 from daqsvc.settings.zone_checks import with_zones
@@ -126,6 +126,7 @@ class _Reading:
         self._spots = spots
         self._path = path
         self._written_as: dict[KeyPath, str] = {}
+        self._moved: dict[KeyPath, KeyPath] = {}
         self._lacks_detector = False
         self._undecided: set[str] = set()
         self.findings: list[Finding] = []
@@ -186,7 +187,33 @@ class _Reading:
             if better is not None:
                 table[better] = value
                 self._written_as[*path[:-1], better] = key
+            elif usable is not None and (there := table_beside(usable, table, key, value)) is not None:
+                self._merge(table[there], value, (*path[:-1], there), path)
         return meant
+
+    def _merge(self, there: Any, value: Any, path: KeyPath, written: KeyPath) -> None:
+        """Add the entries of a misspelt table to those of the table that was meant.
+
+        Else messages about names that are in it would follow.
+
+        Args:
+            there: the table that was meant, or the array of several; is changed.
+            value: the misspelt one.
+            path: of the one that was meant.
+            written: of the misspelt one.
+        """
+        if isinstance(there, list):
+            several = isinstance(value, list)
+            for number, item in enumerate(value if several else [value]):
+                self._moved[*path, len(there)] = (*written, number) if several else written
+                there.append(item)
+        elif isinstance(value, dict):
+            for key, item in value.items():
+                if key not in there:
+                    self._moved[*path, key] = (*written, key)
+                    there[key] = item
+                elif is_table(there[key]) and is_table(item):
+                    self._merge(there[key], item, (*path, key), (*written, key))
 
     def _say(self, errors: Iterable[ErrorDetails], document: dict[str, Any]) -> None:
         words = ErrorFormatter(machine_file_model(), document)
@@ -236,6 +263,9 @@ class _Reading:
 
     def _as_written(self, path: KeyPath) -> KeyPath:
         """A path of the document as it was meant, in the keys that the file really has."""
+        for end in range(len(path), 0, -1):
+            if path[:end] in self._moved:
+                return (*self._moved[path[:end]], *path[end:])
         return tuple(self._written_as.get(path[: depth + 1], step) for depth, step in enumerate(path))
 
 

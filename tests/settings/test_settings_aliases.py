@@ -87,6 +87,31 @@ def test_a_table_without_its_s_is_told_the_header_that_was_meant(old, new, remed
     assert not [one for one in problems_of(text, LAVAL) if "alarm_handling" in one.remedy]
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "count", "key"),
+    [
+        ("[[sensors]]", "[[sensor]]", 1, "sensor"),
+        ("[[sensors]]", "[[Sensors]]", 1, "Sensors"),
+        ("[[sensors]]", "[[snesors]]", 2, "snesors"),
+        ("[[sensors]]", "[[sensor]]", -1, "sensor"),
+        ("[streams.", "[stream.", 1, "stream"),
+        ("[pipeline.rotor_bank]", "[pipelin.rotor_bank]", 1, "pipelin"),
+    ],
+)
+def test_a_misspelt_table_beside_a_right_one_is_all_that_is_told(old, new, count, key):
+    text = LAVAL.read_text(encoding="utf-8")
+    (problem,) = problems_of(text.replace(old, new, count), LAVAL)
+    assert (problem.key, problem.message) == (key, "unknown key")
+
+
+def test_a_fault_in_a_misspelt_table_is_told_where_it_is():
+    text = LAVAL.read_text(encoding="utf-8")
+    text = text.replace("[[sensors]]", "[[sensor]]", 1).replace('type = "proximity"', 'type = "proximty"', 1)
+    unknown, other = problems_of(text, LAVAL)
+    assert (unknown.key, other.key) == ("sensor", "sensor[0].type")
+    assert "proximty" in text.splitlines()[other.line - 1]
+
+
 def test_a_table_within_a_table_is_told_its_whole_header():
     text = (MACHINES / "bearing.toml").read_text(encoding="utf-8")
     text = text.replace("[[pipeline.bearing.bearings]]", "[[pipeline.bearing.bearing]]", 1)
