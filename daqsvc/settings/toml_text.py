@@ -173,9 +173,34 @@ def _syntax_error(text: str, reason: str) -> TomlTextError:
         reason = f"{reason}, at {where}"
     if line is not None and (twice := _twice(text, line, reason)) is not None:
         return TomlTextError(f"is not valid TOML: {twice[0]}", twice[1], NOT_TOML, line)
+    if line is not None and place is not None and reason.startswith(_NO_KEY):
+        braces = _in_braces(text.split("\n")[line - 1], int(place[2] or 0))
+        if braces is not None:
+            return TomlTextError(f"is not valid TOML: {braces[0]}", braces[1], NOT_TOML, line)
     opened = None if line is None else _left_open(text, line, reason)
     remedy = _remedy_in(text, line) if opened is None else f"close the bracket of line {opened}"
     return TomlTextError(f"is not valid TOML: {reason}", remedy, NOT_TOML, line)
+
+
+_NO_KEY = "Invalid initial character for a key part"
+
+
+def _in_braces(line: str, column: int) -> tuple[str, str] | None:
+    """Message and remedy where braces end, or the line does, in place of a key; None if neither does."""
+    before, here = line[: column - 1].rstrip(), line[column - 1 : column]
+    if not before.endswith((",", "{")):
+        return None
+    if here == "}":
+        what = (
+            "a comma behind the last value in braces" if before.endswith(",") else "a comma in empty braces"
+        )
+        return f"{what}, at column {column}", "remove this comma: [ ] may end with one, { } may not"
+    if here in {"", "\r", "#"}:
+        return (
+            f"braces go on behind the end of the line, at column {column}",
+            "write all that is between { and } in one line, or a table of its own: [name]",
+        )
+    return None
 
 
 _TOKENS = re.compile(
@@ -203,6 +228,10 @@ _SLIPS = tuple(
         ),
         (r"\s*:\s*(?P<value>[^#\s].*?)", "write {key} = {value}, with an equals sign"),
         (r"\s*=\s*\"[^\"]*", 'end the text with a quote: "'),
+        (
+            r"\s*=\s*(?P<value>\"[^\"]*\"|'[^']*'|[^\s\"'#=\[\]{},]+)\s*,",
+            "write {key} = {value}, without the comma behind it",
+        ),
         (r"\s*=", "write a value behind {key} ="),
     )
 )
@@ -257,6 +286,10 @@ _THOUSANDS = re.compile(
     r"(?:(?P<point>[.,])(?P<part>\d+))?(?=\s*(?:[,}\]]|$))"
 )
 _COMMA = re.compile(r"(?P<key>[\w-]+)\s*=\s*(?P<whole>[+-]?\d+),(?P<part>\d+)(?=\s*[,}\]])")
+_EITHER_COMMA = re.compile(
+    r"(?P<key>[\w.-]+)\s*=\s*(?P<whole>[+-]?[1-9]\d{0,2}),(?P<part>\d{3})(?=\s*(?:[,}\]]|$))"
+)
+"""A comma between thousands, or a decimal comma: only who wrote it knows."""
 _UNIT = re.compile(
     r"^\s*(?P<key>[\w.-]+)\s*=\s*(?P<text>(?P<number>[+-]?\d[\d_]*(?:\.\d+)?)\s*(?:[^\W\d][^\s#]*|\d[NEO]\d))\s*$"
 )
@@ -267,11 +300,14 @@ def _number_in(line: str) -> str | None:
     bare = _TEXTS.sub(lambda text: " " * len(text[0]), line)
     for found in _THOUSANDS.finditer(bare):
         if found["point"] != found["mark"] and (
-            found["point"] or bare[found.start("whole") :].count(found["mark"]) > 1 or found["mark"] == " "
+            found["point"] or found["whole"].count(found["mark"]) > 1 or found["mark"] == " "
         ):
             digits = found["whole"].replace(found["mark"], "")
             digits += f".{found['part']}" if found["part"] else ""
             return f"write {found['key']} = {digits}, without marks between thousands"
+    if (either := _EITHER_COMMA.search(bare)) is not None:
+        key, whole, part = either["key"], either["whole"], either["part"]
+        return f"write {key} = {whole}{part}, or {key} = {whole}.{part} if the comma is a decimal comma"
     if (found_comma := _COMMA.search(bare)) is not None:
         return (
             f"write {found_comma['key']} = {found_comma['whole']}.{found_comma['part']}, with a decimal point"
