@@ -123,6 +123,18 @@ def selecting_values(signals: Mapping[str, Signal], names: Iterable[str]) -> dic
     return wanted
 
 
+def signals_by_page(message: Message) -> dict[str, list[str]]:
+    """Names of the signals on each page of a multiplexed message; no page if it is not multiplexed.
+
+    A page is named by its selector and the value of it, e.g. ``Page 0``.
+    """
+    pages: dict[tuple[str, int], list[str]] = {}
+    for signal in message.signals:
+        for value in signal.multiplexer_ids or ():
+            pages.setdefault((f"{signal.multiplexer_signal}", int(value)), []).append(signal.name)
+    return {f"{selector} {value}": pages[selector, value] for selector, value in sorted(pages)}
+
+
 MOST_DBC_BYTES = 4 << 20
 """A larger DBC file describes more messages than a car has; reading it takes minutes."""
 
@@ -306,11 +318,36 @@ def _signal_findings(layout: DbcLayout, message: Message, at: KeyPath) -> Iterat
             code=NOT_IN_ONE_FRAME,
         )
     if layout.counter is not None and layout.counter.signal in signals:
-        yield from _counter(signals[layout.counter.signal], (*at, "counter", "signal"))
+        counter = signals[layout.counter.signal]
+        yield from _counter(counter, (*at, "counter", "signal"))
+        measured = [name for channel in layout.channels for name in channel.signals]
+        if counter.multiplexer_ids is None and _on_some_pages(message, measured):
+            yield Finding(
+                (*at, "counter", "signal"),
+                f'is on every page of message "{message.name}", and the samples are on some: where it '
+                "counts the frames of all pages, those of the others count as lost samples",
+                "write no_counter = true in place of counter; keep it if the device counts each page alone",
+                fatal=False,
+                code=UNFIT_COUNTER,
+            )
     for path, name in asked:
         signal = signals.get(name)
         if signal is not None:
             yield from _place(signal, message.length, path)
+
+
+def _on_some_pages(message: Message, names: Iterable[str]) -> bool:
+    """Whether frames come that do not hold these signals, as they are of other pages."""
+    return any(
+        frozenset(
+            value
+            for one in message.signals
+            if one.multiplexer_signal == selector
+            for value in one.multiplexer_ids or ()
+        )
+        - values
+        for selector, values in _pages(message, names).items()
+    )
 
 
 def _counter(counter: Signal, at: KeyPath) -> Iterator[Finding]:

@@ -17,7 +17,7 @@ from drivers.toml_lines import Hexadecimal, array, behind, entry, toml
 
 if TYPE_CHECKING:
     import threading
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from cantools.database.can import Message
 
@@ -239,7 +239,8 @@ class DbcQuestions(_CanQuestions):
         "signals": Topic(
             "Which of its signals are measured?",
             "Names with commas between, e.g. AccelX, AccelY; each becomes a channel. Leave out counters and "
-            "states.",
+            "states. Of a multiplexed message take the signals of one page: the other pages get streams of "
+            "their own.",
         ),
     }
 
@@ -255,15 +256,25 @@ class DbcQuestions(_CanQuestions):
         answers["fd"] = message.length > 8
         yield from self._bit_rates(answers, fd=answers["fd"])
         signals = {one.name: one for one in message.signals}
+        by_page = _by_page(message)
         counters = {
-            name: f"{one.length} bits" for name, one in signals.items() if _may_count(one, len(signals))
+            name: f"{one.length} bits{_of_all_pages(one) if by_page else ''}"
+            for name, one in signals.items()
+            if _may_count(one, len(signals))
         }
         likely = next((name for name in counters if is_count(name)), NONE)
+        if _of_pages(signals[name] for name in _likely_measured(message.signals)):
+            likely = next((name for name in counters if is_count(name) and _of_pages([signals[name]])), NONE)
         choices = {**counters, NONE: "losses are then estimated from the times of arrival"}
         yield self.ask("counter", q.exactly(choices), likely, choices=choices)
         rest = [name for name in signals if name != answers["counter"]]
         measured = _likely_measured([signals[name] for name in rest])
-        yield self.ask("signals", partial(_signals, tuple(rest)), ", ".join(measured or rest[:1]))
+        yield self.ask(
+            "signals",
+            partial(_signals, tuple(rest), by_page),
+            ", ".join(measured or rest[:1]),
+            choices=_shown(by_page),
+        )
 
     listens_behind = "dbc"
 
@@ -284,11 +295,15 @@ class DbcQuestions(_CanQuestions):
         if chosen is None:
             return proposed
         counter = next((one["signal"] for one in chosen["signals"] if one["counts_frames"]), None)
-        if counter is not None or chosen["frames"] >= _SURE_FRAMES:
+        # Of a multiplexed message it counts the frames of all pages, and a stream reads those of one.
+        paged = any(one["multiplexed"] for one in chosen["signals"])
+        if not paged and (counter is not None or chosen["frames"] >= _SURE_FRAMES):
             proposed["counter"] = counter or NONE
         rates = [one["rate_hz"] for one in found["ids"] if one["message"] == chosen["message"]]
         if len(rates) == 1 and rates[0]:
-            proposed["rate"] = f"{usual_rate(rates[0]):g}"
+            measured = [one for one in chosen["signals"] if one["signal"] in answers.get("signals", ())]
+            share = min((one["frames"] for one in measured), default=chosen["frames"]) / chosen["frames"]
+            proposed["rate"] = f"{usual_rate(rates[0] * share):g}"
         return proposed
 
     def _messages(self, answers: Answers) -> dict[str, Message]:
@@ -302,7 +317,8 @@ class DbcQuestions(_CanQuestions):
         """See `BusQuestions.rate_hz`."""
         message = self._messages(answers)[answers["message"]]
         cycle_ms: float | None = message.cycle_time
-        return 1000.0 if not cycle_ms else round(1000.0 / cycle_ms, 6)
+        pages = len(_by_page(message)) if _of_pages(self._measured(answers)) else 1
+        return 1000.0 / pages if not cycle_ms else round(1000.0 / cycle_ms / pages, 6)
 
     def guess(self, answers: Answers, channel: str) -> tuple[str, str | None]:
         """See `BusQuestions.guess`."""
@@ -316,6 +332,20 @@ class DbcQuestions(_CanQuestions):
     def in_volts(self, answers: Answers) -> bool:
         """See `BusQuestions.in_volts`."""
         return "V" in self._units(answers).values()
+
+    def _other_pages(self, answers: Answers) -> Iterator[str]:
+        """Comments on the pages of a multiplexed message that the stream does not read."""
+        by_page = _by_page(self._messages(answers)[answers["message"]])
+        chosen = set(answers["signals"])
+        others = {page: names for page, names in by_page.items() if not chosen & set(names)}
+        if by_page and others:
+            yield f"# {answers['message']} is multiplexed. For these pages make streams of their own:"
+            yield from (f"#   {page} {names}".rstrip() for page, names in _shown(others, ":").items())
+
+    def _measured(self, answers: Answers) -> list[Any]:
+        """The signals that were chosen, as the DBC file describes them."""
+        message = self._messages(answers)[answers["message"]]
+        return [one for one in message.signals if one.name in answers["signals"]]
 
     def _units(self, answers: Answers) -> dict[str, str]:
         from daqsvc.settings.units import unit_of  # noqa: PLC0415 - brings the settings
@@ -336,6 +366,7 @@ class DbcQuestions(_CanQuestions):
             counter = toml({"signal": answers["counter"], "counts": "frames"})
             yield behind(f"counter = {counter}", "grows by 1 with each frame: losses are counted by it")
         yield from of_one_channel(answers["signals"])
+        yield from self._other_pages(answers)
         named = zip(self.channels(answers), answers["signals"], strict=True)
         yield from array("channels", [{"name": name, "signals": [signal]} for name, signal in named])
 
@@ -367,7 +398,33 @@ def _with_signals(file: Path) -> dict[str, Message]:
 
 
 def _about(message: Message) -> str:
-    return f"id {message.frame_id:#x}: {', '.join(one.name for one in message.signals[:6])}"
+    shown = [one.name for one in message.signals[:_SHOWN]]
+    more = len(message.signals) - len(shown)
+    pages = len(_by_page(message))
+    multiplexed = f" ({pages} pages, multiplexed)" if pages else ""
+    return f"id {message.frame_id:#x}: {', '.join(shown)}{f' and {more} more' if more else ''}{multiplexed}"
+
+
+def _by_page(message: Message) -> dict[str, list[str]]:
+    from drivers.can.dbc import signals_by_page  # noqa: PLC0415 - cantools is slow to import
+
+    return signals_by_page(message)
+
+
+def _shown(by_page: Mapping[str, Sequence[str]], behind: str = "") -> dict[str, str]:
+    """The first pages with their signals, as a person reads them."""
+    shown = {f"{page}{behind}": ", ".join(by_page[page]) for page in list(by_page)[:_SHOWN]}
+    more = len(by_page) - len(shown)
+    return {**shown, **({f"and {more} more{behind}": "daqsvc sniff can --dbc shows them"} if more else {})}
+
+
+def _of_pages(signals: Iterable[Any]) -> bool:
+    """Whether any of the signals comes in some frames of its message only."""
+    return any(one.multiplexer_ids for one in signals)
+
+
+def _of_all_pages(counter: Any) -> str:
+    return "" if counter.multiplexer_ids else "; on all pages: fits if it counts each page by itself"
 
 
 def _likely(messages: Mapping[str, Message]) -> str:
@@ -382,7 +439,7 @@ def _likely(messages: Mapping[str, Message]) -> str:
 
 def _may_count(signal: Any, signals: int) -> bool:
     plain = not signal.is_signed and not signal.is_float and signal.scale == 1 and signal.length >= 4
-    return bool(plain) and signals > 1
+    return bool(plain) and signals > 1 and not signal.is_multiplexer
 
 
 def _likely_measured(signals: Sequence[Any]) -> list[str]:
@@ -397,13 +454,16 @@ def _likely_measured(signals: Sequence[Any]) -> list[str]:
     return [one.name for one in (always or page)[:1]]
 
 
-def _signals(known: tuple[str, ...], text: str) -> tuple[str, ...]:
+def _signals(known: tuple[str, ...], by_page: Mapping[str, Sequence[str]], text: str) -> tuple[str, ...]:
     chosen = tuple(part.strip() for part in text.split(","))
     for one in chosen:
         if one not in known:
             raise ValueError(f'there is no signal "{one}"; there are {", ".join(known)}')
     if len({one[: q.LONGEST_NAME] for one in chosen}) < len(chosen):
         raise ValueError(f'"{text}" has a signal twice')
+    paged = {one for one in chosen if any(one in names for names in by_page.values())}
+    if paged and not any(paged <= set(names) for names in by_page.values()):
+        raise ValueError(f"{', '.join(sorted(paged))} are on different pages: name those of one page")
     return chosen
 
 

@@ -485,10 +485,12 @@ class _Report(NamedTuple):
                         {
                             "signal": signal.name,
                             "unit": signal.unit,
+                            "frames": signal.frames,
                             "last": signal.last,
                             "min": signal.least,
                             "max": signal.most,
                             "counts_frames": signal.counts,
+                            "multiplexed": signal.multiplexed,
                         }
                         for signal in message.signals
                         if signal.frames

@@ -185,6 +185,81 @@ def test_new_offers_a_page_of_a_multiplexed_message_and_never_its_selector(tmp_p
     assert [channel["signals"] for channel in stream["layout"]["channels"]] == [["Temperature"]]
 
 
+COUNTED = (
+    MULTIPLEXED.replace(" SG_ Temperature", ' SG_ Count : 24|8@1+ (1,0) [0|255] "" A\n SG_ Temperature')
+    + ' SG_ Humidity m1 : 32|8@1+ (1,0) [0|0] "%" A\n'
+)
+"""With a counter that is on both pages, and counts the frames of both."""
+
+
+def both_pages(bus: UnixBus, number: int) -> None:
+    payload = bytes([number % 2, 21, 0, number % 256, 40, 0, 0, 0])
+    bus.send(can.Message(arbitration_id=801, is_extended_id=False, data=payload))
+
+
+@pytest.mark.usefixtures("hub")
+def test_new_reads_one_page_without_the_counter_of_all_and_names_the_other(tmp_path: Path) -> None:
+    dbc, file = tmp_path / "slow.dbc", tmp_path / "new.toml"
+    dbc.write_text(COUNTED)
+    given = ["--bus=can-dbc", "--listen", "--interface=unixbus", f"--channel={tmp_path / 'bus'}"]
+    with talking(tmp_path / "bus", both_pages):
+        assert main(["new", f"{file}", "--yes", *given, f"--dbc={dbc}"]) == 0
+    text = file.read_text("utf-8")
+    [stream] = tomllib.loads(text)["streams"].values()
+    assert stream["layout"]["no_counter"]
+    assert [channel["signals"] for channel in stream["layout"]["channels"]] == [["Temperature"]]
+    assert "# Slow is multiplexed. For these pages make streams of their own:\n" in text
+    assert "#   Page 1: Supply, Humidity\n" in text
+
+
+@pytest.mark.parametrize(("signals", "rate"), [(("Temperature",), "10"), (("Count",), "20")])
+def test_a_page_is_proposed_at_its_own_rate(signals: tuple[str, ...], rate: str) -> None:
+    heard = [("Page", 100, False), ("Count", 100, False), ("Temperature", 50, True), ("Supply", 50, True)]
+    found = {
+        "ids": [{"message": "Slow", "rate_hz": 20.0}],
+        "dbc": {
+            "messages": [
+                {
+                    "message": "Slow",
+                    "frames": 100,
+                    "signals": [
+                        {
+                            "signal": n,
+                            "frames": f,
+                            "multiplexed": m,
+                            "counts_frames": n == "Count",
+                            "unit": "",
+                        }
+                        for n, f, m in heard
+                    ],
+                }
+            ]
+        },
+    }
+    proposed = questions.DbcQuestions().proposals(found, {"message": "Slow", "signals": signals})
+    assert proposed["rate"] == rate
+    assert "counter" not in proposed
+
+
+def test_signals_of_two_pages_are_not_taken_for_one_stream(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dbc = tmp_path / "slow.dbc"
+    dbc.write_text(COUNTED)
+    given = ["--yes", "--bus=can-dbc", f"--dbc={dbc}", "--signals=Temperature, Supply"]
+    assert main(["new", f"{tmp_path / 'new.toml'}", *given]) != 0
+    assert "Supply, Temperature are on different pages: name those of one page" in capsys.readouterr().err
+
+
+def test_a_counter_of_all_pages_is_warned_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    dbc, file = tmp_path / "slow.dbc", tmp_path / "new.toml"
+    dbc.write_text(COUNTED)
+    assert main(["new", f"{file}", "--yes", "--bus=can-dbc", f"--dbc={dbc}", "--counter=Count"]) == 0
+    capsys.readouterr()
+    assert main(["check", f"{file}"]) == 0
+    assert 'is on every page of message "Slow"' in " ".join(capsys.readouterr().out.split())
+
+
 def test_new_points_out_signals_that_may_be_samples_of_one_channel(tmp_path: Path) -> None:
     dbc, file = tmp_path / "fan.dbc", tmp_path / "new.toml"
     dbc.write_text(FAN)
