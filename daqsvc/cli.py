@@ -270,7 +270,7 @@ def _meant(known: Mapping[str, Command], words: Sequence[str]) -> Mapping[str, C
 
     What the arguments of the others need would take most of the time of a short verb.
     """
-    verb = words[0] if words else None
+    verb = words[0] if words else ""
     return {verb: known[verb]} if verb in known else known
 
 

@@ -40,6 +40,7 @@ class MachineWatch:
         supervisor: keeps its parts going.
         bus_over: why nothing more can come from a bus; empty if something can.
         stream_silent: why nothing comes of a stream, as far as its bus knows; empty if it does not.
+        is_prepared_for: whether the driver of a stream still makes itself ready to read it.
         kernels: threads that its detectors compute in.
         make_reader: makes what hands the samples of a ring to a detector.
         listens: whether its pipeline finds out by itself that a stream is silent.
@@ -70,6 +71,7 @@ class MachineWatch:
         stream_silent: Callable[[str], str],
         kernels: KernelThreads,
         make_reader: Callable[[SampleRing], RingReader] = RingReader,
+        is_prepared_for: Callable[[str], bool] = lambda _stream: False,
         *,
         listens: bool = True,
     ) -> None:
@@ -79,6 +81,7 @@ class MachineWatch:
         self.supervisor = supervisor
         self._bus_over = bus_over
         self._stream_silent = stream_silent
+        self._is_prepared_for = is_prepared_for
         watching = detectors(machine, store)
         grids = [*(Grid({name: stream}) for name, stream in machine.streams.items()), *machine.grids]
         self._grids = grids
@@ -104,6 +107,7 @@ class MachineWatch:
             fall_silent=self._fall_silent,
             why_over=self._why_over,
             why_silent=self._why_silent,
+            is_prepared_for=self._is_prepared,
             make_reader=make_reader,
             on_read=self._on_read,
             on_processed=self._on_processed,
@@ -216,6 +220,11 @@ class MachineWatch:
         """What the bus of a stream or grid knows of why nothing comes; else empty."""
         streams = next(grid.streams for grid in self._grids if grid.name == stream)
         return next(filter(None, (self._stream_silent(name) for name in streams)), "")
+
+    def _is_prepared(self, stream: str) -> bool:
+        """Whether the driver of a stream, or of one of a grid, still makes itself ready."""
+        streams = next(grid.streams for grid in self._grids if grid.name == stream)
+        return any(map(self._is_prepared_for, streams))
 
 
 def _ring(machine: MachineFile, grid: Grid, watching: Sequence[Detector]) -> SampleRing:

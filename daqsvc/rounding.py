@@ -1,4 +1,4 @@
-"""Figures in remedies, rounded to the side that is accepted: who writes one is not refused again."""
+"""Figures that people read: measured ones, and those in remedies, rounded to the side that is accepted."""
 
 from __future__ import annotations
 
@@ -6,6 +6,16 @@ from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 
 _NOISE = 1e-12
 """Relative error of a few floating-point operations: 0.30000000000000004 is 0.3, and not 0.301."""
+
+
+def readable(value: float, digits: int = 4) -> str:
+    """A measured value, rounded to so many digits: 65 540 rpm, and not 6.554e+04.
+
+    Args:
+        value: anything, finite or not.
+        digits: significant ones, from 1.
+    """
+    return f"{float(f'{value:.{digits}g}'):.12g}"
 
 
 def rounded_up(value: float, digits: int = 3) -> str:

@@ -220,6 +220,7 @@ class Service:
             self._why_bus_over,
             partial(self._why_silent, name),
             self._kernels,
+            is_prepared_for=partial(self._is_prepared_for, name),
         )
 
     def _join_streams(self) -> None:
@@ -579,6 +580,11 @@ class Service:
         bus = self.box.machines[machine].streams[stream].bus
         links = (one.link for one in self.driver_reports if one.name == bus)
         return next((link.why_silent(self.box.stream_key(machine, stream)) for link in links), "")
+
+    def _is_prepared_for(self, machine: str, stream: str) -> bool:
+        """Whether the driver of a stream of a machine still makes itself ready."""
+        bus = self.box.machines[machine].streams[stream].bus
+        return any(one.link.preparing for one in self.driver_reports if one.name == bus)
 
     def _report(self, diagnosis: Diagnosis) -> None:
         self.reports[diagnosis.machine].remember(diagnosis)

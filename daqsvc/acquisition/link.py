@@ -137,6 +137,7 @@ class Link:
             so several times a second. 0 where the event loop reads.
         faults: by stream, why no samples of it come while the link is up, in a clause, e.g. that the device
             refuses what is asked.
+        preparing: whether the driver still makes itself ready, so that nothing can have come yet.
     """
 
     name: str
@@ -147,6 +148,7 @@ class Link:
     over: str = ""
     turns: int = 0
     faults: Mapping[str, str] = field(default_factory=dict)
+    preparing: bool = False
     _ever_up: bool = field(default=False, repr=False)
     _said_down: bool = field(default=False, repr=False)
     _sparing: Sparing = field(default_factory=Sparing, repr=False)

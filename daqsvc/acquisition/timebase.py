@@ -28,6 +28,7 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.clock_line import PARTS, Bucket, ClockLine, clock_line
 from daqsvc.acquisition.counter import CounterUnwrapper
 from daqsvc.dsp.quality.rate import AS_BEFORE, FITS, PLAUSIBLE
+from daqsvc.rounding import readable
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -472,13 +473,9 @@ def rate_in_words(rate_hz: float, nominal_ns: float) -> str:
         nominal_ns: nominal time between samples.
     """
     return (
-        f"the device sends {_rounded(rate_hz)} Hz, the file says {_rounded(NS_PER_S / nominal_ns)}; correct "
+        f"the device sends {readable(rate_hz)} Hz, the file says {readable(NS_PER_S / nominal_ns)}; correct "
         "rate_hz in the machine file, or the device's setting"
     )
-
-
-def _rounded(rate_hz: float) -> str:
-    return f"{float(f'{rate_hz:.4g}'):.12g}"
 
 
 def _apart(one: Late, other: Late) -> int:

@@ -12,6 +12,7 @@ from daqsvc.alarms.setpoints import SetpointMonitor
 from daqsvc.alarms.states import Level
 from daqsvc.errors.alarms import CANNOT_JUDGE
 from daqsvc.errors.code import coded
+from daqsvc.rounding import readable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -361,30 +362,30 @@ class MeasureWatch:
         """
         unit = f" {diagnosis.units[self._measure]}" if self._measure in diagnosis.units else ""
         limit = self.monitor.reached(value)
-        measured = f"{self._measure} of {sensor} is {value:.4g}{unit}"
+        measured = f"{self._measure} of {sensor} is {readable(value)}{unit}"
         if self._measure in diagnosis.bounds:
             most = "most" if limit is not None and limit.lower else "least"
             lacks = f"{100.0 * (diagnosis.missing_share or 0.0):.2g} % of its samples are missing"
-            measured = f"{self._measure} of {sensor} is at {most} {value:.4g}{unit} though {lacks}"
+            measured = f"{self._measure} of {sensor} is at {most} {readable(value)}{unit} though {lacks}"
         elif self.setpoint.reference_deg is not None:
             phase, reference = diagnosis.statistics[self._measure], self.setpoint.reference_deg
             measured = (
-                f"{self._measure} of {sensor} is {phase:.4g}{unit}, {value:.4g}{unit} from its reference of "
-                f"{reference:g}{unit}"
+                f"{self._measure} of {sensor} is {readable(phase)}{unit}, {readable(value)}{unit} from its "
+                f"reference of {reference:g}{unit}"
             )
         if zone := self.setpoint.zone(value):
             measured += f", zone {zone} of ISO 20816-3"
         if limit is not None:
             side = "lower " if limit.lower else ""
             multiplied = f" times {self._factor:g} at start-up" if self._factor > 1.0 and not side else ""
-            said = f"{measured}, {side}{limit.level.label} limit {limit.at:.4g}{unit}{multiplied}"
+            said = f"{measured}, {side}{limit.level.label} limit {readable(limit.at)}{unit}{multiplied}"
             return f"{said}{self._until_it_ends(limit, value, unit)}"
         low, high = self.setpoint.highest_low, self.setpoint.lowest
-        if low is None:
-            return f"{measured}, below its limit of {high:.4g}{unit}"
-        if high is None:
-            return f"{measured}, above its limit of {low:.4g}{unit}"
-        return f"{measured}, between its limits of {low:.4g} and {high:.4g}{unit}"
+        if low is not None and high is not None:
+            return f"{measured}, between its limits of {readable(low)} and {readable(high)}{unit}"
+        if low is not None:
+            return f"{measured}, above its limit of {readable(low)}{unit}"
+        return measured if high is None else f"{measured}, below its limit of {readable(high)}{unit}"
 
     def _until_it_ends(self, limit: Limit, value: float, unit: str) -> str:
         """Why a level stands whose limit the value keeps by now; empty while it does not keep it."""
@@ -395,7 +396,7 @@ class MeasureWatch:
         side = "above" if limit.lower else "below"
         delay_s = self.setpoint.off_delay_ns / NS_PER_S
         lasting = f" for {delay_s:g} s" if delay_s else ""
-        return f", which ends {side} {end:.4g}{unit}{lasting}"
+        return f", which ends {side} {readable(end)}{unit}{lasting}"
 
 
 class _LevelWatch:
@@ -501,9 +502,9 @@ def _figures(diagnosis: Diagnosis) -> Iterator[str]:
     limited = [name for name, limit in limits.items() if limit is not None]
     for name in (limited or list(limits))[:MOST_FIGURES]:
         unit, limit = diagnosis.units.get(name, ""), limits[name]
-        yield f"{name} is {diagnosis.statistics[name]:.4g} {unit}".rstrip()
+        yield f"{name} is {readable(diagnosis.statistics[name])} {unit}".rstrip()
         if limit is not None:
-            yield f"{level} limit {limit:.4g} {unit}".rstrip()
+            yield f"{level} limit {readable(limit)} {unit}".rstrip()
 
 
 def _identity(decision: str, group: tuple[str, ...]) -> str:

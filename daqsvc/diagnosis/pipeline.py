@@ -222,6 +222,8 @@ MOST_BLOCKS = 64
 """Blocks in one window at most: a detector that is behind catches up in long strides."""
 
 LOOK_NS = NS_PER_S // 2
+_LONGEST_PREPARATION_NS = 300 * NS_PER_S
+"""A driver that is not ready by then hangs, and the silence of its streams counts."""
 
 MOST_HELD = 4096
 """Statements of a stream that wait for its rate to be known, at most; the oldest are dropped."""
@@ -276,6 +278,7 @@ class Pipeline:
             more; who reports the state of streams passes it on. None: it is passed on at once.
         why_over: why nothing more can come of a stream, in a clause; empty if something may.
         why_silent: what the bus of a stream states of why nothing comes, in a clause; empty if nothing.
+        is_prepared_for: whether the driver of a stream still makes itself ready to read it.
         make_reader: makes what hands the samples of a ring to a detector.
         on_read: called on the event loop with a detector's name and each window that is read for it.
         on_processed: called, on the thread that computes, with a detector and each window it has processed.
@@ -295,6 +298,7 @@ class Pipeline:
         fall_silent: Tell | None = None,
         why_over: Callable[[str], str] = lambda _stream: "",
         why_silent: Callable[[str], str] = lambda _stream: "",
+        is_prepared_for: Callable[[str], bool] = lambda _stream: False,
         make_reader: Callable[[SampleRing], RingReader] = RingReader,
         on_read: Callable[[str, Window], None] = lambda _detector, _window: None,
         on_processed: Callable[[Detector, Window], None] = lambda _detector, _window: None,
@@ -315,6 +319,7 @@ class Pipeline:
         self._fall_silent = fall_silent or self.stand
         self._why_over = why_over
         self._why_silent = why_silent
+        self._is_prepared_for = is_prepared_for
         self._doubts_told = dict.fromkeys(rings, 0)
         self._changes = dict.fromkeys(rings, 0)
         self._held: dict[str, deque[Diagnosis]] = {name: deque(maxlen=MOST_HELD) for name in rings}
@@ -446,7 +451,7 @@ class Pipeline:
         A process that was suspended has not listened: what came meanwhile still waits to be read.
         """
         heard = {name: (ring.end_index, self._doubts_told[name]) for name, ring in self._rings.items()}
-        looked_ns = self._clock.monotonic_ns()
+        begun_ns = looked_ns = self._clock.monotonic_ns()
         since_ns = {name: looked_ns + self._settling_ns.get(name, 0) for name in self._rings}
         silent: set[str] = set()
         unexplained: set[str] = set()
@@ -457,6 +462,8 @@ class Pipeline:
             if late_ns > LOOK_NS:
                 since_ns = {name: heard_ns + late_ns for name, heard_ns in since_ns.items()}
             for name, ring in self._rings.items():
+                if now_ns - begun_ns < _LONGEST_PREPARATION_NS and self._is_prepared_for(name):
+                    since_ns[name] = now_ns + self._settling_ns.get(name, 0)
                 has_doubt = bool(self._standings[name].doubt)
                 come = (heard[name][0] if has_doubt else ring.end_index, self._doubts_told[name])
                 if come != heard[name]:

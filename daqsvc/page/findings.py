@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from daqsvc.dsp.phase import deviation_deg
 from daqsvc.page.text import level_mark, row, time_mark
 from daqsvc.page.views.modes import in_words
+from daqsvc.rounding import readable
 
 if TYPE_CHECKING:
     from daqsvc.page.machine_live import MachineLive
@@ -156,7 +157,9 @@ def _evidence(statement: Document, group: set[str]) -> str:
         if which == statement["severity"] and value is not None and limit is not None and value >= limit:
             unit = statement["units"].get(measure, "")
             off = "" if reference is None else " off its reference"
-            beyond.append(f"{measure} is {value:.4g} {unit}{off}, {which} limit {limit:.4g} {unit}".rstrip())
+            beyond.append(
+                f"{measure} is {readable(value)} {unit}{off}, {which} limit {readable(limit)} {unit}".rstrip()
+            )
     return ", ".join(beyond)
 
 

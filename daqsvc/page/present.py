@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from daqsvc.dsp.phase import deviation_deg
 from daqsvc.page.text import level_mark, row, time_mark
+from daqsvc.rounding import readable
 
 if TYPE_CHECKING:
     from daqsvc.page.machine_live import MachineLive
@@ -63,11 +64,13 @@ def _values(statement: Document) -> list[str]:
         unit = statement["units"].get(name, "")
         thresholds = statement["thresholds"]
         limits = {which: thresholds.get(f"{name}.{which}") for which in LIMITS}
-        known = [f"{which} {limit:.4g}" for which, limit in limits.items() if limit is not None]
+        known = [f"{which} {readable(limit)}" for which, limit in limits.items() if limit is not None]
         if (reference := thresholds.get(f"{name}.reference")) is not None:
-            known.insert(0, f"{deviation_deg(value, reference):.4g} {unit} from {reference:.4g}")
+            known.insert(0, f"{readable(deviation_deg(value, reference))} {unit} from {readable(reference)}")
         begins = [at for which in ZONES if (at := thresholds.get(f"{name}.{which}")) is not None]
         if len(begins) == len(ZONES):
             known.insert(0, f"zone {'ABCD'[bisect_right(begins, value)]} of ISO 20816-3")
-        texts.append(f"{name} {value:.4g} {unit}".rstrip() + (f" ({', '.join(known)})" if known else ""))
+        texts.append(
+            f"{name} {readable(value)} {unit}".rstrip() + (f" ({', '.join(known)})" if known else "")
+        )
     return texts

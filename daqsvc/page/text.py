@@ -8,6 +8,7 @@ from urllib.parse import quote
 
 from daqsvc.acquisition.clock import NS_PER_S, iso_utc
 from daqsvc.page.views.modes import in_words
+from daqsvc.rounding import readable
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -182,7 +183,7 @@ def machine_rows(live: MachineLive) -> str:
     rows = []
     for one in sorted([*live.latest.values()], key=lambda said: str(said["detector"])):
         figures = ", ".join(
-            f"{name} {value:.4g} {one['units'].get(name, '')}".rstrip()
+            f"{name} {readable(value)} {one['units'].get(name, '')}".rstrip()
             for name, value in one["statistics"].items()
             if value is not None and "." not in name
         )

@@ -109,9 +109,13 @@ class SerialDriver:
     async def run(self) -> None:
         """See `drivers.base.Driver.run`."""
         try:
+            # What the device sends meanwhile waits in the port's buffer, or is lost: it is not silent.
+            self.link.preparing = True
             await in_thread(_warm, self._bus, self._port.streams, patience_s=SHUTDOWN_S)
+            self.link.preparing = False
             await run_with_reconnect(self.link, self._port, self._attempt)
         finally:
+            self.link.preparing = False
             self.link.stop()
             for assembler in self._assemblers.values():
                 assembler.flush()

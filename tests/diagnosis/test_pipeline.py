@@ -373,6 +373,32 @@ async def test_what_the_bus_knows_of_a_silence_is_said_also_when_it_comes_later(
     await running
 
 
+async def test_silence_counts_from_when_the_driver_is_ready_but_not_for_ever() -> None:
+    clock, ring = DrivenClock(), SampleRing("s", ("a",), 50)
+    said: list[Diagnosis] = []
+    ready = False
+    pipeline = Pipeline(
+        {"s": ring}, [Listener("one", 10)], said.append, clock, is_prepared_for=lambda _stream: not ready
+    )
+    running = asyncio.create_task(pipeline.run())
+    silent_at: list[float] = []
+    for half_second in range(1, 100):
+        ready = half_second > 40
+        await asyncio.sleep(0.005)
+        clock.advance_to(clock.monotonic_ns() + 500_000_000)
+        silent_at += [half_second / 2] * (len(said) - len(silent_at))
+    assert silent_at == [pytest.approx(22.5, abs=0.6)]
+    write(ring, 10)
+    ready = False
+    for half_second in range(100, 640):
+        await asyncio.sleep(0.001)
+        clock.advance_to(clock.monotonic_ns() + 500_000_000)
+        silent_at += [half_second / 2] * (sum(d.quality == "missing" for d in said) - len(silent_at))
+    assert silent_at[1:] == [pytest.approx(302.5, abs=3.0)]
+    ring.close()
+    await running
+
+
 async def test_a_stream_that_is_sampled_once_a_minute_is_silent_after_minutes_only() -> None:
     clock, ring = DrivenClock(), SampleRing("s", ("a",), 50)
     said: list[Diagnosis] = []

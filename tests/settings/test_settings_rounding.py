@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from support.machine_files import LAVAL, MACHINES, changed
 from support.paths import ROOT
 
-from daqsvc.rounding import rounded_down, rounded_up
+from daqsvc.rounding import readable, rounded_down, rounded_up
 from daqsvc.settings import MachineFileError, parse_machine_file
 
 if TYPE_CHECKING:
@@ -77,3 +77,20 @@ def test_the_figure_that_a_remedy_states_is_accepted(path, key, speed_rpm, setti
     (remedy,) = remedies(path, key, speed, (setting, f"{name} = {refused}"))
     stated = float(re.match(r"(?:write \w+ = |sample at )([0-9.]+)", remedy)[1])
     assert remedies(path, key, speed, (setting, f"{name} = {stated}")) == []
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (65535.0, "65540"),
+        (-2147483.648, "-2147000"),
+        (0.30000000000000004, "0.3"),
+        (25, "25"),
+        (0.0, "0"),
+        (1.23456e-7, "1.235e-07"),
+        (float("nan"), "nan"),
+        (float("inf"), "inf"),
+    ],
+)
+def test_measured_values_are_written_as_people_read_them(value: float, text: str) -> None:
+    assert readable(value) == text

@@ -13,6 +13,7 @@ from daqsvc.page.lines import amplitudes, largest, one_sided, size_of
 from daqsvc.page.shaft import whirl
 from daqsvc.page.views.position import NO_PAIR, pairs_of
 from daqsvc.page.views.view import NO_WAVEFORM, Choice, Figure, Shown
+from daqsvc.rounding import readable
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -126,14 +127,14 @@ class SpectrumView:
         for name, order in cursors.items():
             near = np.abs(frequency - order * speed_hz) <= 2.0 * rate_hz / len(values)
             if near.any():
-                rows.append((f"{name} at {order * speed_hz:.2f} Hz", f"{size_of(lines[near]):.4g}", unit))
+                rows.append((f"{name} at {order * speed_hz:.2f} Hz", readable(size_of(lines[near])), unit))
         highest = int(lines[1:].argmax()) + 1
         around = lines[max(highest - 2, 1) : highest + 3]
-        rows.append((f"largest at {frequency[highest]:.2f} Hz", f"{size_of(around):.4g}", unit))
+        rows.append((f"largest at {frequency[highest]:.2f} Hz", readable(size_of(around)), unit))
         if speed_hz:
             rows.append(("that is order", f"{frequency[highest] / speed_hz:.2f}", "X"))
         overall = np.sqrt(np.sum(np.square(lines[1:] / AMPLITUDES[chosen["amplitude"]][1])) / 3.0)
-        rows.append(("overall", f"{overall:.4g}", f"{_unit(live, chosen)} r.m.s."))
+        rows.append(("overall", readable(overall), f"{_unit(live, chosen)} r.m.s."))
         note = f"{missing} of {len(values)} samples are missing, and left out" if missing else ""
         frequency, lines = largest(frequency, lines, MOST_LINES)
         orders = frequency / speed_hz if speed_hz else np.full(len(frequency), np.nan)

@@ -8,6 +8,7 @@ import numpy as np
 
 from daqsvc.page.charts import ChartAxis, chart, legend, source
 from daqsvc.page.views.view import Choice, Figure, Shown
+from daqsvc.rounding import readable
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -77,7 +78,7 @@ class TimebaseView:
                 "rms about the mean": np.sqrt(np.mean((there - mean) ** 2)),
                 "peak to peak": np.ptp(there),
             }
-            rows = [(name, f"{value:.4g}", unit) for name, value in figures.items()]
+            rows = [(name, readable(value), unit) for name, value in figures.items()]
         missing = len(values) - len(there)
         note = f"{missing} of {len(values)} samples are missing" if missing else ""
         t_s, values = thinned(t_s, values)

@@ -11,6 +11,7 @@ from daqsvc.history.points import Step
 from daqsvc.page.charts import ChartAxis, chart, legend, source
 from daqsvc.page.earlier import opened_history
 from daqsvc.page.views.view import Choice, Figure, Shown
+from daqsvc.rounding import readable
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -110,10 +111,10 @@ class TrendView:
             return Shown(note="nothing was stored in this time")
         t_h, low, mean, high = thinned(points, now_s, step)
         rows = [
-            ("mean", f"{np.average(points.mean, weights=points.n):.4g}", series.unit),
-            ("least", f"{points.low.min():.4g}", series.unit),
-            ("greatest", f"{points.high.max():.4g}", series.unit),
-            ("newest", f"{points.mean[-1]:.4g}", series.unit),
+            ("mean", readable(float(np.average(points.mean, weights=points.n))), series.unit),
+            ("least", readable(float(points.low.min())), series.unit),
+            ("greatest", readable(float(points.high.max())), series.unit),
+            ("newest", readable(float(points.mean[-1])), series.unit),
         ]
         t = t_h / _unit_of(hours)[0]
         return Shown({"trend": {"t": t, "low": low, "mean": mean, "high": high}}, rows)

@@ -10,6 +10,7 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.page.charts import ChartAxis, chart, source
 from daqsvc.page.runs import MOST_SPECTRA
 from daqsvc.page.views.view import NO_WAVEFORM, Choice, Figure, Shown
+from daqsvc.rounding import readable
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -93,8 +94,8 @@ class WaterfallView:
         at = int(newest.peak[1:].argmax()) + 1
         rows = [
             ("spectra", f"{len(spectra)}", f"of {MOST_SPECTRA} at most"),
-            (f"newest at {newest.frequency_hz[at]:.1f} Hz", f"{newest.peak[at]:.4g}", f"{unit} peak"),
-            ("largest of all", f"{largest:.4g}", f"{unit} peak"),
+            (f"newest at {newest.frequency_hz[at]:.1f} Hz", readable(newest.peak[at]), f"{unit} peak"),
+            ("largest of all", readable(largest), f"{unit} peak"),
             ("speed of the newest", f"{newest.speed_rpm:.0f}", "rpm"),
         ]
         columns = dict(zip(("f", "y", "a", "z"), drawn.T, strict=True))

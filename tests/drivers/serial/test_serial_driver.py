@@ -23,6 +23,7 @@ from daqsvc.notice import NOTICE
 from daqsvc.settings import parse_machine_file
 from drivers.base import BusPort, StreamSpec
 from drivers.make import bus_drivers, stream_layout
+from drivers.serial import driver as serial_driver
 from drivers.serial import reader as serial_reader
 from drivers.serial.driver import SerialDriver, framing_of
 from sim_hw.link_faults import LinkFaults
@@ -290,3 +291,18 @@ def test_overtaken_lines_and_numbers_beyond_all_bounds_cost_no_sample(tmp_path: 
     counters, time_base = driver.streams["x"]
     assert (counters.samples_received, counters.samples_lost, counters.values_absent) == (799, 0, 3)
     assert (counters.frames_reordered, counters.frames_rejected, time_base.restarts) == (1, 0, 0)
+
+
+async def test_a_port_is_not_silent_while_its_kernels_are_compiled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compiled = threading.Event()
+    monkeypatch.setattr(serial_driver, "_warm", lambda *_: compiled.wait(PATIENCE_S))
+    with PseudoTerminal(tmp_path / "port"):
+        driver = lines_driver(tmp_path / "port", [])
+        assert not driver.link.preparing
+        async with running(driver):
+            await eventually(lambda: driver.link.preparing)
+            compiled.set()
+            await eventually(lambda: driver.link.state == "up")
+            assert not driver.link.preparing
