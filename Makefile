@@ -22,9 +22,9 @@
 # Each sets up what it needs in .venv; nothing else on the machine is touched.
 
 PYTHON ?= python3.11
-# Tests run side by side, in one process more than there are cores, as many of them wait; each from its end of the
-# list until one helps the other.
-WORKERS ?= $(shell expr $$(nproc) + 1)
+# Tests run side by side, in two processes more than there are cores, as tests of services wait for most of their
+# time; each from its end of the list until one helps the other.
+WORKERS ?= $(shell expr $$(nproc) + 2)
 # Without ROOM all of them.
 ROOMS = $(sort $(patsubst tests/%/,%,$(dir $(wildcard tests/*/test_*.py tests/*/*/test_*.py))))
 TESTS = $(if $(ROOM),$(if $(filter $(ROOMS),$(ROOM)),tests/$(ROOM),$(error there is no room '$(ROOM)' in tests/; there are $(ROOMS))))
