@@ -44,7 +44,7 @@ EXCEPTIONS = {
 REMEDIES = {
     1: "see whether the device has the other table: holding or input registers",
     2: "compare address and table with the register map of the device; what a map that begins at 1 calls "
-    "101 is address 100 here",
+    "101 is address 100 here; daqsvc sniff modbus shows which registers there are",
     3: "let a request read less (max_count), or compare the register map of the device with the layout",
     4: "check the device",
     5: "it takes longer than a reply may; lower the rate of what is read from it",

@@ -22,8 +22,8 @@ from daqsvc.acquisition.timebase import RECENT_DELAYS, TimeBaseState
 from daqsvc.errors.buses import REGISTER_REFUSED
 from daqsvc.errors.code import coded
 from drivers.modbus.reading import PollingReader, streams_in_words
-from drivers.modbus.registers import RegisterRecord, RunLimits, plan_runs, run_of
-from drivers.modbus.replies import FUNCTIONS, NoReplyError, RequestRefusedError
+from drivers.modbus.registers import RegisterRecord, RegisterRun, RunLimits, plan_runs, run_of
+from drivers.modbus.replies import FUNCTIONS, REMEDIES, NoReplyError, RequestRefusedError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.samples import Samples
     from drivers.base import BusPort, StreamSpec
     from drivers.modbus.line import ModbusLine, RegisterValues
-    from drivers.modbus.registers import RegisterRun
     from drivers.modbus.settings import RegistersLayout
 
 logger = logging.getLogger(__name__)
@@ -74,6 +73,12 @@ class _Failure(NamedTuple):
         return len(self.takers) > 1
 
     @property
+    def of_registers(self) -> bool:
+        """Whether one stream's own registers are refused: some of them may be there all the same."""
+        refused = isinstance(self.error, RequestRefusedError) and self.error.code in REFUSALS_OF_REGISTERS
+        return refused and not self.of_merging
+
+    @property
     def in_words(self) -> NoReplyError | RequestRefusedError:
         """The error, with the registers that are refused; the line reports units that are silent."""
         if not isinstance(self.error, RequestRefusedError):
@@ -100,11 +105,16 @@ class _TrendStream:
     def __init__(self, spec: StreamSpec[RegistersLayout], port: BusPort) -> None:
         self.name = spec.name
         self.counters = StreamCounters()
+        self._channels = spec.layout.channels
+        self.channels = len(self._channels)
         self._record = RegisterRecord.of(spec.layout)
         self.own_runs = self._record.runs
-        bare = replace(RunLimits.of(spec.layout), max_gap=0)
-        self.bare_runs = plan_runs(map(run_of, spec.layout.channels), bare)
-        """As `own_runs`, but without any register that is not needed."""
+        self._bare = replace(RunLimits.of(spec.layout), max_gap=0)
+        self._columns: list[int] = []
+        self.absent: dict[str, RegisterRun] = {}
+        """Registers, by channel, that the unit does not have; the values of these channels are NaN."""
+        self.bare_runs: tuple[RegisterRun, ...] = ()
+        """As `own_runs`, but without any register that is not needed, nor those of `absent`."""
         self._deliver = port.deliver
         self._period_ns = NS_PER_S / spec.rate_hz
         self._places: tuple[int, ...] = ()
@@ -113,12 +123,25 @@ class _TrendStream:
         self._next: int | None = None
         self._lateness_ns: deque[float] = deque(maxlen=RECENT_DELAYS)
         self._error_ns = np.inf
+        self.leave_out({})
 
     @property
     def time_base(self) -> TimeBaseState:
         """How well the schedule is kept, and how far off the time of the last sample may be."""
         late_ns = float(np.percentile(self._lateness_ns, 95)) if self._lateness_ns else 0.0
         return TimeBaseState(self._period_ns, 0.0, late_ns, self._next is not None, 0, self._error_ns)
+
+    def leave_out(self, absent: Mapping[str, RegisterRun]) -> None:
+        """Read all channels but these from the next `read_from` on; one at least is left."""
+        self.flush()
+        self.absent = dict(absent)
+        self._columns = [k for k, one in enumerate(self._channels) if one.name not in absent]
+        self.bare_runs = plan_runs((run_of(self._channels[k]) for k in self._columns), self._bare)
+
+    def channels_in(self, run: RegisterRun) -> dict[str, RegisterRun]:
+        """Registers by channel of those that lie in a run."""
+        own = {one.name: run_of(one) for one in self._channels if one.name not in self.absent}
+        return {name: one for name, one in own.items() if run.address <= one.address and one.end <= run.end}
 
     def places_in(self, runs: Sequence[RegisterRun]) -> tuple[int, ...]:
         """Places of those runs that its quantities lie in."""
@@ -133,7 +156,8 @@ class _TrendStream:
         """Say which runs are read from now on, and which of them are for this stream."""
         self.flush()
         self._places = tuple(places)
-        self._record = replace(self._record, runs=tuple(runs[place] for place in places))
+        channels = tuple(self._channels[k] for k in self._columns)
+        self._record = RegisterRecord(channels, tuple(runs[place] for place in places))
 
     def append(self, slot: int, start_ns: int, readings: Sequence[RegisterValues | None]) -> None:
         """Take the sample of a slot, from what each run holds; without one of its own it is lost.
@@ -176,7 +200,7 @@ class _TrendStream:
         lost = 0 if self._next is None else first - self._next
         self._next, self._error_ns = first + len(samples), error_ns
         self.counters.frames_received += len(samples)
-        samples = note_received(self.counters, self.name, samples)
+        samples = self._with_absent(note_received(self.counters, self.name, samples))
         if lost:
             note_gap(self.counters, self.name, lost, first)
         quality = Quality.AFTER_LOSS if lost else Quality.GOOD
@@ -184,12 +208,23 @@ class _TrendStream:
             SampleBlock(self.name, first, samples, t_first_ns, self._period_ns, lost, quality, error_ns)
         )
 
+    def _with_absent(self, samples: Samples) -> Samples:
+        """Samples of all channels, those that are left out NaN, and counted."""
+        if not self.absent:
+            return samples
+        whole = np.full((len(samples), len(self._channels)), np.nan, np.float32)
+        whole[:, self._columns] = samples
+        self.counters.values_absent += len(samples) * len(self.absent)
+        return whole
+
 
 class TrendReader(PollingReader):
     """Polls registers on a schedule, which begins with the first sample; its count is its place in that.
 
     A poll that fails is a lost sample of every stream that has registers in it, and of no other. And so is
-    one whose request could not go out before the next was due, because others held the line.
+    one whose request could not go out before the next was due, because others held the line. Registers that
+    the unit does not have cost their own channels only: each channel is asked for by itself, once, and what
+    is refused is then left out.
 
     Args:
         specs: streams of one unit, table and rate.
@@ -237,9 +272,17 @@ class TrendReader(PollingReader):
         if self._together_at_ns is not None and now_ns >= self._together_at_ns:
             self._read_together()
         readings, failure = await self._ask(line)
-        while failure is not None and failure.of_merging:
-            self._part(failure)
+        asks_for_less = False
+        while failure is not None:
+            if failure.of_merging:
+                self._part(failure)
+            elif not failure.of_registers or not await self._leave_out(line, failure):
+                break
+            asks_for_less = True
             readings, failure = await self._ask(line)
+        if asks_for_less:
+            self._together_at_ns = self._clock.monotonic_ns() + self._apart_ns
+            self._apart_ns = min(2 * self._apart_ns, APART_MOST_NS)
         self._append(slot, readings)
         if failure is not None:
             self._without_sample = sorted(stream.name for stream in failure.takers)
@@ -280,8 +323,6 @@ class TrendReader(PollingReader):
             self._bare |= failure.takers
             what = "the registers between those of the channels are left out"
         self._read_apart()
-        self._together_at_ns = self._clock.monotonic_ns() + self._apart_ns
-        self._apart_ns = min(2 * self._apart_ns, APART_MOST_NS)
         if (message := f"{failure.error} ({_words(failure.run)})") not in self._said:
             self._said.add(message)
             logger.warning(
@@ -293,6 +334,46 @@ class TrendReader(PollingReader):
                 extra=coded(REGISTER_REFUSED),
             )
 
+    async def _leave_out(self, line: ModbusLine, failure: _Failure) -> bool:
+        """Find the channels whose registers the unit does not have; whether others are left to read."""
+        (stream,) = failure.takers
+        asked = stream.channels_in(failure.run)
+        refused = asked if len(asked) == 1 else await self._refused_alone(line, asked)
+        absent = {**stream.absent, **refused}
+        if not refused or len(absent) == stream.channels:
+            return False
+        stream.leave_out(absent)
+        self._bare.add(stream)
+        self._read_apart()
+        for name, run in refused.items():
+            if (message := f"{failure.error} ({_words(run)})") not in self._said:
+                self._said.add(message)
+                logger.warning(
+                    "stream %r: %s: channel %r has no value, and is asked for again only now and then; %s",
+                    stream.name,
+                    message,
+                    name,
+                    REMEDIES[2],
+                    extra=coded(REGISTER_REFUSED),
+                )
+        return True
+
+    async def _refused_alone(
+        self, line: ModbusLine, asked: Mapping[str, RegisterRun]
+    ) -> dict[str, RegisterRun]:
+        """Which of the channels the unit refuses one by one; none if it fails in another way meanwhile."""
+        refused = {}
+        for name, run in asked.items():
+            try:
+                await line.poll(self._unit, self._function, run, _words(run))
+            except NoReplyError:
+                return {}
+            except RequestRefusedError as error:
+                if error.code not in REFUSALS_OF_REGISTERS:
+                    return {}
+                refused[name] = run
+        return refused
+
     def _concerned(self) -> Sequence[str]:
         return self._without_sample
 
@@ -303,6 +384,8 @@ class TrendReader(PollingReader):
         """Read what all streams share, or what each may read at once."""
         self._together_at_ns = None
         self._bare.clear()
+        for stream in self._streams:
+            stream.leave_out({})
         if self._shared is None:
             self._read_apart()
         else:

@@ -174,14 +174,74 @@ def test_a_unit_that_has_not_what_lies_between_the_registers_of_one_stream_is_as
     assert "the registers between those of the channels are left out" in said
 
 
-def test_a_register_of_its_own_that_is_refused_is_named_alone(caplog):
-    streams = {"pump": (trend([16, 18]), 1.0)}
+def test_a_register_that_is_not_there_costs_its_own_channel_only(caplog):
+    streams = {"pump": (trend([16, 17, 18, 30], max_gap=0), 1.0)}
     with caplog.at_level(NOTICE):
-        rig = watched(streams, without_register(18), 30.0)
+        rig = watched(streams, without_register(17), 30.0)
+    samples = rig.samples("pump")
+    assert (samples[:, [0, 2, 3]] == [1016, 1018, 1030]).all()
+    assert np.isnan(samples[:, 1]).all()
+    counters = rig.counters("pump")
+    assert counters.samples_received == pytest.approx(30, abs=1)
+    assert counters.samples_lost == 0
+    assert counters.values_absent == counters.samples_received
+    (said,) = [record.message for record in caplog.records]
+    assert said.startswith(
+        "stream 'pump': unit 1 refuses function 3: illegal data address (register 17): "
+        "channel 'r17' has no value"
+    )
+    # The whole request, and this register by itself: once, and not with every sample.
+    assert rig.driver.counters.exceptions["illegal data address"] == 2
+
+
+def test_a_register_that_comes_back_is_read_again():
+    streams = {"pump": (trend([16, 17], max_gap=0), 1.0)}
+    unit_side = units()
+    answer, asked = unit_side[1].answer, []
+
+    def growing(pdu):
+        asked.append(RegisterRun(pdu[2], pdu[4]))
+        return b"\x83\2" if len(asked) < 60 and pdu[2] <= 17 < pdu[2] + pdu[4] else answer(pdu)
+
+    unit_side[1].answer = growing
+    rig = watched(streams, unit_side, 300.0)
+    samples = rig.samples("pump")
+    assert np.isnan(samples[0, 1])
+    assert (samples[-100:] == [1016, 1017]).all()
+    assert rig.counters("pump").samples_lost == 0
+
+
+def test_a_unit_that_has_none_of_the_registers_gives_no_sample_and_is_named(caplog):
+    streams = {"pump": (trend([16, 17], max_gap=0), 1.0)}
+    unit_side = units()
+    unit_side[1].answer = lambda _pdu: b"\x83\2"
+    with caplog.at_level(NOTICE):
+        rig = watched(streams, unit_side, 30.0)
     assert rig.counters("pump").samples_received == 0
     assert caplog.records[-1].message.startswith(
-        "stream 'pump': unit 1 refuses function 3: illegal data address (register 18)"
+        "stream 'pump': unit 1 refuses function 3: illegal data address (registers 16 to 17)"
     )
+
+
+def test_a_unit_that_falls_silent_while_its_registers_are_sought_loses_no_channel():
+    streams = {"pump": (trend([16, 17], max_gap=0), 1.0)}
+    unit_side = without_register(17)
+    count = iter(range(1000))
+
+    def silent(_unit, pdu):
+        alone = pdu[4] == 1 and next(count) < 1
+        return PlannedReply("silent" if alone else "none")
+
+    rig = Rig(options_of(serial=True, timeout_ms=50.0), streams, clock=LoopClock())
+
+    async def main():
+        async with responding(unit_side, silent, serial=True), rig.running():
+            await asyncio.sleep(20.0)
+
+    simulate(main)
+    rig.check_books("pump")
+    assert (rig.samples("pump")[:, 0] == 1016).all()
+    assert np.isnan(rig.samples("pump")[:, 1]).all()
 
 
 def test_streams_that_were_parted_are_tried_together_again():
