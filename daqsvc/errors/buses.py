@@ -35,9 +35,10 @@ FIELDS_OVERLAP = Code(
 )
 RAW_VALUES = Code(
     "B04",
-    "valid_raw does not fit the type of the channel",
-    "valid_raw has raw values, before scale and offset. These cannot come in the type of the channel.",
-    "Write the least and the largest whole number that the device sends for a measurement.",
+    "valid_raw or no_value does not fit the type of the channel",
+    "Both have raw values, before scale and offset. These cannot come in the type of the channel.",
+    "valid_raw: write the least and the largest whole number that the device sends for a measurement. "
+    "no_value: write those that it sends where it has none.",
     _PAGE,
     example="machine.toml:68: streams.shaft.layout.channels[0].valid_raw = [-40000, 32767]: does not lie "
     "within what int16 can carry, -32768 to 32767. Remedy: write the raw values as the device sends "
@@ -428,10 +429,12 @@ NO_VALUE_MARK = Code(
     "B45",
     "A mark for no value would be a value",
     "Many Modbus devices write 0x8000 into an int16, or 0xFFFF into a uint16, when they have no value, e.g. "
-    "of a broken sensor. Without ok_between it is taken for one.",
-    "Write ok_between with what the sensor can measure.",
+    "of a broken sensor. Without no_value and ok_between it is taken for one.",
+    "Write no_value into the channel, as the device's manual says, or ok_between with what the sensor can "
+    "measure.",
     "modbus.md",
     example="machine.toml:73: sensors[2]: has no ok_between: 0x8000 in its int16, by which many devices mean "
-    "that they have no value, would be -1638.4 degC. Remedy: write ok_between with what it can measure, e.g. "
-    "ok_between = [-40.0, 150.0]",
+    "that they have no value, would be -1638.4 degC. Remedy: write no_value = 0x8000 into its channel if the "
+    "device's manual says so, or ok_between with what the sensor can measure, e.g. ok_between = "
+    "[-40.0, 150.0]",
 )

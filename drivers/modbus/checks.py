@@ -15,6 +15,7 @@ from daqsvc.errors.buses import (
     MANUALS_NUMBER,
     NO_ROOM_FOR_REGISTERS,
     NO_VALUE_MARK,
+    RAW_VALUES,
     REGISTERS_OVERLAP,
     UNIT_ADDRESS,
     WRITE_NOT_ALLOWED,
@@ -85,6 +86,7 @@ def check_modbus(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[Fi
             code=UNIT_ADDRESS,
         )
     yield from _check_bits(layout, path)
+    yield from _check_marks(layout, path)
     yield from _check_counted_from_0(layout, path)
     yield from check_channel_overlaps(layout, path)
     yield from _check_room(layout, path)
@@ -134,12 +136,15 @@ def check_no_value(draft: MachineFile) -> Iterator[Finding]:
             if channel is None or channel.type not in _NO_VALUE or channel.bits or channel.scale == 1.0:
                 continue
             raw = _NO_VALUE[channel.type]
+            if channel.no_value:
+                continue
             value = (raw * channel.scale + channel.offset) * sensor.gain + sensor.shift
             yield Finding(
                 ("sensors", index),
                 f"has no ok_between: 0x{raw & 0xFFFF:04X} in its {channel.type}, by which many devices mean "
                 f"that they have no value, would be {value:.6g} {sensor.unit}",
-                "write ok_between with what it can measure, e.g. ok_between = [-40.0, 150.0]",
+                f"write no_value = 0x{raw & 0xFFFF:04X} into its channel if the device's manual says so, or "
+                "ok_between with what the sensor can measure, e.g. ok_between = [-40.0, 150.0]",
                 fatal=False,
                 code=NO_VALUE_MARK,
             )
@@ -165,6 +170,22 @@ def _check_bits(layout: ModbusLayout, path: KeyPath) -> Iterator[Finding]:
                 f"are no part of {channel.type}",
                 "write [lowest bit, number of bits] of an unsigned type that holds them, e.g. [0, 4]",
                 code=BITS,
+            )
+
+
+def _check_marks(layout: ModbusLayout, path: KeyPath) -> Iterator[Finding]:
+    """The type of each channel can hold the raw values that mean no value."""
+    for index, channel in enumerate(layout.channels):
+        width = channel.width
+        lowest = 0 if channel.bits is not None else -(2 ** (width - 1))
+        wrong = [value for value in channel.no_value if not lowest <= value < 2**width]
+        if wrong and not channel.type.startswith("float"):
+            what = channel.type if channel.bits is None else f"{width} bits"
+            yield Finding(
+                (*path, "channels", index, "no_value"),
+                f"{what} cannot hold {wrong[0]}",
+                "write the raw value as the device sends it, before scale and offset",
+                code=RAW_VALUES,
             )
 
 

@@ -12,7 +12,7 @@ from drivers.bus_questions import BUS, BusQuestions, Heard, only_port
 from drivers.modbus.sniff import ModbusSniffer
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
 from drivers.sniffing import WAVEFORM_HZ, NothingFoundError, SniffError, sniffed
-from drivers.toml_lines import array, entry
+from drivers.toml_lines import Hexadecimal, array, entry
 
 if TYPE_CHECKING:
     import threading
@@ -72,6 +72,10 @@ class _ModbusQuestions(BusQuestions):
         "address": Topic("Register of {channel}", "As on the wire, from 0: what a manual calls 40001 is 0."),
         "register-type": Topic("What do the registers of {channel} hold?", "The register map says so."),
         "order": Topic("Byte order of {channel}", "ABCD is the usual one; CDAB has its words exchanged."),
+        "no-value": Topic(
+            "Which raw value of {channel} means that the device has none?",
+            "E.g. 0x7FFF where a sensor is broken or missing: see the register map. none if there is none.",
+        ),
         "scale": Topic("What is one count of {channel} worth?", "In the unit of the value, e.g. 0.01 mm/s."),
     }
 
@@ -104,6 +108,8 @@ class _ModbusQuestions(BusQuestions):
 
     def _proposals(self, found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
         """See `Heard.proposals`."""
+        from drivers.modbus.scan_report import NO_VALUE  # noqa: PLC0415 - brings the settings
+
         tables = [one for one in found["tables"] if one["registers"]]
         proposed = {"unit": f"{tables[0]['unit']}"}
         tables = [one for one in tables if one["unit"] == answers.get("unit", tables[0]["unit"])]
@@ -114,6 +120,11 @@ class _ModbusQuestions(BusQuestions):
             return proposed
         found_channels = {one["address"]: one for one in tables[0]["channels"]}
         values = {one["address"]: one["int16"] for one in tables[0]["registers"]}
+        marks = {
+            one["address"]: one["uint16"]
+            for one in tables[0]["registers"]
+            if one["uint16"] in NO_VALUE and one["address"] not in tables[0]["moved"]
+        }
         proposed["channels"] = ", ".join(one["name"] for one in found_channels.values())
         for channel in answers.get("channels", ()):
             if sensor_key(channel, "register-type") not in answers:
@@ -130,6 +141,8 @@ class _ModbusQuestions(BusQuestions):
             address = answers[sensor_key(channel, "address")]
             if address in found_channels:
                 proposed[sensor_key(channel, "order")] = found_channels[address]["order"]
+            if address in marks and _width(answers[sensor_key(channel, "register-type")]) == 1:
+                proposed[sensor_key(channel, "no-value")] = f"0x{marks[address]:04X}"
         return proposed
 
     def _heard_address(
@@ -209,6 +222,7 @@ class _ModbusQuestions(BusQuestions):
         is_float = answers[sensor_key(channel, "register-type")].startswith("float")
         scale = "1" if is_float else {"degC": "0.1", "mm/s": "0.01"}.get(unit, "1")
         yield self.ask_of(channel, "scale", q.number, scale)
+        yield self.ask_of(channel, "no-value", q.whole_or_none, NONE, quiet=True)
 
     def _next_address(self, answers: Answers, channel: str) -> int:
         """Behind the registers of all channels before."""
@@ -299,6 +313,11 @@ class _ModbusQuestions(BusQuestions):
         for name in answers["channels"]:
             keys = {"address": "address", "type": "register-type", "order": "order", "scale": "scale"}
             tables.append({"name": name} | {k: answers[sensor_key(name, t)] for k, t in keys.items()})
+            mark = answers[sensor_key(name, "no-value")]
+            if mark is not None:
+                tables[-1]["no_value"] = Hexadecimal(mark)
+        if not any("no_value" in table for table in tables):
+            yield "# If a raw value means that there is no value, add e.g. no_value = 0x7FFF to its channel."
         yield from array("channels", tables)
 
     def _line(self, answers: Answers) -> Iterator[Question]:
@@ -411,6 +430,8 @@ def _sample_registers(answers: Answers) -> int:
 
 def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
     """What was found, in a few lines: which units answer, and the registers that are worth reading."""
+    from drivers.modbus.scan_report import NO_VALUE  # noqa: PLC0415 - brings the settings
+
     first, last = found["units_asked"]
     yield f"units that answer: {', '.join(map(str, found['units']))} (units {first} to {last} were asked)"
     for table in found["tables"]:
@@ -443,7 +464,8 @@ def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
                     if (reading["type"], reading["order"]) == (one["type"], one["order"])
                 ]
                 value, meant = f"{same[0]['value']:.6g}", f" as {one['type']} {one['order']}"
-            yield f"  {address}: {value}{meant}{moves}"
+            is_mark = address not in wide and not moved and by_address[address]["uint16"] in NO_VALUE
+            yield f"  {address}: {value}{meant}{moves}{', no value?' if is_mark else ''}"
         if len(shown) > _SHOWN:
             yield f"  ... and {len(shown) - _SHOWN} more: daqsvc sniff modbus shows them"
 

@@ -127,6 +127,7 @@ class _Group(NamedTuple):
     columns: list[int]
     places: NDArray[np.int64]
     dtype: np.dtype[np.generic]
+    marks: list[NDArray[np.generic]]
 
 
 @dataclass(frozen=True)
@@ -193,6 +194,8 @@ class RegisterRecord:
                         wide = number.astype(np.uint64)
                         number = (wide >> np.uint64(lowest)) & np.uint64(2**width - 1)
                     values[:, column] = number
+                    for mark in group.marks[k]:
+                        values[number == mark, column] = np.nan
             return np.asarray(values * self._scale + self._offset, np.float32)
 
     def encode(
@@ -201,20 +204,24 @@ class RegisterRecord:
         """Put samples into registers, as the device would; registers without a channel are 0.
 
         Args:
-            samples: ``[n, channels]`` in physical units.
+            samples: ``[n, channels]`` in physical units; NaN where there is no value, if ``no_value`` is set.
             clip: saturate what does not fit, as an analogue input does, instead of raising.
 
         Returns:
             uint8 ``[n, 2 * registers]``.
 
         Raises:
-            LayoutError: a value does not fit its registers (and ``clip`` is False), or is NaN.
+            LayoutError: a value does not fit its registers (and ``clip`` is False), or is NaN and the channel
+                has no mark for that.
         """
         rows = np.zeros((len(samples), 2 * self.registers), np.uint8)
         raw = (np.asarray(samples, np.float64) - self._offset) / self._scale
         for group in self._groups:
             for k, (channel, column) in enumerate(zip(group.channels, group.columns, strict=True)):
-                fitting = _fit(channel, raw[:, column], clip=clip)
+                wanted = raw[:, column]
+                if channel.marks:
+                    wanted = np.where(np.isnan(wanted), float(channel.marks[0]), wanted)
+                fitting = _fit(channel, wanted, clip=clip)
                 # Numbers of a few bits share their registers: those of the others stay.
                 places = group.places[k * group.dtype.itemsize :][: group.dtype.itemsize]
                 rows[:, places] |= _bytes_of(channel, fitting)
@@ -235,7 +242,10 @@ class RegisterRecord:
             columns = [k for k, channel in enumerate(self.channels) if channel.type == name]
             channels = [self.channels[k] for k in columns]
             places = np.concatenate([2 * self._place(channel) + byte_places(channel) for channel in channels])
-            groups.append(_Group(channels, columns, places, np.dtype(_DTYPES[name])))
+            dtype = np.dtype(_DTYPES[name])
+            # Of their own type: what is compared as a float is not exact beyond 53 bits.
+            marks = [np.array(channel.marks, dtype.newbyteorder("=")) for channel in channels]
+            groups.append(_Group(channels, columns, places, dtype, marks))
         return groups
 
     def _place(self, channel: RegisterNumber) -> int:

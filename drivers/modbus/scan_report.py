@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 _FEW = 12
 """Number of values up to which all are proposed, whether they moved or not."""
 _MOST_CHANNELS = 64
+NO_VALUE = frozenset({0x7FFF, 0x8000, 0xFFFF})
+"""What many devices write into a register when they have no value."""
 
 
 class ScanReport:
@@ -163,8 +165,14 @@ class ScanReport:
             f"{raw}",
             f"{_signed(raw)}",
             "yes" if address in table.moved else "",
-            "; ".join(_words(one, mark=self._all_orders) for one in shown),
+            "; ".join(_words(one, mark=self._all_orders) for one in shown)
+            or self._no_value(table, numbers, address),
         )
+
+    def _no_value(self, table: FoundTable, numbers: Sequence[Reading], address: int) -> str:
+        """A hint where a register shows nothing but what devices write when they have no value."""
+        seen = {these[address] for these in table.rounds if address in these}
+        return "no value?" if len(seen) == 1 and seen <= NO_VALUE and address not in _covered(numbers) else ""
 
     def _figures(self) -> dict[str, Any]:
         scan = self._scan

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeAlias
 
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
 from pydantic_core import PydanticCustomError
 
 from daqsvc.errors.buses import MANUALS_NUMBER, RING_DEPTH
@@ -58,6 +58,28 @@ UnitAddress = Annotated[int, Field(ge=0, le=255)]
 Table = Literal["holding", "input"]
 CountBits = Literal[16, 32]
 BitNumber = Annotated[int, Field(ge=0, le=64)]
+
+
+def _one_or_several(value: Any) -> Any:
+    """A number by itself is an array of one."""
+    return [value] if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+_MOST_MARKS = 8
+Marks = Annotated[
+    tuple[int, ...],
+    BeforeValidator(_one_or_several),
+    Field(strict=False, max_length=_MOST_MARKS),
+    WithJsonSchema(
+        {
+            "anyOf": [
+                {"type": "integer"},
+                {"type": "array", "items": {"type": "integer"}, "maxItems": _MOST_MARKS},
+            ]
+        }
+    ),
+]
+"""Raw values that are no measurement: one, or an array of several."""
 
 _REGISTERS: dict[RegisterType, int] = {
     "int16": 1,
@@ -202,10 +224,33 @@ class _Quantity(Section):
         default=0.0, description="what the raw value 0 is worth, in V or the unit of the sensor"
     )
 
+    no_value: Marks = Field(
+        default=(),
+        description="raw value by which the device says that it has none, e.g. of a broken sensor; "
+        "or several in brackets",
+        examples=["0x7FFF"],
+    )
+
     @property
     def registers(self) -> int:
         """Registers that hold it."""
         return _REGISTERS[self.type]
+
+    @property
+    def width(self) -> int:
+        """Bits of its raw value."""
+        return 16 * self.registers if self.bits is None else self.bits[1]
+
+    @property
+    def marks(self) -> tuple[int, ...]:
+        """The raw values of `no_value` as its type has them: of an int16, 0x8000 is -32768."""
+        if self.type.startswith("float"):
+            return self.no_value
+        # TOML has no number as large as the largest of 64 bits without sign: there -1 has the same bits.
+        raw = [value % 2**self.width for value in self.no_value]
+        if self.type.startswith("u"):
+            return tuple(raw)
+        return tuple(value - 2**self.width if value >= 2 ** (self.width - 1) else value for value in raw)
 
 
 class RegisterChannel(_Quantity):
@@ -238,8 +283,7 @@ def _range(channels: Sequence[_Quantity], name: str) -> WireRange | None:
     number = next((item for item in channels if item.name == name), None)
     if number is None or number.type.startswith("float"):
         return None
-    bits = 16 * number.registers if number.bits is None else number.bits[1]
-    half = 2.0 ** (bits - 1)
+    half = 2.0 ** (number.width - 1)
     raw = (0.0, 2 * half - 1) if number.type.startswith("u") else (-half, half - 1)
     return WireRange.scaled(raw, number.scale, number.offset)
 

@@ -230,6 +230,19 @@ def test_the_first_line_names_the_schema_that_the_file_itself_says_how_to_make(t
     assert load_machine_file(Path("m.toml")).warnings == ()
 
 
+def test_the_mark_for_no_value_of_a_register_is_an_option_and_a_hint_in_the_file(tmp_path, capsys):
+    file = tmp_path / "m.toml"
+    words = ["new", f"{file}", "--yes", "--overwrite", "--bus=modbus-tcp", "--host=192.0.2.10"]
+    assert main(words) == 0
+    assert "add e.g. no_value = 0x7FFF to its channel" in file.read_text()
+    assert main([*words, "--sensor=temperature.no-value=0x8000"]) == 0
+    text = file.read_text()
+    assert text.count("no_value = 0x8000") == text.count("no_value") == 1
+    capsys.readouterr()
+    assert main([*words, "--sensor=temperature.no-value=0x18000"]) == 2
+    assert "int16 cannot hold 98304" in capsys.readouterr().err
+
+
 def test_answers_of_a_file_are_those_of_the_options(tmp_path, capsys):
     answers = tmp_path / "answers.toml"
     answers.write_text(

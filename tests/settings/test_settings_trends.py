@@ -292,7 +292,39 @@ def test_a_mark_for_no_value_that_would_be_a_value_is_warned_of(old, new, words)
     (warning,) = parsed(PUMP, (old, new)).warnings
     assert words in warning.message
     assert warning.message.endswith(("would be -1638.4 degC", "would be 65.535 mm/s"))
-    assert "write ok_between" in warning.remedy
+    mark = "0xFFFF" if words == "0xFFFF" else "0x8000"
+    assert warning.remedy.startswith(
+        f"write no_value = {mark} into its channel if the device's manual says so, or ok_between"
+    )
+
+
+def test_a_channel_that_names_its_mark_for_no_value_needs_no_ok_between():
+    bare = ('"degC"\nok_between = [-40.0, 105.0]', '"degC"')
+    marked = ('type = "int16", scale = 0.05', 'type = "int16", scale = 0.05, no_value = 0x8000')
+    machine = parsed(PUMP, bare, marked)
+    assert machine.warnings == ()
+    marks = [
+        channel.marks
+        for channel in machine.streams[machine.sensors[0].stream].layout.channels
+        if channel.no_value
+    ]
+    assert marks == [(-32_768,)]
+
+
+@pytest.mark.parametrize(
+    ("mark", "words"),
+    [
+        ("0x18000", "int16 cannot hold 98304"),
+        ("[0x7FFF, -32769]", "int16 cannot hold -32769"),
+    ],
+)
+def test_a_mark_that_the_type_cannot_hold_is_refused(mark, words):
+    text, _ = changed(
+        PUMP, ('type = "int16", scale = 0.05', f'type = "int16", scale = 0.05, no_value = {mark}')
+    )
+    (problem,) = problems_of(text, PUMP)
+    assert problem.key.endswith("].no_value")
+    assert problem.message == words
 
 
 def test_a_count_and_a_number_of_32_bits_have_no_such_mark():

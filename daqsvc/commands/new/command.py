@@ -69,7 +69,8 @@ class NewCommand:
             default=[],
             metavar="CHANNEL.TOPIC=ANSWER",
             help="answer for one channel, e.g. x.type=accelerometer; TOPIC is type, name, unit, sensitivity, "
-            "angle, threshold or bearing, with Modbus values also address, register-type, order or scale",
+            "angle, threshold or bearing, with Modbus values also address, register-type, order, scale or "
+            "no-value",
         )
         for key, topic in all_topics().items():
             group.add_argument(

@@ -38,6 +38,28 @@ LAYOUTS = {
 }
 
 
+def test_a_mark_for_no_value_is_missing_and_counted(caplog):
+    layout = registers_layout(1, "holding", (register("x", 0, "int16", scale=0.1, no_value=0x7FFF),))
+    rig = Rig(options_of(serial=False), {"s": (layout, 10.0)}, clock=LoopClock())
+
+    async def main():
+        unit = ModbusUnit()
+        unit.put("holding", 0, struct.pack(">H", 250))
+        async with responding({1: unit}, lambda *_: PlannedReply(), serial=False), rig.running():
+            await asyncio.sleep(1.0)
+            unit.put("holding", 0, struct.pack(">H", 0x7FFF))
+            await asyncio.sleep(1.0)
+
+    with caplog.at_level(NOTICE):
+        simulate(main)
+    samples = rig.samples("s")[:, 0]
+    absent = int(np.isnan(samples).sum())
+    assert 5 <= absent < len(samples)
+    assert np.unique(samples[~np.isnan(samples)]).tolist() == [25.0]
+    assert rig.counters("s").values_absent == absent
+    assert sum("are missing" in record.message for record in caplog.records) == 1
+
+
 @pytest.mark.gives("B36")
 @pytest.mark.parametrize("way", LAYOUTS)
 def test_what_is_no_number_is_missing_and_counted(way, caplog):

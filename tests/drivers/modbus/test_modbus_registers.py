@@ -96,6 +96,46 @@ def test_bits_of_a_register_share_it(word, lowest, width):
     assert record.decode(raw).tolist() == [[(word >> lowest) & (2**width - 1), word]]
 
 
+@pytest.mark.parametrize(
+    ("kind", "order", "marks", "sent"),
+    [
+        ("int16", "ABCD", (0x7FFF,), [32_767, 32_766]),
+        ("int16", "BADC", (0x7FFF, 0x8000), [-32_768, -1]),  # the bits of the manual, of a number with sign
+        ("int16", "ABCD", (-32_768,), [-32_768, 32_767]),
+        ("uint16", "ABCD", (0xFFFF,), [65_535, 32_767]),
+        ("uint32", "CDAB", (0xFFFF_FFFF,), [2**32 - 1, 2**31 - 1]),
+        ("uint64", "ABCD", (-1,), [2**64 - 1, 2**64 - 2]),  # TOML has no number so large
+        ("int64", "DCBA", (2**63 - 1,), [2**63 - 1, 2**63 - 2]),  # as floats the two are the same
+        ("float32", "CDAB", (-9999,), [-9999.0, -9998.5]),
+    ],
+)
+def test_a_mark_for_no_value_is_absent_and_its_neighbour_is_not(kind, order, marks, sent):
+    channel = register("x", 0, kind, order, scale=0.5, offset=3.0, no_value=marks)
+    beside = register("y", 4, "int16")
+    record = RegisterRecord((channel, beside), (RegisterRun(0, 5),))
+    rows = []
+    for value in sent:
+        raw = reordered(struct.pack(f">{FORMATS[kind]}", value), order)
+        rows.append(raw.ljust(8, b"\0") + b"\x7f\xff")
+    samples = record.decode(np.frombuffer(b"".join(rows), np.uint8).reshape(len(sent), -1))
+    assert np.isnan(samples[:, 0]).tolist() == [True, False]
+    assert samples[:, 1].tolist() == [32_767.0, 32_767.0]
+
+
+def test_a_mark_in_bits_of_a_register_is_that_of_the_bits():
+    part = register("part", 0, "uint16", bits=(4, 8), no_value=(0xFF,))
+    record = RegisterRecord((part,), (RegisterRun(0, 1),))
+    samples = record.decode(np.frombuffer(b"\x0f\xf0\x0f\xe0", np.uint8).reshape(2, 2))
+    assert np.isnan(samples[:, 0]).tolist() == [True, False]
+
+
+def test_no_value_is_encoded_by_the_first_mark():
+    record = RegisterRecord(
+        (register("x", 0, "int16", scale=0.1, no_value=(0x8000, 0x7FFF)),), (RegisterRun(0, 1),)
+    )
+    assert record.encode(np.array([[np.nan]])).tobytes() == b"\x80\x00"
+
+
 def test_parts_of_one_register_are_put_together():
     fields = (
         register("low", 0, "uint16", bits=(0, 4)),

@@ -141,7 +141,7 @@ def test_registers_are_shown_and_what_it_proposes_passes_check(
     assert "Unit 1, holding registers (function 3): 7 at 0-3, 40-41, 107" in shown.out
     assert "Unit 1, input registers (function 4): none" in shown.out
     rows = {line.split()[0]: line for line in shown.out.splitlines() if line[:3].strip().isdecimal()}
-    assert rows["1"].split() == ["1", "ffff", "65535", "-1"]
+    assert rows["1"].split() == ["1", "ffff", "65535", "-1", "no", "value?"]
     assert "yes" in rows["41"]
     assert "float32 ABCD 23." in rows["40"]
     assert "*float32 ABCD 23." in everything
@@ -420,6 +420,8 @@ def test_new_proposes_the_registers_that_it_finds(tmp_path: Path, capsys: pytest
     assert "as float32 ABCD, moves" in said
     layout = tables["streams"]["device"]["layout"]
     assert (layout["unit"], layout["table"]) == (3, "holding")
+    assert "  1: -1, no value?" in said
+    assert [one.get("no_value") for one in layout["channels"]] == [None, 0xFFFF, None, None, None]
     assert [(one["name"], one["address"], one["type"]) for one in layout["channels"]] == [
         ("r0", 0, "uint16"),
         ("r1", 1, "int16"),
