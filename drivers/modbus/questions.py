@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from drivers import questions as q
 from drivers.bus_questions import BUS, BusQuestions, Heard, only_port
-from drivers.modbus.sniff import ModbusSniffer
+from drivers.modbus.sniff import ModbusSniffer, units_of
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
 from drivers.sniffing import WAVEFORM_HZ, NothingFoundError, SniffError, sniffed
 from drivers.toml_lines import Hexadecimal, array, entry
@@ -31,8 +31,9 @@ _COUNT_BITS = {"16": "", "32": ""}
 ADDRESSES = 65_536
 _READ_REGISTERS, _FIFO_REGISTERS = 125, 31
 """Of one reply."""
-_UNITS = ("1-10", "11-247")
+_UNITS, _WHOLE = ("1-10", "11-247"), "1-247"
 """Most devices have one of the first addresses; to ask for all takes a minute."""
+_AUTO = "auto"
 _TABLES = {3: "holding", 4: "input"}
 _SHOWN = 12
 
@@ -41,6 +42,10 @@ class _ModbusQuestions(BusQuestions):
     """Registers of a unit."""
 
     topics: ClassVar[Mapping[str, Topic]] = {
+        "units": Topic(
+            "Which units does --listen look for?",
+            "auto: 1-10, and 11-247 if none of those answers. Else addresses, e.g. 1-247 or 5,17.",
+        ),
         "unit": Topic(
             "Address of the unit (slave id)", "1 to 247; set in the device, by switches or software."
         ),
@@ -85,13 +90,16 @@ class _ModbusQuestions(BusQuestions):
         """See `BusQuestions.listen`: units are asked for their registers, and nothing is written."""
         del folder
         words = self._sniffed_as(answers)
+        chosen: str = answers["units"]
         try:
-            found = sniffed(ModbusSniffer(), ["--units", _UNITS[0], *words], stop, tell)
+            first = _UNITS[0] if chosen == _AUTO else chosen
+            found = sniffed(ModbusSniffer(), ["--units", first, *words], stop, tell)
         except NothingFoundError as error:
             if error.figures.get("units"):
                 return _without_registers(error.figures)
-            if stop.is_set():
+            if stop.is_set() or chosen != _AUTO:
                 raise
+            tell(f"none of units {_UNITS[0]} answers: {_UNITS[1]} are asked, too; Ctrl-C ends that")
             try:
                 found = sniffed(ModbusSniffer(), ["--units", _UNITS[1], *words], stop, tell)
             except NothingFoundError as other:
@@ -100,7 +108,14 @@ class _ModbusQuestions(BusQuestions):
                 raise
         except SniffError as error:
             raise SniffError(f"{error}".replace("TARGET", "its address")) from error
-        return Heard(list(_in_words(found)), lambda so_far: self._proposals(found, so_far))
+        lines = list(_in_words(found))
+        if chosen == _AUTO and found["units_asked"][0] == int(_UNITS[0].partition("-")[0]):
+            lines.append(f"units {_UNITS[1]} were not asked: daqsvc new --listen --units {_WHOLE} asks all")
+        return Heard(lines, lambda so_far: self._proposals(found, so_far))
+
+    def _ask_units(self) -> Question:
+        """Which units are to be found; only an option says so."""
+        return self.ask("units", _units, _AUTO, quiet=True)
 
     def _sniffed_as(self, answers: Answers) -> Sequence[str]:
         """Arguments of the sniffer that say where the units are."""
@@ -346,6 +361,7 @@ class TcpQuestions(_ModbusQuestions):
 
     def _line(self, answers: Answers) -> Iterator[Question]:
         yield self.ask("host", q.line)
+        yield self._ask_units()
         yield self.ask("tcp-port", q.whole, _host_and_port(answers["host"])[1], quiet=True)
 
     def _sniffed_as(self, answers: Answers) -> Sequence[str]:
@@ -373,6 +389,7 @@ class RtuQuestions(_ModbusQuestions):
         del answers
         yield self.ask("port", q.line, only_port())
         yield self.ask("baud", q.bit_rate, "19200")
+        yield self._ask_units()
         yield self.choose("parity", dict.fromkeys(("none", "even", "odd"), ""), "even")
 
     def _sniffed_as(self, answers: Answers) -> Sequence[str]:
@@ -415,6 +432,16 @@ def _unit(channel: str) -> str:
         return "count"
     found = (unit for word, unit in _UNIT_OF.items() if word in channel.lower())
     return next(found, "mm/s")
+
+
+def _units(text: str) -> str:
+    """Addresses of units as the sniffer takes them, or `_AUTO`."""
+    try:
+        if text != _AUTO:
+            units_of(text)
+    except SniffError as error:
+        raise ValueError(f"{error}") from None
+    return text
 
 
 def _width(raw_type: str) -> int:

@@ -100,7 +100,7 @@ class ModbusSniffer(Sniffer):
         from drivers.modbus.scan import Scan, units_in_words  # noqa: PLC0415
         from drivers.modbus.scan_report import ScanReport  # noqa: PLC0415
 
-        units = _units(arguments.units)
+        units = units_of(arguments.units)
         begin, end, note = _registers(arguments.registers or REGISTERS)
         if not 0 <= arguments.pause_ms <= 10_000:
             raise SniffError(f"--pause-ms {arguments.pause_ms:g}: give 0 to 10000 ms", usage=True)
@@ -157,7 +157,7 @@ def _registers(text: str) -> tuple[int, int, str]:
     raise SniffError(note or _no_range("--registers", text, _LAST_REGISTER), usage=True)
 
 
-def _units(text: str) -> list[int]:
+def units_of(text: str) -> list[int]:
     """Addresses of ``A-B``, ``A``, or several of them with commas between.
 
     Raises:

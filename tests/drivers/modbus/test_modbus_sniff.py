@@ -443,7 +443,30 @@ def test_new_asks_the_other_units_where_none_of_the_first_answers(
     monkeypatch.setattr(questions, "_UNITS", ("1-2", "3-4"))
     with tcp({4: pump()}) as target:
         assert new(tmp_path, target)["streams"]["device"]["layout"]["unit"] == 4
-    assert "units that answer: 4" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "none of units 1-2 answers: 3-4 are asked, too; Ctrl-C ends that" in said
+    assert "units that answer: 4" in said
+    assert "not asked" not in said
+
+
+@pytest.mark.usefixtures("_few_registers")
+def test_new_says_which_units_it_did_not_ask_and_asks_them_if_told_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(questions, "_UNITS", ("1-2", "3-4"))
+    with tcp({2: pump(), 4: pump()}) as target:
+        assert new(tmp_path, target)["streams"]["device"]["layout"]["unit"] == 2
+        said = capsys.readouterr().out
+        new(tmp_path, target, "--units=1-4")
+        more = capsys.readouterr().out
+        assert (
+            main(["new", f"{tmp_path / 'n.toml'}", "--yes", "--bus=modbus-tcp", "--host=h", "--units=a"]) == 2
+        )
+    assert "units that answer: 2 (units 1 to 2 were asked)" in said
+    assert "units 3-4 were not asked: daqsvc new --listen --units 1-247 asks all" in said
+    assert "units that answer: 2, 4" in more
+    assert "not asked" not in more
+    assert "write FIRST-LAST" in capsys.readouterr().err
 
 
 class InputOnly(ModbusUnit):
