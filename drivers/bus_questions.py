@@ -131,8 +131,7 @@ class BusQuestions(ABC):
     def guess(self, answers: Answers, channel: str) -> tuple[str, str | None]:
         """Type and, where it is known, unit of the sensor on a channel."""
         waveform = answers["rate"] >= WAVEFORM_HZ
-        unit = "degC" if "temp" in channel.lower() else None
-        return by_name(channel) or ("accelerometer" if waveform else "trend"), unit
+        return by_name(channel) or ("accelerometer" if waveform else "trend"), unit_by_name(channel)
 
     def in_volts(self, answers: Answers) -> bool:
         """Whether the samples of a sensor are volts, as a rule."""
@@ -185,6 +184,24 @@ def by_name(channel: str) -> str | None:
     if any(part in low for part in ("temp", "press", "speed", "rpm", "rms")):
         return "trend"
     return None
+
+
+_UNIT_OF = {
+    "temp": "degC",
+    "speed": "rpm",
+    "rpm": "rpm",
+    "curr": "A",
+    "volt": "V",
+    "press": "bar",
+    "vib": "mm/s",
+    "veloc": "mm/s",
+}
+"""Unit by what is in a name; what comes first counts."""
+
+
+def unit_by_name(channel: str) -> str | None:
+    """The unit that the name of a channel suggests; None if it suggests none."""
+    return next((unit for word, unit in _UNIT_OF.items() if word in channel.lower()), None)
 
 
 def is_count(name: str) -> bool:

@@ -8,7 +8,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from drivers import questions as q
-from drivers.bus_questions import BUS, BusQuestions, Heard, only_port
+from drivers.bus_questions import BUS, BusQuestions, Heard, only_port, unit_by_name
 from drivers.modbus.sniff import ModbusSniffer, units_of
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
 from drivers.sniffing import WAVEFORM_HZ, NothingFoundError, SniffError, sniffed
@@ -81,7 +81,10 @@ class _ModbusQuestions(BusQuestions):
             "Which raw value of {channel} means that the device has none?",
             "E.g. 0x7FFF where a sensor is broken or missing: see the register map. none if there is none.",
         ),
-        "scale": Topic("What is one count of {channel} worth?", "In the unit of the value, e.g. 0.01 mm/s."),
+        "scale": Topic(
+            "What is one count of {channel} worth?",
+            "In the unit of the value, e.g. 0.01 mm/s; see the register map. 1 takes the number as it is.",
+        ),
     }
 
     def listen(
@@ -114,7 +117,7 @@ class _ModbusQuestions(BusQuestions):
         return Heard(lines, lambda so_far: self._proposals(found, so_far))
 
     def _ask_units(self) -> Question:
-        """Which units are to be found; only an option says so."""
+        """Which units are to be found; only an option is asked for them."""
         return self.ask("units", _units, _AUTO, quiet=True)
 
     def _sniffed_as(self, answers: Answers) -> Sequence[str]:
@@ -235,7 +238,8 @@ class _ModbusQuestions(BusQuestions):
         wide = _width(answers[sensor_key(channel, "register-type")]) > 1
         yield self.ask_of(channel, "order", q.exactly(orders), "ABCD", choices=orders, quiet=not wide)
         is_float = answers[sensor_key(channel, "register-type")].startswith("float")
-        scale = "1" if is_float else {"degC": "0.1", "mm/s": "0.01"}.get(unit, "1")
+        # Of what the name does not tell, nothing is guessed.
+        scale = "1" if is_float else _USUAL_SCALES.get(unit_by_name(channel) or "", "1")
         yield self.ask_of(channel, "scale", q.number, scale)
         yield self.ask_of(channel, "no-value", q.whole_or_none, NONE, quiet=True)
 
@@ -420,18 +424,16 @@ def _host_and_port(text: str) -> tuple[str, str]:
     return (text, "502") if both is None else (both[1].strip("[]"), both[2])
 
 
+_USUAL_SCALES = {"degC": "0.1", "mm/s": "0.01"}
 _NAMED_BY_ADDRESS = re.compile(r"[a-z]+\d+", re.IGNORECASE)
 """Channels that are called like registers, as those found on the line: what they mean is not known."""
-_UNIT_OF = {"temp": "degC", "speed": "rpm", "rpm": "rpm", "curr": "A", "volt": "V", "press": "bar"}
-"""Unit by what a name begins with, or has behind a dash; any other name is that of a vibration."""
 
 
 def _unit(channel: str) -> str:
     """The unit that a value with this name has, as a rule."""
     if _NAMED_BY_ADDRESS.fullmatch(channel):
         return "count"
-    found = (unit for word, unit in _UNIT_OF.items() if word in channel.lower())
-    return next(found, "mm/s")
+    return unit_by_name(channel) or "mm/s"
 
 
 def _units(text: str) -> str:

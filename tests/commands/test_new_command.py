@@ -89,6 +89,8 @@ FREE = {
     "broker": st.sampled_from(["none", "mqtt://127.0.0.1:1883", "mqtts://broker.example:8883"]),
     "username": st.one_of(st.just("none"), WORDS),
     "password-file": WORDS,
+    "units": st.sampled_from(["auto", "1-247", "5,17", "0-300", "all"]),
+    "no-value": st.sampled_from(["none", "0x7FFF", "0xFFFF", "-1", "70000", "0xFFFFFFFF"]),
     "address": st.integers(0, 65_535).map(str),
     "sensitivity": st.sampled_from(["none", "7.87", "100", "4", "10.2"]),
     "angle": st.integers(-360, 360).map(str),
@@ -230,6 +232,35 @@ def test_the_first_line_names_the_schema_that_the_file_itself_says_how_to_make(t
     assert load_machine_file(Path("m.toml")).warnings == ()
 
 
+@pytest.mark.parametrize(
+    ("channel", "scale", "unit"),
+    [
+        ("vibration", 0.01, "mm/s"),
+        ("Velocity-x", 0.01, "mm/s"),
+        ("oil-temp", 0.1, "degC"),
+        ("level", 1.0, "mm/s"),
+        ("motor-speed", 1.0, "rpm"),
+        ("r17", 1.0, "count"),
+    ],
+)
+def test_the_worth_of_a_count_is_guessed_only_where_the_name_tells_it(channel, scale, unit):
+    given = {"host": "192.0.2.10", "bus": "modbus-tcp", "channels": channel}
+    answers = conduct(Path("m.toml"), Given(given | {"limits": "none"}, defaults=True), None, print)
+    assert (answers[f"sensor.{channel}.scale"], answers[f"sensor.{channel}.unit"]) == (scale, unit)
+
+
+def test_the_unit_that_a_name_suggests_is_the_same_on_every_bus(tmp_path):
+    for bus, words in (
+        ("modbus-tcp", {"host": "h"}),
+        ("serial", {"port": "/dev/ttyUSB0", "columns": "t, rpm"}),
+    ):
+        texts = words | {"bus": bus, "channels": "rpm", "rate": "1", "limits": "none"}
+        if bus == "serial":
+            del texts["channels"]
+        answers = conduct(tmp_path / "m.toml", Given(texts, defaults=True), None, print)
+        assert answers["sensor.rpm.unit"] == "rpm", bus
+
+
 def test_the_mark_for_no_value_of_a_register_is_an_option_and_a_hint_in_the_file(tmp_path, capsys):
     file = tmp_path / "m.toml"
     words = ["new", f"{file}", "--yes", "--overwrite", "--bus=modbus-tcp", "--host=192.0.2.10"]
@@ -259,7 +290,7 @@ def test_answers_of_a_file_are_those_of_the_options(tmp_path, capsys):
     assert machine.machine.speed_rpm == -1480.0
     layout = tomllib.loads(file.read_text(encoding="utf-8"))["streams"]["device"]["layout"]
     assert layout["unit"] == 4
-    assert [(one["address"], one["scale"]) for one in layout["channels"]] == [(17, 0.01), (32, 0.001)]
+    assert [(one["address"], one["scale"]) for one in layout["channels"]] == [(17, 1.0), (32, 0.001)]
     assert [alarm.alert for alarm in machine.alarms] == [7.1, 7.1]
     # A velocity that no machine has is not believed.
     assert [sensor.ok_between for sensor in machine.sensors] == [(-1.0, 100.0)] * 2
