@@ -18,7 +18,7 @@ import numpy as np
 from cobs import cobs
 
 from drivers.frames import DecodedBatch, LayoutError
-from drivers.serial.framing import DelimitedFraming, in_place
+from drivers.serial.framing import SHOWN_BYTES, DelimitedFraming, NoFrame, in_place
 from drivers.serial.kernels import CRC_BYTES, SyncSearch, crcs_match, gather, hunt, scaled, unstuff
 
 if TYPE_CHECKING:
@@ -231,10 +231,11 @@ class CobsFraming(_BinaryFraming, DelimitedFraming):
 class SyncFraming(_BinaryFraming):
     """Bodies of fixed length, each behind a sync word, with nothing between them.
 
-    The sync word may turn up inside a frame or in garbage, so a frame counts only if its CRC matches, or,
-    where there is none, once the next sync word stands right behind it. After garbage every sync word is
-    tried in turn: one that was none delays what follows by a frame at most, and costs nothing. What is
-    in the place of a frame, behind a sync word, and is none, is a corrupt frame.
+    The sync word may turn up inside a frame or in garbage, so a frame counts only if its CRC matches. Where
+    there is none, it counts once the next sync word stands right behind it, or behind as many stray bytes as
+    the frame after it has. After garbage every sync word is tried in turn: one that was none delays what
+    follows by a frame at most, and costs nothing. What is in the place of a frame, behind a sync word, and is
+    none, is a corrupt frame.
 
     Args:
         codec: what the bodies are.
@@ -245,6 +246,7 @@ class SyncFraming(_BinaryFraming):
         if not sync:
             raise LayoutError("the sync word is empty; give the bytes that each frame begins with")
         super().__init__(codec)
+        self._told = False
         self._sync = np.frombuffer(sync, np.uint8).copy()
         self.restart()
 
@@ -265,16 +267,45 @@ class SyncFraming(_BinaryFraming):
         """See `Framing.cut`."""
         kept = len(self._rest)
         buffer = np.concatenate([self._rest, np.frombuffer(data, np.uint8)])
+        before = self._step
         hunted = self._codec.hunt(buffer, self._sync, self._step)
         batch = DecodedBatch()
         batch.note("bytes_garbage", hunted.garbage_bytes)
         batch.note("frames_malformed", hunted.malformed)
         batch.note("resyncs", hunted.resyncs)
-        placed, tried, *state = hunted.step
-        start = min(placed, tried)
-        self._rest, self._step = buffer[start:].copy(), SyncSearch(placed - start, tried - start, *state)
+        if hunted.malformed and not self._told:
+            batch.malformed, batch.remedy = self._between_frames(buffer, hunted, before)
+            self._told = True
+        step = hunted.step
+        start = min(step.taken, step.tried)
+        self._rest = buffer[start:].copy()
+        self._step = step._replace(taken=step.taken - start, tried=step.tried - start)
         if len(hunted.ends):
             lengths = hunted.ends - hunted.starts
             arrival_ns = arrivals_of(hunted.ends - kept)
             self._codec.sort(Bodies(buffer, hunted.starts, lengths, hunted.intact, arrival_ns), batch)
         return batch
+
+    def _between_frames(self, buffer: NDArray[np.uint8], hunted: Hunted, before: SyncSearch) -> NoFrame:
+        """What stands between two whole frames, if anything does: devices may end their frames by it.
+
+        Args:
+            buffer: the bytes.
+            hunted: what was found in them.
+            before: where the hunt stood.
+        """
+        begins, ends = hunted.starts - len(self._sync), hunted.ends
+        whole = hunted.intact
+        if not (before.fresh or before.astray):
+            ends, whole = np.append(before.taken, ends), np.append(True, whole)
+            begins = np.append(0, begins)
+        gaps = begins[1:] - ends[:-1]
+        few = np.flatnonzero(whole[1:] & whole[:-1] & (gaps > 0) & (gaps <= SHOWN_BYTES))
+        if not len(few):
+            return NoFrame("")
+        count, begin = int(gaps[few[0]]), int(ends[few[0]])
+        shown = buffer[begin : begin + count].tobytes().hex(" ")
+        return NoFrame(
+            f"the first stand between two whole frames, {count} byte{'s' * (count > 1)}: {shown}",
+            "the device sends them behind each frame, and no frame is lost by them",
+        )

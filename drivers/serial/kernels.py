@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     Places = NDArray[np.int64]
 
 CRC_BYTES = 2
+NONE, UNKNOWN = -1, -2
+MOST_STRAY = 4
+"""Bytes that a device may send behind each frame without a CRC: a line end, or an unknown checksum."""
 AT_ONCE = 8
 """Bytes that one step of the CRC takes."""
 
@@ -171,12 +174,14 @@ class SyncSearch(NamedTuple):
         tried: where the next sync word may begin.
         fresh: whether no frame has been found yet.
         astray: whether the last thing seen was no frame.
+        stray: bytes that the device sends behind each frame without a CRC, before the next sync word.
     """
 
     taken: int = 0
     tried: int = 0
     fresh: bool = True
     astray: bool = False
+    stray: int = 0
 
 
 class Hunted(NamedTuple):
@@ -213,6 +218,41 @@ def _stands_at(buffer: Bytes, word: Bytes, at: int) -> bool:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _stray_behind(buffer: Bytes, word: Bytes, lengths: Places, end: int, known: int) -> int:
+    """How many stray bytes are behind a frame without a CRC, before the next sync word.
+
+    A byte that was put into one frame is told from them by the next frame: it has none.
+
+    Args:
+        buffer: uint8.
+        word: uint8, the sync word.
+        lengths: see `hunt`.
+        end: of the frame; a sync word is the least that the buffer has behind it.
+        known: how many have been found before; 0 if none.
+
+    Returns:
+        0 if the sync word is right behind it; `NONE` if none is there, `UNKNOWN` before more bytes have come.
+    """
+    if _stands_at(buffer, word, end):
+        return 0
+    if end + MOST_STRAY + len(word) > len(buffer):
+        return UNKNOWN
+    if known and _stands_at(buffer, word, end + known):
+        return known
+    for count in range(1, MOST_STRAY + 1):
+        start = end + count + len(word)
+        length = lengths[buffer[start]] if start < len(buffer) else 0
+        if length < 0 or not _stands_at(buffer, word, end + count):
+            continue
+        following = start + length
+        if following + count + len(word) > len(buffer):
+            return UNKNOWN
+        if _stands_at(buffer, word, following + count) and not _stands_at(buffer, word, following):
+            return count
+    return NONE
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def hunt(
     buffer: Bytes,
     word: Bytes,
@@ -225,8 +265,9 @@ def hunt(
     """Find the frames behind sync words.
 
     A frame counts if its CRC matches, or, where there is none, once the next sync word stands right behind
-    it. Every sync word is tried in turn. One with no frame behind it, in the place where a frame is due, is a
-    corrupt frame, and may have a good one inside, if bytes are missing.
+    it, or behind as many stray bytes as the frame after it has. Every sync word is tried in turn. One with no
+    frame behind it, in the place where a frame is due, is a corrupt frame, and may have a good one inside,
+    if bytes are missing.
 
     Args:
         buffer: uint8.
@@ -237,7 +278,7 @@ def hunt(
         swap: whether its low byte comes first.
         step: where the last hunt stood, in places of this buffer.
     """
-    taken, at, fresh, astray = step
+    taken, at, fresh, astray, stray = step
     resume = at
     garbage_bytes = malformed = resyncs = 0
     follows = len(word) if initial < 0 else 0
@@ -257,7 +298,11 @@ def hunt(
         if end + follows > len(buffer):
             break
         if initial < 0:
-            good = _stands_at(buffer, word, end)
+            behind = _stray_behind(buffer, word, lengths, end, stray)
+            if behind == UNKNOWN:
+                break
+            good = behind >= 0
+            stray = behind if behind > 0 else stray
         else:
             good = _matches(buffer, start, length, initial, swap)
         due = at == taken and not fresh and not astray
@@ -287,7 +332,7 @@ def hunt(
         bodies[0],
         bodies[1],
         bodies[2],
-        SyncSearch(taken, at, fresh, astray),
+        SyncSearch(taken, at, fresh, astray, stray),
         garbage_bytes,
         malformed,
         resyncs,

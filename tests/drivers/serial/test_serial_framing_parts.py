@@ -105,6 +105,34 @@ def test_a_frame_with_a_bad_crc_is_handed_on_as_corrupt():
     assert (found.notes["bytes_garbage"], found.notes["resyncs"]) == (0, 0)
 
 
+@pytest.mark.parametrize("crc", ["ibm-3740", "none"])
+@pytest.mark.parametrize("stray", [b"\0", b"\r\n", b"\xaa"])
+@pytest.mark.parametrize("chunk", [1, 7, 1000])
+def test_bytes_behind_every_frame_cost_no_frame_and_are_told_once(crc, stray, chunk):
+    framing = SyncFraming(BodyCodec({"a": layout()}, crc=crc), b"\xaa\x55")
+    frames = framing.encode("a", np.arange(20) * 3, np.full((20, 3, 1), 5.0))
+    data = b"".join(frame + stray for frame in frames)
+    batches = [framing.cut(data[at : at + chunk]) for at in range(0, len(data), chunk)]
+    counted = [batch.frames["a"] for batch in batches if batch.frames]
+    assert all(found.intact.all() for found in counted)
+    counters = np.concatenate([found.counter for found in counted]).tolist()
+    # Without a CRC the last frame waits for the sync word of the next one.
+    assert counters == list(range(0, 60, 3))[: 20 if crc != "none" else 19]
+    assert sum(batch.notes["bytes_garbage"] for batch in batches) == (len(counters) - 1) * len(stray)
+    (told,) = [batch for batch in batches if batch.malformed]
+    many = "1 byte" if len(stray) == 1 else "2 bytes"
+    assert told.malformed == f"the first stand between two whole frames, {many}: {stray.hex(' ')}"
+    assert "no frame is lost" in told.remedy
+
+
+def test_a_byte_put_into_one_frame_without_a_crc_still_spoils_it():
+    framing = SyncFraming(BodyCodec({"a": layout()}, crc="none"), b"\xaa\x55")
+    frames = framing.encode("a", np.arange(5) * 3, np.full((5, 3, 1), 5.0))
+    frames[1] = frames[1][:4] + b"\x07" + frames[1][4:]
+    found = framing.cut(b"".join(frames)).frames["a"]
+    assert found.counter[found.intact].tolist() == [0, 6, 9]
+
+
 def test_without_a_crc_a_sync_word_must_follow():
     framing = SyncFraming(BodyCodec({"a": layout()}, crc="none"), b"\xaa\x55")
     frames = framing.encode("a", np.arange(4) * 3, np.full((4, 3, 1), 5.0))

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.serial.kernels import SyncSearch, hunt
+from drivers.serial.kernels import MOST_STRAY, SyncSearch, hunt
 
 pytestmark = pytest.mark.property
 WORD = b"\xa5\x5a"
@@ -20,7 +20,7 @@ def by_search(
     buffer: bytes, step: SyncSearch, *, checked: bool
 ) -> tuple[list[tuple[int, int, bool]], SyncSearch, list[int]]:
     """Bodies as (start, end, intact); where the hunt stands then; garbage, malformed and resyncs."""
-    taken, at, fresh, astray = step
+    taken, at, fresh, astray, stray = step
     resume, bodies, counts = at, [], [0, 0, 0]
     follows = b"" if checked else WORD
     longest = len(WORD) + max(LENGTHS.values())
@@ -45,6 +45,11 @@ def by_search(
             break
         body = buffer[start:end]
         good = buffer.startswith(follows, end) and not (checked and binascii.crc_hqx(body, 0xFFFF))
+        if not checked and not good:
+            count = stray_behind(buffer, end, stray)
+            if count is None:
+                break
+            good, stray = count > 0, count or stray
         if good:
             if at > taken:
                 garbage(at - taken)
@@ -60,7 +65,29 @@ def by_search(
     if at - taken > 2 * longest:
         garbage(at - taken)
         taken = at
-    return bodies, SyncSearch(taken, at, fresh, astray), counts
+    return bodies, SyncSearch(taken, at, fresh, astray, stray), counts
+
+
+def stray_behind(buffer: bytes, end: int, known: int) -> int | None:
+    """Bytes behind a frame that the next one has, too, before its sync word; None: not known yet."""
+    if end + len(WORD) + MOST_STRAY > len(buffer):
+        return None
+    if known and buffer.startswith(WORD, end + known):
+        return known
+    for count in range(1, MOST_STRAY + 1):
+        start = end + count + len(WORD)
+        if not buffer.startswith(WORD, end + count):
+            continue
+        if start >= len(buffer):
+            return None
+        if buffer[start] not in LENGTHS:
+            continue
+        following = start + LENGTHS[buffer[start]]
+        if following + count + len(WORD) > len(buffer):
+            return None
+        if buffer.startswith(WORD, following + count) and not buffer.startswith(WORD, following):
+            return count
+    return 0
 
 
 def compiled(
@@ -93,6 +120,9 @@ FRAMES = st.builds(
 )
 PIECES = st.one_of(
     FRAMES,
+    st.tuples(st.lists(FRAMES, max_size=5), st.sampled_from([b"\0", b"\r\n", b"\xa5"])).map(
+        lambda t: b"".join(frame + t[1] for frame in t[0])
+    ),
     st.tuples(FRAMES, st.integers(0, 12), st.integers(0, 255)).map(
         lambda t: t[0][: t[1]] + bytes([t[2]]) + t[0][t[1] + 1 :]
     ),
