@@ -18,6 +18,22 @@ def readable(value: float, digits: int = 4) -> str:
     return f"{float(f'{value:.{digits}g}'):.12g}"
 
 
+def with_unit(value: float, unit: str, digits: int = 4) -> str:
+    """A measured value and its unit; of a plain number, whose unit is ``"1"``, the value alone.
+
+    Args:
+        value: anything, finite or not.
+        unit: as machine files write it; empty if there is none.
+        digits: significant ones, from 1.
+    """
+    return f"{readable(value, digits)}{unit_behind(unit)}"
+
+
+def unit_behind(unit: str) -> str:
+    """What stands behind a value of this unit: a space and the unit, or nothing."""
+    return f" {unit}" if unit not in {"", "1"} else ""
+
+
 def rounded_up(value: float, digits: int = 3) -> str:
     """The least figure of so many digits that is no less: for "or more".
 

@@ -12,7 +12,7 @@ from daqsvc.alarms.setpoints import SetpointMonitor
 from daqsvc.alarms.states import Level
 from daqsvc.errors.alarms import CANNOT_JUDGE
 from daqsvc.errors.code import coded
-from daqsvc.rounding import readable
+from daqsvc.rounding import readable, unit_behind, with_unit
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -360,7 +360,7 @@ class MeasureWatch:
             sensor: name of the sensor.
             value: as `find` gives it.
         """
-        unit = f" {diagnosis.units[self._measure]}" if self._measure in diagnosis.units else ""
+        unit = unit_behind(diagnosis.units.get(self._measure, ""))
         limit = self.monitor.reached(value)
         measured = f"{self._measure} of {sensor} is {readable(value)}{unit}"
         if self._measure in diagnosis.bounds:
@@ -502,9 +502,9 @@ def _figures(diagnosis: Diagnosis) -> Iterator[str]:
     limited = [name for name, limit in limits.items() if limit is not None]
     for name in (limited or list(limits))[:MOST_FIGURES]:
         unit, limit = diagnosis.units.get(name, ""), limits[name]
-        yield f"{name} is {readable(diagnosis.statistics[name])} {unit}".rstrip()
+        yield f"{name} is {with_unit(diagnosis.statistics[name], unit)}"
         if limit is not None:
-            yield f"{level} limit {readable(limit)} {unit}".rstrip()
+            yield f"{level} limit {with_unit(limit, unit)}"
 
 
 def _identity(decision: str, group: tuple[str, ...]) -> str:

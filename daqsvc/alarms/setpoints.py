@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from daqsvc.alarms.states import Level
 from daqsvc.dsp.phase import deviation_deg
-from daqsvc.rounding import readable
+from daqsvc.rounding import with_unit
 
 
 class Limit(NamedTuple):
@@ -105,9 +105,7 @@ class Setpoint:
     def in_words(self, unit: str) -> str:
         """All limits for a person, e.g. ``"alert 15 um and danger 25 um"``."""
         upwards = sorted(self.limits, key=lambda limit: limit.at)
-        words = [
-            f"{'lower ' * one.lower}{one.level.label} {readable(one.at)} {unit}".rstrip() for one in upwards
-        ]
+        words = [f"{'lower ' * one.lower}{one.level.label} {with_unit(one.at, unit)}" for one in upwards]
         said = " and ".join([", ".join(words[:-1]), words[-1]] if words[1:] else words)
         return said if self.reference_deg is None else f"{said} from {self.reference_deg:g} {unit}".rstrip()
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.commands.tables import ago, aligned, harmless, local_time, wrapped
+from daqsvc.rounding import with_unit
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -205,7 +206,7 @@ def _lost(stream: Document) -> str:
 
 
 def _figure(value: float | None, unit: str, digits: int = 4) -> str:
-    return "-" if value is None else f"{value:.{digits}g} {unit}".rstrip()
+    return "-" if value is None else with_unit(value, unit, digits)
 
 
 def _age(age_s: float | None) -> str:

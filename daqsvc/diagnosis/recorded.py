@@ -16,7 +16,7 @@ from daqsvc.diagnosis.statements import said_of_window
 from daqsvc.dsp.quality.unit import UM_PER_UNIT
 from daqsvc.errors.code import with_code
 from daqsvc.errors.recordings import NOT_JUDGED
-from daqsvc.rounding import readable
+from daqsvc.rounding import with_unit
 from daqsvc.settings.failures import one_line
 from daqsvc.settings.hooks import Hooks, contract, may_raise
 from daqsvc.settings.models import ProximityProbe
@@ -379,7 +379,7 @@ class Statements:
             return f"{self.detector}: the recording is too short for it"
         doubt = f" (data {last.quality}: {last.reason})" if last.quality != "good" else ""
         figures = ", ".join(
-            f"{name} {readable(value)} {last.units.get(name, '')}".rstrip()
+            f"{name} {with_unit(value, last.units.get(name, ''))}"
             for name, value in last.statistics.items()
             if not name.startswith("paper.")
         )

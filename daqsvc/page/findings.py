@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from daqsvc.dsp.phase import deviation_deg
 from daqsvc.page.text import level_mark, row, time_mark
 from daqsvc.page.views.modes import in_words
-from daqsvc.rounding import readable
+from daqsvc.rounding import with_unit
 
 if TYPE_CHECKING:
     from daqsvc.page.machine_live import MachineLive
@@ -158,7 +158,7 @@ def _evidence(statement: Document, group: set[str]) -> str:
             unit = statement["units"].get(measure, "")
             off = "" if reference is None else " off its reference"
             beyond.append(
-                f"{measure} is {readable(value)} {unit}{off}, {which} limit {readable(limit)} {unit}".rstrip()
+                f"{measure} is {with_unit(value, unit)}{off}, {which} limit {with_unit(limit, unit)}"
             )
     return ", ".join(beyond)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from daqsvc.dsp.phase import deviation_deg
 from daqsvc.page.text import level_mark, row, time_mark
-from daqsvc.rounding import readable
+from daqsvc.rounding import readable, with_unit
 
 if TYPE_CHECKING:
     from daqsvc.page.machine_live import MachineLive
@@ -70,7 +70,5 @@ def _values(statement: Document) -> list[str]:
         begins = [at for which in ZONES if (at := thresholds.get(f"{name}.{which}")) is not None]
         if len(begins) == len(ZONES):
             known.insert(0, f"zone {'ABCD'[bisect_right(begins, value)]} of ISO 20816-3")
-        texts.append(
-            f"{name} {readable(value)} {unit}".rstrip() + (f" ({', '.join(known)})" if known else "")
-        )
+        texts.append(f"{name} {with_unit(value, unit)}" + (f" ({', '.join(known)})" if known else ""))
     return texts

@@ -8,7 +8,7 @@ from urllib.parse import quote
 
 from daqsvc.acquisition.clock import NS_PER_S, iso_utc
 from daqsvc.page.views.modes import in_words
-from daqsvc.rounding import readable
+from daqsvc.rounding import with_unit
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -183,7 +183,7 @@ def machine_rows(live: MachineLive) -> str:
     rows = []
     for one in sorted([*live.latest.values()], key=lambda said: str(said["detector"])):
         figures = ", ".join(
-            f"{name} {readable(value)} {one['units'].get(name, '')}".rstrip()
+            f"{name} {with_unit(value, one['units'].get(name, ''))}"
             for name, value in one["statistics"].items()
             if value is not None and "." not in name
         )

@@ -115,6 +115,8 @@ class ScanReport:
             yield f"A gateway reports that no unit answers behind it at {many}."
         if self._note and any(table.first for table in scan.tables):
             yield f"{self._note[0].upper()}{self._note[1:]}."
+        if self._all_orders:
+            yield "* marks the readings that look like quantities; without --all-orders only these are shown."
         for table, numbers in self._tables:
             yield from self._table(table, numbers)
 
@@ -318,7 +320,9 @@ def _runs(addresses: Iterable[int]) -> str:
 
 def _words(one: Reading, *, mark: bool) -> str:
     star = "*" if mark and one.plausible else ""
-    return f"{star}{one.type} {one.order} {one.value:.6g}"
+    # A whole number is compared with the display of the device, digit by digit.
+    value = f"{one.value:.6g}" if one.type.startswith("float") else f"{one.value:.0f}"
+    return f"{star}{one.type} {one.order} {value}"
 
 
 def _signed(raw: int) -> int:

@@ -375,7 +375,10 @@ class _Report(NamedTuple):
         counter, time_column = _counter(what), self._time(what)
         rows = []
         for one in what.columns:
-            limits = (f"{one.least:g}", f"{one.most:g}") if one.numeric else ("", "")
+            # As the device writes them, and as the last one is shown.
+            limits = [
+                f"{end:g}".replace(".", what.decimal) if one.numeric else "" for end in (one.least, one.most)
+            ]
             use = "counts" if one is counter else "time" if one is time_column else ""
             rows.append((one.name, "number" if one.numeric else "text", *limits, one.last[:24], use))
         yield SniffTable(("column", "kind", "min", "max", "last", ""), rows)
@@ -567,8 +570,10 @@ class _Report(NamedTuple):
         yield ""
         yield "[streams.frames.layout]    # what is behind the counter is a guess: see the device's manual"
         yield f"payload_length = {payload}"
-        if counter.order == "big":
-            yield 'byte_order = "big"'
+        known = f"as the counter has; {'little' if counter.order == 'big' else 'big'} if the values jump"
+        if counter.bits == 8:
+            known = "a guess; big if the values jump"
+        yield f'byte_order = "{counter.order}"    # {known}'
         counts = "frames" if counter.step == 1 else "samples"
         yield f'counter = {{ byte = {counter.byte}, bits = {packed.counter_bits}, counts = "{counts}" }}'
         yield f"first_byte = {counter.byte + packed.counter_bits // 8}"

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from support.machine_files import LAVAL, MACHINES, changed
 from support.paths import ROOT
 
-from daqsvc.rounding import readable, rounded_down, rounded_up
+from daqsvc.rounding import readable, rounded_down, rounded_up, with_unit
 from daqsvc.settings import MachineFileError, parse_machine_file
 
 if TYPE_CHECKING:
@@ -94,3 +94,8 @@ def test_the_figure_that_a_remedy_states_is_accepted(path, key, speed_rpm, setti
 )
 def test_measured_values_are_written_as_people_read_them(value: float, text: str) -> None:
     assert readable(value) == text
+
+
+@pytest.mark.parametrize(("unit", "text"), [("rpm", "65540 rpm"), ("1", "65540"), ("", "65540")])
+def test_a_plain_number_has_no_unit_behind_it(unit: str, text: str) -> None:
+    assert with_unit(65535.0, unit) == text

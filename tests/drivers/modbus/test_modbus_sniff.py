@@ -145,6 +145,8 @@ def test_registers_are_shown_and_what_it_proposes_passes_check(
     assert "yes" in rows["41"]
     assert "float32 ABCD 23." in rows["40"]
     assert "*float32 ABCD 23." in everything
+    assert "* marks the readings that look like quantities" in everything
+    assert f"uint32 ABCD {65_535 * 65_536 + 300}" in everything
     assert "float32 DCBA" in everything
     machine = tmp_path / "machine.toml"
     machine.write_text(BEGIN + fragment.replace("127.0.0.1", "192.0.2.10"))

@@ -126,6 +126,8 @@ def test_decimal_commas_are_told_and_can_be_read(
         found = figures(cable, capsys)
         new_layout = new(cable, tmp_path / "new.toml")["streams"]["device"]["layout"]
     assert '3 columns; separated by ";"; numbers have a decimal comma' in said
+    (row,) = [text.split() for text in said.splitlines() if text.startswith("c3")]
+    assert row == ["c3", "number", "-1,5", "-1,5", "-1,5"]
     [stream] = check(tmp_path, found["machine_file"], capsys)["streams"].values()
     for layout in (stream["layout"], new_layout):
         assert (layout["separator"], layout["decimal"]) == (";", ",")
@@ -293,6 +295,7 @@ def test_what_it_proposes_for_frames_passes_check(
     assert stream["layout"]["payload_length"] == 8
     assert stream["layout"]["counter"]["byte"] == 0
     assert stream["layout"]["counter"]["counts"] == "frames"
+    assert stream["layout"]["byte_order"] in {"big", "little"}
 
 
 def test_a_silent_port_and_noise_are_failures_that_say_what_to_check(
