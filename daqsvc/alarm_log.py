@@ -10,8 +10,7 @@ import logging
 from typing import TYPE_CHECKING
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.alarms.codes import code_of_alarm
-from daqsvc.alarms.events import EventKind
+from daqsvc.alarms.codes import EASES, code_of_alarm
 from daqsvc.alarms.states import Level
 from daqsvc.errors.alarms import ALARM_STANDS
 from daqsvc.errors.code import coded
@@ -27,19 +26,6 @@ logger = logging.getLogger(__name__)
 LINES = 100
 LINE_EVERY_NS = NS_PER_S // 5
 """Events that are logged one by one; one more is allowed each time this period passes."""
-
-
-_EASES = frozenset(
-    {
-        EventKind.ACKNOWLEDGED,
-        EventKind.BYPASSED,
-        EventKind.LOWERED,
-        EventKind.QUIET,
-        EventKind.RESET,
-        EventKind.SHELVED,
-    }
-)
-"""Events that call for nobody although the condition stands: a person has seen to it, or it is less bad."""
 
 
 class AlarmLog:
@@ -92,4 +78,4 @@ def _level(event: AlarmEvent) -> int:
     """Of its line: who has read that an alarm stands also reads, by default, that it is over."""
     if event.from_level is event.to_level is Level.NORMAL:
         return logging.INFO
-    return NOTICE if event.to_level is Level.NORMAL or event.kind in _EASES else logging.WARNING
+    return NOTICE if event.to_level is Level.NORMAL or event.kind in EASES else logging.WARNING

@@ -5,6 +5,7 @@ from __future__ import annotations
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
+from daqsvc.alarms.events import EventKind
 from daqsvc.errors.buses import BUFFER_FULL, BUS_ERRORS, FRAMES_UNRECORDED
 from daqsvc.errors.detectors import NOT_JUDGED, SENSOR_NOT_OK
 from daqsvc.errors.outputs import CERTIFICATE_ENDS, MESSAGE_DROPPED, TOPIC_REFUSED
@@ -32,6 +33,18 @@ OF_SERVICE: Mapping[str, Code] = MappingProxyType(
     }
 )
 """Each alarm that a service has by itself; behind a slash at the end stands the name of a thing."""
+
+EASES = frozenset(
+    {
+        EventKind.ACKNOWLEDGED,
+        EventKind.BYPASSED,
+        EventKind.LOWERED,
+        EventKind.QUIET,
+        EventKind.RESET,
+        EventKind.SHELVED,
+    }
+)
+"""Events that call for nobody although the condition stands: a person has seen to it, or it is less bad."""
 
 _OF_QUALITY: Mapping[str, Code] = MappingProxyType({"missing": NOT_JUDGED, "not_ok": SENSOR_NOT_OK})
 

@@ -8,8 +8,11 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from daqsvc.alarms.codes import EASES
 from daqsvc.commands.complaint import complain
 from daqsvc.commands.tables import ago, aligned, local_time
+from daqsvc.errors.alarms import ALARM_STANDS
+from daqsvc.errors.code import with_code
 from daqsvc.errors.service import JOURNAL_DAMAGED
 from daqsvc.outbox.reading import read_journal, read_pasts
 from daqsvc.outbox.safety import as_owner_of
@@ -156,7 +159,7 @@ def current_table(alarms: Sequence[AlarmView], now_ns: int) -> str:
             event["alarm"],
             (event["occurrence"] or "-")[:ID_LENGTH],
             f"{local_time(since_ns)} ({ago(now_ns - since_ns)})",
-            message,
+            with_code(message, _code(event)),
         ]
         for event, since_ns, message in worst_first
     ]
@@ -175,12 +178,17 @@ def history_table(events: Sequence[EventDocument]) -> str:
             *_machine(event, machines),
             event["alarm"],
             (event["occurrence"] or "-")[:ID_LENGTH],
-            event["message"],
+            with_code(event["message"], None if event["kind"] in EASES else _code(event)),
         ]
         for event in events
     ]
     titles = ["TIME", "EVENT", "LEVEL", "STATE", *machines, "ALARM", "ID", "MESSAGE"]
     return aligned(titles, rows)
+
+
+def _code(event: EventDocument) -> str | None:
+    """The code that the log gives an alarm that is not normal."""
+    return None if event["level"] == "normal" else event.get("code") or ALARM_STANDS.id
 
 
 _LEVELS = ("normal", "alert", "danger")

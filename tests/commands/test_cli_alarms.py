@@ -255,7 +255,7 @@ async def test_what_was_done_about_an_alarm_does_not_hide_what_it_is_and_since_w
     )
     _, out, _ = await daqsvc("alarms", "--store", tmp_path)
     assert "(2 h)" in out
-    assert out.endswith("  shaking danger: 9 g; shaking acknowledged by ann\n")
+    assert out.endswith("  shaking danger: 9 g; shaking acknowledged by ann [A17]\n")
 
 
 @pytest.mark.long

@@ -7,7 +7,7 @@ import argparse
 import pytest
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.commands.alarm_journal import AlarmView, ago, current_table
+from daqsvc.commands.alarm_journal import AlarmView, ago, current_table, history_table
 from daqsvc.commands.alarms import user_name
 from daqsvc.commands.arguments import duration
 
@@ -48,18 +48,41 @@ def test_behind_sudo_is_a_person(monkeypatch: pytest.MonkeyPatch) -> None:
     assert user_name() == "uid 4000000"
 
 
+EVENT = {
+    "machine": "m",
+    "alarm": "a",
+    "kind": "raised",
+    "level": "alert",
+    "state": "active_unacknowledged",
+    "occurrence": None,
+    "wall_ns": 0,
+    "message": "a was found",
+    "code": None,
+}
+
+
+@pytest.mark.parametrize(
+    ("others", "ends"),
+    [
+        ({}, "a was found [A17]"),
+        ({"code": "D22"}, "a was found [D22]"),
+        ({"kind": "acknowledged", "code": "D22"}, "a was found [D22]"),
+        ({"level": "normal", "kind": "returned", "state": "normal"}, "a was found"),
+    ],
+)
+def test_the_message_of_an_alarm_ends_with_its_code(others: dict[str, str], ends: str) -> None:
+    event = EVENT | others
+    assert current_table([AlarmView(event, 0, "a was found")], 0).endswith(f"  {ends}")
+    # As in the log, what a person has done has no code: it is no fault.
+    assert history_table([event]).endswith(f"  {'a was found' if 'kind' in others else ends}")
+
+
 def test_what_lies_beneath_a_cover_is_shown() -> None:
-    told = {
-        "machine": "m",
-        "alarm": "a",
-        "level": "alert",
+    told = EVENT | {
         "state": "shelved",
         "covered": "active_acknowledged",
         "shelved_until_wall_ns": 1_795_264_095 * NS_PER_S,
         "chattering": True,
-        "occurrence": None,
-        "wall_ns": 0,
-        "message": "-",
     }
     line = current_table([AlarmView(told, 0, "-")], 0).splitlines()[1]
     assert "shelved until 2026-" in line
