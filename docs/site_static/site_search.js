@@ -108,3 +108,14 @@ const siteSearch = (typed) => {
 
 /* Sphinx shows the last one first. */
 Search._performSearch = (query) => siteSearch(query).reverse();
+
+/* Units and single letters, as messages have them, are within many words: marking them marks nearly everything. */
+const LEAST_MARKED = 3;
+const sphinxQuery = Search._parseQuery;
+Search._parseQuery = (query) => {
+  const [typed, searched, excluded, marked, objects] = sphinxQuery(query);
+  const words = new Set([...marked].filter((word) => word.length >= LEAST_MARKED));
+  /* What is marked on the page that is opened from here. */
+  localStorage.setItem("sphinx_highlight_terms", [...words].join(" "));
+  return [typed, searched, excluded, words, objects];
+};

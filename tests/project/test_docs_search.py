@@ -53,6 +53,18 @@ async def searched(site: Path, queries: Sequence[str]) -> list[list[str]]:
     return found
 
 
+async def test_letters_and_units_of_a_message_are_not_marked_in_other_words(site: Path) -> None:
+    query = quote("no samples of stream 'device' for more than 2.0 s, 8.3 mm/s")
+    async with browsing() as browser:
+        page = await (await browser.new_context()).new_page()
+        for place in (f"search.html?q={query}", "reference/errors.html"):
+            await page.goto(f"{site.as_uri()}/{place}")
+            await page.wait_for_selector("span.highlighted")
+            marked = {text.lower() for text in await page.locator("span.highlighted").all_inner_texts()}
+            assert "samples" in marked
+            assert min(map(len, marked)) >= 3, marked
+
+
 def messages() -> dict[str, str]:
     """Of 25 codes a message that ``daqsvc check`` shows, by the code."""
     texts = [file.read_text("utf-8") for file in sorted(GOLDEN.glob("broken-*.txt"))]
