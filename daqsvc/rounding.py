@@ -30,7 +30,7 @@ def with_unit(value: float, unit: str, digits: int = 4) -> str:
 
 
 def unit_behind(unit: str) -> str:
-    """What stands behind a value of this unit: a space and the unit, or nothing."""
+    """What follows a value of this unit: a space and the unit, or nothing."""
     return f" {unit}" if unit not in {"", "1"} else ""
 
 
