@@ -429,12 +429,13 @@ NO_VALUE_MARK = Code(
     "B45",
     "A mark for no value would be a value",
     "Many Modbus devices write 0x8000 into an int16, or 0xFFFF into a uint16, when they have no value, e.g. "
-    "of a broken sensor. Without no_value and ok_between it is taken for one.",
+    "of a broken sensor. Numbers of 32 bits have such marks, too. Without no_value and "
+    "ok_between it is taken for one.",
     "Write no_value into the channel, as the device's manual says, or ok_between with what the sensor can "
     "measure.",
     "modbus.md",
     example="machine.toml:73: sensors[2]: has no ok_between: 0x8000 in its int16, by which many devices mean "
     "that they have no value, would be -1638.4 degC. Remedy: write no_value = 0x8000 into its channel if the "
-    "device's manual says so, or ok_between with what the sensor can measure, e.g. ok_between = "
-    "[-40.0, 150.0]",
+    "device's manual says so, or ok_between with the least and the greatest value that the sensor "
+    "can measure",
 )

@@ -22,6 +22,8 @@ from daqsvc.errors.buses import (
     WRONG_LAYOUT,
 )
 from daqsvc.errors.machine_file import WRONG_ORDER
+from daqsvc.rounding import with_unit
+from daqsvc.settings.alarms import LevelAlarm, VotingAlarm
 from daqsvc.settings.buses import BUSY
 from daqsvc.settings.problems import Finding
 from daqsvc.settings.section import UnusableValueError
@@ -126,6 +128,7 @@ def check_no_value(draft: MachineFile) -> Iterator[Finding]:
 
     SunSpec, and many devices beside it, mark so a value that is "not implemented".
     """
+    watched = _watched(draft)
     for index, sensor in enumerate(draft.sensors):
         with suppress(UnusableValueError):
             if not isinstance(sensor, TrendValue) or sensor.ok_between is not None:
@@ -133,24 +136,36 @@ def check_no_value(draft: MachineFile) -> Iterator[Finding]:
             layout = draft.streams[sensor.stream].layout if sensor.stream in draft.streams else None
             channels = layout.channels if isinstance(layout, RegistersLayout) else ()
             channel = next((one for one in channels if one.name == sensor.channel), None)
-            if channel is None or channel.type not in _NO_VALUE or channel.bits or channel.scale == 1.0:
+            if channel is None or channel.type not in _NO_VALUE or channel.bits or channel.no_value:
+                continue
+            # A count or a state that no alarm watches may be any number.
+            if channel.scale == 1.0 and sensor.name not in watched:
                 continue
             raw = _NO_VALUE[channel.type]
-            if channel.no_value:
-                continue
+            mark = f"0x{raw & (1 << 16 * channel.registers) - 1:X}"
             value = (raw * channel.scale + channel.offset) * sensor.gain + sensor.shift
             yield Finding(
                 ("sensors", index),
-                f"has no ok_between: 0x{raw & 0xFFFF:04X} in its {channel.type}, by which many devices mean "
-                f"that they have no value, would be {value:.6g} {sensor.unit}",
-                f"write no_value = 0x{raw & 0xFFFF:04X} into its channel if the device's manual says so, or "
-                "ok_between with what the sensor can measure, e.g. ok_between = [-40.0, 150.0]",
+                f"has no ok_between: {mark} in its {channel.type}, by which many devices mean that they have "
+                f"no value, would be {with_unit(value, sensor.unit, 6)}",
+                f"write no_value = {mark} into its channel if the device's manual says so, or ok_between "
+                "with the least and the greatest value that the sensor can measure",
                 fatal=False,
                 code=NO_VALUE_MARK,
             )
 
 
-_NO_VALUE = {"int16": -32_768, "uint16": 65_535}
+def _watched(draft: MachineFile) -> set[str]:
+    """Names of the sensors that an alarm of a measure watches."""
+    names: set[str] = set()
+    for alarm in draft.alarms:
+        with suppress(UnusableValueError):
+            if isinstance(alarm, LevelAlarm | VotingAlarm):
+                names.update(alarm.watched)
+    return names
+
+
+_NO_VALUE = {"int16": -(1 << 15), "uint16": (1 << 16) - 1, "int32": -(1 << 31), "uint32": (1 << 32) - 1}
 """By the type of a register, the mark for no value."""
 
 

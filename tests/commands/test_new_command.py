@@ -274,6 +274,13 @@ def test_the_mark_for_no_value_of_a_register_is_an_option_and_a_hint_in_the_file
     assert "int16 cannot hold 98304" in capsys.readouterr().err
 
 
+def test_the_proposed_range_of_a_speed_holds_the_speed(tmp_path):
+    file = tmp_path / "m.toml"
+    words = ["--bus=modbus-tcp", "--host=192.0.2.10", "--channels=rpm", "--speed=-1473", "--limits=none"]
+    assert main(["new", f"{file}", "--yes", *words]) == 0
+    assert "# ok_between = [0.0, 4410.0]" in file.read_text()
+
+
 def test_answers_of_a_file_are_those_of_the_options(tmp_path, capsys):
     answers = tmp_path / "answers.toml"
     answers.write_text(

@@ -327,9 +327,19 @@ def test_a_mark_that_the_type_cannot_hold_is_refused(mark, words):
     assert problem.message == words
 
 
-def test_a_count_and_a_number_of_32_bits_have_no_such_mark():
+def test_a_number_without_a_scale_has_such_a_mark_if_an_alarm_watches_it():
     bare = ('"degC"\nok_between = [-40.0, 105.0]', '"degC"')
     raw = ('address = 19, type = "int16", scale = 0.05', 'address = 19, type = "int16"')
-    assert parsed(PUMP, bare, raw).warnings == ()
+    (warning,) = parsed(PUMP, bare, raw).warnings
+    assert warning.message.endswith("would be -32768 degC")
+    unwatched = ('sensor = "de-temperature"', 'sensor = "nde-temperature"')
+    assert parsed(PUMP, bare, raw, unwatched).warnings == ()
+
+
+def test_a_number_of_32_bits_has_such_a_mark_and_a_float_has_none():
+    bare = ('"degC"\nok_between = [-40.0, 105.0]', '"degC"')
+    wide = ('address = 19, type = "int16", scale = 0.05', 'address = 65, type = "uint32", scale = 0.05')
+    (warning,) = [one for one in parsed(PUMP, bare, wide).warnings if "no ok_between" in one.message]
+    assert "0xFFFFFFFF in its uint32" in warning.message
     real = ('address = 19, type = "int16", scale = 0.05', 'address = 65, type = "float32", scale = 0.05')
     assert "no ok_between" not in "".join(one.message for one in parsed(PUMP, bare, real).warnings)

@@ -258,7 +258,9 @@ def _ok_between(sensor: Sensor, answers: Answers) -> Iterator[str]:
     usual = {"mm/s": (-1.0, 100.0), "degC": (-40.0, 150.0)}.get(sensor.unit)
     own = [answers[key] for key in ("alert", "danger") if key in answers]
     if usual is None or any(not usual[0] < limit < usual[1] for limit in own):
-        yield f"# ok_between = [0.0, 100.0]    # what it can measure; {about}"
+        fastest = 3.0 * round(abs(answers["speed"]), -1)
+        ends = f"0.0, {fastest:.1f}" if sensor.unit == "rpm" else "LEAST, GREATEST"
+        yield f"# ok_between = [{ends}]    # what it can measure; {about}"
     else:
         yield entry("ok_between", list(usual), f"what it can measure; {about}")
 
