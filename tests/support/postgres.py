@@ -6,13 +6,9 @@ import os
 import shutil
 import subprocess
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 from support.ports import LOOPBACK, free_port
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 OWNER = "nobody"
 """Who runs it where the tests are root's, as PostgreSQL is not for root."""
@@ -29,19 +25,29 @@ def programs() -> Path:
     pytest.skip(reason)
 
 
+def make_cluster(directory: Path) -> None:
+    """Make the files of a server that has nothing in it yet, of which each `Postgres` has a copy.
+
+    Args:
+        directory: where to; it must not exist.
+    """
+    initdb = programs() / "initdb"
+    _run(initdb, "-D", f"{_owned(directory)}/data", "-A", "trust", "-U", "owner", "-E", "UTF8", "--no-sync")
+
+
 class Postgres:
     """A server that can be crashed and started again.
 
+    What it has written survives that, but not a crash of this computer: it waits for no disk.
+
     Args:
         directory: for its files; taken away afterwards.
+        cluster: what `make_cluster` has made.
     """
 
-    def __init__(self, directory: Path) -> None:
+    def __init__(self, directory: Path, cluster: Path) -> None:
         self._programs, self._directory, self.port = programs(), directory, free_port()
-        directory.mkdir(mode=0o700)
-        if os.geteuid() == 0:
-            shutil.chown(directory, OWNER)
-        self._run("initdb", "-D", f"{directory}/data", "-A", "trust", "-U", "owner", "-E", "UTF8")
+        _run("cp", "--recursive", f"{cluster}/data", f"{_owned(directory)}")
 
     @property
     def url(self) -> str:
@@ -54,18 +60,8 @@ class Postgres:
 
     def start(self) -> None:
         """Start and wait until it takes connections; blocks."""
-        listen = f"-h {LOOPBACK} -p {self.port} -k {self._directory}"
-        self._run(
-            "pg_ctl",
-            "-D",
-            f"{self._directory}/data",
-            "-w",
-            "-o",
-            listen,
-            "-l",
-            f"{self._directory}/log",
-            "start",
-        )
+        options = f"-h {LOOPBACK} -p {self.port} -k {self._directory} -c fsync=off"
+        self._pg_ctl("-w", "-o", options, "-l", f"{self._directory}/log", "start")
 
     @property
     def is_running(self) -> bool:
@@ -74,11 +70,22 @@ class Postgres:
 
     def crash(self) -> None:
         """End at once, as a kill or a power cut would."""
-        self._run("pg_ctl", "-D", f"{self._directory}/data", "-m", "immediate", "-w", "stop")
+        self._pg_ctl("-m", "immediate", "-w", "stop")
 
-    def _run(self, program: str, *arguments: str) -> None:
-        command: Sequence[str] = [str(self._programs / program), *arguments]
-        user = OWNER if os.geteuid() == 0 else None
-        subprocess.run(
-            command, check=True, user=user, cwd="/", stdout=subprocess.DEVNULL, stderr=subprocess.STDOUT
-        )
+    def _pg_ctl(self, *arguments: str) -> None:
+        _run(self._programs / "pg_ctl", "-D", f"{self._directory}/data", *arguments)
+
+
+def _owned(directory: Path) -> Path:
+    """A new directory of whoever runs the server."""
+    directory.mkdir(mode=0o700)
+    if os.geteuid() == 0:
+        shutil.chown(directory, OWNER)
+    return directory
+
+
+def _run(*command: str | Path) -> None:
+    user = OWNER if os.geteuid() == 0 else None
+    subprocess.run(
+        command, check=True, user=user, cwd="/", stdout=subprocess.DEVNULL, stderr=subprocess.STDOUT
+    )

@@ -23,7 +23,7 @@ from paho.mqtt.reasoncodes import ReasonCode
 from support.brokers import Mosquitto
 from support.paths import ROOT
 from support.ports import LOOPBACK, free_port
-from support.postgres import Postgres
+from support.postgres import Postgres, make_cluster
 from support.waiting import PATIENCE_S
 
 pytestmark = [pytest.mark.integration, pytest.mark.mosquitto]
@@ -38,12 +38,24 @@ def guide():
     return "\n".join(re.findall(r"```sql\n(.*?)```", text, flags=re.DOTALL)[:1])
 
 
-@pytest.fixture
-def postgres(guide):
+@pytest.fixture(scope="module")
+def base():
     # The folders of pytest are root's, and PostgreSQL is not.
-    base = Path(tempfile.mkdtemp(prefix="daqsvc-pg-"))
-    base.chmod(0o755)
-    server = Postgres(base / "server")
+    made = Path(tempfile.mkdtemp(prefix="daqsvc-pg-"))
+    made.chmod(0o755)
+    yield made
+    shutil.rmtree(made)
+
+
+@pytest.fixture(scope="module")
+def cluster(base):
+    make_cluster(base / "cluster")
+    return base / "cluster"
+
+
+@pytest.fixture
+def postgres(guide, base, cluster):
+    server = Postgres(base / "server", cluster)
     server.start()
     try:
         with psycopg.connect(server.url, autocommit=True) as owner:
@@ -54,7 +66,7 @@ def postgres(guide):
     finally:
         if server.is_running:  # a test that fails may have left it crashed
             server.crash()
-        shutil.rmtree(base)
+        shutil.rmtree(base / "server")
 
 
 @pytest.fixture
