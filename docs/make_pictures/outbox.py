@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import json
 import shutil
+import sqlite3
 import tempfile
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -55,7 +57,7 @@ async def play(folder: Path) -> Course:
             # A power cut: what is on the disk at this moment is what the next start finds.
             lives += 1
             after = folder / str(lives)
-            shutil.copytree(running, after)
+            as_of_now(running, after)
             await outbox.close()
             running = after
         if second == OFF_S[1]:
@@ -79,6 +81,24 @@ async def play(folder: Path) -> Course:
         course.waiting.append((second, waits))
     await outbox.close()
     return course
+
+
+def as_of_now(running: Path, after: Path) -> None:
+    """What is on the disk of an outbox that is open: its databases each as of one moment.
+
+    Copied file by file, a database and its log can be of two moments, as the outbox writes meanwhile.
+    """
+    after.mkdir(mode=0o700)
+    for file in sorted(running.iterdir()):
+        if file.suffix == ".sqlite":
+            with (
+                closing(sqlite3.connect(file)) as source,
+                closing(sqlite3.connect(after / file.name)) as copy,
+            ):
+                source.backup(copy)
+            (after / file.name).chmod(0o600)
+        elif not file.name.endswith(("-wal", "-shm", "-journal")):
+            shutil.copy2(file, after / file.name)
 
 
 def picture() -> Figure:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+import sqlite3
 import sys
+from contextlib import closing
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree as ET
 
@@ -13,7 +15,7 @@ from support.paths import ROOT
 
 sys.path.append(str(ROOT / "docs"))
 
-from make_pictures import alarm_states, architecture, detectors
+from make_pictures import alarm_states, architecture, detectors, outbox
 from make_pictures.catalogue import PICTURES
 from make_pictures.style import save, use
 
@@ -94,6 +96,23 @@ def test_pictures_have_no_date_and_fit_a_page() -> None:
         assert "<text" in text, "text is text, not outlines"
         width = ET.fromstring(text).get("width", "")  # noqa: S314 - our own file
         assert float(width.removesuffix("pt")) * 96 / 72 == pytest.approx(700.0, abs=2.0)
+
+
+def test_what_a_power_cut_leaves_of_the_outbox_is_of_one_moment(tmp_path: Path) -> None:
+    """Copied file by file, the log of a database that is open may be gone, or be of another moment."""
+    (tmp_path / "now").mkdir()
+    with closing(sqlite3.connect(tmp_path / "now" / "outbox.sqlite")) as store:
+        store.execute("PRAGMA journal_mode = WAL")
+        store.execute("CREATE TABLE messages (number)")
+        store.execute("INSERT INTO messages VALUES (1)")
+        store.commit()
+        store.execute("INSERT INTO messages VALUES (2)")
+        (tmp_path / "now" / "outbox.sqlite.version").write_text("1")
+        outbox.as_of_now(tmp_path / "now", tmp_path / "after")
+    after = tmp_path / "after"
+    assert sorted(file.name for file in after.iterdir()) == ["outbox.sqlite", "outbox.sqlite.version"]
+    with closing(sqlite3.connect(after / "outbox.sqlite")) as store:
+        assert store.execute("SELECT number FROM messages").fetchall() == [(1,)]
 
 
 def test_another_move_of_alarms_is_another_picture(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
