@@ -21,6 +21,7 @@ from daqsvc.diagnosis.record import Diagnosis, Severity
 from daqsvc.diagnosis.recorded import Evaluated, Recorded, RecordedDetector, RecordingOptions, statements_of
 from daqsvc.diagnosis.window_detector import Judgement, WindowDetector
 from daqsvc.errors.code import PluginCode, coded
+from daqsvc.notice import notice
 from daqsvc.outbox.messages import OutboxMessage
 from daqsvc.publish.output import Output, OutputPort, Watched
 from daqsvc.publish.plugin import OutputPlugin
@@ -105,6 +106,7 @@ __all__ = [
     "choice",
     "coded",
     "in_thread",
+    "notice",
     "questions",
     "run_with_reconnect",
     "statements_of",

@@ -15,6 +15,9 @@ CODES = "daqsvc.codes"
 
 T = TypeVar("T")
 
+_packages: dict[str, str] = {}
+"""By the top-level module of what was made, the distribution that brings it, with its version."""
+
 
 def plugged(group: str, base: type[T], what: str) -> dict[str, T]:
     """What packages register in a group of entry points, by name, one made of each.
@@ -35,10 +38,22 @@ def plugged(group: str, base: type[T], what: str) -> dict[str, T]:
             continue
         if isinstance(made, base):
             known[point.name] = made
+            if point.dist is not None:
+                home = type(made).__module__.partition(".")[0]
+                _packages[home] = f"{point.dist.name} {point.dist.version}"
         else:
             why = f"it is not derived from {base.__name__} of daqsvc.api"
             complain("daqsvc", f"{what} {point.name} is left out: {why}", LEFT_OUT)
     return known
+
+
+def foreign_words(error: Exception) -> str | None:
+    """What code of another package has failed at, in words that name it; None if the error is not of one."""
+    from daqsvc.settings import failures  # noqa: PLC0415 - only when something has failed
+
+    failures.packages.update(_packages)
+    failed = failures.foreign_failure(error)
+    return None if failed is None else f"{failed}"
 
 
 def plugged_codes() -> dict[str, PluginCode]:

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 
 from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE
 from daqsvc.commands.complaint import complain
-from daqsvc.commands.plugged import plugged
+from daqsvc.commands.plugged import foreign_words, plugged
 from daqsvc.commands.stopping import stopping
 from daqsvc.errors.command_line import NOTHING_ON_BUS
+from daqsvc.errors.machine_file import PLUGIN_FAILED
 from drivers.can.sniff import CanSniffer
 from drivers.modbus.sniff import ModbusSniffer
 from drivers.serial.sniff import SerialSniffer
@@ -50,6 +51,10 @@ class SniffCommand:
                 found = sniffer.sniff(arguments, stop, _tell)
         except SniffError as error:
             return complain("daqsvc", error, error.code, EXIT_USAGE if error.usage else EXIT_FAILED)
+        except Exception as error:
+            if (words := foreign_words(error)) is None:
+                raise
+            return complain("daqsvc", words, PLUGIN_FAILED)
         print(_as_json(found) if arguments.json else _as_text(found))  # noqa: T201 - what the verb is for
         if found.problem:
             sys.stdout.flush()

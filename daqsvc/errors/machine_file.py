@@ -418,3 +418,14 @@ STANDSTILL = Code(
     example="machine.toml:20: machine.speed_rpm = 0.0: is a shaft that stands still. Remedy: write the "
     "nominal speed, negative if the shaft turns clockwise",
 )
+OF_A_PLUGIN = Code(
+    "F43",
+    "A plugin reports something that has no code of its own",
+    "The message is one of a driver, a detector or an output of another package. Its authors have given it "
+    "no code.",
+    "Do what the message asks for, and see the documentation of the package. Its authors can add codes: see "
+    "write-a-driver.md.",
+    "write-a-driver.md",
+    example="machine.toml:14: buses.logger: is named by several streams. Remedy: name another bus in the "
+    "others",
+)

@@ -8,7 +8,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, TypeAlias
 
 from daqsvc.errors.code import with_code
-from daqsvc.errors.machine_file import NAMED_TWICE
+from daqsvc.errors.machine_file import NAMED_TWICE, OF_A_PLUGIN
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -33,14 +33,14 @@ class Finding:
         message: what is wrong, to be read after the value.
         remedy: what to do about it.
         fatal: False for a warning.
-        code: of the kind of mistake; None where a plugin from outside has none.
+        code: of the kind of mistake; one for all messages of plugins that have none of their own.
     """
 
     path: KeyPath
     message: str
     remedy: str
     fatal: bool = True
-    code: Code | None = None
+    code: Code | None = OF_A_PLUGIN
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,12 +92,12 @@ class AssemblyError(Exception):
 
     Args:
         message: what is wrong, and what to do about it.
-        code: of the kind of mistake; None where a plugin from outside has none.
+        code: of the kind of mistake; one for all errors of plugins that have none of their own.
     """
 
     def __init__(self, message: str, *, code: Code | None = None) -> None:
         super().__init__(message)
-        self.code = code
+        self.code: Code | None = code or OF_A_PLUGIN
 
     def __str__(self) -> str:
         return with_code(super().__str__(), self.code)

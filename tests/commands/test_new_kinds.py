@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+from types import FunctionType
 from typing import TYPE_CHECKING
 
 import pytest
@@ -61,6 +62,23 @@ def test_its_questions_are_options_too(capsys: pytest.CaptureFixture[str]) -> No
     assert "--logger-port ANSWER" in capsys.readouterr().out
     assert main(["new", "--yes", "--bus", "tcp-frame"]) == 2
     assert "give --logger" in capsys.readouterr().err
+
+
+def test_questions_of_another_package_that_fail_are_named_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def tables(_: object, answers: dict[str, object]) -> object:
+        return answers["nothing"]
+
+    theirs = vars(importlib.import_module("tcp_questions"))
+    monkeypatch.setattr(theirs["LoggerQuestions"], "tables", FunctionType(tables.__code__, theirs))
+    file = tmp_path / "fan.toml"
+    assert main(["new", f"{file}", "--yes", "--bus", "tcp-frames", "--logger", "192.0.2.7"]) == 1
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said.startswith("daqsvc new: nothing was written: ")
+    assert " of tcp_questions has failed: KeyError: 'nothing' (" in said
+    assert said.endswith("have the authors of tcp-questions 1.0 fix it [F23]")
+    assert not file.exists()
 
 
 def test_the_documentation_shows_the_example_as_it_is() -> None:

@@ -26,6 +26,8 @@ class ProfibusSniffer(Sniffer):
 
     def sniff(self, arguments, stop, tell):
         tell("listening")
+        if arguments.port == "odd":
+            raise KeyError("odd")
         if arguments.port == "absent":
             raise SniffError("there is no absent. Remedy: plug it in")
         table = SniffTable(("station", "bytes"), [("3", "12"), ("\\x1b[31m14", "7")])
@@ -82,6 +84,17 @@ def test_what_is_wrong_goes_to_stderr_and_fails(capsys: pytest.CaptureFixture[st
     said = capsys.readouterr()
     assert said.out == ""
     assert said.err.endswith("daqsvc: there is no absent. Remedy: plug it in [C21]\n")
+
+
+@pytest.mark.usefixtures("package")
+def test_a_kind_of_another_package_that_fails_is_named_in_one_line(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["sniff", "profibus", "odd"]) == 1
+    assert capsys.readouterr().err.endswith(
+        "daqsvc: sniff of profibus_sniff.ProfibusSniffer has failed: KeyError: 'odd' "
+        "(profibus_sniff.py, line 14); have the authors of profibus-sniff 1.0 fix it [F23]\n"
+    )
 
 
 def test_without_a_kind_those_there_are_can_be_seen(capsys: pytest.CaptureFixture[str]) -> None:

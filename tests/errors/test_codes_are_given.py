@@ -67,6 +67,7 @@ GIVEN: list[tuple[str, Path, list[tuple[str, str]]]] = [
 
 ELSEWHERE = {
     "F23": "settings/test_failing_plugins.py",
+    "F43": "settings/test_failing_plugins.py",
     "F25": "settings/test_failing_plugins.py",
     "F26": "service/test_several_machines.py",
     "B14": "settings/test_settings_contradictions.py",

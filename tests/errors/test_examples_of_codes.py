@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.sources
 GOLDEN = ROOT / "tests" / "guard" / "golden"
 OF_A_FILE = [code for code in CODES.values() if code.example.startswith("machine.toml")]
-IN_OTHER_TESTS = {"B14", "D14", "F25", "O02", "S01"}
+IN_OTHER_TESTS = {"B14", "D14", "F25", "O02", "S01", "F43"}
 """Codes of machine files that take more than such a file: another file, a plugin, or a service that runs."""
 
 

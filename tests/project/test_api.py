@@ -18,7 +18,7 @@ NAMES = {
     *("MachineFile", "Section", "Bus", "Layout", "PackedLayout", "Stream", "Sensor", "Name", "Text"),
     *("RecordedDetector", "Recorded", "RecordingOptions", "Evaluated", "statements_of"),
     *("Detectability", "DetectabilityOptions", "UnfitOptionError"),
-    *("AssemblyError", "Finding", "StreamWords", "choice", "PluginCode", "coded"),
+    *("AssemblyError", "Finding", "StreamWords", "choice", "PluginCode", "coded", "notice"),
 }
 TYPE_ALIASES = {"Name", "Text", "Sensor", "Severity"}
 

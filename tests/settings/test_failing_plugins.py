@@ -590,6 +590,16 @@ def test_a_plugin_whose_own_module_fails_is_named_with_its_line(
     assert problem.remedy == f"{remedy} the authors of daqsvc-crest 1.0 fix it, or remove [pipeline.crest]"
 
 
+def test_what_a_plugin_finds_without_a_code_gets_the_one_for_that(monkeypatch: pytest.MonkeyPatch) -> None:
+    def checks(*_: Any) -> Iterator[Iterator[Finding]]:
+        yield iter([Finding(("pipeline", "crest"), "is odd", "make it even")])
+
+    monkeypatch.setattr(class_at("crest.CrestPlugin"), "checks", checks)
+    [problem] = problems_of(TABLES, MACHINE)
+    assert f"{problem}".endswith("pipeline.crest: is odd. Remedy: make it even [F43]")
+    assert f"{AssemblyError('the licence has ended')}" == "the licence has ended [F43]"
+
+
 def test_a_check_that_fails_later_is_one_finding_with_its_line(monkeypatch: pytest.MonkeyPatch) -> None:
     def checks(*_: Any) -> Iterator[Iterator[Any]]:
         yield (1 // zero for zero in [0])

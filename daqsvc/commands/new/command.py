@@ -15,7 +15,9 @@ from daqsvc.commands.arguments import EXIT_OK, EXIT_USAGE
 from daqsvc.commands.complaint import complain
 from daqsvc.commands.new.buses import bus_of
 from daqsvc.commands.new.topics import all_topics
+from daqsvc.commands.plugged import foreign_words
 from daqsvc.errors.command_line import CANNOT_WRITE, INTERRUPTED
+from daqsvc.errors.machine_file import PLUGIN_FAILED
 from drivers.questions import SENSOR, short_name
 
 if TYPE_CHECKING:
@@ -105,6 +107,10 @@ class NewCommand:
         except OSError as error:
             what = f"{error.filename} cannot be written: {error.strerror}"
             return complain("daqsvc new", what, CANNOT_WRITE)
+        except Exception as error:
+            if (words := foreign_words(error)) is None:
+                raise
+            return complain("daqsvc new", f"nothing was written: {words}", PLUGIN_FAILED)
         return _report(target.file, text, answers)
 
 
