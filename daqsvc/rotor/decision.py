@@ -1,8 +1,8 @@
 """Which mode the machine is in: two rules over the same observers.
 
 ``cusum`` keeps a mode until another has gathered a threshold of evidence against it; this is the
-rule that may raise alarms. ``paper`` declares at a conditional probability of 0.9 and starts afresh;
-a posterior of 0.9 is an error of 10 % per declaration by construction, so it is shown and no more.
+rule that may raise alarms. ``paper`` declares at a conditional probability of 0.9 and starts
+again. A posterior of 0.9 is an error of 10 % per declaration by construction, so it is only shown.
 """
 
 from __future__ import annotations
@@ -27,20 +27,21 @@ Rule = Literal["cusum", "paper"]
 class DecisionRules:
     """Thresholds of both rules.
 
-    A mean time between failures belongs into these: a threshold is ln(1 / pi) of the prior pi per
-    decision, so a rarer transition gets a higher one (`from_rates`). As a prior it would redeclare the
-    favourite at every sample.
+    A mean time between failures sets a threshold: ln(1 / pi) of the prior pi per decision, so a rarer
+    transition gets a higher one (`from_rates`). As a prior of the paper's rule, it would declare the most
+    likely mode again at every sample.
 
     Attributes:
         rule: the rule whose mode counts as declared.
         threshold_nats: evidence that changes the decision to a worse mode.
         back_threshold_nats: evidence that changes it to a healthier mode (one before it in the list).
-        identity_nats: lead over the other candidates that a change of the decision takes: odds of 20 to 1.
+        identity_nats: lead over the other candidates that a change of the decision needs: odds of 20 to 1.
         settle_revolutions: time since the onset of its evidence that a change of the decision waits for; the
-            departure is reported at once. The transient after a severe fault passes by the orbits of milder
-            ones of other kinds, so that a bank of many kinds of faults needs some four revolutions.
+            departure is reported at once. The transient after a severe fault passes close to the orbits of
+            milder faults of other kinds, so that a bank of many kinds of faults needs some four revolutions.
         group_nats: lead below which two modes are not told apart: odds of 150 to 1.
-        alike_nats_per_rev: steady evidence a revolution, by the models, below which two modes never are.
+        alike_nats_per_rev: steady evidence a revolution, by the models, below which two modes are always one
+            group.
         probability_threshold: conditional probability that declares under the paper's rule.
         priors: probabilities that the paper's rule starts and resets to; equal if not given.
     """

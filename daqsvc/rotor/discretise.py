@@ -1,16 +1,15 @@
 """From the continuous rotor to what the kernels step with.
 
-Tables and loop counts are made together and travel together (`OBSERVER`): a sub-step propagator that
-does not fit its loop count is a silently wrong observer.
+Tables and loop counts are made together and travel together (`OBSERVER`). With a sub-step propagator that
+does not fit its loop count, an observer would be wrong without an error.
 
 The shaft is isotropic, so the two axes decouple and every observer is a 2 x 2 recursion per axis on
-the deviation from its own reference orbit; the forcing needs no integration at all. The contact is
+the deviation from its own reference orbit. The forcing needs no integration at all. The contact is
 stepped by Strang splitting: exact linear flow over half a sub-step, a kick by the contact force,
 flow over the other half.
 
-By their steady orbits some modes look alike: more unbalance and less damping make the same one at resonance.
-Only the transient of a few revolutions differs, and the side that it falls on by chance is no diagnosis. Such
-modes are one group (`alike`).
+Some modes have the same steady orbit: at resonance more unbalance and less damping do. Only the transient of
+a few revolutions differs, and a decision by chance is no diagnosis. Such modes are one group (`alike`).
 """
 
 from __future__ import annotations
@@ -67,8 +66,8 @@ OBSERVER = np.dtype(
         ("xx", np.float64), ("xv", np.float64), ("vx", np.float64), ("vv", np.float64),
         ("half_xx", np.float64), ("half_xv", np.float64), ("half_vx", np.float64), ("half_vv", np.float64),
         ("full_xx", np.float64), ("full_xv", np.float64), ("full_vx", np.float64), ("full_vv", np.float64),
-        # contact: sub-steps per sample (0: none, a linear observer), the shaft's turn in half a sub-step and
-        # in a whole one, K* times the duration of a sub-step, alpha, mu, speed of the rubbing surface
+        # contact: sub-steps per sample (0: none, a linear observer). Then the shaft's turn in half a sub-step
+        # and in a whole one, K* times the duration of a sub-step, alpha, mu, speed of the rubbing surface
         ("substeps", np.int64),
         ("half_cos", np.float64), ("half_sin", np.float64),
         ("full_cos", np.float64), ("full_sin", np.float64),
@@ -165,8 +164,8 @@ def discretise(
 
     Args:
         modes: the hypotheses; the first is the healthy one and linear.
-        noise: standard deviation of the measured position in clearances, one figure for all modes: a
-            noise that differed by mode would be what decides.
+        noise: standard deviation of the measured position in clearances, one figure for all modes: if
+            the noise differed by mode, it would decide.
         duration: normalised time between samples, omega_s dt.
         variance_factor: how much larger than their own figure the innovations' variance is taken to be, for
             models that are known to be wrong by a little; the gains do not change.

@@ -7,7 +7,7 @@ tau = omega_s t. With z = x + iy the motion is
     z'' + 2 zeta z' + k z = e w^2 exp(i (theta + phi)) + l_x - i g + f(z, z'),    theta' = w
 
 The paper's static load acts along -y alone; here it has both components. Four statements of the paper
-cannot stand as printed and are corrected here:
+are wrong as printed and are corrected here:
 
 * The contact force pushes the disc back: the state equation needs ``- gamma f(Cx)``, not ``+``. With
   the printed sign the disc is thrown out as soon as it touches.
@@ -15,9 +15,9 @@ cannot stand as printed and are corrected here:
 * ``g = G / (M c omega_s^2)``: G is a force, so the mass belongs under it.
 * ``2 zeta = D_s / (M omega_s)`` with omega_s of the healthy shaft: damping does not scale with k.
 
-A machine away from the paper's has two modes where the paper has one: supports that are softer in one
-direction, oil films and gyroscopic moments part them (Genta, "Dynamics of Rotating Systems", 2005, ch. 6).
-With the complex conjugate z* the motion is then
+A machine away from the paper's has two modes where the paper has one. Supports that are softer in one
+direction, oil films and gyroscopic moments separate them (Genta, "Dynamics of Rotating Systems", 2005,
+chapter 6). With the complex conjugate z* the motion is then
 
     z'' + (2 zeta - i gamma w) z' + d z*' + (k + i kappa) z + q z* = same right-hand side
 
@@ -25,7 +25,7 @@ which is the paper's rotor where the four further figures are 0; what higher mod
 unbalance and the square of the speed.
 
 Coulomb friction opposes the slip at the point of contact, so its sign follows the velocity there.
-The paper leaves that sign out; then a backward whirl feeds on the friction without bound.
+The paper leaves that sign out; then friction drives a backward whirl without bound.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class NormalisedRotor:
 
     @property
     def isotropic(self) -> bool:
-        """Whether both axes move alike and on their own: the paper's rotor."""
+        """Whether both axes move in the same way and independently: the paper's rotor."""
         return not (
             self.cross_stiffness
             or self.anisotropy
@@ -170,8 +170,8 @@ class TwoModes:
 
     A shaft that is the same in all directions is in series with supports that need not be: springs with
     dampers beside them, both over the mean spring of the supports. Where the supports give way little, a
-    damper that weakens also makes the machine softer, and a spring that weakens gives the damper more to do:
-    both follow from the supports' part in the deflection.
+    damper that weakens also makes the machine softer, and a spring that weakens makes the damper move more.
+    Both follow from the supports' part in the deflection.
 
     Attributes:
         support_share: beta, part of the static deflection that the supports take, 0 to 1; 1: a rigid shaft.
@@ -205,7 +205,7 @@ class TwoModes:
         """A Laval rotor with these modes: what shaft and supports are together, at its speed.
 
         Args:
-            rotor: speed, unbalance and contact are its.
+            rotor: speed, unbalance and contact are taken from it.
             damping_ratio: of the supports' dampers, over the healthy ones.
             stiffness_ratio: of the static stiffness, over the healthy one, by softer supports.
         """

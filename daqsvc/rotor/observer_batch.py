@@ -1,10 +1,11 @@
 """Memory of a bank for its kernels: eight observers side by side, so that the processor steps them together.
 
-All that a bank knows lies in one piece, `BankMemory`, which is passed on and copied as a whole. It has a
-header (`HEADER`), groups of observers (`GROUP`), constants of the observers, evidence of pairs of modes
-(`PAIR`) and where the axes are coupled what these observers have besides (`coupled.COUPLED`). A group holds
-constants, estimates and evidence of `WIDTH` modes, one member each; mode m is member m % WIDTH of group m
-// WIDTH. The lengths are part of the type: that is what lets the compiler turn a loop over members into
+All that a bank knows is in one array of bytes, `BankMemory`, which is passed on and copied as a whole. It has
+a header (`HEADER`), groups of observers (`GROUP`), constants of the observers, and evidence of pairs of modes
+(`PAIR`). Where the axes are coupled, it also has further constants of these observers (`coupled.COUPLED`).
+
+A group holds constants, estimates and evidence of `WIDTH` modes, one member each; mode m is member m % WIDTH
+of group m // WIDTH. The lengths are part of the type: that lets the compiler turn a loop over members into
 vector instructions. Members that no mode needs explain nothing: their likelihood is 0.
 """
 
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 WIDTH = 8
 """Members in a group: two or one vector registers of float64."""
 _LEAD_LIMIT = 1.5
-"""The lead of the decision counts up to this many thresholds, so that a doubt shows before it wins."""
+"""The lead of the decision counts up to this many thresholds, so that a rival shows before it takes over."""
 
 FREE = ("free_x", "free_u", "free_y", "free_v")
 """Deviation ``(x, x', y, y')`` of the free-running estimate from the mode's orbit."""

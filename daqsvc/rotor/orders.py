@@ -47,7 +47,7 @@ _SCALES = 2.0 ** np.arange(-3, 7)
 _HARMONIC_SHARES = (0.0, 0.02, 0.1, 0.3, 0.6)
 """2X and 3X that unbalance brings along, over its 1X, as velocity: integrated over."""
 _OPEN_NATS = -6.0
-"""An unmodelled change explains everything; it must explain it better by so much."""
+"""An unmodelled change can explain anything, so it must explain a change better by this much."""
 
 
 def surprise(change: Complexes, variance: Floats, freedom: Floats) -> Floats:
@@ -123,8 +123,8 @@ class OrderRules:
     Attributes:
         false_alarm_probability: of an unchanged machine's recording, to be called changed; at most.
         least_change: size below which a change is not named, as a part of the healthy orders' velocity; 1X
-            must have grown by so much of itself.
-        repeatability: size below which a change is none: so well does a measurement repeat.
+            must have grown by this part of itself.
+        repeatability: size below which a change does not count: measurements repeat no better.
         least_residual_ratio: rise of what is left beside the orders that is a change by itself.
         margin_nats: lead of one cause over the others to be named alone.
         most_speed_difference: part of the healthy run's speed beyond which two runs are not compared.
@@ -233,7 +233,7 @@ def compare_orders(
     evidence = cause_evidence(
         change * _VELOCITY, variance * _VELOCITY**2, freedom, level, growing=growth > 1.0
     )
-    # What repeats no better than so is no change, however sure.
+    # A difference below the repeatability is no change, however significant.
     beyond = departure - threshold
     departed = beyond > 0.0 and severity > rules.repeatability
     excess = max(beyond if departed or beyond <= 0.0 else -np.inf, residual.excess, 0.0 if grown else -np.inf)
@@ -243,7 +243,7 @@ def compare_orders(
     elif not large:
         group = ("small_change",)
     else:
-        # Vibration beside the orders shows nothing of 1X.
+        # Vibration beside the orders does not show whether 1X has changed.
         group = _causes(evidence, rules, growth=growth if departed or grown else 1.0, grown=grown)
     return OrderChange(
         verdict=group[0],
@@ -320,7 +320,7 @@ def _freedom(was: _Mean, now: _Mean) -> Floats:
 
 
 def _change(was: Complexes, now: Complexes, variance: Floats, freedom: Floats) -> Complexes:
-    """The present vectors less the healthy ones, these turned to where they surprise least."""
+    """The present vectors less the healthy ones, these turned so that chance explains the difference best."""
     turns = np.exp(1j * np.outer(_ANGLES, ORDERS))[:, :, np.newaxis]
     changes = now - turns * was
     return np.asarray(changes[np.argmin(surprise(changes, variance, freedom).sum(axis=(1, 2)))])
@@ -398,7 +398,7 @@ class _ResidualChange:
 def _causes(
     evidence: Mapping[Cause, float], rules: OrderRules, *, growth: float, grown: bool
 ) -> tuple[Cause, ...]:
-    """What a change comes of, the most likely first."""
+    """The causes of a change, the most likely first."""
     lead = evidence["unbalance"] - evidence["unmodelled"]
     if growth < 1.0 + rules.least_change or lead < -rules.margin_nats:
         return ("unmodelled",)

@@ -68,12 +68,15 @@ def gather(group: Group, own: float, lead_limit: float, width: int) -> int:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def first_verdict(batch: Batch, pairs: Pairs, header: Header) -> int:
-    """One sample's evidence of every mode against every other; a mode that leads all unlike it, or -1.
+    """One sample's evidence of every mode against every other, and what it decides.
 
     Args:
         batch: memory of the bank; ages go on.
-        pairs: ``[M M]`` of `batch.PAIR`; their log-likelihood ratios go on.
-        header: of `batch.HEADER`.
+        pairs: ``[M M]`` of `observer_batch.PAIR`; their log-likelihood ratios go on.
+        header: of `observer_batch.HEADER`.
+
+    Returns:
+        A mode that leads all modes that do not look like it, or -1.
     """
     count = header.modes
     winner = UNDETERMINED
@@ -101,16 +104,16 @@ def first_verdict(batch: Batch, pairs: Pairs, header: Header) -> int:
 def next_verdict(batch: Batch, pairs: Pairs, header: Header) -> tuple[int, int]:
     """The mode with a threshold of evidence against the declared one, and the one that takes over, or -1.
 
-    A transient passes by the mildest faults, so for a moment several are past their thresholds. Who
-    takes over must lead the rest by the margin; past three thresholds it need not any more, for on a
+    A transient passes by the mildest faults, so for a moment several are past their thresholds. The
+    one that takes over must lead the rest by the margin. Past three thresholds this is not needed: on a
     machine that lies between two levels neither ever leads. Where many faults are told apart that is not
     enough, and the transient is given time to settle. A mode that looks like the declared one cannot take
     over from it, and one that looks like the leading one does not hold it up.
 
     Args:
         batch: memory of the bank.
-        pairs: ``[M M]`` of `batch.PAIR`.
-        header: of `batch.HEADER`.
+        pairs: ``[M M]`` of `observer_batch.PAIR`.
+        header: of `observer_batch.HEADER`.
     """
     count = header.modes
     row = header.decision * count
@@ -138,14 +141,14 @@ def next_verdict(batch: Batch, pairs: Pairs, header: Header) -> tuple[int, int]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def stand_by(mode: int, batch: Batch, pairs: Pairs, header: Header) -> None:
+def declare(mode: int, batch: Batch, pairs: Pairs, header: Header) -> None:
     """Make a mode the decision: its lead is what it won by, and the evidence starts again.
 
     Args:
         mode: index of the mode.
         batch: memory of the bank.
-        pairs: ``[M M]`` of `batch.PAIR`.
-        header: of `batch.HEADER`.
+        pairs: ``[M M]`` of `observer_batch.PAIR`.
+        header: of `observer_batch.HEADER`.
     """
     won = batch[mode // WIDTH].cusum[mode % WIDTH]
     for j in range(header.modes):
@@ -220,7 +223,7 @@ def start_anew(memory: Bytes) -> None:
     """Start every observer of a bank again with the next sample that is usable, as after a long gap.
 
     Args:
-        memory: uint8 ``[n]``, see `batch.sections`; changed in place.
+        memory: uint8 ``[n]``, see `observer_batch.sections`; changed in place.
     """
     headers, batch, observers, pairs, _ = sections(memory)
     _forget(observers, batch, pairs, headers[0])
@@ -438,7 +441,7 @@ def advance(  # noqa: C901, PLR0912, PLR0915 - one recursion: correct, weigh, de
         cos: float64 ``[n]``, cosine of the shaft angle; NaN: not known.
         sin: float64 ``[n]``, its sine.
         begin: sample to begin at; not 0 to go on with a block after a change.
-        memory: uint8 ``[n]``, the bank's, see `batch.sections`; changed in place.
+        memory: uint8 ``[n]``, the bank's, see `observer_batch.sections`; changed in place.
 
     Returns:
         ``-1 - k`` if the decision changed at sample k, which is taken in; else n.
@@ -487,7 +490,7 @@ def advance(  # noqa: C901, PLR0912, PLR0915 - one recursion: correct, weigh, de
             header.departed = 0
         if winner != UNDETERMINED:
             onset = k + 1 - batch[winner // WIDTH].age[winner % WIDTH]
-            stand_by(winner, batch, pairs, header)
+            declare(winner, batch, pairs, header)
 
         declared = UNDETERMINED
         if counts:

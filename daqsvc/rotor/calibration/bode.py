@@ -41,7 +41,7 @@ _STARTS = 12
 _FIRST_DAMPING = 0.03
 _SAMPLES_PER_REVOLUTION = 32.0
 _RUN_IN = 0.6
-"""Part of the lowest speed that a sweep is taken to come from: its own start has died out by then."""
+"""Speed at which a sweep is assumed to begin, as a part of the lowest: its start has died out by there."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

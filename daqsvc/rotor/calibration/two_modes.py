@@ -10,7 +10,7 @@ late peak, exact while the rate is even. For small rates it leaves 1X behind by 
 response H; the search begins with that, and ends with the former.
 
 Not everything can be told from a run-up: where nothing whirls backward, the gyroscopic moment is as good as
-more inertia. So each figure is kept near 0 by a weak prior, and stays there unless the orbits say otherwise.
+more inertia. So each figure is kept near 0 by a weak prior, and stays there unless the orbits show otherwise.
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ _USUAL = np.array([1.0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0.5])
 _PRIORS = np.array(
     [0.3, 0.03, 0.3, 0.3, 2.0, 0.1, 0.1, 0.1, 10.0, 10.0, 0.05, 0.05, 0.05, 0.05, 0.05, 0.05, 0.5]
 )
-"""What each figure is without a word of the data, and how far from there it may be.
+"""Prior of each figure: its mean and standard deviation.
 
 They are: k; kappa; q; the supports' lag c; gamma; d; unbalance; higher modes; runout forward and backward;
 beta. Complex ones are two.
 """
 _FLOOR = 0.003
-"""Part of the whirl that no such model is taken to be better than, nor a revolution of it."""
+"""Least error that is assumed of such a model and of each revolution, as a part of the whirl."""
 _WORTH = 100.0
 """Revolutions that count, however many there are: what the model misses is the same in all of them."""
 _MOST_POINTS = 200
@@ -212,8 +212,8 @@ def fit_two_modes(
         return np.concatenate((misfit.real, misfit.imag, (figures - _USUAL) / _PRIORS))
 
     best = None
-    # The stiff direction is somewhere, and so is the share: from one start the search may end beside it. What
-    # is best without the ringing need not be with it, so that the best of every share goes on.
+    # Stiff direction and share are not known, and from one start the search may end at wrong ones. The best
+    # figures without the ringing need not be the best with it, so the best of every share is searched on.
     for share in _SHARES:
         nearest = None
         for number in range(_TURNS):

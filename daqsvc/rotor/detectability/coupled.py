@@ -1,7 +1,7 @@
 """What the bank of a rotor with two modes can tell apart; `prediction` has the paper's rotor.
 
-Steady evidence is computed of the orbits (`coupled.coupled_evidence`), delays and whatever rubs are simulated
-with fixed seeds: with coupled axes the distribution of the evidence has no closed form worth its length.
+Steady evidence is computed from the orbits (`coupled.coupled_evidence`). Delays, and all modes that rub, are
+simulated with fixed seeds: with coupled axes the distribution of the evidence has no simple closed form.
 """
 
 from __future__ import annotations
@@ -85,8 +85,8 @@ class CoupledBank:
             seed: of the noise and the shaft angles.
 
         Returns:
-            Nats a revolution of the row's mode, the truth, over the column's, and revolutions from a change
-            of the column's mode to the row's until half of the runs have declared it; float64 ``[M, M]``.
+            Float64 ``[M, M]`` each: nats a revolution of the row's mode, the truth, over the column's; and
+            revolutions after a change from the column's mode until half of the runs have declared the row's.
         """
         count, w = len(self._modes), self._modes[0].rotor.w
         before, after, steady = (

@@ -4,7 +4,7 @@ A linear observer of mode i that watches a machine in mode j is a linear time-in
 innovation has a mean, driven by the difference of the two orbits through the observer's own closed
 loop, and a variance, driven by the noise of the sensor and of the motion. Both follow exactly from one
 augmented system, the state of the truth beside that of the observer, for any mismatch of damping,
-stiffness, orbit or rest; with them follows the expected log-likelihood of every sample.
+stiffness, orbit or rest. From them follows the expected log-likelihood of every sample.
 
 The shaft is isotropic: a complex number holds both axes, and the mean has two parts, one that stands
 still (the rests differ) and one that turns with the shaft (the orbits differ). Averaged over the shaft
@@ -161,7 +161,7 @@ class Observation:
     def steady_misfit(self, w: float) -> float:
         """What the mean of the innovation alone takes from the log-likelihood of a sample, in nats.
 
-        This part rests on the orbits; what the variance takes rests on how the machine is taken to shake.
+        This part depends on the orbits. What the variance takes depends on the assumed noise of the machine.
         """
         return 0.5 * self._steady_power(w) / self.model.variance
 

@@ -1,6 +1,6 @@
 """What a rotor's bank can tell apart on this machine, and how soon: known before anything breaks.
 
-Between linear modes every figure is computed, where a mode rubs it is simulated with fixed seeds and
+Between linear modes every figure is computed. Where a mode rubs, it is simulated with fixed seeds and
 marked so (`evidence`). Evidence is counted in nats, natural logarithms of likelihood ratios: 3 nats are
 odds of 20 to 1, 16 nats of nine million to one.
 
@@ -278,7 +278,7 @@ def _vector_evidence(before: Axis, changed: NormalisedRotor, calibration_rev: fl
     """Evidence of a change in the synchronous vector after long enough, nats.
 
     With sensor noise alone this is ``nc N SNR delta^2``: the baseline's nc revolutions are the limit, not
-    patience. The orbit's own noise is not white and adds what it has at rest and at 1X.
+    the time. The orbit's own noise is not white and adds what it has at rest and at 1X.
     """
     rotor = before.rotor
     w, revolution = rotor.w, 2.0 * math.pi / abs(rotor.w)
@@ -404,7 +404,7 @@ def detectability(
     when it also leads all the rest.
 
     Args:
-        modes: the hypotheses, healthiest first; the first one's speed is everybody's.
+        modes: the hypotheses, healthiest first; all at the speed of the first one.
         noise: standard deviation of the measured position, in clearances.
         duration: normalised time between samples, omega_s dt.
         threshold_nats: evidence that changes the decision: one figure, or float64 ``[M, M]`` from the

@@ -1,6 +1,6 @@
 """What the synchronous vector of a calibrated rotor can see and tell apart, before any fault happens.
 
-The departure test holds the mean of the last m revolutions against the n healthy ones before them:
+The departure test compares the mean of the last m revolutions with the n healthy ones before them:
 ``T = sum over k of |d_k|^2 / (v_k (1/m + 1/n) + floor)``. A change is visible if T reaches the threshold h
 with the longest window; for white noise and a long window that is ``delta_min = sqrt(h / (n N SNR))``. A loss
 of damping and an unbalance move 1X alone: they are one group wherever the one can bring 1X to where the other

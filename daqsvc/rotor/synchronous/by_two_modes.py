@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 _LOSSES = np.geomspace(0.01, 1.5, 32)
 """1 / k - 1 of the static stiffness."""
 _SEEN = np.array([0.5, 0.7, 1.0, 1.4, 2.0])
-"""What the probes see the shaft sink by, over what the modes predict: it may sink more elsewhere."""
+"""How far the shaft sinks at the probes, over what the modes predict: it may sink more elsewhere."""
 _FILM = 0.05
 """Above this stiffness across the deflection, over the static one, an oil film carries the shaft ..."""
 _ASIDE = np.exp(1j * np.radians([-40.0, -20.0, 0.0, 20.0, 40.0]))

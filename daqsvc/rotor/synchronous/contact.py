@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 _LEAST_NATS = 6.0
-"""Both senses of 2X together pass this by chance once in 60 looks."""
+"""Both senses of 2X together pass this by chance once in 60 evaluations."""
 _LINEAR_2X = 0.003
 """Part of a change that a linear rotor leaves at 2X, by runout that is resampled."""
 _FILLED = 0.9

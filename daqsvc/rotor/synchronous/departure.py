@@ -7,12 +7,12 @@ before it:
 
 Under a healthy machine T of one window is Gamma(5, 1): five complex components. The reference is all that
 was seen since it began, so it gets better while the machine stays as it is. What can be seen at all is
-limited by its length, not by patience: delta_min = sqrt(threshold / (n_ref N SNR)).
+limited by its length, not by the time: delta_min = sqrt(threshold / (n_ref N SNR)).
 
 Before that: are the revolutions of a baseline those of one and the same machine (`oddest_stretch`)? Every
 stretch of revolutions is compared with all others, in its mean vector and in its nonstationarity. The
 scatter that this is judged by comes from neighbouring revolutions, by medians: a step, a burst or a drift
-hardly widens it, so that none of them hides behind itself.
+hardly widens it, so that none of them hides itself.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ WINDOWS = np.array([1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128])
 
 _LONGEST = int(WINDOWS[-1])
 _MOST_REFERENCE = 2000
-"""The reference stops to grow here: beyond, a machine that drifts would take its own drift for healthy."""
+"""The reference stops to grow here: beyond, the drift of a machine would be taken for healthy."""
 
 # Measured over healthy revolutions with a growing baseline (test_rotor_departure.py): 1.6, 0.42, 0.09
 # and 0.02 departures per 1000 revolutions at 16, 18, 20 and 22 nats; the line is on the safe side of them.
@@ -136,7 +136,7 @@ class DepartureEvidence:
 
 
 class DepartureTest:
-    """Holds revolution after revolution against all before.
+    """Compares each revolution with all before.
 
     Args:
         spread: scatter of the vectors.

@@ -13,10 +13,10 @@ rotor's parameters are averaged over, so that a flexible hypothesis pays for its
   or an orbit that fills the clearance.
 * unmodelled: any components, each by itself. It pays `UNMODELLED_NATS` for explaining everything.
 
-Where a run-up has shown the rotor's two modes, they say how damping loss and stiffness loss move the vector
+Where a run-up has shown the rotor's two modes, they show how damping loss and stiffness loss move the vector
 (`daqsvc.rotor.synchronous.by_two_modes`), and the free shapes above are for what few machines do beside that.
 
-The name or group of names that the likelihoods come to (`identify`) follows.
+From the likelihoods follows the name or the group of names (`identify`).
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ FAULTS: tuple[RotorFault, ...] = get_args(RotorFault)
 UNMODELLED_NATS = 6.0
 
 _LEAK = 0.01
-"""What a change of one component may leave in the others: the plant is no Laval rotor to the last digit."""
+"""What a change of one component may leave in the others: the machine is not exactly a Laval rotor."""
 
 _STIFFNESS_LOSSES = np.geomspace(0.02, 1.2, 24)
 """1 / k - 1 of the stiffness losses looked for."""
@@ -97,7 +97,7 @@ _BESIDES = 0.02
 """Probability that a fault moves a rotor in another way than its two modes predict."""
 
 _NO_CONTACT_NATS = 12.0
-"""What a rub stays behind all others where its harmonics would be seen and are not."""
+"""Nats by which a rub is put behind all others where its harmonics would be seen and are not."""
 _HIDDEN_CONTACT_NATS = 1.0
 """The same where noise may hide them: a rub stays in the group, but is not the first of it."""
 
@@ -256,8 +256,8 @@ def _sunk(change: complex, variance: float, healthy: Healthy) -> float:
 def _softer(change: Complexes, variance: Floats, healthy: Healthy, *, still: float) -> float:
     """Log density of mean position and forward 1X where some support gives way under the weight.
 
-    How far the shaft sinks shows how much lower its natural frequency is (Rayleigh's quotient, omega^2 = g
-    over the sag), up to the part that the probes see of it, and that how 1X turns. Or 1X moves in any way.
+    How far the shaft sinks shows how much lower its natural frequency is, up to the part that the probes see
+    of it (Rayleigh's quotient, omega^2 = g over the sag). That shows how 1X turns. Or 1X moves in any way.
     """
     free = _free(change[FORWARD], variance[FORWARD], healthy.amplitude_um)
     if healthy.rotor.two_modes is None:
@@ -357,11 +357,11 @@ _ENERGY_NATS = 12.0
 _MOST_ENERGY_NATS = 100.0
 _MISFIT = 0.005
 """Part of the evidence of a change that the shape of a rub's pulse may be off by: where no rotor model fits
-to the last digit, a few nats of thousands mean nothing."""
+exactly, a few nats of thousands mean nothing."""
 _RIVALS = frozenset(("rub", "unmodelled"))
 TEMPERATURE = 3.0
-"""What evidence is divided by before it is a probability: no machine is any signature's to the last digit, so
-likelihoods are too sure of themselves. Of finite-element rotors this value makes what is true likeliest (the
+"""What evidence is divided by before it is a probability: no machine follows a signature exactly, so
+likelihoods are too certain. Of finite-element rotors this value makes what is true likeliest (the
 best of each geometry and noise lies from 2 to 5); one that grows with the evidence does worse."""
 
 
