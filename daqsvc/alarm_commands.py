@@ -201,7 +201,9 @@ class CommandExecutor:
         try:
             if self._refusals.flooding:
                 # What has not been recorded is not done, and a flood is not recorded.
-                refusal = "too many commands were refused lately; ask again in a minute, or at the box"
+                refusal = (
+                    "too many commands were refused in a short time; try again in a minute, or at the box"
+                )
                 self._refusals.count(command, source, refusal)
                 return self._refuse(refusal, NOT_ASKED)
             entry = await self._audit.asked(command, source)
@@ -303,6 +305,6 @@ def _not_on_disk(committed: Sequence[asyncio.Future[int]]) -> str:
     if all(one.done() and one.exception() is None for one in committed):
         return ""
     errors = [f"{one.exception()}" for one in committed if one.done() and one.exception() is not None]
-    return "done, but the journal cannot be written yet, and a restart before it can will undo it: " + (
+    return "done, but the journal cannot be written yet, and a restart now would undo it: " + (
         "; ".join(errors) or "the event waits in memory; the alarm store/journal has the remedy"
     )

@@ -31,7 +31,7 @@ class Box:
     """One or several machine files that are watched by one process.
 
     A single machine file is its own box: every name is as in the file. Of several ones each bus, by its
-    name, and each table of an output or of the store is one thing of the box; streams and sensors have the
+    name, and each table of an output or of the store is one thing of the box. Streams and sensors have the
     name of their machine in front. So what is made once for all of them is made of one file, `own`.
 
     Args:
@@ -107,7 +107,7 @@ def _of_the_box(files: Sequence[MachineFile]) -> Iterator[Problem]:
         for key in ("site", "box"):
             mine, theirs = getattr(file, key), getattr(first, key)
             if mine != theirs:
-                words = f'but {first.path} says "{theirs}", and one process is one box'
+                words = f'but {first.path} has "{theirs}", and one process is one box'
                 yield _problem(
                     file, (key,), f'"{mine}"', words, f'write {key} = "{theirs}", or run it by itself'
                 )

@@ -684,7 +684,7 @@ def parse_request(line: bytes, machines: Collection[str]) -> ControlRequest:
     except ValidationError as error:
         fault = faults_of(error, "it")[0]
         if fault.startswith("verb: must be "):
-            fault += f"; or a question, as it is documented to the letter: {_QUESTIONS}"
+            fault += f"; or a question exactly as documented: {_QUESTIONS}"
         raise RequestError(f"the request is not valid, {fault}") from None
     except ValueError as error:
         raise RequestError(f"{error}") from None
@@ -759,7 +759,7 @@ def ask_reload(store: Path, *, dry_run: bool = False) -> ReloadAnswer:
         ControlError: there is no service, it is somebody else's, or it does not answer.
     """
     [line] = [line for line, is_dry in _RELOADS.items() if is_dry == dry_run]
-    answer = _asked(store, line + b"\n", RELOAD_S, LONGEST_STATUS, "its log says what it has done")
+    answer = _asked(store, line + b"\n", RELOAD_S, LONGEST_STATUS, "its log shows what it has done")
     try:
         return ReloadAnswer.model_validate_json(answer)
     except ValidationError:
@@ -779,7 +779,7 @@ def ask_snapshot(store: Path, machine: str | None = None) -> SnapshotAnswer:
         ControlError: there is no service, it is somebody else's, or it does not answer.
     """
     named = b"}" if machine is None else b', "machine": ' + json.dumps(machine).encode() + b"}"
-    then = "its log says what it has done"
+    then = "its log shows what it has done"
     answer = _asked(store, _SNAPSHOT_VERB + named + b"\n", SNAPSHOT_S, LONGEST_LINE, then)
     try:
         return SnapshotAnswer.model_validate_json(answer)
@@ -884,7 +884,7 @@ def _absence(store: Path) -> AbsentError:
     else:
         why = (
             f"it starts or stops, or the socket was removed and is made again within {LOOK_S:g} s: try again "
-            "then; the service's log says why, if it cannot be made"
+            "then; the service's log has the reason if it cannot be made"
         )
     return UnreachableError(
         f"the daqsvc of {store} runs, but has no control socket {store / SOCKET} to take commands at: {why}"

@@ -131,7 +131,7 @@ class LiveFeed:
         """Whose machine it is, what comes of it, and its state.
 
         Args:
-            statements: what each detector has said last.
+            statements: the last statement of each detector.
             alarms: the last event of each alarm.
             standings: how each stream stands.
             of_this_box: whether who looks is, and can use the files that the machine file names.

@@ -200,7 +200,7 @@ class SelfCheck:
                 f"ends is lost; {self._remedy}"
             )
             return Condition(JOURNAL, Level.ALERT, sentence)
-        return Condition(JOURNAL, Level.NORMAL, f"the journal in {self._store} takes what comes")
+        return Condition(JOURNAL, Level.NORMAL, f"the journal in {self._store} takes all events")
 
     def _damage(self, vitals: Vitals) -> Condition:
         if not self._damaged.goes_on(vitals.damaged, vitals.now_ns):
@@ -221,7 +221,7 @@ class SelfCheck:
     def _audit(self, vitals: Vitals) -> Condition:
         stands = self._unwritten.goes_on(vitals.unwritten, vitals.now_ns)
         if not stands:
-            return Condition("store/audit-log", Level.NORMAL, "the audit log takes what comes")
+            return Condition("store/audit-log", Level.NORMAL, "the audit log takes all commands")
         sentence = (
             f"the audit log in {self._store} cannot be written, and commands are refused: {self._remedy}"
         )

@@ -60,7 +60,7 @@ class _Seen(NamedTuple):
         oldest_wall_ns: when the oldest event happened that waits for the broker; None if that is not known.
         alarms: the state of each.
         newest: by stream, its newest sample ``[channels]`` and when that was taken; None before the first.
-        latest: what each detector has said last.
+        latest: the last statement of each detector.
         measured: the same, with figures.
     """
 

@@ -29,7 +29,7 @@ SHARED = {
         "What are the channels called?",
         "Names with commas between, in the order in which the device sends them: x, y, kph",
     ),
-    "raw-type": Topic("Type of a sample in the frame", "The device's manual says so."),
+    "raw-type": Topic("Type of a sample in the frame", "The device's manual states it."),
     "scale": Topic(
         "What is one count of a sample worth?",
         "In volts if the device digitises a sensor, else in the unit of the sensor. See the device's manual.",
@@ -38,7 +38,7 @@ SHARED = {
         "Which serial port?",
         "Best the path below /dev/serial/by-id, which stays the same: ls -l /dev/serial/by-id shows it.",
     ),
-    "baud": Topic("Baud rate, in bit/s", "As the device is set; its manual says so."),
+    "baud": Topic("Baud rate, in bit/s", "As the device is set; its manual states it."),
     "counter": Topic(
         "Which signal or column counts the frames or lines, or tells the time?",
         "By it lost samples are found. none if there is no such signal (CAN only).",

@@ -41,7 +41,7 @@ class Field:
 
     Attributes:
         start: bit number as DBC files count: bit ``8 * byte + b`` with ``b = 0`` the least significant
-            bit of its byte; the field's least significant bit if ``order`` is little, its most
+            bit of its byte. It is the field's least significant bit if ``order`` is little, its most
             significant bit if it is big.
         bits: width, 1 to 64 (32 or 64 for a float).
         kind: how the bits are read.

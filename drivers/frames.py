@@ -414,7 +414,7 @@ class FrameLayout:
         at, channel = divmod(column, len(self.channels))
         cell, name = self._cells[column], self.channels[channel]
         value = raw[column] * self.scale[at, channel] + self.offset[at, channel]
-        remedy = "say by valid_raw which raw value stands for none"
+        remedy = "state in valid_raw which raw value means none"
         return LayoutError(
             f"channel {name!r}: {value:g} does not fit a {cell.bits}-bit {cell.kind} field of frame "
             f"{self.frame_id:#x}; {remedy if np.isnan(value) else 'choose a larger scale'}"

@@ -19,13 +19,13 @@ TOPICS = {
         "First byte of the counter in a frame",
         "From 0. By the counter lost samples are found; on CAN, none if the frames have none.",
     ),
-    "counter-bits": Topic("Width of the counter, in bits", "The device's manual says so."),
+    "counter-bits": Topic("Width of the counter, in bits", "The device's manual states it."),
     "counter-counts": Topic(
         "What does the counter count?", "It grows from frame to frame by 1, or by the samples in a frame."
     ),
     "byte-order": Topic("Which byte of a number comes first?", "little: the low one. big: the high one."),
     "first-byte": Topic("Byte of a frame where the samples begin", "From 0; mostly behind the counter."),
-    "samples-per-frame": Topic("Samples of each channel in a frame", "The device's manual says so."),
+    "samples-per-frame": Topic("Samples of each channel in a frame", "The device's manual states it."),
 }
 _PROBE_V = 18.0
 """Lowest voltage of a proximity probe, in V below 0."""

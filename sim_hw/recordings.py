@@ -45,7 +45,7 @@ def load_played(
         )
     if channels:
         raise RecordingError(
-            f"{path} is a CAN log, of which the machine file says channels: leave out --map",
+            f"{path} is a CAN log, of which the machine file states channels; leave out --map",
             NEEDS_MACHINE_FILE,
         )
     from daqsvc.offline.can_logs import load_can_log  # noqa: PLC0415 - brings python-can and kernels

@@ -27,11 +27,11 @@ _CATCHING_UP = 1.0 / 2.0
 class ArrivalCount:
     """Gives each frame the count that fits its time of arrival.
 
-    Frames come late, never early, so the time at which a frame is due follows the earliest ones: a device
+    Frames come late, never early, so the time at which a frame is due follows the earliest ones. A device
     whose rate is off the nominal one by up to 0.5 % gains and loses nothing. Loss is counted exactly while no
     frame is later than half the time between frames, and the device's clock drifts by less than a quarter of
     it during a gap. A longer delay is no loss if the frames have caught up within `WATCH_FRAMES` of that
-    time, as those do that a busy gateway sends all at once; else it is taken for missing frames. A repeated
+    time, as those do that a busy gateway sends all at once. Else it is taken for missing frames. A repeated
     frame is taken for a new one. No frame is ever rejected: one that comes before its time is a frame all the
     same.
 

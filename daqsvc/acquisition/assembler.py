@@ -464,7 +464,7 @@ def note_received(counters: StreamCounters, stream: str, samples: Samples) -> Sa
     absent = there.size - int(np.count_nonzero(there))
     if not counters.values_absent:
         logger.warning(
-            "stream %r: %d of its values are no measurements: the device says that it has none, or what it "
+            "stream %r: %d of its values are no measurements: the device states that it has none, or what it "
             "sends is not finite; such values are missing, and are counted from now on. Look at the sensors "
             "behind it",
             stream,

@@ -116,7 +116,7 @@ class CounterSense:
     @property
     def _flood_words(self) -> str:
         return (
-            f"more than {FLOOD_RATE:g} times as many frames come as the file says "
+            f"more than {FLOOD_RATE:g} times as many frames come as the file states "
             f"({self._frame_rate_hz:.4g} a second); check the device, and rate_hz"
         )
 

@@ -198,7 +198,7 @@ class Link:
     def leave_out(self, reason: str) -> None:
         """The link does not work at start, because of ``reason``, and is not tried again."""
         left_out = f"{self.name}: {reason}; it is left out until the service starts again"
-        logger.warning("%s, as start = 'ignore' says", left_out, extra=coded(LEFT_OUT_AT_START))
+        logger.warning("%s, as start = 'ignore' asks for", left_out, extra=coded(LEFT_OUT_AT_START))
         self.state, self.reason, self._said_down, self.over = "down", reason, False, left_out
         self.code = LEFT_OUT_AT_START
 

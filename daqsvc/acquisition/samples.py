@@ -34,7 +34,7 @@ class Quality(IntFlag):
     LOSS_ESTIMATED = 4
     """The number of missing samples comes from the host clock: the device has no counter, or restarted it."""
     PLACE_ESTIMATED = 8
-    """How far this block lies behind the one before is a guess, which may be off by many samples: the device
+    """How far this block lies behind the one before is a guess, which may be off by many samples. The device
     has begun to count again, or sends no count and was away for long. What goes by phase begins again."""
 
 

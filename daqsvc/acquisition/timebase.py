@@ -473,8 +473,8 @@ def rate_in_words(rate_hz: float, nominal_ns: float) -> str:
         nominal_ns: nominal time between samples.
     """
     return (
-        f"the device sends {readable(rate_hz)} Hz, the file says {readable(NS_PER_S / nominal_ns)}; correct "
-        "rate_hz in the machine file, or the device's setting"
+        f"the device sends {readable(rate_hz)} Hz, the file states {readable(NS_PER_S / nominal_ns)}; "
+        "correct rate_hz in the machine file, or the device's setting"
     )
 
 

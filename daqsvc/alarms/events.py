@@ -110,7 +110,7 @@ class AlarmEvent:
         chattering: whether its returns are held back because it becomes active and returns too often.
         finding: what is found, where a level can have several causes (`Finding.identity`).
         doubts: of a quality alarm, what is said against the sensor.
-        found: the message of the last event that said what is found; empty if this one's message states that,
+        found: the message of the last event that stated what is found; empty if this one's message does,
             or if it is not known.
 
     The last event of an alarm holds all that a restart needs to know about it.

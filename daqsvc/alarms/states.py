@@ -1,9 +1,9 @@
 """Alarm states after ISA-18.2 / IEC 62682 and the one function that moves between them.
 
 An alarm has its own state (`AlarmState.NORMAL` to `AlarmState.LATCHED_ACKNOWLEDGED`), moved by
-its condition and by people, and may in addition be held (`Hold`): suppressed because a sensor is not
+its condition and by people. It may in addition be held (`Hold`): suppressed because a sensor is not
 OK, shelved, or out of service. As in OPC UA Part 9 a hold covers the state without forgetting it: when
-it is lifted, a latched alarm is still latched and an unacknowledged one still wants to be acknowledged.
+it is lifted, a latched alarm is still latched and an unacknowledged one still waits to be acknowledged.
 """
 
 from __future__ import annotations

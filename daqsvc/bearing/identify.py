@@ -6,7 +6,7 @@ innovations, is white on the healthy machine; a change of the machine makes them
 Biometrika 50, 1963): every order up to the highest in one pass, each of them stable.
 
 Innovations of windows of half a second are measured as a whole and in bands, in dB over the healthy machine.
-How much these figures scatter from window to window while the machine is healthy makes the limit: a change is
+How much these figures scatter from window to window while the machine is healthy makes the limit. A change is
 significant at a stated probability of a false alarm, and of a size that matters. That innovations have grown
 shows that something has changed, not what.
 """

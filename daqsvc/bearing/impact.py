@@ -1,6 +1,6 @@
 """What is known of an impact beforehand: its spectrum, frames of the residual, and whether these show bursts.
 
-A race is named by which side the excess is on, and any excess is on some side: a noisier sensor, a changed
+A race is named by which side the excess is on, and any excess is on some side. A noisier sensor, a changed
 gain and steady forces look like one race or the other, too. But they are stationary, and impacts are not. In
 frames as short as an impact, the energies of stationary Gaussian noise scatter in a known way, whatever its
 level and spectrum. Those of impacts scatter more, for some frames hold one and others do not.

@@ -85,8 +85,8 @@ class BearingModel:
     """x' = A x + B v + F u, y = C x + E v + D u.
 
     The state is (x_r, v_r, x_b, v_b, x_h, v_h) in m and m/s. The input v is the force of the unbalance on the
-    rotor in N; u are the displacements of inner and outer race in m; y are the accelerations of rotor and
-    housing in m/s^2. C and D are the paper's; F, B and E are those that fit them.
+    rotor in N, u are the displacements of inner and outer race in m. The outputs y are the accelerations of
+    rotor and housing in m/s^2. C and D are the paper's; F, B and E are those that fit them.
 
     Args:
         parameters: of the machine.

@@ -116,7 +116,7 @@ def _of_pattern(
         more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
         those = f"these are not normal: {', '.join(names[:MOST_NAMED])}{more}" if names else "all are normal"
         raise NoSuchAlarmError(
-            f"no alarm that {pattern!r} matches is one to {verb}; {those}. A pattern means alarms that "
+            f"no alarm that {pattern!r} matches waits for {verb}; {those}. A pattern means alarms that "
             "daqsvc alarms shows; write the name of any other"
         )
     yield from found

@@ -68,7 +68,7 @@ def fleet_misuse(arguments: argparse.Namespace) -> str:
         )
     given = [name for name in _OPTIONS if getattr(arguments, name[2:].replace("-", "_")) not in _LEFT_OUT]
     if given:
-        return f"{', '.join(given)}: the machine files of the archive say this; leave it out with --cluster"
+        return f"{', '.join(given)}: the machine files of the archive state this; leave it out with --cluster"
     if len(arguments.files) > 1:
         places = len(arguments.files)
         return f"--cluster takes one archive, and {places} places are named; give the folder of all"
@@ -148,7 +148,7 @@ def _text(summary: CampaignSummary, results: str) -> str:
         shown = ", ".join(summary.left_out[:5]) + (", ..." if len(summary.left_out) > 5 else "")
         lines.append(f"left out, as no machine's: {shown}")
     failed = list(summary.failed.items())
-    lines += [f"not looked at: {name}: {why}" for name, why in failed[:5]]
+    lines += [f"not read: {name}: {why}" for name, why in failed[:5]]
     if len(failed) > 5:
         lines.append(f"... of {len(failed):,} machines that were left out; --json has all")
     return "\n".join([*lines, f"results: {results}"])

@@ -212,7 +212,7 @@ def channel_map(text: str) -> dict[str, str]:
             )
         if name.strip() in columns:
             raise argparse.ArgumentTypeError(
-                f"{text!r} names {name.strip()!r} twice; give each channel a name of its own"
+                f"{text!r} names {name.strip()!r} twice; give each channel its own name"
             )
         columns[name.strip()] = variable.strip()
     return columns

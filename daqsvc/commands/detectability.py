@@ -29,11 +29,11 @@ class DetectabilityCommand(VerbWithKernels):
 
     help = "compute which faults of a rotor can be told apart, how soon, and from which size on"
     description = (
-        "Compute, before any fault happens, what the rotor bank of a machine file can tell apart: the "
-        "evidence between every two modes in nats per revolution, and the expected delay of its alarms. "
-        "Also the smallest visible change of every kind, and the modes that look the same at this "
-        "speed. Without a rotor bank, compute what [pipeline.rotor_synchronous] can see: from its "
-        "calibration, or from --noise-um."
+        "Compute, before any fault happens, which faults the rotor bank of a machine file can tell "
+        "apart. Print the evidence between every two modes in nats per revolution, and the expected "
+        "delay of its alarms. Also print the smallest visible change of every kind, and the modes that "
+        "look the same at this speed. Without a rotor bank, compute what [pipeline.rotor_synchronous] can "
+        "see: from its calibration, or from --noise-um."
     )
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:

@@ -27,9 +27,9 @@ class ExportCommand(VerbWithKernels):
 
     help = "write a recording, CAN log or snapshot as Parquet, CSV, WAV, MATLAB, UFF58 or MDF4"
     description = (
-        "Write the samples of a recording, or of a snapshot of the service, as a file for another tool: "
-        "Parquet, CSV, WAV, MATLAB, universal file (data sets 58) or MDF 4. The suffix of --to selects "
-        "the format. It reads all files that daqsvc analyze reads; a CAN log needs its machine file "
+        "Write the samples of a recording, or of a snapshot of the service, as a file for another tool. "
+        "The suffix of --to selects the format: Parquet, CSV, WAV, MATLAB, universal file (data sets "
+        "58) or MDF 4. It reads all files that daqsvc analyze reads; a CAN log needs its machine file "
         "(.toml) before it. Names, units, rate, begin and gaps are written with the samples. If there "
         "are several streams, .mat, .uff and .mf4 contain all of them; with the other formats each "
         "stream gets its own file, whose name ends with the name of the stream."

@@ -200,7 +200,7 @@ def _fleet(report: FleetReport) -> str:
         )
         lines.append(_cost(report))
     elif report.cost is not None:
-        lines.append("What false alarms cost is not known: --truth says which alarms are false")
+        lines.append("What false alarms cost is not known: --truth has the alarms that are false")
     if report.years is not None and report.without_times:
         several = len(report.without_times) > 1
         lines.append(

@@ -129,7 +129,7 @@ def _bus(machine: MachineFile, name: str | None) -> tuple[str, CanBus]:
     there = f"CAN buses of {machine.path} are {', '.join(can_buses)}" if can_buses else "there is none"
     if name is None:
         if len(can_buses) != 1:
-            raise _MisuseError(f"--bus: say which CAN bus to record; {there}", ARGUMENTS)
+            raise _MisuseError(f"--bus: name the CAN bus to record; {there}", ARGUMENTS)
         return next(iter(can_buses.items()))
     if name not in can_buses:
         what = f"--bus {name}: {machine.path} has no CAN bus of this name; {there}"
@@ -139,7 +139,7 @@ def _bus(machine: MachineFile, name: str | None) -> tuple[str, CanBus]:
 
 def _check_new(log: Path) -> None:
     if log.suffix.lower() not in ENDINGS:
-        what = f"--out {log}: ends in none of {', '.join(ENDINGS)}, which say the format; add one"
+        what = f"--out {log}: ends in none of {', '.join(ENDINGS)}, by which the format is chosen; add one"
         raise _MisuseError(what, WRONG_VALUE)
     if log.exists():
         what = f"--out {log}: is there already; give another name, or remove it first"

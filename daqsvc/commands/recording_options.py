@@ -55,7 +55,7 @@ _PROBES_ONLY = (
     *("--ac-coupled", "--natural-frequency-tolerance", "--damping-tolerance"),
 )
 """Options of `analyze` that accelerometers have not."""
-_SAID_TWICE = "--bearing and --orders both say what the bearing is; leave out one of them"
+_SAID_TWICE = "--bearing and --orders both define the bearing; leave out one of them"
 _DIMENSIONS = ("--balls", "--ball-diameter-mm", "--pitch-diameter-mm")
 _ORDER_KEYS = ("BPFI", "BPFO", "BSF", "FTF")
 
@@ -148,9 +148,9 @@ def _take_dimensions(arguments: argparse.Namespace) -> str:
     if not given:
         return ""
     if missing := _missing(arguments, _DIMENSIONS):
-        return f"{given[0]} tells of a bearing's dimensions: {', '.join(missing)} must be given too"
+        return f"{given[0]} is one of a bearing's dimensions: {', '.join(missing)} must be given too"
     if arguments.bearing is not None or arguments.orders is not None:
-        return "--balls, --bearing and --orders all say what the bearing is; leave out all but one of them"
+        return "--balls, --bearing and --orders all define the bearing; leave out all but one of them"
     from daqsvc.bearing.geometry import BearingGeometry  # noqa: PLC0415 - each verb imports only what it needs
 
     sizes = arguments.balls, arguments.ball_diameter_mm, arguments.pitch_diameter_mm
@@ -174,10 +174,10 @@ def _probe_misuse(arguments: argparse.Namespace, machine: Path | None, recording
         return f"--unit {arguments.unit}: proximity probes measure in {', '.join(LENGTH_UNITS)}"
     if machine is not None:
         extra = _given(arguments, ("--probes", "--speed-rpm", *_PROBES_ONLY[1:]))
-        return f"{', '.join(extra)}: the machine file says this; leave it out" if extra else ""
+        return f"{', '.join(extra)}: the machine file states this; leave it out" if extra else ""
     known = _given(arguments, ("--natural-frequency-hz", "--damping-ratio", "--static-sag-um"))
     if known and arguments.calibration is not None:
-        return f"{', '.join(known)}: the calibration says this; leave it out, or leave out --calibration"
+        return f"{', '.join(known)}: the calibration states this; leave it out, or leave out --calibration"
     return _lacking(arguments) or _unknown_channels(arguments)
 
 
@@ -193,7 +193,7 @@ def _calibrate_misuse(arguments: argparse.Namespace, machine: Path | None, recor
         return "nothing would be kept: give --out FILE, --json or both"
     rotor = ("--probes", "--speed-rpm", *_ROTOR, "--ac-coupled")
     if machine is not None and (options := _given(arguments, rotor)):
-        return f"{', '.join(options)}: the machine file says this; leave it out"
+        return f"{', '.join(options)}: the machine file states this; leave it out"
     if arguments.live:
         return _live_misuse(arguments, machine, recordings)
     if not recordings:
@@ -561,7 +561,7 @@ def _lacking(arguments: argparse.Namespace) -> str:
 def _order_misuse(arguments: argparse.Namespace, machine: Path | None) -> str:
     """What is wrong with the options of accelerometers together; empty if nothing is."""
     if machine is not None:
-        return "--channels, --baseline: the machine file says what is measured; leave them out"
+        return "--channels, --baseline: the machine file states what is measured; leave them out"
     if extra := _given(arguments, (*_PROBES_ONLY, "--calibration", "--plot")):
         return f"{', '.join(extra)}: not with --channels and --baseline; leave it out"
     if missing := ", ".join(_missing(arguments, ("--channels", "--baseline", "--speed-rpm"))):
@@ -586,11 +586,11 @@ def _misuse_of_accelerometers(arguments: argparse.Namespace) -> Iterator[str]:
 def _bearing_misuse(arguments: argparse.Namespace, machine: Path | None) -> Iterator[str]:
     """What is wrong with the options of bearings together."""
     if machine is not None:
-        yield "--bearing, --orders: the machine file says which bearings there are; leave them out"
+        yield "--bearing, --orders: the machine file lists the bearings; leave them out"
     if arguments.bearing is not None and arguments.orders is not None:
         yield _SAID_TWICE
     if arguments.calibration is not None and arguments.baseline is not None:
-        yield "--calibration and --baseline both say what the healthy machine is; leave out one of them"
+        yield "--calibration and --baseline both define the healthy machine; leave out one of them"
     if extra := _given(arguments, _PROBES_ONLY):
         yield f"{', '.join(extra)}: not with --bearing or --orders; leave it out"
     if missing := _missing(arguments, ("--channels", "--speed-rpm")):
@@ -609,7 +609,7 @@ def _healthy_bearing_misuse(
 ) -> str:
     """What is wrong with the options of bearings together; empty if nothing is."""
     if machine is not None:
-        return "--channels, --bearing, --orders: the machine file says this; leave them out"
+        return "--channels, --bearing, --orders: the machine file states this; leave them out"
     rotor = ("--probes", "--keyphasor", "--natural-frequency-hz", "--damping-ratio", "--clearance-um")
     if extra := _given(arguments, (*rotor, "--sweep-rpm")):
         return f"{extra[0]}: not with --channels; a bearing is calibrated by itself"
@@ -627,7 +627,7 @@ def _healthy_bearing_misuse(
 
 def _live_misuse(arguments: argparse.Namespace, machine: Path | None, recordings: Sequence[str]) -> str:
     if machine is None:
-        return "--live needs a machine file, which says how to reach the machine"
+        return "--live needs a machine file, which states how to reach the machine"
     if recordings or arguments.sweep_rpm:
         return "--live listens to the machine; leave out recordings and --sweep-rpm, or leave out --live"
     return ""
@@ -639,7 +639,7 @@ def _lacking_to_calibrate(arguments: argparse.Namespace, recordings: int) -> str
     if arguments.keyphasor is None and arguments.keyphasor_threshold is not None:
         return "--keyphasor-threshold without --keyphasor: name the channel of the keyphasor"
     if arguments.keyphasor is not None and arguments.sweep_rpm is not None:
-        return "--keyphasor and --sweep-rpm both say the speed; leave out one of them"
+        return "--keyphasor and --sweep-rpm both state the speed; leave out one of them"
     steady = recordings - (arguments.sweep_rpm is not None)
     if arguments.keyphasor is None and arguments.speed_rpm is None and steady:
         return (

@@ -25,9 +25,9 @@ class SnapshotCommand:
 
     help = "make the running service write a snapshot of a machine: samples, statements, alarms"
     description = (
-        "Make the running service write a snapshot: the samples of all channels of a machine from "
-        "before_s before now until after_s after it, with the statements of its detectors and its "
-        "alarms. Waits until the file is complete and prints its path. The machine file needs a table "
+        "Make the running service write a snapshot: the samples of all channels of a machine, with the "
+        "statements of its detectors and its alarms. It begins before_s before now and ends after_s after "
+        "it. Wait until the file is complete and print its path. The machine file needs a table "
         "[recorder]. Exit code 1 if no snapshot was written."
     )
 

@@ -39,7 +39,7 @@ def load_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, budget: Budget
         count = math.prod(shape)
         size = count * dtype.itemsize
         if min(shape, default=0) < 0 or size > member.file_size:
-            raise ValueError(f"{member.filename!r} says that it holds {size} bytes in {member.file_size}")
+            raise ValueError(f"{member.filename!r} claims to hold {size} bytes in {member.file_size}")
         budget.check_declared(size)
         content = bytearray(size)
         view = memoryview(content)
@@ -52,7 +52,7 @@ def load_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, budget: Budget
             at += len(chunk)
             budget.spend(len(chunk))
         if file.read(1):
-            raise ValueError(f"{member.filename!r} holds more than it says")
+            raise ValueError(f"{member.filename!r} holds more than it claims")
     array = np.frombuffer(content, dtype, count) if size else np.empty(count, dtype)
     return array.reshape(shape, order="F" if fortran else "C")
 

@@ -106,7 +106,7 @@ class Budget:
             TooLargeError: that is too much.
         """
         if self.taken_bytes + count > self.most_bytes:
-            raise TooLargeError(self._why("says that it unpacks to", self.taken_bytes + count))
+            raise TooLargeError(self._why("claims to unpack to", self.taken_bytes + count))
 
     def _why(self, does: str, count: float) -> str:
         what = f"its {_size(self.file_bytes)} {does} {_size(count)}"

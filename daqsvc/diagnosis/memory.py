@@ -197,7 +197,7 @@ class _Putter:
                 return self._arrays[rest[0]].item() if kind == "complex" else self._arrays[rest[0]][()]
             case "kept":
                 if there is _MISSING:
-                    raise ValueError("what is no value has no place")
+                    raise ValueError("a value is missing in its place")
                 return there
             case "again":
                 return self._made[rest[0]]

@@ -608,7 +608,7 @@ class Pipeline:
             counters.failures += 1
             self._supervisor.failed(_part(detector), error, "it goes on with the next window")
             reason = f"detector {detector.name} has failed: {error_text(error)}"
-            with self._supervisor.sparing_others(_part(detector), "nothing is said of that window"):
+            with self._supervisor.sparing_others(_part(detector), "there is no statement on that window"):
                 return [
                     # It blames itself, also if it makes statements for each of its sensors: they have done
                     # nothing.

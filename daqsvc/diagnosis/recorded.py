@@ -348,7 +348,7 @@ class Statements:
             return {
                 "decision": None,
                 "quality": "missing",
-                "reason": "it said nothing",
+                "reason": "it gave no statement",
                 "worst": None,
                 "history": [],
             }

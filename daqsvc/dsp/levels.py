@@ -4,8 +4,8 @@ In a band a filled-in value is wrong twice: what is missing takes its power alon
 spread the power of all frequencies over all others. Integration blows that up at the low ones: one sample in
 fifty lost of an accelerometer that hears a loud bearing makes a velocity that is not there.
 
-The autocovariance has neither fault. Its mean product at lag k needs no sample but the pairs that are
-there, and has the right expectation whatever else is missing, as long as samples are not lost because of
+The autocovariance has neither fault. Its mean product at lag k needs only the pairs of samples that
+are there. Its expectation is right whatever else is missing, as long as samples are not lost because of
 their value. The power in a band is a sum over lags of it (Wiener and Khinchin), so it is right on average,
 too. With negative lags and taper, it is exactly the sum of a complete window.
 """

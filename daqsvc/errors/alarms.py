@@ -97,8 +97,8 @@ NO_REFERENCE = Code(
     "Setpoints of a phase are how far it may be from that of the machine in good order.",
     "Add reference_deg, the phase that was measured then.",
     _PAGE,
-    example="machine.toml:90: alarms[0]: does not say from where 1x_phase_lag counts: its setpoints are how "
-    "far it may be from a reference, either way. Remedy: add reference_deg, the phase of the machine "
+    example="machine.toml:90: alarms[0]: does not state from where 1x_phase_lag counts: its setpoints are "
+    "how far it may be from a reference, either way. Remedy: add reference_deg, the phase of the machine "
     "in good order, e.g. reference_deg = 135.0",
 )
 TRIP_MULTIPLY = Code(
@@ -108,7 +108,7 @@ TRIP_MULTIPLY = Code(
     "setpoints above 0.",
     "Add what is missing, or remove trip_multiply.",
     _PAGE,
-    example="machine.toml:145: alarms[3].trip_multiply = 2.0: never holds: nothing says when the machine "
+    example="machine.toml:145: alarms[3].trip_multiply = 2.0: never holds: nothing states when the machine "
     "starts up. Remedy: write a table [alarm_handling.start_up], or remove it",
 )
 ALWAYS_STARTING = Code(
@@ -161,9 +161,9 @@ CANNOT_JUDGE = Code(
 )
 ALARM_STANDS = Code(
     "A17",
-    "An alarm of the machine stands",
-    "A value is beyond a setpoint of the machine file, or a detector has found a fault. The message says "
-    "which. The service itself works as it should.",
+    "An alarm of the machine is active",
+    "A value is beyond a setpoint of the machine file, or a detector has found a fault. The message names "
+    "it. The service itself works as it should.",
     "Look at the machine. daqsvc alarms shows all alarms; daqsvc ack NAME acknowledges this one.",
     "commands.md",
     "alarm probe-x raised: probe-x alert: rms of probe-x is 36.2 um, alert limit 35 um",

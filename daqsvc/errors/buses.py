@@ -7,7 +7,7 @@ _PAGE = "can.md"
 WRONG_LAYOUT = Code(
     "B01",
     "The layout does not belong to this bus",
-    "A layout says how samples lie in what the bus carries: CAN frames, registers, lines or binary "
+    "A layout states where samples are in what the bus carries: CAN frames, registers, lines or binary "
     "frames. This one is for another kind of bus.",
     "Correct bus of the stream, or write the keys of a layout for this bus.",
     "driver-contract.md",
@@ -49,7 +49,7 @@ LOSS_UNNOTICED = Code(
     "Lost samples would not be noticed",
     "A counter in each frame or line tells what was lost and when a sample was taken. A time in each line"
     " does so less exactly.",
-    "Say where the counter is. If the device sends none, write no_counter = true: loss is then estimated.",
+    "State where the counter is. If the device sends none, write no_counter = true: loss is then estimated.",
     "driver-contract.md",
     example="machine.toml:54: streams.casing.layout: has neither counter nor time: lost lines would not be "
     'noticed. Remedy: add counter = { column = "seq" } or time = { column = "t", unit = "ms" }, '
@@ -91,7 +91,7 @@ NOT_TOLD_APART = Code(
     "Give each stream its own, as the devices send it.",
     "driver-contract.md",
     example='machine.toml:65: streams.other.layout.id = 0x101: id 0x101 on bus "can0" belongs to stream '
-    '"shaft" already. Remedy: give each stream of a bus an id of its own, as the devices send it',
+    '"shaft" already. Remedy: give each stream of a bus its own id, as the devices send it',
 )
 BUS_TOO_SLOW = Code(
     "B10",
@@ -264,7 +264,7 @@ MANUALS_NUMBER = Code(
 DEVICE_ABSENT = Code(
     "B27",
     "The device is not there at the start",
-    'The port or interface of a bus cannot be opened, and start = "error" says that the service needs it.',
+    'The port or interface of a bus cannot be opened, and start = "error" means that the service needs it.',
     'Plug the device in, or correct its name. With start = "retry" the service waits for it.',
     "driver-contract.md",
     "CAN bus 'can0' (socketcan can0): it cannot be opened: this kernel has no SocketCAN; `modprobe can-"
@@ -291,12 +291,12 @@ LINK_LOST = Code(
 LEFT_OUT_AT_START = Code(
     "B30",
     "A bus is left out until the next start",
-    'Its device was not there when the service started, and start = "ignore" says to go on without it.',
+    'Its device was not there when the service started, and start = "ignore" means to go on without it.',
     'Restart the service when the device is there. With start = "retry" it is tried again.',
     "driver-contract.md",
     "serial port 'line' (/dev/ttyUSB0): it cannot be opened; it is left out until the service starts "
     "again, as "
-    "start = 'ignore' says",
+    "start = 'ignore' asks for",
 )
 DRIVER_FAILED = Code(
     "B31",
@@ -330,7 +330,7 @@ REGISTER_REFUSED = Code(
 NO_FRAME = Code(
     "B34",
     "What comes is no frame of the stream",
-    "Bytes, lengths or checksums are not as the layout says, or the frame is of no stream of the machine "
+    "Bytes, lengths or checksums are not as the layout states, or the frame is of no stream of the machine "
     "file.",
     "Compare baud rate, framing, length, checksum and ids with the device. daqsvc sniff shows what it sends.",
     "driver-contract.md",
@@ -349,10 +349,10 @@ SAMPLES_MISSING = Code(
 NO_MEASUREMENT = Code(
     "B36",
     "Values of a stream are no measurements",
-    "The device says that it has no value, or sends one that is not finite, e.g. as a sensor is broken.",
+    "The device states that it has no value, or sends one that is not finite, e.g. as a sensor is broken.",
     "Look at the sensors behind the channels, and at their cables.",
     "status.md",
-    "stream 'housing': 3 of its values are no measurements: the device says that it has none",
+    "stream 'housing': 3 of its values are no measurements: the device states that it has none",
 )
 TIME_UNSURE = Code(
     "B37",
@@ -370,7 +370,7 @@ NOT_BELIEVED = Code(
     "Its samples contradict the machine file: another rate or scale, or samples that are lost all the time.",
     "Correct what the message names, in the machine file or in the device.",
     "status.md",
-    "stream 'shaft': it comes at 3950 Hz, and the machine file says 4000 Hz. Nothing is judged by it "
+    "stream 'shaft': it comes at 3950 Hz, and the machine file states 4000 Hz. Nothing is judged by it "
     "meanwhile",
 )
 NOT_ALIGNED = Code(
@@ -431,11 +431,11 @@ NO_VALUE_MARK = Code(
     "Many Modbus devices write 0x8000 into an int16, or 0xFFFF into a uint16, when they have no value, e.g. "
     "of a broken sensor. Numbers of 32 bits have such marks, too. Without no_value and "
     "ok_between it is taken for one.",
-    "Write no_value into the channel, as the device's manual says, or ok_between with what the sensor can "
+    "Write no_value into the channel, as the device's manual has it, or ok_between with what the sensor can "
     "measure.",
     "modbus.md",
     example="machine.toml:73: sensors[2]: has no ok_between: 0x8000 in its int16, by which many devices mean "
     "that they have no value, would be -1638.4 degC. Remedy: write no_value = 0x8000 into its channel if the "
-    "device's manual says so, or ok_between with the least and the greatest value that the sensor "
+    "device's manual has it, or ok_between with the least and the greatest value that the sensor "
     "can measure",
 )

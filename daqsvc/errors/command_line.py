@@ -16,14 +16,14 @@ WRONG_VALUE = Code(
     "C02",
     "An argument has a wrong value",
     "It is no number, time, address or name as the argument takes it, or it is out of its range.",
-    "Write a value as the message says.",
+    "Write a value as the message asks for.",
     "reference/verbs.md",
     "daqsvc shelve: argument --for: '5 min' is not a time; write e.g. 90s, 30m, 8h, 2d or 1h30m",
 )
 NO_STORE = Code(
     "C03",
     "It is not known which store is meant",
-    "The verb works on the alarm journal of a service. No file and no --store says which, and there is not "
+    "The verb works on the alarm journal of a service. No file and no --store names it, and there is not "
     "exactly one at the usual place, or what was named is no directory.",
     "Name the machine file that the service runs, or its store with --store.",
     "outbox.md",
@@ -64,7 +64,7 @@ NOT_ASKED = Code(
     "It takes commands from its own user and from root only, is of an older version, is too busy, or is "
     "about to stop. Or what was sent is no request that it knows.",
     "Try again with sudo, or as the user of the service. Restart a service that is older than this program. "
-    "Programs write requests as the page says.",
+    "Programs write requests as the page shows.",
     _PAGE,
     "daqsvc status: the daqsvc of /var/lib/daqsvc/lab takes commands from its own user and from root only: "
     "try again with sudo",
@@ -74,7 +74,7 @@ COMMAND_REFUSED = Code(
     "The service has refused the command",
     "The state of the alarm does not allow it, or this person may not ask for it. No snapshot is made "
     "without [recorder].",
-    "Do as the message says. daqsvc alarms shows the state of each alarm.",
+    "Do what the message asks for. daqsvc alarms shows the state of each alarm.",
     "alarms.md",
     "daqsvc reset: refused: cannot reset rotor-fault: its condition is still present; remove the cause, then "
     "reset",
@@ -107,7 +107,7 @@ EXTRA_MISSING = Code(
     "C12",
     "A package is missing",
     "What was asked for needs a package that comes with an extra of daqsvc only.",
-    "Install the extra as the message says.",
+    "Install the extra that the message names.",
     "install.md",
     "daqsvc analyze: --plot needs matplotlib; install it with: pip install 'daqsvc[plot]'",
 )
@@ -156,7 +156,7 @@ CANNOT_LISTEN = Code(
 UNSAFE_PAGE = Code(
     "C18",
     "The page would not be safe there",
-    "Beyond this box the page needs TLS and accounts, or a reverse proxy that says who asks.",
+    "Beyond this box the page needs TLS and accounts, or a reverse proxy that names who asks.",
     "Add what the message names, or listen on 127.0.0.1 only.",
     "page.md",
     "daqsvc page: at 192.0.2.7 others than this box reach the page: give --certificate, --private-key and"
@@ -201,7 +201,7 @@ SIMULATION = Code(
     "C23",
     "The machine cannot be simulated",
     "The scenario is not there or has mistakes, or what it plays does not fit the machine file or the bus.",
-    "Do as the message says.",
+    "Do what the message asks for.",
     "virtual-bus.md",
     "daqsvc sim: there is no scenario 'unbalnce': neither a file nor one of healthy, link-faults, paper",
 )
@@ -234,7 +234,7 @@ OTHER_FILES = Code(
     "C27",
     "The service reads other machine files",
     "The file that was named is not the one that the service was started with, or has errors meanwhile.",
-    "Name the file or directory that the message says, or correct the file that has errors.",
+    "Name the file or directory that the message names, or correct the file that has errors.",
     "several-machines.md",
     "daqsvc reload: the service was started with /etc/daqsvc/lab.toml: it reads that again, whatever is "
     "named here",

@@ -68,8 +68,8 @@ MODE_WITHOUT_FAULT = Code(
     "A mode that does not differ from the healthy rotor for the worse cannot be told from it.",
     "Write what differs in the mode, or remove it.",
     "rotor-figures.md",
-    example='machine.toml:109: pipeline.rotor_bank.modes[4].fault = "static_load": nothing in this mode '
-    "makes it that. Remedy: write e.g. static_load_um = [0.0, -10.0]",
+    example='machine.toml:109: pipeline.rotor_bank.modes[4].fault = "static_load": no figure of this mode '
+    "fits that fault. Remedy: write e.g. static_load_um = [0.0, -10.0]",
 )
 MODE_UNSEEN = Code(
     "D08",
@@ -103,12 +103,12 @@ NOISE_TOO_LARGE = Code(
 MODE_TOUCHES = Code(
     "D11",
     "A mode would touch the stator",
-    "The model of the mode knows no contact, and by its figures the orbit does not fit the clearance.",
+    "The model of the mode has no contact, and by its figures the orbit does not fit the clearance.",
     "Write rub = true in the mode, or a smaller fault.",
     "rotor-figures.md",
     example='machine.toml:104: pipeline.rotor_bank.modes[1] = { name = "F1", damping_ratio = 0.02, severity '
     '= "alert" }: mode "F1" would touch the stator: a whirl of 250 um about a rest at 10 um does not '
-    "fit a clearance of 100 um, and its model knows no contact. Remedy: write rub = true in it, or a "
+    "fit a clearance of 100 um; its model has no contact. Remedy: write rub = true in it, or a "
     "smaller fault",
 )
 NEEDS_ROTOR = Code(
@@ -126,8 +126,8 @@ NEEDS_ANGLES = Code(
     "An orbit is put together of two probes. Each needs the angle at which it points.",
     "Add angle_deg to the sensors.",
     "rotor-figures.md",
-    example='machine.toml:98: pipeline.rotor_bank.probes[1] = "probe-y": sensor "probe-y" does not say where '
-    'it points. Remedy: add angle_deg to the entry "probe-y" of sensors, e.g. 90.0',
+    example='machine.toml:98: pipeline.rotor_bank.probes[1] = "probe-y": sensor "probe-y" does not state '
+    'where it points. Remedy: add angle_deg to the entry "probe-y" of sensors, e.g. 90.0',
 )
 NO_REVOLUTIONS = Code(
     "D14",
@@ -173,9 +173,9 @@ NO_OBSERVERS = Code(
 UNFIT_BEARING = Code(
     "D18",
     "The bearing detector cannot be made",
-    "The type of a bearing is not in the catalogue, its orders do not fit each other, its model does not "
-    "fit the sampling rate, or what was learnt is of another machine.",
-    "Do what the message says at the key that it names.",
+    "The type of a bearing is not in the catalogue, or its orders do not fit each other. Or its model does "
+    "not fit the sampling rate, or what was learnt is of another machine.",
+    "Do what the message asks for at the key that it names.",
     "bearing.md",
     example="machine.toml: pipeline.bearing.bearings[1].orders: BPFI 7 does not fit BPFO 3.053 and FTF "
     "0.3817, which make it 4.945; check the four orders",
@@ -201,7 +201,7 @@ SENSOR_NOT_OK = Code(
     "A sensor is not OK",
     "What it sends is not what a working sensor delivers: it is dead, clipped, outside its OK "
     "limits or loose.",
-    "Look at the sensor, its cable and its supply. The message says what is wrong with its signal.",
+    "Look at the sensor, its cable and its supply. The message states what is wrong with its signal.",
     "alarms.md",
     "alarm sensor-ok/probe-x raised: probe-x is not OK: probe-x does not move at all (0 um): dead or "
     "disconnected",

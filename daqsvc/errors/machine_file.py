@@ -62,8 +62,8 @@ MISSING_KEY = Code(
     "The table cannot be understood without this key, and no default would be right for every machine.",
     "Add the key. The message has an example.",
     _PAGE,
-    example="machine.toml:36: buses.can0.record.folder: is missing: holds the files, relative to the machine "
-    'file; must be there. Remedy: add folder = "/var/lib/daqsvc/can" to [buses.can0.record]',
+    example="machine.toml:36: buses.can0.record.folder: is missing: folder of the files, relative to the "
+    'machine file; it must exist. Remedy: add folder = "/var/lib/daqsvc/can" to [buses.can0.record]',
 )
 WRONG_TYPE = Code(
     "F07",
@@ -79,7 +79,7 @@ OUT_OF_RANGE = Code(
     "F08",
     "The value is out of range",
     "Every number has bounds: beyond them no machine, sensor or device works. Usually the value has "
-    "another unit than the name of the key says (_s seconds, _hz hertz, _um micrometres, _rpm revolutions"
+    "another unit than the name of the key has (_s seconds, _hz hertz, _um micrometres, _rpm revolutions"
     " a minute).",
     "Write the value in the unit that the name of the key ends with.",
     _PAGE,
@@ -119,7 +119,7 @@ WRONG_LENGTH = Code(
     "F12",
     "The array has too few or too many entries",
     "Pairs such as ranges have exactly two values. Lists have an upper limit, and some must not be empty.",
-    "Write as many values as the message says.",
+    "Write as many values as the message asks for.",
     _PAGE,
     example="machine.toml:67: sensors[0].gap_ok_v = [-18.0, -2.0, 0]: must have 2 values. Remedy: write "
     "gap_ok_v = [-18.0, -2.0] (OK limits of the mean gap voltage, in V; needed where that is known)",
@@ -195,7 +195,7 @@ NO_EFFECT = Code(
 CONTRADICTION = Code(
     "F20",
     "Two keys contradict each other",
-    "Both keys say the same in different ways, or exclude each other, and only one can be right.",
+    "Both keys state the same in different ways, or exclude each other, and only one can be right.",
     "Remove or correct one of the two.",
     _PAGE,
     example="machine.toml:37: buses.can0.data_bitrate = 250_000: is less than bitrate = 500,000, and the "
@@ -204,7 +204,7 @@ CONTRADICTION = Code(
 INCOMPLETE = Code(
     "F21",
     "The key needs another key",
-    "The table says only a part of what is needed: this key is of no use without the one that the message"
+    "The table has only a part of what is needed: this key is of no use without the one that the message"
     " names.",
     "Add the other key, or remove this one.",
     _PAGE,
@@ -246,7 +246,7 @@ VALUE_REFUSED = Code(
     "F25",
     "The value is refused",
     "The model of this table refuses the value; the message gives the reason.",
-    "Do what the message says. A table of a plugin from outside is described by its package.",
+    "Do what the message asks for. A table of a plugin from outside is described by its package.",
     _PAGE,
     example='machine.toml:12: buses.logger.host = "127.0.0.1": is not valid: 127.0.0.1 is no address. '
     'Remedy: write host = "192.0.2.10" (name or address of the logger)',
@@ -267,7 +267,7 @@ NOT_OF_ONE_BOX = Code(
     "must be alike, and each machine needs its own name.",
     "Make the tables alike, or write them in one of the files only.",
     "several-machines.md",
-    example='machine.toml:13: box = "edge-3": but pump.toml says "edge-1", and one process is one box. '
+    example='machine.toml:13: box = "edge-3": but pump.toml has "edge-1", and one process is one box. '
     'Remedy: write box = "edge-1", or run it by itself',
 )
 UNUSED_BUS = Code(

@@ -156,7 +156,7 @@ OUTPUT_FAILED = Code(
     "O17",
     "An output has failed",
     "A mistake in the output, or in the library below it. The machine is watched, and other outputs go on.",
-    "Do as the message says. If it happens again, report it with the lines of the log before.",
+    "Do what the message asks for. If it happens again, report it with the lines of the log before.",
     "outputs.md",
     "metrics: a request has failed: ConnectionResetError(); the others are answered",
 )
@@ -190,9 +190,9 @@ COMMAND_NOT_OBEYED = Code(
     "A command that came over an output is refused",
     "It is no command of daqsvc, has no time, is too old, has come before, or the machine file does not "
     "allow it over this output.",
-    "Do as the message says. daqsvc alarms shows the state of each alarm.",
+    "Do what the message asks for. daqsvc alarms shows the state of each alarm.",
     "mqtt.md",
-    "spBv1.0/plant/DCMD/edge-1/pump is refused: it does not say when it was sent",
+    "spBv1.0/plant/DCMD/edge-1/pump is refused: it does not state when it was sent",
 )
 NOT_SHOWN = Code(
     "O22",
@@ -215,7 +215,8 @@ DATABASE_AWAY = Code(
     "O24",
     "PostgreSQL does not take the messages",
     "config/postgresql/ingest.py does not reach it, it is read-only or full, or lacks a table or a right.",
-    "Do as the message says. Nothing is lost: the broker keeps the messages until PostgreSQL takes them.",
+    "Do what the message asks for. Nothing is lost: the broker keeps the messages until PostgreSQL takes "
+    "them.",
     "postgresql.md",
     "PostgreSQL is away, and nothing is acknowledged: the database system is shutting down",
 )
@@ -223,7 +224,7 @@ PAGE_SAYS = Code(
     "O25",
     "The process of the page reports something",
     "The page runs in its own process. What this prints is in the log of the service, behind 'page:'.",
-    "Do as the message says. The service and its alarms do not depend on the page.",
+    "Do what the message asks for. The service and its alarms do not depend on the page.",
     "page.md",
     "page: WARNING:  Invalid HTTP request received.",
 )

@@ -15,7 +15,7 @@ NOT_FOUND = Code(
 UNKNOWN_FORMAT = Code(
     "R02",
     "The file is of no kind that can be read",
-    "The ending of its name says the kind. It is none that is known, or the file has contents "
+    "The ending of its name shows the kind. It is none that is known, or the file has contents "
     "of another kind.",
     "Save it as one of the kinds that the message lists, with the ending of that kind.",
     _PAGE,
@@ -45,7 +45,7 @@ NO_SUCH_CHANNEL = Code(
     "R05",
     "A channel is not in the recording",
     "No column or variable has the name of the channel, or several may be meant.",
-    "Say which with --map NAME=VARIABLE. The message lists what the file has.",
+    "Choose one with --map NAME=VARIABLE. The message lists what the file has.",
     _PAGE,
     "daqsvc export: run.npz has no channel 'x_um'; it holds ch1 (1000), ch2 (1000)",
 )
@@ -60,7 +60,7 @@ NOT_NUMBERS = Code(
 RATE_UNKNOWN = Code(
     "R07",
     "The sampling rate is not known",
-    "The file says no sampling rate, and has no column of time, or the rate that it says is none.",
+    "The file states no sampling rate and has no column of time, or the rate that it states is none.",
     "Give it with --fs, in Hz.",
     _PAGE,
     "daqsvc export: the sampling rate of run.csv is not known: the file does not state one. Give it with "
@@ -69,7 +69,8 @@ RATE_UNKNOWN = Code(
 RATE_CONTRADICTED = Code(
     "R08",
     "Two sampling rates contradict each other",
-    "The file, its column of time, the machine file or --fs say different rates. Frequencies would be wrong.",
+    "The file, its column of time, the machine file or --fs state different rates. Frequencies would be "
+    "wrong.",
     "Leave --fs out, or correct the one that is wrong.",
     _PAGE,
     "the sampling rate of run.csv is 2000 Hz by the file and 5000 Hz as given: leave --fs out, or correct it",
@@ -102,7 +103,7 @@ TOO_SHORT = Code(
 NEEDS_MACHINE_FILE = Code(
     "R12",
     "A CAN log needs a machine file",
-    "A log holds frames. Only the layouts of a machine file say which samples are in them.",
+    "A log holds frames. Only the layouts of a machine file state which samples are in them.",
     "Name the machine file before the log, and leave out --map and --fs.",
     _PAGE,
     "daqsvc export: plant.blf is a CAN log, which only the layouts of a machine file make sense of: name "
@@ -120,7 +121,7 @@ UNFIT_SAMPLES = Code(
     "R14",
     "The samples are not what a working sensor delivers",
     "They are clipped, stuck at one value, too weak, or in another unit.",
-    "Look at sensor, cable and range, and record again. --map says which channel is meant.",
+    "Look at sensor, cable and range, and record again. --map names the channel that is meant.",
     _PAGE,
     "shaft.csv: not judged: channel is clipped: 310 of 8000 samples are at 200; use a sensor or a gain "
     "with a larger range",
@@ -129,7 +130,7 @@ NOT_JUDGED = Code(
     "R15",
     "The recording cannot be judged",
     "What it shows does not fit what was stated of the machine: speed, keyphasor, length or state.",
-    "Do as the message says: correct the option, or record again.",
+    "Do what the message asks for: correct the option, or record again.",
     _PAGE,
     "run.csv: not judged: run.csv has no channel for shaft-x of pump.toml; name its variable, e.g. --map "
     "shaft-x=VARIABLE. It holds a, b",
@@ -140,7 +141,7 @@ NOT_HEALTHY = Code(
     "A calibration needs a machine in good order at steady speed, or running up. This one is too short, "
     "not "
     "steady, or already shows a change.",
-    "Record the machine in good order, as docs/calibration.md says.",
+    "Record the machine in good order, as docs/calibration.md describes.",
     "calibration.md",
     "not calibrated: only 12 usable revolutions; a baseline needs 50: give a longer recording",
 )

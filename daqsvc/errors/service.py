@@ -32,7 +32,7 @@ STORE_IN_USE = Code(
     "Stop the other service, or give this one a separate store.",
     "outbox.md",
     "another daqsvc uses the store /var/lib/daqsvc; stop it if it watches the same machine, else give "
-    "this one a directory of its own, e.g. /var/lib/daqsvc/NAME, in [store] of its machine file",
+    "this one its own directory, e.g. /var/lib/daqsvc/NAME, in [store] of its machine file",
 )
 JOURNAL = Code(
     "S04",

@@ -141,7 +141,7 @@ class Results:
     def compact(self, folder: str, change: Change, newest: Mapping[str, str] | None = None) -> None:
         """Make one table of the files of a machine, in the order of its recordings, each with one row.
 
-        Of rows that depend on the same, the one of a recording that was judged is kept, and else the last: a
+        Of rows that depend on the same, the one of a recording that was judged is kept, and else the last. A
         run that tried again what could not be judged may have been killed.
 
         Args:

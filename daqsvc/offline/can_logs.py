@@ -155,7 +155,7 @@ def load_can_streams(machine: MachineFile, path: str) -> tuple[list[RecordedStre
         )
     notes = list(playing.notes)
     if any(one.start_ns is None for one in streams):
-        notes.append(f"{path} does not say when it began, and neither does what is made of it")
+        notes.append(f"{path} does not state when it began, so the result does not either")
     return streams, notes
 
 
@@ -309,8 +309,8 @@ class _Playing:
             too_few = seen_hz < stated_hz * (1.0 - _MOST_OFF_RATE)
             if seen_hz > stated_hz * (1.0 + _MOST_OFF_RATE) or (too_few and not counters.samples_lost):
                 raise RecordingError(
-                    f"{self._path}: stream {name!r} comes at {seen_hz:.4g} Hz, and {self._machine.path} says "
-                    f"{stated_hz:g} Hz; correct its rate_hz",
+                    f"{self._path}: stream {name!r} comes at {seen_hz:.4g} Hz, and {self._machine.path} "
+                    f"states {stated_hz:g} Hz; correct its rate_hz",
                     RATE_CONTRADICTED,
                 )
 

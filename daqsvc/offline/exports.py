@@ -91,7 +91,7 @@ def _read(
     if (is_can_log or is_snapshot) and (channels or rate_hz is not None):
         kind, who = ("CAN log", "the machine file") if is_can_log else ("snapshot", "itself")
         raise RecordingError(
-            f"{path} is a {kind}, of which {who} says channels and rate: leave out --map and --fs",
+            f"{path} is a {kind}, of which {who} states channels and rate: leave out --map and --fs",
             NEEDS_MACHINE_FILE,
         )
     if is_can_log and machine is not None:
@@ -198,7 +198,7 @@ def _add_sensors(wanted: dict[str, str], machine: MachineFile, there: Collection
             continue
         if len(rivals) > 1:
             raise ExportUsageError(
-                f"channel {variable} may be {' or '.join(rivals)} of {machine.path}: say which with "
+                f"channel {variable} may be {' or '.join(rivals)} of {machine.path}: choose one with "
                 f"--map {rivals[0]}={variable}",
                 NO_SUCH_CHANNEL,
             )

@@ -67,7 +67,7 @@ def rotor_machine(arguments: argparse.Namespace) -> MachineFile:
     if keyphasor is not None and orbit:
         raise ValueError(
             "speed and angle come either from the keyphasor or from the orbit: leave out --keyphasor, or "
-            "follow the orbit no more"
+            "do not follow the orbit"
         )
     names = [*probes, *([] if keyphasor is None else [keyphasor])]
     if len({arguments.map.get(name, name) for name in names}) < len(names):

@@ -285,7 +285,7 @@ def analyse_orders(
     if not baseline.speed_seen:
         quality = quality.with_problem(
             f"no order of {setup.speed_rpm:g} rpm stands out of the healthy run {baseline_name}: if it "
-            "turned at another speed, this comparison says nothing; check its speed"
+            "turned at another speed, this comparison is of no use; check its speed"
         )
     return OrderVerdict(
         recording=name, baseline=baseline_name, setup=setup, quality=quality, orders=orders, change=change

@@ -287,7 +287,7 @@ class Replay:
             if changed_ns is not None and int(changed_ns) > self._begin_ns:
                 self._result.notes.append(
                     f"other limits came into force at {iso_utc(int(changed_ns) + self._wall_ns)}: what was "
-                    "before is judged by them too, and may differ from what was said then"
+                    "before is judged by them too, and may differ from what was reported then"
                 )
             self._from_start = set(about["streams"] if about["from_start"] else ())
             self._from_start |= set(about.get("streams_from_start", ()))
@@ -359,7 +359,7 @@ class Replay:
             )
         if given and (idle := streams.keys() - given):
             self._result.notes.append(
-                f"{_listed(idle)} not judged: the snapshot does not say which samples they were given"
+                f"{_listed(idle)} not judged: the snapshot does not state which samples they were given"
             )
 
     async def run(self) -> Replayed:

@@ -270,7 +270,7 @@ class Runner:
             return self._in_its_units(load_recording(recording, wanted, options.rate_hz, narrow=narrow))
         if options.channels or options.unit is not None:
             raise RefusedError(
-                f"{recording} is a CAN log, of which the machine file says channels and units: leave out "
+                f"{recording} is a CAN log, of which the machine file states channels and units: leave out "
                 f"{'--map' if options.channels else '--unit'}"
             )
         from daqsvc.offline.can_logs import load_can_log  # noqa: PLC0415 - brings python-can and kernels
@@ -302,8 +302,8 @@ class Runner:
                 unit = self.options.unit
             if factor_between(stated, unit) not in {None, 1.0}:
                 raise RefusedError(
-                    f"{sensor.name} of {recording.source} is in {stated} by the file and in {unit} as it "
-                    "would be read: say the file's unit (--unit, or the sensor's in the machine file), or "
+                    f"{sensor.name} of {recording.source} is in {stated} by the file, and would be read "
+                    f"in {unit}; state the file's unit (--unit, or the sensor's in the machine file), or "
                     f"save it in {unit}"
                 )
         return recording

@@ -194,7 +194,7 @@ def take_possession(path: Path) -> BinaryIO:
         lock.close()
         raise StoreInUseError(
             f"another daqsvc uses the store {path.parent}; stop it if it watches the same machine, else give "
-            f"this one a directory of its own, e.g. {path.parent}/NAME, in [store] of its machine file, or "
+            f"this one its own directory, e.g. {path.parent}/NAME, in [store] of its machine file; or "
             "have one service watch all these machines"
         ) from None
     except BaseException:

@@ -170,7 +170,7 @@ class Renewal:
             replace_durably(self._note, json.dumps(asdict(damage)).encode())
         except OSError as error:
             log.warning(
-                "outbox %s: a crash will make forget its damage: %s",
+                "outbox %s: after a crash its damage will not be known: %s",
                 self._path,
                 error,
                 extra=coded(JOURNAL_DAMAGED),
@@ -184,7 +184,7 @@ class Renewal:
         except FileNotFoundError:
             return JournalDamage()
         except (OSError, ValueError, KeyError, TypeError) as error:
-            log.info("what is said of damage in %s cannot be read: %s", self._note, error)
+            log.info("the record of damage in %s cannot be read: %s", self._note, error)
             return JournalDamage(quarantined=1)
 
     def is_told(self) -> None:

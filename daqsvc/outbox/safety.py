@@ -170,7 +170,7 @@ def refuse_unwritable(store: Path) -> None:
     else:
         helps = (
             f"it belongs to {owner} and has mode {stat.S_IMODE(status.st_mode):04o}: "
-            f"chown -R {account()} {store}, run the service as {owner}, or give it a directory of its own"
+            f"chown -R {account()} {store}, run the service as {owner}, or give it its own directory"
         )
     raise StoreRefusedError(f"the store {store} may not be written by {us}: {helps}")
 
@@ -281,7 +281,7 @@ def _refuse_directory(directory: Path, status: os.stat_result, store: Path | Non
             raise StoreRefusedError(_belongs(f"the store {store}", status.st_uid, directory))
         raise StoreRefusedError(
             f"{above} belongs to {_user(status.st_uid)}, who could put another store in its place, and the "
-            f"service runs as {_user(os.geteuid())}: give it a directory of its own, such as /var/lib/daqsvc"
+            f"service runs as {_user(os.geteuid())}: give it its own directory, such as /var/lib/daqsvc"
         )
     mode = stat.S_IMODE(status.st_mode)
     is_open = mode & stat.S_IWOTH or (mode & stat.S_IWGRP and status.st_gid != os.getegid())
@@ -323,7 +323,7 @@ def _belongs(what: str, owner: int, path: Path) -> str:
     taken = f"chown {account()} {path}, " if os.geteuid() else ""
     return (
         f"{what} belongs to {_user(owner)} and the service runs as {_user(os.geteuid())}: "
-        f"{taken}run the service as {_user(owner)}, or give it a directory of its own"
+        f"{taken}run the service as {_user(owner)}, or give it its own directory"
     )
 
 

@@ -17,7 +17,7 @@ disk stops neither. A disk that takes no writes at all stops both: then numbers 
 
 Every run begins above all of these and above the wall clock in ms, also one that can write nothing. A run
 uses far fewer than a thousand numbers a second, so the next one begins above it without any trace on the
-disk. After an end that was not a proper one some more are skipped if the clock is not ahead of them; and a
+disk. After an end that was not a proper one some more are skipped if the clock is not ahead of them. A
 run begins far ahead when a side file is damaged or missing.
 """
 

@@ -56,8 +56,8 @@ NAMED = 5
 """Topics that the log names of messages that are lost."""
 
 UNBACKED = (
-    "delivery is not backed by the disk until it can: messages wait in memory, go to the broker from there, "
-    "and are lost if the process ends before either has them"
+    "delivery is not backed by the disk until it can; messages wait in memory and go to the broker from "
+    "there; they are lost if the process ends before disk or broker has them"
 )
 
 READ_FAILURES_MAX = 3

@@ -45,7 +45,7 @@ def why_no_detector(live: MachineLive) -> str:
     known = [key for key, table in tables.items() if cast("DetectorPlugin[Any]", table).predictable]
     if any(key in live.values.get("pipeline", {}) for key in known):
         return ""
-    return f"this machine has none of the detectors that can say it: {', '.join(known)}"
+    return f"this machine has none of the detectors that can show it: {', '.join(known)}"
 
 
 class Detectabilities:
@@ -119,7 +119,7 @@ async def _asked(values: Path, folder: str, *, is_here: bool) -> Detectable:
             await process.wait()
     if process.returncode == 0:
         return Detectable(out.decode(), "")
-    said = err.decode(errors="replace").strip().splitlines() or ["it has failed without a word"]
+    said = err.decode(errors="replace").strip().splitlines() or ["it has failed without a message"]
     # No path goes out, but units such as mm/s do.
     why = _PATH.sub("", said[-1].replace(f"{values}: ", "").replace(f"{folder}/", ""))
     return Detectable("", why if is_here else f"{why}; {NOT_HERE}")

@@ -132,7 +132,7 @@ class Forms:
             raise FormError("it is no form") from None
         fields = dict(pairs)
         if len(fields) < len(pairs):
-            raise FormError("a field of it stands twice")
+            raise FormError("a field is in it twice")
         token = fields.pop("token", "").encode("utf-8", "replace")
         if not hmac.compare_digest(token, self.token(request.state.person).encode()):
             raise FormError("it is of another session: open the page again, and send it from there")

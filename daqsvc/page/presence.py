@@ -153,7 +153,7 @@ class Picture:
             told["token"] = live.token
             stream, away_s = live.silence(self._streams(listening))
             if stream and not why:
-                told |= {"age_s": round(away_s, 1), "why": f"nothing comes of {stream} any more"}
+                told |= {"age_s": round(away_s, 1), "why": f"nothing comes from {stream} any more"}
             told["html"] = {"head": head(live), "alarms": alarm_rows(live)}
             if self._as_a_whole:
                 told["html"] |= {

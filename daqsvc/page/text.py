@@ -149,7 +149,7 @@ def _state(alarm: Document | None) -> str:
     if (until_ns := alarm.get("shelved_until_wall_ns")) is not None:
         words.append(f"until {iso_utc(until_ns // NS_PER_S * NS_PER_S)}")
     if alarm.get("chattering"):
-        words.append("comes and goes")
+        words.append("chatters")
     return "; ".join(words)
 
 

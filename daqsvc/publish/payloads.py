@@ -102,7 +102,7 @@ class _Statement(JsonPayload):
     where: str = Field("", description="the part of the machine that it is about, e.g. a bearing; or empty")
     missing_share: Number = Field(
         None,
-        description="share of the window's samples that are missing; null if the detector does not say",
+        description="share of the window's samples that are missing; null if the detector does not state it",
     )
     bounds: dict[str, tuple[Number, Number]] = Field(
         {},
@@ -127,8 +127,8 @@ class DoubtPayload(JsonPayload):
     """What a detector has against a sensor."""
 
     detector: str = Field(description="name of the detector")
-    quality: Quality = Field(description="what it said last")
-    not_ok: bool = Field(description="whether it said not_ok since it was last good")
+    quality: Quality = Field(description="its last quality")
+    not_ok: bool = Field(description="whether it stated not_ok since it was last good")
     reason: str = Field(description="why, in a sentence")
     sensors: tuple[str, ...] = Field(description="names of the sensors that it is about")
 
@@ -163,8 +163,8 @@ class AlarmPayload(Stamped):
     found: str = Field("", description="what is found, joined with what it is not told apart from by |")
     found_message: str = Field(
         "",
-        description="message of the last event that said what is found; empty if this one's message does, or "
-        "if that is not known",
+        description="message of the last event that stated what is found; empty if this one's message does, "
+        "or if that is not known",
     )
     doubts: tuple[DoubtPayload, ...] = Field(
         (), description="of a quality alarm: what is wrong with the sensor"

@@ -47,7 +47,7 @@ class ChannelPayload(JsonPayload):
     value: Number = Field(description="null if the newest sample is missing, or none has come")
     unit: str = Field(description="unit of the value")
     age_s: Number = Field(description="age of the newest sample; null before the first one")
-    state: SensorState = Field(description="what the detectors say of the sensor")
+    state: SensorState = Field(description="what the detectors state about the sensor")
     reason: str = Field(description="why it is not ok")
     code: str | None = Field(None, description="code of that reason; null if there is none")
 
@@ -131,7 +131,7 @@ class ServiceStatusPayload(Stamped):
     buses: dict[str, BusPayload] = Field(description="the buses, by name")
     streams: dict[str, StreamPayload] = Field(description="the streams, by name")
     channels: tuple[ChannelPayload, ...] = Field(description="the channels with their newest samples")
-    statements: tuple[StatementPayload, ...] = Field(description="what each detector has said last")
+    statements: tuple[StatementPayload, ...] = Field(description="the last statement of each detector")
     alarms: AlarmsPayload = Field(description="the state of the alarms")
     outbox: OutboxPayload = Field(description="what waits for the broker and for the disk")
     outputs: dict[str, OutputPayload] = Field(description="by table; empty if the machine file has none")

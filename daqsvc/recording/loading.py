@@ -154,8 +154,8 @@ def _called(path: Path, contents: Contents, channels: Mapping[str, str]) -> dict
     for one, name in called.items():
         if name in there and name not in called:
             raise NamesError(
-                f"{one} of {path} cannot be called {name}, as another channel of the file is: give it a name "
-                f"of its own, or map that, too: --map {name}={one},OTHER={name}",
+                f"{one} of {path} cannot be called {name}, as another channel of the file is: give it its "
+                f"own name, or map that, too: --map {name}={one},OTHER={name}",
                 NO_SUCH_CHANNEL,
             )
     return called

@@ -126,7 +126,7 @@ def timing_of(
     column = _time(path, contents, length, channels)
     if given_hz is not None:
         others = "".join(
-            f"; {name} of the file says {hz:g} Hz" for name, hz in stated.items() if hz != given_hz
+            f"; {name} of the file is {hz:g} Hz" for name, hz in stated.items() if hz != given_hz
         )
         rate_hz, source = given_hz, f"given{others}"
     elif len(set(stated.values())) == 1:
@@ -147,7 +147,7 @@ def timing_of(
         )
     if not LEAST_RATE_HZ <= rate_hz <= MOST_RATE_HZ:
         raise RecordingError(
-            f"the sampling rate of {path} is said to be {rate_hz:g} Hz ({source}); give one from "
+            f"the sampling rate of {path} is stated as {rate_hz:g} Hz ({source}); give one from "
             f"{LEAST_RATE_HZ:g} to {MOST_RATE_HZ:,.0f} Hz with --fs",
             RATE_UNKNOWN,
         )
@@ -213,7 +213,7 @@ def _refuse_contradictions(
         if column is not None and any(not column.agrees(hz) for hz in stated.values()):
             raise RecordingError(
                 f"the sampling rate of {path} is {_rates(stated, column)} by the file, which contradicts "
-                "itself: say which with --fs, or correct the file",
+                "itself: give it with --fs, or correct the file",
                 RATE_CONTRADICTED,
             )
     elif other := _other_rates(stated, column, given_hz):

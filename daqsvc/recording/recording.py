@@ -97,8 +97,8 @@ def load_recording(
 
     In the file a channel is named by its variable (``X105_DE_time``), the field of a struct
     (``bearing.gs``) or a column of a matrix (``data[2]``). In a table it is named by its header or its
-    number from 0, in a WAV file by its number from 0, in an HDF5 file by the path of the data set
-    (``run/accel``).
+    number from 0. In a WAV file it is named by its number from 0, in an HDF5 file by the path of the data
+    set (``run/accel``).
 
     The file is read in a separate process, within the limits of `set_limits`: what is damaged or hostile
     costs that process at most. Samples that are missing by a column of time are NaN.

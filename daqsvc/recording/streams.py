@@ -112,7 +112,7 @@ def checked(stream: RecordedStream, recording: str) -> tuple[RecordedStream, lis
         )
     if not 0.0 < stream.rate_hz < np.inf or len(stream.samples) / stream.rate_hz > LAST_NS / NS_PER_S:
         raise RecordingError(
-            f"{recording} cannot be read: stream {printable(stream.name):.80} is said to have "
+            f"{recording} cannot be read: stream {printable(stream.name):.80} is stated to have "
             f"{stream.rate_hz!r} samples a second; it may be damaged: copy it again",
             DAMAGED,
         )
@@ -121,7 +121,8 @@ def checked(stream: RecordedStream, recording: str) -> tuple[RecordedStream, lis
     if start_ns is not None and not FIRST_NS <= start_ns <= LAST_NS - length_ns:
         start_ns = None
         notes.append(
-            f"{recording} says a begin outside of the years 1678 to 2261, and it is left out; check the clock"
+            f"{recording} states a begin outside of the years 1678 to 2261, and it is left out; check the "
+            "clock"
         )
     measured_hz = stream.measured_hz
     if measured_hz is not None and not 0.0 < measured_hz < np.inf:

@@ -34,9 +34,9 @@ OWN: Mapping[str, str] = {
 }
 """Alarms of the service itself; behind a slash at the end stands the name of what they are about."""
 STATES: Mapping[str, str] = {
-    "normal": "the condition does not stand, and nobody has anything to do",
-    "active_unacknowledged": "the condition stands, and nobody has acknowledged it",
-    "active_acknowledged": "the condition stands, and somebody has acknowledged it",
+    "normal": "the condition is not present, and nothing is to be done",
+    "active_unacknowledged": "the condition is present, and nobody has acknowledged it",
+    "active_acknowledged": "the condition is present, and somebody has acknowledged it",
     "returned_unacknowledged": "the condition has gone before anybody acknowledged it",
     "latched_unacknowledged": "it has gone, nobody has acknowledged it, and the alarm waits to be reset",
     "latched_acknowledged": "the condition has gone, and the alarm waits to be reset",
@@ -104,11 +104,11 @@ def pages() -> dict[str, str]:
             _ABOUT,
             "## Alarms of the service",
             "Beside the alarms of the machine file. `NAME` is a sensor, a detector, a certificate or a bus.",
-            table(("alarm", "stands while"), own),
+            table(("alarm", "active while"), own),
             "## States",
-            table(("state", "what it says"), ((code(name), text) for name, text in STATES.items())),
+            table(("state", "what it means"), ((code(name), text) for name, text in STATES.items())),
             "## Marks",
-            table(("mark", "what it says"), ((code(name), text) for name, text in MARKS.items())),
+            table(("mark", "what it means"), ((code(name), text) for name, text in MARKS.items())),
             "## Kinds of events",
             table(("kind", "why the event was sent"), ((code(name), text) for name, text in EVENTS.items())),
         )

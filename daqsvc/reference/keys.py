@@ -182,7 +182,7 @@ def pages() -> dict[str, str]:
 _READ = """Every key, with its type, unit, range, default and an example. A key is named by its path, with
 dots: `pipeline.rotor_bank.noise_um` is the key `noise_um` of the table `[pipeline.rotor_bank]`. `NAME`
 is a name that you choose: `buses.NAME.driver` is `buses.can0.driver` in your file. `[]` is one of
-several tables: `sensors[].name` is the key `name` of each `[[sensors]]`. `daqsvc check` says what of a file
+several tables: `sensors[].name` is the key `name` of each `[[sensors]]`. `daqsvc check` shows what of a file
 cannot be used. Editors can show the same ([machine-file.md](../machine-file.md#in-an-editor))."""
 _HOW = "How to read this: [keys.md](keys.md)."
 

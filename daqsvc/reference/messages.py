@@ -77,10 +77,10 @@ def topics() -> dict[str, Topic]:
             "daqsvc.summary/1",
             1,
             "yes",
-            "how all alarms of a machine stand; with `[mqtt.home_assistant]` only",
+            "the states of all alarms of a machine; with `[mqtt.home_assistant]` only",
         ),
         "command": Topic(
-            command, "daqsvc.command/1", 1, "never", "to the box: a command to an alarm; `VERB` says which"
+            command, "daqsvc.command/1", 1, "never", "to the box: a command to an alarm, named by `VERB`"
         ),
         "snapshot": Topic(
             _BOX.command("MACHINE", "snapshot"),
@@ -218,7 +218,7 @@ SPARKPLUG_WORDS: Mapping[str, str] = {
     "Properties/Box": "the box, as the machine file names it",
     "Alarms/MACHINE/ALARM/State": "state of the alarm, as `state` of `daqsvc.alarm/1`",
     "Alarms/MACHINE/ALARM/Level": "0 normal, 1 alert, 2 danger",
-    "Alarms/MACHINE/ALARM/Active": "whether the condition stands, also below what covers the alarm",
+    "Alarms/MACHINE/ALARM/Active": "whether the condition is present, also below what covers the alarm",
     "Alarms/MACHINE/ALARM/Acknowledged": "whether somebody has seen it",
     "Alarms/MACHINE/ALARM/Message": "the latest event in a sentence",
     "Alarms/MACHINE/ALARM/Occurrence": "id of the activation",

@@ -37,7 +37,7 @@ EXIT_CODES = (
         "all",
         "it could not be done: a bus that must be there is absent, no service runs, a command was refused, "
         "a file cannot be written, or somebody interrupted it",
-        "stderr, or the log, says in one sentence what and why",
+        "stderr, or the log, states in one sentence what and why",
     ),
     ExitCode(
         "EXIT_USAGE",
@@ -49,25 +49,25 @@ EXIT_CODES = (
         "EXIT_REFUSED",
         "`analyze`, `calibrate`, `export`, `replay`",
         "a recording cannot be judged, or read",
-        "the message says what is wrong with the recording",
+        "the message states what is wrong with the recording",
     ),
     ExitCode(
         "EXIT_LOST",
         "`run`",
         "something without which the service is useless was lost, such as the writer of the journal",
-        "start it again; the log says what was lost",
+        "start it again; the log states what was lost",
     ),
     ExitCode(
         "EXIT_HUNG",
         "`run`",
         "something hung while the service stopped, and it was ended by force",
-        "start it again; the log says what hung",
+        "start it again; the log states what hung",
     ),
     ExitCode(
         "EXIT_STUCK",
         "`run`",
         "the event loop stood still for 30 s, and the service was ended by force",
-        "start it again; the log says where it stood",
+        "start it again; the log states where it stood",
     ),
     ExitCode(
         "EXIT_INTERRUPTED",
@@ -99,7 +99,7 @@ ENVIRONMENT: Mapping[str, str] = {
     _NOTIFY: "socket on which the service reports to systemd that it is ready, its state, and that it stops",
     _WATCHDOG_US: "how often systemd expects a sign of life, in us; systemd sets it by `WatchdogSec=`",
     _WATCHDOG_PID: "process that these signs are expected of; systemd sets it",
-    "JOURNAL_STREAM": "says that the log goes to systemd's journal, which has the times; systemd sets it",
+    "JOURNAL_STREAM": "set if the log goes to systemd's journal, which has the times; systemd sets it",
     "SUDO_USER": "who handled an alarm, if root does so by `sudo`: this name is in the audit log",
     "TERM": "with `dumb`, `daqsvc status --watch` prints one status after another instead of drawing "
     "over the last one",
@@ -150,7 +150,7 @@ def pages() -> dict[str, str]:
             "## Signals",
             table(("signal", "what it does"), ((code(name), text) for name, text in SIGNALS.items())),
             "## Environment variables",
-            table(("variable", "what it says"), ((code(name), text) for name, text in ENVIRONMENT.items())),
+            table(("variable", "what it sets"), ((code(name), text) for name, text in ENVIRONMENT.items())),
         )
     }
 

@@ -289,7 +289,7 @@ def _phase_alone(alarm: SetpointAlarm, at: KeyPath) -> Iterator[Finding]:
     if alarm.reference_deg is None:
         yield Finding(
             at,
-            f"does not say from where {alarm.measure} counts: its setpoints are how far it may be from a "
+            f"does not state from where {alarm.measure} counts: its setpoints are how far it may be from a "
             "reference, either way",
             "add reference_deg, the phase of the machine in good order, e.g. reference_deg = 135.0",
             code=NO_REFERENCE,
@@ -482,7 +482,7 @@ def _trip_multiply(draft: MachineFile, alarm: SetpointAlarm, at: KeyPath) -> Ite
     if draft.alarm_handling.start_up is None:
         yield Finding(
             here,
-            "never holds: nothing says when the machine starts up",
+            "never holds: nothing states when the machine starts up",
             "write a table [alarm_handling.start_up], or remove it",
             code=TRIP_MULTIPLY,
         )

@@ -305,7 +305,7 @@ def _check_channel_use(draft: MachineFile) -> Iterator[Finding]:
                     ("sensors", index, "channel"),
                     f'channel "{sensor.channel}" of stream "{sensor.stream}" belongs to '
                     f'sensor "{draft.sensors[owner].name}" already',
-                    "give each sensor a channel of its own",
+                    "give each sensor its own channel",
                     code=NAMED_TWICE,
                 )
 

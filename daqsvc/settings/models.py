@@ -186,7 +186,7 @@ class MachineFile(Section):
     """
 
     schema_version: Annotated[Literal[1], Field(description="version of this file's format", examples=[1])]
-    site: Annotated[Name, Field(description="where the box stands; part of every topic", examples=["lab"])]
+    site: Annotated[Name, Field(description="where the box is; part of every topic", examples=["lab"])]
     box: Annotated[Name, Field(description="name of this box; part of every topic", examples=["edge-1"])]
     machine: Annotated[Machine, Field(description="the machine that is watched")]
     buses: Annotated[

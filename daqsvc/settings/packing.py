@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
 CRC_BYTES = 2
 LONGEST_FRAME = 65_536
-NO_COUNTER = "says that the frames carry none: what is lost is then estimated from the times of arrival"
+NO_COUNTER = "true if the frames carry none: losses are then estimated from the times of arrival"
 LEAST_SCALE = 1 / MOST
 LARGEST_SCALE = MOST
-VALID_RAW = "least and largest raw value that is a measurement; any other says that there is none"
+VALID_RAW = "least and largest raw value that is a measurement; any other means that there is none"
 
 RawType = Literal["int8", "int16", "int24", "int32", "uint8", "uint16", "uint24", "uint32", "float32"]
 Counts = Literal["samples", "frames"]
@@ -78,7 +78,7 @@ def _ordered_raw(limits: tuple[float, float]) -> tuple[float, float]:
             "valid_raw_order",
             "the least raw value that is a measurement must come first, and the largest be another",
             {
-                "remedy": "write e.g. [-32767, 32767] if -32768 says that there is no value",
+                "remedy": "write e.g. [-32767, 32767] if -32768 means that there is no value",
                 "code": WRONG_ORDER,
             },
         )
@@ -352,7 +352,7 @@ def counted(layout: _Counted, at: KeyPath) -> Iterator[Finding]:
         yield Finding(
             (*at, "counter"),
             "is missing: it tells what was lost, and what the time of a sample is",
-            "say where the device's counter lies; if it sends none, write no_counter = true, and loss is "
+            "state where the device's counter lies; if it sends none, write no_counter = true, and loss is "
             "estimated from the times of arrival",
             code=LOSS_UNNOTICED,
         )

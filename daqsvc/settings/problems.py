@@ -121,6 +121,6 @@ def unique(names: list[str], at: KeyPath, what: str) -> Iterator[Finding]:
             yield Finding(
                 (*at, index, "name"),
                 f"is the name of an earlier {what} already",
-                f"give each {what} a name of its own",
+                f"give each {what} its own name",
                 code=NAMED_TWICE,
             )

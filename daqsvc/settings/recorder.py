@@ -33,7 +33,7 @@ class Recorder(Section):
         description="change of the speed, up or down, after which a snapshot is made; none if absent",
         examples=[100.0],
     )
-    continuous: bool = Field(default=False, description="says that everything is recorded, file after file")
+    continuous: bool = Field(default=False, description="whether everything is recorded, file after file")
     continuous_s: Annotated[float, Field(ge=1.0, le=86_400.0)] = Field(
         default=600.0, description="how long each file of a continuous recording is"
     )

@@ -175,7 +175,7 @@ def _made(point: EntryPoint, what: str, contract: type[Any]) -> Any:
             setattr(plugin, name, tuple(listed))
     needed = "buses" if contract is DriverKind else "settings"
     if getattr(plugin, needed, ()) in (None, ()):
-        raise TypeError(f"{plugin.__qualname__} does not say its {needed}")
+        raise TypeError(f"{plugin.__qualname__} does not state its {needed}")
     see_declared(plugin)
     for table in (*getattr(plugin, "buses", ()), *getattr(plugin, "layouts", ())):
         see_declared(table)

@@ -104,7 +104,7 @@ class ProximityProbe(BaseSensor):
         default=None, description="where the sensor points, from +x anticlockwise", examples=[45.0]
     )
     ac_coupled: bool = Field(
-        default=False, description="says that it shows motion only, not the static position of the shaft"
+        default=False, description="whether it shows motion only, not the static position of the shaft"
     )
 
 

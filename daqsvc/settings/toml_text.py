@@ -198,7 +198,7 @@ def _in_braces(line: str, column: int) -> tuple[str, str] | None:
     if here in {"", "\r", "#"}:
         return (
             f"braces go on behind the end of the line, at column {column}",
-            "write all that is between { and } in one line, or a table of its own: [name]",
+            "write all that is between { and } in one line, or a separate table: [name]",
         )
     return None
 
@@ -274,7 +274,7 @@ def _remedy_in(text: str, line: int | None) -> str:
             return remedy.format(**words, lower=words.get("word", "").lower())
     if (curly := re.search(f"[{_CURLY}]", _TEXTS.sub("", wrong))) is not None:
         return f'write straight quotes (") in place of {curly[0]}'
-    return "correct the TOML there: text stands in quotes, tables are [name], values are key = value"
+    return "correct the TOML there: text is in quotes, tables are [name], values are key = value"
 
 
 _LONGEST_SLIP = 1000

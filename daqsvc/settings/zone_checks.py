@@ -72,7 +72,7 @@ def _of_shaft(alarm: SetpointAlarm, zones: Zones, watched: list[Sensor], here: K
         key = "group" if zones.group is not None else "support"
         yield Finding(
             (*here, key),
-            "says nothing of the shaft, whose zones follow from machine.speed_rpm alone",
+            "has no effect on the shaft, whose zones follow from machine.speed_rpm alone",
             "remove it, or shaft = true for the zones of the velocity",
             code=UNFIT_ZONES,
         )
@@ -116,7 +116,7 @@ def _of_housing(
         lacks = [key for key in ("group", "support") if getattr(zones, key) is None]
         yield Finding(
             here,
-            f"lack {' and '.join(lacks)}: the zones of the velocity are other ones for each class of machine",
+            f"lack {' and '.join(lacks)}: the zones of the velocity differ with the class of machine",
             'write e.g. { standard = "iso-20816-3", group = 2, support = "rigid" }, or shaft = true with '
             "proximity probes",
             code=UNFIT_ZONES,
@@ -128,4 +128,4 @@ def _remedy(other: TrendValue | None) -> str:
         return 'write measure = "velocity_rms", or setpoints in place of zones'
     if same_unit(other.unit, "mm/s"):
         return f'write unit = "mm/s" for "{other.name}"'
-    return "give it an alarm of its own, with setpoints in place of zones"
+    return "give it its own alarm, with setpoints in place of zones"

@@ -210,7 +210,7 @@ def check_counter(stream: Stream, message: DbcMessage | None, at: KeyPath) -> It
         yield Finding(
             (*at, "layout", "counter"),
             f"has {facts.counter_bits} bit{'s' if facts.counter_bits > 1 else ''}: it wraps within a few "
-            f"frames, and tells nothing of what was lost",
+            f"frames, and does not show what was lost",
             f"name a counter of {LEAST_COUNTER_BITS} bits or more; if the device sends none, write "
             "no_counter = true in its place, and loss is estimated from the times of arrival",
             code=UNFIT_COUNTER,
@@ -256,7 +256,7 @@ def check_ids(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterato
                 yield Finding(
                     ("streams", name, "layout", key),
                     f'id {facts.frame_id:#x} on bus "{stream.bus}" belongs to stream "{owner}" already',
-                    "give each stream of a bus an id of its own, as the devices send it",
+                    "give each stream of a bus its own id, as the devices send it",
                     code=NOT_TOLD_APART,
                 )
 

@@ -362,8 +362,8 @@ def _counter(counter: Signal, at: KeyPath) -> Iterator[Finding]:
     elif counter.scale != 1:
         yield Finding(
             at,
-            f"has the scale {counter.scale:g} in the DBC file: the raw value is counted, and one count of it "
-            "would then be something else than a frame or a sample",
+            f"has the scale {counter.scale:g} in the DBC file: a counter counts frames or samples one by "
+            "one, so its scale must be 1",
             "name a signal that grows by 1; if this one does, write (1,0) in the DBC file",
             code=UNFIT_COUNTER,
         )
@@ -372,8 +372,8 @@ def _counter(counter: Signal, at: KeyPath) -> Iterator[Finding]:
         if largest != all_ones:
             yield Finding(
                 at,
-                f"ends at {largest:g} by the DBC file: unless it goes on to {all_ones}, samples that were "
-                "not lost count as lost at each of its turns",
+                f"ends at {largest:g} by the DBC file, not at {all_ones}: if so, samples are counted as lost "
+                "each time it wraps, although none is",
                 "see what the device sends: if it ends there, write no_counter = true in place of counter, "
                 "else correct the range in the DBC file",
                 fatal=False,

@@ -46,7 +46,7 @@ class _CanQuestions(BusQuestions):
         ),
         "fd": Topic(
             "Are CAN FD frames on the bus?",
-            "CAN FD frames carry up to 64 bytes. The device's manual says so.",
+            "CAN FD frames carry up to 64 bytes. The device's manual states it.",
         ),
         "bitrate": Topic(
             "Bit rate of the bus, in bit/s", "As all devices on it are set: often 250000 or 500000."
@@ -239,8 +239,8 @@ class DbcQuestions(_CanQuestions):
         "signals": Topic(
             "Which of its signals are measured?",
             "Names with commas between, e.g. AccelX, AccelY; each becomes a channel. Leave out counters and "
-            "states. Of a multiplexed message take the signals of one page: the other pages get streams of "
-            "their own.",
+            "states. Of a multiplexed message take the signals of one page: the other pages get separate "
+            "streams.",
         ),
     }
 
@@ -339,7 +339,7 @@ class DbcQuestions(_CanQuestions):
         chosen = set(answers["signals"])
         others = {page: names for page, names in by_page.items() if not chosen & set(names)}
         if by_page and others:
-            yield f"# {answers['message']} is multiplexed. For these pages make streams of their own:"
+            yield f"# {answers['message']} is multiplexed. For these pages make separate streams:"
             yield from (f"#   {page} {names}".rstrip() for page, names in _shown(others, ":").items())
 
     def _measured(self, answers: Answers) -> list[Any]:

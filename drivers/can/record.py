@@ -287,7 +287,7 @@ def recorder_of(
     if not bus.fd and bus.interface != "socketcan":
         logger.warning(
             "%s: CAN FD frames are neither read nor recorded, and not counted as unrecorded: the machine "
-            "file says fd = false. Set fd = true if the bus carries any",
+            "file has fd = false. Set fd = true if the bus carries any",
             link_name,
             extra=coded(FRAMES_UNRECORDED),
         )

@@ -38,7 +38,7 @@ class CanRecord(Section):
     folder: Annotated[
         FilePath,
         Field(
-            description="holds the files, relative to the machine file; must be there",
+            description="folder of the files, relative to the machine file; it must exist",
             examples=["/var/lib/daqsvc/can"],
         ),
     ]
@@ -72,7 +72,8 @@ class CanBus(Bus):
         examples=["{ receive_own_messages = false }"],
     )
     receive_buffer_bytes: Annotated[int, Field(ge=4096, le=1 << 30)] = Field(
-        default=4 << 20, description="SocketCAN: what the kernel holds for us; a frame takes some 400 of it"
+        default=4 << 20,
+        description="SocketCAN: receive buffer in the kernel; a frame takes some 400 bytes of it",
     )
     filter: bool | None = Field(
         default=None,

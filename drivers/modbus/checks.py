@@ -148,7 +148,7 @@ def check_no_value(draft: MachineFile) -> Iterator[Finding]:
                 ("sensors", index),
                 f"has no ok_between: {mark} in its {channel.type}, by which many devices mean that they have "
                 f"no value, would be {with_unit(value, sensor.unit, 6)}",
-                f"write no_value = {mark} into its channel if the device's manual says so, or ok_between "
+                f"write no_value = {mark} into its channel if the device's manual has it, or ok_between "
                 "with the least and the greatest value that the sensor can measure",
                 fatal=False,
                 code=NO_VALUE_MARK,

@@ -51,8 +51,8 @@ class _ModbusQuestions(BusQuestions):
         ),
         "way": Topic(
             "What does the device give?",
-            "values: it measures levels itself, e.g. velocity RMS. waveform: it takes a block of samples now "
-            "and then. ring, fifo: it samples all the time, and keeps the last samples until they are read.",
+            "values: it measures levels itself, e.g. velocity RMS; waveform: it takes a block of samples now "
+            "and then; ring, fifo: it samples all the time, and keeps the last samples until they are read.",
         ),
         "table": Topic(
             "Which registers are they?",
@@ -60,7 +60,7 @@ class _ModbusQuestions(BusQuestions):
         ),
         "block-id": Topic("Register that changes with every block", "As on the wire, from 0: 40001 is 0."),
         "block-address": Topic("First register of the block", "As on the wire, from 0: 40001 is 0."),
-        "samples": Topic("Samples of each channel in a block", "The device's manual says so."),
+        "samples": Topic("Samples of each channel in a block", "The device's manual states it."),
         "count-address": Topic(
             "Register that counts the samples in the ring", "As on the wire, from 0: 40001 is 0."
         ),
@@ -75,7 +75,7 @@ class _ModbusQuestions(BusQuestions):
     }
     channel_topics: ClassVar[Mapping[str, Topic]] = {
         "address": Topic("Register of {channel}", "As on the wire, from 0: what a manual calls 40001 is 0."),
-        "register-type": Topic("What do the registers of {channel} hold?", "The register map says so."),
+        "register-type": Topic("What do the registers of {channel} hold?", "The register map states it."),
         "order": Topic("Byte order of {channel}", "ABCD is the usual one; CDAB has its words exchanged."),
         "no-value": Topic(
             "Which raw value of {channel} means that the device has none?",
@@ -356,8 +356,7 @@ class TcpQuestions(_ModbusQuestions):
     topics: ClassVar[Mapping[str, Topic]] = {
         "host": Topic(
             "Address of the Modbus device",
-            "An IP address or a host name, without http://. Its port is 502 unless it stands behind: "
-            "192.0.2.20:5020.",
+            "An IP address or a host name, without http://. Its port is 502, or is added: 192.0.2.20:5020.",
         ),
         "tcp-port": Topic("TCP port of the Modbus device", "Nearly always 502."),
         **_ModbusQuestions.topics,

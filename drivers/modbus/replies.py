@@ -48,7 +48,7 @@ REMEDIES = {
     3: "let a request read less (max_count), or compare the register map of the device with the layout",
     4: "check the device",
     5: "it takes longer than a reply may; lower the rate of what is read from it",
-    6: "it is at something else; lower the rate of what is read from it",
+    6: "it is busy; lower the rate of what is read from it",
     8: "its memory fails; have it repaired",
     10: "compare unit with the routes of the gateway",
     11: "check the unit and its line behind the gateway, and compare unit with its address",

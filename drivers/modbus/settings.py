@@ -182,7 +182,8 @@ class ModbusRtuBus(_ModbusBus):
     stop_bits: Literal[1, 2] = Field(default=1, description="stop bits of each character")
     quiet_ms: WaitMs | None = Field(
         default=None,
-        description="silence after a request without reply, at least timeout_ms; that longer after opening",
+        description="silence after a request without reply, at least timeout_ms; "
+        "the wait after opening is longer by it",
         examples=[1000.0],
     )
 
@@ -226,7 +227,7 @@ class _Quantity(Section):
 
     no_value: Marks = Field(
         default=(),
-        description="raw value by which the device says that it has none, e.g. of a broken sensor; "
+        description="raw value by which the device states that it has none, e.g. of a broken sensor; "
         "or several in brackets",
         examples=["0x7FFF"],
     )
@@ -530,7 +531,7 @@ class BlockTrigger(Section):
     address: Annotated[Address, Field(description="holding register to write", examples=[98])]
     value: Annotated[int, Field(ge=0, le=65_535)] = Field(default=1, description="what to write there")
     every_s: Annotated[float, Field(ge=0.1, le=86_400)] = Field(
-        default=60.0, description="how often to write it: each costs a sensor with a battery a part of that"
+        default=60.0, description="how often to write it: each write shortens the life of a sensor's battery"
     )
 
 

@@ -218,7 +218,7 @@ class BlfFile:
             zlib.error: a container is damaged.
         """
         if length > LARGEST_OBJECT:
-            raise ValueError(f"an object says that it has {length:,} bytes")
+            raise ValueError(f"an object claims to have {length:,} bytes")
         data: bytes = self._file.read(length)
         if length <= _LONGEST_PADDING:
             return data

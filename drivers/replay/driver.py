@@ -101,7 +101,7 @@ class ChannelChoice:
         self._others.append(name)
         logger.warning(
             "%s: the log has frames of channel %s too, and only those of %s are played; others are counted "
-            "(frames_other_channel). Write channel = %r to play these, on a bus of their own if both are",
+            "(frames_other_channel). Write channel = %r to play these, on a separate bus if both are",
             self._link_name,
             name,
             self._chosen,

@@ -232,7 +232,7 @@ class SyncFraming(_BinaryFraming):
     """Bodies of fixed length, each behind a sync word, with nothing between them.
 
     The sync word may turn up inside a frame or in garbage, so a frame counts only if its CRC matches. Where
-    there is none, it counts once the next sync word stands right behind it, or behind as many stray bytes as
+    there is none, it counts once the next sync word is right behind it, or behind as many stray bytes as
     the frame after it has. After garbage every sync word is tried in turn: one that was none delays what
     follows by a frame at most, and costs nothing. What is in the place of a frame, behind a sync word, and is
     none, is a corrupt frame.

@@ -5,8 +5,8 @@ be a comma. Where that takes more than the arithmetic of doubles (more than 15 d
 beyond 22), the line is left to them. An empty field, one of dashes only, and ``nan`` are no value, NaN.
 
 Read by `re` and `float`, by the same grammar, the data of a UART at 12 Mbit/s take 6 % of a core in lines
-of 34 bytes, and 12 to 16 % in lines of 9. All this is under the interpreter's lock. Here it takes 0.6 and
-1.1 %.
+of 34 bytes. In lines of 9 they take 12 to 16 %. All this is under the interpreter's lock. Here it takes
+0.6 and 1.1 %.
 """
 
 from __future__ import annotations

@@ -99,7 +99,7 @@ class LineCodec:
     def __init__(self, layout: LineLayout) -> None:
         if (layout.counter is None) == (layout.time is None):
             raise LayoutError(
-                "a line needs a counter or a time, and not both: without it loss cannot be told"
+                "a line needs a counter or a time, and not both: without it lost lines cannot be found"
             )
         place = layout.counter or layout.time
         assert place is not None  # noqa: S101 - there is one, as above

@@ -63,7 +63,7 @@ class SerialQuestions(BusQuestions):
             "Bytes that each frame begins with", "In hexadecimal, as the device's manual has them, e.g. a55a."
         ),
         "crc": Topic("Which CRC is at the end of a frame?", "ibm-3740 is often called CRC-16/CCITT-FALSE."),
-        "crc-order": Topic("Which byte of the CRC comes first?", "The device's manual says so."),
+        "crc-order": Topic("Which byte of the CRC comes first?", "The device's manual states it."),
         "payload-length": Topic(
             "Bytes of a frame without sync word and CRC", "Counter and samples, and whatever is behind them."
         ),
@@ -81,7 +81,7 @@ class SerialQuestions(BusQuestions):
         ),
         "columns": Topic(
             "What are the columns of a line, in order?",
-            "Names with commas between, e.g. t, x, y; give those that nobody needs a name, too.",
+            "Names with commas between, e.g. t, x, y. Name columns that are not needed, too.",
         ),
         "counts": Topic(
             "What does it hold?", "count grows by one with each frame or line; s, ms and us are times."

@@ -51,7 +51,7 @@ def _delimiter(text: str) -> str:
     if not text.isascii() or text.isalnum() or text in "+-.* ,":
         raise PydanticCustomError(
             "delimiter",
-            "cannot stand at the end of a line",
+            "cannot be the end of a line",
             {"remedy": r'write the character that the device puts there, e.g. "\n" or ";"', "code": BAD_TEXT},
         )
     return text

@@ -301,8 +301,8 @@ class _Report(NamedTuple):
         if not heard.received and not any(one.heard.received for one in self.tried):
             return (
                 f"{self.port}: no byte came. Remedy: check that the device is powered and sends without "
-                "being asked, that its TX leads to RX of this port (for RS-485: A to A, B to B), and that "
-                "ground is connected; a Modbus device is asked: daqsvc sniff modbus"
+                "being asked. Its TX must lead to RX of this port (for RS-485: A to A, B to B), and "
+                "ground must be connected. A Modbus device must be asked: daqsvc sniff modbus"
             )
         if self._what is None and heard.received < LEAST_BYTES:
             return (

@@ -154,7 +154,7 @@ def for_recording(
         bearing: what the channels are watched for; None: no bearing.
 
     Raises:
-        DemoError: more channels than a frame has room for, or the service could not diagnose it; states it
+        DemoError: more channels than a frame has room for, or the service could not diagnose it. It states it
             in words of the recording, as the machine file that is made of it is not shown.
     """
     names = recording.names

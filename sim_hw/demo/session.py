@@ -344,7 +344,7 @@ class DemoSession:
                     try:
                         await _unless_ended(running, self._play(bus, service, clock))
                     except TimeoutError as error:
-                        raise DemoError(f"the playing came to a stop: {error}") from error
+                        raise DemoError(f"playing has stopped: {error}") from error
                 await self._last_frames(service)
             finally:
                 # Also when playing is broken off: the service stops as it does in the field.

@@ -267,8 +267,8 @@ class View:
             self._console.print(f"daqsvc replay {shlex.quote(path)}", soft_wrap=True)
         if gone := summary["snapshots_gone"]:
             self._console.print(
-                f"alarms left {'a snapshot' if gone == 1 else f'{gone} snapshots'}, which went with the "
-                "demo: --snapshots DIR keeps them for daqsvc replay"
+                f"alarms left {'a snapshot' if gone == 1 else f'{gone} snapshots'}, which were removed "
+                "with the demo: --snapshots DIR keeps them for daqsvc replay"
             )
 
 

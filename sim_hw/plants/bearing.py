@@ -1,6 +1,6 @@
 """A rolling element bearing between rotor and housing, with faults on its races or its balls.
 
-Three masses in a line by their mass, damping and stiffness matrices. The motion is exact: every run is
+Three masses in a line by their mass, damping and stiffness matrices. The motion is exact. Every run is
 periodic, and its spectrum is the dynamic stiffness's answer to the spectrum of its excitation, up to half
 the sampling rate (the range of an accelerometer's anti-aliasing filter). Nothing here is shared with the
 detectors.

@@ -10,7 +10,7 @@ frequency omega_s = sqrt(K_s / M) of the healthy shaft, with tau = omega_s t and
     f_y = -K* (r - 1)^alpha (y + m x) / r       where r > 1, else 0
     m   = mu sign(w R + (x y' - y x') / r)
 
-The housing pushes inwards and friction opposes the sliding of the disc's rim; the paper prints the
+The housing pushes inwards and friction opposes the sliding of the disc's rim. The paper prints the
 contact force of its state equation with the other sign, which throws the rotor out of its housing.
 Friction follows the sign of the sliding speed at the rim, so that a rotor whirling backwards faster
 than its rim turns is not driven any further.

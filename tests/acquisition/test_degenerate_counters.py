@@ -258,7 +258,7 @@ def test_a_flood_is_set_aside_and_counted(rate: int) -> None:
         frames = at + np.arange(batch)
         t_ns = frames * (1_000_000 // rate)
         unit.accept(frames, np.ones((batch, 1, 1), np.float32), np.ones(batch, bool), t_ns)
-    assert unit.doubt.startswith("more than 4 times as many frames come as the file says (1000 a second)")
+    assert unit.doubt.startswith("more than 4 times as many frames come as the file states (1000 a second)")
     counters = unit.counters
     assert counters.frames_received == n
     assert counters.frames_set_aside > n // 4

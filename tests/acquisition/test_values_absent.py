@@ -97,7 +97,7 @@ def test_nothing_says_that_there_is_no_value_unless_some_raw_value_does() -> Non
     plain = layout(any_priority=False)
     assert decoded(plain, 0xFFFF) == np.float32(335.35)
     with pytest.raises(
-        LayoutError, match=r"nan does not fit .*; say by valid_raw which raw value stands for none"
+        LayoutError, match=r"nan does not fit .*; state in valid_raw which raw value means none"
     ):
         plain.encode(np.array([0]), np.full((1, 1, 1), math.nan), clip=True)
     everything = layout(valid_raw={"a": (0.0, 65535.0)})

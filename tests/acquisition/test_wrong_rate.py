@@ -62,7 +62,7 @@ def sent(rate_hz: float, seconds: float, seed: int, since_s: float = 0.0) -> np.
 
 
 def sentence(hz: float) -> str:
-    return f"the device sends {hz:g} Hz, the file says 1000"
+    return f"the device sends {hz:g} Hz, the file states 1000"
 
 
 @pytest.mark.parametrize("hz", [500.0, *first_of(5000.0, 900.0, 1100.0, 2000.0)])

@@ -6,7 +6,7 @@ from daqsvc.alarms.quality import SensorHealth
 from daqsvc.diagnosis.record import Diagnosis
 
 SILENCE = "no samples of stream 's' for more than {} s; check bus and device"
-RATE = "the device sends {} Hz, the file says 50"
+RATE = "the device sends {} Hz, the file states 50"
 
 
 def test_a_wrong_rate_takes_over_from_silence() -> None:

@@ -273,14 +273,14 @@ def silent(rig, reason, seconds=0.5):
 def test_reasons_that_alternate_are_an_event_every_few_seconds_and_the_last_one_is_told():
     rig = AlarmRig(LEVEL)
     assert kinds(silent(rig, "no samples of shaft for 2.0 s")) == [("sensor-ok/probe-x", "raised")]
-    (changed,) = silent(rig, "the device sends 320 Hz, the file says 640")
-    assert (changed.kind.value, changed.message[-42:]) == (
+    (changed,) = silent(rig, "the device sends 320 Hz, the file states 640")
+    assert (changed.kind.value, changed.message[-44:]) == (
         "changed",
-        "the device sends 320 Hz, the file says 640",
+        "the device sends 320 Hz, the file states 640",
     )
     for _ in range(30):
         silent(rig, "the counter makes no sense")
-        silent(rig, "the device sends 320 Hz, the file says 640")
+        silent(rig, "the device sends 320 Hz, the file states 640")
     assert 4 <= len(rig.events) <= 2 + 30 / 5
     silent(rig, "the counter stands still at 7")
     for _ in range(6):

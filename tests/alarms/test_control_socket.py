@@ -139,7 +139,7 @@ async def test_the_client_and_the_server_understand_each_other(tmp_path: Path) -
         (wish(schema="daqsvc.control/2"), "schema"),
         (
             wish(verb="delete"),
-            "'unbypass'; or a question, as it is documented to the letter: 'status', 'live', 'reload'",
+            "'unbypass'; or a question exactly as documented: 'status', 'live', 'reload'",
         ),
         (wish(verb=None), "verb"),
         (wish(alarm=""), "alarm"),
@@ -558,5 +558,6 @@ async def test_a_service_that_is_killed_meanwhile_is_said_in_plain_words(tmp_pat
         server.close()
         await server.wait_closed()
     assert f"{told.value}" == (
-        f"the daqsvc of {tmp_path} has closed the connection without an answer; its log says what it has done"
+        f"the daqsvc of {tmp_path} has closed the connection without an answer; its log shows what it has "
+        "done"
     )

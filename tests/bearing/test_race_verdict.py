@@ -92,7 +92,7 @@ GAPPED[100:2000] = np.nan
     [
         (np.zeros(60_000), {}, r"channel is dead: 100%"),
         (np.repeat(strikes(None, 1.0), 5), {}, r"channel is dead: 80%"),
-        (CLIPPED, {}, r"channel is clipped: .* stand at -2 or 2;"),
+        (CLIPPED, {}, r"channel is clipped: .* are at -2 or 2;"),
         (GAPPED, {}, r"lacks 3.2% of its samples"),
         (np.full(60_000, np.inf), {}, r"lacks 100.0% of its samples"),
         (strikes(None, 0.5), {}, r"too short: 0.5 s are 15 revolutions; give 25"),

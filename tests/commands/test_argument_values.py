@@ -25,9 +25,7 @@ def test_what_is_no_map(text):
 
 
 def test_a_map_names_each_channel_once():
-    with pytest.raises(
-        argparse.ArgumentTypeError, match="names 'x' twice; give each channel a name of its own"
-    ):
+    with pytest.raises(argparse.ArgumentTypeError, match="names 'x' twice; give each channel its own name"):
         channel_map("x=a,y=b, x=c")
 
 

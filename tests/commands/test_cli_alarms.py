@@ -455,7 +455,7 @@ async def test_a_pattern_that_means_nothing_names_what_there_is_and_nothing_is_d
     async with taking_commands(tmp_path, {}) as commands:
         code, out, err = await daqsvc("reset", "fan.a", "fan.[ab]", "--store", tmp_path, "--machine", "motor")
         assert (code, out, commands) == (1, "", [])
-        assert "no alarm that 'fan.[ab]' matches is one to reset; these are not normal: fan.a (active" in err
+        assert "no alarm that 'fan.[ab]' matches waits for reset; these are not normal: fan.a (active" in err
         assert "fan.c (latched unacknowledged). A pattern means" in err
         assert err.endswith("[C05]\n")
         assert "fan.d" not in err

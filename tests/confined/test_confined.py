@@ -154,7 +154,7 @@ def test_nothing_of_the_working_directory_is_run(tmp_path, monkeypatch):
 def test_a_budget_is_bounded_by_the_file_and_by_memory():
     small = Budget(1_000, ResourceLimits(10**12).content_bytes)
     small.check_declared(FREE_BYTES)
-    with pytest.raises(TooLargeError, match="its 1 kB says that it unpacks to 64 MB, 200 times and more"):
+    with pytest.raises(TooLargeError, match="its 1 kB claims to unpack to 64 MB, 200 times and more"):
         small.check_declared(FREE_BYTES + 1)
     small.spend(FREE_BYTES)
     with pytest.raises(TooLargeError, match="its 1 kB unpacks to more than 64 MB"):

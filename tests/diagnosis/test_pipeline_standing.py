@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 pytestmark = pytest.mark.integration
 BLOCK = 10
-DOUBT = "the device sends 1000 Hz, the file says 2000"
+DOUBT = "the device sends 1000 Hz, the file states 2000"
 
 
 class Listener:

@@ -161,7 +161,7 @@ MEND = "have the authors of daqsvc-tcp-frames 1.0 fix it"
     [
         (None, "import of tcp_frames halted", "install the package that brings it again"),
         (dict, "it is not derived from DriverPlugin of daqsvc.api", MEND),
-        (_Unfinished, "_Unfinished does not say its buses", MEND),
+        (_Unfinished, "_Unfinished does not state its buses", MEND),
     ],
 )
 def test_a_package_that_cannot_be_loaded_is_named_with_its_bus(

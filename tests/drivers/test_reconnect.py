@@ -141,7 +141,7 @@ async def test_an_absent_device_may_be_gone_without() -> None:
         ("error", []),  # whoever gets the exception says it
         pytest.param(
             "ignore",
-            ["it is left out until the service starts again, as start = 'ignore' says"],
+            ["it is left out until the service starts again, as start = 'ignore' asks for"],
             marks=pytest.mark.gives("B30"),
         ),
         pytest.param("retry", ["it is being tried again"], marks=pytest.mark.gives("B29")),

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
         (["a", "--cluster", "local:0"], "is no cluster"),
         (
             ["a", "--cluster", "local", "--probes", "x,y"],
-            "--probes: the machine files of the archive say this",
+            "--probes: the machine files of the archive state this",
         ),
         (["a", "--cluster", "local", "--plot", "p"], "--plot: the machine files"),
         (["a", "b", "--cluster", "local"], "takes one archive, and 2 places are named"),

@@ -145,7 +145,7 @@ def test_what_false_alarms_cost_is_said_without_any_time(
     assert "times not known, 2 alarms 0 known faults" in text
     assert "2 false alarms cost 4,000; how many that is a year is not known" in text
     assert main(["fleet", "report", str(results), "--false-alarm-cost", "2000"]) == 0
-    assert "What false alarms cost is not known: --truth says" in capsys.readouterr().out
+    assert "What false alarms cost is not known: --truth has" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -166,7 +166,7 @@ def test_two_buses_are_put_on_one_grid(analyze, tmp_path):
         (["--fs", "999"], "is 3200 Hz by .* and 999 Hz as given: leave --fs out"),
         (
             ["--map", "probe-x=x"],
-            "a CAN log, of which the machine file says channels and units: leave out --map",
+            "a CAN log, of which the machine file states channels and units: leave out --map",
         ),
         (["--unit", "mm"], "leave out --unit"),
     ],
@@ -198,7 +198,7 @@ def test_a_log_of_another_rate_than_the_machine_file_says_is_refused(analyze, ma
     slow = machine_file(tmp_path / "slow.toml", rate_hz=RATE_HZ / 2)
     code, (found,), _ = analyze(slow, write(tmp_path / "run.blf", sent))
     assert code == 3
-    assert re.search(r"stream 'shaft' comes at 32\d\d Hz, and .*slow.toml says 1600 Hz", found["refused"])
+    assert re.search(r"stream 'shaft' comes at 32\d\d Hz, and .*slow.toml states 1600 Hz", found["refused"])
 
 
 def test_a_log_without_a_machine_file_is_refused(analyze, machine, tmp_path):

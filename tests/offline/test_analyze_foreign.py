@@ -43,7 +43,7 @@ def test_a_unit_that_contradicts_the_file_is_refused(analyze, tmp_path):
     code, (found,), _ = analyze(path, "--channels", "de", *OPTIONS)
     assert (code, found["verdict"]) == (3, None)
     assert "de of " in found["refused"]
-    assert "is in m/s^2 by the file and in g as it would be read: say the file's unit" in found["refused"]
+    assert "is in m/s^2 by the file, and would be read in g; state the file's unit" in found["refused"]
     code, (found,), _ = analyze(path, "--channels", "de", *OPTIONS, "--unit", "m/s2")
     assert (code, found["verdict"]) == (0, "inner")
 

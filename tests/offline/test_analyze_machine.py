@@ -107,7 +107,7 @@ def test_a_calibration_stands_in_for_the_first_revolutions(
     assert found[1]["departure"]["revolution"] <= 2
     code, found, err = analyze(tmp_path / "f.npz", *options, "--damping-ratio", "0.1")
     assert (code, found) == (2, [])
-    assert "the calibration says this" in err
+    assert "the calibration states this" in err
     code, found, err = analyze(tmp_path / "f.npz", *options, "--speed-rpm", 1000)
     assert (code, found) == (2, [])
     assert "no baseline within 5 % of 1000.0 rpm" in err

@@ -261,10 +261,10 @@ def test_refuses_two_recordings_of_one_kind(tmp_path: Path, capsys) -> None:
         ),
         ([MACHINE, "--json"], "no recording is given; name one after the machine file, or listen"),
         ([MACHINE, "a.npz", "--json", "--live"], "--live listens to the machine; leave out recordings"),
-        (["a.npz", "--json", "--live"], "--live needs a machine file, which says how to reach"),
+        (["a.npz", "--json", "--live"], "--live needs a machine file, which states how to reach"),
         (
             [MACHINE, "a.npz", "--json", "--probes", "x,y"],
-            "--probes: the machine file says this; leave it out",
+            "--probes: the machine file states this; leave it out",
         ),
         (
             ["a.npz", *OPTIONS, "--json", "--damping-ratio", "0.1"],

@@ -278,7 +278,7 @@ def test_a_recording_that_has_no_begin_and_no_units_gets_none(tmp_path, capsys, 
     assert stream.names == tuple(SENSORS)
     assert stream.rate_hz == pytest.approx(RATE_HZ, rel=1e-9)
     if suffix == ".mf4":
-        assert "begins in 1970, as the recording does not say when it began" in capsys.readouterr().err
+        assert "begins in 1970, as the recording does not state when it began" in capsys.readouterr().err
     else:
         assert stream.start_ns is None
     exact = np.float32 if suffix == ".wav" else np.float64
@@ -336,7 +336,7 @@ def test_force_does_not_replace_the_recording_itself(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("a.paquet", r"a.paquet ends in .paquet, and that says no format to write: did you mean .parquet?"),
+        ("a.paquet", r"a.paquet ends in .paquet, which selects no format: did you mean .parquet?"),
         ("a.mp3", "take one of .parquet, .csv, .wav, .mat, .uff, .mf4"),
         ("a", "has no suffix"),
         ("none/a.csv", "there is no folder"),
@@ -377,7 +377,7 @@ def test_what_cannot_be_read_ends_with_3(tmp_path, capsys):
 def test_a_rate_that_wav_cannot_say_is_refused(tmp_path, capsys):
     np.savez(tmp_path / "run.npz", x=np.arange(9.0), fs=100.5)
     assert export(tmp_path / "run.npz", "--to", tmp_path / "run.wav") == 3
-    assert "has 100.5 samples a second, and a WAV file says whole numbers only" in capsys.readouterr().err
+    assert "has 100.5 samples a second, and a WAV file holds whole numbers only" in capsys.readouterr().err
     assert not (tmp_path / "run.wav").exists()
 
 

@@ -18,7 +18,7 @@ from daqsvc.settings import load_machine_file
 from drivers.can.plugin import frame_layout
 
 pytestmark = pytest.mark.integration
-NOT_SAID = "does not say when it began, and neither does what is made of it"
+NOT_SAID = "does not state when it began, so the result does not either"
 TRIGGERED = "date Wed Nov 25 22:52:36.424 2026\nBegin Triggerblock Mon Nov 23 {} 2026\n"
 HEADERS = {
     "trigger": (TRIGGERED.format("14:58:31.125"), "2026-11-23T14:58:31.125"),

@@ -26,7 +26,7 @@ from daqsvc.snapshots.writing import SnapshotWriter
 
 pytestmark = pytest.mark.integration
 SUFFIXES = list(WRITERS)
-OUTSIDE = "says a begin outside of the years 1678 to 2261, and it is left out"
+OUTSIDE = "states a begin outside of the years 1678 to 2261, and it is left out"
 FACTS = {"rate_hz": 100.0, "channels": ["c0"], "sensors": ["x"], "units": ["um"]}
 
 

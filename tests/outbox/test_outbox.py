@@ -368,7 +368,7 @@ async def test_a_store_belongs_to_one_service_at_a_time(tmp_path):
     await first.open()
     second = Outbox(tmp_path / "outbox.sqlite", SystemClock())
     with pytest.raises(
-        OutboxError, match=r"another daqsvc uses the store .*, or have one service watch all"
+        OutboxError, match=r"another daqsvc uses the store .*; or have one service watch all"
     ) as refused:
         await second.open()
     assert refused.value.code.id == "S03"

@@ -90,7 +90,7 @@ def test_a_machine_without_such_a_detector_says_so_where_one_would_look() -> Non
     known: dict[str, Any] = about()
     known["values"]["pipeline"] = {"levels": [{"name": "a"}]}
     why = why_no_detector(MachineLive(known))
-    assert "none of the detectors that can say it: rotor_bank, rotor_synchronous" in why
+    assert "none of the detectors that can show it: rotor_bank, rotor_synchronous" in why
     known["values"]["pipeline"]["rotor_synchronous"] = {}
     assert not why_no_detector(MachineLive(known))
     navigation = Environment(loader=PackageLoader("daqsvc.page"), autoescape=True).get_template(

@@ -387,7 +387,7 @@ def test_a_stream_that_comes_no_more_is_told_with_its_age(monkeypatch: pytest.Mo
     with monkeypatch.context() as later:
         later.setattr(time, "monotonic", lambda: now_s + 30.0)
         said = json.loads(picture._whatever(heard))  # type: ignore[arg-type]
-    assert said["why"] == "nothing comes of shaft any more"
+    assert said["why"] == "nothing comes from shaft any more"
     assert said["age_s"] == pytest.approx(30.0, abs=0.5)
     live.hear({"standing": {"stream": "shaft", "doubt": "", "proven": True, "silent": True}})
     assert json.loads(picture._whatever(heard))["why"], "so says the service, too"  # type: ignore[arg-type]

@@ -51,7 +51,7 @@ class Text:
 def texts_of(file: Path) -> Iterator[Text]:
     """All prose of a page, a module or a TOML file."""
     readers = {".md": _of_page, ".py": _of_module, ".toml": _of_toml}
-    is_record = file.name == "CHANGELOG.md" or file.parent.name == "decisions"
+    is_record = file.name == "CHANGELOG.md"
     for line, found, words in readers[file.suffix](file.read_text("utf-8")):
         kind = "record" if is_record and found == "page" else found
         if plain := " ".join(_LITERAL.sub(CODE, words).split()):

@@ -225,7 +225,7 @@ def test_hdf5_that_says_more_than_it_holds_takes_no_memory(tmp_path):
     path = tmp_path / "rig.h5"
     with h5py.File(path, "w") as file:
         file.create_dataset("x", (10**11,), "f8", chunks=(1000,))
-    with pytest.raises(RecordingError, match="says that it unpacks to 800 GB"):
+    with pytest.raises(RecordingError, match="claims to unpack to 800 GB"):
         load_recording(path, rate_hz=RATE_HZ)
 
 
@@ -246,7 +246,7 @@ def test_hdf5_that_nobody_wants_may_say_more_than_it_holds(tmp_path):
     (stream,), notes = load_all(path, {"x": "run/accel[1]"})
     assert stream.names == ("run/accel[0]", "x")
     assert notes == ["left out huge, square[0], square[1], table.x, table.y: too large to be read"]
-    with pytest.raises(RecordingError, match="says that it unpacks to 800 GB"):
+    with pytest.raises(RecordingError, match="claims to unpack to 800 GB"):
         load_recording(path, {"x": "huge"})
 
 

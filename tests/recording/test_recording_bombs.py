@@ -50,7 +50,7 @@ def largest_mb():
 def test_a_bomb_is_refused(tmp_path, name):
     path = file_bombs.write(tmp_path, name)
     with pytest.raises(
-        RecordingError, match=r"is too large: its .* unpacks to .*, 200 times and more"
+        RecordingError, match=r"is too large: its .* unpacks? to .*, 200 times and more"
     ) as refused:
         load_recording(path, rate_hz=1000)
     assert str(refused.value).startswith(str(path))
@@ -60,7 +60,7 @@ def test_a_bomb_is_refused(tmp_path, name):
 def test_a_header_that_lies_takes_no_memory(tmp_path):
     path = tmp_path / "a.npz"
     path.write_bytes(file_bombs.npz_that_says_too_much())
-    with pytest.raises(RecordingError, match="says that it holds 8000000000000 bytes in"):
+    with pytest.raises(RecordingError, match="claims to hold 8000000000000 bytes in"):
         load_recording(path, rate_hz=1000)
     assert largest_mb() < MOST_MB
 
@@ -115,7 +115,7 @@ def test_memory_is_given_on_the_command_line(tmp_path, capsys):
     np.savez(run, **dict.fromkeys("xy", np.random.default_rng(1).normal(size=2_000_000)), fs=1000)
     code, (said,) = analyze(capsys, run, *OPTIONS, "--max-memory", "0.05")
     assert code == 3
-    assert "32 MB says that it unpacks to 32 MB, and 25 MB may be read; allow more memory" in said["refused"]
+    assert "32 MB claims to unpack to 32 MB, and 25 MB may be read; allow more memory" in said["refused"]
     with pytest.raises(SystemExit):
         main(["analyze", str(run), *OPTIONS, "--max-memory", "0.001"])
     assert "is not a number of GB from 0.05 to 1000" in capsys.readouterr().err
@@ -129,7 +129,7 @@ COLUMNS = table_layout(("x", "x", 1.0, 0.0))
 def test_a_replayed_table_is_refused_likewise(tmp_path, name):
     path = tmp_path / name
     path.write_bytes(file_bombs.npz() if name == "a.npz" else file_bombs.npz_that_says_too_much())
-    with pytest.raises(ReplayError, match=r"a.npz is too large: its .*|said.npz .*says that it holds"):
+    with pytest.raises(ReplayError, match=r"a.npz is too large: its .*|said.npz .*claims to hold"):
         SampleTable(path, [StreamSpec("s", COLUMNS, 1000.0)], {})
 
 
@@ -187,7 +187,7 @@ def test_an_object_of_a_can_log_may_not_be_of_any_size(tmp_path):
     at = content.index(b"LOBJ")
     struct.pack_into("<I", content, at + 8, 2**31)
     path.write_bytes(content)
-    with pytest.raises(ReplayError, match="an object says that it has 2,147,483,632 bytes"):
+    with pytest.raises(ReplayError, match="an object claims to have 2,147,483,632 bytes"):
         read_whole(path)
 
 

@@ -359,7 +359,7 @@ def test_what_is_given_must_agree_with_what_is_stated(tmp_path):
     recording = load_recording(path)
     assert (recording.rate_hz, recording.names) == (640, ("x",))
     recording = load_recording(path, rate_hz=641)
-    assert (recording.rate_hz, recording.rate_source) == (641, "given; fs of the file says 640 Hz")
+    assert (recording.rate_hz, recording.rate_source) == (641, "given; fs of the file is 640 Hz")
     with pytest.raises(RecordingError, match=r"is 640 Hz \(fs\) by the file and 100 Hz as given: leave --fs"):
         load_recording(path, rate_hz=100)
     assert load_recording(path, rate_hz=640).rate_source == "given"

@@ -193,7 +193,7 @@ def test_a_saved_calibration_can_be_loaded(tmp_path: Path) -> None:
     save_record(record(5110.0, 3600.0), path)
     assert [p.name for p in tmp_path.iterdir()] == ["rotor.toml"]
     assert load_calibration(path, speed_rpm=-3650.0).speed_rpm == 3600.0
-    with pytest.raises(CalibrationFileError, match=r"baselines at 5110.0, 3600.0 rpm; say at which speed"):
+    with pytest.raises(CalibrationFileError, match=r"baselines at 5110.0, 3600.0 rpm; give the speed"):
         load_calibration(path)
     with pytest.raises(CalibrationFileError, match=r"no baseline within 5 % of 4400.0 rpm, but at 5110.0"):
         load_calibration(path, 4400.0)

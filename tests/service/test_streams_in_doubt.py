@@ -37,8 +37,8 @@ danger = 3.0
 LOUD = Phase("loud", values="loud")
 CALM_AND_TWICE = Phase("calm and twice", per_s=2 * NOMINAL_HZ)
 """Whatever comes before a rate is known has to be judged some time, and raises no limit."""
-RATE = re.compile(rf"the device sends [\d.]+ Hz, the file says {NOMINAL_HZ:g}\b")
-RATE_WRONG = re.compile(rf"the device sends (9[5-9]|10[0-5])(\.\d+)? Hz, the file says {NOMINAL_HZ:g}\b")
+RATE = re.compile(rf"the device sends [\d.]+ Hz, the file states {NOMINAL_HZ:g}\b")
+RATE_WRONG = re.compile(rf"the device sends (9[5-9]|10[0-5])(\.\d+)? Hz, the file states {NOMINAL_HZ:g}\b")
 COUNTER_STILL = "the device's counter stands still at 3000000077; check the device"
 
 

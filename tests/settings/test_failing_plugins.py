@@ -529,7 +529,7 @@ def test_a_hook_that_answers_nothing_or_something_else_is_named(
         ("about", None, "about of CrestPlugin is None, which must be str"),
         ("settings", dict, "settings of CrestPlugin is <class 'dict'>, which must be type[Section]"),
         ("settings", 42, "settings of CrestPlugin is 42, which must be type[Section]"),
-        ("settings", None, "CrestPlugin does not say its settings"),
+        ("settings", None, "CrestPlugin does not state its settings"),
         ("start_up_signals", 42, "start_up_signals of CrestPlugin is 42, which must be a method"),
     ],
 )
@@ -549,7 +549,7 @@ def test_a_plugin_with_odd_attributes_is_one_finding(
     [
         ("buses", 42, "buses of LoggerPlugin is 42, which must be tuple[type[Bus], ...]"),
         ("buses", (int,), "buses of LoggerPlugin is (<class 'int'>,), which must be tuple[type[Bus], ...]"),
-        ("buses", (), "LoggerPlugin does not say its buses"),
+        ("buses", (), "LoggerPlugin does not state its buses"),
         ("layouts", 42, "layouts of LoggerPlugin is 42, which must be tuple[type[Layout], ...]"),
         ("self_checks", (1,), "self_checks of LoggerPlugin is (1,), which must be tuple[str, ...]"),
     ],

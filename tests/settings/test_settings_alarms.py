@@ -110,7 +110,7 @@ def test_evidence_and_group_reach_the_rules():
         (
             [("[mqtt]", VOTING)],
             "alarms[3].trip_multiply",
-            "nothing says when the machine starts up",
+            "nothing states when the machine starts up",
             "[alarm_handling.start_up]",
         ),
         (

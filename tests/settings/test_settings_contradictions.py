@@ -187,7 +187,7 @@ ERRORS += [
         BEARING,
         [('type = "6205-2RS"', ORDERS), ("speed_rpm = 1772.0", "speed_rpm = 150_000.0")],
         "pipeline.bearing.bearings[0].sensor",
-        "and the inner race's line lies at 13538 Hz: samples tell nothing above 12800 Hz",
+        "and the inner race's line lies at 13538 Hz: samples show nothing above 12800 Hz",
         "sample at 33844 Hz or faster",
     ),
 ]
@@ -278,7 +278,7 @@ WARNINGS += [
         BEARING,
         [('type = "6205-2RS"', ORDERS.replace("5.415", "5.95"))],
         "pipeline.bearing.bearings[0].orders",
-        "make 9.535 balls, for which bpfo + bpfi stands",
+        "make 9.535 balls, the number in bpfo + bpfi",
         "data sheet",
     ),
     (

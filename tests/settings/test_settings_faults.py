@@ -196,7 +196,7 @@ MISSING = [
         "samples_per_frame = 10",
     ),
     ('driver = "can"', "buses.can0.driver", "[buses.can0]", "driver", 'driver = "can"'),
-    ('site = "lab"', "site", "", "where the box stands", 'site = "lab"'),
+    ('site = "lab"', "site", "", "where the box is", 'site = "lab"'),
     ('directory = "/var/lib/daqsvc"', "store.directory", "[store]", "journal", "/var/lib/daqsvc"),
 ]
 
@@ -374,12 +374,12 @@ def test_broken_toml(text, line, words):
         (
             "x = {\n a = 1,\n}\n",
             1,
-            "write all that is between { and } in one line, or a table of its own: [name]",
+            "write all that is between { and } in one line, or a separate table: [name]",
         ),
         (
             "x = { a = 1, # one\n b = 2 }\n",
             1,
-            "write all that is between { and } in one line, or a table of its own: [name]",
+            "write all that is between { and } in one line, or a separate table: [name]",
         ),
         ("rate_hz = 1.000,0\n", 1, "write rate_hz = 1000.0, without marks between thousands"),
         ("rate_hz = 1,000.5 # Hz\n", 1, "write rate_hz = 1000.5, without marks between thousands"),

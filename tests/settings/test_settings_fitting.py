@@ -75,7 +75,7 @@ FITTING = [
         ],
         "streams.shaft.layout.channels[3].name",
         "earlier channel",
-        "name of its own",
+        "its own name",
     ),
     (
         LAVAL,
@@ -100,13 +100,19 @@ FITTING = [
         'stream "shaft" has no such',
         "kph, x, y",
     ),
-    (LAVAL, [('channel = "y"', 'channel = "x"')], "sensors[1].channel", 'to sensor "probe-x"', "of its own"),
+    (
+        LAVAL,
+        [('channel = "y"', 'channel = "x"')],
+        "sensors[1].channel",
+        'to sensor "probe-x"',
+        "its own channel",
+    ),
     (
         LAVAL,
         [('name = "shaft-vibration-y"', 'name = "rotor-fault"')],
         "alarms[2].name",
         "earlier alarm",
-        "of its own",
+        "its own name",
     ),
     (LAVAL, [("sensitivity_mv_per_unit = 7.87", "")], "sensors[0].zero_v", "no effect", "add sensitivity"),
     (
@@ -144,7 +150,7 @@ FITTING = [
         "one line",
         "angle_deg",
     ),
-    (LAVAL, [("angle_deg = 90.0", "")], "pipeline.rotor_bank.probes[1]", "does not say", "angle_deg"),
+    (LAVAL, [("angle_deg = 90.0", "")], "pipeline.rotor_bank.probes[1]", "does not state", "angle_deg"),
     (
         LAVAL,
         [('damping_ratio = 0.18, severity = "normal"', 'damping_ratio = 0.18, severity = "alert"')],
@@ -157,7 +163,7 @@ FITTING = [
         [('name = "F1"', 'name = "N"')],
         "pipeline.rotor_bank.modes[1].name",
         "earlier mode",
-        "of its own",
+        "its own name",
     ),
     (LAVAL, [("window_s = 0.5", "window_s = 20")], "pipeline.levels.window_s", "ring of 30 s", "ring_s = 40"),
     (LAVAL, [("window_s = 0.5", "window_s = 0.01")], "pipeline.levels.window_s", "fewer than 16", "0.025"),

@@ -205,7 +205,7 @@ def test_stated_limits_win_over_zones_and_a_trend_value_has_zones_too():
         (
             [("shaft = true", "shaft = true, group = 1")],
             "alarms[4].zones.group",
-            "says nothing of the shaft",
+            "has no effect on the shaft",
             "remove it",
         ),
         (
@@ -238,7 +238,7 @@ def test_stated_limits_win_over_zones_and_a_trend_value_has_zones_too():
             "must be above alert = 2.8, where zone C begins",
             "write alert as well",
         ),
-        ([("reference_deg = 350.0", "")], "alarms[1]", "does not say from where", "add reference_deg"),
+        ([("reference_deg = 350.0", "")], "alarms[1]", "does not state from where", "add reference_deg"),
         (
             [("alert = 30.0\nreference", "alert = 190.0\nreference")],
             "alarms[1].alert",

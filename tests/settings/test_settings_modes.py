@@ -94,26 +94,26 @@ def test_thresholds_from_rates():
         (
             [('unbalance_ratio = 1.3, severity = "alert"', 'severity = "alert"')],
             f"{MODES}[1].fault",
-            "nothing in this mode",
+            "no figure of this mode",
             "unbalance_ratio = 1.8",
         ),
         (
             [("damping_ratio = 0.10", "damping_ratio = 0.20")],
             f"{MODES}[7].fault",
-            "nothing in this mode",
+            "no figure of this mode",
             "damping_ratio = 0.09, below",
         ),
         (
             [("stiffness_ratio = 0.95", "stiffness_ratio = 1.05")],
             f"{MODES}[10].fault",
-            "nothing in this mode",
+            "no figure of this mode",
             "stiffness_ratio = 0.9",
         ),
-        ([("rub = true, ", "")], f"{MODES}[9].fault", "nothing in this mode", "rub = true"),
+        ([("rub = true, ", "")], f"{MODES}[9].fault", "no figure of this mode", "rub = true"),
         (
             [("[0.0, -5.0]", "[0.0, 0.0]")],
             f"{MODES}[4].fault",
-            "nothing in this mode",
+            "no figure of this mode",
             "static_load_um = [0.0, -10.0]",
         ),
         (

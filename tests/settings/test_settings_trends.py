@@ -294,7 +294,7 @@ def test_a_mark_for_no_value_that_would_be_a_value_is_warned_of(old, new, words)
     assert warning.message.endswith(("would be -1638.4 degC", "would be 65.535 mm/s"))
     mark = "0xFFFF" if words == "0xFFFF" else "0x8000"
     assert warning.remedy.startswith(
-        f"write no_value = {mark} into its channel if the device's manual says so, or ok_between"
+        f"write no_value = {mark} into its channel if the device's manual has it, or ok_between"
     )
 
 

@@ -67,4 +67,4 @@ def test_a_receiver_that_stops_reading_ends_the_demo_in_a_sentence(
     monkeypatch.setattr(session.DemoSession, "backlog", lambda _: 10**6)
     code, _, err = demo(capsys, "--scenario", "healthy")
     assert code == 1
-    assert "daqsvc demo: the playing came to a stop: the receiver has been 1000000 behind" in err
+    assert "daqsvc demo: playing has stopped: the receiver has been 1000000 behind" in err

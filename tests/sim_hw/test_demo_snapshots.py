@@ -81,7 +81,7 @@ def test_the_demo_says_how_to_judge_its_snapshot_again_and_how_to_keep_one(
 
     assert "snapshot" not in "".join(shown())
     outcome.snapshots_gone = 2
-    assert "2 snapshots, which went with the demo: --snapshots DIR" in " ".join(shown())
+    assert "2 snapshots, which were removed with the demo: --snapshots DIR" in " ".join(shown())
     outcome.snapshots = [tmp_path / ("long-" * 40) / "an alarm.mcap"]
     assert f"daqsvc replay '{outcome.snapshots[0]}'" in shown()
 

@@ -208,7 +208,7 @@ def _covered(order: float, drive: DriveLines) -> str:
 def _smeared(part: Part, order: float) -> str:
     """Why a part is not testable beside a smeared harmonic of the shaft."""
     return (
-        f"its lines at order {order:.3f} stand on both sides of {round(order)}X, as the shaft makes them "
+        f"its lines at order {order:.3f} are on both sides of {round(order)}X, as the shaft makes them "
         f"where its speed wanders; record at a steady speed to test the {PLACES[part]}"
     )
 

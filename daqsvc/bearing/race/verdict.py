@@ -37,8 +37,8 @@ class PartEvidence:
         z: significance of its kinematic lines, in standard deviations of the Gaussian-noise null, search
             included.
         depth: size: root sum of squares of the modulation indices of its lines in the whitened envelope.
-        steadiness: depth in the logarithm of the envelope over depth in its square: small if a few hard
-            transients make the lines, as a rub or a loose part does, and not strike after strike.
+        steadiness: depth in the logarithm of the envelope over depth in its square. It is small if a few
+            hard transients make the lines, as a rub or a loose part does, and not strike after strike.
         severity: ``z * depth``, what the rule weighs parts by.
         z_limit: the significance from which the part may be named.
         steadiness_limit: the steadiness from which a race may be named; 0 for a ball.

@@ -76,7 +76,7 @@ def _head(answers: Answers, file: str) -> Iterator[str]:
     yield f"#:schema ./{SCHEMA_FILE}"
     yield f"# {answers['name']}: a machine file of daqsvc, made by daqsvc new."
     yield "#"
-    yield f"#   daqsvc check {file}    says what it understood, or everything that is wrong"
+    yield f"#   daqsvc check {file}    shows what it understood, or all errors"
     yield f"#   daqsvc run {file}      watches the machine; while it runs, after a change here:"
     yield f"#   daqsvc reload {file}   takes the change over"
     yield "#"
@@ -104,14 +104,14 @@ def _machine(answers: Answers) -> Iterator[str]:
 def _broker(answers: Answers) -> Iterator[str]:
     url = answers["broker"]
     if url is None:
-        yield "# Alarms stand in the journal of this box: daqsvc alarms. To send them to an MQTT broker, too:"
+        yield "# Alarms are kept on this box: daqsvc alarms shows them. To send them to an MQTT broker, too:"
         yield "# [mqtt]"
         yield '# url = "mqtts://broker.example:8883"'
         return
     yield "[mqtt]"
     yield entry("url", url)
     if url.startswith("mqtt://"):
-        yield entry("insecure", value=True, comment="says that it is meant: nothing is encrypted")
+        yield entry("insecure", value=True, comment="accepts that nothing is encrypted")
     if answers["username"] is not None:
         yield entry("username", answers["username"])
         yield entry("password_file", answers["password-file"], "its first line; only daqsvc may read it")

@@ -293,8 +293,8 @@ def pipeline_tables(answers: Answers) -> Iterator[str]:
         about = "of the velocity RMS" + (early if high_hz < _BAND_HZ[1] else "")
         yield entry("velocity_band_hz", band, about)
     if by_mark:
-        yield entry("keyphasor", keyphasor, "the mark that phases count from")
-        yield entry("measures", ["1x_amplitude", "1x_phase_lag"], "told for trends, without an alarm")
+        yield entry("keyphasor", keyphasor, "the mark from which phases count")
+        yield entry("measures", ["1x_amplitude", "1x_phase_lag"], "measured for trends, without an alarm")
     yield ""
     bearings = [one for one in there if one.bearing is not None]
     if bearings:
@@ -380,7 +380,7 @@ def _alarm(name: str, measure: str, limits: dict[str, Any], alert: float) -> Ite
         yield entry(key, value)
     yield entry("deadband", float(f"{0.05 * abs(alert):.2g}"), "returns this far below a limit")
     yield entry("on_delay_s", 3.0, "time at a limit before it counts")
-    yield entry("off_delay_s", 5.0, "so long below before it returns")
+    yield entry("off_delay_s", 5.0, "time below a limit before it returns")
     yield entry("latching", value=False, comment="true: it stays until somebody resets it")
 
 

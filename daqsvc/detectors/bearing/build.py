@@ -229,7 +229,7 @@ def _refuse_other_units(path: Path, baseline: BearingBaseline, bearings: list[Ho
     unknown = [name for name in units if name not in baseline.units]
     if unknown:
         log.warning(
-            "%s: does not say in which unit it was learnt at %s; calibrate again, and that is checked",
+            "%s: does not state in which unit it was learnt at %s; calibrate again, and that is checked",
             path,
             ", ".join(unknown),
             extra=coded(HEALTHY_STATE),
@@ -252,7 +252,7 @@ def _refuse_other_bearing(path: Path, baseline: BearingBaseline, bearing: Housed
     learnt = baseline.races[bearing.sensor].orders
     if learnt is None:
         log.warning(
-            "%s: does not say of which bearing it was learnt at %s; calibrate again, and that is checked",
+            "%s: does not state of which bearing it was learnt at %s; calibrate again, and that is checked",
             path,
             bearing.sensor,
             extra=coded(HEALTHY_STATE),

@@ -105,7 +105,7 @@ def _geometry(orders: FaultOrders, at: KeyPath) -> Iterator[Finding]:
     if abs(balls - round(balls)) > _OFF * balls:
         yield Finding(
             at,
-            f"make {balls:.4g} balls, for which bpfo + bpfi stands: a bearing has a whole number of them",
+            f"make {balls:.4g} balls, the number in bpfo + bpfi: a bearing has a whole number of them",
             "compare bpfo and bpfi with the data sheet of the bearing",
             fatal=False,
             code=BEARING_FIGURES,
@@ -292,7 +292,7 @@ def _lines(draft: MachineFile, bearing: WatchedBearing, at: KeyPath) -> Iterator
     if line_hz >= rate_hz / 2.0:
         yield Finding(
             (*at, "sensor"),
-            f"is sampled at {rate_hz:g} Hz, and the inner race's line lies at {line_hz:.0f} Hz: samples tell "
+            f"is sampled at {rate_hz:g} Hz, and the inner race's line lies at {line_hz:.0f} Hz: samples show "
             f"nothing above {rate_hz / 2.0:g} Hz",
             f"sample at {2.5 * line_hz:.0f} Hz or faster, or correct the orders or machine.speed_rpm",
             code=SAMPLED_TOO_SLOWLY,

@@ -155,7 +155,7 @@ def _revolutions(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
         yield Finding(
             (*_LEVELS, "window_s"),
             f"{window_s:g} s hold {window_s * speed_rpm / 60.0:.3g} revolutions at {speed_rpm:g} rpm: 1X is "
-            "not told from what lies beside it",
+            "not separate from what lies beside it",
             f"write window_s = {rounded_up(_LEAST_REVOLUTIONS * 60.0 / speed_rpm)} or more",
             code=WINDOW_TOO_SHORT,
         )
@@ -212,7 +212,7 @@ def _slow_velocity(draft: MachineFile, levels: Levels, asked: _Asked) -> Iterato
         yield Finding(
             asked.at,
             f"a window of {levels.window_s:g} s holds {low_hz * levels.window_s:.3g} periods of {low_hz:g} "
-            "Hz: what is that slow is not told from the mean value",
+            "Hz: so slow a motion cannot be separated from the mean value",
             f"write window_s = {rounded_up(_LEAST_PERIODS / low_hz)} or more in [pipeline.levels]",
             fatal=False,
             code=WINDOW_TOO_SHORT,

@@ -370,7 +370,7 @@ def _lowest_frequency(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
         yield Finding(
             ("pipeline", "levels", "window_s"),
             f"{window_s:g} s hold {low_hz * window_s:.3g} periods of {low_hz:g} Hz, the lowest frequency of "
-            "velocity_band_hz: its velocity is not told from the mean value",
+            "velocity_band_hz: its velocity cannot be separated from the mean value",
             f"write window_s = {rounded_up(_LEAST_PERIODS / low_hz)} or more, or begin the band at "
             f"{rounded_up(_LEAST_PERIODS / window_s)} Hz",
             fatal=False,

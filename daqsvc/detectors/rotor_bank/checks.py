@@ -174,7 +174,7 @@ def _mode_fault(draft: MachineFile, mode: Mode, at: KeyPath) -> Iterator[Finding
         if not made:
             yield Finding(
                 (*at, "fault"),
-                "nothing in this mode makes it that",
+                "no figure of this mode fits that fault",
                 f"write e.g. {example}",
                 code=MODE_WITHOUT_FAULT,
             )
@@ -298,8 +298,7 @@ def _mode(draft: MachineFile, rotor: Rotor, mode: Mode, at: KeyPath) -> Iterator
         yield Finding(
             at,
             f'mode "{mode.name}" would touch the stator: a whirl of {whirl:.4g} um about a rest at '
-            f"{rest:.4g} um does not fit a clearance of {rotor.clearance_um:g} um, and its model knows no "
-            "contact",
+            f"{rest:.4g} um does not fit a clearance of {rotor.clearance_um:g} um; its model has no contact",
             "write rub = true in it, or a smaller fault",
             fatal=False,
             code=MODE_TOUCHES,

@@ -163,8 +163,8 @@ class OrbitWatch:
             return ""
         return (
             f"{self._pair}: the orbit turns {100.0 * abs(slip):.2g} % {'faster' if slip > 0.0 else 'slower'} "
-            f"than {self._keyphasor} says; they do not see the same shaft, or pulses are miscounted: "
-            "check the keyphasor's channel and its threshold"
+            f"than the pulses of {self._keyphasor}; they do not see the same shaft, or pulses are "
+            "miscounted: check the keyphasor's channel and its threshold"
         )
 
 

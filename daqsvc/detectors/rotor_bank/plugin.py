@@ -110,7 +110,7 @@ class RotorBankPlugin(DetectorPlugin[RotorBank]):
         if options.noise_um is not None or options.eccentricity_um is not None:
             raise UnfitOptionError(
                 "--noise-um, --eccentricity-um: pipeline.rotor_bank.noise_um and "
-                "machine.rotor.eccentricity_um say this; leave them out"
+                "machine.rotor.eccentricity_um state this; leave them out"
             )
         from daqsvc.detectors.rotor_bank import detectability as bank  # noqa: PLC0415 - brings the compiler
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 _CLOSED_LIST = (
     "the rotor bank knows its modes and nothing else: on a machine that does not follow its model closely, "
-    "the nearest mode may be the wrong one; [pipeline.rotor_synchronous] can say unmodelled"
+    "the nearest mode may be the wrong one; [pipeline.rotor_synchronous] can report unmodelled"
 )
 
 

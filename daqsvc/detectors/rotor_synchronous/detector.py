@@ -81,7 +81,7 @@ class RotorSynchronousDetector:
     A shaft that turns clockwise is viewed from its other end (x mirrored): its whirl is then forward, and
     gravity still points down. Statistics are in the machine's own coordinates.
 
-    With AC-coupled probes the mean position shows nothing and is left out: a static load cannot be seen,
+    With AC-coupled probes the mean position shows nothing and is left out. A static load cannot be seen,
     stiffness loss is hard to tell from unbalance, and rub and an unmodelled change stay one group. The same
     is assumed if the calibrated mean position is zero where the shaft's weight must bend it.
 

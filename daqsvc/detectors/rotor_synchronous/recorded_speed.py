@@ -294,7 +294,7 @@ def _keyphasor_speed(
             _refuse_trend(trend_of_pulses(places, recording.rate_hz) or trend)
     if setup.speed_rpm is not None and abs(rpm / setup.speed_rpm - 1.0) > _OFF_NOMINAL:
         quality = quality.with_problem(
-            f"keyphasor {keyphasor.name} says {abs(rpm):.1f} rpm, not {abs(setup.speed_rpm):.1f} rpm; "
+            f"keyphasor {keyphasor.name} gives {abs(rpm):.1f} rpm, not {abs(setup.speed_rpm):.1f} rpm; "
             "the keyphasor decides"
         )
     probe = KeyphasorProbe(keyphasor.name, 2, threshold, hysteresis, keyphasor.edge)

@@ -91,7 +91,7 @@ def check_geometry(draft: MachineFile, detector: KeyPath, probes: tuple[str, str
         if probe.angle_deg is None:
             yield Finding(
                 (*at, index),
-                f'sensor "{name}" does not say where it points',
+                f'sensor "{name}" does not state where it points',
                 f'add angle_deg to the entry "{name}" of sensors, e.g. {90 * index}.0',
                 code=NEEDS_ANGLES,
             )

@@ -76,7 +76,7 @@ class RotorAlarm:
 
     def describe(self) -> str:
         """One line for a person."""
-        what = " or ".join(words(name) for name in self.group) or "a change that got no look"
+        what = " or ".join(words(name) for name in self.group) or "a change that was not evaluated"
         named = (
             "not named" if self.declaration is None else f"named at revolution {self.declaration.revolution}"
         )

@@ -100,7 +100,7 @@ def checked(samples: Real, rate_hz: float, speed_rpm: float, band_hz: tuple[floa
     if clipped > CLIPPED_SHARE:
         raise UnfitError(
             "channel",
-            f"is clipped: {clipped:.1%} of its samples stand at {x.min():.4g} or {x.max():.4g}",
+            f"is clipped: {clipped:.1%} of its samples are at {x.min():.4g} or {x.max():.4g}",
             "use a sensor or a gain with a larger range",
         )
     if clipped > CLIPPED_NOTE_SHARE:

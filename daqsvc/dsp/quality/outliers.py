@@ -5,8 +5,8 @@ vibration as a whole can yet be louder than all of the bands where the machine i
 are all that is seen. So outliers are looked for where they do harm: in the channel whitened by a spectrum
 that no single event bends (`Prewhitening`).
 
-No housing moves from one sample to the next as a wrong sample does: it, and a step of the supply, have a
-shape of their own in the whitened channel, which is known exactly. What has that shape and nothing else is
+No housing moves from one sample to the next as a wrong sample does. A wrong sample and a step of the supply
+each have their own shape in the whitened channel, which is known exactly. What has only that shape is
 estimated by least squares and subtracted (`despiked`); a strike in the bearing rings on and does not have it.
 A transient is much louder than anything that the machine does every revolution (`find_transients`).
 """

@@ -169,7 +169,7 @@ class ByProxy:
             return "this page is opened through its reverse proxy only"
         names = request.headers.getlist(self._header)
         if len(names) != 1 or not names[0].strip() or not names[0].isprintable() or len(names[0]) > 100:
-            return f"the reverse proxy has not said in one header {self._header} who asks"
+            return f"the reverse proxy does not name in one header {self._header} who asks"
         return ""
 
 

@@ -143,7 +143,7 @@ class LeasedListening(Listening):
 
     def _take_line(self, line: Document) -> None:
         if line.get("accepted") is False:
-            self._refused(str(line.get("reason", "it does not say why")))
+            self._refused(str(line.get("reason", "it does not state why")))
         elif "schema" in line:
             line.pop("folder", None)  # no box states which files are opened here
             self.begin(line)

@@ -53,7 +53,7 @@ def read_plant_file(path: Path) -> Mqtt:
     if not mqtt.tls and not mqtt.insecure:
         raise PlantFileError(
             f"{path}: mqtt.url is without TLS, so that passwords and alarms can be read and changed on the "
-            "way. Remedy: use mqtts://, or say insecure = true if you accept that"
+            "way. Remedy: use mqtts://, or write insecure = true if you accept that"
         )
     files = {key: getattr(mqtt, key) for key in FILES}
     return mqtt.model_copy(update={key: path.parent / one for key, one in files.items() if one is not None})

@@ -144,7 +144,7 @@ class PlantSource:
         except BrokerAwayError as error:
             return _refused(f"{error}", BROKER_AWAY)
         if answer is None:
-            why = box.away or "it takes commands only if its machine file says so in [mqtt.commands]"
+            why = box.away or "it takes commands only if its machine file allows it in [mqtt.commands]"
             return _refused(f"the box has not answered: {why}", NO_SERVICE)
         code = answer.get("code")
         return CommandOutcome(

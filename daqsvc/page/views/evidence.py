@@ -30,9 +30,9 @@ class EvidenceView:
     name = "evidence"
     title = "Innovations"
     sentence = (
-        "How much better the observer of each mode predicts the samples than that of the declared one: the "
-        "log-likelihood ratio of their innovations, summed since it began to grow, in nats. Past the dashed "
-        "line the bank changes its decision."
+        "How much better the observer of each mode predicts the samples than that of the declared one, in "
+        "nats. It is the log-likelihood ratio of their innovations, summed since it began to grow. Past "
+        "the dashed line the bank changes its decision."
     )
     every_s = 0.5
 

@@ -53,7 +53,7 @@ class SpectrumView:
     title = "Spectrum"
     sentence = (
         "How strong each frequency is in what a sensor measures, by a Hann window. Dashed lines are "
-        "multiples of the speed, or of a line of a bearing, as chosen; the cursor says which order a line is."
+        "multiples of the speed, or of a line of a bearing, as chosen; the cursor shows the order of a line."
     )
     every_s = 0.5
 

@@ -30,7 +30,7 @@ class StandingPayload(JsonPayload):
 
     problem: Literal["ON", "OFF"] | None = Field(
         description="ON from raising to return or reset; null while the alarm is covered (suppressed, "
-        "shelved or out of service), or is not raised and what it rests on is not OK: nobody can say then"
+        "shelved or out of service), or is not raised and what it rests on is not OK: then it is not known"
     )
     state: AlarmState = Field(description="state of the alarm")
     level: Severity = Field(description="how bad it is")

@@ -125,7 +125,7 @@ def reading_metrics(
     words = "Whether the last statement of the detector rests on good samples of sensors that are OK."
     good = {(name,): float(statement.quality == "good") for name, (statement, _) in spoken.items()}
     yield make.gauge("detector_good", words, good, "detector")
-    words = "When the detector has spoken last."
+    words = "When the detector made its last statement."
     spoke = {(name,): at_s for name, (_, at_s) in spoken.items()}
     yield make.gauge("detector_last_statement_timestamp_seconds", words, spoke, "detector")
     values: dict[tuple[str, ...], float] = {}
@@ -134,7 +134,7 @@ def reading_metrics(
         value = None if pair is None else getattr(pair[0], reading.kind).get(reading.key)
         if value is not None:
             values[reading.detector, reading.kind, reading.key, reading.unit] = float(value)
-    words = "A figure of the detector's last statement, in the unit that the label says; none if it has none."
+    words = "A figure of the detector's last statement, in the unit of the label; none if it has none."
     yield make.gauge("reading", words, values, "detector", "kind", "reading", "unit")
 
 

@@ -339,7 +339,7 @@ class CommandIntake:
         now = datetime.fromtimestamp(now_ns / NS_PER_S, UTC).isoformat(timespec="seconds")
         raise CommandRefusedError(
             f"it was issued {abs(age_s):.0f} s {'ago' if age_s > 0 else 'in the future'}, with at most "
-            f"{oldest_s if age_s > 0 else limit_s:g} s allowed; the clock of the box says {now}: "
+            f"{oldest_s if age_s > 0 else limit_s:g} s allowed; the clock of the box shows {now}: "
             "send it again, or set the clocks"
         )
 

@@ -210,8 +210,8 @@ class Session:
             refused = [self._earlier.topic]
         if refused:
             log.info(
-                "MQTT broker %s:%d does not say what it keeps on %s: if an earlier run could not write its "
-                "disk, the broker may go on showing its states",
+                "MQTT broker %s:%d does not report what it keeps on %s: if an earlier run could not write "
+                "its disk, the broker may go on showing its states",
                 self._settings.host,
                 self._settings.port,
                 self._earlier.topic,

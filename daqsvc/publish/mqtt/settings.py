@@ -107,7 +107,7 @@ Command: TypeAlias = Literal["acknowledge", "reset", "shelve", "unshelve", "bypa
 class MqttCommands(Section):
     """What may be asked of alarms and machines over the broker; who may ask is the broker's access list."""
 
-    enabled: bool = Field(default=False, description="says that commands are taken from the broker")
+    enabled: bool = Field(default=False, description="whether commands are taken from the broker")
     allow: Annotated[tuple[Command, ...], Field(strict=False, max_length=16)] = Field(
         default=("acknowledge",),
         description="what may be asked: acknowledge, reset, shelve, unshelve, bypass, unbypass, snapshot",
@@ -134,7 +134,7 @@ class Mqtt(Section):
     url: Annotated[
         BrokerUrl, Field(description="address of the broker", examples=["mqtts://broker.example:8883"])
     ]
-    insecure: bool = Field(default=False, description="says that mqtt:// without TLS is meant")
+    insecure: bool = Field(default=False, description="whether mqtt:// without TLS is accepted")
     client_id: ClientId | None = Field(
         default=None,
         description="client id, by which the broker knows this box; daqsvc-<site>:<box> if absent",

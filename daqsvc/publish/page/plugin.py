@@ -89,7 +89,7 @@ def _pairs(settings: Page) -> Iterator[Finding]:
     if settings.accounts_file is not None and settings.user_header is not None:
         yield Finding(
             ("page", "accounts_file"),
-            "is given besides user_header, and only one can say who asks",
+            "is given besides user_header, and only one can name who asks",
             "remove one of them",
             code=CONTRADICTION,
         )

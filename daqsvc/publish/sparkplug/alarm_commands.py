@@ -102,7 +102,9 @@ class AlarmCommands:
         """Have a wish carried out, one at a time; whether it was."""
         if wish.sent_ms is None:
             log.warning(
-                "%s is refused: it does not say when it was sent", wish.topic, extra=coded(COMMAND_NOT_OBEYED)
+                "%s is refused: it does not state when it was sent",
+                wish.topic,
+                extra=coded(COMMAND_NOT_OBEYED),
             )
             return False
         try:

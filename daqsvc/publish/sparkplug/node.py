@@ -218,7 +218,7 @@ class EdgeNode:
         owner, name = self._names.get(metric.alias, (None, None))
         if name is not None and owner == device:
             return replace(metric, name=name)
-        raise PayloadError(f"alias {metric.alias} stands for no metric of {device or self._name}")
+        raise PayloadError(f"alias {metric.alias} is the alias of no metric of {device or self._name}")
 
     def _demand(self, owner: str | None) -> None:
         if owner not in self._born:
@@ -236,5 +236,5 @@ def _bd_seq(number: int, sent_ms: int) -> Metric:
 def _check(what: str, name: str) -> None:
     if not name or _FORBIDDEN.search(name):
         raise ValueError(
-            f"{name!r} cannot be a Sparkplug {what} id: it stands in a topic; leave out '+', '/' and '#'"
+            f"{name!r} cannot be a Sparkplug {what} id: it is part of a topic; leave out '+', '/' and '#'"
         )

@@ -265,7 +265,7 @@ class EdgeSession:
         if self._host.online:
             return
         offline = self._host.online is False
-        word = "says that it is offline" if offline else "has sent no state that can be read"
+        word = "reports that it is offline" if offline else "has sent no state that can be read"
         closed = [topic for topic in self._ungranted if topic in wanted]
         there = ", ".join(repr(name) for name in sorted(others))
         barred = f" (the broker lets this client not listen to {' and '.join(closed)})" if closed else ""

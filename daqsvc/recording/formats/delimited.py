@@ -434,7 +434,7 @@ class TextFile:
                     if self.may_be_latin_1:
                         raise
                     raise RecordingError(
-                        f"{self._path} cannot be read: it is no text in UTF-16, as its first two bytes say "
+                        f"{self._path} cannot be read: it is no text in UTF-16, as its first two bytes show "
                         f"({error}); save it as CSV in UTF-8",
                         NOT_NUMBERS,
                     ) from None

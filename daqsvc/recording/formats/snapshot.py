@@ -36,7 +36,7 @@ GRID = "+"
 def read_snapshot_channels(path: Path, budget: Budget) -> Contents:
     """Samples in the sensors' units, NaN where they are missing, by the names of sensors; and the rate.
 
-    Of streams of several rates those of the highest are read, or the first grid that one of them is on: its
+    Of streams of several rates those of the highest are read, or the first grid that one of them is on. Its
     sensors are at one rate, and the service's detectors take them from there. Streams of one rate begin and
     end together. The others' channels are `Contents.elsewhere`.
     """

@@ -78,7 +78,7 @@ def _check_segments(path: Path, file_bytes: int) -> None:
             head = file.read(LEAD.size)
             if len(head) < LEAD.size or head[:4] != TAG:
                 raise RecordingError(
-                    f"{path} cannot be read: {head[:4]!r} stands at byte {at:,}, where a segment (TDSm) "
+                    f"{path} cannot be read: {head[:4]!r} is at byte {at:,}, where a segment (TDSm) "
                     "belongs; copy or save it again",
                     DAMAGED,
                 )
@@ -86,8 +86,8 @@ def _check_segments(path: Path, file_bytes: int) -> None:
             at += LEAD.size + after
             if after == UNFINISHED or at > file_bytes or metadata > after:
                 raise RecordingError(
-                    f"{path} cannot be read: a segment has not the length that it says; it is cut short, or "
-                    "was not finished: copy or save it again",
+                    f"{path} cannot be read: a segment has not the length that it states; it is cut short, "
+                    "or was not finished: copy or save it again",
                     DAMAGED,
                 )
 

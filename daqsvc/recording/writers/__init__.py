@@ -83,7 +83,7 @@ def writer_of(target: Path) -> Writer:
         meant = f"did you mean {close[0]}? There are" if close else "take one of"
         ends = f"ends in {target.suffix}" if suffix else "has no suffix"
         raise ExportUsageError(
-            f"{target} {ends}, and that says no format to write: {meant} {', '.join(WRITERS)}", WRONG_VALUE
+            f"{target} {ends}, which selects no format: {meant} {', '.join(WRITERS)}", WRONG_VALUE
         )
     if writer.library and importlib.util.find_spec(writer.library) is None:
         raise ExportUsageError(

@@ -59,7 +59,7 @@ def write_mdf(path: Path, streams: Sequence[RecordedStream], about: Mapping[str,
     written.replace(path)
     if begin_ns < 0:
         return [f"{path.name}: begins in 1970, as no MDF file begins before"]
-    return [] if starts else [f"{path.name}: begins in 1970, as the recording does not say when it began"]
+    return [] if starts else [f"{path.name}: begins in 1970, as the recording does not state when it began"]
 
 
 def _comment(stream: RecordedStream) -> str:

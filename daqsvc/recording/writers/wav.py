@@ -44,14 +44,14 @@ def write_wav(path: Path, streams: Sequence[RecordedStream], about: Mapping[str,
     rate_hz, channels = round(stream.rate_hz), len(stream.names)
     if rate_hz < 1 or abs(stream.rate_hz / rate_hz - 1.0) > _WHOLE:
         raise RecordingError(
-            f"stream {stream.name} has {stream.rate_hz!r} samples a second, and a WAV file says whole "
+            f"stream {stream.name} has {stream.rate_hz!r} samples a second, and a WAV file holds whole "
             "numbers only; write .parquet, .mf4 or .mat, or another stream alone with --stream",
             NOT_HELD,
         )
     if 4 * channels * rate_hz > MOST_RATE_BYTES:
         raise RecordingError(
             f"stream {stream.name} has {stream.rate_hz:g} samples a second of {channels} channels, and a WAV "
-            "file says 4.29 GB a second at most; write .parquet, .mf4 or .mat",
+            "file holds 4.29 GB a second at most; write .parquet, .mf4 or .mat",
             NOT_HELD,
         )
     data_bytes = 4 * channels * len(stream.samples)

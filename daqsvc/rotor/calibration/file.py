@@ -76,9 +76,7 @@ class CalibrationRecord:
         if speed_rpm is not None:
             return baseline_at(self.steady, speed_rpm)
         if len(self.steady) > 1:
-            raise ValueError(
-                f"the calibration holds baselines at {_speeds(self.steady)} rpm; say at which speed"
-            )
+            raise ValueError(f"the calibration holds baselines at {_speeds(self.steady)} rpm; give the speed")
         return self.steady[0]
 
 

@@ -9,7 +9,7 @@ speed that changes; phi is theta, omega_s and zeta are those of the shaft):
 Eccentricity e, centre c and the transient at the start are linear and are solved for at every omega_s and
 zeta (variable projection: Golub and Pereyra 1973); only these two are searched.
 
-The right-hand side is -e d^2/dt^2 exp(i theta), so the response is that of the transfer function -s^2 / (s^2
+The right-hand side is -e d^2/dt^2 exp(i theta). So the response is that of the transfer function -s^2 / (s^2
 + 2 zeta omega_s s + omega_s^2) to e exp(i theta), and the angle need not be differentiated.
 
 What follows from the fit for other speeds is in `RunUpFit`.
@@ -127,7 +127,7 @@ def _refuse_reversed(vectors: SynchronousVectors) -> None:
     if size[_BACKWARD] > _REVERSED * size[_FORWARD]:
         raise NotCalibratableError(
             f"the orbit turns against the stated rotation (backward 1X {size[_BACKWARD]:.3g} um rms, forward "
-            f"{size[_FORWARD]:.3g} um): x and y are swapped, one probe has the wrong sign, or the shaft "
+            f"{size[_FORWARD]:.3g} um); x and y are swapped, one probe has the wrong sign, or the shaft "
             "turns clockwise; swap the probes, or give the speed a minus sign"
         )
 
@@ -220,7 +220,7 @@ def _covariance(
     """Covariance of ln omega, ln zeta, Re and Im of ln e, Re and Im of c, and the free motions.
 
     A sandwich: scores are summed over pieces of the record before they are squared, so a residual that is
-    correlated over less than a piece counts for what it is worth (White 1980, clustered).
+    correlated over less than a piece gets its right weight (White 1980, clustered).
     """
     step = 1e-4
 
@@ -282,13 +282,13 @@ class RunUpFit:
         natural_frequency_hz: undamped natural frequency omega_s / 2 pi.
         damping_ratio: zeta.
         eccentricity_um: complex mass eccentricity e; its argument is the heavy spot's angle from the mark.
-        centre_um: where the shaft runs at standstill of the whirl, c; sag and the probes' zero are in it.
+        centre_um: where the shaft would run without whirl, c; sag and the probes' zero are in it.
         covariance: float64 ``[4, 4]`` of ln f, ln zeta, and real and imaginary part of ln e.
         centre_uncertainty_um: of each coordinate of ``centre_um``.
         ellipticity: backward over forward whirl, rms over the record, beyond what noise explains.
         noise_um: standard deviation of the noise of one probe's sample.
-        fit_error: rms of what repeats with the shaft and no Laval rotor does, beyond what noise
-            explains, over that of the whirl.
+        fit_error: rms of the part that repeats with the shaft and that no Laval rotor explains, beyond noise,
+            over that of the whirl.
         speed_range_rpm: lowest and highest speed seen.
         revolutions: in the record.
     """

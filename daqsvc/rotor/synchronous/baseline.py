@@ -37,13 +37,13 @@ SPEED_TOLERANCE = 0.05
 _VISIBLE_NATS = 20.0
 """Departure of about one false alarm in 10,000 revolutions."""
 _FLOOR = 0.002
-"""Part of the 1X amplitude that no patience resolves: the sensor chain is not better than that."""
+"""Part of the 1X amplitude that no average resolves: the sensor chain is not better than that."""
 _NOISE_FLOOR = 1e-3
 """The same of the residual: rounding of the recording."""
 _EDGE_SAMPLES = 0.29
 """A keyphasor's edge may lie anywhere between two samples: a sharp one is not interpolated."""
 _TURNING_LEAVES = 0.1
-"""Part of 1X that may still move where turning is what it is."""
+"""Part of 1X that may still change without its turning, where a wrong speed is what turns it."""
 _LEAST_NONSTATIONARITY = 0.15
 """Relative change of what does not repeat from which on a baseline is refused."""
 _LAVAL_ELLIPTICITY = 0.05
@@ -175,7 +175,7 @@ class Calibration:
                 else f"backward over forward 1X is {100.0 * self.ellipticity:.0f} %"
             )
             told = (
-                "the two modes of its run-up say how faults move it"
+                "the two modes of its run-up show how faults move it"
                 if self.rotor.two_modes is not None
                 else "generic mode, in which rub and unmodelled changes stay one group"
             )
@@ -289,7 +289,7 @@ def _long_run_variance(vectors: Complexes, white: float, memory: float) -> Float
     """v_k: variance of one revolution's vector as it counts in means of many.
 
     What is above the white noise is the stirred orbit, correlated from revolution to revolution. A trend is
-    taken out first: it is for the test of steadiness to judge, not to hide behind.
+    taken out first: the test of steadiness judges it, and it must not hide there.
     """
     time = np.arange(len(vectors)) - (len(vectors) - 1) / 2.0
     level = vectors - vectors.mean(axis=0)

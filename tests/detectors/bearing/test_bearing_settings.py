@@ -96,7 +96,12 @@ def test_what_was_understood_is_told() -> None:
             "ftf < 0.5 < bpfo < bpfi",
             "per revolution",
         ),
-        ((('name = "fan-end"', 'name = "drive-end"'),), "bearings[1].name", "earlier bearing", "of its own"),
+        (
+            (('name = "fan-end"', 'name = "drive-end"'),),
+            "bearings[1].name",
+            "earlier bearing",
+            "its own name",
+        ),
         (
             ((TYPE, f'{TYPE}\nrotor_sensor = "accel-fe"'),),
             "bearings[0].rotor_sensor",
@@ -327,7 +332,7 @@ def test_a_calibration_of_another_bearing_stops_it_and_one_that_names_none_is_ta
     lines = path.read_text().splitlines()
     path.write_text("\n".join(line for line in lines if not line.startswith("orders = ")))
     assert detector(machine((TYPE, 'type = "6206-2RS"'), named)).baseline.races["accel-fe"].orders is None
-    assert "motor.toml: does not say of which bearing it was learnt at accel-de" in caplog.text
+    assert "motor.toml: does not state of which bearing it was learnt at accel-de" in caplog.text
 
 
 def test_a_calibration_in_another_unit_stops_it_and_one_that_names_none_is_taken(
@@ -346,7 +351,7 @@ def test_a_calibration_in_another_unit_stops_it_and_one_that_names_none_is_taken
     lines = path.read_text().splitlines()
     path.write_text("\n".join(line for line in lines if not line.startswith("units = ")))
     assert detector(machine(other, named)).baseline.races == right.races
-    assert "does not say in which unit it was learnt at accel-de, accel-fe" in caplog.text
+    assert "does not state in which unit it was learnt at accel-de, accel-fe" in caplog.text
 
 
 def test_a_kept_state_is_taken_up_or_learnt_anew(right, tmp_path, caplog) -> None:

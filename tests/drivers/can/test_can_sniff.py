@@ -208,7 +208,7 @@ def test_new_reads_one_page_without_the_counter_of_all_and_names_the_other(tmp_p
     [stream] = tomllib.loads(text)["streams"].values()
     assert stream["layout"]["no_counter"]
     assert [channel["signals"] for channel in stream["layout"]["channels"]] == [["Temperature"]]
-    assert "# Slow is multiplexed. For these pages make streams of their own:\n" in text
+    assert "# Slow is multiplexed. For these pages make separate streams:\n" in text
     assert "#   Page 1: Supply, Humidity\n" in text
 
 

@@ -238,7 +238,7 @@ def test_each_refusal_is_told_once_with_what_to_do_about_it(caplog):
     assert [record.message for record in caplog.records if "refuses" in record.message] == [
         begin.format(*told)
         for told in (
-            ("server device busy", "it is at something else; lower the rate of what is read from it"),
+            ("server device busy", "it is busy; lower the rate of what is read from it"),
             ("illegal data address", REMEDIES[2]),
             ("exception 77", "look the exception up in the manual of the device"),
         )
