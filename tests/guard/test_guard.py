@@ -60,6 +60,7 @@ def test_what_users_see_is_as_before(part):
 
 
 @pytest.mark.long
+@pytest.mark.first
 @pytest.mark.data
 @pytest.mark.timeout(1800)
 def test_what_is_said_of_every_recording_is_as_before():

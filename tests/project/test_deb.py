@@ -18,7 +18,10 @@ from support.paths import ROOT
 
 from daqsvc.page.documentation import PLACES
 
-pytestmark = [pytest.mark.integration, pytest.mark.long, pytest.mark.sources, pytest.mark.timeout(600)]
+pytestmark = [
+    *(pytest.mark.integration, pytest.mark.long, pytest.mark.first, pytest.mark.sources),
+    pytest.mark.timeout(600),
+]
 
 LOCK = ROOT / "requirements-service.lock"
 NOT_FOR_A_SERVICE = {"matplotlib", "pyarrow", "amqtt", "aiomqtt", "rich", "pytest", "hypothesis"}
