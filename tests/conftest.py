@@ -17,7 +17,7 @@ import pytest_asyncio
 from hypothesis import settings
 from hypothesis.internal.conjecture import providers
 from support.examples import examples
-from support.given_codes import codes_logged
+from support.given_codes import codes_logged, unknown
 from support.paths import ROOT
 
 if TYPE_CHECKING:
@@ -88,7 +88,13 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None]:
     wanted = set() if mark is None else {*mark.args}
     with codes_logged() as codes:
         outcome = yield
-    assert wanted <= codes.given, f"no line of the log has {', '.join(sorted(wanted - codes.given))}"
+    absent = sorted(wanted - codes.given.keys())
+    assert not absent, f"no line of the log has {', '.join(absent)}"
+    other = [code for code in sorted(wanted) if unknown(code, codes.given[code])]
+    assert not other, (
+        f"the message of {', '.join(other)} is another than in tests/errors/messages.txt: correct it there "
+        "(DAQSVC_TAKE_MESSAGES=1 adds it), and the example in daqsvc/errors if it was that one"
+    )
     assert not codes.lacking, f"lines of the log from WARNING on have no code: {codes.lacking}"
     return outcome
 

@@ -157,7 +157,8 @@ CANNOT_JUDGE = Code(
     "The detector that the alarm follows does not give its measure.",
     "Correct the measure of the alarm. The message lists those that there are.",
     _PAGE,
-    "alarm housing cannot be judged: levels measures rms, peak, not 'crest'; correct the alarm's measure",
+    "alarm housing cannot be judged: levels/probe-x measures rms, not 'velocity_rms'; correct the alarm's "
+    "measure",
 )
 ALARM_STANDS = Code(
     "A17",

@@ -286,7 +286,9 @@ LINK_LOST = Code(
     "it is there.",
     "Look at power, cable and address. Nothing else is to be done: the service takes it up again by itself.",
     "driver-contract.md",
-    "serial port 'line' (/dev/ttyUSB0) is lost: the device was unplugged; it is being tried again",
+    "serial port 'line' (/dev/ttyUSB0): it cannot be opened: there is no /dev/ttyUSB0; plug the device "
+    "in, or "
+    "correct port; it is being tried again",
 )
 LEFT_OUT_AT_START = Code(
     "B30",
@@ -294,9 +296,8 @@ LEFT_OUT_AT_START = Code(
     'Its device was not there when the service started, and start = "ignore" means to go on without it.',
     'Restart the service when the device is there. With start = "retry" it is tried again.',
     "driver-contract.md",
-    "serial port 'line' (/dev/ttyUSB0): it cannot be opened; it is left out until the service starts "
-    "again, as "
-    "start = 'ignore' asks for",
+    "CAN bus 'can0': nobody is there; it is left out until the service starts again, as start = 'ignore' "
+    "asks for",
 )
 DRIVER_FAILED = Code(
     "B31",
@@ -314,7 +315,9 @@ NO_ANSWER = Code(
     "now and then, so that the others are not held up.",
     "Look at power, address, baud rate, parity and timeout_ms. daqsvc sniff modbus shows who answers.",
     "modbus.md",
-    "unit 3 has not answered within 300 ms; the unit is set aside, and asked again in 5 s",
+    "unit 3 at 10.0.0.20:502 has not answered within 500 ms; the unit is set aside, and asked again in 10 "
+    "s, then "
+    "after times that double up to 60 s",
 )
 REGISTER_REFUSED = Code(
     "B33",
@@ -323,9 +326,9 @@ REGISTER_REFUSED = Code(
     "once.",
     "Compare address, table and number of registers with the manual of the unit. See max_gap and forbidden.",
     "modbus.md",
-    "stream 'housing': unit 3 refuses input registers 100 to 103: illegal data address, which is counted "
-    "from "
-    "now on",
+    "stream 'housing': unit 3 refuses function 4: illegal data address (registers 100 to 103), which is "
+    "counted "
+    "from now on; compare address and table with the register map of the device",
 )
 NO_FRAME = Code(
     "B34",
@@ -335,8 +338,8 @@ NO_FRAME = Code(
     "Compare baud rate, framing, length, checksum and ids with the device. daqsvc sniff shows what it sends.",
     "driver-contract.md",
     "serial port 'line' (/dev/ttyUSB0) carries bytes that are no frame; they are counted and left out; the "
-    'first line is "17,0.012,-0.998": 3 columns, the file lists 2 (seq, x). If it is all of them, name the '
-    '1 column more in line of the layout, needed or not, or correct separator = ","',
+    'first line is "17": 1 column, the file lists 2 (seq, x). If it is all of them, remove the 1 column that '
+    'the device does not send from line of the layout, or correct separator = ","',
 )
 SAMPLES_MISSING = Code(
     "B35",
@@ -360,9 +363,9 @@ TIME_UNSURE = Code(
     "The device has restarted, its counter does not go on, or its frames come late or unevenly.",
     "Nothing, if the device was restarted. Else compare rate_hz and the counter with the device.",
     "alignment.md",
-    "stream 'shaft': the device has begun to count its blocks again; blocks that it took just before are "
-    "not "
-    "counted as lost",
+    "stream 'shaft': the device has restarted its counter, or has not counted for a while; how many "
+    "samples are "
+    "missing is estimated from the clock",
 )
 NOT_BELIEVED = Code(
     "B38",
@@ -370,8 +373,8 @@ NOT_BELIEVED = Code(
     "Its samples contradict the machine file: another rate or scale, or samples that are lost all the time.",
     "Correct what the message names, in the machine file or in the device.",
     "status.md",
-    "stream 'shaft': it comes at 3950 Hz, and the machine file states 4000 Hz. Nothing is judged by it "
-    "meanwhile",
+    "stream 'shaft': the device sends 3950 Hz, the file states 4000; correct rate_hz in the machine file, "
+    "or the device's setting. Nothing is judged by it meanwhile",
 )
 NOT_ALIGNED = Code(
     "B39",
@@ -388,8 +391,8 @@ BUS_ERRORS = Code(
     "the bus.",
     "Compare bit rates, and look at cable and terminating resistors (120 ohm at both ends).",
     "can.md",
-    "CAN bus 'can0' (socketcan can0) is error-warning: its controller counts more than 95 errors; look at"
-    " wiring, termination and bit rate",
+    "CAN bus 'can0' (socketcan can0) is error-passive: its controller counts more than 127 errors and "
+    "cannot flag errors any more; look at wiring, termination and bit rate",
 )
 BUFFER_FULL = Code(
     "B41",

@@ -18,7 +18,8 @@ WRONG_VALUE = Code(
     "It is no number, time, address or name as the argument takes it, or it is out of its range.",
     "Write a value as the message asks for.",
     "reference/verbs.md",
-    "daqsvc shelve: argument --for: '5 min' is not a time; write e.g. 90s, 30m, 8h, 2d or 1h30m",
+    "daqsvc shelve: argument --for: '5 min' is not a time; write e.g. 90s, 30m, 8h, 2d or 1h30m; see daqsvc "
+    "shelve --help",
 )
 NO_STORE = Code(
     "C03",
@@ -236,6 +237,6 @@ OTHER_FILES = Code(
     "The file that was named is not the one that the service was started with, or has errors meanwhile.",
     "Name the file or directory that the message names, or correct the file that has errors.",
     "several-machines.md",
-    "daqsvc reload: the service was started with /etc/daqsvc/lab.toml: it reads that again, whatever is "
-    "named here",
+    "daqsvc reload: the service was started with /etc/daqsvc/lab.toml: it reads that again, also if "
+    "another one is named here",
 )

@@ -186,7 +186,8 @@ HEALTHY_STATE = Code(
     "The file that keeps what was learnt of the healthy machine cannot be read, used or written.",
     "Make sure that the machine is in good order now, or calibrate it again. Check the disk.",
     "calibration.md",
-    "the healthy state of the rotor is measured again: /var/lib/daqsvc/rotor.toml was made at another speed",
+    "the healthy state of the rotor is measured again: /var/lib/daqsvc/rotor.toml: schema_version is "
+    "missing; restore the file, or calibrate again",
 )
 NO_DETECTOR = Code(
     "D20",
@@ -194,7 +195,7 @@ NO_DETECTOR = Code(
     "A stream has failed that no detector reads. An alarm would not show it.",
     "Add a detector for the stream, or remove the stream.",
     _PAGE,
-    "no samples of spare for 5.0 s; check bus and device; no detector reads them",
+    "no samples of stream 'spare' for more than 2.0 s; check bus and device; no detector reads them",
 )
 SENSOR_NOT_OK = Code(
     "D21",
@@ -203,8 +204,9 @@ SENSOR_NOT_OK = Code(
     "limits or loose.",
     "Look at the sensor, its cable and its supply. The message states what is wrong with its signal.",
     "alarms.md",
-    "alarm sensor-ok/probe-x raised: probe-x is not OK: probe-x does not move at all (0 um): dead or "
-    "disconnected",
+    "alarm sensor-ok/probe-x raised: sensor-ok/probe-x alert: probe-x not OK: probe-x does not move at "
+    "all (0 um): "
+    "dead or disconnected",
 )
 NOT_JUDGED = Code(
     "D22",
@@ -213,6 +215,6 @@ NOT_JUDGED = Code(
     "The message names the stream and, where it is known, the reason. Look at the device and its bus; daqsvc "
     "status shows both. Alarms keep their states until samples come again.",
     "alarms.md",
-    "alarm sensor-ok/probe-x raised: probe-x cannot be judged: no samples of stream 'shaft' for more than "
-    "2.0 s; check bus and device",
+    "alarm sensor-ok/probe-x raised: sensor-ok/probe-x alert: probe-x cannot be judged: no samples of stream "
+    "'shaft' for more than 2.0 s; check bus and device",
 )

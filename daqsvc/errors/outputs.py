@@ -114,8 +114,9 @@ TOPIC_REFUSED = Code(
     "This client may connect, but not write or read the topic, or the message is too large for the broker.",
     "Allow the topic to this client in the access list of the broker, or raise its limit of size.",
     "mqtt.md",
-    "MQTT broker 10.0.0.1:8883 refuses an alarm message on daqsvc/lab/edge-1/pump/alarms/housing: not "
-    "authorized",
+    "MQTT broker 10.0.0.1:8883 refuses an alarm message on daqsvc/lab/edge-1/pump/alarms/housing: the "
+    "broker refuses messages: Not authorized; it is kept on disk and tried again now and then, and all "
+    "others go on",
 )
 CLIENT_ID_TAKEN = Code(
     "O13",
@@ -123,9 +124,8 @@ CLIENT_ID_TAKEN = Code(
     "A broker ends a connection when another client comes with the same id. Both end each other in turn.",
     "Give each box its own box name, or mqtt.client_id.",
     "mqtt.md",
-    "MQTT broker 10.0.0.1:8883: another client takes over the connection with client_id "
-    "'daqsvc-lab:edge-1'; "
-    "give each box its own box name or mqtt.client_id",
+    "MQTT broker 10.0.0.1:8883: this connection was ended by another client with client_id "
+    "'daqsvc-lab:edge-1'; give each box its own box name or mqtt.client_id",
 )
 CERTIFICATE_UNKNOWN = Code(
     "O14",
@@ -166,7 +166,7 @@ HISTORY_DAMAGED = Code(
     "The file of the history cannot be read any more. It is set aside, and a new one is begun.",
     "Check the disk. What was set aside may be read with the tools of SQLite.",
     "history.md",
-    "the history /var/lib/daqsvc/history.sqlite is damaged (database disk image is malformed): it is now "
+    "the history /var/lib/daqsvc/history.sqlite is damaged (file is not a database): it is now "
     "history.sqlite.corrupt-1, and a new one is begun",
 )
 PAGE_ENDED = Code(
@@ -183,7 +183,8 @@ HOST_MISSING = Code(
     "The host that the machine file names is offline, so that nothing is sent to it. Alarms wait.",
     "Start the host application, or correct primary_host.",
     "sparkplug.md",
-    "Sparkplug sends nothing yet: primary host scada is offline on 10.0.0.1:8883",
+    "Sparkplug sends nothing yet: primary host scada1 has sent no state that can be read on "
+    "spBv1.0/STATE/scada1 or STATE/scada1",
 )
 COMMAND_NOT_OBEYED = Code(
     "O21",

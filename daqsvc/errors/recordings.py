@@ -132,8 +132,9 @@ NOT_JUDGED = Code(
     "What it shows does not fit what was stated of the machine: speed, keyphasor, length or state.",
     "Do what the message asks for: correct the option, or record again.",
     _PAGE,
-    "run.csv: not judged: run.csv has no channel for shaft-x of pump.toml; name its variable, e.g. --map "
-    "shaft-x=VARIABLE. It holds a, b",
+    "run.csv: not judged: run.csv has no channel for probe-y, keyphasor of pump.toml; name its variable, "
+    "e.g. --map "
+    "probe-y=VARIABLE. It holds x",
 )
 NOT_HEALTHY = Code(
     "R16",

@@ -87,7 +87,7 @@ PART_FAILED = Code(
     "Update the plugin that the message names. If it happens again, report it with the lines of the log "
     "before.",
     "status.md",
-    "detector levels: ValueError: math domain error; it is started again",
+    "detector levels: failed with RuntimeError: boom at levels.py:315; it goes on with the next window",
 )
 PART_STALLED = Code(
     "S10",
@@ -95,7 +95,8 @@ PART_STALLED = Code(
     "It has made no step for some time: a disk, an adapter or a plugin does not return.",
     "Look at what the message names. systemd starts the service again if that lasts.",
     "status.md",
-    "the outbox has stalled, without a step for 60 s: the service is started again",
+    "outbox has stalled, without a step for 60 s: the service manager gets no more signs of life, and "
+    "starts the service again",
 )
 TOO_SLOW = Code(
     "S11",

@@ -66,3 +66,19 @@ def test_what_calls_for_a_person_is_a_warning_and_what_a_person_did_is_none(capl
         ("NOTICE", "None"),
         ("NOTICE", "None"),
     ]
+
+
+@pytest.mark.gives("A17", "D21", "D22")
+def test_alarms_of_sensors_have_their_codes():
+    rig = AlarmRig(LevelRule("probe-x", "probe-x", "rms", Setpoint(alert=35.0)))
+    log = AlarmLog(rig.clock)
+    dead = "probe-x does not move at all (0 um): dead or disconnected"
+    silent = "no samples of stream 'shaft' for more than 2.0 s; check bus and device"
+    for events in (
+        rig.rms(36.2),
+        rig.rms(36.2, "not_ok", reason=dead),
+        rig.rms(36.2),
+        rig.rms(36.2, "missing", reason=silent),
+    ):
+        for event in events:
+            log.say(event)

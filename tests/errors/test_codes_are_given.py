@@ -10,7 +10,7 @@ import re
 from typing import TYPE_CHECKING
 
 import pytest
-from support.given_codes import codes_of_marks
+from support.given_codes import codes_of_marks, unknown
 from support.machine_files import LAVAL, MACHINES, changed
 from support.paths import ROOT
 
@@ -177,7 +177,9 @@ def test_the_command_is_answered_with_the_code(
         exit_code = error.code
     assert exit_code != 0
     out, err = capsys.readouterr()
-    assert re.search(rf"\[{code}\]$", (err or out).rstrip(), re.MULTILINE), (out, err)
+    given = re.findall(rf"^(.*) \[{code}\]$", (err or out).rstrip(), re.MULTILINE)
+    assert given, (out, err)
+    assert not unknown(code, set(given)), "correct the message in tests/errors/messages.txt"
 
 
 def said_of(path: Path, edits: list[tuple[str, str]]) -> list[str]:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import functools
 import logging
+import os
+import re
 from typing import TYPE_CHECKING
 
 from support.paths import ROOT
@@ -13,6 +16,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 
+MESSAGES = ROOT / "tests" / "errors" / "messages.txt"
+"""Messages that tests have had from the program, each behind its code."""
+TAKE = os.environ.get("DAQSVC_TAKE_MESSAGES") == "1"
+"""Whether those of the tests that run now are kept there, in place of being compared. One process only."""
 OURS = ("daqsvc", "drivers")
 """The packages whose lines have codes, by the names of their loggers."""
 
@@ -21,19 +28,20 @@ class Codes(logging.Handler):
     """Looks at the lines of the log.
 
     Attributes:
-        given: the codes that lines have had.
+        given: the codes that lines have had, each with their messages.
         lacking: the lines from WARNING on that have had none.
     """
 
     def __init__(self) -> None:
         super().__init__()
-        self.given: set[str] = set()
+        self.given: dict[str, set[str]] = {}
         self.lacking: list[str] = []
 
     def emit(self, record: logging.LogRecord) -> None:
         """See `logging.Handler.emit`."""
         if (code := record.__dict__.get("code")) is not None:
-            self.given.add(f"{code}")
+            message = " ".join(record.getMessage().removesuffix(f" [{code}]").split())
+            self.given.setdefault(f"{code}", set()).add(message)
         elif record.levelno >= logging.WARNING and record.name.partition(".")[0] in OURS:
             self.lacking.append(f"{record.levelname} {record.getMessage()}")
 
@@ -58,3 +66,41 @@ def codes_of_marks() -> set[str]:
         if isinstance(node, ast.Call) and ast.unparse(node.func) == "pytest.mark.gives"
         for argument in node.args
     }
+
+
+def shape(message: str) -> str:
+    """A message without what depends on the hour, the computer and the machine file: figures and files."""
+    message = re.sub(r"(?<!\w)'[^']*'|\"[^\"]*\"", "#", message)
+    words = [re.sub(r"\S*[\d/#]\S*?(?=[,;:.()]*(?:\s|$))", "#", word) for word in message.split()]
+    return re.sub(r"\b[\w-]+\.(?:toml|csv|npz|wav|mcap|blf)\b", "#", " ".join(words))
+
+
+@functools.cache
+def messages() -> dict[str, list[str]]:
+    """The messages of `MESSAGES`, by their codes."""
+    found: dict[str, list[str]] = {}
+    for line in MESSAGES.read_text("utf-8").splitlines():
+        code, _, message = line.partition(" ")
+        found.setdefault(code, []).append(message)
+    return found
+
+
+def unknown(code: str, given: set[str]) -> bool:
+    """Whether none of the messages that a test has had is in `MESSAGES`; with `TAKE` one is put there."""
+    known = {shape(message) for message in messages().get(code, ())}
+    if known & {shape(message) for message in given}:
+        return False
+    if TAKE:
+        lines = {*MESSAGES.read_text("utf-8").splitlines(), f"{code} {min(given)}"}
+        MESSAGES.write_text("".join(f"{line}\n" for line in sorted(lines)), "utf-8")
+        messages.cache_clear()
+    return not TAKE
+
+
+def is_had(code: str, example: str) -> bool:
+    """Whether a test has had this message, or one that begins so, from the program; one name may differ."""
+    words = shape(example).split()
+    return any(
+        len(had) >= len(words) and sum(one != other for one, other in zip(words, had, strict=False)) <= 1
+        for had in (shape(message).split() for message in messages().get(code, ()))
+    )
