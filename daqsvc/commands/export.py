@@ -57,7 +57,13 @@ class ExportCommand(VerbWithKernels):
             help="file to write: .parquet, .csv, .wav, .mat, .uff or .mf4",
         )
         parser.add_argument("--stream", metavar="NAME", help="write only this stream (default: all)")
-        parser.add_argument("--force", action="store_true", help="replace the file if it exists")
+        parser.add_argument(
+            "--overwrite",
+            "--force",
+            dest="overwrite",
+            action="store_true",
+            help="replace the file if it exists; --force is its former name",
+        )
         parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
         add_channel_map(parser.add_argument)
 
@@ -107,7 +113,7 @@ class ExportCommand(VerbWithKernels):
         from daqsvc.settings.problems import choice  # noqa: PLC0415
 
         writer_of(arguments.to)
-        if not arguments.force:
+        if not arguments.overwrite:
             refuse_existing([arguments.to])
         loaded = None
         if machine is not None and (loaded := self._load(machine)) is None:
@@ -126,10 +132,10 @@ class ExportCommand(VerbWithKernels):
         for target in files:
             if target.exists() and target.samefile(recording):
                 raise ExportUsageError(
-                    f"{target} is the recording itself, which --force does not replace; give another name",
+                    f"{target} is the recording itself, which nothing replaces; give another name",
                     THERE_ALREADY,
                 )
-        notes = exported.notes + write_all(files, exported.about, force=arguments.force)
+        notes = exported.notes + write_all(files, exported.about, force=arguments.overwrite)
         for note in notes:
             print(f"daqsvc export: {note}", file=sys.stderr)  # noqa: T201 - stdout is for what was written
         document = _document(files, notes)

@@ -120,7 +120,13 @@ class TrendCommand:
         form.add_argument(
             "--events", action="store_true", help="print the alarm events instead, one JSON object per line"
         )
-        parser.add_argument("--force", action="store_true", help="replace the file if it exists")
+        parser.add_argument(
+            "--overwrite",
+            "--force",
+            dest="overwrite",
+            action="store_true",
+            help="replace the file if it exists; --force is its former name",
+        )
         add_store(parser)
 
     def run(self, arguments: argparse.Namespace) -> int:
@@ -200,8 +206,8 @@ def _taken(arguments: argparse.Namespace) -> tuple[str, Code] | None:
     elif not stat.S_ISREG(mode) and arguments.csv is None:  # a pipe or a device takes a table as it comes
         what = f"{target} is no regular file; give another name, or write a table to it with --csv"
         problem = what, CANNOT_WRITE
-    elif stat.S_ISREG(mode) and not arguments.force:
-        what = f"{target} is there already; give another name, or --force to replace it"
+    elif stat.S_ISREG(mode) and not arguments.overwrite:
+        what = f"{target} is there already; give another name, or --overwrite to replace it"
         problem = what, THERE_ALREADY
     return problem
 
@@ -247,12 +253,12 @@ def _tell(
         for one in shown:
             print(json.dumps(_document(one, step)))  # noqa: T201 - as above
     elif arguments.csv is not None:
-        _write_csv(arguments.csv, shown, force=arguments.force)
+        _write_csv(arguments.csv, shown, force=arguments.overwrite)
     elif arguments.parquet is not None:
-        with _put_whole(arguments.parquet, force=arguments.force) as path:
+        with _put_whole(arguments.parquet, force=arguments.overwrite) as path:
             _write_parquet(path, shown)
     elif arguments.plot is not None:
-        with _put_whole(arguments.plot, force=arguments.force) as path:
+        with _put_whole(arguments.plot, force=arguments.overwrite) as path:
             _plot(path, shown)
     else:
         print(_text(shown, step, since_s, until_s, shutil.get_terminal_size().columns))  # noqa: T201

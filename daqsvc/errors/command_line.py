@@ -100,7 +100,7 @@ THERE_ALREADY = Code(
     "C11",
     "The file is there already",
     "No file is replaced unless the arguments ask for it.",
-    "Give another name, or remove the file first. Some verbs replace it with --force.",
+    "Give another name, or remove the file first. new, export and trend replace it with --overwrite.",
     _PAGE,
     "daqsvc example: pump.toml is there already; give another name",
 )

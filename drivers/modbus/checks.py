@@ -350,9 +350,10 @@ def _clash(
     floats = one.type.startswith("float") or other.type.startswith("float")
     # The same number twice, or words of a long whole number by themselves, may be meant.
     within = first + other.registers <= end
+    registers = f"registers {begin} to {end - 1}" if end - begin > 1 else f"register {begin}"
     yield Finding(
         at,
-        f'is part of {one.type} "{one.name}" too, which takes registers {begin} to {end - 1}',
+        f'is part of {one.type} "{one.name}" too, which takes {registers}',
         f"correct the two: {one.type} takes {one.registers} register{'s' if one.registers > 1 else ''}, "
         f"so the next number begins at {end} or later",
         fatal=not whole and (floats or not within),

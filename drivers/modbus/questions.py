@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -231,7 +232,8 @@ class _ModbusQuestions(BusQuestions):
 
         types, orders = dict.fromkeys(REGISTERS, ""), dict.fromkeys(("ABCD", "CDAB", "BADC", "DCBA"), "")
         following = f"{self._next_address(answers, channel)}"
-        yield self.ask_of(channel, "address", q.whole, following, doubt=_doubt)
+        doubt = partial(_doubt, self._taken(answers, channel), following)
+        yield self.ask_of(channel, "address", q.whole, following, doubt=doubt)
         unit = _unit(channel)
         default = "int16" if unit == "degC" else "uint16"
         yield self.ask_of(channel, "register-type", q.one_of(types), default, choices=types)
@@ -242,6 +244,15 @@ class _ModbusQuestions(BusQuestions):
         scale = "1" if is_float else _USUAL_SCALES.get(unit_by_name(channel) or "", "1")
         yield self.ask_of(channel, "scale", q.number, scale)
         yield self.ask_of(channel, "no-value", q.whole_or_none, NONE, quiet=True)
+
+    def _taken(self, answers: Answers, channel: str) -> dict[int, str]:
+        """Which registers hold the channels before."""
+        taken: dict[int, str] = {}
+        for before in answers["channels"][: answers["channels"].index(channel)]:
+            first = answers[sensor_key(before, "address")]
+            width = _width(answers[sensor_key(before, "register-type")])
+            taken.update(dict.fromkeys(range(first, first + width), before))
+        return taken
 
     def _next_address(self, answers: Answers, channel: str) -> int:
         """Behind the registers of all channels before."""
@@ -523,8 +534,14 @@ def _without_registers(found: Mapping[str, Any]) -> Heard:
     return Heard(lines, proposals)
 
 
-def _doubt(address: int | None) -> tuple[str, str] | None:
-    """See `Question.doubt`: manuals count registers from 30001 or 40001, the line from 0."""
+def _doubt(taken: Mapping[int, str], free: str, address: int | None) -> tuple[str, str] | None:
+    """See `Question.doubt`: another channel is there, or it is counted as in manuals, from 30001 or 40001."""
+    if address is not None and address in taken:
+        reason = (
+            f'register {address} holds "{taken[address]}" already. Enter takes {free}; type {address} again '
+            "if both are in it"
+        )
+        return reason, free
     from drivers.modbus.checks import manuals_first  # noqa: PLC0415 - brings the settings
 
     first = None if address is None else manuals_first(address)

@@ -54,6 +54,12 @@ class RegisterRun:
         """One past the address of the last register."""
         return self.address + self.count
 
+    @property
+    def in_words(self) -> str:
+        """As a person names them, e.g. ``"registers 16 to 17"``."""
+        one = self.count == 1
+        return f"register {self.address}" if one else f"registers {self.address} to {self.end - 1}"
+
 
 @dataclass(frozen=True, slots=True)
 class RunLimits:

@@ -83,7 +83,7 @@ class _Failure(NamedTuple):
         """The error, with the registers that are refused; the line reports units that are silent."""
         if not isinstance(self.error, RequestRefusedError):
             return self.error
-        return RequestRefusedError(f"{self.error} ({_words(self.run)})", self.error.code)
+        return RequestRefusedError(f"{self.error} ({self.run.in_words})", self.error.code)
 
 
 class _Row(NamedTuple):
@@ -323,7 +323,7 @@ class TrendReader(PollingReader):
             self._bare |= failure.takers
             what = "the registers between those of the channels are left out"
         self._read_apart()
-        if (message := f"{failure.error} ({_words(failure.run)})") not in self._said:
+        if (message := f"{failure.error} ({failure.run.in_words})") not in self._said:
             self._said.add(message)
             logger.warning(
                 "%s: %s; from now on %s, and the whole request is tried only now and then. A smaller "
@@ -346,7 +346,7 @@ class TrendReader(PollingReader):
         self._bare.add(stream)
         self._read_apart()
         for name, run in refused.items():
-            if (message := f"{failure.error} ({_words(run)})") not in self._said:
+            if (message := f"{failure.error} ({run.in_words})") not in self._said:
                 self._said.add(message)
                 logger.warning(
                     "stream %r: %s: channel %r has no value, and is asked for again only now and then; %s",
@@ -365,7 +365,7 @@ class TrendReader(PollingReader):
         refused = {}
         for name, run in asked.items():
             try:
-                await line.poll(self._unit, self._function, run, _words(run))
+                await line.poll(self._unit, self._function, run, run.in_words)
             except NoReplyError:
                 return {}
             except RequestRefusedError as error:
@@ -405,7 +405,7 @@ class TrendReader(PollingReader):
         for stream in self._streams:
             stream.read_from(runs, places[stream])
         self._plan = [
-            (run, _words(run), frozenset(stream for stream in self._streams if place in places[stream]))
+            (run, run.in_words, frozenset(stream for stream in self._streams if place in places[stream]))
             for place, run in enumerate(runs)
         ]
 
@@ -430,7 +430,3 @@ class TrendReader(PollingReader):
 
     def _due_ns(self, slot: int) -> int:
         return self._start_ns + round(slot * self._period_ns)
-
-
-def _words(run: RegisterRun) -> str:
-    return f"register {run.address}" if run.count == 1 else f"registers {run.address} to {run.end - 1}"

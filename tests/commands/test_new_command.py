@@ -576,6 +576,26 @@ def test_a_number_of_the_manual_is_asked_again_with_the_address_that_it_means():
     assert asked(["30000"], "modbus-tcp")[1] == []
 
 
+def test_a_register_that_another_channel_has_is_asked_again():
+    texts, said = iter(["40", "40", "41", "41"]), []
+
+    def ask(question: Question) -> str:
+        if question.key in {"sensor.a.address", "sensor.b.address"}:
+            return next(texts)
+        if question.key == "sensor.a.register-type":
+            return "uint32"
+        assert question.default is not None, question.key
+        return question.default
+
+    beforehand = Given({"bus": "modbus-tcp", "host": "::1", "channels": "a, b"}, defaults=False)
+    answers = conduct(Path("m.toml"), beforehand, ask, said.append)
+    assert said == [
+        'register 40 holds "a" already. Enter takes 42; type 40 again if both are in it',
+        'register 41 holds "a" already. Enter takes 42; type 41 again if both are in it',
+    ]
+    assert answers["sensor.b.address"] == 41
+
+
 @pytest.mark.parametrize(
     ("text", "rate"),
     [("500k", 500_000), ("1M", 1_000_000), ("33.3 kbit/s", 33_300), ("83333", 83_333), ("125 kBit", 125_000)],

@@ -202,11 +202,11 @@ def test_a_file_that_is_there_is_replaced_only_by_force(store, capsys, option) -
     target.write_text("dear to me")
     command = ["trend", "--store", str(store), "--since", "1h", option, str(target)]
     assert main(command) == 2
-    assert f"{target} is there already; give another name, or --force" in capsys.readouterr().err
+    assert f"{target} is there already; give another name, or --overwrite" in capsys.readouterr().err
     assert target.read_text() == "dear to me"
     link = store / "link"
     link.symlink_to(target)
-    assert main([*command[:-1], str(link), "--force"]) == 0
+    assert main([*command[:-1], str(link), "--overwrite"]) == 0
     assert link.is_symlink()
     assert len(target.read_bytes()) > 10_000
     assert not list(store.glob(".daqsvc*"))
@@ -219,7 +219,7 @@ def test_a_full_disk_leaves_no_cut_file_and_keeps_what_was_there(store, capsys, 
     target = store / "out"
     if force:
         target.write_text("dear to me")
-    command = ["trend", "--store", str(store), "--since", "1h", option, str(target), *["--force"] * force]
+    command = ["trend", "--store", str(store), "--since", "1h", option, str(target), *["--overwrite"] * force]
     with files_of_at_most(34_000):
         assert main(command) == 1
     assert capsys.readouterr().err == f"daqsvc trend: {target}: File too large [C09]\n"
@@ -238,7 +238,7 @@ def files_of_at_most(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
-@pytest.mark.parametrize("force", [[], ["--force"]])
+@pytest.mark.parametrize("force", [[], ["--overwrite"]])
 def test_what_is_no_regular_file_stays_and_takes_a_table_only(store, capsys, force) -> None:
     pipe = store / "pipe.png"
     os.mkfifo(pipe)

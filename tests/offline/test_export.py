@@ -312,10 +312,10 @@ def test_nothing_is_written_over(snapshot, tmp_path, capsys):
     target.write_text("mine")
     assert export(snapshot, "--to", target) == 2
     assert capsys.readouterr().err == (
-        f"daqsvc export: {target} is there already; give another name, or --force to replace it [C11]\n"
+        f"daqsvc export: {target} is there already; give another name, or --overwrite to replace it [C11]\n"
     )
     assert target.read_text() == "mine"
-    assert export(snapshot, "--to", target, "--force") == 0
+    assert export(snapshot, "--to", target, "--overwrite") == 0
     assert target.read_text().startswith("#")
 
 
@@ -324,10 +324,10 @@ def test_force_does_not_replace_the_recording_itself(tmp_path, capsys):
     source.write_text("# fs = 100\nx\n1\n2\n")
     link.symlink_to(source)
     for target in (source, link):
-        assert export(source, "--to", target, "--force") == 2
+        assert export(source, "--to", target, "--overwrite") == 2
         assert capsys.readouterr().err == (
-            f"daqsvc export: {target} is the recording itself, which --force does not replace; give another "
-            "name [C11]\n"
+            f"daqsvc export: {target} is the recording itself, which nothing replaces; "
+            "give another name [C11]\n"
         )
     assert source.read_text() == "# fs = 100\nx\n1\n2\n"
     assert link.is_symlink()

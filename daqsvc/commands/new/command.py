@@ -155,8 +155,13 @@ class _Target:
         Raises:
             AnswerError: that file is there already, and nobody can be asked.
         """
-        if question.key == "name" and self._given is None:
-            self.file = self._free(Path(f"{short_name(answers['name'])}.toml"))
+        if question.key != "name":
+            return
+        short = short_name(answers["name"])
+        if self._person and short != answers["name"]:
+            _say(f'  It is called "{short}" in topics and names of files.')
+        if self._given is None:
+            self.file = self._free(Path(f"{short}.toml"))
 
     def _free(self, file: Path) -> Path:
         """The file, or another one where it is there already and must stay."""

@@ -130,7 +130,7 @@ def refuse_existing(targets: Sequence[Path]) -> None:
             )
         if target.exists():
             raise ExportUsageError(
-                f"{target} is there already; give another name, or --force to replace it", THERE_ALREADY
+                f"{target} is there already; give another name, or --overwrite to replace it", THERE_ALREADY
             )
 
 
@@ -208,7 +208,7 @@ def _put(written: Path, target: Path, *, force: bool) -> None:
             target.hardlink_to(written)
         except FileExistsError:
             raise ExportUsageError(
-                f"{target} has been written by somebody else meanwhile; give another name, or --force",
+                f"{target} has been written by somebody else meanwhile; give another name, or --overwrite",
                 THERE_ALREADY,
             ) from None
         except OSError:
