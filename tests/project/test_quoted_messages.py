@@ -142,6 +142,8 @@ WITH_CODE = [
     for page in PAGES
     if page.parent not in ELSEWHERE
     for match in ENDS_WITH_A_CODE.finditer(page.read_text("utf-8"))
+    if "  "
+    not in match[1]  # else a row of daqsvc alarms, which holds what an alarm found and no text of its own
 ]
 
 
