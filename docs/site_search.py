@@ -7,7 +7,9 @@ an entry, and so is each row of a table that has an anchor. ``site_search.js`` r
 
 from __future__ import annotations
 
+import ast
 import json
+import re
 from collections import Counter
 from pathlib import Path
 from textwrap import shorten
@@ -25,6 +27,17 @@ if TYPE_CHECKING:
 SCRIPT = "site_search.js"
 INDEX = "site_search_index.js"
 _EXCERPT = 240
+ROOT = Path(__file__).parent.parent
+ERRORS = "daqsvc/errors/"
+FAR_AWAY = {
+    "drivers/replay/can_log.py": "B43",
+    "daqsvc/alarms/rules.py": "A17",
+    "daqsvc/alarms/setpoints.py": "A17",
+    "daqsvc/dsp/quality/": "D21",
+    "daqsvc/detectors/levels/trends.py": "D22",
+}
+"""Where messages are put together that have their codes elsewhere, e.g. those of alarms."""
+ERRORS_PAGE = "reference/errors"
 
 
 def _words_apart(node: nodes.Node) -> Iterator[str]:
@@ -65,6 +78,52 @@ def entries(doctree: nodes.document) -> Iterator[tuple[str, str, str]]:
             yield anchor, name, "; ".join(filter(None, cells))
 
 
+def messages() -> dict[str, set[str]]:
+    """The texts of the source that go with each code: messages before figures and names are put in.
+
+    The page of a code has one example, and a code may have twenty messages.
+    """
+    trees = {
+        file.relative_to(ROOT).as_posix(): ast.parse(file.read_text("utf-8"))
+        for package in ("daqsvc", "drivers", "sim_hw")
+        for file in sorted((ROOT / package).rglob("*.py"))
+    }
+    found: dict[str, set[str]] = {}
+    ids: dict[str, str] = {}
+    for file, tree in trees.items():
+        for node in tree.body if file.startswith(ERRORS) else ():
+            if isinstance(node, ast.Assign) and isinstance(node.value, ast.Call) and node.value.args:
+                code, example = (next(_texts(part), "") for part in (node.value.args[0], _last(node.value)))
+                ids |= {target.id: code for target in node.targets if isinstance(target, ast.Name)}
+                found[code] = {example}
+    for file, tree in trees.items():
+        for code in {code for place, code in FAR_AWAY.items() if file.startswith(place)}:
+            found[code].update(_texts(tree))
+        for node in ast.walk(tree) if not file.startswith(ERRORS) else ():
+            # What names one code only is about it, be it a whole module.
+            if isinstance(node, ast.Call | ast.Raise | ast.FunctionDef | ast.ClassDef | ast.Module):
+                names = {part.id for part in ast.walk(node) if isinstance(part, ast.Name)}
+                if len(codes := {ids[name] for name in names & ids.keys()}) == 1:
+                    found[codes.pop()].update(_texts(node))
+    return found
+
+
+def _last(call: ast.Call) -> ast.expr:
+    """The example of a code, its last argument."""
+    return call.keywords[-1].value if call.keywords else call.args[-1]
+
+
+def _texts(tree: ast.AST) -> Iterator[str]:
+    """The texts within, each with `|` for what is put in; no docstrings."""
+    docs = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.JoinedStr):
+            parts = (part.value if isinstance(part, ast.Constant) else "|" for part in node.values)
+            yield "".join(map(str, parts))
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docs:
+            yield re.sub(r"%[-.\d]*[a-z]|\{\w*\}", "|", node.value)
+
+
 def _write_index(app: Sphinx, failure: Exception | None) -> None:
     """Write all entries of the site, and how often each word is in each of them."""
     if failure is not None or app.builder.format != "html":
@@ -75,14 +134,19 @@ def _write_index(app: Sphinx, failure: Exception | None) -> None:
     found: list[tuple[int, str, str, str]] = []
     terms: dict[str, list[tuple[int, int]]] = {}
     lengths: list[int] = []
+    of_codes = messages()
+    said: list[tuple[int, list[str]]] = []
     for number, page in enumerate(pages):
         for anchor, title, text in entries(app.env.get_doctree(page)):
             words = [language.stem(word) for word in language.split(f"{title} {title} {title} {text}")]
+            if page == ERRORS_PAGE and (code := re.match(r"[A-Z]\d\d(?=: )", title)):
+                said.append((len(found), sorted(text for text in of_codes[code[0]] if " " in text)))
             for word, times in Counter(words).items():
                 terms.setdefault(word, []).append((len(found), times))
             lengths.append(len(words))
             found.append((number, anchor, title, shorten(text, _EXCERPT, placeholder=" ...")))
     index = {"pages": pages, "titles": titles, "entries": found, "lengths": lengths, "terms": terms}
+    index["messages"] = said
     text = json.dumps(index, ensure_ascii=False, separators=(",", ":"), sort_keys=True)
     (Path(app.outdir) / "_static" / INDEX).write_text(f"const SITE_INDEX = {text};\n", encoding="utf-8")
 

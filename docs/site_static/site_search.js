@@ -70,6 +70,37 @@ const rankByWords = (text, scores) => {
   }
 };
 
+/* A message that was copied has pairs of words that its text in the source has; names and figures are between them. */
+const LEAST_PAIRS = 3;
+/* A question is no message, though it has such pairs, too. */
+const QUESTION = /^\s*(how|what|where|why|when|which|who|can|does|do|is)\b|\?\s*$/i;
+
+const pairsOf = (text) => {
+  const pairs = new Set();
+  for (const piece of text.toLowerCase().split("|")) {
+    const words = splitQuery(piece);
+    for (let i = 1; i < words.length; i++) pairs.add(`${words[i - 1]} ${words[i]}`);
+  }
+  return pairs;
+};
+
+/* Puts the errors first whose messages have most of the query, by the rarity of the pairs. */
+const rankByMessages = (query, scores) => {
+  const asked = pairsOf(query);
+  const had = SITE_INDEX.messages.map(([entry, texts]) => {
+    const pairs = new Set(texts.flatMap((text) => [...pairsOf(text)]).filter((pair) => asked.has(pair)));
+    return [entry, pairs];
+  });
+  const times = new Map();
+  for (const [, pairs] of had) for (const pair of pairs) times.set(pair, (times.get(pair) || 0) + 1);
+  const rarity = (pair) => Math.log(1 + had.length / times.get(pair));
+  for (const [entry, pairs] of had) {
+    if (pairs.size < LEAST_PAIRS) continue;
+    const sum = [...pairs].reduce((sum, pair) => sum + rarity(pair), 0);
+    scores.set(entry, Math.max(scores.get(entry) || 0, 3 * NAMED + sum));
+  }
+};
+
 const siteSearch = (typed) => {
   const query = withoutNumbers(typed);
   const { pages, titles, entries } = SITE_INDEX;
@@ -79,7 +110,7 @@ const siteSearch = (typed) => {
   entries.forEach(([page, , title], entry) => {
     const pattern = nameIn(title);
     for (const name of pattern ? names.filter((name) => pattern.test(name)) : []) {
-      scores.set(entry, pages[page] === ERRORS ? 2 * NAMED : NAMED * pageWeight(pages[page]));
+      scores.set(entry, pages[page] === ERRORS ? 5 * NAMED : NAMED * pageWeight(pages[page]));
       others = others.replaceAll(name, " ");
     }
   });
@@ -91,6 +122,7 @@ const siteSearch = (typed) => {
     const [entry, score] = errors.reduce((one, other) => (other[1] > one[1] ? other : one));
     scores.set(entry, Math.max(score, NAMED / 2));
   }
+  if (splitQuery(query).length >= MESSAGE_WORDS && !QUESTION.test(query)) rankByMessages(query, scores);
   const best = Math.max(0, ...scores.values());
   const enough = best > NAMED / 4 ? 0 : best * LEAST_SHARE;
   return [...scores]

@@ -10,6 +10,7 @@ from urllib.parse import quote
 import pytest
 from support.browsers import browsing
 from support.docs_site import built_docs
+from support.given_codes import messages as known_messages
 from support.paths import ROOT
 
 from daqsvc.errors.table import CODES
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.integration, pytest.mark.long, pytest.mark.sources]
 GOLDEN = ROOT / "tests" / "guard" / "golden"
 FIRST_THREE = "query => siteSearch(query).slice(0, 3).map(([page, , anchor]) => `${page}.html${anchor}`)"
+BY_OTHERS = {"O17", "O25"}
+"""Codes whose messages are put together far from where the code is named, or by a library."""
 MESSAGE = re.compile(r"^! machines/(.+ \[([A-Z]\d\d)\])$", re.MULTILINE)
 
 
@@ -97,6 +100,23 @@ async def test_a_message_without_its_code_leads_to_the_errors(site: Path) -> Non
         assert any(link.startswith("reference/errors.html#") for link in found), (message, found)
         right += any(link.startswith(f"reference/errors.html#{code.lower()}-") for link in found)
     assert right >= 22, right
+
+
+async def test_a_message_that_a_test_has_had_leads_to_its_code(site: Path) -> None:
+    """With the figures and names that it had then; its words alone, as daqsvc alarms printed them."""
+    had = [(code, message) for code, those in known_messages().items() for message in those]
+    had += [
+        ("A17", "alarm vib-de raised: vib-de danger: value of vib-de is 8.301 mm/s, zone D of ISO 20816-3"),
+        ("D22", "vib-de cannot be judged: the last 3 values of vib-de did not arrive, or are no numbers"),
+        ("B37", "the device has restarted its counter, or has not counted for a while"),
+    ]
+    led = [
+        any(link.startswith(f"reference/errors.html#{code.lower()}-") for link in found)
+        for (code, _), found in zip(had, await searched(site, [message for _, message in had]), strict=True)
+    ]
+    assert all(led[-3:])
+    missed = {code for (code, _), found in zip(had, led, strict=True) if not found}
+    assert missed <= BY_OTHERS, missed
 
 
 async def test_codes_subjects_keys_topics_and_metrics_lead_to_their_places(site: Path) -> None:
