@@ -7,6 +7,7 @@ import tomllib
 from typing import get_args
 
 import pytest
+from support.alarm_rig import AlarmRig
 from support.paths import ROOT
 
 from daqsvc.alarms.commands import Verb
@@ -50,7 +51,7 @@ def test_every_state_verb_and_own_alarm_is_explained(word):
 
 
 def test_the_example_is_valid_has_every_key_and_the_defaults():
-    example, _ = map(tomllib.loads, fenced("toml"))
+    example, *_ = map(tomllib.loads, fenced("toml"))
     level, vote, both_sides, region, phase, zones, detector = example["alarms"]
     assert LevelAlarm.model_validate(level).trip_multiply == 2.0
     assert VotingAlarm.model_validate(vote).vote == 2
@@ -77,8 +78,26 @@ def test_the_example_is_valid_has_every_key_and_the_defaults():
 def test_every_measure_is_in_the_table_and_the_trend_value_has_every_key():
     table = "".join(re.findall(r"^\| `.*`.*\|$", TEXT.split("| `measure` |")[1], re.MULTILINE))
     assert all(f"`{measure}`" in table for measure in get_args(Measure))
-    _, example = map(tomllib.loads, fenced("toml"))
+    _, example, _ = map(tomllib.loads, fenced("toml"))
     (sensor,) = example["sensors"]
     assert TrendValue.model_validate(sensor).ok_between == (-40.0, 125.0)
     assert set(sensor) == set(TrendValue.model_fields) - {"sensitivity_mv_per_unit", "zero_v"}
     assert Levels.model_validate(example["pipeline"]["levels"]) == Levels()
+
+
+@pytest.mark.parametrize(("state", "level"), [(0.0, "normal"), (1.0, "alert"), (2.0, "danger")])
+def test_an_enum_signal_raises_the_alarm_of_its_state(state, level):
+    _, _, example = map(tomllib.loads, fenced("toml"))
+    (sensor,), (alarm,) = example["sensors"], example["alarms"]
+    assert TrendValue.model_validate(sensor).unit == "1"
+    rig = AlarmRig(alarm_rule(LevelAlarm.model_validate(alarm)))
+    for _ in range(5):
+        rig.take(
+            detector="levels/drive-state",
+            decision="normal",
+            statistics={"value": state},
+            units={"value": "1"},
+            quality="good",
+            sensors=("drive-state",),
+        )
+    assert rig.status("drive-state").level.label == level
