@@ -173,8 +173,9 @@ class StreamAssembler:
         if not intact.all():
             if not self.counters.frames_corrupt:
                 logger.warning(
-                    "stream %r: a frame's CRC does not match; such frames are counted and left out. If it is "
-                    "every frame, compare the place of the CRC in the layout with the device's",
+                    "stream %r: the CRC of a frame, or the checksum of a line, does not match; it is counted "
+                    "and left out. If it is every one, compare crc and its place, or checksum, with those of "
+                    "the device",
                     self.stream,
                     extra=coded(NO_FRAME),
                 )
@@ -464,7 +465,7 @@ def note_received(counters: StreamCounters, stream: str, samples: Samples) -> Sa
     absent = there.size - int(np.count_nonzero(there))
     if not counters.values_absent:
         logger.warning(
-            "stream %r: %d of its values are no measurements: the device states that it has none, or what it "
+            "stream %r: no measurement in %d of its values: the device states that it has none, or what it "
             "sends is not finite; such values are missing, and are counted from now on. Look at the sensors "
             "behind it",
             stream,
@@ -486,10 +487,10 @@ def note_gap(counters: StreamCounters, stream: str, lost: int, first: int) -> No
     """
     if not counters.gaps:
         logger.warning(
-            "stream %r: %d samples are missing before index %d; gaps are counted from now on",
+            "stream %r: samples are missing before index %d, by now %d; gaps are counted from now on",
             stream,
-            lost,
             first,
+            lost,
             extra=coded(SAMPLES_MISSING),
         )
     counters.gaps += 1

@@ -272,7 +272,7 @@ async def _await_samples(service: Service) -> None:
         if all(one.ring.started for one in service.streams.values()):
             break
         await asyncio.sleep(LOOK_S)
-    milestones.info("samples come of all streams: %s", ", ".join(service.streams))
+    milestones.info("samples come from all streams: %s", ", ".join(service.streams))
 
 
 def _reloading(manager: ServiceManager, begins: bool) -> None:  # noqa: FBT001 - a callback

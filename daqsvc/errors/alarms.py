@@ -54,8 +54,8 @@ UNFIT_SETPOINT = Code(
 NEVER_REACHED = Code(
     "A06",
     "The setpoint is never reached",
-    "The value is not believed there, the channel cannot carry it, or the stator does not let the shaft "
-    "move as far.",
+    "A sensor with such a value counts as broken, the channel cannot carry it, or the stator does not let "
+    "the shaft move as far.",
     "Correct the setpoint, or the limits of the sensor.",
     _PAGE,
     example='machine.toml:113: alarms[0].alert = 40.0: is never reached: the channel of "probe-x" carries '

@@ -67,7 +67,7 @@ UNFIT_COUNTER = Code(
 )
 CAN_ID = Code(
     "B07",
-    "The id is none of this kind of frame",
+    "No frame of this kind has such an id",
     "Ids of CAN have 11 bits, or 29 with extended = true. Ids of SAE J1939 have 29.",
     "Correct the id, or write extended = true.",
     _PAGE,
@@ -139,7 +139,7 @@ DBC_FILE = Code(
 DBC_SIGNAL = Code(
     "B14",
     "A signal of the DBC file cannot be used",
-    "Its length, place, type or scale in the DBC file is none that a frame or a quantity can have.",
+    "No frame or quantity can have its length, place, type or scale in the DBC file.",
     "Correct the signal in the DBC file.",
     _PAGE,
     example='machine.toml:30: streams.housing.layout.channels[0].signals[0] = "AccelX": has the scale 0 in '
@@ -347,7 +347,7 @@ SAMPLES_MISSING = Code(
     "The counter of the device shows a gap: the bus, the device or this computer has lost frames.",
     "Look at the load of the bus, its cables and this computer. daqsvc status shows how many are missing.",
     "status.md",
-    "stream 'shaft': 24 samples are missing before index 81920; gaps are counted from now on",
+    "stream 'shaft': samples are missing before index 81920, by now 24; gaps are counted from now on",
 )
 NO_MEASUREMENT = Code(
     "B36",
@@ -355,7 +355,7 @@ NO_MEASUREMENT = Code(
     "The device states that it has no value, or sends one that is not finite, e.g. as a sensor is broken.",
     "Look at the sensors behind the channels, and at their cables.",
     "status.md",
-    "stream 'housing': 3 of its values are no measurements: the device states that it has none",
+    "stream 'housing': no measurement in 3 of its values: the device states that it has none",
 )
 TIME_UNSURE = Code(
     "B37",

@@ -148,7 +148,8 @@ OUTPUT_CUT = Code(
 CANNOT_LISTEN = Code(
     "C17",
     "The page cannot listen at this address",
-    "Another program listens there, the address is none of this box, or this user may not use the port.",
+    "Another program listens there, this computer does not have the address, or this user may not use the "
+    "port.",
     "Name another port with --port, or another address with --listen. For the page of a service, write "
     "another listen in [page] of the machine file.",
     "page.md",

@@ -65,7 +65,7 @@ HEALTHY_MODE = Code(
 MODE_WITHOUT_FAULT = Code(
     "D07",
     "A mode has no fault",
-    "A mode that does not differ from the healthy rotor for the worse cannot be told from it.",
+    "A mode must be worse than the healthy rotor, or nobody can tell them apart.",
     "Write what differs in the mode, or remove it.",
     "rotor-figures.md",
     example='machine.toml:109: pipeline.rotor_bank.modes[4].fault = "static_load": no figure of this mode '
@@ -88,8 +88,7 @@ FALSE_ALARM_RATE = Code(
     "Write e.g. 0.02 false alarms in 1000 revolutions.",
     "rotor-figures.md",
     example="machine.toml:99: pipeline.rotor_bank.false_alarms_per_1000_rev = 5e3: would be a false alarm at "
-    "every revolution. Remedy: write e.g. 0.02, which takes 16 nats of evidence on a bank of four "
-    "modes",
+    "every revolution. Remedy: write e.g. 0.02",
 )
 NOISE_TOO_LARGE = Code(
     "D10",

@@ -79,7 +79,7 @@ GAPS = Code(
     "R09",
     "Too many samples are missing",
     "By its time the recording has long gaps, in which nothing is known.",
-    "Cut the recording at the gap, or give logs of one time without long gaps.",
+    "Cut the recording at the gap, or give logs that follow each other without long gaps.",
     _PAGE,
     "run.csv lacks 5,000 of 9,000 samples by its time column 't', the most behind sample 2,000; cut the "
     "recording there",

@@ -106,7 +106,7 @@ class _CanQuestions(BusQuestions):
         yield entry("interface", answers["interface"], "any interface that python-can knows")
         yield entry("channel", channel)
         yield entry("fd", answers["fd"], "whether CAN FD frames are on the bus")
-        yield entry("bitrate", rate, "bit/s; it sets nothing, and tells whether the bus has time enough")
+        yield entry("bitrate", rate, "bit/s; daqsvc check computes from it if the bus has time enough")
         if answers["fd"]:
             yield entry("data_bitrate", answers["data-bitrate"], "bit/s of the data of CAN FD frames")
         yield ""

@@ -16,7 +16,7 @@ from daqsvc.errors.buses import DRIVER_FAILED
 from daqsvc.errors.code import coded
 from drivers.modbus.client import ModbusClient
 from drivers.modbus.fifo import FifoReader
-from drivers.modbus.line import ModbusLine, RetryPolicy, SparingByEnquiry
+from drivers.modbus.line import ModbusLine, RetryPolicy, SparingByRequest
 from drivers.modbus.registers import shared_runs
 from drivers.modbus.replies import LineLostError, ModbusCounters
 from drivers.modbus.ring import DeviceRingReader
@@ -89,7 +89,7 @@ class ModbusDriver:
         self._readers = readers_for(bus, port, self.counters)
         self.link.faults = ChainMap(*(reader.faults for reader in self._readers))
         self._line: ModbusLine | None = None
-        self._sparing: SparingByEnquiry = {}
+        self._sparing: SparingByRequest = {}
 
     @property
     def streams(self) -> Mapping[str, tuple[StreamCounters, TimeBaseState]]:

@@ -112,8 +112,8 @@ class RetryPolicy:
         return f"asked again in {first_s:g} s, then after times that double up to {longest_s:g} s"
 
 
-class Enquiry(NamedTuple):
-    """What a unit is asked again and again, and what is set aside by itself.
+class RequestKey(NamedTuple):
+    """What a unit is asked again and again; each is set aside by itself.
 
     Attributes:
         function: code of the function.
@@ -128,22 +128,22 @@ class Enquiry(NamedTuple):
 
 
 @dataclass(slots=True)
-class Silence:
+class RequestHealth:
     """Requests without reply in a row, and when to ask again.
 
     Attributes:
-        enquiry: what was asked.
+        key: what was asked.
         failures: requests without reply in a row.
         wait_ns: how long it is set aside at a time.
         probe_ns: when to ask again; None if it is not set aside.
-        hopeful: whether there was a reply when it was asked last, or it has not been asked yet.
+        answers: whether there was a reply when it was asked last, or it has not been asked yet.
     """
 
-    enquiry: Enquiry
+    key: RequestKey
     failures: int = 0
     wait_ns: int = 0
     probe_ns: int | None = None
-    hopeful: bool = False
+    answers: bool = False
 
     def set_aside(self, patience: RetryPolicy, now_ns: int) -> bool:
         """Make no request for a while; returns whether that is new."""
@@ -157,12 +157,12 @@ class Silence:
         self.failures, self.probe_ns = 0, None
 
 
-SparingByEnquiry: TypeAlias = dict[tuple[int, Enquiry], Sparing]
+SparingByRequest: TypeAlias = dict[tuple[int, RequestKey], Sparing]
 """How often it has been said of a unit, or of what it is asked, that there is no reply."""
 
 
-class UnitSilence:
-    """What is known about the silence of a unit.
+class UnitHealth:
+    """Whether a unit answers, as far as is known: it, and each thing that it is asked.
 
     Args:
         unit: its address.
@@ -176,104 +176,104 @@ class UnitSilence:
         unit: int,
         patience: RetryPolicy,
         counters: ModbusCounters,
-        sparing: SparingByEnquiry | None = None,
+        sparing: SparingByRequest | None = None,
     ) -> None:
         self._unit = unit
         self._patience = patience
         self._counters = counters
-        self._whole = Silence(Enquiry(0, "anything"))
-        self._enquiries: dict[Enquiry, Silence] = {}
+        self._whole = RequestHealth(RequestKey(0, "anything"))
+        self._requests: dict[RequestKey, RequestHealth] = {}
         self._last_words = ""
-        self._sparing: SparingByEnquiry = {} if sparing is None else sparing
+        self._sparing: SparingByRequest = {} if sparing is None else sparing
 
     @property
     def dead(self) -> bool:
         """Whether the whole unit is set aside."""
         return self._whole.probe_ns is not None
 
-    def of(self, enquiry: Enquiry) -> Silence:
-        """What is known about an enquiry; one that is new may be answered."""
-        silence = self._enquiries.get(enquiry)
-        if silence is None:
-            silence = self._enquiries[enquiry] = Silence(enquiry, hopeful=_is_repeated(enquiry))
-        return silence
+    def of(self, key: RequestKey) -> RequestHealth:
+        """What is known of a request; one that is new may be answered."""
+        health = self._requests.get(key)
+        if health is None:
+            health = self._requests[key] = RequestHealth(key, answers=_is_repeated(key))
+        return health
 
-    def check(self, silence: Silence, now_ns: int) -> None:
+    def check(self, health: RequestHealth, now_ns: int) -> None:
         """Make sure that this may be asked now.
 
         Raises:
             UnitSetAsideError: it is not yet time.
         """
-        for kept in (self._whole, silence):
+        for kept in (self._whole, health):
             if kept.probe_ns is not None and now_ns < kept.probe_ns:
                 raise UnitSetAsideError(f"unit {self._unit} is set aside: {self._last_words}")
 
-    def doubts(self, silence: Silence) -> bool:
+    def doubts(self, health: RequestHealth) -> bool:
         """Whether this may well stay without reply."""
-        return self.dead or silence.failures > 0
+        return self.dead or health.failures > 0
 
-    def probes(self, silence: Silence) -> bool:
+    def probes(self, health: RequestHealth) -> bool:
         """Whether this, asked now, is to find out if somebody is back."""
-        return self.dead or silence.probe_ns is not None
+        return self.dead or health.probe_ns is not None
 
-    def answered(self, silence: Silence, *, refused: bool = False) -> None:
+    def answered(self, health: RequestHealth, *, refused: bool = False) -> None:
         """There was a reply.
 
         Args:
-            silence: what was asked.
+            health: of what was asked.
             refused: whether the unit refuses: it lives now, but need not be asked that again.
         """
-        silence.hopeful = not refused and _is_repeated(silence.enquiry)
+        health.answers = not refused and _is_repeated(health.key)
         if self.dead:
             self._counters.units_back += 1
-            for other in self._enquiries.values():
+            for other in self._requests.values():
                 other.end()
-        elif silence.probe_ns is not None:
+        elif health.probe_ns is not None:
             self._counters.requests_back += 1
         if self._say_end(self._whole, "unit %d is back", self._unit):
             for (unit, _), sparing in self._sparing.items():
                 if unit == self._unit:
                     sparing.may_take_back()
-        self._say_end(silence, "unit %d answers %s again", self._unit, silence.enquiry)
+        self._say_end(health, "unit %d answers %s again", self._unit, health.key)
         self._whole.end()
-        silence.end()
+        health.end()
 
-    def missed(self, silence: Silence, why: str, now_ns: int) -> None:
+    def missed(self, health: RequestHealth, why: str, now_ns: int) -> None:
         """There was no reply, because of ``why``."""
         whole, patience = self._whole, self._patience
         whole.failures += 1
-        silence.failures += 1
-        silence.hopeful = False
+        health.failures += 1
+        health.answers = False
         self._last_words = why
-        lives = any(other.hopeful for other in self._enquiries.values())
+        lives = any(other.answers for other in self._requests.values())
         if not lives and whole.failures >= patience.demote_after:
             if whole.set_aside(patience, now_ns):
                 self._counters.units_demoted += 1
             self._say(whole, "%s; the unit is set aside, and %s%s", why, patience.of_probes)
-            if len(self._enquiries) > 1:
+            if len(self._requests) > 1:
                 # Something else is to probe next: this one may be what the unit does not know.
-                silence.probe_ns = now_ns + whole.wait_ns + patience.demotion_ns
-        elif silence.failures >= patience.demote_after:
-            if silence.set_aside(patience, now_ns):
+                health.probe_ns = now_ns + whole.wait_ns + patience.demotion_ns
+        elif health.failures >= patience.demote_after:
+            if health.set_aside(patience, now_ns):
                 self._counters.requests_demoted += 1
-            self._say(silence, "%s; %s is set aside, and %s%s", why, silence.enquiry, patience.of_probes)
+            self._say(health, "%s; %s is set aside, and %s%s", why, health.key, patience.of_probes)
 
-    def _say(self, silence: Silence, message: str, *arguments: object) -> None:
-        sparing = self._sparing.setdefault((self._unit, silence.enquiry), Sparing())
+    def _say(self, health: RequestHealth, message: str, *arguments: object) -> None:
+        sparing = self._sparing.setdefault((self._unit, health.key), Sparing())
         if sparing.may_say():
             logger.warning(message, *arguments, OFTEN if sparing.often else "", extra=coded(NO_ANSWER))
 
-    def _say_end(self, silence: Silence, message: str, *arguments: object) -> bool:
-        sparing = self._sparing.get((self._unit, silence.enquiry))
+    def _say_end(self, health: RequestHealth, message: str, *arguments: object) -> bool:
+        sparing = self._sparing.get((self._unit, health.key))
         if sparing is None or not sparing.may_take_back():
             return False
         notice(logger, message, *arguments)
         return True
 
 
-def _is_repeated(enquiry: Enquiry) -> bool:
+def _is_repeated(key: RequestKey) -> bool:
     """Whether it is asked again and again: nothing need ever be written again."""
-    return enquiry.function != WRITE_REGISTERS
+    return key.function != WRITE_REGISTERS
 
 
 LONGEST_BABBLE = 4
@@ -332,15 +332,15 @@ class ModbusLine:
         units: Sequence[int],
         may_write: Callable[[int, int, int], bool] = lambda _unit, _address, _count: False,
         heard: Callable[[], None] = lambda: None,
-        sparing: SparingByEnquiry | None = None,
+        sparing: SparingByRequest | None = None,
     ) -> None:
         self.lost: asyncio.Future[str] = asyncio.get_running_loop().create_future()
         self._client = client
         self._clock = clock
         self._counters = counters
         self._patience = patience
-        self._sparing: SparingByEnquiry = {} if sparing is None else sparing
-        self._units = {unit: UnitSilence(unit, patience, counters, self._sparing) for unit in units}
+        self._sparing: SparingByRequest = {} if sparing is None else sparing
+        self._units = {unit: UnitHealth(unit, patience, counters, self._sparing) for unit in units}
         self._may_write = may_write
         self._heard = heard
         self._lock = asyncio.Lock()
@@ -354,9 +354,9 @@ class ModbusLine:
 
     async def poll(self, unit: int, function: int, run: RegisterRun, what: str = "") -> RegisterValues:
         """Read registers, and tell when that was; see `read`."""
-        enquiry = Enquiry(function, what)
+        key = RequestKey(function, what)
         return RegisterValues(
-            *await self._ask(unit, enquiry, lambda: self._client.read(unit, function, run.address, run.count))
+            *await self._ask(unit, key, lambda: self._client.read(unit, function, run.address, run.count))
         )
 
     async def read(self, unit: int, function: int, run: RegisterRun, what: str = "") -> bytes:
@@ -376,8 +376,8 @@ class ModbusLine:
 
     async def read_fifo(self, unit: int, address: int, what: str = "") -> bytes:
         """Read a FIFO queue; see `read`."""
-        enquiry = Enquiry(READ_FIFO, what)
-        registers, _, _ = await self._ask(unit, enquiry, lambda: self._client.read_fifo(unit, address))
+        key = RequestKey(READ_FIFO, what)
+        registers, _, _ = await self._ask(unit, key, lambda: self._client.read_fifo(unit, address))
         return registers
 
     async def write(self, unit: int, address: int, values: Sequence[int]) -> None:
@@ -394,27 +394,27 @@ class ModbusLine:
                 f"{{ unit = {unit}, address = {address}, count = {len(values)} }} to writes of the bus if "
                 "they may"
             )
-        await self._ask(unit, Enquiry(WRITE_REGISTERS), lambda: self._client.write(unit, address, values))
+        await self._ask(unit, RequestKey(WRITE_REGISTERS), lambda: self._client.write(unit, address, values))
 
     async def _ask(
-        self, unit: int, enquiry: Enquiry, request: Callable[[], Awaitable[Result]]
+        self, unit: int, key: RequestKey, request: Callable[[], Awaitable[Result]]
     ) -> tuple[Result, int, int]:
         """Make a request as soon as it may be; returns its result, when it went out and when it ended."""
         asked = self._units.get(unit)
         if asked is None:
-            asked = self._units[unit] = UnitSilence(unit, self._patience, self._counters, self._sparing)
-        silence = asked.of(enquiry)
-        if asked.doubts(silence):
-            asked.check(silence, self._clock.monotonic_ns())
+            asked = self._units[unit] = UnitHealth(unit, self._patience, self._counters, self._sparing)
+        health = asked.of(key)
+        if asked.doubts(health):
+            asked.check(health, self._clock.monotonic_ns())
             await self._let_others_go_first()
         async with self._lock:
             asked_ns = self._clock.monotonic_ns()
             if self._quiet_until() > asked_ns:
                 await self._keep_quiet()
                 asked_ns = self._clock.monotonic_ns()
-            if asked.doubts(silence):
-                asked.check(silence, asked_ns)
-                self._counters.probes += asked.probes(silence)
+            if asked.doubts(health):
+                asked.check(health, asked_ns)
+                self._counters.probes += asked.probes(health)
             self._failed = True  # until a reply is there: also if this task is cancelled meanwhile
             ended_ns = 0
             try:
@@ -423,20 +423,20 @@ class ModbusLine:
                 self._lose(f"{error}")
                 raise
             except NoReplyError as error:
-                self._miss(asked, silence, f"{error}")
+                self._miss(asked, health, f"{error}")
                 raise
             except RequestRefusedError as error:
                 self._failed = False
                 if error.code in GATEWAY_CODES:
-                    self._miss(asked, silence, f"{error}")
+                    self._miss(asked, health, f"{error}")
                 else:
                     self._heard()
-                    asked.answered(silence, refused=True)
+                    asked.answered(health, refused=True)
                 raise
             else:
                 self._failed = False
                 self._heard()
-                asked.answered(silence)
+                asked.answered(health)
                 ended_ns = self._clock.monotonic_ns()
                 return result, asked_ns, ended_ns
             finally:
@@ -471,8 +471,8 @@ class ModbusLine:
     def _quiet_until(self) -> int:
         return max(self._quiet_until_ns, self._client.last_byte_ns + self._patience.gap_ns)
 
-    def _miss(self, asked: UnitSilence, silence: Silence, why: str) -> None:
-        asked.missed(silence, why, self._clock.monotonic_ns())
+    def _miss(self, asked: UnitHealth, health: RequestHealth, why: str) -> None:
+        asked.missed(health, why, self._clock.monotonic_ns())
         if all(unit.dead for unit in self._units.values()):
             self._lose(f"no unit answers any more, the last one to answer was: {why}")
 

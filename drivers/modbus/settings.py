@@ -67,7 +67,7 @@ def _one_or_several(value: Any) -> Any:
 
 _MOST_MARKS = 8
 Marks = Annotated[
-    tuple[int, ...],
+    tuple[Annotated[int, Field(ge=-(1 << 63), le=(1 << 63) - 1)], ...],
     BeforeValidator(_one_or_several),
     Field(strict=False, max_length=_MOST_MARKS),
     WithJsonSchema(

@@ -185,7 +185,7 @@ class LineCodec:
         """What to do if lines have so many columns more than the file lists; fewer if it is negative."""
         many = f"{abs(more)} column{'s' * (abs(more) != 1)}"
         if more > 0:
-            change = f"name the {many} more in line of the layout, needed or not"
+            change = f"list {many} more in line of the layout: all that the device sends, in their order"
         else:
             change = f"remove the {many} that the device does not send from line of the layout"
         return f"{change}, or correct separator = {json.dumps(self._layout.separator)}"

@@ -146,7 +146,7 @@ def test_absent_values_are_counted_beside_the_samples_and_said_once(caplog: pyte
     values = np.concatenate([block.samples for block in blocks])
     assert np.isnan(values).sum() == 12
     assert (values[np.isfinite(values)] == 1.0).all()
-    assert [r.message for r in caplog.records if "no measurements" in r.message] == [caplog.messages[0]]
+    assert [r.message for r in caplog.records if "no measurement in" in r.message] == [caplog.messages[0]]
 
 
 def test_a_sensor_without_values_neither_raises_nor_clears_an_alarm() -> None:

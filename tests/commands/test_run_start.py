@@ -74,7 +74,7 @@ async def test_without_v_a_person_sees_that_it_watches_and_that_samples_come(jou
     said = [line.partition("INFO ")[2] for line in log.read_text().splitlines()]
     assert said == [
         f"watching motor; the journal is in {tmp_path}/store",
-        "samples come of all streams: shaking",
+        "samples come from all streams: shaking",
     ], "and nothing else is said while all is well"
 
 

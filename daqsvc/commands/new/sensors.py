@@ -241,7 +241,7 @@ def sensor_tables(answers: Answers) -> Iterator[str]:
         if sensor.type == "proximity":
             if sensitivity is not None:
                 yield entry("zero_v", _ZERO_V, "gap voltage with the shaft centred: measure it")
-                yield entry("gap_ok_v", _OK_V, "beyond, the probe is not believed; see its manual")
+                yield entry("gap_ok_v", _OK_V, "beyond, the probe counts as broken; see its manual")
             yield entry("angle_deg", get("angle"), "0 to the right, 90 upwards, anticlockwise")
         if sensor.type == "keyphasor":
             yield entry("threshold_v", get("threshold"), "half-way up a pulse: look at it on a scope")
@@ -254,7 +254,7 @@ def sensor_tables(answers: Answers) -> Iterator[str]:
 
 def _ok_between(sensor: Sensor, answers: Answers) -> Iterator[str]:
     """What the sensor can measure: by it a wrong type, order or scale is found, and a broken sensor."""
-    about = "beyond, it is not believed; see its manual"
+    about = "beyond, it counts as broken; see its manual"
     usual = {"mm/s": (-1.0, 100.0), "degC": (-40.0, 150.0)}.get(sensor.unit)
     own = [answers[key] for key in ("alert", "danger") if key in answers]
     if usual is None or any(not usual[0] < limit < usual[1] for limit in own):

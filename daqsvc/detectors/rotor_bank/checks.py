@@ -182,7 +182,7 @@ def _mode_fault(draft: MachineFile, mode: Mode, at: KeyPath) -> Iterator[Finding
         examples = ", ".join(example.split(" = ")[0] for _, example in makes.values())
         yield Finding(
             at,
-            f'mode "{mode.name}" does not differ from the healthy rotor for the worse',
+            f'mode "{mode.name}" is not worse than the healthy rotor',
             f"set one of {examples}, or remove the mode",
             code=MODE_WITHOUT_FAULT,
         )
@@ -222,7 +222,7 @@ def _rates(bank: RotorBank) -> Iterator[Finding]:
         yield Finding(
             (*_BANK, "false_alarms_per_1000_rev"),
             "would be a false alarm at every revolution",
-            "write e.g. 0.02, which takes 16 nats of evidence on a bank of four modes",
+            "write e.g. 0.02",
             code=FALSE_ALARM_RATE,
         )
 

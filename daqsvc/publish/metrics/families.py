@@ -156,22 +156,28 @@ def _streams(make: _Maker, streams: Figures, rates_hz: Mapping[str, float]) -> I
         return make.gauge(f"stream_{name}", words, values, "stream")
 
     yield count("frames_received", "Frames of the right length that arrived.", "frames_received")
-    yield count("samples_received", "Samples handed on.", "samples_received")
+    yield count("samples_received", "Samples that went on to the detectors.", "samples_received")
     yield count("samples_lost", "Samples that never came.", "samples_lost")
     settled = {name: one for name, one in streams.items() if one["time_settled"]}
     yield gauge("rate_hertz", "The device's own rate, measured, once known.", _each(settled, "rate_hz"))
-    yield gauge("configured_rate_hertz", "Of the machine file.", {(n,): hz for n, hz in rates_hz.items()})
-    yield gauge("jitter_seconds", "Of the arrivals, 95th percentile.", _each(streams, "jitter_ms", 1000.0))
+    yield gauge(
+        "configured_rate_hertz",
+        "The sampling rate in the machine file.",
+        {(n,): hz for n, hz in rates_hz.items()},
+    )
+    yield gauge(
+        "jitter_seconds", "How late frames arrive: the 95th percentile.", _each(streams, "jitter_ms", 1000.0)
+    )
     doubted = {(name,): float(bool(one["doubt"])) for name, one in streams.items()}
-    yield gauge("doubted", "Whether nothing can be judged by the samples.", doubted)
+    yield gauge("doubted", "Whether the samples are doubtful, so that nothing is judged by them.", doubted)
 
 
 def _detectors(make: _Maker, detectors: Figures) -> Iterator[Metric]:
     def count(name: str, words: str, key: str, per: float = 1.0) -> Metric:
         return make.count(f"detector_{name}", words, _each(detectors, key, per), "detector")
 
-    yield count("windows", "Windows processed.", "windows")
-    yield count("samples", "Samples in them.", "samples")
+    yield count("windows", "Windows of samples that were processed.", "windows")
+    yield count("samples", "Samples in the windows that were processed.", "samples")
     yield count("busy_seconds", "Time that its kernels took.", "busy_ns", NS_PER_S)
 
 
@@ -192,7 +198,9 @@ def _alarms(make: _Maker, alarms: Figures) -> Iterator[Metric]:
     words = "Alarms by state; an active one may be unacknowledged, too."
     yield make.gauge("alarms", words, {(state,): alarms[state] for state in _STATES}, "state")
     yield make.count("alarm_events", "Alarm events.", {(): alarms["events"]})
-    yield make.count("alarm_annunciations", "Those that call for a person.", {(): alarms["annunciations"]})
+    yield make.count(
+        "alarm_annunciations", "Alarm events that call for a person.", {(): alarms["annunciations"]}
+    )
     words = "How often alarms came faster than a person can attend to."
     yield make.count("alarm_floods", words, {(): alarms["floods"]})
 

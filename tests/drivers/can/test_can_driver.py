@@ -117,7 +117,7 @@ async def test_what_is_no_sample_is_counted_and_said_once(caplog: pytest.LogCapt
     assert (counters.samples_received, counters.samples_lost) == (len(strays) * PER_FRAME, 0)
     said = [r.message for r in caplog.records]
     assert sum("0x7ff (11 bit) the first of them" in text for text in said) == 1
-    assert sum("CRC does not match" in text for text in said) == 1
+    assert sum("CRC of a frame, or the checksum of a line, does not match" in text for text in said) == 1
     assert len(said) == 3, "every kind is said once, however many there are"
     assert sum("bytes, its layout 64" in text for text in said) == 1
 

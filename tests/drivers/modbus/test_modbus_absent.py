@@ -95,5 +95,5 @@ def test_what_is_no_number_is_missing_and_counted(way, caplog):
     assert rig.counters("s").samples_lost == 0
     (said,) = [record.message for record in caplog.records if "are missing" in record.message]
     assert said.startswith(
-        "stream 's': 1 of its values are no measurements" if way != "waveform" else "stream 's'"
+        "stream 's': no measurement in 1 of its values" if way != "waveform" else "stream 's'"
     )

@@ -19,7 +19,7 @@ from support.modbus_lines import Rig, options_of, responding, simulate
 from daqsvc.acquisition import link as supervision
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.notice import NOTICE
-from drivers.modbus.line import Enquiry, RetryPolicy, UnitSetAsideError, UnitSilence
+from drivers.modbus.line import RequestKey, RetryPolicy, UnitHealth, UnitSetAsideError
 from drivers.modbus.replies import READ_FIFO, REMEDIES, WRITE_REGISTERS, ModbusCounters
 from sim_hw.nodes.modbus_node import PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit
@@ -189,28 +189,28 @@ def test_a_unit_is_found_to_be_back_though_one_of_its_streams_never_is(serial):
 def test_all_that_a_dead_unit_was_asked_shares_its_probes():
     patience = RetryPolicy(0, 0, demote_after=3)
     counters = ModbusCounters()
-    unit = UnitSilence(9, patience, counters)
-    enquiries = [unit.of(Enquiry(3, f"registers {k}")) for k in range(5)]
+    unit = UnitHealth(9, patience, counters)
+    requests = [unit.of(RequestKey(3, f"registers {k}")) for k in range(5)]
     asked = 0
     now_ns = 0
-    for enquiry in enquiries:
-        unit.check(enquiry, 0)
-        unit.answered(enquiry)
+    for request in requests:
+        unit.check(request, 0)
+        unit.answered(request)
     for now_s_ in range(1000):
-        for enquiry in enquiries:
+        for request in requests:
             now_ns = now_s_ * NS_PER_S
             try:
-                unit.check(enquiry, now_ns)
+                unit.check(request, now_ns)
             except UnitSetAsideError:
                 continue
             asked += 1
-            unit.missed(enquiry, "unit 9 has not answered", now_ns)
+            unit.missed(request, "unit 9 has not answered", now_ns)
     assert unit.dead
     # One each until it was dead, and then one for all of them, at most every 60 s but at first.
     assert asked <= 5 + 3 + 1000 // 60
-    unit.answered(enquiries[0])
-    for enquiry in enquiries:
-        unit.check(enquiry, now_ns)
+    unit.answered(requests[0])
+    for request in requests:
+        unit.check(request, now_ns)
 
 
 @pytest.mark.gives("B33")

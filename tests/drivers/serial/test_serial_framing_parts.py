@@ -185,7 +185,7 @@ def test_a_sentence_of_a_gps_receiver_is_a_line():
         (
             b"1,2,3,4,5,6,7",
             '"1,2,3,4,5,6,7": 7 columns, the file lists 3 (seq, x, y)',
-            "name the 4 columns more in line",
+            "list 4 columns more in line",
         ),
         (b"1,2", '"1,2": 2 columns, the file lists 3 (seq, x, y)', "remove the 1 column that the device"),
         (b"1;2;3", '"1;2;3": 1 column, the file lists 3', 'or correct separator = ","'),
@@ -199,7 +199,7 @@ def test_a_sentence_of_a_gps_receiver_is_a_line():
             "correct bits",
         ),
         (b"\xfe\x01\x80", '"\\xfe\x01\\x80": no text, as at another baud rate or parity', "compare baud"),
-        (b"7," * 100 + b"7", "..." + '": 101 columns', "name the 98 columns more"),
+        (b"7," * 100 + b"7", "..." + '": 101 columns', "list 98 columns more"),
     ],
 )
 def test_a_line_that_is_none_is_quoted_with_what_is_wrong(spoilt, said, remedy):
