@@ -99,7 +99,7 @@ class CommandIds:
             return True
 
     def begin(self) -> None:
-        """Have the file of a new store on disk, before its journal is: else it would look lost. Blocks.
+        """Make the file of a new store on disk, before its journal: else it would seem lost. Blocks.
 
         Raises:
             OSError: the disk is full or takes no writes; what will not pass by itself is only logged.

@@ -16,7 +16,7 @@ NS_PER_DAY = 86_400 * NS_PER_S
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OutboxLimits:
-    """Bounds of the two classes of messages. What is not sent of the alarms has none but the disk.
+    """Bounds of the two classes of messages. Unsent alarms are bounded by the disk alone.
 
     No copy of the table ``[store]``: in bytes and ns, with bounds that no machine file sets, and there even
     without the table.
@@ -28,7 +28,7 @@ class OutboxLimits:
         alarms_keep_at_least: so many of the newest messages are kept whatever their age, so that a wall
             clock that is wrong for a while does not cost the history.
         alarms_waiting_max: messages that may wait in memory while the disk cannot be written; further ones
-            are refused, loudly. One takes about 4 KiB, so that 16,384 of them take about 64 MiB.
+            are refused, which is logged. One takes about 4 KiB, so that 16,384 of them take about 64 MiB.
         telemetry_max_bytes: size of the telemetry's file from which on the oldest messages are dropped.
         telemetry_max_age_ns: age from which on a telemetry message is dropped.
         reserve_bytes: free space that telemetry leaves on the disk to the alarms.

@@ -257,10 +257,10 @@ class SequenceMark:
             )
 
     def note(self, used: int) -> None:
-        """Tell that numbers up to ``used`` are in the journal.
+        """Write down that numbers up to ``used`` are in the journal.
 
         Raises:
-            OSError: the disk takes no writes any more, so that its word for the last sync is worth nothing.
+            OSError: the disk takes no writes any more; what it confirmed last may be lost, too.
         """
         first = self._first if self._told.used < self._first else self._told.first
         mark = replace(self._told, used=used, first=first)
@@ -283,7 +283,7 @@ class SequenceMark:
         self._told = mark
 
     def settle(self, last: int) -> None:
-        """Tell, durably, that ``last`` is the highest number in use and will stay so for now.
+        """Write to disk that ``last`` is the highest number in use, as it stays for now.
 
         Raises:
             OSError: a side file cannot be written; the next run goes on above the ceiling.
@@ -361,7 +361,7 @@ class _Side:
         self._size = len(line)
 
     def note(self, line: bytes) -> None:
-        """Have it tell ``line``, sooner or later."""
+        """Write ``line`` into the file; the disk has it sooner or later."""
         if self._file is not None:
             os.pwrite(self._file, line, 0)
 

@@ -20,7 +20,7 @@ class Acknowledged(NamedTuple):
 
     Attributes:
         from_memory: how many were for messages that are not on the disk.
-        given_up: numbers of messages that will never be, for there are too many.
+        given_up: numbers that are waited for no longer, as too many are: no message will have them.
     """
 
     from_memory: int

@@ -146,7 +146,7 @@ class Reports(Protocol):
         """A journal that could not be opened at first is open; it has so many unsent messages."""
 
     def replaced(self, unsent: int) -> None:
-        """A corrupt file was set aside; so many unsent messages are in the new one."""
+        """A corrupt file was set aside, and a new one begun, with this number of unsent messages."""
 
     def abandoned(
         self, lost: Sequence[asyncio.Future[int]], accepted: Sequence[asyncio.Future[int]], error: OutboxError
@@ -225,7 +225,7 @@ class JournalWriter:
         self._work.put(batch)
 
     def mark(self, sequences: Iterable[int]) -> None:
-        """Have messages marked as sent with what is done next, or within `MARK_LINGER_S`; from one thread."""
+        """Mark messages as sent, together with the next work or within `MARK_LINGER_S`; from one thread."""
         self._marks.extend(sequences)
         if not self._expects_marks:  # else the thread knows already: to wake it costs more than a mark
             self._expects_marks = True
@@ -328,7 +328,7 @@ class JournalWriter:
             if not self._recover(error, post, give_up=failed_reads >= READ_FAILURES_MAX):
                 if failure.write:
                     self._show(batch, post)
-                self._bide(batch, post, retry_s)
+                self._wait_for_disk(batch, post, retry_s)
                 retry_s = min(2 * retry_s, RETRY_MOST_S)
 
     def _gather(self, batch: Batch, *, wait: bool) -> None:
@@ -367,8 +367,8 @@ class JournalWriter:
             log.debug("outbox %s has no numbers: %s", self._journal.path, error)
         post(self._reports.shown, self._journal.newest)
 
-    def _bide(self, batch: Batch, post: _Post, seconds: float) -> None:
-        """Until the disk is tried again, have what comes go out from memory, if it can be read there."""
+    def _wait_for_disk(self, batch: Batch, post: _Post, seconds: float) -> None:
+        """Wait until the disk is tried again; meanwhile send new messages from memory, where that can be."""
         until = time.monotonic() + seconds
         while not self._closing.is_set() and (left_s := until - time.monotonic()) > 0:
             self._turns += 1

@@ -370,7 +370,7 @@ class _ResidualChange:
     Attributes:
         ratio: float64 ``[channels]``, now over healthy.
         changed: whether a channel's rise is significant and large.
-        excess: nats of the clearest large rise over its threshold.
+        excess: evidence of the most significant large rise above its threshold, in nats.
     """
 
     ratio: Floats

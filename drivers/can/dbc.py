@@ -230,7 +230,7 @@ def _database(file: Path, at: KeyPath) -> Database | Finding:
         return Finding(here, f"{file} {error}", remedy, code=DBC_FILE)
     text = _text(data)
     try:
-        _see_sizes(text)
+        _refuse_endless(text)
         database = load_string(text, "dbc")
     except Exception as error:  # noqa: BLE001 - the parser raises what it likes: of lookups, numbers, recursion
         reason = shortened(" ".join(str(error).split()) or type(error).__name__, 200)
@@ -253,11 +253,11 @@ def _text(data: bytes) -> str:
         return data.decode("cp1252", "replace")
 
 
-def _see_sizes(text: str) -> None:
-    """See that the parser will come to an end.
+def _refuse_endless(text: str) -> None:
+    """Refuse a file that the parser would need hours for.
 
     Raises:
-        ValueError: it would make lists of what has no end.
+        ValueError: a number of bits, bytes or pages is so large that the parser would list millions.
     """
     plain = _STRING.sub(lambda match: "\n" * match[0].count("\n"), text)
     if (match := _ENDLESS.search(plain)) is not None:

@@ -96,7 +96,7 @@ def check_modbus(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[Fi
 
 
 def check_line_load(draft: MachineFile) -> Iterator[Finding]:
-    """A serial line has time for all that it is asked."""
+    """A serial line has time for all requests."""
     for name, bus in draft.buses.items():
         with suppress(UnusableValueError):
             if not isinstance(bus, ModbusRtuBus):

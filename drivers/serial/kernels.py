@@ -167,7 +167,7 @@ def scaled(raw: NDArray[Any], scale: NDArray[np.float64], offset: NDArray[np.flo
 
 
 class SyncSearch(NamedTuple):
-    """Where the hunt for sync words stands.
+    """How far the search for sync words has come.
 
     Attributes:
         taken: what is before this is in a frame, or counted.

@@ -70,7 +70,7 @@ class Spread:
             an orbit that is stirred by process noise is correlated from one revolution to the next.
         noise: variance of the complex residual of one sample.
         noise_variance: relative variance of it from one revolution to the next.
-        floor: um^2, a difference that no patience resolves.
+        floor: um^2, a difference that more revolutions do not resolve.
         speed_slope: standard deviation of d ln Z_1 / d ln Omega after compensation.
         amplitude_um: modulus of Z_1 that the slope belongs to.
         drift: um^2, variance of the mean position that is the probes', not the shaft's.
