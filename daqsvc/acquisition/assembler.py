@@ -57,7 +57,7 @@ class StreamCounters:
             no sense, or far more frames came than the file states.
         frames_wrong_length: frames of the stream's id that are shorter or longer than its layout.
         samples_received: samples handed on.
-        samples_lost: samples declared missing, by the device's counter, or by time if it sends none.
+        samples_lost: samples that were lost, by the device's counter, or by time if it sends none.
         gaps: how often samples were missing.
         values_absent: values in the samples handed on, of any channel, that the device said it does not have,
             or that are not finite.

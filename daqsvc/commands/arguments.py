@@ -53,6 +53,17 @@ class ArgumentParser(argparse.ArgumentParser):
         self.exit(EXIT_USAGE, with_code(f"{self.prog}: {message}; see {self.prog} --help", code) + "\n")
 
 
+def add_overwrite(parser: argparse.ArgumentParser) -> None:
+    """The option of verbs that write a file, which replaces one that is there; it was called ``--force``."""
+    parser.add_argument(
+        "--overwrite",
+        "--force",
+        dest="overwrite",
+        action="store_true",
+        help="replace the file if it exists; --force is its former name",
+    )
+
+
 def path(text: str) -> Path:
     """A file or directory; what ``type=Path`` of an argument means here."""
     if not text:

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from daqsvc.commands.arguments import EXIT_OK, EXIT_REFUSED, EXIT_USAGE
+from daqsvc.commands.arguments import EXIT_OK, EXIT_REFUSED, EXIT_USAGE, add_overwrite
 from daqsvc.commands.complaint import complain
 from daqsvc.commands.recording_options import add_channel_map, split_files
 from daqsvc.commands.with_kernels import VerbWithKernels
@@ -57,13 +57,7 @@ class ExportCommand(VerbWithKernels):
             help="file to write: .parquet, .csv, .wav, .mat, .uff or .mf4",
         )
         parser.add_argument("--stream", metavar="NAME", help="write only this stream (default: all)")
-        parser.add_argument(
-            "--overwrite",
-            "--force",
-            dest="overwrite",
-            action="store_true",
-            help="replace the file if it exists; --force is its former name",
-        )
+        add_overwrite(parser)
         parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
         add_channel_map(parser.add_argument)
 

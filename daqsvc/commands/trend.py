@@ -19,7 +19,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from daqsvc.commands.arguments import EXIT_OK, EXIT_USAGE, duration
+from daqsvc.commands.arguments import EXIT_OK, EXIT_USAGE, add_overwrite, duration
 from daqsvc.commands.complaint import complain
 from daqsvc.commands.store_argument import BadFileError, StoreNotFoundError, add_store, chosen_store
 from daqsvc.errors.command_line import (
@@ -120,13 +120,7 @@ class TrendCommand:
         form.add_argument(
             "--events", action="store_true", help="print the alarm events instead, one JSON object per line"
         )
-        parser.add_argument(
-            "--overwrite",
-            "--force",
-            dest="overwrite",
-            action="store_true",
-            help="replace the file if it exists; --force is its former name",
-        )
+        add_overwrite(parser)
         add_store(parser)
 
     def run(self, arguments: argparse.Namespace) -> int:

@@ -155,5 +155,6 @@ def pages() -> dict[str, str]:
     }
 
 
-_ABOUT = """What a process of `daqsvc` gives to whoever starts it, and what it takes from there. How the
-service ends, and what should start it again: [architecture.md](../architecture.md#how-the-process-ends)."""
+_ABOUT = """What a process of `daqsvc` gives to whoever starts it, and what it takes from there. An exit code
+is also called an exit status. How the service ends, and what should start it again:
+[architecture.md](../architecture.md#how-the-process-ends)."""

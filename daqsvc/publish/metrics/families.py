@@ -157,7 +157,7 @@ def _streams(make: _Maker, streams: Figures, rates_hz: Mapping[str, float]) -> I
 
     yield count("frames_received", "Frames of the right length that arrived.", "frames_received")
     yield count("samples_received", "Samples that went on to the detectors.", "samples_received")
-    yield count("samples_lost", "Samples that never came.", "samples_lost")
+    yield count("samples_lost", "Samples that were lost, as they never came.", "samples_lost")
     settled = {name: one for name, one in streams.items() if one["time_settled"]}
     yield gauge("rate_hertz", "The device's own rate, measured, once known.", _each(settled, "rate_hz"))
     yield gauge(
