@@ -119,7 +119,7 @@ def test_thresholds_from_rates():
         (
             [('fault = "unbalance", unbalance_ratio = 1.3, ', "")],
             f"{MODES}[1]",
-            '"U1" does not differ',
+            '"U1" is not worse',
             "damping_ratio, static_load_um, stiffness_ratio, rub, or remove",
         ),
         (
