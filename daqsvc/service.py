@@ -583,7 +583,11 @@ class Service:
 
     def _is_prepared_for(self, machine: str, stream: str) -> bool:
         """Whether the driver of a stream of a machine still makes itself ready."""
-        bus = self.box.machines[machine].streams[stream].bus
+        watched = self.box.machines.get(machine)
+        # A reload may have removed either, while the old pipeline still ends.
+        if watched is None or stream not in watched.streams:
+            return False
+        bus = watched.streams[stream].bus
         return any(one.link.preparing for one in self.driver_reports if one.name == bus)
 
     def _report(self, diagnosis: Diagnosis) -> None:

@@ -444,7 +444,7 @@ def _joined(parts: list[Frames]) -> Frames:
     return np.concatenate(counter), np.concatenate(samples), np.concatenate(arrival_ns)
 
 
-def note_received(counters: StreamCounters, stream: str, samples: Samples) -> Samples:
+def note_received(counters: StreamCounters, stream: str, samples: Samples, *, left_out: int = 0) -> Samples:
     """Count samples that are handed on, and what in them is absent; the first such is logged.
 
     A value is absent if the device states that it has none (NaN), or if it is infinite. An overflow on the
@@ -454,6 +454,7 @@ def note_received(counters: StreamCounters, stream: str, samples: Samples) -> Sa
         counters: of the stream.
         stream: its name.
         samples: float32 ``[n, channels]``.
+        left_out: values counted as absent so far that were never asked for; they are logged elsewhere.
 
     Returns:
         The samples with NaN for what is absent; the same array if it states it already.
@@ -463,7 +464,7 @@ def note_received(counters: StreamCounters, stream: str, samples: Samples) -> Sa
     if there.all():
         return samples
     absent = there.size - int(np.count_nonzero(there))
-    if not counters.values_absent:
+    if counters.values_absent == left_out:
         logger.warning(
             "stream %r: no measurement in %d of its values: the device states that it has none, or what it "
             "sends is not finite; such values are missing, and are counted from now on. Look at the sensors "

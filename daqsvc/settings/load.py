@@ -167,7 +167,8 @@ class _Reading:
         meant = self._without_unknown_keys([error["loc"] for error in unknown]) if unknown else self._document
         if unknown:
             _, errors = _validated(meant)
-        self._say([error for error in errors if error["type"] != "extra_forbidden"], meant)
+        # Unknown keys that are left are those of misspelt tables.
+        self._say(errors, meant)
         part = valid_part(machine_file_model(), meant)
         assert isinstance(part, MachineFile)  # noqa: S101 - for the type checker
         return part

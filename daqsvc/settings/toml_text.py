@@ -229,7 +229,7 @@ _SLIPS = tuple(
         (r"\s*:\s*(?P<value>[^#\s].*?)", "write {key} = {value}, with an equals sign"),
         (r"\s*=\s*\"[^\"]*", 'end the text with a quote: "'),
         (
-            r"\s*=\s*(?P<value>\"[^\"]*\"|'[^']*'|[^\s\"'#=\[\]{},]+)\s*,",
+            r"\s*=\s*(?P<value>\"[^\"]*\"|'[^']*'|true|false|0x[\da-fA-F]+|[+-]?\d[\d_]*(\.\d+)?(e[+-]?\d+)?)\s*,",
             "write {key} = {value}, without the comma behind it",
         ),
         (r"\s*=", "write a value behind {key} ="),

@@ -321,10 +321,10 @@ def _signal_findings(layout: DbcLayout, message: Message, at: KeyPath) -> Iterat
         counter = signals[layout.counter.signal]
         yield from _counter(counter, (*at, "counter", "signal"))
         measured = [name for channel in layout.channels for name in channel.signals]
-        if counter.multiplexer_ids is None and _on_some_pages(message, measured):
+        if _on_more_pages(message, counter.name, measured):
             yield Finding(
                 (*at, "counter", "signal"),
-                f'is on every page of message "{message.name}", and the samples are on some: where it '
+                f'is on more pages of message "{message.name}" than the samples: where it '
                 "counts the frames of all pages, those of the others count as lost samples",
                 "write no_counter = true in place of counter; keep it if the device counts each page alone",
                 fatal=False,
@@ -336,17 +336,22 @@ def _signal_findings(layout: DbcLayout, message: Message, at: KeyPath) -> Iterat
             yield from _place(signal, message.length, path)
 
 
-def _on_some_pages(message: Message, names: Iterable[str]) -> bool:
-    """Whether frames come that do not hold these signals, as they are of other pages."""
+def values_of(message: Message, selector: str) -> frozenset[int]:
+    """All values of a multiplexer that have a page."""
+    return frozenset(
+        value
+        for one in message.signals
+        if one.multiplexer_signal == selector
+        for value in one.multiplexer_ids or ()
+    )
+
+
+def _on_more_pages(message: Message, counter: str, measured: Iterable[str]) -> bool:
+    """Whether frames come that hold the counter, and not these signals."""
+    of_counter = _pages(message, [counter])
     return any(
-        frozenset(
-            value
-            for one in message.signals
-            if one.multiplexer_signal == selector
-            for value in one.multiplexer_ids or ()
-        )
-        - values
-        for selector, values in _pages(message, names).items()
+        of_counter.get(selector, values_of(message, selector)) - values
+        for selector, values in _pages(message, measured).items()
     )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import math
 import tempfile
 from functools import partial
 from pathlib import Path
@@ -271,7 +273,7 @@ class DbcQuestions(_CanQuestions):
         measured = _likely_measured([signals[name] for name in rest])
         yield self.ask(
             "signals",
-            partial(_signals, tuple(rest), by_page),
+            partial(_signals, tuple(rest), signals),
             ", ".join(measured or rest[:1]),
             choices=_shown(by_page),
         )
@@ -317,8 +319,7 @@ class DbcQuestions(_CanQuestions):
         """See `BusQuestions.rate_hz`."""
         message = self._messages(answers)[answers["message"]]
         cycle_ms: float | None = message.cycle_time
-        pages = len(_by_page(message)) if _of_pages(self._measured(answers)) else 1
-        return 1000.0 / pages if not cycle_ms else round(1000.0 / cycle_ms / pages, 6)
+        return round(1000.0 / (cycle_ms or 1.0) * _share(message, answers["signals"]), 6)
 
     def guess(self, answers: Answers, channel: str) -> tuple[str, str | None]:
         """See `BusQuestions.guess`."""
@@ -341,11 +342,6 @@ class DbcQuestions(_CanQuestions):
         if by_page and others:
             yield f"# {answers['message']} is multiplexed. For these pages make separate streams:"
             yield from (f"#   {page} {names}".rstrip() for page, names in _shown(others, ":").items())
-
-    def _measured(self, answers: Answers) -> list[Any]:
-        """The signals that were chosen, as the DBC file describes them."""
-        message = self._messages(answers)[answers["message"]]
-        return [one for one in message.signals if one.name in answers["signals"]]
 
     def _units(self, answers: Answers) -> dict[str, str]:
         from daqsvc.settings.units import unit_of  # noqa: PLC0415 - brings the settings
@@ -392,9 +388,17 @@ def _with_signals(file: Path) -> dict[str, Message]:
     Raises:
         LayoutError: the file cannot be read, or cantools is not installed.
     """
+    changed_ns = file.stat().st_mtime_ns if file.is_file() else 0
+    return _read_once(file.absolute(), changed_ns)
+
+
+@functools.lru_cache(maxsize=1)
+def _read_once(file: Path, changed_ns: int) -> dict[str, Message]:
+    """The same; a large file takes seconds, and is asked about several times."""
     from drivers.can.dbc import messages_of  # noqa: PLC0415 - cantools is slow to import
 
-    return {message.name: message for message in messages_of(file.absolute()) if message.signals}
+    del changed_ns
+    return {message.name: message for message in messages_of(file) if message.signals}
 
 
 def _about(message: Message) -> str:
@@ -409,6 +413,21 @@ def _by_page(message: Message) -> dict[str, list[str]]:
     from drivers.can.dbc import signals_by_page  # noqa: PLC0415 - cantools is slow to import
 
     return signals_by_page(message)
+
+
+def _come_together(signals: Mapping[str, Any], names: Iterable[str]) -> bool:
+    """Whether some frame holds all of these signals."""
+    from drivers.can.dbc import selecting_values  # noqa: PLC0415 - cantools is slow to import
+
+    return all(selecting_values(signals, names).values())
+
+
+def _share(message: Message, names: Sequence[str]) -> float:
+    """Which part of the frames holds these signals, if all pages come equally often."""
+    from drivers.can.dbc import selecting_values, values_of  # noqa: PLC0415 - cantools is slow to import
+
+    pages = selecting_values({one.name: one for one in message.signals}, names)
+    return math.prod(len(values) / len(values_of(message, selector)) for selector, values in pages.items())
 
 
 def _shown(by_page: Mapping[str, Sequence[str]], behind: str = "") -> dict[str, str]:
@@ -446,24 +465,27 @@ def _likely_measured(signals: Sequence[Any]) -> list[str]:
     """Names of what one stream measures: no states, no selectors, one page of a multiplexed message."""
     numbers = [one for one in signals if not one.is_multiplexer and not one.choices]
     always = [one for one in numbers if one.multiplexer_ids is None]
-    first = min((min(one.multiplexer_ids) for one in numbers if one.multiplexer_ids), default=None)
-    page = [one for one in numbers if one.multiplexer_ids and first in one.multiplexer_ids]
+    known = {one.name: one for one in signals}
+    page: list[Any] = []
+    for one in sorted((n for n in numbers if n.multiplexer_ids), key=lambda n: min(n.multiplexer_ids)):
+        if _come_together(known, [*(other.name for other in page), one.name]):
+            page.append(one)
     for likely in (always, page):
         if found := [one.name for one in likely if one.unit]:
             return found
     return [one.name for one in (always or page)[:1]]
 
 
-def _signals(known: tuple[str, ...], by_page: Mapping[str, Sequence[str]], text: str) -> tuple[str, ...]:
+def _signals(known: tuple[str, ...], signals: Mapping[str, Any], text: str) -> tuple[str, ...]:
     chosen = tuple(part.strip() for part in text.split(","))
     for one in chosen:
         if one not in known:
             raise ValueError(f'there is no signal "{one}"; there are {", ".join(known)}')
     if len({one[: q.LONGEST_NAME] for one in chosen}) < len(chosen):
         raise ValueError(f'"{text}" has a signal twice')
-    paged = {one for one in chosen if any(one in names for names in by_page.values())}
-    if paged and not any(paged <= set(names) for names in by_page.values()):
-        raise ValueError(f"{', '.join(sorted(paged))} are on different pages: name those of one page")
+    if not _come_together(signals, chosen):
+        paged = sorted(one for one in chosen if signals[one].multiplexer_ids)
+        raise ValueError(f"{', '.join(paged)} are on different pages: name those of one page")
     return chosen
 
 

@@ -198,6 +198,10 @@ class UnitHealth:
             health = self._requests[key] = RequestHealth(key, answers=_is_repeated(key))
         return health
 
+    def forget(self, key: RequestKey) -> None:
+        """Forget a request that will not be made again: its last reply does not show how the unit is now."""
+        self._requests.pop(key, None)
+
     def check(self, health: RequestHealth, now_ns: int) -> None:
         """Make sure that this may be asked now.
 
@@ -351,6 +355,11 @@ class ModbusLine:
     def expect(self, who: object, due_ns: int) -> None:
         """Note the time of the next request: what may stay without reply is sent between such times."""
         self._due_ns[who] = due_ns
+
+    def forget(self, unit: int, function: int, what: str) -> None:
+        """Forget what a unit has been asked and will not be asked again: see `poll`."""
+        if (asked := self._units.get(unit)) is not None:
+            asked.forget(RequestKey(function, what))
 
     async def poll(self, unit: int, function: int, run: RegisterRun, what: str = "") -> RegisterValues:
         """Read registers, and tell when that was; see `read`."""

@@ -69,31 +69,35 @@ class PollingReader(ABC):
             except LineLostError:
                 return
             except (NoReplyError, RequestRefusedError) as error:
-                fault = f"{error}"
-                if isinstance(error, RequestRefusedError):
-                    remedy = REMEDIES.get(error.code, OTHER_REMEDY)
-                    self._tell(fault, remedy)
-                    fault = f"{fault}; {remedy}"
-                self._stand(dict.fromkeys(self._concerned(), fault))
+                self._stand(self._faults_of(error))
                 await self._pause_after_failure()
             else:
                 self._stand({})
+
+    def _faults_of(self, error: NoReplyError | RequestRefusedError) -> dict[str, str]:
+        """By stream, why it gets no sample; a refusal is logged once."""
+        return self._told(error, self._names)
+
+    def _told(self, error: NoReplyError | RequestRefusedError, streams: Sequence[str]) -> dict[str, str]:
+        """The same, of streams that one request was for."""
+        fault = f"{error}"
+        if isinstance(error, RequestRefusedError):
+            remedy = REMEDIES.get(error.code, OTHER_REMEDY)
+            self._tell(streams, fault, remedy)
+            fault = f"{fault}; {remedy}"
+        return dict.fromkeys(streams, fault)
 
     def _stand(self, faults: Mapping[str, str]) -> None:
         self.faults.clear()
         self.faults.update(faults)
 
-    def _tell(self, refusal: str, remedy: str) -> None:
-        """Tell each refusal once; how often there are such, the counters of the bus say."""
-        if (message := f"{streams_in_words(self._concerned())}: {refusal}") not in self._said:
+    def _tell(self, streams: Sequence[str], refusal: str, remedy: str) -> None:
+        """Log each refusal once; the counters of the bus have how often there were such."""
+        if (message := f"{streams_in_words(streams)}: {refusal}") not in self._said:
             self._said.add(message)
             logger.warning(
                 "%s, which is counted from now on; %s", message, remedy, extra=coded(REGISTER_REFUSED)
             )
-
-    def _concerned(self) -> Sequence[str]:
-        """The streams that get no sample by the request that has failed."""
-        return self._names
 
     @abstractmethod
     async def _look(self, line: ModbusLine) -> None:

@@ -224,13 +224,11 @@ class RegisterRecord:
         raw = (np.asarray(samples, np.float64) - self._offset) / self._scale
         for group in self._groups:
             for k, (channel, column) in enumerate(zip(group.channels, group.columns, strict=True)):
-                wanted = raw[:, column]
-                if channel.marks:
-                    wanted = np.where(np.isnan(wanted), float(channel.marks[0]), wanted)
-                fitting = _fit(channel, wanted, clip=clip)
+                absent = np.isnan(raw[:, column]) & bool(channel.marks)
+                fitting = _fit(channel, np.where(absent, 0.0, raw[:, column]), clip=clip)
                 # Numbers of a few bits share their registers: those of the others stay.
                 places = group.places[k * group.dtype.itemsize :][: group.dtype.itemsize]
-                rows[:, places] |= _bytes_of(channel, fitting)
+                rows[:, places] |= _bytes_of(channel, fitting, absent)
         return rows
 
     @cached_property
@@ -278,12 +276,17 @@ def _fit(channel: RegisterNumber, raw: NDArray[np.float64], *, clip: bool) -> ND
     return np.clip(values, low, high)
 
 
-def _bytes_of(channel: RegisterNumber, values: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Bytes ``[n, bytes]`` of whole numbers or floats that fit, highest first."""
+def _bytes_of(
+    channel: RegisterNumber, values: NDArray[np.float64], absent: NDArray[np.bool_]
+) -> NDArray[np.uint8]:
+    """Bytes ``[n, bytes]`` of whole numbers or floats that fit, highest first; the mark of what is absent."""
     if channel.bits is not None:
         numbers = (values.astype(np.uint64) << np.uint64(channel.bits[0])).astype(dtype_of(channel))
     else:
         numbers = values.astype(dtype_of(channel))
+    if absent.any():
+        # As a whole number: a float has not all digits of a mark of 64 bits.
+        numbers[absent] = channel.marks[0] << (0 if channel.bits is None else channel.bits[0])
     return np.ascontiguousarray(numbers).view(np.uint8).reshape(len(values), -1)
 
 

@@ -123,6 +123,7 @@ class _TrendStream:
         self._next: int | None = None
         self._lateness_ns: deque[float] = deque(maxlen=RECENT_DELAYS)
         self._error_ns = np.inf
+        self._left_out = 0
         self.leave_out({})
 
     @property
@@ -200,7 +201,8 @@ class _TrendStream:
         lost = 0 if self._next is None else first - self._next
         self._next, self._error_ns = first + len(samples), error_ns
         self.counters.frames_received += len(samples)
-        samples = self._with_absent(note_received(self.counters, self.name, samples))
+        samples = note_received(self.counters, self.name, samples, left_out=self._left_out)
+        samples = self._with_absent(samples)
         if lost:
             note_gap(self.counters, self.name, lost, first)
         quality = Quality.AFTER_LOSS if lost else Quality.GOOD
@@ -214,7 +216,9 @@ class _TrendStream:
             return samples
         whole = np.full((len(samples), len(self._channels)), np.nan, np.float32)
         whole[:, self._columns] = samples
-        self.counters.values_absent += len(samples) * len(self.absent)
+        count = len(samples) * len(self.absent)
+        self._left_out += count
+        self.counters.values_absent += count
         return whole
 
 
@@ -246,12 +250,19 @@ class TrendReader(PollingReader):
         self._start_ns = 0
         self._done = -1
         self._begun = False
-        self._without_sample: Sequence[str] = ()
+        self._failures: Sequence[_Failure] = ()
+        """Those of the last poll, which cost streams their samples."""
         self._streams = [_TrendStream(spec, port) for spec in specs]
         self._shared = runs
         self._bare: set[_TrendStream] = set()
         """Streams of which nothing is read but their own registers."""
         self._apart_ns = APART_NS
+        self._absent_before: set[tuple[str, str]] = set()
+        """Streams and channels that were left out when all were tried together last."""
+        self._search_again_ns: dict[RegisterRun, int] = {}
+        """When the channels of a request may be asked for one by one again, where that did not help."""
+        self._asked: set[str] = set()
+        """What has been asked for since the plan was another."""
         self._together_at_ns: int | None = None
         """When what is read apart now is tried together again."""
         self._read_together()
@@ -271,38 +282,61 @@ class TrendReader(PollingReader):
         now_ns = self._clock.monotonic_ns()
         if self._together_at_ns is not None and now_ns >= self._together_at_ns:
             self._read_together()
-        readings, failure = await self._ask(line)
+        readings, failures = await self._ask(line)
         asks_for_less = False
-        while failure is not None:
-            if failure.of_merging:
-                self._part(failure)
-            elif not failure.of_registers or not await self._leave_out(line, failure):
-                break
+        while await self._ask_for_less(line, failures):
             asks_for_less = True
-            readings, failure = await self._ask(line)
+            readings, failures = await self._ask(line)
         if asks_for_less:
             self._together_at_ns = self._clock.monotonic_ns() + self._apart_ns
             self._apart_ns = min(2 * self._apart_ns, APART_MOST_NS)
+        self._forget(line)
         self._append(slot, readings)
-        if failure is not None:
-            self._without_sample = sorted(stream.name for stream in failure.takers)
-            raise failure.in_words
+        self._failures = failures
+        if failures:
+            raise failures[-1].in_words
 
-    async def _ask(self, line: ModbusLine) -> tuple[list[RegisterValues | None], _Failure | None]:
-        """Read all runs; the last failure that cost some stream its sample, if any."""
+    async def run(self, line: ModbusLine) -> None:
+        """See `Reader.run`: over a new line, all is tried together again at once."""
+        self._apart_ns = APART_NS
+        self._search_again_ns.clear()
+        self._read_together()
+        await super().run(line)
+
+    async def _ask_for_less(self, line: ModbusLine, failures: Sequence[_Failure]) -> bool:
+        """Ask differently where that may help; whether it is worth asking again at once."""
+        differently = False
+        for failure in failures:
+            if failure.of_merging:
+                self._part(failure)
+                differently = True
+            elif failure.of_registers:
+                differently = await self._leave_out(line, failure) or differently
+        return differently
+
+    def _forget(self, line: ModbusLine) -> None:
+        """Have the line forget what is asked for no more: it would seem to be answered for ever."""
+        planned = {what for _, what, _ in self._plan}
+        for what in self._asked - planned:
+            line.forget(self._unit, self._function, what)
+        self._asked = planned
+
+    async def _ask(self, line: ModbusLine) -> tuple[list[RegisterValues | None], list[_Failure]]:
+        """Read all runs; the failures that cost streams their sample, one a stream at most."""
         readings: list[RegisterValues | None] = []
         lost: frozenset[_TrendStream] = frozenset()
-        failure: _Failure | None = None
+        failures: list[_Failure] = []
         for run, what, takers in self._plan:
             reading = None
             if not takers <= lost:  # else no stream's sample can be whole any more
+                self._asked.add(what)
                 try:
                     reading = await line.poll(self._unit, self._function, run, what)
                 except (NoReplyError, RequestRefusedError) as error:
-                    failure = _Failure(error, run, takers)
+                    failures.append(_Failure(error, run, takers))
                     lost |= takers
             readings.append(reading)
-        return readings, failure
+        return readings, failures
 
     def _append(self, slot: int, readings: Sequence[RegisterValues | None]) -> None:
         """Hand the sample to the streams; its place in the schedule is that of its request."""
@@ -337,22 +371,28 @@ class TrendReader(PollingReader):
     async def _leave_out(self, line: ModbusLine, failure: _Failure) -> bool:
         """Find the channels whose registers the unit does not have; whether others are left to read."""
         (stream,) = failure.takers
+        now_ns = self._clock.monotonic_ns()
+        if now_ns < self._search_again_ns.get(failure.run, 0):
+            return False
         asked = stream.channels_in(failure.run)
-        refused = asked if len(asked) == 1 else await self._refused_alone(line, asked)
+        refused, are_all_asked = (asked, True) if len(asked) == 1 else await self._refused_alone(line, asked)
         absent = {**stream.absent, **refused}
         if not refused or len(absent) == stream.channels:
+            if are_all_asked:
+                self._search_again_ns[failure.run] = now_ns + APART_MOST_NS
             return False
+        if {(stream.name, name) for name in refused} - self._absent_before:
+            self._apart_ns = APART_NS  # it may be short, however long others are away
         stream.leave_out(absent)
         self._bare.add(stream)
         self._read_apart()
         for name, run in refused.items():
-            if (message := f"{failure.error} ({run.in_words})") not in self._said:
+            said = f"{failure.error} ({run.in_words}): channel {name!r}"
+            if (message := f"stream {stream.name!r}: {said}") not in self._said:
                 self._said.add(message)
                 logger.warning(
-                    "stream %r: %s: channel %r has no value, and is asked for again only now and then; %s",
-                    stream.name,
+                    "%s has no value, and is asked for again only now and then; %s",
                     message,
-                    name,
                     REMEDIES[2],
                     extra=coded(REGISTER_REFUSED),
                 )
@@ -360,22 +400,26 @@ class TrendReader(PollingReader):
 
     async def _refused_alone(
         self, line: ModbusLine, asked: Mapping[str, RegisterRun]
-    ) -> dict[str, RegisterRun]:
-        """Which of the channels the unit refuses one by one; none if it fails in another way meanwhile."""
-        refused = {}
+    ) -> tuple[dict[str, RegisterRun], bool]:
+        """Which of the channels the unit refuses one by one, and whether all could be asked for."""
+        refused: dict[str, RegisterRun] = {}
         for name, run in asked.items():
+            self._asked.add(run.in_words)
             try:
                 await line.poll(self._unit, self._function, run, run.in_words)
             except NoReplyError:
-                return {}
+                return refused, False
             except RequestRefusedError as error:
-                if error.code not in REFUSALS_OF_REGISTERS:
-                    return {}
-                refused[name] = run
-        return refused
+                if error.code in REFUSALS_OF_REGISTERS:
+                    refused[name] = run
+        return refused, True
 
-    def _concerned(self) -> Sequence[str]:
-        return self._without_sample
+    def _faults_of(self, error: NoReplyError | RequestRefusedError) -> dict[str, str]:
+        del error  # the last one of these
+        faults: dict[str, str] = {}
+        for failure in self._failures:
+            faults |= self._told(failure.in_words, sorted(stream.name for stream in failure.takers))
+        return faults
 
     async def _pause_after_failure(self) -> None:
         """The schedule itself is the pause."""
@@ -384,6 +428,7 @@ class TrendReader(PollingReader):
         """Read what all streams share, or what each may read at once."""
         self._together_at_ns = None
         self._bare.clear()
+        self._absent_before = {(one.name, name) for one in self._streams for name in one.absent}
         for stream in self._streams:
             stream.leave_out({})
         if self._shared is None:

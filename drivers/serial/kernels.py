@@ -302,7 +302,8 @@ def hunt(
             if behind == UNKNOWN:
                 break
             good = behind >= 0
-            stray = behind if behind > 0 else stray
+            # None behind a good frame: those that were seen before were damage, and would hide more of it.
+            stray = behind if good else stray
         else:
             good = _matches(buffer, start, length, initial, swap)
         due = at == taken and not fresh and not astray

@@ -112,6 +112,12 @@ def test_a_fault_in_a_misspelt_table_is_told_where_it_is():
     assert "proximty" in text.splitlines()[other.line - 1]
 
 
+def test_an_unknown_key_in_a_misspelt_table_is_told_too():
+    text = LAVAL.read_text(encoding="utf-8")
+    text = text.replace("[[sensors]]", "[[sensor]]\ncolour = 3", 1)
+    assert [problem.key for problem in problems_of(text, LAVAL)] == ["sensor", "sensor[0].colour"]
+
+
 def test_a_table_within_a_table_is_told_its_whole_header():
     text = (MACHINES / "bearing.toml").read_text(encoding="utf-8")
     text = text.replace("[[pipeline.bearing.bearings]]", "[[pipeline.bearing.bearing]]", 1)

@@ -364,6 +364,11 @@ def test_broken_toml(text, line, words):
         ("scale = 0,001\n", 1, "write scale = 0.001, with a decimal point"),
         ("bits = 1,000,000\n", 1, "write bits = 1000000, without marks between thousands"),
         ("rate_hz = 640,\n", 1, "write rate_hz = 640, without the comma behind it"),
+        (
+            "host = 10.0.0.1,\n",
+            1,
+            "correct the TOML there: text is in quotes, tables are [name], values are key = value",
+        ),
         ('site = "lab", # in Ulm\n', 1, 'write site = "lab", without the comma behind it'),
         ("x = { a = 1, }\n", 1, "remove this comma: [ ] may end with one, { } may not"),
         (

@@ -251,13 +251,59 @@ def test_signals_of_two_pages_are_not_taken_for_one_stream(
     assert "Supply, Temperature are on different pages: name those of one page" in capsys.readouterr().err
 
 
+NESTED = """VERSION ""
+BU_: X
+BO_ 291 Msg: 8 X
+ SG_ M0 M : 0|4@1+ (1,0) [0|15] "" X
+ SG_ S m1M : 4|4@1+ (1,0) [0|15] "" X
+ SG_ A m0 : 8|16@1- (0.1,0) [0|0] "V" X
+ SG_ C m1 : 8|8@1- (0.1,0) [0|0] "V" X
+ SG_ B m0 : 16|16@1- (0.1,0) [0|0] "A" X
+ SG_ B2 m2 : 32|16@1- (0.1,0) [0|0] "A" X
+SG_MUL_VAL_ 291 S M0 1-1;
+SG_MUL_VAL_ 291 A M0 0-0;
+SG_MUL_VAL_ 291 C M0 1-1;
+SG_MUL_VAL_ 291 B S 0-0;
+SG_MUL_VAL_ 291 B2 S 2-2;
+BO_ 292 Wide: 8 X
+ SG_ P M : 0|8@1+ (1,0) [0|255] "" X
+ SG_ V m0 : 16|16@1- (0.1,0) [0|0] "V" X
+ SG_ W m0 : 32|16@1- (0.1,0) [0|0] "V" X
+SG_MUL_VAL_ 292 V P 0-199;
+SG_MUL_VAL_ 292 W P 0-49;
+"""
+"""Pages within a page, and signals on many pages."""
+
+
+@pytest.mark.parametrize(
+    ("more", "channels", "rate_hz"),
+    [
+        (["--message=Msg"], ["A"], 500.0),
+        (["--message=Msg", "--signals=C, B"], ["C", "B"], 250.0),
+        (["--message=Msg", "--signals=C"], ["C"], 500.0),
+        (["--message=Wide"], ["V", "W"], 250.0),
+        (["--message=Wide", "--signals=V"], ["V"], 1000.0),
+    ],
+)
+def test_new_reads_signals_that_come_in_one_frame_at_their_share_of_the_frames(
+    tmp_path: Path, more: list[str], channels: list[str], rate_hz: float
+) -> None:
+    dbc, file = tmp_path / "nested.dbc", tmp_path / "new.toml"
+    dbc.write_text(NESTED)
+    assert main(["new", f"{file}", "--yes", "--bus=can-dbc", f"--dbc={dbc}", *more]) == 0
+    [stream] = tomllib.loads(file.read_text("utf-8"))["streams"].values()
+    assert [channel["name"] for channel in stream["layout"]["channels"]] == channels
+    assert stream["rate_hz"] == rate_hz
+    assert main(["check", f"{file}"]) == 0
+
+
 def test_a_counter_of_all_pages_is_warned_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     dbc, file = tmp_path / "slow.dbc", tmp_path / "new.toml"
     dbc.write_text(COUNTED)
     assert main(["new", f"{file}", "--yes", "--bus=can-dbc", f"--dbc={dbc}", "--counter=Count"]) == 0
     capsys.readouterr()
     assert main(["check", f"{file}"]) == 0
-    assert 'is on every page of message "Slow"' in " ".join(capsys.readouterr().out.split())
+    assert 'is on more pages of message "Slow"' in " ".join(capsys.readouterr().out.split())
 
 
 def test_new_points_out_signals_that_may_be_samples_of_one_channel(tmp_path: Path) -> None:

@@ -136,6 +136,15 @@ def test_no_value_is_encoded_by_the_first_mark():
     assert record.encode(np.array([[np.nan]])).tobytes() == b"\x80\x00"
 
 
+@pytest.mark.parametrize("clip", [False, True])
+@pytest.mark.parametrize(
+    ("kind", "mark", "sent"), [("uint64", -1, b"\xff" * 8), ("int64", 2**63 - 1, b"\x7f" + b"\xff" * 7)]
+)
+def test_a_mark_of_64_bits_is_encoded_to_its_last_digit(kind, mark, sent, clip):
+    record = RegisterRecord((register("x", 0, kind, no_value=(mark,)),), (RegisterRun(0, 4),))
+    assert record.encode(np.array([[np.nan], [1.0]]), clip=clip)[0].tobytes() == sent
+
+
 def test_parts_of_one_register_are_put_together():
     fields = (
         register("low", 0, "uint16", bits=(0, 4)),

@@ -244,6 +244,94 @@ def test_a_unit_that_falls_silent_while_its_registers_are_sought_loses_no_channe
     assert np.isnan(rig.samples("pump")[:, 1]).all()
 
 
+def refusing(*addresses, code=2):
+    """Units, the first of which refuses whatever includes one of these registers."""
+    unit_side = units()
+    answer, asked = unit_side[1].answer, []
+
+    def refuse(pdu):
+        asked.append(RegisterRun(pdu[2], pdu[4]))
+        there = any(pdu[2] <= one < pdu[2] + pdu[4] for one in addresses)
+        return bytes([0x83, code]) if there else answer(pdu)
+
+    unit_side[1].answer = refuse
+    return unit_side, asked
+
+
+def test_what_is_refused_of_one_stream_does_not_hide_what_is_of_another(caplog):
+    streams = {"one": (trend([16, 17]), 1.0), "other": (trend([20, 21]), 1.0)}
+    with caplog.at_level(NOTICE):
+        rig = watched(streams, refusing(17, 20, 21)[0], 30.0)
+    assert (rig.samples("one")[:, 0] == 1016).all()
+    assert rig.counters("one").samples_received == pytest.approx(30, abs=1)
+    assert rig.counters("other").samples_received == 0
+    assert [*rig.driver.link.faults] == ["other"]
+    said = "\n".join(record.message for record in caplog.records)
+    assert "channel 'r17' has no value" in said
+    assert "stream 'other': unit 1 refuses function 3: illegal data address (registers 20 to 21)" in said
+
+
+@pytest.mark.parametrize(
+    ("unit_side", "channels", "requests"),
+    [
+        (refusing(*range(16, 32)), range(16, 32), 60 + 16),  # the whole map is elsewhere
+        (refusing(*range(16, 32), code=3), range(16, 32), 60 + 16),
+    ],
+)
+def test_channels_are_asked_for_one_by_one_once_and_not_with_every_sample(unit_side, channels, requests):
+    sides, asked = unit_side
+    watched({"pump": (trend([*channels], max_gap=0), 1.0)}, sides, 60.0)
+    assert len(asked) == pytest.approx(requests, abs=3)
+
+
+def test_a_unit_that_dies_is_known_as_dead_though_its_channels_were_asked_for_one_by_one():
+    sides, asked = refusing(17)
+    rig = Rig(
+        options_of(serial=True, timeout_ms=50.0),
+        {"pump": (trend([16, 17, 18], max_gap=0), 1.0)},
+        clock=LoopClock(),
+    )
+
+    async def main():
+        async with (
+            responding(sides, lambda *_: PlannedReply("silent" if len(asked) > 15 else "none"), serial=True),
+            rig.running(),
+        ):
+            await asyncio.sleep(120.0)
+
+    simulate(main)
+    assert rig.driver.counters.units_demoted > 0
+    assert rig.driver.link.losses > 0
+
+
+def test_a_short_refusal_costs_a_channel_a_minute_however_long_another_is_away():
+    sides, _ = refusing(17)
+    refuse, begun = sides[1].answer, []
+
+    def shortly(pdu):
+        now_s = asyncio.get_running_loop().time()
+        begun.append(now_s)
+        short = 14_000 < now_s - begun[0] < 14_012 and pdu[2] <= 18 < pdu[2] + pdu[4]
+        return b"\x83\2" if short else refuse(pdu)
+
+    sides[1].answer = shortly
+    rig = watched({"pump": (trend([16, 17, 18], max_gap=0), 0.1)}, sides, 16_000.0)
+    samples = rig.samples("pump")
+    assert np.isnan(samples[:, 1]).all()
+    assert 1 <= np.isnan(samples[:, 2]).sum() <= 8
+
+
+def test_each_channel_and_stream_without_its_register_is_named(caplog):
+    parts = [register(name, 17, "uint16", bits=[at, 4]) for name, at in (("low", 0), ("high", 4))]
+    layout = registers_layout(1, "holding", [register("r16", 16, "uint16"), *parts], max_gap=0)
+    with caplog.at_level(NOTICE):
+        watched({"bits": (layout, 1.0), "pump": (trend([17, 18]), 1.0)}, refusing(17)[0], 10.0)
+    said = "\n".join(record.message for record in caplog.records)
+    for stream, channel in (("bits", "low"), ("bits", "high"), ("pump", "r17")):
+        refused = "unit 1 refuses function 3: illegal data address (register 17)"
+        assert f"stream {stream!r}: {refused}: channel {channel!r}" in said
+
+
 def test_streams_that_were_parted_are_tried_together_again():
     """A gateway that refused everything while it started is asked once for both, as before."""
     streams = {"one": (trend([16]), 1.0), "other": (trend([20]), 1.0)}

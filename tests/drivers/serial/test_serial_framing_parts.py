@@ -125,6 +125,15 @@ def test_bytes_behind_every_frame_cost_no_frame_and_are_told_once(crc, stray, ch
     assert "no frame is lost" in told.remedy
 
 
+def test_bytes_put_into_two_neighbours_do_not_make_later_ones_intact():
+    framing = SyncFraming(BodyCodec({"a": layout()}, crc="none"), b"\xaa\x55")
+    frames = framing.encode("a", np.arange(80) * 3, np.full((80, 3, 1), 5.0))
+    for k in (10, 11, 50, 60, 70):
+        frames[k] = frames[k][:4] + b"\x77" + frames[k][4:]
+    found = framing.cut(b"".join(frames)).frames["a"]
+    assert not {50 * 3, 60 * 3, 70 * 3} & {*found.counter[found.intact].tolist()}
+
+
 def test_a_byte_put_into_one_frame_without_a_crc_still_spoils_it():
     framing = SyncFraming(BodyCodec({"a": layout()}, crc="none"), b"\xaa\x55")
     frames = framing.encode("a", np.arange(5) * 3, np.full((5, 3, 1), 5.0))

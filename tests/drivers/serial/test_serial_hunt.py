@@ -45,7 +45,9 @@ def by_search(
             break
         body = buffer[start:end]
         good = buffer.startswith(follows, end) and not (checked and binascii.crc_hqx(body, 0xFFFF))
-        if not checked and not good:
+        if not checked and good:
+            stray = 0
+        elif not checked:
             count = stray_behind(buffer, end, stray)
             if count is None:
                 break
