@@ -34,7 +34,13 @@ rm -f "$out/exit-code" "$out/console"
 # the first, however it ends.
 cpu=${HIL_CPU:-$(taskset -pc $$ | sed 's/.*[^0-9]//')}
 sockets=$(mktemp -d "${TMPDIR:-/tmp}/uml.XXXXXX")
-unshare --pid --fork --kill-child -- taskset -c "$cpu" linux.uml \
+# See whole_registers.c: without it no guest starts on a processor with AMX.
+preload=()
+if grep -qw amx_tile /proc/cpuinfo; then
+    gcc -shared -fPIC -O2 -o "$sockets/whole_registers.so" "$here/whole_registers.c"
+    preload=(env LD_PRELOAD="$sockets/whole_registers.so")
+fi
+unshare --pid --fork --kill-child -- taskset -c "$cpu" "${preload[@]}" linux.uml \
     mem="${HIL_MEMORY:-1500M}" umid=hil uml_dir="$sockets" con=null con0=null,fd:1 ssl=null panic=-1 loglevel=4 \
     root=/dev/root rootfstype=hostfs rootflags=/ ro init="$here/guest-init.sh" \
     HIL_GUEST=1 HIL_MODE=$mode HIL_LIB="$here" HIL_OUT="$out" HIL_MODULES=/usr/lib/uml/modules </dev/null >"$out/kernel.log" 2>&1 &

@@ -10,7 +10,7 @@ set -euo pipefail
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 cd "$here/../.."
 
-missing() { echo "hil: $1 is missing; install it with: apt-get install --no-install-recommends user-mode-linux kmod iproute2 can-utils mosquitto systemd debhelper" >&2; exit 1; }
+missing() { echo "hil: $1 is missing; install it with: apt-get install --no-install-recommends user-mode-linux kmod iproute2 can-utils mosquitto systemd debhelper gcc libc6-dev" >&2; exit 1; }
 [ "$(id -u)" = 0 ] || { echo "hil: interfaces are made by root only; run it as root" >&2; exit 1; }
 for program in ip cansend candump cangen; do command -v "$program" >/dev/null || missing "$program"; done
 command -v mosquitto >/dev/null || [ -x /usr/sbin/mosquitto ] || missing mosquitto
@@ -24,6 +24,7 @@ command -v linux.uml >/dev/null || missing linux.uml
 command -v modprobe >/dev/null || missing kmod
 [ -x /lib/systemd/systemd ] || missing systemd
 command -v dh >/dev/null || missing dh
+! grep -qw amx_tile /proc/cpuinfo || command -v gcc >/dev/null || missing gcc
 status=0
 package=
 told=$(mktemp)
