@@ -287,12 +287,12 @@ class SyncFraming(_BinaryFraming):
         return batch
 
     def _between_frames(self, buffer: NDArray[np.uint8], hunted: Hunted, before: SyncSearch) -> NoFrame:
-        """What stands between two whole frames, if anything does: devices may end their frames by it.
+        """What is between two whole frames, if anything is: devices may end their frames by it.
 
         Args:
             buffer: the bytes.
             hunted: what was found in them.
-            before: where the hunt stood.
+            before: how far the search had come.
         """
         begins, ends = hunted.starts - len(self._sync), hunted.ends
         whole = hunted.intact
@@ -306,6 +306,6 @@ class SyncFraming(_BinaryFraming):
         count, begin = int(gaps[few[0]]), int(ends[few[0]])
         shown = buffer[begin : begin + count].tobytes().hex(" ")
         return NoFrame(
-            f"the first stand between two whole frames, {count} byte{'s' * (count > 1)}: {shown}",
+            f"the first are between two whole frames, {count} byte{'s' * (count > 1)}: {shown}",
             "the device sends them behind each frame, and no frame is lost by them",
         )

@@ -195,8 +195,8 @@ def test_a_damaged_history_is_said(tmp_path, capsys) -> None:
     assert "cannot be read: file is not a database" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("option", ["--csv", "--parquet"])
-def test_a_file_that_is_there_is_replaced_only_by_force(store, capsys, option) -> None:
+@pytest.mark.parametrize(("option", "replace"), [("--csv", "--overwrite"), ("--parquet", "--force")])
+def test_a_file_that_is_there_is_replaced_only_on_purpose(store, capsys, option, replace) -> None:
     pytest.importorskip("pyarrow")
     target = store / "mine"
     target.write_text("dear to me")
@@ -206,7 +206,7 @@ def test_a_file_that_is_there_is_replaced_only_by_force(store, capsys, option) -
     assert target.read_text() == "dear to me"
     link = store / "link"
     link.symlink_to(target)
-    assert main([*command[:-1], str(link), "--overwrite"]) == 0
+    assert main([*command[:-1], str(link), replace]) == 0
     assert link.is_symlink()
     assert len(target.read_bytes()) > 10_000
     assert not list(store.glob(".daqsvc*"))

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import asyncio
+import threading
 from typing import TYPE_CHECKING
 
 import pytest
 from support.live_service import running
 from support.machine_files import MACHINES
+from support.waiting import PATIENCE_S, eventually
 
 from daqsvc.alarms.states import Level
 from daqsvc.settings import parse_machine_file
 from drivers.can.errors import ErrorCounts
 from drivers.frames import DecodedBatch
+from drivers.serial import driver as serial_driver
+from sim_hw.nodes.serial_node import PseudoTerminal
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -21,6 +26,7 @@ if TYPE_CHECKING:
 
 pytestmark = pytest.mark.integration
 MOTOR = MACHINES / "motor-accelerometer.toml"
+SERIAL = MACHINES / "serial-probes.toml"
 
 
 def how(service: Service, alarm: str) -> tuple[Level, str]:
@@ -51,3 +57,20 @@ async def test_an_overrun_and_a_bus_off_are_alarms_that_return(tmp_path: Path) -
         driver.accept(DecodedBatch(errors=ErrorCounts({"restarts": 1}, "error-active")))
         service.alarms.tick()
         assert how(service, "bus-controller/can0")[0] is Level.DANGER, "it has only just come back"
+
+
+async def test_a_first_start_raises_no_alarm_of_silence_while_kernels_are_compiled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compiled = threading.Event()
+    monkeypatch.setattr(serial_driver, "_warm", lambda *_: compiled.wait(PATIENCE_S))
+    text = SERIAL.read_text().partition("[mqtt]")[0]
+    for number, line in enumerate(line for line in text.splitlines() if line.startswith('port = "')):
+        text = text.replace(line, f'port = "{tmp_path / str(number)}"')
+    with PseudoTerminal(tmp_path / "0"), PseudoTerminal(tmp_path / "1"):
+        async with running(parse_machine_file(text, SERIAL), tmp_path / "store") as service:
+            alarms = service.alarms.manager.alarms
+            await asyncio.sleep(3.5)  # longer than a stream of waveforms may be silent
+            assert not [one for one in alarms.values() if one.level is not Level.NORMAL]
+            compiled.set()
+            await eventually(lambda: [one for one in alarms.values() if one.level is not Level.NORMAL])

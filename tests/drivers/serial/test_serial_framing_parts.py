@@ -121,7 +121,7 @@ def test_bytes_behind_every_frame_cost_no_frame_and_are_told_once(crc, stray, ch
     assert sum(batch.notes["bytes_garbage"] for batch in batches) == (len(counters) - 1) * len(stray)
     (told,) = [batch for batch in batches if batch.malformed]
     many = "1 byte" if len(stray) == 1 else "2 bytes"
-    assert told.malformed == f"the first stand between two whole frames, {many}: {stray.hex(' ')}"
+    assert told.malformed == f"the first are between two whole frames, {many}: {stray.hex(' ')}"
     assert "no frame is lost" in told.remedy
 
 
