@@ -182,7 +182,7 @@ class ErrorFormatter:
             meant = table_beside(section, table, key, table[key])
         if meant is not None:
             return "unknown key", f"did you mean {meant}?"
-        homes = homes_of(self._root, key, self._document)
+        homes = homes_of(self._root, path, self._document)
         if homes:
             return "unknown key", f"move it to {' or '.join(homes)}, where it belongs"
         free = sorted(name for name in section.model_fields if name not in table)

@@ -110,12 +110,25 @@ def forget_homes() -> None:
     _homes.cache_clear()
 
 
-def homes_of(root: type[Section], key: str, document: Any) -> tuple[str, ...]:
-    """The tables of a document that can hold a key, as people write them; none where there are many kinds."""
-    places = _homes(root).get(key, ())
+def homes_of(root: type[Section], path: KeyPath, document: Any) -> tuple[str, ...]:
+    """The other tables of a document that can hold a key, as people write them; none if of many kinds."""
+    places = _homes(root).get(str(path[-1]), ())
     if len(places) > _MOST_HOMES:
         return ()
-    return tuple(f"[{place}]" for place in places if _has_table(document, place.strip("[]").split(".")))
+    here = [str(step) for step in path[:-1] if not isinstance(step, int)]
+    homes = {place: place.strip("[]").split(".") for place in places}
+    return tuple(
+        f"[{place}]"
+        for place, names in homes.items()
+        if _has_table(document, names) and not _same_table(names, here)
+    )
+
+
+def _same_table(names: list[str], here: list[str]) -> bool:
+    """Whether the names of a table, with ``NAME`` for any, are those of the table at ``here``."""
+    return len(names) == len(here) and all(
+        name in {"NAME", step} for name, step in zip(names, here, strict=True)
+    )
 
 
 def _has_table(document: Any, names: list[str]) -> bool:

@@ -118,6 +118,13 @@ def test_an_unknown_key_in_a_misspelt_table_is_told_too():
     assert [problem.key for problem in problems_of(text, LAVAL)] == ["sensor", "sensor[0].colour"]
 
 
+def test_a_key_is_not_sent_to_the_table_where_it_is():
+    text = (MACHINES / "dbc-triaxial.toml").read_text(encoding="utf-8")
+    text = text.replace("dbc = ", "dbcx = ").replace("message = ", "mssage = ")
+    problem = next(one for one in problems_of(text, LAVAL) if one.key.endswith("counter.signal"))
+    assert problem.remedy.startswith("remove it; possible here: ")
+
+
 def test_a_table_within_a_table_is_told_its_whole_header():
     text = (MACHINES / "bearing.toml").read_text(encoding="utf-8")
     text = text.replace("[[pipeline.bearing.bearings]]", "[[pipeline.bearing.bearing]]", 1)
