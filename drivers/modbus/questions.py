@@ -232,7 +232,7 @@ class _ModbusQuestions(BusQuestions):
 
         types, orders = dict.fromkeys(REGISTERS, ""), dict.fromkeys(("ABCD", "CDAB", "BADC", "DCBA"), "")
         following = f"{self._next_address(answers, channel)}"
-        doubt = partial(_doubt, self._taken(answers, channel), following)
+        doubt = partial(_doubt_of_channel, self._taken(answers, channel), following)
         yield self.ask_of(channel, "address", q.whole, following, doubt=doubt)
         unit = _unit(channel)
         default = "int16" if unit == "degC" else "uint16"
@@ -534,18 +534,14 @@ def _without_registers(found: Mapping[str, Any]) -> Heard:
     return Heard(lines, proposals)
 
 
-def _doubt(taken: Mapping[int, str], free: str, address: int | None) -> tuple[str, str] | None:
-    """See `Question.doubt`: another channel is there, or it is counted as in manuals, from 30001 or 40001."""
-    if address is not None and address in taken:
-        reason = (
-            f'register {address} holds "{taken[address]}" already. Enter takes {free}; type {address} again '
-            "if both are in it"
-        )
-        return reason, free
+def _doubt(address: int | None) -> tuple[str, str] | None:
+    """See `Question.doubt`: it is counted as in manuals, from 30001 or 40001."""
+    if address is None:
+        return None
     from drivers.modbus.checks import manuals_first  # noqa: PLC0415 - brings the settings
 
-    first = None if address is None else manuals_first(address)
-    if address is None or first is None:
+    first = manuals_first(address)
+    if first is None:
         return None
     meant = address - first
     reason = (
@@ -553,3 +549,14 @@ def _doubt(taken: Mapping[int, str], free: str, address: int | None) -> tuple[st
         f"here. Enter takes it; type {address} again if the device has such addresses"
     )
     return reason, f"{meant}"
+
+
+def _doubt_of_channel(taken: Mapping[int, str], free: str, address: int) -> tuple[str, str] | None:
+    """The same of a channel's register, which may be that of another channel, too."""
+    if address not in taken:
+        return _doubt(address)
+    reason = (
+        f'register {address} holds "{taken[address]}" already. Enter takes {free}; type {address} again '
+        "if both are in it"
+    )
+    return reason, free

@@ -576,6 +576,31 @@ def test_a_number_of_the_manual_is_asked_again_with_the_address_that_it_means():
     assert asked(["30000"], "modbus-tcp")[1] == []
 
 
+@pytest.mark.parametrize(
+    ("way", "key"),
+    [
+        ("waveform", "block-id"),
+        ("waveform", "block-address"),
+        ("ring", "count-address"),
+        ("ring", "ring-address"),
+        ("fifo", "fifo-address"),
+        ("fifo", "acknowledge"),
+    ],
+)
+def test_each_way_is_asked_to_its_end_and_a_number_of_the_manual_is_noticed(way, key):
+    said: list[str] = []
+    texts = iter(["40017"])
+
+    def ask(question: Question) -> str:
+        assert question.default is not None, question.key
+        return next(texts, question.default) if question.key == key else question.default
+
+    beforehand = Given({"bus": "modbus-tcp", "host": "::1", "way": way}, defaults=False)
+    assert conduct(Path("m.toml"), beforehand, ask, said.append)[key] == 16
+    assert len(said) == 1
+    assert "that is 16 here" in said[0]
+
+
 def test_a_register_that_another_channel_has_is_asked_again():
     texts, said = iter(["40", "40", "41", "41"]), []
 
