@@ -13,7 +13,7 @@ _SOUND = {
     "streams": {"frames_received", "samples_received", "time_settled", "end_index"},
     "buses": {
         *("up", "requests", "replies", "bytes_received", "frames_recorded", "passes", "probes", "restarts"),
-        *("frames_remote", "units_back", "requests_back", "tx_errors", "rx_errors"),
+        *("frames_remote", "units_back", "requests_back", "idle_closes", "tx_errors", "rx_errors"),
         "unknown_ids",  # of frames that frames_unknown has
     },
     "detectors": {"windows", "samples", "busy_ns"},

@@ -25,6 +25,8 @@ from pymodbus.pdu.register_message import (
 )
 from pymodbus.transport import CommParams, CommType, ModbusProtocol
 
+from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.notice import notice
 from drivers.modbus.replies import (
     FAULTY,
     READ_HOLDING,
@@ -50,6 +52,8 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.clock import Clock
     from drivers.modbus.settings import ModbusBus
 
+
+logger = logging.getLogger(__name__)
 
 logging.getLogger("pymodbus.logging").setLevel(
     logging.CRITICAL
@@ -89,12 +93,15 @@ class ModbusWire(ModbusProtocol):
     Attributes:
         last_byte_ns: when bytes last arrived, monotonic; 0 if never.
         why_lost: why there is no connection, if there is none.
+        idle_ns: how long nothing had come when the other end closed a connection that had worked, and over
+            which nothing was asked; None if that is not how it ended.
     """
 
     def __init__(self, bus: ModbusBus, clock: Clock, counters: ModbusCounters) -> None:
         super().__init__(_transport_of(bus), is_server=False)
         self.last_byte_ns = 0
         self.why_lost = f"{bus.where} is closed"
+        self.idle_ns: int | None = None
         self._bus = bus
         self._serial = isinstance(bus, ModbusRtuBus)
         self._timeout_s = bus.timeout_ms / MS_PER_S
@@ -170,7 +177,12 @@ class ModbusWire(ModbusProtocol):
 
     def callback_disconnected(self, exc: Exception | None) -> None:
         """End the wait for a reply that cannot come any more."""
-        self.why_lost = f"{self._bus.where} has closed the connection" + (f" ({exc})" if exc else "")
+        self.why_lost = (
+            f"{self._bus.where} has closed the connection{f' ({exc})' if exc else ''}; see whether the "
+            "device has restarted, or other clients take its connections"
+        )
+        if self.last_byte_ns and not self._serial and not self._waits:
+            self.idle_ns = self._clock.monotonic_ns() - self.last_byte_ns
         self._fail(LineLostError(self.why_lost))
 
     def callback_connected(self) -> None:
@@ -321,6 +333,9 @@ def _read_request(unit: int, function: int, address: int, count: int) -> ModbusR
 class ModbusClient:
     """One connection, one request at a time. Connect again with a new client.
 
+    Only a connection that the device has closed while nothing was asked is opened again by this one: many
+    devices close it after some seconds without a request.
+
     Args:
         bus: its table in the machine file.
         clock: stamps when bytes last arrived.
@@ -328,8 +343,10 @@ class ModbusClient:
     """
 
     def __init__(self, bus: ModbusBus, clock: Clock, counters: ModbusCounters) -> None:
-        self._wire = ModbusWire(bus, clock, counters)
+        self._bus = bus
+        self._clock = clock
         self._counters = counters
+        self._wire = ModbusWire(bus, clock, counters)
 
     @property
     def last_byte_ns(self) -> int:
@@ -356,6 +373,7 @@ class ModbusClient:
             # Closing a tty waits until everything is sent, which a dead adapter never does.
             with contextlib.suppress(OSError, ValueError):
                 serial.reset_output_buffer()
+        self._wire.idle_ns = None  # and it stays closed
         with contextlib.suppress(OSError):
             self._wire.close()
         await asyncio.sleep(0)  # a TCP transport closes its socket in the next turn
@@ -390,7 +408,7 @@ class ModbusClient:
 
     async def _ask(self, request: ModbusRequest) -> bytes:
         if not self._wire.is_active():
-            raise LineLostError(self._wire.why_lost)
+            await self._open_again()
         self._counters.requests += 1
         pdu = await self._wire.exchange(request)
         self._counters.replies += 1
@@ -400,3 +418,23 @@ class ModbusClient:
                 f"unit {request.unit} refuses function {request.pdu[0]}: {kind}", pdu[1]
             )
         return register_bytes(pdu)
+
+    async def _open_again(self) -> None:
+        closed = self._wire
+        if closed.idle_ns is None:
+            raise LineLostError(closed.why_lost)
+        wire = ModbusWire(self._bus, self._clock, self._counters)
+        try:
+            await wire.open()
+        except LineLostError as error:
+            raise LineLostError(closed.why_lost) from error
+        self._wire = wire
+        self._counters.idle_closes += 1
+        if self._counters.idle_closes == 1:
+            notice(
+                logger,
+                "%s closes a connection over which nothing is asked (after %.3g s); it is opened again for "
+                "each request, and counted from now on. A rate_hz that asks more often keeps it open",
+                self._bus.where,
+                closed.idle_ns / NS_PER_S,
+            )

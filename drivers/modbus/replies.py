@@ -266,6 +266,7 @@ class ModbusCounters(BusCounters):
         replies_wrong_function: frames that answer another function.
         replies_wrong_protocol: TCP frames that are not Modbus.
         replies_unasked: bunches of bytes on a serial line while no reply was waited for: late replies.
+        idle_closes: connections that the device closed while nothing was asked, opened again for a request.
         units_demoted: how often a silent unit was set aside.
         units_back: how often one was found to be back.
         requests_demoted: how often requests of a unit that answers others were set aside.
@@ -289,6 +290,7 @@ class ModbusCounters(BusCounters):
     replies_wrong_function: int = 0
     replies_wrong_protocol: int = 0
     replies_unasked: int = 0
+    idle_closes: int = 0
     units_demoted: int = 0
     units_back: int = 0
     requests_demoted: int = 0

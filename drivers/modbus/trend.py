@@ -287,6 +287,7 @@ class TrendReader(PollingReader):
         while await self._ask_for_less(line, failures):
             asks_for_less = True
             readings, failures = await self._ask(line)
+        self._done = slot  # not if the line was lost meanwhile: then it is due as soon as there is one again
         if asks_for_less:
             self._together_at_ns = self._clock.monotonic_ns() + self._apart_ns
             self._apart_ns = min(2 * self._apart_ns, APART_MOST_NS)
@@ -459,15 +460,15 @@ class TrendReader(PollingReader):
         now_ns = self._clock.monotonic_ns()
         if self._done < 0:
             self._start_ns = now_ns
-        self._done = max(self._done + 1, self._oldest_slot(now_ns))
-        due_ns = self._due_ns(self._done)
+        slot = max(self._done + 1, self._oldest_slot(now_ns))
+        due_ns = self._due_ns(slot)
         line.expect(self, due_ns)
         wait_ns = due_ns - now_ns
         if wait_ns > WORTH_A_BATCH_NS:
             self.flush()
         if wait_ns > EARLY_NS:
             await self._clock.sleep_ns(wait_ns)
-        return self._done
+        return slot
 
     def _oldest_slot(self, now_ns: int) -> int:
         """The first place in the schedule that has not passed for good: the next but one is not due yet."""

@@ -17,7 +17,7 @@ from pymodbus.framer import FramerRTU
 from support.bus_tables import modbus_bus
 
 from daqsvc.acquisition.clock import SystemClock
-from drivers.modbus.client import ModbusClient
+from drivers.modbus.client import ModbusClient, ModbusWire
 from drivers.modbus.replies import LineLostError, ModbusCounters, NoReplyError
 from sim_hw.nodes.serial_node import PseudoTerminal
 
@@ -108,6 +108,30 @@ async def test_a_connection_that_is_closed_ends_the_request_at_once():
         with pytest.raises(LineLostError, match="has closed the connection"):
             await client.read(1, 3, 0, 3)
     assert counters.timeouts == 0
+
+
+async def test_a_connection_that_was_closed_while_nothing_was_asked_is_opened_again_if_somebody_is_there():
+    def answer_and_close(request, writer):
+        writer.write(reply(request, 7))
+        writer.close()
+
+    async def closed(client):
+        async with asyncio.timeout(10):
+            while client.connected:
+                await asyncio.sleep(0.005)
+
+    async with far_end(answer_and_close) as (client, counters):
+        for _ in range(3):
+            assert await client.read(1, 3, 0, 1) == b"\0\7"
+            await closed(client)
+        why = "has closed the connection; see whether the device has restarted"
+        gone = mock.patch.object(ModbusWire, "open", side_effect=LineLostError("nobody listens there"))
+        with gone, pytest.raises(LineLostError, match=why):
+            await client.read(1, 3, 0, 1)
+        await client.close()
+        with pytest.raises(LineLostError, match=why):  # what its owner has closed stays so
+            await client.read(1, 3, 0, 1)
+    assert (counters.idle_closes, counters.requests) == (2, 3)
 
 
 @contextlib.contextmanager

@@ -16,6 +16,7 @@ from support.modbus_layouts import count_at, in_sample, register, registers_layo
 from support.modbus_lines import Rig, options_of, ramp, responding, simulate
 
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.notice import NOTICE
 from drivers.modbus.client import ModbusClient
 from drivers.modbus.line import ModbusLine, RetryPolicy, UnitSetAsideError
 from drivers.modbus.registers import RegisterRun
@@ -213,6 +214,50 @@ def test_a_tcp_stream_that_lost_its_frames_is_opened_again(fault):
     simulate(main)
     rig.check_books("s")
     assert (rig.samples("s") == register_of(1, 3, 5)).all()
+
+
+SLOW = registers_layout(1, "holding", [register("x", 5, "uint16")])
+
+
+def test_a_device_that_closes_idle_connections_is_connected_for_each_request(caplog):
+    rig = Rig(options_of(serial=False), {"s": (SLOW, 0.04)}, clock=LoopClock())
+
+    async def main():
+        async with (
+            responding(marked_units([1]), lambda *_: PlannedReply(), serial=False) as units,
+            rig.running() as driver,
+        ):
+            await asyncio.sleep(20)
+            for _ in range(5):  # each time before the next request is due
+                for connection in list(units.active_connections.values()):
+                    connection.close()
+                await asyncio.sleep(25)
+            assert driver.link.state == "up"
+
+    with caplog.at_level(NOTICE):
+        simulate(main)
+    assert rig.indices("s").tolist() == [0, 1, 2, 3, 4, 5]
+    assert (rig.driver.link.losses, rig.driver.counters.idle_closes) == (0, 5)
+    (said,) = [one.getMessage() for one in caplog.records if "closes a connection" in one.getMessage()]
+    assert "over which nothing is asked (after 20 s); it is opened again for each request" in said
+
+
+def test_a_poll_that_was_due_when_the_line_was_lost_is_made_over_the_next_line():
+    plan = iter([PlannedReply(), PlannedReply("wrong protocol"), PlannedReply(), PlannedReply("cut off")])
+    rig = Rig(options_of(serial=False, timeout_ms=100.0), {"s": (SLOW, 0.04)}, clock=LoopClock())
+
+    async def main():
+        async with (
+            responding(marked_units([1]), lambda *_: next(plan, PlannedReply()), serial=False),
+            rig.running() as driver,
+        ):
+            await asyncio.sleep(110)
+            assert driver.link.losses == 2
+
+    simulate(main)
+    rig.check_books("s")
+    assert rig.indices("s").tolist() == [0, 1, 2, 3, 4]
+    assert rig.counters("s").samples_lost == 0
 
 
 @pytest.mark.parametrize("serial", [True, False])
