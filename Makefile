@@ -1,4 +1,5 @@
 # make demo   the whole service against a simulated machine, live in the terminal
+# make venv   daqsvc itself, as .venv/bin/daqsvc; . .venv/bin/activate puts it on the PATH of a shell
 # make test   the tests; make test ROOM=rotor those of one room, a folder of tests/
 # make test-long  the long ones: statistics over hundreds of runs, soak, fuzz; of one room likewise
 # make hil    tests on real CAN interfaces (vcan), and of the unit under systemd, in a guest kernel; as root
@@ -39,7 +40,7 @@ export OMP_NUM_THREADS ?= 1
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.cache/kernels
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-long hil check guard measure bench bench-data bench-diagnosis docs reference evaluation pictures dist deb nothing-lost soak test-wheel hooks proto lock clean
+.PHONY: help demo venv test test-long hil check guard measure bench bench-data bench-diagnosis docs reference evaluation pictures dist deb nothing-lost soak test-wheel hooks proto lock clean
 
 help:
 	@sed -n 's/^# \(make.*\)/\1/p' Makefile
@@ -55,6 +56,8 @@ $(READY): requirements-dev.lock pyproject.toml
 
 demo: $(READY)
 	@$(BIN)/daqsvc demo --snapshots build/demo --page $(ARGS)
+
+venv: $(READY)
 
 test: $(READY)
 	@$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal -m "not long" $(TESTS) $(ARGS)

@@ -2,7 +2,8 @@
 
 Sphinx finds pages that have every word. No page has every word of a message that was copied: some are
 names and numbers of this machine. And a page of the reference holds hundreds of things. Here each section is
-an entry, and so is each row of a table that has an anchor. ``site_search.js`` ranks them, in Sphinx's page.
+an entry, and so is each row of a table that has an anchor. ``search_questions.toml`` has what engineers ask
+in words that no page has. ``site_search.js`` ranks all of them, in Sphinx's page.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import ast
 import json
 import re
+import tomllib
 from collections import Counter
 from pathlib import Path
 from textwrap import shorten
@@ -18,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 from docutils import nodes
 from site_pages import ANCHOR
 from sphinx.search.en import SearchEnglish
+from sphinx.util import logging
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -26,8 +29,10 @@ if TYPE_CHECKING:
 
 SCRIPT = "site_search.js"
 INDEX = "site_search_index.js"
+QUESTIONS = Path(__file__).parent / "search_questions.toml"
 _EXCERPT = 240
 ROOT = Path(__file__).parent.parent
+_log = logging.getLogger(__name__)
 ERRORS = "daqsvc/errors/"
 FAR_AWAY = {
     "drivers/replay/can_log.py": "B43",
@@ -124,6 +129,22 @@ def _texts(tree: ast.AST) -> Iterator[str]:
             yield re.sub(r"%[-.\d]*[a-z]|\{\w*\}", "|", node.value)
 
 
+def questions(places: dict[str, int], language: SearchEnglish) -> Iterator[tuple[int, list[list[str]]]]:
+    """The entries that answer questions, each with the words of its questions.
+
+    Args:
+        places: number of each entry, by page and anchor.
+        language: to stem the words.
+    """
+    for place, asked in tomllib.loads(QUESTIONS.read_text("utf-8")).items():
+        if place not in places:
+            _log.warning("%s: no such place: %s", QUESTIONS.name, place)
+            continue
+        words = ((word.lower() for word in language.split(one)) for one in asked)
+        stems = ({language.stem(word) for word in these if word not in language.stopwords} for these in words)
+        yield places[place], [sorted(these) for these in stems]
+
+
 def _write_index(app: Sphinx, failure: Exception | None) -> None:
     """Write all entries of the site, and how often each word is in each of them."""
     if failure is not None or app.builder.format != "html":
@@ -147,6 +168,8 @@ def _write_index(app: Sphinx, failure: Exception | None) -> None:
             found.append((number, anchor, title, shorten(text, _EXCERPT, placeholder=" ...")))
     index = {"pages": pages, "titles": titles, "entries": found, "lengths": lengths, "terms": terms}
     index["messages"] = said
+    places = {f"{pages[one]}#{anchor}".rstrip("#"): number for number, (one, anchor, *_) in enumerate(found)}
+    index["questions"] = [*questions(places, language)]
     text = json.dumps(index, ensure_ascii=False, separators=(",", ":"), sort_keys=True)
     (Path(app.outdir) / "_static" / INDEX).write_text(f"const SITE_INDEX = {text};\n", encoding="utf-8")
 

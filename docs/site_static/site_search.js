@@ -25,6 +25,10 @@ const MESSAGE_WORDS = 5;
 const ERRORS = "reference/errors";
 const errorsWeight = (words) => (words.length >= MESSAGE_WORDS ? 1.5 : 0.7);
 
+/* An option is looked up by its name, with its dashes; the words of a task lead to where it is explained. */
+const OPTION = /^daqsvc-.*--/;
+const OPTION_WEIGHT = 0.5;
+
 const pageWeight = (page) => (PAGE_WEIGHTS.find(([pattern]) => pattern.test(page)) || [null, 1])[1];
 
 /* Of entries of a list, `alarms[2].sensor` is `alarms[].sensor`. */
@@ -42,7 +46,26 @@ const nameIn = (title) => {
   return new RegExp(`^${pattern}$`, "i");
 };
 
-const wordsOf = (text) => splitQuery(text.toLowerCase()).filter((word) => !stopwords.has(word));
+/* What no page has as one word, e.g. sensor_ok, is looked for by its parts. */
+const partsOf = (word) => {
+  const isKnown = Object.hasOwn(SITE_INDEX.terms, new Stemmer().stemWord(word));
+  return isKnown ? [word] : word.split("_").filter((part) => part);
+};
+
+const wordsOf = (text) =>
+  splitQuery(text.toLowerCase()).flatMap(partsOf).filter((word) => !stopwords.has(word));
+
+const stemsOf = (text) => {
+  const stemmer = new Stemmer();
+  return new Set(wordsOf(text).map((word) => stemmer.stemWord(word)));
+};
+
+/* How much a word tells: the fewer entries have it, the more. */
+const rarityOf = (word) => {
+  const { entries, terms } = SITE_INDEX;
+  const had = Object.hasOwn(terms, word) ? terms[word].length : 0;
+  return Math.log(1 + (entries.length - had + 0.5) / (had + 0.5));
+};
 
 /* What may be a name in a query, without the brackets, quotes and full stops around it. */
 const possibleNames = (query) =>
@@ -51,23 +74,51 @@ const possibleNames = (query) =>
 /* Adds to the score of each entry that has the words. */
 const rankByWords = (text, scores) => {
   const { pages, titles, entries, lengths, terms } = SITE_INDEX;
-  const stemmer = new Stemmer();
-  const stems = (text) => new Set(wordsOf(text).map((word) => stemmer.stemWord(word)));
-  const words = stems(text);
+  const words = stemsOf(text);
   const mean = lengths.reduce((sum, length) => sum + length, 0) / lengths.length;
   const weights = pages.map((page) => (page === ERRORS ? errorsWeight([...words]) : pageWeight(page)));
-  const headings = titles.map((title) => [...words].every((word) => stems(title).has(word)));
+  const headings = titles.map((title) => [...words].every((word) => stemsOf(title).has(word)));
   for (const word of words) {
     const listed = Object.hasOwn(terms, word) ? terms[word] : [];
-    const rarity = Math.log(1 + (entries.length - listed.length + 0.5) / (listed.length + 0.5));
+    const rarity = rarityOf(word);
     for (const [entry, times] of listed) {
       const [page, anchor] = entries[entry];
       const length = 1 - LENGTH_SHARE + (LENGTH_SHARE * lengths[entry]) / mean;
-      const weight = weights[page] * (!anchor && headings[page] ? HEADING_WEIGHT : 1);
+      const weight =
+        weights[page] * (!anchor && headings[page] ? HEADING_WEIGHT : 1) * (OPTION.test(anchor) ? OPTION_WEIGHT : 1);
       const score = (weight * rarity * times * (SATURATION + 1)) / (times + SATURATION * length);
       scores.set(entry, (scores.get(entry) || 0) + score);
     }
   }
+};
+
+/* A question of the list that has the words of the query, and few others, is the query. */
+const LEAST_LIKENESS = 0.3;
+const SAME_QUESTION = 0.75;
+const QUESTION_WEIGHT = 2;
+
+/* Adds to the score of each entry that answers questions like the query; the likeness of the best one. */
+const rankByQuestions = (text, scores) => {
+  const { pages, titles, entries, questions, terms } = SITE_INDEX;
+  const isAsked = new Set(questions.flatMap(([, those]) => those.flat()));
+  /* What is nowhere on the site tells nothing. */
+  const words = [...stemsOf(text)].filter((word) => isAsked.has(word) || Object.hasOwn(terms, word));
+  const sum = (words) => words.reduce((sum, word) => sum + rarityOf(word), 0);
+  const asked = sum(words);
+  let most = 0;
+  for (const [entry, those] of questions) {
+    const [page, , title] = entries[entry];
+    const known = new Set([...those.flat(), ...stemsOf(`${titles[page]} ${title}`)]);
+    const share = sum(words.filter((word) => known.has(word))) / (asked || 1);
+    const nearest = Math.max(
+      ...those.map((question) => sum(question.filter((word) => words.includes(word))) / (sum(question) || 1)),
+    );
+    const likeness = share * Math.sqrt(nearest);
+    if (likeness < LEAST_LIKENESS) continue;
+    most = Math.max(most, likeness);
+    scores.set(entry, (scores.get(entry) || 0) + QUESTION_WEIGHT * (SATURATION + 1) * asked * likeness);
+  }
+  return most;
 };
 
 /* A message that was copied has pairs of words that its text in the source has; names and figures are between them. */
@@ -122,13 +173,13 @@ const siteSearch = (typed) => {
     const [entry, score] = errors.reduce((one, other) => (other[1] > one[1] ? other : one));
     scores.set(entry, Math.max(score, NAMED / 2));
   }
-  if (splitQuery(query).length >= MESSAGE_WORDS && !QUESTION.test(query)) rankByMessages(query, scores);
+  const isQuestion = rankByQuestions(others, scores) >= SAME_QUESTION || QUESTION.test(query);
+  if (splitQuery(query).length >= MESSAGE_WORDS && !isQuestion) rankByMessages(query, scores);
   const best = Math.max(0, ...scores.values());
   const enough = best > NAMED / 4 ? 0 : best * LEAST_SHARE;
   return [...scores]
     .filter(([, score]) => score > enough)
     .sort(([one, a], [other, b]) => b - a || one - other)
-    .slice(0, MOST_RESULTS)
     .map(([entry, score]) => {
       const [page, anchor, title, excerpt] = entries[entry];
       const shown = anchor ? `${titles[page]} > ${title}` : title;
@@ -138,8 +189,19 @@ const siteSearch = (typed) => {
     });
 };
 
+/* What Sphinx shows below the heading. It counts pages, and would count only what is shown. */
+const summaryOf = (count) => {
+  if (count === 0) return "Nothing found. Try fewer words, or other ones.";
+  if (count === 1) return "1 result.";
+  return count > MOST_RESULTS ? `${count} results; the best ${MOST_RESULTS} are shown.` : `${count} results.`;
+};
+
 /* Sphinx shows the last one first. */
-Search._performSearch = (query) => siteSearch(query).reverse();
+Search._performSearch = (query) => {
+  const found = siteSearch(query);
+  Documentation.gettext = Documentation.ngettext = () => summaryOf(found.length);
+  return found.slice(0, MOST_RESULTS).reverse();
+};
 
 /* Units and single letters, as messages have them, are within many words: marking them marks nearly everything. */
 const LEAST_MARKED = 3;

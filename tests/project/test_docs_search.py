@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import re
+import tomllib
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
@@ -22,10 +23,103 @@ if TYPE_CHECKING:
 
 pytestmark = [pytest.mark.integration, pytest.mark.long, pytest.mark.sources]
 GOLDEN = ROOT / "tests" / "guard" / "golden"
+QUESTIONS = ROOT / "docs" / "search_questions.toml"
 FIRST_THREE = "query => siteSearch(query).slice(0, 3).map(([page, , anchor]) => `${page}.html${anchor}`)"
 BY_OTHERS = {"O17", "O25"}
 """Codes whose messages are put together far from where the code is named, or by a library."""
 MESSAGE = re.compile(r"^! machines/(.+ \[([A-Z]\d\d)\])$", re.MULTILINE)
+
+PLAIN = {
+    "alarm comes and goes all the time": "alarms.html#alarms-that-come-and-go",
+    "how to stop an alarm for one hour": "commands.html#commands",
+    "how do I see last week": "history.html",
+    "update software": "install.html#upgrade",
+    "stop the service": "edge-box.html",
+    "usb stick copy data": "export.html",
+    "forgot to calibrate": "calibration.html",
+    "natural frequency unknown": "calibration.html tutorials/07-calibrate",
+    "time out slow device": "modbus.html#silent-units",
+    "device closes connection": "modbus.html#errors-that-you-may-meet",
+    "clock of the box is wrong": "alarms.html#clocks-and-restarts",
+    "exception 3": "modbus.html#errors-that-you-may-meet reference/errors.html#b33-",
+    "illegal data value": "reference/errors.html#b33-",
+    "value table": "alarms.html#a-state-or-an-enum-signal",
+    "bit rate": "reference/keys-buses.html#buses-name-bitrate",
+    "baud rate": "reference/keys-buses.html#buses-name-baud",
+    "bearing number": "bearing.html#catalogue",
+    "sensor_ok": "alarms.html#alarms-that-daqsvc-adds",
+    "slow device": "modbus.html#silent-units",
+    "false alarm too many": "alarms.html#alarms-that-come-and-go",
+    "which files to back up": "install.html#upgrade",
+    "counter that wraps at 999": "serial.html#lines-of-text",
+    "alarm comes and goes": "alarms.html#alarms-that-come-and-go",
+    "my alarm keeps toggling": "alarms.html#alarms-that-come-and-go",
+    "alarm raised again and again": "alarms.html#alarms-that-come-and-go",
+    "nuisance alarms": "alarms.html#alarms-that-come-and-go",
+    "mute alarm": "commands.html#commands tutorials/02-handle",
+    "pause alarm during maintenance": "commands.html#commands tutorials/02-handle",
+    "see data of last month": "history.html",
+    "trend of yesterday": "history.html",
+    "how do I upgrade": "install.html#upgrade",
+    "restart service": "edge-box.html",
+    "start service at boot": "edge-box.html",
+    "backup": "install.html",
+    "save data to usb": "export.html",
+    "open samples in excel": "export.html",
+    "modbus exception code 2": "modbus.html#errors-that-you-may-meet reference/errors.html#b33-",
+    "slave does not answer": "modbus.html#silent-units",
+    "parity": "serial.html#the-port reference/keys-buses.html#buses-name-parity",
+    "CAN speed 500 kbit": "can.html#the-bus reference/keys-buses.html#buses-name-bitrate",
+    "send mail": "outputs.html tutorials/08-broker",
+    "status word alarm": "alarms.html#a-state-or-an-enum-signal",
+    "system time wrong": "alarms.html#clocks-and-restarts",
+    "user password page": "page.html#who-may-look",
+    "no baseline yet": "calibration.html",
+    "raw waveform of an alarm": "recorder.html",
+    "scada": "sparkplug.html",
+    "disk full": "outbox.html#when-the-disk-is-full",
+    "wrong byte order": "can.html#if-no-frames serial.html#if-no-bytes modbus.html",
+    "29 bit id": "reference/keys-streams.html#streams-name-layout-extended",
+    "multiplexed signal": "can.html#the-frames",
+    "temperature limit": "tutorials/0",
+    "shelve": "tutorials/02-handle reference/verbs.html#daqsvc-shelve commands",
+    "connect to scada": "sparkplug.html",
+    "prometheus": "reference/metrics.html",
+    "several machines one box": "several-machines.html",
+    "change alarm limit while running": "edge-box.html#reload",
+    "permission denied /dev/ttyUSB0": "serial.html#the-port",
+    "send email when alarm": "outputs.html tutorials/08-broker",
+    "acknowledge from phone": "page.html#who-may-look",
+    "python program read values": "commands.html#programs",
+    "grafana": "status.html#metrics-for-prometheus",
+    "where are the files stored": "install.html#the-package edge-box.html#account",
+    "chattering alarm": "alarms.html#alarms-that-come-and-go",
+    "what is a deadband": "reference/keys-alarms.html#alarms-deadband",
+    "status bit": "alarms.html#a-state-or-an-enum-signal",
+    "word swap": "modbus.html",
+    "sensor cable broken": "reference/errors.html",
+    "max_count": "reference/keys-streams.html#streams-name-layout-max-count",
+    "password of the broker": "mqtt.html#credentials",
+    "sampling rate too low": "reference/errors.html#f34-",
+    "one recording has one rate": "reference/errors.html#r08-",
+    "device sends too slow": "modbus.html#silent-units serial.html#if-no-bytes",
+    "extended id": "reference/keys-streams.html#streams-name-layout-extended",
+    "frames_unknown": "reference/counters.html#buses.NAME.frames_unknown",
+    "bits = [lowest, count]": "reference/keys-streams.html#streams-name-layout-channels-bits",
+    "max_gap": "reference/keys-streams.html#streams-name-layout-max-gap",
+    "velocity_rms": "reference/keys-alarms.html#alarms-measure",
+    "temperature sensor PT100": "tutorials/0",
+    "what means quality not_ok": "reference/payloads.html",
+    "alarm shelve time": "commands.html tutorials/02-handle",
+    "shaft speed changes": "order-change.html calibration.html",
+    "daqsvc command not found": "install.html#from-a-clone",
+    "mqtt login": "mqtt.html#credentials",
+    "service does not start": "edge-box.html",
+}
+"""What engineers ask in plain words, and how the addresses begin of which one must be among the first three.
+
+Some are in docs/search_questions.toml as they are here, some in other words, and some are not there at all.
+"""
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +148,39 @@ async def searched(site: Path, queries: Sequence[str]) -> list[list[str]]:
         assert found[0] == shown
         assert wrong == []
     return found
+
+
+async def test_a_question_in_plain_words_leads_to_its_page(site: Path) -> None:
+    wrong = {
+        query: found
+        for (query, wanted), found in zip(PLAIN.items(), await searched(site, [*PLAIN]), strict=True)
+        if not any(link.startswith(tuple(wanted.split())) for link in found)
+    }
+    assert wrong == {}
+
+
+async def test_the_list_of_questions_is_not_all_that_is_asked_here() -> None:
+    kept = {question for those in tomllib.loads(QUESTIONS.read_text("utf-8")).values() for question in those}
+    assert len({*PLAIN} - kept) > len(PLAIN) / 2
+
+
+async def test_the_page_states_how_many_results_there_are(site: Path) -> None:
+    async with browsing() as browser:
+        page = await (await browser.new_context()).new_page()
+
+        async def stated(query: str) -> str:
+            await page.goto(f"{(site / 'search.html').as_uri()}?q={quote(query)}")
+            await page.wait_for_function(
+                "document.querySelector('#search-results h2').innerText == 'Search Results'"
+            )
+            return await page.locator("#search-results .search-summary").inner_text()
+
+        said = await stated("alarm of a sensor")
+        count = await page.evaluate("siteSearch('alarm of a sensor').length")
+        assert count > 40
+        assert said == f"{count} results; the best 40 are shown."
+        assert await stated("frames_set_aside") != said
+        assert await stated("xyzzyx") == "Nothing found. Try fewer words, or other ones."
 
 
 async def test_letters_and_units_of_a_message_are_not_marked_in_other_words(site: Path) -> None:

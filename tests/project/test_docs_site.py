@@ -58,7 +58,16 @@ def test_the_build_fails_at_links_that_lead_nowhere_and_names_each(tmp_path: Pat
     with (docs / "history.md").open("a") as page:
         page.write("\n[a](no-page.md), [b](alarms.md#no-heading), [c](#not-here), [d](../config/no.toml)\n")
     (docs / "forgotten.md").write_text("# In no list\n")
+    with (docs / "search_questions.toml").open("a") as questions:
+        questions.write('"alarms#no-such-section" = ["a question"]\n')
     made = make_docs(tree)
     assert made.returncode != 0
-    for what in ("no-page.md", "no-heading", "not-here", "no.toml", "forgotten.md"):
+    for what in (
+        "no such place: alarms#no-such-section",
+        "no-page.md",
+        "no-heading",
+        "not-here",
+        "no.toml",
+        "forgotten.md",
+    ):
         assert what in made.stderr, made.stderr

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+import tomllib
 from typing import TYPE_CHECKING
 
 import pytest
@@ -35,3 +36,16 @@ def test_a_box_has_its_first_machine_in_the_three_commands_that_both_guides_give
     assert len(install) == 3
     readme = [block for blocks in shell_blocks("README.md", ROOT).values() for block in blocks]
     assert ["make deb", *install] in readme
+
+
+def test_a_clone_gets_daqsvc_on_the_path_as_the_guide_and_the_readme_state() -> None:
+    [[setup, activate, _]] = shell_blocks("install.md")["From a clone"]
+    assert (setup, activate) == ("make venv", ". .venv/bin/activate")
+    readme = (ROOT / "README.md").read_text("utf-8")
+    assert all(f"`{command}`" in readme for command in (setup, activate))
+    # Nothing but the environment is set up, and there daqsvc is.
+    command = [*setup.split(), "--dry-run", "--old-file=.venv/.ready"]
+    made = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True)
+    assert "Nothing to be done" in made.stdout
+    daqsvc = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["scripts"]["daqsvc"]
+    assert daqsvc == "daqsvc.cli:main"

@@ -62,6 +62,7 @@ ALLOWED = {
     "/tmp/try/bin/pip install --require-hashes -r requirements.lock": PIP,  # noqa: S108 - as it is shown
     "/tmp/try/bin/pip install --no-deps 'dist/*.whl'": PIP,  # noqa: S108
     ".venv/bin/pip install -e /path/to/package": "tests/project/test_example_wheels.py",
+    ". .venv/bin/activate": INSTALL,
     "git clone URL": RELEASE,
     "git commit -am 'Release 0.1.0' -m 'What it is for, in a sentence or two.'": RELEASE,
     "git tag -a v0.1.0 -m 'daqsvc 0.1.0'": RELEASE,
