@@ -133,9 +133,9 @@ class BusQuestions(ABC):
         waveform = answers["rate"] >= WAVEFORM_HZ
         return by_name(channel) or ("accelerometer" if waveform else "trend"), unit_by_name(channel)
 
-    def in_volts(self, answers: Answers) -> bool:
-        """Whether the samples of a sensor are volts, as a rule."""
-        del answers
+    def in_volts(self, answers: Answers, channel: str) -> bool:
+        """Whether the samples of the sensor on a channel are volts, as a rule."""
+        del answers, channel
         return False
 
     def beside(self, file: str) -> tuple[str, str]:

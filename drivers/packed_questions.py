@@ -117,7 +117,7 @@ def guess(answers: Answers, channel: str) -> tuple[str, str | None]:
 
 
 def in_volts(answers: Answers) -> bool:
-    """See `BusQuestions.in_volts`."""
+    """See `BusQuestions.in_volts`; all channels have one scale."""
     return bool(abs(answers["scale"]) < 0.5)  # no converter is so coarse
 
 

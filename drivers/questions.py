@@ -19,6 +19,8 @@ Answers = dict[str, Any]
 
 NONE = "none"
 LONGEST_NAME = 64
+LONGEST_LINE = 256
+"""Characters of a name, and of any other text of a machine file."""
 SENSOR = "sensor"
 """First part of the keys that belong to one channel: ``sensor.CHANNEL.TOPIC``."""
 
@@ -95,6 +97,8 @@ def line(text: str) -> str:
     """Any text on one line."""
     if not text.strip() or not text.isprintable():
         raise ValueError("it must be one line of plain text")
+    if len(text.strip()) > LONGEST_LINE:
+        raise ValueError(f"it has {len(text.strip())} characters; {LONGEST_LINE} are allowed: shorten it")
     return text.strip()
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from drivers import packed_questions as packed
 from drivers import questions as q
 from drivers.bus_questions import BUS, BusQuestions, Heard, by_name, is_count
-from drivers.can.sniff import CanSniffer, of_one_channel
+from drivers.can.sniff import CanSniffer, number_of, numbered, of_one_channel
 from drivers.questions import NONE, Answers, Question, Topic
 from drivers.sniffing import WAVEFORM_HZ, NothingFoundError, SniffError, sniffed, usual_rate
 from drivers.toml_lines import Hexadecimal, array, behind, entry, toml
@@ -154,8 +154,9 @@ class PackedQuestions(_CanQuestions):
         """See `BusQuestions.guess`."""
         return packed.guess(answers, channel)
 
-    def in_volts(self, answers: Answers) -> bool:
+    def in_volts(self, answers: Answers, channel: str) -> bool:
         """See `BusQuestions.in_volts`."""
+        del channel
         return packed.in_volts(answers)
 
     def proposals(self, found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
@@ -244,6 +245,11 @@ class DbcQuestions(_CanQuestions):
             "states. Of a multiplexed message take the signals of one page: the other pages get separate "
             "streams.",
         ),
+        "consecutive": Topic(
+            "Are numbered signals such as AX_0, AX_1 consecutive samples of one channel?",
+            "yes: the device measures faster than it sends, and puts several samples into a frame, the "
+            "oldest first. no: they are of separate sensors, as Temp1, Temp2 may be.",
+        ),
     }
 
     def questions(self, answers: Answers, folder: Path) -> Iterator[Question]:
@@ -277,6 +283,14 @@ class DbcQuestions(_CanQuestions):
             ", ".join(measured or rest[:1]),
             choices=_shown(by_page),
         )
+        if samples := _samples_of_one(answers["signals"]):
+            together = "; ".join(f"{stem}: {', '.join(names)}" for stem, names in samples.items())
+            yield self.ask(
+                "consecutive",
+                q.yes_no,
+                "yes" if _most_likely_samples(message.signals, answers["signals"]) else "no",
+                choices={"yes": together, "no": f"{len(answers['signals'])} channels"},
+            )
 
     listens_behind = "dbc"
 
@@ -305,7 +319,8 @@ class DbcQuestions(_CanQuestions):
         if len(rates) == 1 and rates[0]:
             measured = [one for one in chosen["signals"] if one["signal"] in answers.get("signals", ())]
             share = min((one["frames"] for one in measured), default=chosen["frames"]) / chosen["frames"]
-            proposed["rate"] = f"{usual_rate(rates[0] * share):g}"
+            in_frame = self._samples_in_frame(answers) if "signals" in answers else 1
+            proposed["rate"] = f"{usual_rate(rates[0] * share * in_frame):g}"
         return proposed
 
     def _messages(self, answers: Answers) -> dict[str, Message]:
@@ -313,26 +328,36 @@ class DbcQuestions(_CanQuestions):
 
     def channels(self, answers: Answers) -> tuple[str, ...]:
         """See `BusQuestions.channels`."""
-        return tuple(signal[: q.LONGEST_NAME] for signal in answers["signals"])
+        return tuple(self._by_channel(answers))
+
+    def _by_channel(self, answers: Answers) -> dict[str, Sequence[str]]:
+        """Signals of each channel."""
+        if answers.get("consecutive"):
+            samples = _samples_of_one(answers["signals"])
+            return {stem[: q.LONGEST_NAME]: names for stem, names in samples.items()}
+        return {signal[: q.LONGEST_NAME]: [signal] for signal in answers["signals"]}
+
+    def _samples_in_frame(self, answers: Answers) -> int:
+        return len(next(iter(self._by_channel(answers).values())))
 
     def rate_hz(self, answers: Answers) -> float:
         """See `BusQuestions.rate_hz`."""
         message = self._messages(answers)[answers["message"]]
         cycle_ms: float | None = message.cycle_time
-        return round(1000.0 / (cycle_ms or 1.0) * _share(message, answers["signals"]), 6)
+        frames_hz = 1000.0 / (cycle_ms or 1.0) * _share(message, answers["signals"])
+        return round(frames_hz * self._samples_in_frame(answers), 6)
 
     def guess(self, answers: Answers, channel: str) -> tuple[str, str | None]:
         """See `BusQuestions.guess`."""
         unit = self._units(answers).get(channel)
-        kind = {"g": "accelerometer", "m/s2": "accelerometer", "mm/s": "velocity"}.get(unit or "")
-        kind = "proximity" if unit in {"um", "mm", "mil"} else kind
+        kind = _KINDS.get(unit or "")
         if answers["rate"] < WAVEFORM_HZ:
             kind = "trend"
         return kind or by_name(channel) or "trend", unit
 
-    def in_volts(self, answers: Answers) -> bool:
+    def in_volts(self, answers: Answers, channel: str) -> bool:
         """See `BusQuestions.in_volts`."""
-        return "V" in self._units(answers).values()
+        return self._units(answers).get(channel) == "V"
 
     def _other_pages(self, answers: Answers) -> Iterator[str]:
         """Comments on the pages of a multiplexed message that the stream does not read."""
@@ -344,16 +369,17 @@ class DbcQuestions(_CanQuestions):
             yield from (f"#   {page} {names}".rstrip() for page, names in _shown(others, ":").items())
 
     def _units(self, answers: Answers) -> dict[str, str]:
-        from daqsvc.settings.units import unit_of  # noqa: PLC0415 - brings the settings
-
-        message = self._messages(answers)[answers["message"]]
-        known = {one.name[: q.LONGEST_NAME]: unit_of(one.unit or "") for one in message.signals}
-        return {name: unit.name for name, unit in known.items() if unit is not None}
+        units = _unit_names(self._messages(answers)[answers["message"]].signals, answers["signals"])
+        return {
+            name: units[first] for name, (first, *_) in self._by_channel(answers).items() if first in units
+        }
 
     def tables(self, answers: Answers) -> Iterator[str]:
         """See `BusQuestions.tables`."""
         yield from self._bus(answers)
-        yield from self.stream(answers, "samples a second of each channel, here one a frame")
+        in_frame = self._samples_in_frame(answers)
+        many = "one" if in_frame == 1 else f"{in_frame}"
+        yield from self.stream(answers, f"samples a second of each channel, here {many} a frame")
         yield entry("dbc", answers["dbc"], "relative to this file; where signals lie, scale, unit")
         yield entry("message", answers["message"])
         if answers["counter"] is None:
@@ -361,10 +387,11 @@ class DbcQuestions(_CanQuestions):
         else:
             counter = toml({"signal": answers["counter"], "counts": "frames"})
             yield behind(f"counter = {counter}", "grows by 1 with each frame: losses are counted by it")
-        yield from of_one_channel(answers["signals"])
+        if not answers.get("consecutive"):
+            yield from of_one_channel(answers["signals"])
         yield from self._other_pages(answers)
-        named = zip(self.channels(answers), answers["signals"], strict=True)
-        yield from array("channels", [{"name": name, "signals": [signal]} for name, signal in named])
+        channels = self._by_channel(answers).items()
+        yield from array("channels", [{"name": name, "signals": [*signals]} for name, signals in channels])
 
 
 def _dbc_file(folder: Path, text: str) -> str:
@@ -446,12 +473,55 @@ def _of_all_pages(counter: Any) -> str:
     return "" if counter.multiplexer_ids else "; on all pages: fits if it counts each page by itself"
 
 
-def _likely(messages: Mapping[str, Message]) -> str:
-    """The message that most likely carries samples: with a counter, and with numbers that have units."""
+def _samples_of_one(signals: Sequence[str]) -> dict[str, list[str]]:
+    """Signals that may be samples of one channel, by its name; none if a stream cannot read all as such."""
+    found = numbered(signals)
+    lengths = {len(names) for names in found.values()}
+    return found if len(lengths) == 1 and sum(map(len, found.values())) == len(signals) else {}
 
-    def score(message: Message) -> tuple[bool, int]:
+
+_KINDS = {
+    "g": "accelerometer",
+    "m/s2": "accelerometer",
+    "mm/s": "velocity",
+    **dict.fromkeys(("um", "mm", "mil"), "proximity"),
+}
+"""Sensors by the unit of their samples."""
+
+
+def _most_likely_samples(signals: Iterable[Any], names: Sequence[str]) -> list[str]:
+    """Those of the names that count from 0, and are of vibration: hardly of separate sensors."""
+    units = _unit_names(signals, names)
+    found = {
+        stem: of_one
+        for stem, of_one in numbered(names).items()
+        if number_of(of_one[0]) == 0 and all(units.get(name) in _KINDS for name in of_one)
+    }
+    return [name for name in names if any(name in of_one for of_one in found.values())]
+
+
+def _unit_names(signals: Iterable[Any], names: Iterable[str]) -> dict[str, str]:
+    """Units of the signals of these names, as far as they are known, as machine files write them."""
+    from daqsvc.settings.units import unit_of  # noqa: PLC0415 - brings the settings
+
+    chosen = set(names)
+    known = {one.name: unit_of(one.unit or "") for one in signals if one.name in chosen}
+    return {name: unit.name for name, unit in known.items() if unit is not None}
+
+
+def _likely(messages: Mapping[str, Message]) -> str:
+    """The message that most likely carries samples: of vibration, with a counter, of numbers with units."""
+
+    def score(message: Message) -> tuple[bool, bool, bool, int]:
+        units = _unit_names(message.signals, [one.name for one in message.signals])
+        vibration = any(unit in _KINDS for unit in units.values())
         counted = any(is_count(one.name) for one in message.signals)
-        return counted, sum(bool(one.unit) for one in message.signals)
+        return (
+            vibration,
+            counted,
+            not message.is_multiplexed(),
+            sum(bool(one.unit) for one in message.signals),
+        )
 
     return max(messages, key=lambda name: score(messages[name]))
 
@@ -472,7 +542,7 @@ def _likely_measured(signals: Sequence[Any]) -> list[str]:
             page.append(one)
     for likely in (always, page):
         if found := [one.name for one in likely if one.unit]:
-            return found
+            return _most_likely_samples(signals, found) or found
     return [one.name for one in (always or page)[:1]]
 
 

@@ -577,16 +577,29 @@ def _why_left_out(signal: SignalTraffic) -> str:
 
 
 def of_one_channel(signals: Sequence[str]) -> Iterator[str]:
-    """A comment on signals that may be samples of one channel in a frame: names ending in 0, 1 and so on."""
+    """A comment on signals that may be samples of one channel in a frame."""
+    for stem, of_one in numbered(signals).items():
+        channel = f"{{ name = {quoted(stem)}, signals = [{', '.join(map(quoted, of_one))}] }}"
+        yield f"# If these are samples of one channel: {channel}, and {len(of_one)} times the rate."
+
+
+def numbered(signals: Sequence[str]) -> dict[str, list[str]]:
+    """Signals whose names differ in a last 0, 1 and so on only, or 1, 2, by what they have in common."""
     stems: dict[str, list[str]] = {}
     for name in signals:
         if match := re.fullmatch(r"(.*[^0-9_])_?(\d+)", name):
             stems.setdefault(match[1], []).append(name)
-    for stem, of_one in stems.items():
-        first, *_ = numbers = [int(re.sub(r".*[^0-9]", "", name)) for name in of_one]
-        if len(of_one) > 1 and first < 2 and numbers == list(range(first, first + len(numbers))):
-            channel = f"{{ name = {quoted(stem)}, signals = [{', '.join(map(quoted, of_one))}] }}"
-            yield f"# If these are samples of one channel: {channel}, and {len(of_one)} times the rate."
+    return {stem: names for stem, names in stems.items() if len(names) > 1 and _in_a_row(names)}
+
+
+def _in_a_row(names: Sequence[str]) -> bool:
+    first, *_ = numbers = [number_of(name) for name in names]
+    return first < 2 and numbers == list(range(first, first + len(numbers)))
+
+
+def number_of(name: str) -> int:
+    """The number that a name ends in."""
+    return int(re.sub(r".*[^0-9]", "", name))
 
 
 def _id(frame_id: int, *, extended: bool) -> str:

@@ -146,8 +146,9 @@ class SerialQuestions(BusQuestions):
         # A column without a name may be anything: limits of vibration are not for it.
         return kind, "1" if unit is None and _UNNAMED.fullmatch(channel) else unit
 
-    def in_volts(self, answers: Answers) -> bool:
+    def in_volts(self, answers: Answers, channel: str) -> bool:
         """See `BusQuestions.in_volts`."""
+        del channel
         return answers["framing"] != "lines" and packed.in_volts(answers)
 
     def rate_hz(self, answers: Answers) -> float:

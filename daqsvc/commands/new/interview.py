@@ -204,7 +204,12 @@ def refusal(answers: Answers, file: Path) -> str | None:
     try:
         checked(machine_text(complete, file.name), file)
     except MachineFileError as error:
-        problem = error.problems[0]
+        of_sensors = any(key.startswith(f"{SENSOR}.") for key in answers) or complete.keys() == answers.keys()
+        # Of a sensor nothing has been answered yet: whoever is asked can still do so as it must be.
+        known = [one for one in error.problems if of_sensors or not one.key.startswith("sensors")]
+        if not known:
+            return None
+        problem = known[0]
         subject = f"{problem.key} = {problem.value}" if problem.value else problem.key
         return f"{subject}: {problem.message}. Remedy: {problem.remedy}"
     except AssemblyError as error:

@@ -131,7 +131,7 @@ def _of_channel(answers: Answers, channel: str) -> Iterator[Question]:
 def _of_waveform(answers: Answers, channel: str, ask: Any) -> Iterator[Question]:
     kind = answers[sensor_key(channel, "type")]
     unit = _FIXED_UNITS.get(kind) or answers[sensor_key(channel, "unit")]
-    volts = bus_of(answers).in_volts(answers)
+    volts = bus_of(answers).in_volts(answers, channel)
     yield ask("sensitivity", q.number_or_none, f"{_SENSITIVITY[unit]:g}" if volts else NONE)
     if kind == "proximity":
         probes = [one for one in sensors(answers) if one.type == "proximity"]

@@ -309,7 +309,7 @@ def test_a_counter_of_all_pages_is_warned_of(tmp_path: Path, capsys: pytest.Capt
 def test_new_points_out_signals_that_may_be_samples_of_one_channel(tmp_path: Path) -> None:
     dbc, file = tmp_path / "fan.dbc", tmp_path / "new.toml"
     dbc.write_text(FAN)
-    assert main(["new", f"{file}", "--yes", "--bus=can-dbc", f"--dbc={dbc}"]) == 0
+    assert main(["new", f"{file}", "--yes", "--bus=can-dbc", f"--dbc={dbc}", "--consecutive=no"]) == 0
     one = '{ name = "VibDE", signals = ["VibDE_0", "VibDE_1"] }, and 2 times the rate'
     assert f"# If these are samples of one channel: {one}" in file.read_text("utf-8")
 

@@ -1,0 +1,138 @@
+"""What ``daqsvc new`` makes of a DBC file."""
+
+from __future__ import annotations
+
+import tomllib
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from daqsvc.cli import main
+from daqsvc.commands.new.interview import Given, conduct, take
+from daqsvc.commands.new.machine_text import questions
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from drivers.questions import Answers, Question
+
+pytestmark = pytest.mark.integration
+GEARBOX = """VERSION ""
+BU_: A
+BO_ 801 Slow: 8 A
+ SG_ Page M : 0|4@1+ (1,0) [0|0] "" A
+ SG_ SlowCount : 4|4@1+ (1,0) [0|0] "" A
+ SG_ OilTemp m0 : 8|16@1- (0.1,0) [0|0] "degC" A
+ SG_ OilPress m0 : 24|16@1+ (0.01,0) [0|0] "bar" A
+ SG_ ShaftSpeed m1 : 8|16@1+ (0.25,0) [0|0] "rpm" A
+ SG_ MotorCurrent m1 : 24|12@1- (0.1,0) [0|0] "A" A
+ SG_ Hours m2 : 16|32@1+ (0.1,0) [0|0] "h" A
+BO_ 800 Vibration: 8 A
+ SG_ Count : 0|4@1+ (1,0) [0|0] "" A
+ SG_ AX_0 : 8|12@1- (0.002,0) [0|0] "g" A
+ SG_ AY_0 : 20|12@1- (0.002,0) [0|0] "g" A
+ SG_ AX_1 : 32|12@1- (0.002,0) [0|0] "g" A
+ SG_ AY_1 : 44|12@1- (0.002,0) [0|0] "g" A
+ SG_ Supply : 56|8@1+ (0.2,0) [0|0] "V" A
+BA_DEF_ BO_ "GenMsgCycleTime" INT 0 10000;
+BA_ "GenMsgCycleTime" BO_ 800 2;
+"""
+"""Two axes with two samples each in a frame, beside a supply voltage; a slow message that is multiplexed."""
+
+
+def new(folder: Path, dbc: str, *more: str) -> dict[str, Any]:
+    """The tables of the file that is written for a DBC file."""
+    (folder / "device.dbc").write_text(dbc)
+    file = folder / "new.toml"
+    given = ["--yes", "--overwrite", "--bus=can-dbc", f"--dbc={folder / 'device.dbc'}", *more]
+    assert main(["new", f"{file}", *given]) == 0
+    assert main(["check", f"{file}"]) == 0
+    return tomllib.loads(file.read_text("utf-8"))
+
+
+def layout_of(tables: dict[str, Any]) -> dict[str, Any]:
+    [stream] = tables["streams"].values()
+    return stream["layout"] | {"rate_hz": stream["rate_hz"]}
+
+
+@pytest.mark.parametrize("signals", ["AX_0, AY_0", "AX_0, Supply"])
+def test_a_supply_voltage_makes_no_volts_of_the_other_signals(tmp_path: Path, signals: str) -> None:
+    tables = new(tmp_path, GEARBOX, f"--signals={signals}")
+    kinds = [(one["type"], one["unit"]) for one in tables["sensors"]]
+    assert kinds == [("accelerometer", "g"), *{"Supply": [("trend", "V")]}.get(signals[6:], kinds[:1])]
+    assert not any("sensitivity_mv_per_unit" in one for one in tables["sensors"])
+
+
+def test_the_message_of_vibration_is_proposed_and_its_samples_are_of_one_channel(tmp_path: Path) -> None:
+    layout = layout_of(new(tmp_path, GEARBOX))
+    assert layout["message"] == "Vibration"
+    assert layout["channels"] == [
+        {"name": "AX", "signals": ["AX_0", "AX_1"]},
+        {"name": "AY", "signals": ["AY_0", "AY_1"]},
+    ]
+    assert layout["rate_hz"] == 1000.0  # 500 frames a second
+
+
+@pytest.mark.parametrize(
+    ("dbc", "likely"),
+    [
+        (GEARBOX, "yes"),
+        (GEARBOX.replace("_1", "_2").replace("_0", "_1"), "no"),  # two bearings have such names, too
+        (GEARBOX.replace('"g"', '"degC"'), "no"),
+    ],
+)
+def test_whether_samples_are_of_one_channel_is_asked(tmp_path: Path, dbc: str, likely: str) -> None:
+    (tmp_path / "device.dbc").write_text(dbc)
+    shown: dict[str, Question] = {}
+
+    def ask(question: Question) -> str:
+        shown[question.key] = question
+        return question.default or ""
+
+    signals = ", ".join(name for name in dbc.split() if name.startswith(("AX_", "AY_")))
+    given = {
+        "bus": "can-dbc",
+        "dbc": "device.dbc",
+        "message": "Vibration",
+        "signals": signals,
+        "limits": "none",
+    }
+    answers = conduct(tmp_path / "new.toml", Given(given, defaults=False), ask, print)
+    assert shown["consecutive"].default == likely
+    assert answers["consecutive"] == (likely == "yes")
+    assert len([key for key in answers if key.endswith(".type")]) == (2 if likely == "yes" else 4)
+
+
+def test_it_is_not_asked_where_one_stream_could_not_read_them_so(tmp_path: Path) -> None:
+    layout = layout_of(new(tmp_path, GEARBOX, "--signals=AX_0, AX_1, Supply"))
+    assert [one["name"] for one in layout["channels"]] == ["AX_0", "AX_1", "Supply"]
+    assert layout["rate_hz"] == 500.0
+
+
+def test_an_answer_is_not_refused_for_a_sensor_that_was_not_asked_about(tmp_path: Path) -> None:
+    """The default type of this one does not fit its unit: there another can be taken, here nothing."""
+    file, dbc = tmp_path / "new.toml", GEARBOX.replace("AX_0", "Accel").replace('"g"', '"mA"')
+    (tmp_path / "device.dbc").write_text(dbc)
+    answers: Answers = {}
+    texts = {"bus": "can-dbc", "dbc": "device.dbc", "message": "Vibration", "signals": "Accel"}
+    for question in questions(answers, tmp_path):
+        refused = take(question, texts.get(question.key, question.default or ""), answers, file)
+        if question.key == "sensor.Accel.type":
+            assert refused is not None
+            assert "sensors[0].unit" in refused
+            assert take(question, "trend", answers, file) is None
+        else:
+            assert refused is None, question.key
+    assert answers["sensor.Accel.unit"] == "mA"
+
+
+def test_a_name_that_is_too_long_is_refused_at_its_own_question(tmp_path: Path) -> None:
+    answers: Answers = {}
+    for question in questions(answers, tmp_path):
+        if question.key == "name":
+            refused = take(question, "x" * 257, answers, tmp_path / "new.toml")
+            assert refused == "it has 257 characters; 256 are allowed: shorten it"
+            break
+        assert take(question, "can-dbc", answers, tmp_path / "new.toml") is None
+    tables = new(tmp_path, GEARBOX, f"--name={'x' * 256}")
+    assert len(tables["machine"]["description"]) == 256
