@@ -72,7 +72,8 @@ class DecodedBatch:
     Attributes:
         frames: decoded frames by stream.
         notes: what to add to which of the bus's counters.
-        unknown: frames by unknown id, in words.
+        unknown: frames by unknown id, in words, or by page where streams read other pages of a message.
+        pages_of: of those that are a page of a multiplexer, which streams read other pages of that message.
         wrong_length: frames by stream, and the length of the last of them.
         malformed: what the first piece was that should have been a frame, and why it is none; empty if there
             was none, or it was reported before.
@@ -86,6 +87,7 @@ class DecodedBatch:
     frames: dict[str, DecodedFrames] = field(default_factory=dict)
     notes: Counter[str] = field(default_factory=Counter)
     unknown: Counter[str] = field(default_factory=Counter)
+    pages_of: dict[str, Sequence[str]] = field(default_factory=dict)
     wrong_length: dict[str, tuple[int, int]] = field(default_factory=dict)
     malformed: str = ""
     remedy: str = ""
@@ -302,6 +304,27 @@ class FrameLayout:
         for group, values in self._selector_groups:
             chosen &= np.isin(group.read(payloads)[:, 0], values)
         return chosen
+
+    def pages(self, payloads: Payloads) -> Counter[str]:
+        """How many frames have each page, in words such as ``Page 1``; of a page within a page, both.
+
+        Args:
+            payloads: uint8 ``[n, length]``, of a layout with `selectors`.
+        """
+        values = np.stack([group.read(payloads)[:, 0] for group, _ in self._selector_groups], axis=1)
+        found: Counter[str] = Counter()
+        for row, count in zip(*np.unique(values, axis=0, return_counts=True), strict=True):
+            found[self._page_in_words(row.tolist())] += int(count)
+        return found
+
+    def _page_in_words(self, values: Sequence[float]) -> str:
+        parts = []
+        # The innermost comes first, and means something only on the pages of those around it.
+        for selector, value in reversed(list(zip(self.selectors, values, strict=True))):
+            parts.append(f"{selector.name} {int(value)}")
+            if value not in selector.values:
+                break
+        return ", ".join(parts)
 
     def _crc(self, payloads: Payloads) -> NDArray[np.uint16]:
         assert self.crc_byte is not None  # noqa: S101 - callers ask only where there is one

@@ -169,10 +169,9 @@ class FrameDemultiplexer:
             takers = [k for k, match in enumerate(self._matches) if frame_id in match]
             if not takers:
                 decoded.note("frames_unknown", len(rows))
-                decoded.unknown[_id_in_words(frame_id)] = len(rows)
-            elif pageless := self._on_no_page(takers, batch, rows):
-                decoded.note("frames_unknown", pageless)
-                decoded.unknown[f"{_id_in_words(frame_id)}, a page of no stream"] = pageless
+                decoded.unknown[id_in_words(frame_id)] = len(rows)
+            else:
+                self._note_unread_pages(takers, frame_id, batch, rows, decoded)
             for k in takers:
                 chosen.setdefault(k, []).append(rows)
         for k, groups in chosen.items():
@@ -180,16 +179,30 @@ class FrameDemultiplexer:
             self._decode(self._specs[k], batch, rows, decoded)
         return decoded
 
-    def _on_no_page(self, takers: Sequence[int], batch: CanBatch, rows: NDArray[np.intp]) -> int:
-        """How many of the frames no stream has, though they have the streams' id: pages of a multiplexer."""
+    def _note_unread_pages(
+        self,
+        takers: Sequence[int],
+        frame_id: int,
+        batch: CanBatch,
+        rows: NDArray[np.intp],
+        decoded: DecodedBatch,
+    ) -> None:
+        """Note frames that no stream has, though they have the streams' id: pages of a multiplexer."""
         left = rows
         for k in takers:
             layout = self._specs[k].layout
             if not layout.selectors:
-                return 0
+                return
             left = left[batch.lengths[left] == layout.length]
             left = left[~layout.selects(batch.data[left, : layout.length])]
-        return len(left)
+        if not len(left):
+            return
+        decoded.note("frames_unknown", len(left))
+        specs = [self._specs[k] for k in takers]
+        layout, streams = max((s.layout for s in specs), key=_depth), [spec.name for spec in specs]
+        for page, count in layout.pages(batch.data[left, : layout.length]).items():
+            name = f"{id_in_words(frame_id)}, {page}"
+            decoded.unknown[name], decoded.pages_of[name] = count, streams
 
     def _decode(
         self, spec: StreamSpec[FrameLayout], batch: CanBatch, rows: NDArray[np.intp], decoded: DecodedBatch
@@ -222,7 +235,16 @@ def by_id(ids: NDArray[np.uint32]) -> Iterator[tuple[int, NDArray[np.intp]]]:
         yield frame_id, rows
 
 
-def _id_in_words(frame_id: int) -> str:
+def _depth(layout: FrameLayout) -> int:
+    return len(layout.selectors)
+
+
+def id_in_words(frame_id: int) -> str:
+    """An id as people read it, e.g. ``0x7ff (11 bit)``.
+
+    Args:
+        frame_id: with its flags, as in `CanBatch`.
+    """
     if frame_id & EXTENDED:
         return f"{frame_id & EXTENDED_ID:#x} (29 bit)"
     return f"{frame_id & STANDARD_ID:#x} (11 bit)"

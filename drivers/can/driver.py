@@ -43,7 +43,7 @@ from drivers.reconnect import (
 from drivers.stream_driver import assembler_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from daqsvc.acquisition.assembler import StreamCounters
     from daqsvc.acquisition.timebase import TimeBaseState
@@ -307,7 +307,7 @@ class CanDriver:
             self._count_errors(ErrorCounts(state="error-active"))
         self._is_fresh &= not (batch.errors or batch.data_frames)
         for name, count in batch.unknown.items():
-            self._count_unknown(name, count)
+            self._count_unknown(name, count, batch.pages_of.get(name, ()))
         for stream, (count, length) in batch.wrong_length.items():
             self._count_wrong_length(stream, count, length)
         for stream, frames in batch.frames.items():
@@ -348,11 +348,21 @@ class CanDriver:
             f"`ip link set {self._bus.channel} type can restart`"
         )
 
-    def _count_unknown(self, name: str, count: int) -> None:
-        self._faults.heard_other(name)
+    def _count_unknown(self, name: str, count: int, pages_of: Sequence[str]) -> None:
+        self._faults.heard_other(name, pages_of)
         ids = self.counters.unknown_ids
         if name in ids or len(ids) < REMEMBERED_IDS:
             ids[name] = ids.get(name, 0) + count
+        if pages_of:
+            self._say_once(
+                "unread page",
+                NO_FRAME,
+                "%s carries pages of a multiplexed message that no stream reads, such as %s; they are "
+                "counted by id and page",
+                self.link.name,
+                name,
+            )
+            return
         self._say_once(
             "unknown id",
             NO_FRAME,

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from daqsvc.acquisition.clock import NS_PER_S
+from drivers.can.batches import EXTENDED, id_in_words
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -33,15 +34,24 @@ class StreamFaults(Mapping[str, str]):
         self._specs = {spec.name: spec for spec in specs}
         self._clock = clock
         self._others_ns: dict[str, int] = {}
+        self._other_pages: dict[str, Sequence[str]] = {}
+        self._heard_ns: dict[str, int] = {}
         self._wrong_length: dict[str, int] = {}
 
     def heard(self, stream: str) -> None:
         """Frames of a stream have come that can be read."""
+        self._heard_ns[stream] = self._clock.monotonic_ns()
         self._wrong_length.pop(stream, None)
 
-    def heard_other(self, frame_id: str) -> None:
-        """Frames have come that no stream has; their id in words."""
-        self._others_ns[frame_id] = self._clock.monotonic_ns()
+    def heard_other(self, name: str, pages_of: Sequence[str] = ()) -> None:
+        """Frames have come that no stream has; their id in words.
+
+        Args:
+            name: the id, with the page if some page of this message is read.
+            pages_of: the streams that read other pages of this message.
+        """
+        self._others_ns[name] = self._clock.monotonic_ns()
+        self._other_pages[name] = pages_of
 
     def has_wrong_length(self, stream: str, length: int) -> None:
         """Frames with the id of a stream have come, of another length in bytes."""
@@ -54,19 +64,35 @@ class StreamFaults(Mapping[str, str]):
                 f"its frames {spec.layout.frame_id:#x} have {length} bytes, the layout {spec.layout.length}; "
                 "correct the layout"
             )
-        recent_ns = self._clock.monotonic_ns() - RECENT_NS
-        others = [name for name, at_ns in self._others_ns.items() if at_ns >= recent_ns]
+        others = self._come_without(spec)
         if not others:
             raise KeyError(stream)
-        named = ", ".join(others[:MOST_NAMED])
-        more = f" and {len(others) - MOST_NAMED} more" if len(others) > MOST_NAMED else ""
+        pages = [name for name in others if stream in self._other_pages[name]]
+        if pages:
+            return (
+                f"only other pages of its message come on {self._bus}: {_listed(pages)}; compare the DBC "
+                "file with the manual of the device"
+            )
         return (
-            f"the bus works, as other frames come on {self._bus}: {named}{more}; compare the id "
-            f"{spec.layout.frame_id:#x}, or check the device"
+            f"the bus works, as other frames come on {self._bus}: {_listed(others)}; compare the id "
+            f"{id_in_words(spec.layout.frame_id | EXTENDED * spec.layout.extended)}, or check the device"
         )
+
+    def _come_without(self, spec: StreamSpec[FrameLayout]) -> list[str]:
+        """What comes though frames of a stream are missing, and not just came before the bus fell silent."""
+        since_ns = self._clock.monotonic_ns() - RECENT_NS
+        if spec.name in self._heard_ns:
+            missing_ns = int(spec.layout.samples_per_frame / spec.rate_hz * NS_PER_S) + NS_PER_S
+            since_ns = max(since_ns, self._heard_ns[spec.name] + missing_ns)
+        return [name for name, at_ns in self._others_ns.items() if at_ns >= since_ns]
 
     def __iter__(self) -> Iterator[str]:
         return (stream for stream in self._specs if self.get(stream) is not None)
 
     def __len__(self) -> int:
         return sum(1 for _ in self)
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    return f"{', '.join(names[:MOST_NAMED])}{more}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import can
@@ -16,7 +17,8 @@ from support.waiting import eventually
 from daqsvc.notice import NOTICE
 from drivers.base import BusPort, DeviceAbsentError, StreamSpec
 from drivers.can.driver import CanDriver
-from drivers.frames import FrameLayout
+from drivers.fields import Field
+from drivers.frames import FrameLayout, Selector
 from sim_hw.bus_socket_hub import overflow_message
 
 if TYPE_CHECKING:
@@ -135,7 +137,7 @@ async def test_a_silent_stream_says_what_comes_in_its_place() -> None:
         await eventually(lambda: driver.counters.frames_unknown == 2)
         assert driver.link.why_silent("shaft") == (
             "the bus works, as other frames come on can0: 0x320 (11 bit), 0x7a0 (11 bit); "
-            "compare the id 0x101, or check the device"
+            "compare the id 0x101 (11 bit), or check the device"
         )
         FaultyBus.inbox.put(message(1, data=message(1).data[:40]))
         await eventually(lambda: driver.streams["shaft"][0].frames_wrong_length == 1)
@@ -147,6 +149,42 @@ async def test_a_silent_stream_says_what_comes_in_its_place() -> None:
         assert "have 40 bytes" not in driver.link.why_silent("shaft")
         clock.advance(11.0)
         assert dict(driver.link.faults) == {}, "nothing comes any more"
+
+
+def paged(page: int) -> FrameLayout:
+    """The layout of frames whose last byte is this page."""
+    selector = Selector("Page", Field(8 * 63, 8), frozenset({page}))
+    return replace(layout(), crc_byte=None, selectors=(selector,))
+
+
+async def test_a_device_that_is_off_is_not_taken_for_a_bus_that_works(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    blocks: list[SampleBlock] = []
+    streams = [StreamSpec("shaft", paged(0), 1000.0)]
+    clock = SettableClock()
+    driver = CanDriver(FAULTY, port(blocks, streams=streams, clock=clock))
+    pages = [message(0, data=bytes([*message(0).data[:63], page])) for page in (0, 1)]
+    with caplog.at_level("WARNING"):
+        async with begun(driver):
+            for frame in (*pages, message(0, arbitration_id=0x320)):
+                FaultyBus.inbox.put(frame)
+            await eventually(lambda: driver.counters.frames_unknown == 2)
+            clock.advance(2.0)
+            assert driver.link.why_silent("shaft") == "", "all that came, came with the frames of the stream"
+            FaultyBus.inbox.put(message(0, arbitration_id=0x320))
+            await eventually(lambda: driver.counters.frames_unknown == 3)
+            assert driver.link.why_silent("shaft").startswith(
+                "the bus works, as other frames come on can0: 0x320"
+            )
+            FaultyBus.inbox.put(pages[1])
+            await eventually(lambda: driver.counters.frames_unknown == 4)
+            assert driver.link.why_silent("shaft") == (
+                "only other pages of its message come on can0: 0x101 (11 bit), Page 1; compare the DBC "
+                "file with the manual of the device"
+            )
+    assert driver.counters.unknown_ids == {"0x101 (11 bit), Page 1": 2, "0x320 (11 bit)": 2}
+    assert [r.message for r in caplog.records if "such as 0x101 (11 bit), Page 1; they" in r.message]
 
 
 @pytest.mark.parametrize(

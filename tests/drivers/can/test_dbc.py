@@ -135,19 +135,22 @@ def test_pages_go_to_their_streams_and_are_encoded_as_they_are_read(paged: Path)
         layouts["LittleSigned"].encode(np.array([0]), np.array([[[-100.0]]]))[0],
         layouts["Nested"].encode(np.array([1]), np.array([[[-5.0]]]))[0],
         np.frombuffer(bytes([2, 3, *range(10)]), np.uint8),
+        np.frombuffer(bytes([3, 4, 5, *range(9)]), np.uint8),
     ]
     (message,) = messages_of(paged)
     assert message.decode(sent[0].tobytes())["LittleSigned"] == -100.0
     assert message.decode(sent[1].tobytes())["Nested"] == -5
-    data = np.zeros((3, 64), np.uint8)
+    data = np.zeros((4, 64), np.uint8)
     data[:, :12] = sent
     sorter = FrameDemultiplexer([StreamSpec(name, layout, 100.0) for name, layout in layouts.items()])
-    ids = np.full(3, 2566844416, np.uint32)
-    found = sorter.sort(CanBatch(ids, np.full(3, 12), data, np.arange(3)), 0)
+    ids = np.full(4, 2566844416, np.uint32)
+    found = sorter.sort(CanBatch(ids, np.full(4, 12), data, np.arange(4)), 0)
     got = {name: part.samples.ravel().tolist() for name, part in found.frames.items()}
     assert got == {"LittleSigned": [-100.0], "Nested": [-5.0]}
-    assert list(found.unknown.values()) == [found.notes["frames_unknown"]] == [1]
-    assert "page of no stream" in next(iter(found.unknown))
+    assert found.notes["frames_unknown"] == 2
+    pages = {"0x18fef000 (29 bit), Page 3": 1, "0x18fef000 (29 bit), Page 4, Deeper 5": 1}
+    assert found.unknown == pages
+    assert found.pages_of == {page: ["LittleSigned", "Nested"] for page in pages}
 
 
 def test_signals_of_different_pages_are_no_stream(paged: Path) -> None:
