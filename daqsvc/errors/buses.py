@@ -324,7 +324,8 @@ REGISTER_REFUSED = Code(
     "A unit refuses a request",
     "The unit answers with an exception: it has no such register or function, or cannot read that many at "
     "once.",
-    "Compare address, table and number of registers with the manual of the unit. See max_gap and forbidden.",
+    "Compare address, table and number of registers with the manual of the unit. See max_count, max_gap and "
+    "forbidden.",
     "modbus.md",
     "stream 'housing': unit 3 refuses function 4: illegal data address (registers 100 to 103), which is "
     "counted "

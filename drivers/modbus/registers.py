@@ -290,6 +290,17 @@ def _bytes_of(
     return np.ascontiguousarray(numbers).view(np.uint8).reshape(len(values), -1)
 
 
+def inseparable(wanted: Iterable[RegisterRun]) -> list[RegisterRun]:
+    """The runs by address; those that share registers are one."""
+    together: list[RegisterRun] = []
+    for run in sorted(wanted):
+        if together and run.address < together[-1].end:
+            last = together.pop()
+            run = RegisterRun(last.address, max(last.end, run.end) - last.address)  # noqa: PLW2901 - it has grown
+        together.append(run)
+    return together
+
+
 def plan_runs(wanted: Iterable[RegisterRun], limits: RunLimits = ANY_RUN) -> tuple[RegisterRun, ...]:
     """Few requests that read every wanted register exactly once.
 
@@ -306,12 +317,7 @@ def plan_runs(wanted: Iterable[RegisterRun], limits: RunLimits = ANY_RUN) -> tup
     Raises:
         LayoutError: a wanted register is forbidden, or what must stay together exceeds ``max_count``.
     """
-    together: list[RegisterRun] = []
-    for run in sorted(wanted):
-        if together and run.address < together[-1].end:
-            last = together.pop()
-            run = RegisterRun(last.address, max(last.end, run.end) - last.address)  # noqa: PLW2901 - it has grown
-        together.append(run)
+    together = inseparable(wanted)
     for run in together:
         if run.count > limits.max_count:
             raise LayoutError(

@@ -371,7 +371,7 @@ class RegistersLayout(_ModbusLayout):
     max_gap: Annotated[int, Field(ge=0, lt=MAX_REGISTERS)] = Field(
         default=8, description="registers between two channels that may be read with them to save a request"
     )
-    max_count: Annotated[int, Field(ge=4, le=MAX_REGISTERS)] = Field(
+    max_count: Annotated[int, Field(ge=1, le=MAX_REGISTERS)] = Field(
         default=MAX_REGISTERS, description="registers in a request, at most"
     )
     forbidden: Annotated[

@@ -22,7 +22,16 @@ from daqsvc.acquisition.timebase import RECENT_DELAYS, TimeBaseState
 from daqsvc.errors.buses import REGISTER_REFUSED
 from daqsvc.errors.code import coded
 from drivers.modbus.reading import PollingReader, streams_in_words
-from drivers.modbus.registers import RegisterRecord, RegisterRun, RunLimits, plan_runs, run_of
+from drivers.modbus.refusals import ILLEGAL_VALUE, REFUSALS_OF_REGISTERS, RefusalSearch
+from drivers.modbus.registers import (
+    RegisterRecord,
+    RegisterRun,
+    RunLimits,
+    inseparable,
+    plan_runs,
+    run_of,
+    shared_runs,
+)
 from drivers.modbus.replies import FUNCTIONS, REMEDIES, NoReplyError, RequestRefusedError
 
 if TYPE_CHECKING:
@@ -46,9 +55,6 @@ EARLY_NS = 500_000
 LATE_NS = 2_000_000
 """How late one may be at least: no event loop wakes up to the millisecond; what is overdue is soon asked."""
 
-REFUSALS_OF_REGISTERS = frozenset({2, 3})
-"""Exceptions of a unit that does not have these registers, or not that many at once."""
-
 APART_NS = 60 * NS_PER_S
 APART_MOST_NS = 3600 * NS_PER_S
 """How long streams are read apart before they are tried together again; twice as long each time."""
@@ -66,6 +72,11 @@ class _Failure(NamedTuple):
         """Whether the unit may have all registers that are wanted, and not all that lies between them."""
         refused = isinstance(self.error, RequestRefusedError) and self.error.code in REFUSALS_OF_REGISTERS
         return refused and (self.of_sharing or any(self.run not in one.bare_runs for one in self.takers))
+
+    @property
+    def is_of_length(self) -> bool:
+        """Whether the unit may have all registers, and answer for fewer of them at once."""
+        return isinstance(self.error, RequestRefusedError) and self.error.code == ILLEGAL_VALUE
 
     @property
     def of_sharing(self) -> bool:
@@ -107,6 +118,7 @@ class _TrendStream:
         self.counters = StreamCounters()
         self._channels = spec.layout.channels
         self.channels = len(self._channels)
+        self.layout = spec.layout
         self._record = RegisterRecord.of(spec.layout)
         self.own_runs = self._record.runs
         self._bare = replace(RunLimits.of(spec.layout), max_gap=0)
@@ -131,6 +143,21 @@ class _TrendStream:
         """How well the schedule is kept, and how far off the time of the last sample may be."""
         late_ns = float(np.percentile(self._lateness_ns, 95)) if self._lateness_ns else 0.0
         return TimeBaseState(self._period_ns, 0.0, late_ns, self._next is not None, 0, self._error_ns)
+
+    def read_at_most(self, count: int) -> bool:
+        """Read no more registers by one request from the next `read_from` on; whether that is less.
+
+        Those of one channel stay together.
+        """
+        widest = max(run.count for run in inseparable(map(run_of, self._channels)))
+        max_count = max(count, widest)
+        if max_count >= self.layout.max_count:
+            return False
+        self.layout = self.layout.model_copy(update={"max_count": max_count})
+        self.own_runs = RegisterRecord.of(self.layout).runs
+        self._bare = replace(RunLimits.of(self.layout), max_gap=0)
+        self.leave_out(self.absent)
+        return True
 
     def leave_out(self, absent: Mapping[str, RegisterRun]) -> None:
         """Read all channels but these from the next `read_from` on; one at least is left."""
@@ -308,7 +335,9 @@ class TrendReader(PollingReader):
         """Ask differently where that may help; whether it is worth asking again at once."""
         differently = False
         for failure in failures:
-            if failure.of_merging:
+            if failure.is_of_length and await self._read_shorter(line, failure):
+                differently = True
+            elif failure.of_merging:
                 self._part(failure)
                 differently = True
             elif failure.of_registers:
@@ -376,8 +405,11 @@ class TrendReader(PollingReader):
         if now_ns < self._search_again_ns.get(failure.run, 0):
             return False
         asked = stream.channels_in(failure.run)
-        refused, are_all_asked = (asked, True) if len(asked) == 1 else await self._refused_alone(line, asked)
+        search = self._search(line)
+        refused, are_all_asked = (asked, True) if len(asked) == 1 else await search.refused_alone(asked)
         absent = {**stream.absent, **refused}
+        if not refused and are_all_asked and await self._read_shorter(line, failure):
+            return True
         if not refused or len(absent) == stream.channels:
             if are_all_asked:
                 self._search_again_ns[failure.run] = now_ns + APART_MOST_NS
@@ -399,21 +431,36 @@ class TrendReader(PollingReader):
                 )
         return True
 
-    async def _refused_alone(
-        self, line: ModbusLine, asked: Mapping[str, RegisterRun]
-    ) -> tuple[dict[str, RegisterRun], bool]:
-        """Which of the channels the unit refuses one by one, and whether all could be asked for."""
-        refused: dict[str, RegisterRun] = {}
-        for name, run in asked.items():
-            self._asked.add(run.in_words)
-            try:
-                await line.poll(self._unit, self._function, run, run.in_words)
-            except NoReplyError:
-                return refused, False
-            except RequestRefusedError as error:
-                if error.code in REFUSALS_OF_REGISTERS:
-                    refused[name] = run
-        return refused, True
+    async def _read_shorter(self, line: ModbusLine, failure: _Failure) -> bool:
+        """Find out how many registers the unit answers at once, and read no more by one request."""
+        if self._clock.monotonic_ns() < self._search_again_ns.get(failure.run, 0):
+            return False
+        assert isinstance(failure.error, RequestRefusedError)  # noqa: S101 - for the type checker
+        wanted = [one for stream in failure.takers for one in stream.channels_in(failure.run).values()]
+        most = await self._search(line).longest(failure.error.code, wanted)
+        if most is None:
+            return False
+        shorter = [stream.read_at_most(most) for stream in self._streams]
+        if not any(shorter):
+            return False
+        if self._shared is not None:
+            self._shared = shared_runs([stream.layout for stream in self._streams])
+        self._read_together()
+        if (message := f"{failure.error} ({failure.run.in_words})") not in self._said:
+            self._said.add(message)
+            logger.warning(
+                "%s: %s; it answers for %d at once, and is asked for no more by one request from now on. "
+                "max_count = %d avoids the refusal",
+                streams_in_words(sorted(stream.name for stream in failure.takers)),
+                message,
+                most,
+                most,
+                extra=coded(REGISTER_REFUSED),
+            )
+        return True
+
+    def _search(self, line: ModbusLine) -> RefusalSearch:
+        return RefusalSearch(line, self._unit, self._function, self._asked)
 
     def _faults_of(self, error: NoReplyError | RequestRefusedError) -> dict[str, str]:
         del error  # the last one of these

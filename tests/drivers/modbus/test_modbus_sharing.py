@@ -284,6 +284,75 @@ def test_channels_are_asked_for_one_by_one_once_and_not_with_every_sample(unit_s
     assert len(asked) == pytest.approx(requests, abs=3)
 
 
+def answering(most, code=3):
+    """Units, the first of which refuses what is longer than that."""
+    unit_side = units()
+    answer, asked = unit_side[1].answer, []
+
+    def refuse(pdu):
+        asked.append(RegisterRun(pdu[2], pdu[4]))
+        return bytes([0x83, code]) if pdu[4] > most else answer(pdu)
+
+    unit_side[1].answer = refuse
+    return unit_side, asked
+
+
+@pytest.mark.parametrize("code", [2, 3])
+@pytest.mark.parametrize(("channels", "most"), [(range(100, 109), 8), ([*range(100, 107), 120], 4)])
+def test_a_unit_that_answers_for_few_registers_at_once_is_asked_for_no_more(channels, most, code, caplog):
+    sides, asked = answering(most, code)
+    with caplog.at_level(NOTICE):
+        rig = watched({"device": (trend([*channels]), 1.0)}, sides, 4000.0)
+    assert (rig.samples("device") == [1000 + one for one in channels]).all()
+    assert rig.counters("device").samples_lost == 0
+    assert rig.counters("device").samples_received == pytest.approx(4000, abs=1)
+    (said,) = [record.message for record in caplog.records if "max_count" in record.message]
+    kind = {2: "address", 3: "value"}[code]
+    last = max(one for one in channels if one < 110)
+    assert said == (
+        f"stream 'device': unit 1 refuses function 3: illegal data {kind} (registers 100 to {last}); it "
+        f"answers for {most} at once, and is asked for no more by one request from now on. max_count = "
+        f"{most} avoids the refusal"
+    )
+    # A few refusals while it was sought, and none later.
+    assert sum(one.count > most for one in asked) <= 6
+    assert all(one.count <= most for one in asked[40:])
+
+
+def test_streams_that_share_requests_share_a_limit_of_their_length(caplog):
+    streams = {"one": (trend([16, 17, 18]), 1.0), "other": (trend([20, 21], max_count=100), 1.0)}
+    sides, asked = answering(3)
+    with caplog.at_level(NOTICE):
+        rig = watched(streams, sides, 200.0)
+    for name in streams:
+        assert rig.counters(name).samples_lost == 0
+    assert set(asked[-100:]) == {RegisterRun(16, 3), RegisterRun(20, 2)}
+    assert sum(one.count > 3 for one in asked) <= 4
+
+
+def test_a_register_that_is_refused_as_if_it_were_too_long_costs_its_own_channel_only(caplog):
+    with caplog.at_level(NOTICE):
+        rig = watched({"pump": (trend([16, 17, 18, 19]), 1.0)}, refusing(18, code=3)[0], 30.0)
+    samples = rig.samples("pump")
+    assert (samples[:, [0, 1, 3]] == [1016, 1017, 1019]).all()
+    assert np.isnan(samples[:, 2]).all()
+    (said,) = [record.message for record in caplog.records]
+    assert "channel 'r18' has no value" in said
+
+
+def test_a_refusal_of_length_for_a_moment_limits_nothing():
+    sides = units()
+    answer, asked = sides[1].answer, []
+
+    def starting(pdu):
+        asked.append(RegisterRun(pdu[2], pdu[4]))
+        return b"\x83\3" if len(asked) == 1 else answer(pdu)
+
+    sides[1].answer = starting
+    watched({"pump": (trend([16, 17, 18]), 1.0)}, sides, 30.0)
+    assert set(asked[-20:]) == {RegisterRun(16, 3)}
+
+
 def test_a_unit_that_dies_is_known_as_dead_though_its_channels_were_asked_for_one_by_one():
     sides, asked = refusing(17)
     rig = Rig(
