@@ -59,6 +59,10 @@ class _ModbusQuestions(BusQuestions):
             "Which registers are they?",
             "Manuals call holding registers 40001 and on, input registers 30001 and on.",
         ),
+        "max-count": Topic(
+            "Most registers that a request may read",
+            "125 by Modbus; less if the device refuses that as an illegal data value. See its manual.",
+        ),
         "block-id": Topic("Register that changes with every block", "As on the wire, from 0: 40001 is 0."),
         "block-address": Topic("First register of the block", "As on the wire, from 0: 40001 is 0."),
         "samples": Topic("Samples of each channel in a block", "The device's manual states it."),
@@ -137,6 +141,8 @@ class _ModbusQuestions(BusQuestions):
         tables = [one for one in tables if _TABLES[one["function"]] == answers.get("table")]
         if not tables or answers.get("way") != "values":
             return proposed
+        if tables[0]["max_count"] is not None:
+            proposed["max-count"] = f"{tables[0]['max_count']}"
         found_channels = {one["address"]: one for one in tables[0]["channels"]}
         values = {one["address"]: one["int16"] for one in tables[0]["registers"]}
         marks = {
@@ -183,6 +189,8 @@ class _ModbusQuestions(BusQuestions):
         way = answers["way"]
         if way != "fifo":
             yield self.choose("table", dict.fromkeys(("holding", "input"), ""), "holding")
+        if way == "values":
+            yield self.ask("max-count", q.whole, f"{_READ_REGISTERS}", quiet=True)
         yield self.ask("channels", q.names, "vibration, temperature" if way == "values" else "x")
         if way == "values":
             return
@@ -338,6 +346,8 @@ class _ModbusQuestions(BusQuestions):
         )
         if any(before + width < after for (before, width), (after, _) in pairwise(runs)):
             yield entry("max_gap", 0, "registers between are not read: the device may not have them")
+        if answers["max-count"] != _READ_REGISTERS:
+            yield entry("max_count", answers["max-count"], "the device refuses requests of more registers")
         yield "# value = raw * scale, in the unit of the sensor below"
         tables = []
         for name in answers["channels"]:
@@ -480,6 +490,8 @@ def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
         asked = " to ".join(map(str, table["asked"]))
         name = f"unit {table['unit']} has {_TABLES[table['function']]} registers {runs}"
         yield f"{name} ({asked} were asked; daqsvc sniff modbus --registers looks further):"
+        if table["max_count"] is not None:
+            yield f"  registers in a request: {table['max_count']} at most"
         by_address = {one["address"]: one for one in table["registers"]}
         wide = {one["address"]: one for one in table["channels"] if not one["type"].endswith("int16")}
         behind = {

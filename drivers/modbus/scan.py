@@ -64,6 +64,8 @@ class FoundTable:
         again: the same, each time that they were read again.
         refused: exception codes but illegal address, by the first address of a request.
         silent: first addresses of requests that stayed without reply.
+        longest: registers of the longest request that was answered.
+        too_long: registers of the shortest request that was refused for its length; None if none was.
     """
 
     unit: int
@@ -75,6 +77,31 @@ class FoundTable:
     again: list[dict[int, int]] = field(default_factory=list)
     refused: dict[int, int] = field(default_factory=dict)
     silent: list[int] = field(default_factory=list)
+    longest: int = 0
+    too_long: int | None = None
+    _refuses_addresses: bool = False
+
+    def answered(self, count: int) -> None:
+        """Note that a request of so many registers was answered."""
+        self.longest = max(self.longest, count)
+        if self.too_long is not None and count >= self.too_long:
+            self._not_for_its_length()
+
+    def refused_value(self, count: int) -> None:
+        """Note that a request of so many registers was refused as an illegal value."""
+        if count == 1 or count <= self.longest:
+            self._not_for_its_length()
+        elif not self._refuses_addresses:
+            self.too_long = min(count, self.too_long or count)
+
+    def _not_for_its_length(self) -> None:
+        """This unit refuses registers so that it does not have."""
+        self._refuses_addresses, self.too_long = True, None
+
+    @property
+    def max_count(self) -> int | None:
+        """How many registers the unit answers at once; None if it has refused no request for its length."""
+        return self.longest if self.too_long is not None and self.longest else None
 
     @property
     def name(self) -> str:
@@ -130,6 +157,7 @@ class Scan:
         alike: whether every address answered, so that only the first is taken for a unit.
         tables: what was read.
         lost: why the line was lost; empty if it was not.
+        counters: of the line.
     """
 
     bus: ModbusBus
@@ -147,8 +175,13 @@ class Scan:
     alike: bool = False
     tables: list[FoundTable] = field(default_factory=list)
     lost: str = ""
+    counters: ModbusCounters = field(default_factory=ModbusCounters)
     _client: ModbusClient | None = None
     _told_ns: int = 0
+    _begun_ns: int = 0
+    """When the first register of a table was asked for."""
+    _end: int = 0
+    """The last register of it that is asked for."""
 
     def longest_s(self, units: int) -> float:
         """Time to ask so many units that do not answer."""
@@ -229,7 +262,9 @@ class Scan:
     async def _read_table(self, table: FoundTable, end: int, most: int) -> None:
         """Registers to the last one, and on to the most as long as the last one is there."""
         at = table.begin
+        self._begun_ns = self.clock.monotonic_ns()
         while at <= end:
+            self._end = end
             count = min(BLOCK, end + 1 - at)
             await self._read(table, at, count)
             if self.stop.is_set():
@@ -238,6 +273,7 @@ class Scan:
             if at > end and end in table.first:
                 end = min(end + BLOCK, most)
         table.complete = True
+        await self._find_longest(table)
 
     async def _read(self, table: FoundTable, address: int, count: int) -> None:
         """Registers in a row; where one of them is not there, both halves by themselves."""
@@ -245,20 +281,55 @@ class Scan:
             return
         if ILLEGAL_FUNCTION in table.refused.values():
             return
+        if table.too_long is not None and count >= table.too_long:
+            await self._read_halves(table, address, count)
+            return
         try:
-            self._progress(f"reading {table.name} from {address} on")
+            self._progress(f"reading {table.name} from {address} on{self._rest(table, address)}")
             raw = await self._ask(table.unit, table.function, address, count)
             table.first.update(_registers(raw, address))
+            table.answered(count)
         except NoReplyError:
             table.silent.append(address)
         except RequestRefusedError as error:
+            if error.code == ILLEGAL_VALUE:
+                table.refused_value(count)
             if error.code in {ILLEGAL_ADDRESS, ILLEGAL_VALUE} and count > 1:
-                await self._read(table, address, count // 2)
-                await self._read(table, address + count // 2, count - count // 2)
+                await self._read_halves(table, address, count)
                 return
             if error.code != ILLEGAL_ADDRESS:
                 table.refused[address] = error.code
         table.last = address + count - 1
+
+    def _rest(self, table: FoundTable, address: int) -> str:
+        """How long the rest of a table takes, if it takes as long as what has been read of it."""
+        done = address - table.begin
+        if not done:
+            return ""
+        spent_s = (self.clock.monotonic_ns() - self._begun_ns) / NS_PER_S
+        return f", about {math.ceil(spent_s * (self._end + 1 - address) / done)} s to go"
+
+    async def _read_halves(self, table: FoundTable, address: int, count: int) -> None:
+        await self._read(table, address, count // 2)
+        await self._read(table, address + count // 2, count - count // 2)
+
+    async def _find_longest(self, table: FoundTable) -> None:
+        """How many registers the unit answers at once, as far as it has so many in a row."""
+        first, last = max(table.runs, key=lambda run: run[1] - run[0], default=(0, 0))
+        while not self.stop.is_set() and table.too_long is not None and table.longest:
+            most = min(table.too_long - 1, last - first + 1)
+            if most <= table.longest:
+                return
+            count = (table.longest + 1 + most) // 2
+            try:
+                await self._ask(table.unit, table.function, first, count)
+                table.answered(count)
+            except RequestRefusedError as error:
+                if error.code != ILLEGAL_VALUE:
+                    return
+                table.refused_value(count)
+            except NoReplyError:
+                return
 
     async def _read_again(self) -> None:
         """What is there, so often that what moves is seen to, also if the device measures once a second."""
@@ -271,12 +342,13 @@ class Scan:
                 await self._read_round(table, table.again[-1])
 
     async def _read_round(self, table: FoundTable, again: dict[int, int]) -> None:
+        most = table.max_count or BLOCK
         for first, last in table.runs:
-            for at in range(first, last + 1, BLOCK):
+            for at in range(first, last + 1, most):
                 if self.stop.is_set():
                     return
                 self._progress(f"reading {table.name} again")
-                count = min(BLOCK, last + 1 - at)
+                count = min(most, last + 1 - at)
                 try:
                     raw = await self._ask(table.unit, table.function, at, count)
                 except (NoReplyError, RequestRefusedError):
@@ -308,7 +380,7 @@ class Scan:
 
     async def _connect(self) -> None:
         await self._close()
-        self._client = ModbusClient(self.bus, self.clock, ModbusCounters())
+        self._client = ModbusClient(self.bus, self.clock, self.counters)
         await self._client.connect()
 
     async def _close(self) -> None:

@@ -86,7 +86,12 @@ class ScanReport:
     def _to_check(self) -> str:
         """What there is to see to if nobody answers."""
         bus = self._bus
-        slow = "a slow one needs a longer --timeout-ms"
+        late = self._scan.counters.replies_wrong_transaction
+        slow = f"a slow one needs a longer --timeout-ms than {bus.timeout_ms:g}"
+        if late:
+            longer = max(1000, round(3 * bus.timeout_ms))
+            came = f"{late} repl{'y' if late == 1 else 'ies'} came"
+            return f"{came} later than --timeout-ms {bus.timeout_ms:g}: write --timeout-ms {longer}"
         if not isinstance(bus, ModbusTcpBus):
             return (
                 "check that the device is powered, that baud rate and parity are its own, that A and B are "
@@ -132,6 +137,8 @@ class ScanReport:
             lines.append(f"refused from {address} on: exception {code}, {EXCEPTIONS.get(code, 'unknown')}")
         if table.silent:
             lines.append(f"no reply to requests from {', '.join(map(str, table.silent))} on")
+        if table.max_count is not None:
+            lines.append(f"Registers in a request: {table.max_count} at most (max_count).")
         yield "\n".join(lines)
         if table.first:
             yield SniffTable(
@@ -217,6 +224,7 @@ def _table_figures(table: FoundTable, numbers: Sequence[Reading]) -> dict[str, A
         "runs": [list(run) for run in table.runs],
         "refused": [[address, code] for address, code in table.refused.items()],
         "silent": table.silent,
+        "max_count": table.max_count,
         "moved": sorted(table.moved),
         "channels": [one._asdict() for one in _channels(table, numbers)],
         "registers": [
@@ -253,6 +261,8 @@ def _stream(table: FoundTable, numbers: Sequence[Reading], sensors: set[str]) ->
     if table.function == 4:
         yield 'table = "input"'
     yield "max_gap = 0    # registers between them may not be there"
+    if table.max_count is not None:
+        yield f"max_count = {table.max_count}    # it refuses requests of more registers"
     yield "channels = ["
     yield from (f"  {{ {one.keys} }}," for one in channels)
     yield "]"

@@ -20,7 +20,7 @@ from support.waiting import PATIENCE_S
 
 from daqsvc.cli import main
 from drivers.modbus import questions, scan, sniff
-from sim_hw.nodes.modbus_node import ModbusRtuServer, ModbusTcpServer
+from sim_hw.nodes.modbus_node import ModbusRtuServer, ModbusTcpServer, PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit
 
 if TYPE_CHECKING:
@@ -274,8 +274,21 @@ def test_a_long_scan_says_how_far_it_is(
         assert main(words(target, "--units", "1-4", "--registers", "0-9")) == 0
     said = capsys.readouterr().err
     assert "asking unit 4, at most 1 s to go; units that answer: 2\n" in said
-    assert "reading unit 2, holding registers (function 3) from 5 on\n" in said
+    assert "reading unit 2, holding registers (function 3) from 5 on, about 1 s to go\n" in said
     assert "reading unit 2, holding registers (function 3) again\n" in said
+
+
+def test_replies_that_come_too_late_are_told_with_a_longer_time_out(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    late = lambda *_: PlannedReply(delay_ns=100_000_000)  # noqa: E731
+    with serving(lambda: ModbusTcpServer({2: pump()}, plan=late)) as server:
+        assert main(words(f"127.0.0.1:{server.port}", "--units", "1-5")) == 1
+    said = capsys.readouterr().err
+    assert (
+        "no unit answers (units 1 to 5 were asked). Remedy: 1 reply came later than --timeout-ms 60: " in said
+    )
+    assert "write --timeout-ms 1000" in said
 
 
 def test_input_registers_are_found_where_there_are_no_holding_registers(
@@ -517,3 +530,57 @@ def test_new_says_what_to_do_when_nobody_answers_and_goes_on(
         "vibration",
         "temperature",
     ]
+
+
+class Short(Watched):
+    """A unit that answers for few registers at once."""
+
+    def __init__(self, most: int) -> None:
+        super().__init__()
+        self._most = most
+        self.put("holding", 0, struct.pack(">10H", *range(5, 15)))
+
+    def answer(self, pdu: bytes) -> bytes:
+        answered = super().answer(pdu)
+        return bytes([pdu[0] | 0x80, 3]) if int.from_bytes(pdu[3:5], "big") > self._most else answered
+
+
+@pytest.mark.usefixtures("_few_registers")
+@pytest.mark.parametrize("most", [1, 4, 7, 8])
+def test_how_many_registers_a_unit_answers_for_at_once_is_found_and_proposed(
+    most: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    unit = Short(most)
+    with tcp({1: unit}) as target:
+        assert main(words(target, "--units", "1", "--registers", "0-45")) == 0
+        said = capsys.readouterr().out
+        assert main(words(target, "--units", "1", "--registers", "0-45", "--json")) == 0
+        found = figures(capsys)
+        layout = new(tmp_path, target)["streams"]["device"]["layout"]
+    assert found["tables"][0]["max_count"] == most
+    assert found["tables"][0]["runs"] == [[0, 9], [40, 41]]
+    assert found["tables"][0]["moved"] == [41]
+    assert f"Registers in a request: {most} at most (max_count)." in said
+    assert f"\nmax_count = {most}    # it refuses requests of more registers" in said
+    assert layout["max_count"] == most
+    assert f"  registers in a request: {most} at most" in capsys.readouterr().out
+
+
+class Valued(Watched):
+    """A unit that refuses registers that it does not have as an illegal value."""
+
+    def answer(self, pdu: bytes) -> bytes:
+        answered = super().answer(pdu)
+        return bytes([answered[0], 3]) if answered[0] & 0x80 else answered
+
+
+def test_a_unit_that_refuses_registers_as_illegal_values_has_no_limit(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    unit = Valued()
+    unit.put("holding", 3, struct.pack(">6H", *range(5, 11)))
+    with tcp({1: unit}) as target:
+        assert main(words(target, "--units", "1", "--registers", "0-45", "--json")) == 0
+    [table] = figures(capsys)["tables"]
+    assert table["runs"] == [[3, 8], [40, 41]]
+    assert table["max_count"] is None
