@@ -361,7 +361,8 @@ NO_MEASUREMENT = Code(
 TIME_UNSURE = Code(
     "B37",
     "The time of samples is not certain",
-    "The device has restarted, its counter does not go on, or its frames come late or unevenly.",
+    "The device has restarted, its counter does not go on, or its frames come late or unevenly. Each turn of "
+    "a counter of lines that begins again at 0 after 999, 9999 or the like looks like a restart, too.",
     "Nothing, if the device was restarted. Else compare rate_hz and the counter with the device.",
     "alignment.md",
     "stream 'shaft': the device has restarted its counter, or has not counted for a while; how many "

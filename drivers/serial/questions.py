@@ -9,7 +9,7 @@ from drivers import packed_questions as packed
 from drivers import questions as q
 from drivers.bus_questions import BUS, BusQuestions, Heard, is_count, only_port
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
-from drivers.serial.sniff import SerialSniffer
+from drivers.serial.sniff import MUST_TURN, SerialSniffer, turn_words
 from drivers.sniffing import sniffed, table_name, unused, usual_rate
 from drivers.toml_lines import array, entry
 
@@ -84,7 +84,9 @@ class SerialQuestions(BusQuestions):
             "Names with commas between, e.g. t, x, y. Name columns that are not needed, too.",
         ),
         "counts": Topic(
-            "What does it hold?", "count grows by one with each frame or line; s, ms and us are times."
+            "What does it hold?",
+            "count grows by one with each frame or line, to 255, 65535 or 4294967295, and begins again at 0; "
+            f"{MUST_TURN}. s, ms and us are times.",
         ),
     }
 
@@ -199,6 +201,7 @@ class SerialQuestions(BusQuestions):
         if answers.get("decimal") == ",":
             yield entry("decimal", ",", "numbers have a decimal comma")
         if answers["counts"] == "count":
+            yield f"# {MUST_TURN[0].upper()}{MUST_TURN[1:]}."
             yield entry("counter", {"column": answers["counter"]}, "losses are counted by it")
         else:
             time = {"column": answers["counter"], "unit": answers["counts"]}
@@ -254,6 +257,11 @@ def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
     if found["lines_damaged"]:
         yield f"  {found['lines_damaged']} of {found['lines_heard']} lines are damaged"
     yield from (f"  {one}" for one in found["lines"][:_SHOWN_LINES])
+    for one in found["columns"]:
+        if one["turns_at"]:
+            yield f"  {turn_words(one['name'], one['turns_at'])}"
+        elif one["counts"]:
+            yield f"  {one['name']} counts lines; {MUST_TURN}"
     if found["other_prefixes"]:
         others = ", ".join(found["other_prefixes"])
         yield f"  Lines that begin with {others} come, too. The file reads one kind of line; add a stream for"
@@ -282,6 +290,9 @@ def _proposals(found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
     for name, one in zip(answers.get("columns", named), named.values(), strict=False):
         if one["counts"] or one["time_unit"]:
             proposed |= {"counter": name, "counts": one["time_unit"] or "count"}
+        elif one["turns_at"]:
+            # For want of another one; what was heard states what comes of it.
+            proposed = {"counter": name, "counts": "count"} | proposed
         elif not one["numeric"]:
             proposed[sensor_key(name, "type")] = NONE
     return proposed

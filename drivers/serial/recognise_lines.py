@@ -31,6 +31,8 @@ _LEAST_STEPS = 5
 _MOST_RESETS = 2
 _WRAP = 256
 """What counters wrap at is a multiple of it."""
+_TURN_SHARE = 0.05
+"""So near to the turn are the values before and after it, as lines may be missing there."""
 _MOST_KINDS = 16
 _LEAST_SHARE = 0.02
 """Of the lines begin with a word that is no accident."""
@@ -58,6 +60,7 @@ class Column:
         least: least value; 0 of a text.
         most: largest one.
         step: by how much it counts, if it is whole numbers that do; else 0.
+        turns_at: the power of ten at which it was seen to begin again at 0; else 0. No counter of bits does.
         grows: whether it never falls, and grows at all.
         per_line: by how much it grows from line to line, on average.
         last: its last text.
@@ -68,6 +71,7 @@ class Column:
     least: float = 0.0
     most: float = 0.0
     step: float = 0.0
+    turns_at: int = 0
     grows: bool = False
     per_line: float = 0.0
     last: str = ""
@@ -278,7 +282,9 @@ def _column(texts: Sequence[str], places: NDArray[np.int64], name: str, decimal:
         lines = np.median(places[-ends:]) - np.median(places[:ends])
         per_line = float((np.median(values[-ends:]) - np.median(values[:ends])) / lines)
     step = _step_of(values, places) if whole else 0.0
-    return Column(name, True, float(values.min()), float(values.max()), step, grows, per_line, texts[-1])
+    turns_at = _turn_of(values, step)
+    least, most = float(values.min()), float(values.max())
+    return Column(name, True, least, most, step, turns_at, grows, per_line, texts[-1])
 
 
 def _step_of(values: NDArray[np.float64], places: NDArray[np.int64]) -> float:
@@ -298,6 +304,17 @@ def _step_of(values: NDArray[np.float64], places: NDArray[np.int64]) -> float:
     resets = (steps[1:-1] < 0) & same[:-2] & same[2:]
     beyond = (steps[1:-1] - step * lines[1:-1]) % _WRAP != 0
     return float(step) if (resets & beyond).sum() <= _MOST_RESETS else 0.0
+
+
+def _turn_of(values: NDArray[np.float64], step: float) -> int:
+    """The power of ten at which a count begins again; 0 if none was seen."""
+    if not step or len(values) < 3:
+        return 0
+    before, after, beyond = values[:-2], values[1:-1], values[2:]
+    # Lines at the turn may be missing. Behind a damaged digit the count goes on as before it.
+    turns_at = 10.0 ** np.ceil(np.log10(np.maximum(before, 1.0) + step))
+    turned = (before >= (1 - _TURN_SHARE) * turns_at) & (after <= _TURN_SHARE * turns_at) & (beyond < before)
+    return int(turns_at[turned][0]) if turned.any() else 0
 
 
 def _sum_fits(line: str, checksum: str) -> bool:

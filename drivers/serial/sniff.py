@@ -380,8 +380,10 @@ class _Report(NamedTuple):
                 f"{end:g}".replace(".", what.decimal) if one.numeric else "" for end in (one.least, one.most)
             ]
             use = "counts" if one is counter else "time" if one is time_column else ""
+            use = f"counts to {one.turns_at - 1}" if one.turns_at else use
             rows.append((one.name, "number" if one.numeric else "text", *limits, one.last[:24], use))
         yield SniffTable(("column", "kind", "min", "max", "last", ""), rows)
+        yield from (turn_words(one.name, one.turns_at) for one in what.columns if one.turns_at)
 
     def _time(self, what: TextLines) -> Column | None:
         """The column that has the device's time, if none counts."""
@@ -457,6 +459,7 @@ class _Report(NamedTuple):
                         "min": one.least,
                         "max": one.most,
                         "counts": one is counter,
+                        "turns_at": one.turns_at or None,
                         "time_unit": self._time_unit(what, one) if one is time_column else None,
                     }
                     for one in what.columns
@@ -539,7 +542,7 @@ class _Report(NamedTuple):
         if counter is not None:
             bits = 8 if counter.most < 256 else 16 if counter.most < 65_536 else 32
             table = f"{{ column = {quoted(names[counter])}, bits = {bits} }}"
-            yield f"counter = {table}    # as far as it was seen; see the manual"
+            yield f"counter = {table}    # as far as it was seen: {MUST_TURN}"
         else:
             unit = self._time_unit(what, place)
             yield f'time = {{ column = {quoted(names[place])}, unit = "{unit}" }}'
@@ -618,9 +621,23 @@ def _tried_row(one: Tried) -> Sequence[str]:
     )
 
 
+MUST_TURN = "one that begins again at 0 after 999, 9999 or the like is no counter for daqsvc"
+"""What a few seconds of a counter do not show."""
+
+
+def turn_words(name: str, turns_at: int) -> str:
+    """What a column means for daqsvc that begins again at 0 after 99, 999, ..."""
+    return (
+        f"{name} begins again at 0 after {turns_at - 1}: daqsvc cannot count lines by it. It would report "
+        "each turn as a restarted counter [B37], and samples as lost that are not (docs/serial.md). Use a "
+        "column with the device's time, if there is one."
+    )
+
+
 def _counter(what: TextLines) -> Column | None:
-    """The column that counts lines: whole numbers, always by 1."""
-    return next((one for one in what.columns if one.numeric and one.step == 1 and one.least >= 0), None)
+    """The column that counts lines: whole numbers, always by 1, to a power of two."""
+    counts = (one for one in what.columns if one.numeric and one.step == 1 and one.least >= 0)
+    return next((one for one in counts if not one.turns_at), None)
 
 
 def _prefixes(what: TextLines) -> str:

@@ -317,6 +317,23 @@ def test_what_counts_to_four_again_and_again_counts_no_lines() -> None:
     wraps = recognised(b"".join(b"%d,%d\n" % (k % 256, 7 * k % 11) for k in range(2000))).what
     assert isinstance(wraps, TextLines)
     assert [column.step for column in wraps.columns] == [1, 0]
+    assert [column.turns_at for column in wraps.columns] == [0, 0]
+
+
+@pytest.mark.parametrize("turns_at", [100, 1000, 10_000])
+@pytest.mark.parametrize("lost", [0, 3])
+def test_a_count_that_begins_again_at_a_power_of_ten_is_seen(turns_at: int, lost: int) -> None:
+    """Also where the lines at the turn are lost; a damaged digit is no turn."""
+    counts = [turns_at - 60 + k for k in range(120) if not 60 <= k < 60 + lost]
+    texts = [b"%d" % (count % turns_at) for count in counts]
+    turned = recognised(b"".join(b"%s,%d\n" % (text, 7 * k % 11) for k, text in enumerate(texts))).what
+    assert isinstance(turned, TextLines)
+    assert [column.turns_at for column in turned.columns] == [turns_at, 0]
+    texts[:] = [b"%d" % (4 * turns_at + 5 * turns_at // 10 + k) for k in range(120)]
+    texts[40] = b"%d" % (int(texts[40]) - turns_at)
+    damaged = recognised(b"".join(b"%s,%d\n" % (text, 7 * k % 11) for k, text in enumerate(texts))).what
+    assert isinstance(damaged, TextLines)
+    assert [column.turns_at for column in damaged.columns] == [0, 0]
 
 
 @settings(max_examples=examples(40), deadline=None)

@@ -20,8 +20,10 @@ from support.waiting import PATIENCE_S
 
 from daqsvc.cli import main
 from drivers.serial import questions, sniff
+from drivers.serial.questions import _in_words, _proposals
 from drivers.serial.recognise import recognised
 from drivers.serial.recognise_lines import TextLines
+from drivers.serial.sniff import MUST_TURN
 from sim_hw.nodes.serial_node import PseudoTerminal
 
 if TYPE_CHECKING:
@@ -98,6 +100,34 @@ def test_lines_are_shown_with_their_columns(
     assert rows["c1"][-1] == "counts"
     assert rows["c3"][1:5] == ["number", "-1.5", "-1.5", "-1.5"]
     assert 'framing = "lines"' in said.out
+
+
+def test_a_counter_that_begins_again_after_999_is_not_proposed(
+    cable: PseudoTerminal, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def decimal(number: int) -> bytes:
+        return b"%d,%d.25,-1.5\r\n" % ((960 + number) % 1000, number % 7)
+
+    with talking(cable, decimal):
+        found = figures(cable, capsys)
+    assert [(one["counts"], one["turns_at"]) for one in found["columns"]] == [
+        (False, 1000),
+        (False, None),
+        (False, None),
+    ]
+    assert "counter =" not in found["machine_file"]
+    proposed = _proposals(found, {})
+    assert (proposed["counter"], proposed["counts"]) == ("c1", "count")
+    assert any("c1 begins again at 0 after 999" in line for line in _in_words(found))
+
+
+def test_a_counter_whose_turn_was_not_seen_is_proposed_with_a_word(
+    cable: PseudoTerminal, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with talking(cable, line):
+        found = figures(cable, capsys)
+    assert f"bits = 8 }}    # as far as it was seen: {MUST_TURN}" in found["machine_file"].replace("16", "8")
+    assert f"  c1 counts lines; {MUST_TURN}" in _in_words(found)
 
 
 @pytest.mark.long
