@@ -80,7 +80,13 @@ class _ModbusQuestions(BusQuestions):
     }
     channel_topics: ClassVar[Mapping[str, Topic]] = {
         "address": Topic("Register of {channel}", "As on the wire, from 0: what a manual calls 40001 is 0."),
-        "register-type": Topic("What do the registers of {channel} hold?", "The register map states it."),
+        "register-type": Topic(
+            "What do the registers of {channel} hold?",
+            "The register map states it. One register: uint16 (UINT, WORD, unsigned) or int16 (INT, signed). "
+            "Two: uint32 (UDINT, ULONG, DWORD), int32 (DINT, LONG) or float32 (REAL, FLOAT, IEEE 754). Four: "
+            "uint64, int64 or float64 (LREAL, DOUBLE). Of a status word take uint16; add bits to its channel "
+            "in the file for one bit of it.",
+        ),
         "order": Topic("Byte order of {channel}", "ABCD is the usual one; CDAB has its words exchanged."),
         "no-value": Topic(
             "Which raw value of {channel} means that the device has none?",
@@ -248,8 +254,7 @@ class _ModbusQuestions(BusQuestions):
         wide = _width(answers[sensor_key(channel, "register-type")]) > 1
         yield self.ask_of(channel, "order", q.exactly(orders), "ABCD", choices=orders, quiet=not wide)
         is_float = answers[sensor_key(channel, "register-type")].startswith("float")
-        # Of what the name does not tell, nothing is guessed.
-        scale = "1" if is_float else _USUAL_SCALES.get(unit_by_name(channel) or "", "1")
+        scale = "1" if is_float else _USUAL_SCALES.get(unit or "", "1")
         yield self.ask_of(channel, "scale", q.number, scale)
         yield self.ask_of(channel, "no-value", q.whole_or_none, NONE, quiet=True)
 
@@ -449,11 +454,9 @@ _NAMED_BY_ADDRESS = re.compile(r"[a-z]+\d+", re.IGNORECASE)
 """Channels that are called like registers, as those found on the line: what they mean is not known."""
 
 
-def _unit(channel: str) -> str:
-    """The unit that a value with this name has, as a rule."""
-    if _NAMED_BY_ADDRESS.fullmatch(channel):
-        return "count"
-    return unit_by_name(channel) or "mm/s"
+def _unit(channel: str) -> str | None:
+    """The unit that a value with this name has, as a rule; None if the name does not tell it."""
+    return unit_by_name(channel) or ("count" if _NAMED_BY_ADDRESS.fullmatch(channel) else None)
 
 
 def _units(text: str) -> str:

@@ -238,15 +238,25 @@ def test_the_first_line_names_the_schema_that_the_file_itself_says_how_to_make(t
         ("vibration", 0.01, "mm/s"),
         ("Velocity-x", 0.01, "mm/s"),
         ("oil-temp", 0.1, "degC"),
-        ("level", 1.0, "mm/s"),
+        ("level", 1.0, "1"),
+        ("status", 1.0, "1"),
         ("motor-speed", 1.0, "rpm"),
         ("r17", 1.0, "count"),
+        ("temp1", 0.1, "degC"),
     ],
 )
 def test_the_worth_of_a_count_is_guessed_only_where_the_name_tells_it(channel, scale, unit):
     given = {"host": "192.0.2.10", "bus": "modbus-tcp", "channels": channel}
     answers = conduct(Path("m.toml"), Given(given | {"limits": "none"}, defaults=True), None, print)
     assert (answers[f"sensor.{channel}.scale"], answers[f"sensor.{channel}.unit"]) == (scale, unit)
+
+
+def test_a_value_whose_name_tells_no_vibration_gets_no_limits_of_one(tmp_path):
+    given = {"host": "h", "bus": "modbus-tcp", "channels": "vibration, power, status, flow"}
+    answers = conduct(tmp_path / "m.toml", Given(given, defaults=True), None, print)
+    assert answers["limits"] == "iso"
+    alarms = tomllib.loads(machine_text(answers, "m.toml"))["alarms"]
+    assert [one["sensor"] for one in alarms] == ["vibration"]
 
 
 def test_the_unit_that_a_name_suggests_is_the_same_on_every_bus(tmp_path):
@@ -286,7 +296,8 @@ def test_answers_of_a_file_are_those_of_the_options(tmp_path, capsys):
     answers.write_text(
         'bus = "modbus-tcp"\nname = "Lüfter \\"7\\" \'süd\' 泵"\nhost = "::1"\nunit = 3\nspeed = -1480\n'
         'channels = ["de", "nde"]\nlimits = "iso"\nclass = "1-flexible"\n'
-        'sensor.de.address = 17\nsensor.de.type = "trend"\n[sensor.nde]\naddress = 0x20\nscale = 0.001\n',
+        'sensor.de.address = 17\nsensor.de.type = "trend"\nsensor.de.unit = "mm/s"\n'
+        '[sensor.nde]\naddress = 0x20\nscale = 0.001\nunit = "mm/s"\n',
         encoding="utf-8",
     )
     file = tmp_path / "fan.toml"

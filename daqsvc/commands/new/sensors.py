@@ -27,6 +27,7 @@ TYPES = {
     NONE: "nothing that is of interest",
 }
 _UNITS = {"proximity": ("um", "mm", "mil"), "accelerometer": ("g", "m/s2")}
+_NO_UNIT = "1"
 _FIXED_UNITS = {"velocity": "mm/s", "keyphasor": "V"}
 _SENSITIVITY = {"um": 7.87, "mm": 7870.0, "mil": 200.0, "g": 100.0, "m/s2": 10.2, "mm/s": 4.0}
 _PREFIX = {"proximity": "probe-", "accelerometer": "accel-", "velocity": "velocity-"}
@@ -121,7 +122,8 @@ def _of_channel(answers: Answers, channel: str) -> Iterator[Question]:
         units = dict.fromkeys(_UNITS[chosen], "")
         yield ask("unit", q.one_of(units), unit if unit in units else next(iter(units)), choices=units)
     elif chosen == "trend":
-        yield ask("unit", q.line, unit or "mm/s")
+        # Of mm/s limits of ISO 20816-3 are proposed: only a name that means a vibration has it.
+        yield ask("unit", q.line, unit or _NO_UNIT)
     if chosen in {"proximity", "accelerometer", "velocity"}:
         yield from _of_waveform(answers, channel, ask)
     if chosen == "keyphasor":
@@ -386,7 +388,8 @@ def _alarm(name: str, measure: str, limits: dict[str, Any], alert: float) -> Ite
 
 def _later(sensor: Sensor) -> Iterator[str]:
     measure, unit = sensor.measure or ("", "")
-    yield f"# No limits yet. In {unit}; take them from the machine in good order, or ask its maker:"
+    begin = "Take them" if unit == _NO_UNIT else f"In {unit}; take them"
+    yield f"# No limits yet. {begin} from the machine in good order, or ask its maker:"
     yield "# [[alarms]]"
     for key, value in (("name", sensor.name), ("sensor", sensor.name), ("measure", measure)):
         yield f"# {key} = {toml(value)}"
