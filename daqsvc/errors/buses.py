@@ -345,8 +345,10 @@ NO_FRAME = Code(
 SAMPLES_MISSING = Code(
     "B35",
     "Samples are missing",
-    "The counter of the device shows a gap: the bus, the device or this computer has lost frames.",
-    "Look at the load of the bus, its cables and this computer. daqsvc status shows how many are missing.",
+    "The counter of the device shows a gap: the bus, the device or this computer has lost frames. Or the "
+    "values are polled (Modbus), and a poll had no answer or took longer than rate_hz has time for.",
+    "Look at the load of the bus, its cables and this computer. daqsvc status shows how many are missing. If "
+    "they are polled, lower rate_hz, or look at timeouts and exceptions of the bus in daqsvc status.",
     "status.md",
     "stream 'shaft': samples are missing before index 81920, by now 24; gaps are counted from now on",
 )

@@ -19,8 +19,9 @@ from daqsvc.acquisition.assembler import StreamCounters, note_gap, note_received
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.acquisition.timebase import RECENT_DELAYS, TimeBaseState
-from daqsvc.errors.buses import REGISTER_REFUSED
+from daqsvc.errors.buses import REGISTER_REFUSED, SAMPLES_MISSING
 from daqsvc.errors.code import coded
+from drivers.modbus.line import NS_PER_MS
 from drivers.modbus.reading import PollingReader, streams_in_words
 from drivers.modbus.refusals import ILLEGAL_VALUE, REFUSALS_OF_REGISTERS, RefusalSearch
 from drivers.modbus.registers import (
@@ -54,6 +55,9 @@ EARLY_NS = 500_000
 
 LATE_NS = 2_000_000
 """How late one may be at least: no event loop wakes up to the millisecond; what is overdue is soon asked."""
+
+SLOW_POLLS, ROOM = 3, 0.9
+"""Polls in a row by which a schedule is known as too fast, and the part of the time that is to be used."""
 
 APART_NS = 60 * NS_PER_S
 APART_MOST_NS = 3600 * NS_PER_S
@@ -290,6 +294,9 @@ class TrendReader(PollingReader):
         """When the channels of a request may be asked for one by one again, where that did not help."""
         self._asked: set[str] = set()
         """What has been asked for since the plan was another."""
+        self._slow_polls = 0
+        """Polls in a row that took longer than there is time for one."""
+        self._is_slow_said = False
         self._together_at_ns: int | None = None
         """When what is read apart now is tried together again."""
         self._read_together()
@@ -314,6 +321,7 @@ class TrendReader(PollingReader):
         while await self._ask_for_less(line, failures):
             asks_for_less = True
             readings, failures = await self._ask(line)
+        self._watch_pace(now_ns, undisturbed=not (failures or asks_for_less))
         self._done = slot  # not if the line was lost meanwhile: then it is due as soon as there is one again
         if asks_for_less:
             self._together_at_ns = self._clock.monotonic_ns() + self._apart_ns
@@ -323,6 +331,24 @@ class TrendReader(PollingReader):
         self._failures = failures
         if failures:
             raise failures[-1].in_words
+
+    def _watch_pace(self, begun_ns: int, *, undisturbed: bool) -> None:
+        """State once that polls take longer than there is time for them."""
+        took_ns = self._clock.monotonic_ns() - begun_ns
+        self._slow_polls = self._slow_polls + 1 if undisturbed and took_ns > self._late_ns else 0
+        if self._slow_polls == SLOW_POLLS and not self._is_slow_said:
+            self._is_slow_said = True
+            logger.warning(
+                "%s: a poll takes %.3g ms, and at rate_hz = %.4g there are %.3g ms for it, so samples are "
+                "lost. Write rate_hz = %.2g or less, or have fewer requests on this line (max_gap, other "
+                "streams)",
+                self._who,
+                took_ns / NS_PER_MS,
+                NS_PER_S / self._period_ns,
+                self._period_ns / NS_PER_MS,
+                ROOM * NS_PER_S / took_ns,
+                extra=coded(SAMPLES_MISSING),
+            )
 
     async def run(self, line: ModbusLine) -> None:
         """See `Reader.run`: over a new line, all is tried together again at once."""

@@ -143,6 +143,24 @@ def test_a_request_that_fails_costs_a_sample_of_those_in_it_and_of_nobody_else()
     assert rig.counters("gearbox").samples_received == rig.counters("drive-end").samples_received - refused
 
 
+def test_polls_that_take_longer_than_their_rate_allows_are_told_with_a_rate_that_can_be(caplog):
+    slow = PlannedReply(delay_ns=290_000_000)
+    rig = Rig(options_of(serial=False), {"device": (trend([16, 90]), 3.0)}, clock=LoopClock())
+
+    async def main():
+        async with responding(units(), lambda *_: slow, serial=False), rig.running():
+            await asyncio.sleep(60.0)
+
+    with caplog.at_level(NOTICE):
+        simulate(main)
+    assert rig.counters("device").samples_lost > 60
+    (said,) = [record.message for record in caplog.records if "rate_hz" in record.message]
+    assert said == (
+        "stream 'device': a poll takes 580 ms, and at rate_hz = 3 there are 333 ms for it, so samples are "
+        "lost. Write rate_hz = 1.6 or less, or have fewer requests on this line (max_gap, other streams)"
+    )
+
+
 def test_a_unit_that_has_not_what_lies_between_is_asked_by_stream(caplog):
     streams = {"one": (trend([16]), 10.0), "other": (trend([20]), 10.0)}
     with caplog.at_level(NOTICE):
