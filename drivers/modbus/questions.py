@@ -455,7 +455,7 @@ _NAMED_BY_ADDRESS = re.compile(r"[a-z]+\d+", re.IGNORECASE)
 
 
 def _unit(channel: str) -> str | None:
-    """The unit that a value with this name has, as a rule; None if the name does not tell it."""
+    """The unit that a value with this name has, as a rule; None if the name suggests none."""
     return unit_by_name(channel) or ("count" if _NAMED_BY_ADDRESS.fullmatch(channel) else None)
 
 

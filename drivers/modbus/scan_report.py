@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from drivers.modbus.readings import chosen, is_signed, readings
 from drivers.modbus.replies import EXCEPTIONS
-from drivers.modbus.scan import ILLEGAL_FUNCTION, LAST_REGISTER, units_in_words
+from drivers.modbus.scan import ILLEGAL_FUNCTION, LAST_REGISTER, TABLES, units_in_words
 from drivers.modbus.settings import ModbusTcpBus
 from drivers.sniffing import Sniffed, SniffTable, quoted, sensor_lines
 
@@ -122,8 +122,25 @@ class ScanReport:
             yield f"{self._note[0].upper()}{self._note[1:]}."
         if self._all_orders:
             yield "* marks the readings that look like quantities; without --all-orders only these are shown."
+        refusing = self._refusing()
         for table, numbers in self._tables:
-            yield from self._table(table, numbers)
+            code = _only_refusal(table)
+            units = [] if code is None else refusing[table.function, code]
+            if code is None or len(units) == 1:
+                yield from self._table(table, numbers)
+            elif units[0] == table.unit:
+                whose = units_in_words(units)
+                name = f"{whose[0].upper()}{whose[1:]}, {TABLES[table.function]} registers"
+                said = f"exception {code}, {EXCEPTIONS.get(code, 'unknown')}"
+                yield f"{name} (function {table.function}): none; each answers with {said}"
+
+    def _refusing(self) -> dict[tuple[int, int], list[int]]:
+        """Units that answer with nothing but one exception, by function and exception."""
+        units: dict[tuple[int, int], list[int]] = {}
+        for table, _ in self._tables:
+            if (code := _only_refusal(table)) is not None:
+                units.setdefault((table.function, code), []).append(table.unit)
+        return units
 
     def _table(self, table: FoundTable, numbers: Sequence[Reading]) -> Iterator[str | SniffTable]:
         name = f"{table.name[0].upper()}{table.name[1:]}"
@@ -212,6 +229,13 @@ class ScanReport:
         for table, numbers in tables:
             lines += ["", *_stream(table, numbers, sensors)]
         return "\n".join(lines)
+
+
+def _only_refusal(table: FoundTable) -> int | None:
+    """The exception that the unit answers with, if it answers with nothing else."""
+    codes = set(table.refused.values())
+    is_all = table.complete and not table.first and not table.silent
+    return codes.pop() if is_all and len(codes) == 1 else None
 
 
 def _table_figures(table: FoundTable, numbers: Sequence[Reading]) -> dict[str, Any]:

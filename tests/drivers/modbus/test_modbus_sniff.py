@@ -316,6 +316,19 @@ def test_a_server_that_ignores_the_unit_is_one_device(capsys: pytest.CaptureFixt
     assert len(unit.asked) < 60
 
 
+def test_units_that_answer_with_one_exception_only_share_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    units = {unit: pump() if unit == 3 else Watched(4) for unit in range(1, 6)}
+    with tcp(units) as target:
+        assert main(words(target, "--units", "1-5", "--registers", "0-9")) == 0
+    said = capsys.readouterr().out
+    assert (
+        "\nUnits 1, 2, 4, 5, holding registers (function 3): none; each answers with exception 4, server "
+        "device failure\n" in said
+    )
+    assert said.count("exception 4") == 2  # by function 4, too
+    assert "Unit 3, holding registers (function 3): 4 at 0-3" in said
+
+
 def test_units_on_a_serial_line_are_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     port = tmp_path / "ttyS0"
     with serving(lambda: ModbusRtuServer({2: pump()}, port)):
