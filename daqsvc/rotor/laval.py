@@ -62,6 +62,7 @@ class LavalRotor:
             massless shaft, g / omega_s^2, if not given. 0 for a vertical shaft.
         two_modes: the same rotor with the two modes of its run-up and a clearance of 1 um, so that its orbits
             are in um. None where no run-up was seen, or two modes do not explain it.
+        plain_bearings: whether oil films carry the shaft; None: not known.
 
     Raises:
         ValueError: a figure that no rotor has.
@@ -74,6 +75,7 @@ class LavalRotor:
     clearance_um: float | None = None
     static_sag_um: float | None = None
     two_modes: RotorParameters | None = None
+    plain_bearings: bool | None = None
 
     def __post_init__(self) -> None:
         positive = {"natural_frequency_hz": self.natural_frequency_hz, "damping_ratio": self.damping_ratio}

@@ -33,7 +33,7 @@ from __future__ import annotations
 import cmath
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -164,6 +164,35 @@ class NormalisedRotor:
         return complex(self.k, self.cross_stiffness) * rest + self.anisotropy * rest.conjugate()
 
 
+class Film(NamedTuple):
+    """Oil films that carry a shaft, over the healthy ones.
+
+    Attributes:
+        stiffness: along the deflection.
+        damping: of the damping, and of the stiffness across the deflection, which comes of it.
+        turned_rad: angle by which they have turned with what they carry.
+    """
+
+    stiffness: float = 1.0
+    damping: float = 1.0
+    turned_rad: float = 0.0
+
+
+class Pedestal(NamedTuple):
+    """What holds the supports, in series with their springs and dampers.
+
+    Attributes:
+        compliance: how much more it gives way, mean of both axes, over the static compliance of the rotor.
+        anisotropy: compliance that came along x less that along y, over their sum.
+    """
+
+    compliance: float = 0.0
+    anisotropy: float = 0.0
+
+
+SAME_FILM, SAME_PEDESTAL = Film(), Pedestal()
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TwoModes:
     """What makes a rotor differ from a Laval rotor, as its run-up shows it.
@@ -200,7 +229,13 @@ class TwoModes:
         return (forward.imag + backward.imag) / 4.0
 
     def put_on(
-        self, rotor: NormalisedRotor, *, damping_ratio: float = 1.0, stiffness_ratio: float = 1.0
+        self,
+        rotor: NormalisedRotor,
+        *,
+        damping_ratio: float = 1.0,
+        stiffness_ratio: float = 1.0,
+        film: Film = SAME_FILM,
+        pedestal: Pedestal = SAME_PEDESTAL,
     ) -> NormalisedRotor:
         """A Laval rotor with these modes: what shaft and supports are together, at its speed.
 
@@ -208,9 +243,13 @@ class TwoModes:
             rotor: speed, unbalance and contact are taken from it.
             damping_ratio: of the supports' dampers, over the healthy ones.
             stiffness_ratio: of the static stiffness, over the healthy one, by softer supports.
+            film: what has become of the oil films that carry the shaft.
+            pedestal: how much more what holds the supports gives way.
         """
         w = rotor.w
-        forward, to_forward, to_backward, backward = self._stiffness(w, damping_ratio, stiffness_ratio)
+        forward, to_forward, to_backward, backward = self._stiffness(
+            w, damping_ratio, stiffness_ratio, film, pedestal
+        )
         stiffened = (forward.real - backward.real) / (2.0 * w**2)
         return replace(
             rotor,
@@ -243,22 +282,35 @@ class TwoModes:
         return np.asarray(np.linalg.inv(stiffness) + np.diag([higher, higher.conjugate()]))
 
     def _stiffness(
-        self, w: float, damped: float, stiffness_ratio: float
+        self,
+        w: float,
+        damped: float,
+        stiffness_ratio: float,
+        film: Film = SAME_FILM,
+        pedestal: Pedestal = SAME_PEDESTAL,
     ) -> tuple[complex, complex, complex, complex]:
         """Dynamic stiffness by rows, for forward and conjugate backward 1X, over the static one."""
         share = self.support_share
         spring = share / (1.0 / stiffness_ratio - 1.0 + share)
+        damper = damped * film.damping
+        turned = cmath.exp(2j * film.turned_rad)
         return series_stiffness(
             share,
-            spring * complex(1.0, self.cross_stiffness),
-            w * damped * self.support_lag,
-            spring * self.anisotropy,
-            w * damped * self.damping_anisotropy,
+            spring * complex(film.stiffness, film.damping * self.cross_stiffness),
+            w * damper * self.support_lag,
+            spring * film.stiffness * turned * self.anisotropy,
+            w * damper * turned * self.damping_anisotropy,
+            (1.0 - share + pedestal.compliance, pedestal.compliance * pedestal.anisotropy),
         )
 
 
 def series_stiffness(
-    share: Any, spring: Any, damper: Any, anisotropy: Any, damping_anisotropy: Any
+    share: Any,
+    spring: Any,
+    damper: Any,
+    anisotropy: Any,
+    damping_anisotropy: Any,
+    shaft: tuple[Any, Any] | None = None,
 ) -> tuple[Any, Any, Any, Any]:
     """Dynamic stiffness of a shaft in series with its supports, over the static one of both.
 
@@ -270,6 +322,8 @@ def series_stiffness(
         damper: w c / k of the supports.
         anisotropy: see `TwoModes`.
         damping_anisotropy: the same, times w.
+        shaft: compliance of what is in series with the supports, and half the difference of its axes; None:
+            that of a shaft which takes the rest of the deflection, the same in all directions.
 
     Returns:
         The four elements of the 2 x 2 matrix, row by row.
@@ -279,7 +333,8 @@ def series_stiffness(
     c, d = anisotropy.conjugate() + 1j * damping_anisotropy.conjugate(), spring.conjugate() + 1j * damper
     held = share / (a * d - b * c)
     # Deflections in series add.
-    a, b, c, d = 1.0 - share + held * d, -held * b, -held * c, 1.0 - share + held * a
+    mean, half = (1.0 - share, 0.0) if shaft is None else shaft
+    a, b, c, d = mean + held * d, half - held * b, half - held * c, mean + held * a
     whole = 1.0 / (a * d - b * c)
     return whole * d, -whole * b, -whole * c, whole * a
 
@@ -362,6 +417,8 @@ class RotorParameters:
         unbalance_ratio: float = 1.0,
         stiffness_ratio: float = 1.0,
         static_load_um: complex = 0j,
+        film: Film = SAME_FILM,
+        pedestal: Pedestal = SAME_PEDESTAL,
     ) -> NormalisedRotor:
         """The rotor with a fault, at a speed, in normalised quantities.
 
@@ -371,6 +428,8 @@ class RotorParameters:
             unbalance_ratio: eccentricity over the healthy one.
             stiffness_ratio: static stiffness over the healthy one.
             static_load_um: additional load, as the sag of the healthy shaft under it, x + iy.
+            film: what has become of the oil films, where there are two modes.
+            pedestal: how much more what holds the supports gives way, where there are two modes.
 
         Raises:
             ValueError: a quantity is outside what the model can mean.
@@ -388,13 +447,19 @@ class RotorParameters:
         forward, backward = self.two_modes.runout_um
         changed = replace(
             self.two_modes.put_on(
-                rotor, damping_ratio=rotor.zeta / self.damping_ratio, stiffness_ratio=stiffness_ratio
+                rotor,
+                damping_ratio=rotor.zeta / self.damping_ratio,
+                stiffness_ratio=stiffness_ratio,
+                film=film,
+                pedestal=pedestal,
             ),
             e=rotor.e * unbalance_ratio,
             runout=(0j, forward / self.clearance_um, backward / self.clearance_um),
         )
         # Weight and load rest on the static stiffness, which dampers have no part in.
-        force = changed.load_for((rotor.rest + load) / stiffness_ratio)
+        rest = rotor.rest + load
+        sunk = pedestal.compliance * (rest + pedestal.anisotropy * rest.conjugate())
+        force = changed.load_for(rest / stiffness_ratio + sunk)
         return replace(changed, load_x=force.real, g=-force.imag)
 
 

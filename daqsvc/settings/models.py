@@ -126,6 +126,11 @@ class Rotor(Section):
     static_load_x_um: PositionUm = Field(
         default=0.0, description="sag of the healthy shaft under its static load, towards +x"
     )
+    plain_bearings: bool | None = Field(
+        default=None,
+        description="whether oil films carry the shaft; if not given, the run-up of a calibration shows it",
+        examples=[True],
+    )
 
 
 def _turning(speed_rpm: float) -> float:

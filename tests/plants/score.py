@@ -181,6 +181,7 @@ def judge(folder: Path, seed: int, job: tuple[dict[str, object], int], *, run_up
         natural_frequency_hz=float(case["critical_hz"]) * off[0],
         damping_ratio=float(case["damping_ratio"]) * off[1],
         clearance_um=float(case["clearance_um"]),
+        plain_bearings="journals" in str(case["geometry"]),
     )
     detector = RotorSynchronousDetector(
         machine=str(case["geometry"]),

@@ -14,6 +14,7 @@ from daqsvc.rotor.synchronous.baseline import Calibration
 from daqsvc.rotor.synchronous.signatures import (
     TEMPERATURE,
     NamingRules,
+    _group,
     damping_misfit,
     identify,
     likelihoods,
@@ -242,10 +243,8 @@ def test_without_a_laval_rotor_1x_that_turns_as_the_sink_tells_is_a_softer_suppo
     assert lead(turned) > lead(-turned) + 2.0
 
 
-def test_probabilities_are_of_tempered_evidence():
-    machine = healthy(laval=False, ellipticity=0.2)
-    change = only(0, -5.0j)
-    healthy_run = Calibration(
+def healthy_run(machine: Healthy) -> Calibration:
+    return Calibration(
         rotor=ROTOR,
         speed_rpm=SPEED_RAD_S * 30.0 / math.pi,
         revolutions=100,
@@ -255,7 +254,12 @@ def test_probabilities_are_of_tempered_evidence():
         noise_variance=0.01,
         samples_per_rev=64.0,
     )
-    found = identify(change, VARIANCE, healthy_run, previous=None, rules=NamingRules())
+
+
+def test_probabilities_are_of_tempered_evidence():
+    machine = healthy(laval=False, ellipticity=0.2)
+    change = only(0, -5.0j)
+    found = identify(change, VARIANCE, healthy_run(machine), previous=None, rules=NamingRules())
     first, second = sorted(found.evidence, key=found.evidence.get, reverse=True)[:2]
     odds = found.probabilities[first] / found.probabilities[second]
     assert odds == pytest.approx(math.exp((found.evidence[first] - found.evidence[second]) / TEMPERATURE))
@@ -264,9 +268,33 @@ def test_probabilities_are_of_tempered_evidence():
 
 def test_without_a_laval_rotor_a_load_may_stiffen_the_oil_film():
     machine = healthy(laval=False, ellipticity=0.5)
-    best, scores = judged(only(0, 8.0 + 7.0j) + only(1, 1.6) + only(-1, 1.0j), machine)
+    change = only(0, 8.0 + 7.0j) + only(1, 1.6) + only(-1, 1.0j)
+    best, scores = judged(change, machine)
     assert best == "static_load"
     assert scores["static_load"] - scores["stiffness_loss"] > 5.0
+    on_springs = replace(machine, rotor=replace(machine.rotor, plain_bearings=False))
+    assert judged(change, on_springs)[1]["static_load"] < scores["static_load"] - 50.0
+
+
+@pytest.mark.parametrize(
+    ("best", "behind", "marked", "together"),
+    [
+        ("unbalance", 1.0, False, True),
+        ("unbalance", 3.0, False, False),
+        ("unbalance", 3.0, True, True),
+        ("damping_loss", 3.0, False, False),
+        ("stiffness_loss", 3.0, False, True),
+        ("rub", -3.0, False, True),
+    ],
+)
+def test_a_rub_without_a_mark_is_left_out_sooner_where_1x_alone_explains_it(
+    best: str, behind: float, *, marked: bool, together: bool
+):
+    """And never the other way round: a rub that leads leaves unbalance in the group."""
+    other = "unbalance" if best == "rub" else best
+    scores = {"normal": 0.0, "unbalance": 50.0, other: 100.0, "rub": 100.0 - behind}
+    group = _group(scores, best, healthy_run(healthy(laval=False)), NamingRules(), marked=marked)
+    assert ({other, "rub"} == set(group)) == together
 
 
 def test_1x_that_moves_alone_is_no_stiffness_loss_where_the_mean_position_is_known():

@@ -12,7 +12,7 @@ from support.two_mode_rotors import RATE_HZ, UNIT_HZ, Machine, run_up
 
 from daqsvc.rotor.calibration.run_up import fit_run_up, revolutions_of
 from daqsvc.rotor.calibration.two_modes import TwoModeFit, fit_two_modes
-from daqsvc.rotor.model import RotorParameters
+from daqsvc.rotor.model import Film, Pedestal, RotorParameters
 from daqsvc.rotor.synchronous.baseline import NotCalibratableError
 from daqsvc.rotor.synchronous.vectors import synchronous_vectors
 
@@ -88,6 +88,25 @@ def test_orbits_of_derived_faults_come_true(speed_hz):
     assert off(MACHINE.softened(0.6), speed_hz, stiffness_ratio=left) < 0.05
 
 
+@pytest.mark.parametrize("speed_hz", [20.0, 28.0, 38.0])
+def test_what_gives_way_in_series_leaves_the_dampers_as_they_are(speed_hz):
+    softer = replace(MACHINE, shaft=1.2)
+    static = 1.0 / MACHINE.shaft + 2.0 / sum(MACHINE.supports)
+    more = Pedestal((1.0 / softer.shaft - 1.0 / MACHINE.shaft) / static)
+    assert off(softer, speed_hz, pedestal=more) < 0.02
+    beside = {"stiffness_ratio": 1.0 / (1.0 + more.compliance)}
+    assert off(softer, speed_hz, **beside) > 2.0 * off(softer, speed_hz, pedestal=more)
+
+
+@pytest.mark.parametrize("speed_hz", [20.0, 28.0, 38.0])
+def test_films_that_stiffen_and_turn_come_true(speed_hz):
+    films = Film(stiffness=1.3, damping=1.1, turned_rad=math.pi / 2.0)
+    (x, y), (dx, dy) = MACHINE.supports, MACHINE.dampers
+    turned = replace(MACHINE, supports=(1.3 * y, 1.3 * x), dampers=(1.1 * dy, 1.1 * dx))
+    assert off(turned, speed_hz, film=films) < 0.03
+    assert off(turned, speed_hz) > 0.1
+
+
 def test_damping_alone_would_be_far_off():
     # Without the supports' share a weaker damper leaves the frequency where it was.
     fit = identified()
@@ -105,6 +124,7 @@ def test_weight_rests_on_the_static_stiffness():
     assert rotor.faulty(1500.0).rest == pytest.approx(-40.0j / 200.0)
     assert rotor.faulty(1500.0, damping_ratio=0.4 * rotor.damping_ratio).rest == pytest.approx(-0.2j)
     assert rotor.faulty(1500.0, stiffness_ratio=0.8).rest == pytest.approx(-0.25j)
+    assert rotor.faulty(1500.0, pedestal=Pedestal(0.25, 0.2)).rest == pytest.approx(-0.24j)
     assert rotor.faulty(1500.0, static_load_um=20.0 + 0j).rest == pytest.approx(0.1 - 0.2j)
 
 

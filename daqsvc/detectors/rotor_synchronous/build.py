@@ -56,7 +56,12 @@ def healthy_rotor(
     if calibration is None and settings.calibration is not None:
         calibration = machine.resolve(settings.calibration)
     if calibration is not None:
-        return load_healthy(calibration, known(machine.machine.speed_rpm), rotor.clearance_um)
+        return load_healthy(
+            calibration,
+            known(machine.machine.speed_rpm),
+            rotor.clearance_um,
+            plain_bearings=rotor.plain_bearings,
+        )
     stated = LavalRotor(
         natural_frequency_hz=rotor.natural_frequency_hz,
         damping_ratio=rotor.damping_ratio,
@@ -64,6 +69,7 @@ def healthy_rotor(
         damping_tolerance=settings.damping_tolerance_percent / 100.0,
         clearance_um=rotor.clearance_um,
         static_sag_um=rotor.static_sag_um,
+        plain_bearings=rotor.plain_bearings,
     )
     return stated, ()
 

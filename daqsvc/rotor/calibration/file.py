@@ -385,7 +385,11 @@ def load_calibration(path: Path | str, speed_rpm: float | None = None) -> Calibr
 
 
 def load_healthy(
-    path: Path | str, speed_rpm: float | None, clearance_um: float | None = None
+    path: Path | str,
+    speed_rpm: float | None,
+    clearance_um: float | None = None,
+    *,
+    plain_bearings: bool | None = None,
 ) -> tuple[LavalRotor, tuple[Calibration, ...]]:
     """What a file holds about the healthy machine, at one speed or at any.
 
@@ -393,6 +397,7 @@ def load_healthy(
         path: the file.
         speed_rpm: shaft speed of either sign; None where it is not known yet.
         clearance_um: radial clearance, in place of the file's.
+        plain_bearings: whether oil films carry the shaft; None: not known.
 
     Returns:
         The rotor, with the two modes of a run-up that passed the speed, and the baseline of the speed, or of
@@ -414,6 +419,7 @@ def load_healthy(
             baselines = ()
     if clearance_um is not None:
         rotor = replace(rotor, clearance_um=clearance_um)
+    rotor = replace(rotor, plain_bearings=plain_bearings)
     if record.two_modes is not None and (speed_rpm is None or record.two_modes.holds_at(speed_rpm)):
         rotor = record.two_modes.beside(rotor)
     return rotor, tuple(replace(baseline, rotor=rotor) for baseline in baselines)

@@ -1,4 +1,4 @@
-"""What softer supports and weaker dampers do to a rotor whose run-up showed two modes.
+"""What softer supports, weaker dampers and a load on oil films do to a rotor whose run-up showed two modes.
 
 A Laval rotor answers such a fault by one line in the plane of forward 1X. Real supports part the mode in two,
 take a share of the deflection only, and make the shaft whirl backward, too. `daqsvc.rotor.model.TwoModes`
@@ -7,15 +7,18 @@ states how mean position, forward and backward 1X move together: what fits all t
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import math
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from daqsvc.rotor.model import Film, Pedestal
 from daqsvc.rotor.synchronous.vectors import BACKWARD, DC, FORWARD, Healthy, log_density, log_mean
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from daqsvc.rotor.laval import LavalRotor
     from daqsvc.rotor.model import NormalisedRotor, RotorParameters
 
     Complexes = NDArray[np.complex128]
@@ -29,6 +32,8 @@ _FILM = 0.05
 """Above this stiffness across the deflection, over the static one, an oil film carries the shaft ..."""
 _ASIDE = np.exp(1j * np.radians([-40.0, -20.0, 0.0, 20.0, 40.0]))
 """... so that its way down need not be the one that the modes predict."""
+_PEDESTALS = (-0.25, 0.0, 0.25)
+"""Compliance of a pedestal along x less that along y, over their sum: most are softer along x."""
 _LEFT = np.linspace(0.05, 0.97, 32)
 """Parts of the damping that are left."""
 _TOLERANCES = np.array([0.1, 0.2, 0.4])
@@ -36,6 +41,12 @@ _TOLERANCES = np.array([0.1, 0.2, 0.4])
 _BESIDE = 0.05
 """The least that such a component is off by, as a part of the largest."""
 _COMPONENTS = [DC, FORWARD, BACKWARD]
+_GROWS = ((0.4, 0.0), (0.8, 0.0), (1.2, 0.0), (0.8, 0.4), (1.2, 1.2))
+"""Powers of the load that stiffness and damping of an oil film grow with. In a short bearing that carries
+little, stiffness follows the load and damping does not (Ocvirk); both do where it carries much, and a
+pedestal in series makes it less."""
+_LEAST_LOAD, _MOST_LOAD = 0.3, 3.0
+"""Load of a film over the healthy one: bounds within which it is followed."""
 
 
 def softer(change: Complexes, variance: Floats, healthy: Healthy, rotor: RotorParameters) -> float:
@@ -47,12 +58,57 @@ def softer(change: Complexes, variance: Floats, healthy: Healthy, rotor: RotorPa
         healthy: the machine before.
         rotor: the same with its two modes.
     """
-    moved = _moved(healthy, rotor, [{"stiffness_ratio": 1.0 / (1.0 + loss)} for loss in _LOSSES])
-    film = rotor.two_modes is not None and abs(rotor.two_modes.cross_stiffness) > _FILM
-    ways = np.outer(_SEEN, _ASIDE if film else [1.0]).ravel()
+    beside = _moved(healthy, rotor, _beside_dampers())
+    if not on_film(healthy.rotor):
+        return _likelihood(change, variance, _as_seen(beside, _SEEN))
+    # Either the film itself is softer, or what holds it up; the latter has no damper beside it.
+    films = _likelihood(change, variance, _as_seen(beside, np.outer(_SEEN, _ASIDE).ravel()))
+    pedestals = _likelihood(change, variance, _as_seen(_moved(healthy, rotor, _in_series()), _SEEN))
+    return float(np.logaddexp(films, pedestals)) - math.log(2.0)
+
+
+def _beside_dampers() -> list[dict[str, Any]]:
+    """Softer springs that have the dampers beside them."""
+    return [{"stiffness_ratio": 1.0 / (1.0 + loss)} for loss in _LOSSES]
+
+
+def _in_series() -> list[dict[str, Any]]:
+    """Softer pedestals, in series with springs and dampers."""
+    return [{"pedestal": Pedestal(loss, part)} for part in _PEDESTALS for loss in _LOSSES]
+
+
+def _as_seen(moved: Complexes, ways: Complexes | Floats) -> Complexes:
+    """Predicted changes with each of the ways in which the probes may see the mean position move."""
     moved = np.tile(moved, (len(ways), 1, 1))
     moved[..., 0] *= ways[:, np.newaxis]
-    return _likelihood(change, variance, moved.reshape(-1, 3))
+    return moved.reshape(-1, 3)
+
+
+def on_film(rotor: LavalRotor) -> bool:
+    """Whether oil films carry the shaft: as stated, else by how much its supports push across the sag."""
+    if rotor.plain_bearings is not None or rotor.two_modes is None or rotor.two_modes.two_modes is None:
+        return bool(rotor.plain_bearings)
+    return abs(rotor.two_modes.two_modes.cross_stiffness) > _FILM
+
+
+def loaded(change: Complexes, variance: Floats, healthy: Healthy, rotor: RotorParameters) -> float:
+    """Log marginal likelihood of both senses of 1X where oil films carry another load.
+
+    How far the mean position moves shows by how much the load has grown and turned. A film gets stiffer the
+    more it carries, and turns with what it carries, and 1X follows.
+    """
+    speed_rpm = healthy.speed_rad_s * 30.0 / np.pi
+    still = rotor.faulty(speed_rpm)
+    weight = still.load_for(still.rest)
+    films = [Film()]
+    for seen in _SEEN if weight else ():  # an upright shaft: no weight to compare a load with
+        for aside in _ASIDE:
+            load = still.load_for(still.rest + complex(change[DC] * aside) / seen) / weight
+            grown = min(max(abs(load), _LEAST_LOAD), _MOST_LOAD)
+            turned = float(np.angle(load))
+            films += [Film(grown**p, grown**q, way) for p, q in _GROWS for way in (0.0, turned)]
+    moved = _moved(healthy, rotor, [{"film": film} for film in films])
+    return _likelihood(change, variance, moved[:, 1:], [FORWARD, BACKWARD])
 
 
 def less_damped(change: Complexes, variance: Floats, healthy: Healthy, rotor: RotorParameters) -> float:
@@ -64,9 +120,9 @@ def less_damped(change: Complexes, variance: Floats, healthy: Healthy, rotor: Ro
 
 def stiffness_left(change: Complexes, healthy: Healthy, rotor: RotorParameters) -> float:
     """Part of the static stiffness that explains a change best; see `softer`."""
-    left = 1.0 / (1.0 + _LOSSES)
-    moved = _moved(healthy, rotor, [{"stiffness_ratio": part} for part in left])
-    return float(left[_misfit(change, moved).argmin()])
+    losses = _beside_dampers() + (_in_series() if on_film(healthy.rotor) else [])
+    best = int(_misfit(change, _moved(healthy, rotor, losses)).argmin())
+    return float(1.0 / (1.0 + _LOSSES[best % len(_LOSSES)]))
 
 
 def damping_left(change: Complexes, healthy: Healthy, rotor: RotorParameters) -> float:
@@ -83,7 +139,7 @@ def _misfit(change: Complexes, moved: Complexes) -> Floats:
     return np.asarray((np.abs(change[[FORWARD, BACKWARD]] - moved[:, 1:]) ** 2).sum(axis=1))
 
 
-def _moved(healthy: Healthy, rotor: RotorParameters, faults: list[dict[str, float]]) -> Complexes:
+def _moved(healthy: Healthy, rotor: RotorParameters, faults: list[dict[str, Any]]) -> Complexes:
     """Change of the mean position, forward and backward 1X by faults, complex128 ``[n, 3]``, um.
 
     The unbalance is that of the baseline, which need not be that of the run-up.
@@ -100,10 +156,12 @@ def _orbit(rotor: NormalisedRotor) -> Complexes:
     return np.array([rotor.rest, rotor.orbit() - forward, rotor.backward_orbit() - backward])
 
 
-def _likelihood(change: Complexes, variance: Floats, moved: Complexes) -> float:
+def _likelihood(
+    change: Complexes, variance: Floats, moved: Complexes, components: list[int] = _COMPONENTS
+) -> float:
     size = np.abs(moved).max(axis=1, keepdims=True)
     spread = (
-        variance[_COMPONENTS]
+        variance[components]
         + (_TOLERANCES[:, np.newaxis, np.newaxis] * np.maximum(np.abs(moved), _BESIDE * size)) ** 2
     )
-    return log_mean(log_density(change[_COMPONENTS] - moved, spread).sum(axis=-1).ravel())
+    return log_mean(log_density(change[components] - moved, spread).sum(axis=-1).ravel())

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 import numpy as np
 
 from daqsvc.rotor.laval import unbalance_response
-from daqsvc.rotor.synchronous.by_two_modes import less_damped, softer
+from daqsvc.rotor.synchronous.by_two_modes import less_damped, loaded, on_film, softer
 from daqsvc.rotor.synchronous.contact import fills_clearance, has_marks, marks_would_show
 from daqsvc.rotor.synchronous.pulses import crack, rub_pulse
 from daqsvc.rotor.synchronous.vectors import (
@@ -234,9 +234,19 @@ def _damped(healthy: Healthy) -> tuple[Complexes, Complexes]:
 
 
 def _static_load(change: Complexes, variance: Floats, healthy: Healthy) -> float:
+    free = _free_static_load(change, variance, healthy)
+    rotor = healthy.rotor.two_modes
+    if rotor is None or not on_film(healthy.rotor):
+        return free
+    rest = _still(change, variance, abs(change[DC]))
+    told = float(rest[BEYOND_1X].sum()) + _free(change[DC], variance[DC], healthy.amplitude_um)
+    return _besides(told + loaded(change, variance, healthy, rotor), free)
+
+
+def _free_static_load(change: Complexes, variance: Floats, healthy: Healthy) -> float:
     score = _still(change, variance, abs(change[DC]))
     score[DC] = _free(change[DC], variance[DC], healthy.amplitude_um)
-    if not healthy.laval:
+    if not healthy.laval and healthy.rotor.plain_bearings is not False:
         # An oil film that carries more is stiffer: the orbit follows, by a part of the shaft's way.
         way = min(abs(change[DC]), healthy.amplitude_um)
         for k in (FORWARD, BACKWARD):
@@ -358,6 +368,10 @@ _MOST_ENERGY_NATS = 100.0
 _MISFIT = 0.005
 """Part of the evidence of a change that the shape of a rub's pulse may be off by: where no rotor model fits
 exactly, a few nats of thousands mean nothing."""
+_UNMARKED_RUB_MARGIN_NATS = 2.0
+"""A rub that leaves no mark of contact is rare, even where noise may hide one: what explains a change of 1X
+alone leaves it out of the group sooner."""
+_ONLY_1X = frozenset(("unbalance", "damping_loss"))
 _RIVALS = frozenset(("rub", "unmodelled"))
 TEMPERATURE = 3.0
 """What evidence is divided by before it is a probability: no machine follows a signature exactly, so
@@ -517,6 +531,8 @@ def _group(
             return math.inf
         if {name, best} == _RIVALS:
             return rules.rub_margin_nats if healthy.healthy.modelled else _GENERIC_RUB_MARGIN_NATS
+        if name == "rub" and best in _ONLY_1X and not marked:
+            return _UNMARKED_RUB_MARGIN_NATS
         return rules.margin_nats
 
     close = [name for name in scores if scores[best] - scores[name] < margin(name)]

@@ -64,7 +64,19 @@ def test_the_detector_is_what_the_machine_file_says():
     assert (rotor.natural_frequency_hz, rotor.natural_frequency_tolerance) == (31.0, 0.05)
     assert (rotor.damping_ratio, rotor.damping_tolerance) == (0.1, 0.2)
     assert (rotor.clearance_um, rotor.static_sag_um) == (100.0, 10.0)
+    assert rotor.plain_bearings is None
     assert not made.ac_coupled
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_the_machine_file_states_whether_its_bearings_are_plain(stated, tmp_path):
+    text, _ = changed(EXAMPLE, ("clearance_um =", f"plain_bearings = {str(stated).lower()}\nclearance_um ="))
+    assert detector(parse_machine_file(text, EXAMPLE)).watch.rotor.plain_bearings is stated
+    save_calibration(
+        healthy(LavalRotor(natural_frequency_hz=31.0, damping_ratio=0.1), 50), tmp_path / "a.toml"
+    )
+    text = text.replace("probe_drift_um = 0.0", 'calibration = "a.toml"')
+    assert detector(parse_machine_file(text, tmp_path / "m.toml")).watch.rotor.plain_bearings is stated
 
 
 @pytest.mark.parametrize(
