@@ -144,6 +144,7 @@ _ENDLESS = re.compile(
     r"\bSG_\s[^:@]{0,200}:[^@(]{0,60}?\d{6}|\bBO_\s[^:]{0,200}:\s{0,20}\d{6}|\d\s{0,9}-\s{0,9}\d{6}"
 )
 _STRING = re.compile(r'"[^"]*"')
+_MESSAGE = re.compile(r"^[ \t]*BO_\s", re.MULTILINE)
 
 
 def check_dbc(layout: DbcLayout, file: Path, at: KeyPath) -> tuple[DbcMessage | None, list[Finding]]:
@@ -233,16 +234,31 @@ def _database(file: Path, at: KeyPath) -> Database | Finding:
         _refuse_endless(text)
         database = load_string(text, "dbc")
     except Exception as error:  # noqa: BLE001 - the parser raises what it likes: of lookups, numbers, recursion
-        reason = shortened(" ".join(str(error).split()) or type(error).__name__, 200)
-        return Finding(
-            here,
-            f"{file} cannot be read as a DBC file: {reason}",
-            "open it in the tool it came from and export it as DBC again",
-            code=DBC_FILE,
-        )
+        statement, remedy = _why_unreadable(text, error)
+        return Finding(here, f"{file} {statement}", remedy, code=DBC_FILE)
     if not isinstance(database, can.Database):
         return Finding(here, f"{file} describes no CAN messages", "give another DBC file", code=DBC_FILE)
     return database
+
+
+def _why_unreadable(text: str, error: Exception) -> tuple[str, str]:
+    """What is wrong with the text of a file that the parser refuses, and the remedy."""
+    if not text.strip():
+        return "is empty", "copy it again, or export it from its tool again"
+    if not _MESSAGE.search(text):
+        return "is no DBC file: no line begins with BO_, as messages do", "give the DBC file of the device"
+    # Of all formats that it knows, the parser states what does not fit this one.
+    words = f"{getattr(error, 'e_dbc', None) or error}".replace(">>!<<", "")
+    reason = shortened(" ".join(words.split()) or type(error).__name__, 200)
+    remedy = "open it in the tool it came from and export it as DBC again"
+    if "overlapping" in reason or "does not fit" in reason:
+        remedy = (
+            "correct start bit, length or byte order of these signals in the tool it came from (@0: the "
+            "start bit is the highest one, @1: the lowest)"
+        )
+    elif reason.startswith("Invalid syntax"):
+        remedy = "correct that line in the tool it came from, or export it as DBC again"
+    return f"cannot be read as a DBC file: {reason}", remedy
 
 
 def _text(data: bytes) -> str:

@@ -240,3 +240,34 @@ def test_what_is_no_dbc_file_is_refused_with_a_remedy(tmp_path: Path) -> None:
     (tmp_path / "bad.dbc").write_text("BO_ nonsense")
     with pytest.raises(LayoutError, match="cannot be read as a DBC file"):
         messages_of(tmp_path / "bad.dbc")
+
+
+MESSAGE = 'BU_: A\nBO_ 1 M: 8 A\n SG_ X : 0|12@1+ (1,0) [0|0] "" A\n SG_ Y : 12|12@1+ (1,0) [0|0] "" A\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "statement", "remedy"),
+    [
+        ("", "is empty", "copy it again"),
+        ('name = "fan"\n', "is no DBC file: no line begins with BO_, as messages do", "give the DBC file"),
+        (
+            MESSAGE.replace("12|12", "8|12"),
+            "cannot be read as a DBC file: The signals Y and X are overlapping in message M.",
+            "correct start bit, length or byte order of these signals",
+        ),
+        (MESSAGE.replace("12|12", "60|12"), "does not fit in message M.", "correct start bit, length"),
+        (
+            MESSAGE.replace("X :", "X"),
+            'cannot be read as a DBC file: Invalid syntax at line 3, column 8: " SG_ X 0|12@1+',
+            "correct that line",
+        ),
+    ],
+)
+def test_a_dbc_file_that_cannot_be_read_has_a_remedy_for_its_fault(
+    tmp_path: Path, text: str, statement: str, remedy: str
+) -> None:
+    (tmp_path / "bad.dbc").write_text(text)
+    with pytest.raises(LayoutError) as raised:
+        messages_of(tmp_path / "bad.dbc")
+    assert statement in f"{raised.value}"
+    assert f"Remedy: {remedy}" in f"{raised.value}"
