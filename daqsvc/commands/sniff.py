@@ -31,7 +31,7 @@ class SniffCommand:
     help = "show what is on a bus, without a machine file, and print tables to begin one with"
     description = (
         "Show what is on a bus, without a machine file. The output ends with tables to begin a machine "
-        "file with. Ctrl-C ends it early, and what was found until then is printed (docs/sniff.md)."
+        "file with. Ctrl-C ends it early, and what was found until then is printed."
     )
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
@@ -75,7 +75,7 @@ def _as_json(found: Sniffed) -> str:
 def _as_text(found: Sniffed) -> str:
     parts = [part if isinstance(part, str) else _drawn(part) for part in found.parts]
     if found.fragment:
-        parts.append(f"To begin a machine file with (docs/machine-file.md has the rest):\n\n{found.fragment}")
+        parts.append(f"To begin a machine file with (daqsvc new asks for the rest):\n\n{found.fragment}")
     return "\n\n".join(part.rstrip() for part in parts if part)
 
 

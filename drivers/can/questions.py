@@ -318,9 +318,11 @@ class DbcQuestions(_CanQuestions):
         rates = [one["rate_hz"] for one in found["ids"] if one["message"] == chosen["message"]]
         if len(rates) == 1 and rates[0]:
             measured = [one for one in chosen["signals"] if one["signal"] in answers.get("signals", ())]
-            share = min((one["frames"] for one in measured), default=chosen["frames"]) / chosen["frames"]
+            share = _simple_share(
+                min((one["frames"] for one in measured), default=chosen["frames"]), chosen["frames"]
+            )
             in_frame = self._samples_in_frame(answers) if "signals" in answers else 1
-            proposed["rate"] = f"{usual_rate(rates[0] * share * in_frame):g}"
+            proposed["rate"] = f"{usual_rate(rates[0]) * share * in_frame:g}"
         return proposed
 
     def _messages(self, answers: Answers) -> dict[str, Message]:
@@ -455,6 +457,15 @@ def _share(message: Message, names: Sequence[str]) -> float:
 
     pages = selecting_values({one.name: one for one in message.signals}, names)
     return math.prod(len(values) / len(values_of(message, selector)) for selector, values in pages.items())
+
+
+def _simple_share(frames: int, of_all: int) -> float:
+    """The simplest fraction that so many of all frames can be: of a short time, one frame more or less."""
+    for pages in range(1, of_all):
+        taken = max(round(frames / of_all * pages), 1)
+        if abs(frames - of_all * taken / pages) <= 1.0:
+            return taken / pages
+    return frames / of_all
 
 
 def _shown(by_page: Mapping[str, Sequence[str]], behind: str = "") -> dict[str, str]:

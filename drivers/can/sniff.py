@@ -217,7 +217,7 @@ def _opened(bus: CanBus, clock: Any) -> CanSource:
         said = f"{error}" or type(error).__name__
         raise SniffError(
             f"{bus.interface} {bus.channel} cannot be opened: {said}. Remedy: see what is plugged in and "
-            "whether its driver is installed (docs/can.md)"
+            "whether its driver is installed"
         ) from error
 
 
@@ -537,7 +537,9 @@ class _Report(NamedTuple):
         measured = [s for s in message.signals if s.frames and not s.counts and not s.multiplexed]
         channels = [s for s in measured if not s.named and not s.rises]
         if any(signal.multiplexed for signal in message.signals):
-            return [f"# {message.name} is multiplexed: make a stream for each page (docs/can.md)"]
+            return [
+                f"# {message.name} is multiplexed: make a stream for each page; daqsvc new makes that of one"
+            ]
         if len(of_ids) != 1 or not channels or message.short:
             return [f"# {message.name} came too seldom, or not as the DBC file describes it"]
         rate_hz = of_ids[0].rate_hz

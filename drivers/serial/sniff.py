@@ -524,7 +524,7 @@ class _Report(NamedTuple):
             if what.prefix:
                 yield f"# Lines that begin with {what.prefix}:"
             yield "# A stream needs a column that counts lines, or one with the device's time, and a column"
-            yield "# of numbers beside it; have the device send them (docs/serial.md)."
+            yield "# of numbers beside it; have the device send them."
             return
         names = _names(what.columns)
         yield f"[streams.{stream}]"
@@ -564,7 +564,7 @@ class _Report(NamedTuple):
         rate_hz = self._rate_hz(what)
         if counter is None or packed is None or rate_hz is None:
             yield f"# A stream needs a counter: none was found in the {payload} bytes of payload, or nothing"
-            yield "# behind it. See the manual of the device (docs/serial.md)."
+            yield "# behind it. See the manual of the device."
             return
         samples = packed.samples_per_frame
         yield "[streams.frames]"

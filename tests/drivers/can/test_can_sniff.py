@@ -212,9 +212,11 @@ def test_new_reads_one_page_without_the_counter_of_all_and_names_the_other(tmp_p
     assert "#   Page 1: Supply, Humidity\n" in text
 
 
-@pytest.mark.parametrize(("signals", "rate"), [(("Temperature",), "10"), (("Count",), "20")])
+@pytest.mark.parametrize(
+    ("signals", "rate"), [(("Temperature",), "10"), (("Count",), "20"), (("Supply",), "6.66667")]
+)
 def test_a_page_is_proposed_at_its_own_rate(signals: tuple[str, ...], rate: str) -> None:
-    heard = [("Page", 100, False), ("Count", 100, False), ("Temperature", 50, True), ("Supply", 50, True)]
+    heard = [("Page", 100, False), ("Count", 100, False), ("Temperature", 50, True), ("Supply", 34, True)]
     found = {
         "ids": [{"message": "Slow", "rate_hz": 20.0}],
         "dbc": {
