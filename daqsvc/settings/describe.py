@@ -7,6 +7,7 @@ import textwrap
 from functools import partial
 from typing import TYPE_CHECKING
 
+from daqsvc.rounding import unit_behind
 from daqsvc.settings.alarms import LevelAlarm, SetpointAlarm
 from daqsvc.settings.failures import one_line
 from daqsvc.settings.hooks import PluginFailedError
@@ -131,7 +132,7 @@ _SENSOR_HEADER = ("name", "type", "channel", "unit", "sensitivity", "details")
 
 def _sensor(sensor: Sensor) -> Sequence[str]:
     if sensor.sensitivity_mv_per_unit is None:
-        sensitivity = f"in {sensor.unit} already"
+        sensitivity = "a plain number" if sensor.unit == "1" else f"in {sensor.unit} already"
     else:
         sensitivity = f"{sensor.sensitivity_mv_per_unit:g} mV/{sensor.unit}"
         if sensor.zero_v != 0:
@@ -156,7 +157,7 @@ def _sensor_details(sensor: Sensor) -> Iterator[str]:
     if isinstance(sensor, Keyphasor):
         yield f"{sensor.edge} at {sensor.threshold_v:g} V, hysteresis {sensor.hysteresis_v:g} V"
     if isinstance(sensor, TrendValue) and sensor.ok_between is not None:
-        yield f"OK {sensor.ok_between[0]:g} to {sensor.ok_between[1]:g} {sensor.unit}"
+        yield f"OK {sensor.ok_between[0]:g} to {sensor.ok_between[1]:g}{unit_behind(sensor.unit)}"
 
 
 def _detectors(machine: MachineFile) -> Iterator[tuple[str, str]]:
@@ -182,12 +183,12 @@ def _alarms(machine: MachineFile) -> Iterator[Sequence[str]]:
             evidence = f"{alarm.evidence_nats:g} nats at least" if alarm.evidence_nats else "none"
             yield alarm.name, alarm.detector, "by mode", "by mode", f"{evidence}{latching}"
             continue
-        unit = UNITS.get(alarm.measure, machine.sensor(alarm.watched[0]).unit)
+        unit = unit_behind(UNITS.get(alarm.measure, machine.sensor(alarm.watched[0]).unit))
         if isinstance(alarm, LevelAlarm):
             watched = f"{alarm.measure} of {alarm.sensor}"
         else:
             watched = f"{alarm.measure}, {alarm.vote} of {', '.join(alarm.sensors)}"
-        deadband = f"{alarm.deadband:g} {unit}".rstrip()
+        deadband = f"{alarm.deadband:g}{unit}"
         delays = f"on {alarm.on_delay_s:g} s, off {alarm.off_delay_s:g} s"
         multiplied = f", start-up x{alarm.trip_multiply:g}" if alarm.trip_multiply > 1 else ""
         yield (
@@ -216,8 +217,8 @@ def _more_of(alarm: SetpointAlarm) -> str:
 def _limits(low: float | None, high: float | None, unit: str) -> str:
     """Where a level begins: at and above ``high``, at and below ``low``, or at both ends of a window."""
     if low is None:
-        return "-" if high is None else f"{high:g} {unit}".rstrip()
-    return f"<= {low:g} {unit}" if high is None else f"{low:g}..{high:g} {unit}"
+        return "-" if high is None else f"{high:g}{unit}"
+    return f"<= {low:g}{unit}" if high is None else f"{low:g}..{high:g}{unit}"
 
 
 def _outlets(machine: MachineFile, store: str) -> Iterator[tuple[str, str]]:

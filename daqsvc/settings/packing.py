@@ -243,8 +243,13 @@ class PackedLayout(PackedFields):
     def summary(self) -> str:
         """See `Layout.summary`."""
         count = "no count" if self.counter is None else f"{self.counter.bits} bit count"
-        samples = f"{self.samples_per_frame} x {len(self.channels)} samples"
+        samples = samples_in_words(self.samples_per_frame, len(self.channels))
         return f"{self.frame_bytes} bytes, {samples}, {count}"
+
+
+def samples_in_words(samples_per_frame: int, channels: int) -> str:
+    """What a frame holds: ``10 x 3 channels``."""
+    return f"{samples_per_frame} x {channels} channel{'s' * (channels != 1)}"
 
 
 def packed_range(channels: tuple[Channel, ...], name: str) -> WireRange | None:

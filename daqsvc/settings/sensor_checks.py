@@ -15,6 +15,7 @@ from daqsvc.errors.machine_file import (
     UNLIKELY_SENSITIVITY,
     WRONG_SCALE,
 )
+from daqsvc.rounding import unit_behind
 from daqsvc.settings.alarms import SetpointAlarm
 from daqsvc.settings.measures import NOT_1X
 from daqsvc.settings.problems import Finding
@@ -207,7 +208,7 @@ def check_reach(
         if sensor.ok_between[1] < least or largest < sensor.ok_between[0]:
             yield Finding(
                 (*at, "ok_between"),
-                f"is never met: the channel carries {least:g} to {largest:g} {sensor.unit}",
+                f"is never met: the channel carries {least:g} to {largest:g}{unit_behind(sensor.unit)}",
                 remedy,
                 code=BEYOND_CHANNEL,
             )
@@ -254,9 +255,9 @@ def check_alarm_reach(draft: MachineFile, facts: Mapping[str, Any]) -> Iterator[
 
 def _range(reach: tuple[float, float], unit: str) -> str:
     return (
-        f"{reach[1]:.4g} {unit} at most"
+        f"{reach[1]:.4g}{unit_behind(unit)} at most"
         if math.isinf(reach[0])
-        else f"{reach[0]:.4g} to {reach[1]:.4g} {unit}"
+        else f"{reach[0]:.4g} to {reach[1]:.4g}{unit_behind(unit)}"
     )
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from daqsvc.errors.buses import WRONG_LAYOUT
 from daqsvc.settings.buses import percent
+from daqsvc.settings.packing import samples_in_words
 from daqsvc.settings.plugins import StreamWords
 from daqsvc.settings.problems import AssemblyError
 from daqsvc.settings.section import UnusableValueError
@@ -139,7 +140,7 @@ def stream_words(machine: MachineFile, name: str) -> StreamWords:
     shown_share = "" if share is None else percent(*share)
     if facts is None:
         return StreamWords(share=shown_share)
-    samples = f"{facts.samples_per_frame} x {len(layout.channels)} samples"
+    samples = samples_in_words(facts.samples_per_frame, len(layout.channels))
     return StreamWords(
         f"{facts.frame_id:#x}",
         f"{stream.rate_hz / facts.samples_per_frame:.4g}/s",

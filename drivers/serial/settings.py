@@ -16,6 +16,7 @@ from daqsvc.settings.packing import (
     Counter,
     Scale,
     packed_range,
+    samples_in_words,
 )
 from daqsvc.settings.section import MOST_CHANNELS, Name, Quantity, Section
 
@@ -226,10 +227,8 @@ class SerialLayout(Layout):
     def summary(self) -> str:
         """What a person should know about it, in a few words."""
         named = "" if self.stream_id is None else f"id {self.stream_id}, "
-        return (
-            f"{named}{self.payload_length} bytes, {self.samples_per_frame} x {len(self.channels)} samples, "
-            f"{self.counter.bits} bit count"
-        )
+        samples = samples_in_words(self.samples_per_frame, len(self.channels))
+        return f"{named}{self.payload_length} bytes, {samples}, {self.counter.bits} bit count"
 
     def wire_range(self, channel: str, facts: Any) -> WireRange | None:
         """See `Layout.wire_range`."""

@@ -68,7 +68,7 @@ async def test_the_example_serves_a_machine(tmp_path: Path) -> None:
 def test_check_says_what_it_has_understood_of_it() -> None:
     text = " ".join(describe(load_machine_file(MACHINE)).split())
     assert "logger driver tcp-frames, host 127.0.0.1, tcp_port 4001; if absent at start: retry" in text
-    assert "128 bytes, 30 x 2 samples, 32 bit count" in text
+    assert "128 bytes, 30 x 2 channels, 32 bit count" in text
 
 
 def test_a_frame_may_have_any_length() -> None:

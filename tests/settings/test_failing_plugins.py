@@ -626,7 +626,7 @@ def test_words_that_fail_are_named_in_their_place(
     failed = break_(monkeypatch, owner, hook)
     text = " ".join(describe(parse_machine_file(TABLES, MACHINE)).split())
     assert failed in text
-    assert "128 bytes, 30 x 2 samples, 32 bit count" in text
+    assert "128 bytes, 30 x 2 channels, 32 bit count" in text
 
 
 @pytest.mark.parametrize("hook", ["readings", "quality_alarms"])
@@ -657,7 +657,7 @@ def test_words_that_fail_end_check_with_an_error(
         said = capsys.readouterr()
         assert said.err.startswith(f"{file}: {table}: {failed}")
         assert said.err.endswith(f" fix it, or remove [{table}] [F23]\n")
-        assert "128 bytes, 30 x 2 samples" in " ".join(said.out.split())
+        assert "128 bytes, 30 x 2 channels" in " ".join(said.out.split())
 
 
 def test_a_driver_that_cannot_be_made_is_named_with_its_bus(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,8 @@ from support.machine_files import LAVAL, MACHINES, changed
 from support.paths import ROOT
 
 from daqsvc.rounding import readable, rounded_down, rounded_up, with_unit
-from daqsvc.settings import MachineFileError, parse_machine_file
+from daqsvc.settings import MachineFileError, load_machine_file, parse_machine_file
+from daqsvc.settings.describe import describe
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -96,6 +97,58 @@ def test_measured_values_are_written_as_people_read_them(value: float, text: str
     assert readable(value) == text
 
 
+STATE = """
+schema_version = 1
+site = "lab"
+box = "edge-1"
+[machine]
+name = "fan"
+speed_rpm = 1480.0
+[buses.can0]
+driver = "can"
+interface = "virtual"
+channel = "1"
+[streams.state]
+bus = "can0"
+rate_hz = 10.0
+[streams.state.layout]
+id = 1
+length = 8
+no_counter = true
+first_byte = 0
+samples_per_frame = 1
+channels = [{ name = "state", type = "uint8", scale = 1.0 }]
+[[sensors]]
+name = "state"
+type = "trend"
+stream = "state"
+channel = "state"
+unit = "1"
+ok_between = [0.0, 3.0]
+[pipeline]
+[pipeline.levels]
+[[alarms]]
+name = "state"
+sensor = "state"
+measure = "value"
+alert = 0.5
+danger = 1.5
+deadband = 0.1
+"""
+
+
 @pytest.mark.parametrize(("unit", "text"), [("rpm", "65540 rpm"), ("1", "65540"), ("", "65540")])
 def test_a_plain_number_has_no_unit_behind_it(unit: str, text: str) -> None:
     assert with_unit(65535.0, unit) == text
+
+
+def test_check_shows_limits_of_a_plain_number_without_its_unit(tmp_path: Path) -> None:
+    file = tmp_path / "machine.toml"
+    file.write_text(STATE)
+    text = describe(load_machine_file(file))
+    assert "  state  value of state  0.5    1.5     0.1, on 0 s, off 0 s" in text
+    assert "OK 0 to 3\n" in text
+    assert "1 x 1 channel " in text
+    file.write_text(STATE.replace("danger = 1.5", "danger = 300.0"))
+    with pytest.raises(MachineFileError, match=r'channel of "state" carries 0 to 255\. Remedy'):
+        load_machine_file(file)

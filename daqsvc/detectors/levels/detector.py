@@ -24,6 +24,7 @@ from daqsvc.dsp.quality.missing import (
 from daqsvc.dsp.quality.stuck import StandstillWatch
 from daqsvc.dsp.quality.unit import M_S2_PER_UNIT, RESCALE, beyond_any_unit
 from daqsvc.dsp.window_orders import phase_lag_deg, steady_angle, window_orders
+from daqsvc.rounding import unit_behind
 from daqsvc.settings.measures import (
     AMPLITUDES,
     KURTOSIS,
@@ -401,7 +402,7 @@ def _beyond_gap(channel: LevelChannel, statistics: Mapping[str, float], known: N
 def _dead(channel: LevelChannel, count: int, still: Standstill | None) -> str:
     if still is None:
         return ""
-    value = f"{round(still.value, 6) + 0.0:g} {channel.unit}"  # + 0.0: no "-0"
+    value = f"{round(still.value, 6) + 0.0:g}{unit_behind(channel.unit)}"  # + 0.0: no "-0"
     if still.samples == count:
         return (
             f"{channel.sensor} does not move at all ({value}): dead or disconnected; "

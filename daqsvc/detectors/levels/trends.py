@@ -16,6 +16,7 @@ from daqsvc.diagnosis.record import silence_reason
 from daqsvc.dsp.quality.misread import Misread
 from daqsvc.dsp.quality.missing import BRIDGED, MOST_MISSING, not_judged, nothing_known, partly_missing
 from daqsvc.dsp.quality.unit import RESCALE, beyond_any_value
+from daqsvc.rounding import unit_behind
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -218,11 +219,12 @@ def _beyond_ok(channel: TrendChannel, known: NDArray[np.float32]) -> str:
     if channel.ok_between is None:
         return ""
     low, high = np.array(channel.ok_between, np.float32)
+    unit = unit_behind(channel.unit)
     # One such value is enough: in an average with it, the others would be believed in vain.
     beyond = known[(known < low) | (known > high)]
     if not len(beyond):
         return ""
     return (
-        f"{channel.sensor} reads {beyond[-1]:.6g} {channel.unit}, outside its OK limits {low:g} to {high:g} "
-        f"{channel.unit}; check sensor, cable and supply"
+        f"{channel.sensor} reads {beyond[-1]:.6g}{unit}, outside its OK limits {low:g} to {high:g}{unit}; "
+        "check sensor, cable and supply"
     )

@@ -11,7 +11,7 @@ from daqsvc.history.points import Step
 from daqsvc.page.charts import ChartAxis, chart, legend, source
 from daqsvc.page.earlier import opened_history
 from daqsvc.page.views.view import Choice, Figure, Shown
-from daqsvc.rounding import readable
+from daqsvc.rounding import readable, unit_behind
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -73,7 +73,7 @@ class TrendView:
         figure_unit = _units(live).get(reading, "")
         made = chart(
             ChartAxis(f"time before now, {unit}", -hours / per_unit, 0.0),
-            ChartAxis(f"{reading}, {figure_unit}".rstrip(", ")),
+            ChartAxis(f"{reading}, {figure_unit}" if unit_behind(figure_unit) else reading),
             theme,
             tips=[
                 ("time", f"@t{{0.000}} {unit}"),

@@ -18,6 +18,7 @@ from daqsvc.alarms.commands import Verb
 from daqsvc.alarms.states import AlarmState, Level
 from daqsvc.diagnosis.reading import STALE_S
 from daqsvc.publish.home_assistant.readings import digits_of
+from daqsvc.rounding import unit_behind
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -243,8 +244,8 @@ def _safe_id(name: str) -> str:
 
 
 def _in_home_assistant(unit: str) -> Mapping[str, str]:
-    """Unit and device class as Home Assistant knows them."""
-    if not unit:
+    """Unit and device class as Home Assistant knows them; a plain number has none."""
+    if not unit_behind(unit):
         return {}
     named = {"unit_of_measurement": _UNITS.get(unit, unit)}
     return {**named, "device_class": _CLASSES[unit]} if unit in _CLASSES else named

@@ -197,6 +197,11 @@ def test_beyond_its_ok_limits_a_sensor_is_not_believed(broken):
     assert (back.quality, back.decision) == ("good", "normal")
 
 
+def test_a_plain_number_has_no_unit_in_the_reason():
+    (said,) = detector(unit="1", limits=[], ok_between=(0.0, 3.0)).process(window([7.0]))
+    assert "oil reads 7, outside its OK limits 0 to 3; check" in said.reason
+
+
 def test_one_such_value_spoils_its_window():
     fast = detector(rate_hz=4.0, window_s=1.0, ok_between=(-40.0, 125.0))
     (said,) = fast.process(window([60.0, 60.0, 150.0, 60.0], period_s=0.25))

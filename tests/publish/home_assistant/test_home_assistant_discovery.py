@@ -68,6 +68,7 @@ def test_units_are_written_as_home_assistant_writes_them():
             Reading("d", "statistics", "velocity_rms", "mm/s"),
             Reading("d", "statistics", "gap_voltage", "V"),
             Reading("d", "statistics", "value", "degC"),
+            Reading("d", "statistics", "state", "1"),
             Reading("d", "probabilities", "F1"),
         ),
     )
@@ -78,6 +79,7 @@ def test_units_are_written_as_home_assistant_writes_them():
         "d velocity rms": ("mm/s", "speed"),
         "d gap voltage": ("V", "voltage"),
         "d value": ("°C", "temperature"),
+        "d state": (None, None),
         "d F1": (None, None),
     }
 
