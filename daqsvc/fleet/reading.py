@@ -10,8 +10,6 @@ from daqsvc.offline.runner import Runner
 from daqsvc.recording import RecordingError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from daqsvc.recording.recording import Recording
 
 
@@ -25,17 +23,17 @@ class PatientRunner(Runner):
 
     is_passing = False
 
-    def load(self, recording: str, only: Sequence[str] | None = None, *, narrow: bool = False) -> Recording:
-        """See `Runner.load`."""
+    def load_by_rate(self, recording: str) -> list[Recording]:
+        """See `Runner.load_by_rate`."""
         self.is_passing = False
         try:
-            return super().load(recording, only, narrow=narrow)
+            return super().load_by_rate(recording)
         except (RecordingError, RefusedError) as error:
             if not was_killed(error):
                 self.is_passing = is_passing(error)
                 raise
         try:
-            return super().load(recording, only, narrow=narrow)
+            return super().load_by_rate(recording)
         except (RecordingError, RefusedError) as error:
             self.is_passing = is_passing(error)
             raise

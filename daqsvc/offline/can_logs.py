@@ -6,7 +6,7 @@ import gzip
 import heapq
 import re
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -66,34 +66,54 @@ _MONTHS = dict(zip(_ENGLISH, range(1, 13), strict=True)) | {"mär": 3, "mai": 5,
 _LAYOUTS = "ids and lengths of its layouts"
 
 
-def load_can_log(
+def load_can_log(machine: MachineFile, path: str, rate_hz: float | None = None) -> Recording:
+    """The first recording of `load_can_rates`; its notes also state what has another rate and is left out."""
+    first, *others = load_can_rates(machine, path, rate_hz)
+    left_out = (f"{', '.join(one.names)} ({one.rate_hz:g} Hz)" for one in others)
+    notes = [f"left out, as one rate is read ({first.rate_hz:g} Hz): {', '.join(left_out)}"] if others else []
+    return replace(first, notes=(*first.notes, *notes))
+
+
+def load_can_rates(
     machine: MachineFile, path: str, rate_hz: float | None = None, watched: Sequence[str] = ()
-) -> Recording:
+) -> list[Recording]:
     """The sensors of a machine in a CAN log, or in all logs of a folder: its buses, and the parts of each.
 
     The frames go through the decoders and assemblers of the live service, and streams that the detectors take
-    together through its grid. A recording has one rate: streams of others are left out, and `Recording.notes`
-    states it; it also states what of a log is damaged.
+    together through its grid.
 
     Args:
         machine: the machine file.
         path: the log or folder.
-        rate_hz: what the user states about the rate.
-        watched: sensors whose verdict needs all samples at one rate; unless there are any, all sensors.
+        rate_hz: what the user states about the rate of the first recording.
+        watched: sensors that the verdict rests on.
+
+    Returns:
+        A recording for each rate and each grid. The first has the sensors that are watched; without any, it
+        is the grid or has the highest rate. Its notes state what of a log is damaged.
 
     Raises:
         RecordingError: it cannot be read, holds no samples of the machine, or not at the rates that the
             machine file states.
     """
     playing = _played(machine, path)
-    return _recording(machine, path, playing, rate_hz, watched)
+    first, *others = _groups(machine, path, playing, watched)
+    recordings = [_recording(machine, path, playing, first, rate_hz)]
+    notes = list(playing.notes)
+    for group in others:
+        try:
+            recordings.append(_recording(machine, path, playing, group))
+        except RecordingError as error:
+            notes.append(f"left out {', '.join(group.streams)} ({group.rate_hz:g} Hz): {error}")
+    recordings[0] = replace(recordings[0], notes=tuple(notes))
+    return recordings
 
 
 def _played(machine: MachineFile, path: str) -> _Playing:
     """All logs of a recording, decoded.
 
     Raises:
-        RecordingError: see `load_can_log`.
+        RecordingError: see `load_can_rates`.
     """
     playing = _Playing(machine, path)
     playing.play()
@@ -122,7 +142,7 @@ def load_can_streams(machine: MachineFile, path: str) -> tuple[list[RecordedStre
         damaged. Channels without a sensor have their own names.
 
     Raises:
-        RecordingError: see `load_can_log`.
+        RecordingError: see `load_can_rates`.
     """
     playing = _played(machine, path)
     sensors = {(one.stream, one.channel): one for one in machine.sensors}
@@ -441,11 +461,25 @@ def _rows(path: str, name: str, blocks: Sequence[SampleBlock]) -> _Rows:
     return _Rows(samples, last.t_first_ns - (last.first_index - first) * last.period_ns)
 
 
+@dataclass(frozen=True, slots=True)
+class _Group:
+    """What is one recording: a grid, or streams of one rate.
+
+    Attributes:
+        streams: the grid or the streams; for each the stream and channel of each of its columns.
+        rate_hz: samples per second.
+        sensors: the names of its sensors.
+    """
+
+    streams: dict[str, list[tuple[str, str]]]
+    rate_hz: float
+    sensors: frozenset[str]
+
+
 def _recording(
-    machine: MachineFile, path: str, playing: _Playing, given_hz: float | None, watched: Sequence[str]
+    machine: MachineFile, path: str, playing: _Playing, group: _Group, given_hz: float | None = None
 ) -> Recording:
-    notes = list(playing.notes)
-    group, rate_hz = _group(machine, playing, watched)
+    rate_hz = group.rate_hz
     if given_hz is not None and abs(given_hz / rate_hz - 1.0) > SAME_RATE:
         raise RecordingError(
             f"the sampling rate of {path} is {rate_hz:g} Hz by {machine.path} and {given_hz:g} Hz as given: "
@@ -453,24 +487,18 @@ def _recording(
             RATE_CONTRADICTED,
         )
     names, columns = [], []
-    rows = {name: _rows(path, name, playing.blocks[name]) for name in group}
+    rows = {name: _rows(path, name, playing.blocks[name]) for name in group.streams}
     begun_ns = min(one.t_first_ns for one in rows.values())
     shifts = {n: round((one.t_first_ns - begun_ns) * rate_hz / NS_PER_S) for n, one in rows.items()}
     length = max(shifts[name] + len(one.samples) for name, one in rows.items())
     for sensor in machine.sensors:
-        for name, channels in group.items():
+        for name, channels in group.streams.items():
             if (sensor.stream, sensor.channel) in channels:
                 column = np.full(length, np.nan)
                 values = rows[name].samples[:, channels.index((sensor.stream, sensor.channel))]
                 column[shifts[name] : shifts[name] + len(values)] = values
                 names.append(sensor.name)
                 columns.append(column)
-    streams = {stream for channels in group.values() for stream, _ in channels}
-    if left_out := sorted(name for name in playing.spans_ns if name not in streams):
-        notes.append(
-            f"left out, as a recording has one rate ({rate_hz:g} Hz): "
-            + ", ".join(f"{name} ({machine.streams[name].rate_hz:g} Hz)" for name in left_out)
-        )
     samples = np.column_stack(columns)
     return Recording(
         names=tuple(names),
@@ -480,36 +508,43 @@ def _recording(
         nan_count=int(np.isnan(samples).sum()),
         infinity_count=int(np.isinf(samples).sum()),
         rate_source=f"of {machine.path}",
-        notes=tuple(notes),
     )
 
 
-def _group(
-    machine: MachineFile, playing: _Playing, watched: Sequence[str]
-) -> tuple[dict[str, list[tuple[str, str]]], float]:
-    """What makes the recording: a grid, or streams of one rate; with the stream and channel of each column.
+def _groups(machine: MachineFile, path: str, playing: _Playing, watched: Sequence[str]) -> list[_Group]:
+    """What is read together: each grid, and streams of each rate; first what most watched sensors are in.
 
     Raises:
-        RecordingError: there is a grid, and nothing could be put on it.
+        RecordingError: there is a grid, and nothing could be put on it; or no sensor has any samples.
     """
+    sensors = {(sensor.stream, sensor.channel): sensor.name for sensor in machine.sensors}
+    groups: list[_Group] = []
+
+    def add(streams: dict[str, list[tuple[str, str]]], rate_hz: float) -> None:
+        there = (sensors.get(column) for columns in streams.values() for column in columns)
+        groups.append(_Group(streams, rate_hz, frozenset(filter(None, there))))
+
+    on_grids: set[str] = set()
     for grid in machine.grids:
         if grid.name in playing.blocks:
             columns = [(name, c) for name, s in grid.streams.items() for c in s.layout.channel_names]
-            return {grid.name: columns}, next(iter(grid.streams.values())).rate_hz
-        if not set(grid.streams) - set(playing.spans_ns):
+            add({grid.name: columns}, next(iter(grid.streams.values())).rate_hz)
+            on_grids |= set(grid.streams)
+        elif not set(grid.streams) - set(playing.spans_ns):
             raise RecordingError(
                 f"the streams {', '.join(grid.streams)} could not be put on one grid: they are too short, or "
                 "of different times; give logs of some 10 s and more, of the same time",
                 NOT_TOGETHER,
             )
-    present = [name for name in machine.streams if name in playing.blocks]
-    streams = [machine.sensor(name).stream for name in watched]
-    wanted = [stream for stream in streams if stream in present] or present
-    rates = [machine.streams[name].rate_hz for name in wanted]
-    rate_hz = max(dict.fromkeys(rates), key=rates.count)
-    group = {
-        name: [(name, channel) for channel in machine.streams[name].layout.channel_names]
-        for name in present
-        if machine.streams[name].rate_hz == rate_hz
-    }
-    return group, rate_hz
+    single = [name for name in machine.streams if name in playing.blocks and name not in on_grids]
+    for rate_hz in sorted({machine.streams[name].rate_hz for name in single}, reverse=True):
+        of_rate = [name for name in single if machine.streams[name].rate_hz == rate_hz]
+        add({n: [(n, c) for c in machine.streams[n].layout.channel_names] for n in of_rate}, rate_hz)
+    groups = [group for group in groups if group.sensors]
+    if not groups:
+        raise RecordingError(
+            f"{path} holds no samples of a sensor of {machine.path}; give the log of this machine's bus, or "
+            "add [[sensors]] for its channels",
+            NOT_IN_LOG,
+        )
+    return sorted(groups, key=lambda group: -len(group.sensors & set(watched)))

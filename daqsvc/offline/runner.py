@@ -21,9 +21,11 @@ from daqsvc import kernel_cache
 from daqsvc.detectors.shaft.verdict import RotorVerdict
 from daqsvc.diagnosis.recorded import Recorded, worst
 from daqsvc.dsp.quality import RefusedError
+from daqsvc.dsp.quality.rate import SAME_RATE
 from daqsvc.dsp.quality.recorded import known_against
 from daqsvc.errors.command_line import PROCESS_LOST
 from daqsvc.recording import RecordingError
+from daqsvc.recording.contents import left_out
 from daqsvc.recording.formats import named_as_can_log
 from daqsvc.recording.formats.column_units import unit_in_name
 from daqsvc.recording.recording import (
@@ -89,7 +91,8 @@ class Runner:
 
     A sensor's samples are the variable that ``options.channels`` states, else the one with the sensor's name,
     else the one with its channel's name. Detectors whose sensors the recording lacks are left out. The
-    recording's sampling rate replaces that of the streams.
+    recording's sampling rate replaces that of the streams. If a recording has several rates, the sensors of
+    each are judged by the detectors that read them.
 
     Args:
         make: makes the machine file, once a process.
@@ -160,36 +163,61 @@ class Runner:
             progress: called with the samples done and the samples in all.
         """
         try:
-            loaded = self.load(recording, narrow=True)
+            loaded, *slower = self.load_by_rate(recording)
         except (RecordingError, RefusedError) as error:
             refused = _not_judged(self.detectors, recording, str(error))
             return self._outcome(replace(refused, code=error.code), {})
-        present, machine = self._as_recorded(loaded)
-        left_out = (one.left_out(loaded.names) for one in self.detectors.values())
-        notes = [*loaded.notes, *map(one_line, filter(None, left_out))]
+        recordings = [loaded, *slower]
+        homes = {key: _home(one, recordings) for key, one in self.detectors.items()}
+        names = [name for one in recordings for name in one.names]
+        lacking = (
+            one.left_out(homes[key].names if one.part else names) for key, one in self.detectors.items()
+        )
+        notes = [*loaded.notes, *map(one_line, filter(None, lacking))]
+        present: Detectors = {}
         evaluated: dict[str, Evaluated] = {}
         wrong = ""
-        for key, settings in present.items():
-            detector = self.detectors[key]
+        for key, one, judges in self._judging(recordings, homes):
+            present[key] = self.detectors[key]
             try:
-                evaluated[key] = detector.evaluate(
-                    Recorded(machine, loaded, detector.options), settings, progress
-                )
+                found = judges(progress)
             except (ValueError, AssemblyError) as error:
-                wrong = one_line(str(error))
+                why = one_line(str(error))
+                if one is loaded or self.detectors[key].part:
+                    wrong = why
+                else:
+                    notes.append(f"{key} has not judged {', '.join(one.names)}: {why}")
                 continue
-            draw = evaluated[key].draw
-            if figures is not None and draw is not None:
-                draw(figures)
+            evaluated[key] = _joined(evaluated[key], found) if key in evaluated else found
+            if figures is not None and found.draw is not None:
+                found.draw(figures)
         if wrong:
-            first = _not_judged({key: self.detectors[key] for key in present}, recording, wrong)
-            return self._outcome(first, evaluated, notes)
-        heads = _heads({key: self.detectors[key] for key in present})
+            return self._outcome(_not_judged(present, recording, wrong), evaluated, notes)
+        heads = _heads({key: one for key, one in present.items() if key in evaluated})
         verdicts = [verdict for key in heads.values() if (verdict := evaluated[key].verdict) is not None]
         if not verdicts:
             verdicts = [RotorVerdict(recording=recording, quality=known_against(loaded))]
+        for one in slower:
+            verdicts[0] = replace(verdicts[0], quality=verdicts[0].quality.joined(known_against(one)))
         others = {key: one for key, one in evaluated.items() if key not in heads.values()}
         return self._outcome(verdicts[0], evaluated, notes, verdicts[1:], others)
+
+    def _judging(
+        self, recordings: Sequence[Recording], homes: Mapping[str, Recording]
+    ) -> Iterator[tuple[str, Recording, Callable[[Progress | None], Evaluated]]]:
+        """What judges what: the key of a detector, one of the recordings, and the call.
+
+        Args:
+            recordings: one for each rate.
+            homes: by detector the one that it gives its verdict about; without a verdict, it judges all.
+        """
+        for one in recordings:
+            tables, machine = self._as_recorded(one)
+            for key, settings in tables.items():
+                detector = self.detectors[key]
+                if not detector.part or homes[key] is one:
+                    recorded = Recorded(machine, one, detector.options)
+                    yield key, one, partial(detector.evaluate, recorded, settings)
 
     def _outcome(
         self,
@@ -246,40 +274,27 @@ class Runner:
         present = {key: table for key, table in tables.items() if table is not None}
         return present, machine.model_copy(update=update)
 
-    def load(self, recording: str, only: Sequence[str] | None = None, *, narrow: bool = False) -> Recording:
-        """The sensors of the machine in a recording, by their names.
+    def load(self, recording: str, only: Sequence[str]) -> Recording:
+        """Some sensors of the machine in a recording, by their names.
 
         Args:
             recording: path of the recording: a file, a CAN log, or a folder of CAN logs.
-            only: names of the sensors that are wanted; None: all that it has.
-            narrow: see `load_recording`.
+            only: names of the sensors that are wanted.
 
         Raises:
             RecordingError: it cannot be read.
-            RefusedError: it lacks a sensor that is wanted, or that the verdict needs, or has none at all.
+            RefusedError: it lacks a sensor that is wanted.
         """
-        machine, options = self.machine, self.options
+        options = self.options
         if options.in_memory:
-            wanted = {sensor.name: sensor.channel for sensor in machine.sensors}
-            load = load_matching if options.patterns else load_recording
-            return self._in_its_units(load(recording, wanted, options.rate_hz, narrow=narrow))
+            return self._of_options(recording, narrow=False)
         if not _is_can_log(recording):
-            columns = self._columns(recording)
-            self._refuse_lacking(recording, only or (), columns)
-            wanted = columns if only is None else {name: columns[name] for name in only}
-            return self._in_its_units(load_recording(recording, wanted, options.rate_hz, narrow=narrow))
-        if options.channels or options.unit is not None:
-            raise RefusedError(
-                f"{recording} is a CAN log, of which the machine file states channels and units: leave out "
-                f"{'--map' if options.channels else '--unit'}"
-            )
-        from daqsvc.offline.can_logs import load_can_log  # noqa: PLC0415 - brings python-can and kernels
-
-        watched = [name for one in self.detectors.values() for name in one.sensors]
-        loaded = load_can_log(machine, recording, options.rate_hz, watched)
-        self._refuse_lacking(recording, only or _needs(self.detectors), loaded.names)
-        if only is None:
-            return loaded
+            columns = self._columns(recording, list_channels(recording))
+            self._refuse_lacking(recording, only, columns)
+            wanted = {name: columns[name] for name in only}
+            return self._in_its_units(load_recording(recording, wanted, options.rate_hz))
+        loaded = self._of_can_log(recording, only)[0]
+        self._refuse_lacking(recording, only, loaded.names)
         samples = loaded.samples[:, [loaded.names.index(name) for name in only]]
         return replace(
             loaded,
@@ -288,6 +303,105 @@ class Runner:
             nan_count=int(np.isnan(samples).sum()),
             infinity_count=int(np.isinf(samples).sum()),
         )
+
+    def load_by_rate(self, recording: str) -> list[Recording]:
+        """The sensors of the machine in a recording, by their names: those of each rate together.
+
+        Args:
+            recording: path of the recording: a file, a CAN log, or a folder of CAN logs.
+
+        Returns:
+            First the one with the sensors of the verdict; without any, the one of the highest rate.
+            Its notes state what else could not be read.
+
+        Raises:
+            RecordingError: the first cannot be read.
+            RefusedError: it lacks a sensor that the verdict needs, or there is none at all.
+        """
+        if self.options.in_memory:
+            return [self._of_options(recording, narrow=True)]
+        if _is_can_log(recording):
+            loaded = self._of_can_log(recording, _watched(self.detectors))
+            self._refuse_lacking(recording, _needs(self.detectors), loaded[0].names)
+            return loaded
+        there = list_channels(recording)
+        columns, *others = self._groups(self._columns(recording, there), there)
+        first = self._in_its_units(load_recording(recording, columns, self.options.rate_hz, narrow=True))
+        known = {sensor.name for sensor in self.machine.sensors}
+        beside = {name: name for name in first.of_other_rates if name in known}
+        others += self._groups(beside, {}, by_rate=True)
+        notes = _without_others(first)
+        notes += left_out({name: why for name, why in first.of_other_rates.items() if name not in known})
+        loaded = [first]
+        for group in others:
+            try:
+                one = self._in_its_units(load_recording(recording, group, narrow=True))
+                self._refuse_other_rate(one)
+            except (RecordingError, RefusedError) as error:
+                notes.append(one_line(f"left out {', '.join(group)}: {error}"))
+            else:
+                notes += [note for note in _without_others(one) if note not in notes]
+                loaded.append(replace(one, notes=()))
+        loaded[0] = replace(first, notes=tuple(notes))
+        return loaded
+
+    def _refuse_other_rate(self, recording: Recording) -> None:
+        """Refuse channels at another rate than the machine file states of them.
+
+        Raises:
+            RefusedError: they are.
+        """
+        stated_hz = self._rate_of(recording.names[0])
+        if abs(recording.rate_hz / stated_hz - 1.0) > SAME_RATE:
+            raise RefusedError(
+                f"the rate is {recording.rate_hz:g} Hz by the file and {stated_hz:g} Hz by "
+                f"{self.machine.path}; correct rate_hz of the stream"
+            )
+
+    def _rate_of(self, sensor: str) -> float:
+        """Samples per second of a sensor by the machine file."""
+        return self.machine.streams[self.machine.sensor(sensor).stream].rate_hz
+
+    def _groups(
+        self, columns: Mapping[str, str], there: Mapping[str, int], *, by_rate: bool = False
+    ) -> list[dict[str, str]]:
+        """The variables of sensors that are read together, as they have one length and rate.
+
+        Args:
+            columns: the variable of each sensor.
+            there: the samples of each variable of the file.
+            by_rate: whether sensors of one length may have several rates.
+
+        Returns:
+            First those that the verdict rests on, else those of the highest rate.
+        """
+        lengths = {there[variable] for variable in columns.values() if variable in there}
+        if len(lengths) <= 1 and not by_rate:
+            return [dict(columns)]
+        keys = {name: (self._rate_of(name), there.get(variable, 0)) for name, variable in columns.items()}
+        watched = [name for name in _watched(self.detectors) if name in columns]
+        keys |= dict.fromkeys(watched, keys[watched[0]]) if watched else {}
+        first = [keys[watched[0]]] if watched else []
+        ordered = dict.fromkeys([*first, *sorted(keys.values(), reverse=True)])
+        return [{name: columns[name] for name in columns if keys[name] == key} for key in ordered]
+
+    def _of_options(self, recording: str, *, narrow: bool) -> Recording:
+        """The sensors that options name."""
+        wanted = {sensor.name: sensor.channel for sensor in self.machine.sensors}
+        load = load_matching if self.options.patterns else load_recording
+        return self._in_its_units(load(recording, wanted, self.options.rate_hz, narrow=narrow))
+
+    def _of_can_log(self, recording: str, watched: Sequence[str]) -> list[Recording]:
+        """See `load_can_rates`."""
+        options = self.options
+        if options.channels or options.unit is not None:
+            raise RefusedError(
+                f"{recording} is a CAN log, of which the machine file states channels and units: leave out "
+                f"{'--map' if options.channels else '--unit'}"
+            )
+        from daqsvc.offline.can_logs import load_can_rates  # noqa: PLC0415 - brings python-can and kernels
+
+        return load_can_rates(self.machine, recording, options.rate_hz, watched)
 
     def _in_its_units(self, recording: Recording) -> Recording:
         """A recording whose units are not contradicted by its file.
@@ -326,14 +440,17 @@ class Runner:
                 f"variable, e.g. --map {lacking[0]}=VARIABLE"
             )
 
-    def _columns(self, recording: str) -> dict[str, str]:
+    def _columns(self, recording: str, there: Mapping[str, int]) -> dict[str, str]:
         """The variable of each sensor that a recording has.
+
+        Args:
+            recording: its path.
+            there: its channels.
 
         Raises:
             RecordingError: it cannot be read.
             RefusedError: it lacks a sensor that the verdict needs, or has none at all.
         """
-        there = list_channels(recording)
         channels, columns = self.options.channels, {}
         for sensor in self.machine.sensors:
             mapped = channels.get(sensor.name, channels.get(sensor.channel))
@@ -404,6 +521,31 @@ def calibrated_tables() -> list[str]:
 def _heads(detectors: Detectors) -> dict[str, str]:
     """The detector that gives the verdict of each part of the machine, the first part first."""
     return {one.part: key for key, one in detectors.items() if one.part}
+
+
+def _watched(detectors: Detectors) -> tuple[str, ...]:
+    """The sensors that the first verdict rests on; without one, those that any detector needs."""
+    heads = [detectors[key].sensors for key in _heads(detectors).values()]
+    return next(
+        (sensors for sensors in (*heads, *(one.sensors for one in detectors.values())) if sensors), ()
+    )
+
+
+def _joined(one: Evaluated, other: Evaluated) -> Evaluated:
+    """What a detector brings forward about the channels of two rates."""
+    return replace(one, statements=(*one.statements, *other.statements))
+
+
+def _without_others(recording: Recording) -> list[str]:
+    """The notes of a recording, but for those on channels of other rates, which are read, too."""
+    others = left_out(recording.of_other_rates)
+    return [note for note in recording.notes if note not in others]
+
+
+def _home(detector: RecordedDetector[Any], recordings: Sequence[Recording]) -> Recording:
+    """Which of the recordings of several rates a detector gives its verdict about."""
+    having = (one for one in recordings if set(detector.sensors).intersection(one.names))
+    return next(having, recordings[0])
 
 
 def _needs(detectors: Detectors) -> tuple[str, ...]:

@@ -90,6 +90,7 @@ class Contents:
             states one for each.
         elsewhere: channels that are not among the entries, by their names.
         notes: what is wrong with the file, in sentences.
+        of_other_rates: for channels that are not among the entries why, e.g. "sampled at 10 Hz, ...".
         unread: entries that have their length and zeros for samples, as they are too large and are not
             wanted.
     """
@@ -103,6 +104,7 @@ class Contents:
     starts_ns: Mapping[str, int] = field(default_factory=dict)
     elsewhere: Mapping[str, Elsewhere] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    of_other_rates: Mapping[str, str] = field(default_factory=dict)
     unread: frozenset[str] = frozenset()
 
     def holding(self, names: Iterable[str]) -> Contents:
@@ -162,6 +164,14 @@ def _told(name: str, values: NDArray[np.generic]) -> str:
     if values.ndim and values.dtype.kind not in NUMERIC:
         return f"{name} (not numeric)"
     return name if values.ndim == 0 else f"{name} (0)"
+
+
+def left_out(of_other_rates: Mapping[str, str]) -> list[str]:
+    """What to say of channels that are not read, in sentences; see `Contents.of_other_rates`."""
+    by_reason: dict[str, list[str]] = {}
+    for name, why in of_other_rates.items():
+        by_reason.setdefault(why, []).append(name)
+    return [f"{', '.join(names)} left out: {why}" for why, names in by_reason.items()]
 
 
 def column_names(headers: Sequence[str]) -> list[str]:

@@ -16,7 +16,7 @@ from daqsvc.dsp.quality import UnfitError
 from daqsvc.dsp.quality.unit import refuse_beyond_any_unit
 from daqsvc.errors.recordings import NO_SUCH_CHANNEL, NOT_TOGETHER, TOO_SHORT
 from daqsvc.recording import NamesError, RecordingError
-from daqsvc.recording.contents import GROUP_TIME, NUMERIC, STATED_START
+from daqsvc.recording.contents import GROUP_TIME, NUMERIC, STATED_START, left_out
 from daqsvc.recording.formats import read
 from daqsvc.recording.rate import place_at, time_column, timing_of
 from daqsvc.recording.streams import FIRST_NS, LAST_NS, NS_PER_S, iso_ns, ns_of_iso
@@ -52,18 +52,19 @@ def load(
     named = bool(channels)
     wanted = list((channels or {}).values())
     contents = read(file, ResourceLimits(memory_bytes), wanted if named else None).holding(wanted)
-    left_out: dict[str, int] = {}
+    shorter: dict[str, int] = {}
     if not channels:
-        channels, left_out = _longest(file, contents)
+        channels, shorter = _longest(file, contents)
     columns, length = _channels(file, contents, channels)
     in_file = [_variable(contents, variable) for variable in channels.values()]
     timing = timing_of(file, contents, length, rate_hz, in_file)
     about: dict[str, Any] = {
         "names": list(columns),
         "rate_hz": timing.rate_hz,
-        "left_out": left_out,
+        "left_out": shorter,
         "rate_source": timing.source,
-        "notes": [*contents.notes, *timing.notes],
+        "notes": [*contents.notes, *left_out(contents.of_other_rates), *timing.notes],
+        "of_other_rates": dict(contents.of_other_rates),
         "scalars": contents.scalars(),
         "texts": contents.texts(),
         "units": {
@@ -276,7 +277,7 @@ def load_streams(
         rows, noted = place_at(file, contents, length, rate_hz, in_file)
         samples = _Begins.of(contents, in_file, rate_hz).aligned(file, _together(columns, length, rows))
         _refuse_impossible(file, list(channels), samples)
-        notes.append([*contents.notes, *noted])
+        notes.append([*contents.notes, *left_out(contents.of_other_rates), *noted])
         loaded.append(samples)
     return notes, loaded
 
@@ -313,10 +314,12 @@ def _longest(path: Path, contents: Contents) -> tuple[dict[str, str], dict[str, 
     channels = {name: name for name, length in lengths.items() if length == longest and name != time}
     if not channels:
         numeric = any(values.dtype.kind in NUMERIC for values in contents.entries.values())
-        why = "is too short: no channel has two samples" if numeric else "holds no numeric channel"
+        why, code = "holds no numeric channel", NO_SUCH_CHANNEL
         if time is not None:
             why = f"holds no channel beside its time column {time!r}"
-        raise RecordingError(f"{path} {why}; it holds {contents.listing()}", NO_SUCH_CHANNEL)
+        elif numeric:
+            why, code = "is too short: no channel has two samples", TOO_SHORT
+        raise RecordingError(f"{path} {why}; it holds {contents.listing()}", code)
     return channels, {name: length for name, length in lengths.items() if length < longest}
 
 
@@ -366,8 +369,11 @@ def _common_length(
     lengths = {name: len(values) for name, values in columns.items()}
     if len(set(lengths.values())) > 1:
         stated = ", ".join(f"{name} ({channels[name]}) {length}" for name, length in lengths.items())
+        longest = [name for name, length in lengths.items() if length == max(lengths.values())]
+        example = f", such as {' and '.join(longest)}" if len(longest) > 1 else ""
         raise RecordingError(
-            f"the channels of {path} have different lengths: {stated}; map only channels taken together",
+            f"the channels of {path} have different lengths: {stated}; map only channels taken "
+            f"together{example}",
             NOT_TOGETHER,
         )
     length = next(iter(lengths.values()))

@@ -44,6 +44,7 @@ class Recording:
         texts: its single texts, e.g. ``{"label": "healthy"}``.
         notes: what a person should know of how it was read, in sentences.
         units: of the channels that the file names one of, as it spells them.
+        of_other_rates: for channels that were taken at another rate why they are not read, which notes state.
     """
 
     names: tuple[str, ...]
@@ -58,6 +59,7 @@ class Recording:
     texts: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
+    of_other_rates: Mapping[str, str] = field(default_factory=dict)
 
 
 class _ReadingLimits:

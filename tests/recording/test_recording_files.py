@@ -10,6 +10,7 @@ import pytest
 from scipy.io import savemat, wavfile
 from support.paths import ROOT
 
+from daqsvc.errors.recordings import TOO_SHORT
 from daqsvc.recording import RecordingError
 from daqsvc.recording.recording import list_channels, load_recording
 
@@ -240,6 +241,19 @@ def test_a_rate_is_not_told_as_a_channel(tmp_path, ending):
         path.write_text("# rate_hz = 100\n" + "\n".join(map(str, A)))
     with pytest.raises(RecordingError, match=r"has no channel 'de'; it holds 0 \(500\)$"):
         load_recording(path, {"x": "de"})
+
+
+def test_a_file_of_single_samples_has_the_code_of_one_that_is_too_short(tmp_path):
+    with pytest.raises(RecordingError, match="no channel has two samples") as raised:
+        load_recording(write_csv(tmp_path, "x,y\n1,2\n"))
+    assert raised.value.code is TOO_SHORT
+
+
+def test_channels_of_different_lengths_come_with_an_example_of_those_taken_together(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez(path, fs=100, x=A, y=A, oil=A[:20])
+    with pytest.raises(RecordingError, match=r"map only channels taken together, such as x and y$"):
+        load_recording(path, {"x": "x", "oil": "oil", "y": "y"})
 
 
 def test_one_sample_asked_for_by_name_is_too_short(tmp_path):

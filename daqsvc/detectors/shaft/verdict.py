@@ -247,7 +247,7 @@ class RotorVerdict(Verdict):
             )
             lines.append(f"the machine {_grown(was, self.reference_revolutions).describe()}")
         bad = [
-            f"{count} {what} samples of {name}"
+            f"{count} {what} {'sample' if count == 1 else 'samples'} of {name}"
             for what, counts in (("missing", self.quality.missing), ("infinite", self.quality.infinite))
             for name, count in counts.items()
             if count

@@ -87,6 +87,16 @@ class DataQuality:
         """The same with one more problem."""
         return replace(self, problems=(*self.problems, problem))
 
+    def joined(self, other: DataQuality) -> DataQuality:
+        """The same with what is known against channels of another rate."""
+        return replace(
+            self,
+            missing={**self.missing, **other.missing},
+            infinite={**self.infinite, **other.infinite},
+            clipped={**self.clipped, **other.clipped},
+            problems=tuple(dict.fromkeys((*self.problems, *other.problems))),
+        )
+
     def as_json(self) -> dict[str, Any]:
         """For the output."""
         marks = self.keyphasor

@@ -19,7 +19,7 @@ from daqsvc.recording.contents import STATED_START, Contents, Elsewhere, check_c
 from daqsvc.recording.streams import FIRST_NS, LAST_NS, iso_ns
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Sequence
+    from collections.abc import Collection, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -143,12 +143,15 @@ class _Streams:
         """The channels of streams: their sensors, or what they are called themselves."""
         return [name for stream in group for name in self._sensors[stream]]
 
-    def _left_out(self, read: Sequence[str], names: Collection[str]) -> Iterator[str]:
-        """Which sensors are not among the names that are read, and why, in sentences."""
-        for group in self.groups():
-            sensors = [one for stream in group for one in self._facts[stream]["sensors"] if one]
-            if left_out := [one for one in sensors if one not in names]:
-                yield f"{', '.join(left_out)} left out: {self.why_not(group, read)}"
+    def _left_out(self, read: Sequence[str], names: Collection[str]) -> dict[str, str]:
+        """Which sensors are not among the names that are read, and why."""
+        return {
+            sensor: self.why_not(group, read)
+            for group in self.groups()
+            for stream in group
+            for sensor in self._facts[stream]["sensors"]
+            if sensor and sensor not in names
+        }
 
     def why_not(self, group: Sequence[str], read: Sequence[str]) -> str:
         """Why channels of a group are not read together with those of another."""
@@ -176,7 +179,8 @@ class _Streams:
         if isinstance(self._wall_ns, int) and FIRST_NS <= self._wall_ns + begin_ns <= LAST_NS:
             cut[STATED_START] = np.array(iso_ns(self._wall_ns + begin_ns))
         units = {name: self._units[name] for name in entries if self._units.get(name)}
-        return Contents(cut, units=units, notes=(*self._notes, *self._left_out(group, entries)))
+        of_other_rates = self._left_out(group, entries)
+        return Contents(cut, units=units, notes=self._notes, of_other_rates=of_other_rates)
 
 
 def _joined(blocks: list[SampleBlock], begin_ns: int, budget: Budget) -> NDArray[np.float32]:
