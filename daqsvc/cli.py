@@ -285,32 +285,35 @@ def _chosen(root: argparse.ArgumentParser, arguments: Sequence[str]) -> argparse
     """
     chosen, rest = root.parse_known_args(arguments)
     files = getattr(chosen, "files", None)
+    verb_parser = ArgumentParser(prog=f"{root.prog} {chosen.verb}")  # errors name the verb
     if "" in rest and not any(one.startswith("-") for one in rest):
-        root.error("argument FILE: must not be empty")
+        verb_parser.error("argument FILE: must not be empty")
     if any(one.startswith("-") for one in rest):
-        root.parse_args(arguments)  # states what is wrong
+        verb_parser.error(f"unrecognized arguments: {' '.join(rest)}")
     elif (alarms := getattr(chosen, "alarms", None)) is not None:
-        _take_words(root, chosen, [*alarms, *rest])
+        _take_words(verb_parser, chosen, [*alarms, *rest])
     elif rest and files is not None:
         chosen.files = [*files, *(rest if isinstance(files[0], str) else map(Path, rest))]
     elif len(rest) == 1 and {"file", "store"} <= vars(chosen).keys() and chosen.file is None:
         if chosen.store is not None:
-            root.error("argument FILE: not allowed with argument --store")
+            verb_parser.error("argument FILE: not allowed with argument --store")
         chosen.file = Path(rest[0])
     elif rest and getattr(chosen, "file", None) is not None and "store" in chosen:
-        root.error(f"unrecognized arguments: {' '.join(rest)}: {_ONE_FILE}")
+        verb_parser.error(f"unrecognized arguments: {' '.join(rest)}: {_ONE_FILE}")
     elif rest:
-        root.parse_args(arguments)  # as above
+        verb_parser.error(f"unrecognized arguments: {' '.join(rest)}")
     return chosen
 
 
-def _take_words(root: argparse.ArgumentParser, chosen: argparse.Namespace, words: Sequence[str]) -> None:
+def _take_words(
+    verb_parser: argparse.ArgumentParser, chosen: argparse.Namespace, words: Sequence[str]
+) -> None:
     """Take the alarms of a verb, and FILE, which may be anywhere behind the first of them."""
     paths = [word for word in words[1:] if is_path(word)]
     if paths and chosen.store is not None:
-        root.error("argument FILE: not allowed with argument --store")
+        verb_parser.error("argument FILE: not allowed with argument --store")
     if len(paths) > 1:
-        root.error(f"unrecognized arguments: {' '.join(paths[1:])}: {_ONE_FILE}")
+        verb_parser.error(f"unrecognized arguments: {' '.join(paths[1:])}: {_ONE_FILE}")
     chosen.alarms = [word for word in words if word not in paths]
     chosen.file = Path(paths[0]) if paths else None
 

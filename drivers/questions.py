@@ -9,10 +9,11 @@ import math
 import re
 import unicodedata
 from dataclasses import dataclass
+from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
 Answers = dict[str, Any]
 """Values by the key of their question."""
@@ -76,10 +77,17 @@ def one_of(choices: Mapping[str, str]) -> Callable[[str], str]:
             return word
         begun = [choice for choice in choices if word and choice.startswith(word)]
         if len(begun) != 1:
-            raise ValueError(f'"{text}" is not one of {", ".join(choices)}')
+            raise _no_choice(text, choices, begun)
         return begun[0]
 
     return read
+
+
+def _no_choice(text: str, choices: Mapping[str, str], begun: Sequence[str] = ()) -> ValueError:
+    """What to say of a text that is none of the choices, with those that may be meant."""
+    near = begun or get_close_matches(text.lower(), choices, n=1)
+    meant = f"; did you mean {' or '.join(near)}?" if near else ""
+    return ValueError(f'"{text}" is not one of {", ".join(choices)}{meant}')
 
 
 def exactly(choices: Mapping[str, str]) -> Callable[[str], str | None]:
@@ -87,7 +95,7 @@ def exactly(choices: Mapping[str, str]) -> Callable[[str], str | None]:
 
     def read(text: str) -> str | None:
         if text not in choices:
-            raise ValueError(f'"{text}" is not one of {", ".join(choices)}')
+            raise _no_choice(text, choices)
         return None if text == NONE else text
 
     return read

@@ -12,13 +12,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 from daqsvc.commands.analyze_fleet import fleet_misuse, run_fleet
-from daqsvc.commands.arguments import EXIT_OK, EXIT_REFUSED, EXIT_USAGE
+from daqsvc.commands.arguments import EXIT_OK, EXIT_REFUSED, EXIT_USAGE, refuse_value
 from daqsvc.commands.complaint import complain
 from daqsvc.commands.recording_options import (
     add_analyze_options,
     analyze_misuse,
     by_bearing,
     by_orders,
+    refuse,
     split_files,
 )
 from daqsvc.commands.with_kernels import VerbWithKernels
@@ -73,7 +74,7 @@ class AnalyzeCommand(VerbWithKernels):
             return run_fleet(arguments)
         machine, recordings = split_files(arguments)
         if wrong := analyze_misuse(arguments, machine, recordings):
-            self._parser.error(wrong)
+            refuse(self._parser, wrong, recordings)
         from daqsvc.recording.recording import set_memory  # noqa: PLC0415 - each verb imports what it needs
 
         set_memory(arguments.max_memory)
@@ -86,11 +87,14 @@ class AnalyzeCommand(VerbWithKernels):
             loaded = self._load(machine)
             if loaded is None:
                 return EXIT_USAGE
+        from daqsvc.offline.machine_options import WrongValueError  # noqa: PLC0415
         from daqsvc.offline.runner import WorkerLostError  # noqa: PLC0415
 
         try:
             runner = _by_options(arguments) if machine is None else _by_file(machine, loaded, arguments)
             runner.prepare()
+        except WrongValueError as error:
+            refuse_value(self._parser, error, error.code)
         except (OSError, ValueError) as error:
             self._parser.error(str(error))
         figures = _figure_names(recordings, arguments.plot)

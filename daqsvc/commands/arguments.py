@@ -11,6 +11,7 @@ import re
 import signal
 from dataclasses import dataclass
 from decimal import Decimal
+from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -21,6 +22,8 @@ from daqsvc.recording.rate import LEAST_RATE_HZ, MOST_RATE_HZ
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from daqsvc.errors.code import Code
 
 EXIT_OK = 0
 EXIT_FAILED = 1
@@ -36,6 +39,10 @@ EXIT_STUCK = 5
 """Of `run`: the event loop stood still."""
 
 
+_ALIKE = 0.7
+"""How alike a word and a choice are that may be meant, as `difflib` counts it."""
+
+
 class ArgumentParser(argparse.ArgumentParser):
     """A parser whose errors are one line; so are those of its verbs."""
 
@@ -46,11 +53,26 @@ class ArgumentParser(argparse.ArgumentParser):
         # An empty path, as of a variable that is not set, would be the working directory.
         self.register("type", Path, path)
 
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        """See `argparse.ArgumentParser`; the choice that may be meant comes before all others."""
+        try:
+            super()._check_value(action, value)
+        except argparse.ArgumentError as error:
+            near = get_close_matches(str(value), map(str, action.choices or ()), n=1, cutoff=_ALIKE)
+            if near:
+                error.message = error.message.replace(" (choose", f"; did you mean {near[0]!r}? (choose", 1)
+            raise
+
     def error(self, message: str) -> NoReturn:
         """Say what is wrong and where help is, and exit with 2."""
         is_value = message.startswith("argument ") and "not allowed with argument" not in message
         code = WRONG_VALUE if is_value else ARGUMENTS
         self.exit(EXIT_USAGE, with_code(f"{self.prog}: {message}; see {self.prog} --help", code) + "\n")
+
+
+def refuse_value(parser: argparse.ArgumentParser, error: object, code: Code) -> NoReturn:
+    """Say what is wrong with a value or a file that was named, and exit with 2."""
+    parser.exit(EXIT_USAGE, with_code(f"{parser.prog}: {error}", code) + "\n")
 
 
 def add_overwrite(parser: argparse.ArgumentParser) -> None:

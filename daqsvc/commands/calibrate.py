@@ -8,13 +8,14 @@ import sys
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from daqsvc.commands.arguments import EXIT_OK, EXIT_REFUSED, EXIT_USAGE, signals_to_end
+from daqsvc.commands.arguments import EXIT_OK, EXIT_REFUSED, EXIT_USAGE, refuse_value, signals_to_end
 from daqsvc.commands.complaint import complain
 from daqsvc.commands.recording_options import (
     add_calibrate_options,
     bearing_recording_misuse,
     calibrate_misuse,
     calibrates_bearing,
+    refuse,
     split_files,
 )
 from daqsvc.commands.with_kernels import VerbWithKernels
@@ -63,7 +64,7 @@ class CalibrateCommand(VerbWithKernels):
         self._prepare_kernel_cache()
         path, recordings = split_files(arguments)
         if wrong := calibrate_misuse(arguments, path, recordings):
-            self._parser.error(wrong)
+            refuse(self._parser, wrong, recordings)
         if arguments.out is not None and not arguments.out.absolute().parent.is_dir():
             self._parser.error(f"--out {arguments.out}: there is no such directory; make it first")
         machine = None
@@ -118,7 +119,7 @@ class CalibrateCommand(VerbWithKernels):
             machine: the machine file on disk, if there is one.
             arguments: the options.
         """
-        from daqsvc.offline.machine_options import recording_options  # noqa: PLC0415
+        from daqsvc.offline.machine_options import WrongValueError, recording_options  # noqa: PLC0415
         from daqsvc.offline.runner import Runner  # noqa: PLC0415
 
         patterns = calibrates_bearing(arguments)
@@ -126,6 +127,8 @@ class CalibrateCommand(VerbWithKernels):
         try:
             runner = Runner(lambda: make(arguments), options, machine=machine and _uncalibrated(machine))
             runner.prepare()
+        except WrongValueError as error:
+            refuse_value(self._parser, error, error.code)
         except ValueError as error:
             self._parser.error(str(error))
         return runner

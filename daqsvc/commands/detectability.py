@@ -13,10 +13,12 @@ from daqsvc.commands.arguments import EXIT_OK, EXIT_USAGE, positive
 from daqsvc.commands.complaint import complain
 from daqsvc.commands.with_kernels import VerbWithKernels
 from daqsvc.errors.code import with_code
-from daqsvc.errors.command_line import ARGUMENTS
+from daqsvc.errors.command_line import ARGUMENTS, WRONG_VALUE
+from daqsvc.errors.machine_file import MISSING_KEY
 
 if TYPE_CHECKING:
     from daqsvc.diagnosis.plugin import DetectorPlugin
+    from daqsvc.errors.code import Code
     from daqsvc.settings import MachineFile
 
 LEAST_FALSE_ALARMS = 1e-9
@@ -86,7 +88,8 @@ class DetectabilityCommand(VerbWithKernels):
         from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415 - as above
 
         if wrong := _misuse(machine, arguments):
-            return complain(f"{arguments.file}", wrong, ARGUMENTS, EXIT_USAGE)
+            who, what, code = wrong
+            return complain(who, what, code, EXIT_USAGE)
         machine = _varied(machine, arguments.speed_rpm, arguments.false_alarms_per_1000_rev)
         plugin, settings = next(
             (table, settings) for _, table, settings in configured(machine.pipeline) if _is_predictable(table)
@@ -126,23 +129,25 @@ def _is_predictable(table: object) -> bool:
     return cast("DetectorPlugin[Any]", table).predictable
 
 
-def _misuse(machine: MachineFile, arguments: argparse.Namespace) -> str:
-    """What is wrong with the options for this machine; empty if nothing is."""
+def _misuse(machine: MachineFile, arguments: argparse.Namespace) -> tuple[str, str, Code] | None:
+    """What is wrong with the machine file or the options, as `complain` takes it; None if nothing is."""
     from daqsvc.settings.plugins import configured, detector_tables  # noqa: PLC0415 - brings pydantic
 
     if not any(_is_predictable(table) for _, table, _ in configured(machine.pipeline)):
         known = [f"[pipeline.{key}]" for key, table in detector_tables().items() if _is_predictable(table)]
-        return (
+        lacking = (
             f"there is neither {' nor '.join(known)}, whose view of a fault could be computed; add one, with "
             "[machine.rotor] for the rotor that it watches"
         )
+        return f"{arguments.file}", lacking, MISSING_KEY
     rate = arguments.false_alarms_per_1000_rev
     if rate is not None and not LEAST_FALSE_ALARMS <= rate <= MOST_FALSE_ALARMS:
-        return (
+        beyond = (
             f"--false-alarms-per-1000-rev = {rate:g}: give a rate from {LEAST_FALSE_ALARMS:g} to "
             f"{MOST_FALSE_ALARMS:g}"
         )
-    return ""
+        return "daqsvc detectability", beyond, WRONG_VALUE
+    return None
 
 
 def _varied(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 from daqsvc.commands.analyze_fleet import cluster_address
 from daqsvc.commands.arguments import (
@@ -24,6 +24,7 @@ from daqsvc.commands.arguments import (
     positive,
     probability,
     probe_pair,
+    refuse_value,
     sampling_rate_hz,
     speed,
 )
@@ -56,6 +57,8 @@ _PROBES_ONLY = (
 )
 """Options of `analyze` that accelerometers have not."""
 _SAID_TWICE = "--bearing and --orders both define the bearing; leave out one of them"
+_WITHOUT = "without a machine file, "
+"""Begins what asks for options."""
 _DIMENSIONS = ("--balls", "--ball-diameter-mm", "--pitch-diameter-mm")
 _ORDER_KEYS = ("BPFI", "BPFO", "BSF", "FTF")
 
@@ -179,6 +182,26 @@ def _probe_misuse(arguments: argparse.Namespace, machine: Path | None, recording
     if known and arguments.calibration is not None:
         return f"{', '.join(known)}: the calibration states this; leave it out, or leave out --calibration"
     return _lacking(arguments) or _unknown_channels(arguments)
+
+
+def refuse(parser: argparse.ArgumentParser, wrong: str, recordings: Iterable[str]) -> NoReturn:
+    """Say what is wrong, and exit with 2; if options are asked for, first what is no recording.
+
+    Args:
+        parser: of the verb.
+        wrong: what `analyze_misuse` or `calibrate_misuse` states.
+        recordings: the files.
+    """
+    if wrong.startswith(_WITHOUT):
+        from daqsvc.recording import RecordingError  # noqa: PLC0415 - each verb imports only what it needs
+        from daqsvc.recording.formats import find  # noqa: PLC0415
+
+        try:
+            for recording in recordings:
+                find(Path(recording))
+        except RecordingError as error:
+            refuse_value(parser, error, error.code)
+    parser.error(wrong)
 
 
 def calibrate_misuse(arguments: argparse.Namespace, machine: Path | None, recordings: Sequence[str]) -> str:
@@ -555,7 +578,7 @@ def _lacking(arguments: argparse.Namespace) -> str:
     if not missing:
         return ""
     instead = ", or --keyphasor in place of --speed-rpm" if "--speed-rpm" in missing else ""
-    return f"without a machine file, {', '.join(missing)} must be given{instead}"
+    return f"{_WITHOUT}{', '.join(missing)} must be given{instead}"
 
 
 def _order_misuse(arguments: argparse.Namespace, machine: Path | None) -> str:
@@ -635,7 +658,7 @@ def _live_misuse(arguments: argparse.Namespace, machine: Path | None, recordings
 
 def _lacking_to_calibrate(arguments: argparse.Namespace, recordings: int) -> str:
     if arguments.probes is None:
-        return "without a machine file, --probes must be given"
+        return f"{_WITHOUT}--probes must be given"
     if arguments.keyphasor is None and arguments.keyphasor_threshold is not None:
         return "--keyphasor-threshold without --keyphasor: name the channel of the keyphasor"
     if arguments.keyphasor is not None and arguments.sweep_rpm is not None:

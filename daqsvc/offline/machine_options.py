@@ -14,6 +14,7 @@ from daqsvc.bearing.geometry import BearingOrders, bearing_orders
 from daqsvc.detectors.bearing.settings import Bearing, FaultOrders, WatchedBearing
 from daqsvc.detectors.rotor_synchronous.settings import RotorSynchronous
 from daqsvc.diagnosis.recorded import RecordingOptions
+from daqsvc.errors.command_line import WRONG_VALUE
 from daqsvc.settings.models import (
     Accelerometer,
     Keyphasor,
@@ -36,6 +37,12 @@ _RECORDING = "recording"
 """Name of the machine, its bus and its stream."""
 _ANY_ROTOR = (1.0, 0.1)
 """Natural frequency and damping ratio of a rotor that a run-up has to tell."""
+
+
+class WrongValueError(ValueError):
+    """The value of one option cannot be used."""
+
+    code = WRONG_VALUE
 
 
 def recording_options(arguments: argparse.Namespace, **others: Any) -> RecordingOptions:
@@ -190,17 +197,17 @@ def _orders(arguments: argparse.Namespace) -> BearingOrders:
     """Fault orders as given, or out of the catalogue.
 
     Raises:
-        ValueError: they contradict each other, or the catalogue does not know the bearing.
+        WrongValueError: they contradict each other, or the catalogue does not know the bearing.
     """
     if arguments.bearing is not None:
         try:
             return bearing_orders(arguments.bearing)
         except KeyError as error:
-            raise ValueError(f"--bearing: {error.args[0]}") from None
+            raise WrongValueError(f"--bearing: {error.args[0]}") from None
     orders = arguments.orders
     try:
         return BearingOrders(
             inner=orders["BPFI"], outer=orders["BPFO"], ball=orders["BSF"], cage=orders["FTF"]
         )
     except ValueError as error:
-        raise ValueError(f"--orders: {error}") from None
+        raise WrongValueError(f"--orders: {error}") from None

@@ -31,6 +31,7 @@ from daqsvc.settings.registry import (
 from daqsvc.settings.schema import declared_at, is_table, only_follows, section_of, valid_part, value_at
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.toml_text import MOST_BYTES, TomlTextError, decoded, parse
+from daqsvc.settings.units import factor_between
 from daqsvc.settings.zone_checks import with_zones
 
 if TYPE_CHECKING:
@@ -118,6 +119,15 @@ def _machine_file(
     return draft.found_at(Origin(path, tuple(warnings), MappingProxyType(facts), text))
 
 
+def _in_its_unit(value: Any, key: str, better: str) -> Any:
+    """The value of a misspelt key in the unit that the right one ends with: timeout_s = 0.5 is 500 ms."""
+    factor = factor_between(key.rpartition("_")[2], better.rpartition("_")[2])
+    if factor is None or isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > 1e15:
+        return value
+    converted = float(value) * factor
+    return int(converted) if converted.is_integer() else converted
+
+
 class _Reading:
     """A parsed file on its way to a `MachineFile`, and what was found wrong with it so far."""
 
@@ -186,7 +196,7 @@ class _Reading:
             better = None if usable is None else suggested_key(usable, table, key)
             value = table.pop(key)
             if better is not None:
-                table[better] = value
+                table[better] = _in_its_unit(value, key, better)
                 self._written_as[*path[:-1], better] = key
             elif usable is not None and (there := table_beside(usable, table, key, value)) is not None:
                 self._merge(table[there], value, (*path[:-1], there), path)

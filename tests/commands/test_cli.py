@@ -186,3 +186,41 @@ def test_a_reader_that_has_had_enough_is_no_error() -> None:
         process.stdout.close()
         assert process.stderr.read() == ""
         assert process.wait(60) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (
+            ["alarm", "gearbox.toml"],
+            "VERB: invalid choice: 'alarm'; did you mean 'alarms'? (choose from 'run', ",
+        ),
+        (
+            ["trend", "--step", "minutes"],
+            "--step: invalid choice: 'minutes'; did you mean 'minute'? (choose from",
+        ),
+        (
+            ["trend", "--step", "xyz"],
+            "--step: invalid choice: 'xyz' (choose from 'second', 'minute', 'hour')",
+        ),
+    ],
+)
+def test_of_a_verb_or_choice_that_is_misspelt_the_one_that_is_meant_is_named(arguments, words, capsys):
+    with pytest.raises(SystemExit):
+        main(arguments)
+    assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["ack", "foo", "pump.toml", "--store", "."], "argument FILE: not allowed with argument --store"),
+        (["trend", "--nope"], "unrecognized arguments: --nope"),
+        (["check", "pump.toml", "--nope"], "unrecognized arguments: --nope"),
+    ],
+)
+def test_what_is_wrong_with_arguments_is_told_with_the_verb_and_its_help(arguments, words, capsys):
+    with pytest.raises(SystemExit):
+        main(arguments)
+    verb = f"daqsvc {arguments[0]}"
+    assert capsys.readouterr().err == f"{verb}: {words}; see {verb} --help [C01]\n"

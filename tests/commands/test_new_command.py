@@ -324,6 +324,8 @@ def test_answers_of_a_file_are_those_of_the_options(tmp_path, capsys):
         ),
         ([], "give --bus, or --yes for virtual and all other defaults"),
         (["--yes", "--bus", "modbus"], '--bus modbus: "modbus" is not one of virtual, can-dbc, '),
+        (["--yes", "--bus", "modbus"], "; did you mean modbus-tcp or modbus-rtu? [C22]"),
+        (["--yes", "--bus", "canbus"], "; did you mean can? [C22]"),
         (
             [
                 "--yes",

@@ -295,3 +295,4 @@ def test_what_it_can_see_is_said_by_daqsvc_detectability(installed, tmp_path, ca
     assert said.startswith(
         "there is neither [pipeline.rotor_bank] nor [pipeline.rotor_synchronous] nor [pipeline.k"
     )
+    assert said.endswith("[F06]")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import wave
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +15,6 @@ from daqsvc.cli import main
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
 pytestmark = pytest.mark.integration
 
@@ -209,10 +209,27 @@ def test_every_format_gives_the_same_verdict(
     assert found["calibration"]["amplitude_um"] == pytest.approx(40.0, rel=0.01)
 
 
+@pytest.mark.parametrize("verb", ["analyze", "calibrate"])
+def test_options_are_asked_for_only_if_the_file_is_a_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], verb: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("gearbox.dbc").touch()
+    Path("a.npz").touch()
+    for recording, words in (
+        ("gearbox.dbc", "gearbox.dbc is not a kind of file that can be read"),
+        ("b.npz", "b.npz cannot be read: there is no such file"),
+        ("a.npz", "without a machine file, --probes"),
+    ):
+        with pytest.raises(SystemExit) as stopped:
+            main([verb, recording, "--json"])
+        assert stopped.value.code == 2
+        assert f"daqsvc {verb}: {words}" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["a.npz"], "--probes, --natural-frequency-hz, --damping-ratio, --speed-rpm must be given"),
         (["a.npz", *OPTIONS, "--probes", "x"], "does not name two probes"),
         (["a.npz", *OPTIONS, "--speed-rpm", "0"], "is not a speed"),
         (["a.npz", *OPTIONS, "--speed-rpm", "nan"], "is not a speed"),

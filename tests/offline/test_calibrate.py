@@ -254,7 +254,6 @@ def test_refuses_two_recordings_of_one_kind(tmp_path: Path, capsys) -> None:
     ("arguments", "message"),
     [
         (["a.npz"], "nothing would be kept: give --out FILE, --json or both"),
-        (["a.npz", "--json"], "without a machine file, --probes must be given"),
         (
             ["a.npz", "--json", "--probes", "x,y"],
             "the speed is not known: give --speed-rpm for a steady recor",

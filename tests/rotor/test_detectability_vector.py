@@ -125,7 +125,7 @@ def test_the_command_asks_for_what_is_not_known(capsys):
         assert main(["detectability", file, "--false-alarms-per-1000-rev", "1e9"]) == 2
         errors = capsys.readouterr().err
         assert errors.strip() == (
-            f"{file}: --false-alarms-per-1000-rev = 1e+09: give a rate from 1e-09 to 10 [C01]"
+            "daqsvc detectability: --false-alarms-per-1000-rev = 1e+09: give a rate from 1e-09 to 10 [C02]"
         )
 
 

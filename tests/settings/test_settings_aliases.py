@@ -23,6 +23,7 @@ SERIAL = MACHINES / "serial-probes.toml"
         (PUMP, "unit = 1", "slave_id = 1", "unit"),
         (PUMP, "address = 17", "register = 17", "address"),
         (PUMP, "timeout_ms = 500.0", "timeout = 500.0", "timeout_ms"),
+        (PUMP, "timeout_ms = 500.0", "timeout_s = 0.5", "timeout_ms"),
         (PUMP, "alert_low = 2.0", "low = 2.0", "alert_low"),
         (SERIAL, "baud = ", "baudrate = ", "baud"),
         (SERIAL, "rate_hz", "fs", "rate_hz"),
