@@ -39,6 +39,8 @@ const nameIn = (title) => {
   const code = title.match(/^([A-Z]+\d\d): /);
   const name = code ? code[1] : withoutNumbers(title).split(/[ =,]/)[0];
   if (!code && !/[._/-]/.test(name)) return null;
+  /* What consists of names to be put in, as STATE/HOST, is the name of nothing in particular. */
+  if (!code && name.split(/[./]/).every((part) => /^[A-Z_]+$/.test(part))) return null;
   const pattern = name
     .split(/([./])/)
     .map((part) => (/^[A-Z_]+$/.test(part) ? "[^./\\s]+" : _escapeRegExp(part)))
