@@ -29,6 +29,11 @@ const errorsWeight = (words) => (words.length >= MESSAGE_WORDS ? 1.5 : 0.7);
 const OPTION = /^daqsvc-.*--/;
 const OPTION_WEIGHT = 0.5;
 
+/* Who asks what a word means is led to the glossary. */
+const DEFINITION = /^\s*what (is|are|does|do|means)\b|\bmean(s|ing)?\b/i;
+const GLOSSARY = "glossary";
+const DEFINITION_WEIGHT = 2;
+
 const pageWeight = (page) => (PAGE_WEIGHTS.find(([pattern]) => pattern.test(page)) || [null, 1])[1];
 
 /* Of entries of a list, `alarms[2].sensor` is `alarms[].sensor`. */
@@ -170,6 +175,9 @@ const siteSearch = (typed) => {
   /* In a message the words beside the name of a key are those that lead to its code. */
   const named = scores.size > 0;
   rankByWords(wordsOf(others).length >= FEW_WORDS ? others : query, scores);
+  if (DEFINITION.test(query))
+    for (const [entry, score] of scores)
+      if (pages[entries[entry][0]] === GLOSSARY) scores.set(entry, DEFINITION_WEIGHT * score);
   const errors = [...scores].filter(([entry]) => pages[entries[entry][0]] === ERRORS);
   if (named && errors.length && wordsOf(others).length >= MESSAGE_WORDS) {
     const [entry, score] = errors.reduce((one, other) => (other[1] > one[1] ? other : one));

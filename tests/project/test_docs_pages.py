@@ -37,6 +37,20 @@ def test_every_page_is_listed_once_with_a_line_that_says_when_to_read_it() -> No
     assert [entry for entry in entries if not re.match(r"- \[.+\]\(.+\): .{20,}\.$", entry)] == []
 
 
+def test_the_glossary_has_the_words_that_are_not_explained_where_they_are() -> None:
+    """And pages link to it where such a word is first met."""
+    words = set(re.findall(r'<a id="([^"]+)"', (DOCS / "glossary.md").read_text("utf-8")))
+    assert words >= {
+        *("statement", "finding", "cover", "set-aside", "departure", "first-out", "evidence", "nat", "score"),
+        *("prior", "whirl", "1x", "innovation", "residual", "coloured", "keyphasor"),
+    }
+    linked = {
+        word for page in PAGES for word in re.findall(r"glossary\.md#([\w-]+)\)", page.read_text("utf-8"))
+    }
+    assert linked >= {"statement", "finding", "cover", "set-aside", "departure", "first-out", "nat", "score"}
+    assert linked <= words
+
+
 @pytest.mark.sources
 @pytest.mark.parametrize("text", TEXTS, ids=lambda text: f"{text.relative_to(ROOT)}")
 def test_what_is_linked_is_there(text: Path) -> None:
