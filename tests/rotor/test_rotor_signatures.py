@@ -287,14 +287,22 @@ def test_without_a_laval_rotor_a_load_may_stiffen_the_oil_film():
         ("rub", -3.0, False, True),
     ],
 )
+@pytest.mark.parametrize("modelled", [True, False])
 def test_a_rub_without_a_mark_is_left_out_sooner_where_1x_alone_explains_it(
-    best: str, behind: float, *, marked: bool, together: bool
+    best: str, behind: float, *, marked: bool, together: bool, modelled: bool
 ):
-    """And never the other way round: a rub that leads leaves unbalance in the group."""
+    """And never the other way round: a rub that leads leaves unbalance in the group.
+
+    Nor where no model tells what the pulse of a rub would do.
+    """
     other = "unbalance" if best == "rub" else best
     scores = {"normal": 0.0, "unbalance": 50.0, other: 100.0, "rub": 100.0 - behind}
-    group = _group(scores, best, healthy_run(healthy(laval=False)), NamingRules(), marked=marked)
-    assert ({other, "rub"} == set(group)) == together
+    before = healthy_run(healthy())
+    assert before.healthy.modelled
+    if not modelled:
+        before = replace(before, fit_error=1.0)
+    group = _group(scores, best, before, NamingRules(), marked=marked)
+    assert ({other, "rub"} == set(group)) == (together or not modelled)
 
 
 def test_1x_that_moves_alone_is_no_stiffness_loss_where_the_mean_position_is_known():

@@ -370,7 +370,7 @@ _MISFIT = 0.005
 exactly, a few nats of thousands mean nothing."""
 _UNMARKED_RUB_MARGIN_NATS = 2.0
 """A rub that leaves no mark of contact is rare, even where noise may hide one: what explains a change of 1X
-alone leaves it out of the group sooner."""
+alone leaves it out of the group sooner, if a model tells how the pulse of a rub would move the machine."""
 _ONLY_1X = frozenset(("unbalance", "damping_loss"))
 _RIVALS = frozenset(("rub", "unmodelled"))
 TEMPERATURE = 3.0
@@ -531,7 +531,7 @@ def _group(
             return math.inf
         if {name, best} == _RIVALS:
             return rules.rub_margin_nats if healthy.healthy.modelled else _GENERIC_RUB_MARGIN_NATS
-        if name == "rub" and best in _ONLY_1X and not marked:
+        if name == "rub" and best in _ONLY_1X and healthy.healthy.modelled and not marked:
             return _UNMARKED_RUB_MARGIN_NATS
         return rules.margin_nats
 
