@@ -160,7 +160,7 @@ def paper(docs: Path) -> Iterator[Row]:
             f"delay that `daqsvc detectability` predicts, {change}, {row['SNR']}",
             f"{delay} revolutions, predicted / seen",
             "simulated machines with another integrator",
-            "pytest tests/rotor/test_detectability_comes_true.py",
+            "pytest -s tests/rotor/test_detectability_comes_true.py",
             "detectability.md#how-accurate-it-is",
         )
 
@@ -252,7 +252,7 @@ def bearings(docs: Path) -> Iterator[Row]:
         "sensors away from the bearing",
         f"{other[2]} of {other[1]} damaged races named, {other[4]} of {other[3]} balls, no wrong part",
         "fan end and base plate of the CWRU rig",
-        "pytest tests/bearing/test_race_other_sensors.py",
+        "pytest -s tests/bearing/test_race_other_sensors.py",
         "race-test.md#results",
     )
     pair, again = (
@@ -347,7 +347,7 @@ def kept(docs: Path) -> Iterator[Row]:
         )
     samples, events = box.row("samples", after="## Soak"), box.row("alarm events", after="## Soak")
     yield Row(
-        "ten minutes of all that befalls a box in months",
+        "ten minutes of all that happens to a box in months",
         f"samples: {samples['soak']}; alarm events: {events['soak']}",
         "six machines on buses of every kind; every sample's number is checked",
         "make soak",
@@ -365,7 +365,7 @@ def kept(docs: Path) -> Iterator[Row]:
         "samples of two devices on one grid",
         f"error {align['median']} us median, {align['95 %']} us 95 %, {align['largest']} us at most",
         "clocks 50 ppm fast and slow, blocks late by 0 to 5 ms; worse where no block is prompt",
-        "pytest tests/acquisition/test_alignment_clocks.py",
+        "DAQSVC_SEEDS=30 pytest -s tests/acquisition/test_alignment_clocks.py",
         "alignment.md",
     )
 
@@ -395,7 +395,7 @@ def alarms(docs: Path) -> Iterator[Row]:
         "RMS with 10 % of the samples lost",
         f"off by {gaps['RMS']} %",
         "mean and standard deviation, 300 windows; single samples",
-        "pytest tests/detectors/levels/test_levels_of_gaps.py",
+        "DAQSVC_SEEDS=300 pytest -s tests/detectors/levels/test_levels_of_gaps.py",
         "alarms.md#missing-samples",
     )
     orders = Page(docs, "order-change.md").find(
@@ -405,7 +405,7 @@ def alarms(docs: Path) -> Iterator[Row]:
         "order change of accelerometers, no keyphasor",
         f"{orders[1]} false alarms in {orders[2]} pairs",
         "simulated machines that have not changed",
-        "pytest tests/rotor/test_order_change_adi.py",
+        "pytest -s tests/rotor/test_order_change_adi.py",
         "order-change.md#what-was-measured",
     )
 

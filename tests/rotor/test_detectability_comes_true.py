@@ -5,6 +5,8 @@ figure is a mean or a median over 400 runs (160 for the rub), which are themselv
 of a delay and less of an evidence (one standard deviation).
 """
 
+# ruff: noqa: T201 - the figures are part of what it is for
+
 from __future__ import annotations
 
 import functools
@@ -143,6 +145,7 @@ def test_evidence_and_delay_come_true(snr_db, before, after, settled_rev):
     noise = noise_at(snr_db)
     predicted = foreseen(before, after, noise, process_noise=CALM)
     seen = observed(before, after, noise, settled_rev=settled_rev, seeds=50)
+    print(f"{before} to {after}, {snr_db} dB: delay {predicted[2]:.1f} / {seen[2]:.1f} revolutions")
     assert predicted == pytest.approx(seen, rel=0.15)
 
 
@@ -151,6 +154,7 @@ def test_evidence_and_delay_of_a_rub_come_true(other):
     noise = noise_at(0)
     predicted = foreseen(other, "R", noise, process_noise=CALM)
     seen = observed(other, "R", noise, settled_rev=30, seeds=20)
+    print(f"{other} to R, 0 dB: delay {predicted[2]:.1f} / {seen[2]:.1f} revolutions")
     assert predicted == pytest.approx(seen, rel=0.15)
 
 

@@ -1,10 +1,16 @@
-"""Levels of windows that lack samples, against those of the same windows when they are whole."""
+"""Levels of windows that lack samples, against those of the same windows when they are whole.
+
+``DAQSVC_SEEDS=300 pytest -s`` takes as many windows as docs/alarms.md states, and prints its figures.
+"""
+
+# ruff: noqa: T201 - the figures are part of what it is for
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 from support.gapped_signals import FRAMES, RATE_HZ, SHARES, SIGNALS, lost
+from support.rotor_runs import seeds
 
 from daqsvc.detectors.levels.detector import LevelChannel, LevelDetector
 from daqsvc.diagnosis.detector import Window
@@ -12,7 +18,7 @@ from daqsvc.dsp.quality.missing import MOST_MISSING
 
 pytestmark = pytest.mark.statistical
 WINDOW = 1000
-WINDOWS = 60
+WINDOWS = seeds(60)
 MEASURES = ("rms", "peak", "crest_factor", "velocity_rms")
 
 
@@ -60,6 +66,10 @@ def test_rms_and_velocity_have_no_bias(pairs):
     for (share, frame), both in found.items():
         for measure in ("rms", "velocity_rms"):
             judgeable = [pair for pair in both if pair[1].statistics]
+            off = 100.0 * (ratios(judgeable, measure) - 1.0)
+            if len(off):
+                deviation = f"{measure} {off.mean():.1f} ± {off.std():.1f} %"
+                print(f"{name}, {share:.0%} lost, frames of {frame}: {deviation}")
             power = ratios(judgeable, measure, squared=True)
             if len(power) < 0.95 * len(judgeable):
                 assert measure == "velocity_rms", (share, frame)
