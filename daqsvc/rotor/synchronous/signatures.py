@@ -369,8 +369,8 @@ _MISFIT = 0.005
 """Part of the evidence of a change that the shape of a rub's pulse may be off by: where no rotor model fits
 exactly, a few nats of thousands mean nothing."""
 _UNMARKED_RUB_MARGIN_NATS = 2.0
-"""A rub that leaves no mark of contact is rare, even where noise may hide one: what explains a change of 1X
-alone leaves it out of the group sooner, if a model tells how the pulse of a rub would move the machine."""
+"""A rub that leaves no mark of contact is rare, even where noise may hide one. So what explains a change of
+1X alone leaves it out of the group sooner, if a model tells how the pulse of a rub would move the machine."""
 _ONLY_1X = frozenset(("unbalance", "damping_loss"))
 _RIVALS = frozenset(("rub", "unmodelled"))
 TEMPERATURE = 3.0
