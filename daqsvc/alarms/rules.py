@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+_LARGE_ODDS = 2.0
+"""From so many decades on, odds are a power of ten: 10^6 to 1."""
 SURE = 0.999
 """More digits than this no model of a machine deserves."""
 
@@ -281,6 +283,14 @@ def decision_evidence(diagnosis: Diagnosis) -> float | None:
     return _finite(max((evidence[mode] for mode in among if mode in evidence), default=math.nan))
 
 
+def _odds(nats: float) -> str:
+    """The same as the odds on the finding, in parentheses; empty if there is no evidence for it."""
+    decades = nats / math.log(10.0)
+    if decades <= 0.0:
+        return ""
+    return f" ({math.exp(nats):.2g} to 1)" if decades < _LARGE_ODDS else f" (10^{decades:.0f} to 1)"
+
+
 def _finite(nats: float) -> float | None:
     return nats if math.isfinite(nats) else None
 
@@ -485,7 +495,7 @@ class _DecisionWatch:
         if probability > 0.5:  # a smaller one states less than the words
             sentence += ", p > 0.999" if probability > SURE else f", p = {probability:.3f}"
         if evidence is not None:
-            sentence += f", evidence {evidence:.3g} nats"
+            sentence += f", evidence {evidence:.3g} nats{_odds(evidence)}"
         others = [_IN_WORDS.get(mode, mode) for mode in diagnosis.group if mode not in decision.split("_or_")]
         if others:
             how = "possibly" if decision == DEPARTURE else "not told apart from"

@@ -49,7 +49,13 @@ def test_a_probability_of_nine_tenths_raises_nothing_without_the_evidence_asked_
     rig = AlarmRig(STRICT)
     assert rig.mode("F1", "alert", probabilities={"F1": 0.999}, evidence=leads(N=17.9)) == []
     (raised,) = rig.mode("F1", "alert", probabilities={"F1": 0.999}, evidence=leads(N=18.0))
-    assert raised.message == "rotor-fault alert: rotor-bank finds F1, p = 0.999, evidence 18 nats"
+    assert raised.message == "rotor-fault alert: rotor-bank finds F1, p = 0.999, evidence 18 nats (10^8 to 1)"
+
+
+def test_evidence_is_told_as_odds_too():
+    rig = AlarmRig(DiagnosisRule("rotor-fault", "rotor-bank"))
+    (raised,) = rig.mode("F1", "alert", evidence=leads(N=2.0))
+    assert raised.message.endswith("evidence 2 nats (7.4 to 1)")
 
 
 def test_weak_evidence_neither_worsens_nor_renames_an_alarm_and_a_return_needs_none():
