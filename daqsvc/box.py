@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import TYPE_CHECKING, Any, cast
 
 from daqsvc.errors.machine_file import NOT_OF_ONE_BOX, TOO_MUCH_MEMORY
@@ -155,9 +156,19 @@ def _buses(files: Sequence[MachineFile]) -> Iterator[Problem]:
             if mine != theirs:
                 differ = [key for key, value in mine if value != getattr(theirs, key, None)] or ["driver"]
                 here, there = (getattr(table, differ[0], None) for table in (mine, theirs))
-                words = f"the bus of that name in {owner.path} has {differ[0]} = {there!r}"
-                remedy = f"files of one box mean one bus by one name: write its table alike, or rename {name}"
-                yield _problem(file, ("buses", name, differ[0]), f"{here!r}", words, remedy)
+                has = f"no {differ[0]}" if there is None else f"{differ[0]} = {_as_written(there)}"
+                words = f"the bus of that name in {owner.path} has {has}"
+                remedy = (
+                    f"in all files of a box, one name is one bus: make both tables [buses.{name}] equal, or "
+                    "give this bus another name"
+                )
+                written = "" if here is None else _as_written(here)
+                yield _problem(file, ("buses", name, differ[0]), written, words, remedy)
+
+
+def _as_written(value: object) -> str:
+    """A value as a machine file has it, or nearly."""
+    return json.dumps(value, ensure_ascii=False, default=str)
 
 
 def _absolute(file: MachineFile, name: str) -> Bus:

@@ -94,7 +94,7 @@ def test_files_that_do_not_make_one_box_are_refused_with_what_is_wrong() -> None
         'machine.name = "one": is the name': ('name = "two"', 'name = "one"'),
         f'machine.name = "{BOX}": is the name of the service': ('name = "two"', f'name = "{BOX}"'),
         'id 0x101 on bus "can0" belongs to stream "one/shaft" already': ("0x102", "0x101"),
-        "buses.can0.channel = 'can1': the bus of that name": ('channel = "can0"', 'channel = "can1"'),
+        'buses.can0.channel = "can1": the bus of that name': ('channel = "can0"', 'channel = "can1"'),
     }
     for words, change in changes.items():
         said = refused(machine("one", 1), machine("two", 2, "", change))
