@@ -299,6 +299,7 @@ def range_of(schema: Mapping[str, Any]) -> str:
         words += [f"more than {_number(above)}"] if above is not None else []
         words += [f"{_number(most)} or less"] if most is not None else []
         words += [f"less than {_number(below)}"] if below is not None else []
+    words += [schema["$comment"]] if "$comment" in schema else []
     if schema.get("pattern") == _NAME_PATTERN:
         words.append("letters, digits, `_`, `.` and `-`")
     if "maxLength" in schema:

@@ -12,7 +12,7 @@ from pydantic_core import PydanticCustomError
 
 from daqsvc.errors.machine_file import BAD_ADDRESS, BAD_PATH
 from daqsvc.settings.buses import Device
-from daqsvc.settings.section import Text
+from daqsvc.settings.section import InSchema, Text
 
 _LABEL = re.compile(r"(?!-)[A-Za-z0-9_-]{1,63}(?<!-)")
 _LONGEST_HOST = 253
@@ -141,5 +141,10 @@ def _listening(text: str) -> str:
     return text
 
 
-ListenAddress: TypeAlias = Annotated[Text, AfterValidator(_listening)]
+_PORT_DIGITS = r"0*([1-9][0-9]{0,3}|[1-5][0-9]{4}|6[0-4][0-9]{3}|65[0-4][0-9]{2}|655[0-2][0-9]|6553[0-5])"
+ListenAddress: TypeAlias = Annotated[
+    Text,
+    AfterValidator(_listening),
+    InSchema("`HOST:PORT`, port 1 to 65_535", pattern=rf"^(\[[^\[\]]+\]|[^:\[\]]+):{_PORT_DIGITS}$"),
+]
 """``HOST:PORT`` where this machine listens."""

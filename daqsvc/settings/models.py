@@ -30,7 +30,16 @@ from daqsvc.settings.registry import (
     no_detectors,
     with_outputs,
 )
-from daqsvc.settings.section import AngleDeg, DampingRatio, FrozenTables, Line, Name, PositionUm, Section
+from daqsvc.settings.section import (
+    NOT_ZERO,
+    AngleDeg,
+    DampingRatio,
+    FrozenTables,
+    Line,
+    Name,
+    PositionUm,
+    Section,
+)
 from daqsvc.settings.sensors import (
     Accelerometer,
     Keyphasor,
@@ -155,6 +164,7 @@ class Machine(Section):
     speed_rpm: Annotated[
         float,
         AfterValidator(_turning),
+        NOT_ZERO,
         Field(
             ge=-1_000_000,
             le=1_000_000,

@@ -13,7 +13,7 @@ from daqsvc.errors.buses import FIELD_OUTSIDE, FIELDS_OVERLAP, LOSS_UNNOTICED, R
 from daqsvc.errors.machine_file import CONTRADICTION, WRONG_ORDER, WRONG_SCALE
 from daqsvc.settings.buses import Layout, WireRange
 from daqsvc.settings.problems import Finding
-from daqsvc.settings.section import MOST, MOST_CHANNELS, Name, Quantity, Section
+from daqsvc.settings.section import MOST, MOST_CHANNELS, NOT_ZERO, Name, Quantity, Section
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -65,7 +65,7 @@ def _not_zero(scale: float) -> float:
     return scale
 
 
-Scale = Annotated[float, Field(ge=-LARGEST_SCALE, le=LARGEST_SCALE), AfterValidator(_not_zero)]
+Scale = Annotated[float, Field(ge=-LARGEST_SCALE, le=LARGEST_SCALE), AfterValidator(_not_zero), NOT_ZERO]
 """What one count of a raw value is worth."""
 
 RawLimit = Annotated[float, Field(ge=-3.4028235e38, le=3.4028235e38)]

@@ -14,7 +14,27 @@ from daqsvc.settings.failures import failure
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from pydantic import GetCoreSchemaHandler
+    from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
+
+
+class InSchema:
+    """A mark on a type: what a validator of ours asks of a value, as the JSON Schema states it.
+
+    Args:
+        keywords: of JSON Schema (draft 7). ``words`` is for the reference: its ``$comment``.
+    """
+
+    def __init__(self, words: str = "", **keywords: Any) -> None:
+        self._keywords = {**keywords, **({"$comment": words} if words else {})}
+
+    def __get_pydantic_json_schema__(
+        self, core: core_schema.CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        """The schema of the type, with the keywords."""
+        return {**handler(core), **self._keywords}
+
+
+NOT_ZERO = InSchema("not 0", **{"not": {"const": 0}})
 
 Name = Annotated[str, Field(pattern=r"^\.*[A-Za-z0-9_-][A-Za-z0-9_.-]*$", max_length=64)]
 """A name that can be used in an MQTT topic, a file name and a log line as it is; not ``.`` or ``..``."""

@@ -9,7 +9,7 @@ from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
 from daqsvc.errors.machine_file import BAD_TEXT, UNLIKELY_SENSITIVITY, WRONG_ORDER
-from daqsvc.settings.section import MOST, AngleDeg, Kinds, Line, Name, Quantity, Section, Volts
+from daqsvc.settings.section import MOST, NOT_ZERO, AngleDeg, Kinds, Line, Name, Quantity, Section, Volts
 
 TYPE = "what kind of sensor it is"
 
@@ -68,12 +68,12 @@ class BaseSensor(Section):
     name: Annotated[Name, Field(description="name of the sensor", examples=["probe-x"])]
     stream: Annotated[Name, Field(description="the stream it is in", examples=["shaft"])]
     channel: Annotated[Name, Field(description="its channel in that stream", examples=["x"])]
-    sensitivity_mv_per_unit: Annotated[float, Field(ge=-MOST, le=MOST), AfterValidator(_not_zero)] | None = (
-        Field(
-            default=None,
-            description="sensitivity of the sensor; absent if the channel already carries the physical unit",
-            examples=[7.87],
-        )
+    sensitivity_mv_per_unit: (
+        Annotated[float, Field(ge=-MOST, le=MOST), AfterValidator(_not_zero), NOT_ZERO] | None
+    ) = Field(
+        default=None,
+        description="sensitivity of the sensor; absent if the channel already carries the physical unit",
+        examples=[7.87],
     )
     zero_v: Volts = Field(default=0.0, description="voltage that means 0 in the physical unit")
 

@@ -136,7 +136,7 @@ def probable(stated: Sequence[Diagnosis]) -> dict[str, str]:
 
 
 def named(diagnosis: Diagnosis) -> str:
-    """A statement in words."""
+    """What a statement says, in words."""
     return " or ".join(diagnosis.group or (diagnosis.decision,)).replace("_", " ")
 
 

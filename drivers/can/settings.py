@@ -13,7 +13,7 @@ from daqsvc.errors.buses import FRAME_LENGTH
 from daqsvc.settings.buses import Bus, Device, Layout, WireRange
 from daqsvc.settings.files import FilePath  # noqa: TC001 - pydantic reads the annotations
 from daqsvc.settings.packing import NO_COUNTER, VALID_RAW, Channel, Counter, Counts, PackedFields, ValidRaw
-from daqsvc.settings.section import MOST_CHANNELS, Name, Section, Text
+from daqsvc.settings.section import MOST_CHANNELS, InSchema, Name, Section, Text
 
 CAN_FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 """Payload lengths in bytes that a CAN FD frame can have (ISO 11898-1); up to 8 also in classic CAN."""
@@ -106,6 +106,7 @@ class PlainLayout(PackedFields):
         int,
         Field(ge=0, le=64, description="payload length in bytes", examples=[64]),
         AfterValidator(_payload_length),
+        InSchema(enum=list(CAN_FD_LENGTHS)),
     ]
     byte_order: Literal["little", "big"] = Field(
         default="little", description="byte order of counter and samples"

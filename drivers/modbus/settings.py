@@ -11,7 +11,7 @@ from daqsvc.errors.buses import MANUALS_NUMBER, RING_DEPTH
 from daqsvc.settings.addresses import DevicePath, Host, serial_port
 from daqsvc.settings.buses import Block, Bus, Device, Layout, WireRange
 from daqsvc.settings.packing import Scale  # noqa: TC001 - pydantic reads the annotations
-from daqsvc.settings.section import MOST_CHANNELS, Name, Quantity, Section, WaitMs
+from daqsvc.settings.section import MOST_CHANNELS, InSchema, Name, Quantity, Section, WaitMs
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -497,6 +497,7 @@ class RingLayout(_Sampled):
     depth: Annotated[
         int,
         AfterValidator(_power_of_two),
+        InSchema(enum=[1 << exponent for exponent in range(1, 16)]),
         Field(ge=2, le=32_768, description="samples that the ring holds", examples=[256]),
     ]
 

@@ -113,6 +113,46 @@ def test_a_slip_is_underlined_where_it_is(old, new, place):
     assert place in underlined(tomllib.loads(text.replace(old, new, 1)))
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "place"),
+    [
+        ("speed_rpm = 600.0", "speed_rpm = 0", ("machine", "speed_rpm")),
+        (
+            "sensitivity_mv_per_unit = 7.87",
+            "sensitivity_mv_per_unit = 0",
+            ("sensors", 0, "sensitivity_mv_per_unit"),
+        ),
+        ("length = 64", "length = 13", ("streams", "shaft", "layout", "length")),
+        ("scale = 0.001", "scale = 0.0", ("streams", "shaft", "layout", "channels", 0, "scale")),
+        ("[mqtt]", '[page]\nlisten = "x"\n[mqtt]', ("page", "listen")),
+        ("[mqtt]", '[page]\nlisten = "127.0.0.1:99999"\n[mqtt]', ("page", "listen")),
+        ("[mqtt]", '[page]\nlisten = "::1:9000"\n[mqtt]', ("page", "listen")),
+        ("[mqtt]", '[page]\nproxies = ["abc"]\n[mqtt]', ("page", "proxies", 0)),
+        ("[mqtt]", '[page]\nuser_header = "X User"\n[mqtt]', ("page", "user_header")),
+    ],
+)
+def test_what_a_validator_of_ours_refuses_of_a_single_value_is_underlined(old, new, place):
+    text = LAVAL.read_text(encoding="utf-8")
+    assert old in text
+    document = tomllib.loads(text.replace(old, new, 1))
+    assert underlined(document) == {place} == refused(document)[1]
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        'listen = "[::1]:8420"',
+        'listen = "edge-1.example:08420"',
+        'listen = "0.0.0.0:65535"',
+        'proxies = ["127.0.0.1", "::1", "2001:db8::1"]',
+        'user_header = "X-Remote-User"',
+    ],
+)
+def test_addresses_that_are_taken_are_not_underlined(table):
+    document = tomllib.loads(f"{LAVAL.read_text(encoding='utf-8')}\n[page]\n{table}\n")
+    assert (underlined(document), refused(document)) == (set(), (set(), set()))
+
+
 @pytest.mark.long
 def test_it_underlines_what_the_models_refuse_and_nothing_else():
     """Every key of every kind of table misspelt, of another type, beyond its bounds, and left out."""

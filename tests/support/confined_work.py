@@ -54,7 +54,7 @@ def fail() -> NoReturn:
 
 
 def grow(rows: int) -> Answer:
-    # The JSON is short, what it announces is large.
+    # What JSON says is little, what is announced is much.
     return None, [np.zeros(1)] * rows
 
 

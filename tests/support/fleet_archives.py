@@ -1,4 +1,4 @@
-"""Archives of a fleet, made up; and ``daqsvc analyze --cluster`` over them, as separate processes."""
+"""Archives of a fleet, made up; and ``daqsvc analyze --cluster`` over them, as processes of their own."""
 
 from __future__ import annotations
 

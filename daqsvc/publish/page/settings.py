@@ -11,7 +11,7 @@ from pydantic_core import PydanticCustomError
 from daqsvc.errors.machine_file import BAD_ADDRESS, BAD_TEXT
 from daqsvc.settings.addresses import ListenAddress  # noqa: TC001 - pydantic reads the annotations
 from daqsvc.settings.files import FilePath  # noqa: TC001
-from daqsvc.settings.section import Section, Text
+from daqsvc.settings.section import InSchema, Section, Text
 
 DEFAULT = "127.0.0.1:8420"
 MOST_NAMES = 32
@@ -34,6 +34,10 @@ def _header(text: str) -> str:
     return text
 
 
+_LIKE_AN_ADDRESS = InSchema("an IP address", pattern=r"^[0-9]{1,3}(\.[0-9]{1,3}){3}$|^[^.]*:.*:")
+_LETTERS = InSchema("letters, digits and `-`", pattern="^-*[A-Za-z0-9][A-Za-z0-9-]*$")
+
+
 class Page(Section):
     """The page in a browser, which the service starts as a separate process."""
 
@@ -54,13 +58,14 @@ class Page(Section):
         description="file with accounts to sign in with, made by daqsvc account",
         examples=["/etc/daqsvc/accounts"],
     )
-    user_header: Annotated[Text, AfterValidator(_header)] | None = Field(
+    user_header: Annotated[Text, AfterValidator(_header), _LETTERS] | None = Field(
         default=None,
         description="header in which a reverse proxy names the user who asks",
         examples=["X-Remote-User"],
     )
     proxies: Annotated[
-        tuple[Annotated[Text, AfterValidator(_ip_address)], ...], Field(strict=False, max_length=MOST_NAMES)
+        tuple[Annotated[Text, AfterValidator(_ip_address), _LIKE_AN_ADDRESS], ...],
+        Field(strict=False, max_length=MOST_NAMES),
     ] = Field(default=(), description="IP addresses of that proxy", examples=['["127.0.0.1"]'])
     operators: Annotated[tuple[Text, ...], Field(strict=False, max_length=1000)] = Field(
         default=(), description="users of that proxy who may handle alarms", examples=['["ada"]']
