@@ -29,7 +29,8 @@ NO_SETPOINT = Code(
     "Without alert and danger the alarm would never come.",
     "Add alert, danger or both.",
     _PAGE,
-    example="machine.toml:109: alarms[0]: has neither alert nor danger. Remedy: add alert, danger or both",
+    example='machine.toml:109: alarms[0] ("shaft-vibration-x"): has neither alert nor danger. Remedy: add '
+    "alert, danger or both",
 )
 SETPOINT_ORDER = Code(
     "A04",
@@ -97,9 +98,9 @@ NO_REFERENCE = Code(
     "Setpoints of a phase are how far it may be from that of the machine in good order.",
     "Add reference_deg, the phase that was measured then.",
     _PAGE,
-    example="machine.toml:90: alarms[0]: does not state from where 1x_phase_lag counts: its setpoints are "
-    "how far it may be from a reference, either way. Remedy: add reference_deg, the phase of the machine "
-    "in good order, e.g. reference_deg = 135.0",
+    example='machine.toml:90: alarms[0] ("housing"): does not state from where 1x_phase_lag counts: its '
+    "setpoints are how far it may be from a reference, either way. Remedy: add reference_deg, the phase of "
+    "the machine in good order, e.g. reference_deg = 135.0",
 )
 TRIP_MULTIPLY = Code(
     "A11",

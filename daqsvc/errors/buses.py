@@ -441,8 +441,8 @@ NO_VALUE_MARK = Code(
     "Write no_value into the channel, as the device's manual has it, or ok_between with what the sensor can "
     "measure.",
     "modbus.md",
-    example="machine.toml:73: sensors[2]: has no ok_between: 0x8000 in its int16, by which many devices mean "
-    "that they have no value, would be -1638.4 degC. Remedy: write no_value = 0x8000 into its channel if the "
-    "device's manual has it, or ok_between with the least and the greatest value that the sensor "
-    "can measure",
+    example='machine.toml:73: sensors[2] ("de-temperature"): has no ok_between: 0x8000 in its int16, by '
+    "which many devices mean that they have no value, would be -1638.4 degC. Remedy: write no_value = 0x8000 "
+    "into its channel if the device's manual has it, or ok_between with the least and the greatest value "
+    "that the sensor can measure",
 )

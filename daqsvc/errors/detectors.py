@@ -11,9 +11,9 @@ BEARING_FIGURES = Code(
     "shaft and obey ftf < 0.5 < bpfo < bpfi, and bpfo + bpfi is the number of balls.",
     "Compare the figures with the data sheet of the bearing.",
     "bearing.md",
-    example="machine.toml:70: pipeline.bearing.bearings[0]: has both type and orders. Remedy: write type = "
-    '"6205-2RS", or orders = { bpfi = .., bpfo = .., bsf = .., ftf = .. }, or geometry = { balls = '
-    ".., ball_diameter_mm = .., pitch_diameter_mm = .. }",
+    example='machine.toml:70: pipeline.bearing.bearings[0] ("drive-end"): has both type and orders. Remedy: '
+    'write type = "6205-2RS", or orders = { bpfi = .., bpfo = .., bsf = .., ftf = .. }, or geometry = { '
+    "balls = .., ball_diameter_mm = .., pitch_diameter_mm = .. }",
 )
 TOO_SLOW_A_MACHINE = Code(
     "D02",

@@ -61,11 +61,12 @@ def is_host(text: str) -> bool:
 
 def _device_path(path: str) -> str:
     if not path.startswith("/"):
+        port = path if path.startswith("tty") else "ttyUSB0"
         raise PydanticCustomError(
             "device_path",
             "is not the whole path of a port",
             {
-                "remedy": f"write it from the root, e.g. /dev/serial/by-id/... or /dev/{path or 'ttyS0'}",
+                "remedy": f"write it from the root, e.g. /dev/serial/by-id/... or /dev/{port}",
                 "code": BAD_PATH,
             },
         )

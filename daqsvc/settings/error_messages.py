@@ -253,8 +253,9 @@ class ErrorFormatter:
 
     def _less_than_equal(self, path: KeyPath, context: Mapping[str, Any]) -> tuple[str, str]:
         limit = context["le"]
-        shown = hex(limit) if path[-1] == "id" else _shown(limit)
-        return f"must be {shown} or less", self._write_example(path)
+        if path[-1] == "id":
+            return f"must be {limit:#x} or less", "write the id of the frames, which candump shows"
+        return f"must be {_shown(limit)} or less", self._write_example(path)
 
     def _string_pattern_mismatch(self, path: KeyPath, context: Mapping[str, Any]) -> tuple[str, str]:
         parts = "/" in str(context["pattern"])

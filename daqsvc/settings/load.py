@@ -15,7 +15,7 @@ from daqsvc.errors.machine_file import PLUGIN_FAILED, UNKNOWN_KEY
 from daqsvc.settings.checks import check, failure
 from daqsvc.settings.error_messages import ErrorFormatter, dotted, is_secret, suggested_key, table_beside
 from daqsvc.settings.failures import one_line
-from daqsvc.settings.files import UnreadableFileError, read_bounded
+from daqsvc.settings.files import UnreadableFileError, read_bounded, shortened
 from daqsvc.settings.hooks import collecting
 from daqsvc.settings.locate import Spot
 from daqsvc.settings.models import MachineFile, Origin, machine_file_model
@@ -259,18 +259,21 @@ class _Reading:
 
     def _problem(self, finding: Finding) -> Problem:
         path = self._as_written(finding.path)
+        name = ""
         try:
-            value_at(self._document, path)
+            value = value_at(self._document, path)
         except LookupError:
             source = ""
         else:
             source = _shown(path, self._spots.get(path, Spot(1)).source)
+            if isinstance(value, dict) and isinstance(value.get("name"), str) and isinstance(path[-1], int):
+                name = shortened(one_line(value["name"]), _LONGEST_VALUE)
         # A key that is missing has no line: its table has.
         line = next(
             self._spots[path[:end]].line for end in range(len(path), -1, -1) if path[:end] in self._spots
         )
         message, remedy = one_line(finding.message), one_line(finding.remedy)
-        return Problem(self._path, line, dotted(path), source, message, remedy, finding.code)
+        return Problem(self._path, line, dotted(path), source, message, remedy, finding.code, name)
 
     def _as_written(self, path: KeyPath) -> KeyPath:
         """A path of the document as it was meant, in the keys that the file really has."""

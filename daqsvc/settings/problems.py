@@ -55,6 +55,7 @@ class Problem:
         message: what is wrong with it.
         remedy: what to do about it.
         code: see `Finding`.
+        name: of the sensor, alarm or the like whose whole table ``key`` is; empty otherwise.
     """
 
     file: Path
@@ -64,11 +65,18 @@ class Problem:
     message: str
     remedy: str
     code: Code | None = None
+    name: str = ""
+
+    @property
+    def subject(self) -> str:
+        """The key with its value or, of a table, its name; empty if it concerns the file as a whole."""
+        if self.value:
+            return f"{self.key} = {self.value}"
+        return f'{self.key} ("{self.name}")' if self.name else self.key
 
     def __str__(self) -> str:
         place = f"{self.file}:{self.line}" if self.line is not None else f"{self.file}"
-        subject = f"{self.key} = {self.value}" if self.value else self.key
-        middle = f"{subject}: " if subject else ""
+        middle = f"{self.subject}: " if self.subject else ""
         return with_code(f"{place}: {middle}{self.message}. Remedy: {self.remedy}", self.code)
 
 

@@ -341,6 +341,20 @@ def test_answers_of_a_file_are_those_of_the_options(tmp_path, capsys):
             "--sensor x.bearing= is not asked for with these answers; bearings need ",
         ),
         (["--yes", "--bus=can", "--sensor", "x.angle=up"], "--sensor x.angle=up: "),
+        (
+            ["--yes", "--bus=can", "--sensor", "foo.unit=g"],
+            "--sensor foo.unit= is not asked for with these answers; there is no channel foo; there are x, y",
+        ),
+        (
+            ["--yes", "--home-assistant", "yes"],
+            "--home-assistant is not asked for with these answers; it needs --b",
+        ),
+        (["--yes", "--bus=can", "--limits=none", "--alert=2"], "it needs --limits own"),
+        (["--yes", "--bus=serial", "--port=COM3"], "or /dev/ttyUSB0"),
+        (
+            ["--yes", "--bus=can", "--id=0x123456789"],
+            "Remedy: write the id of the frames, which candump shows",
+        ),
         (["--yes", "--host", "a"], "--host is not asked for with these answers; leave it out"),
         (["--yes", "--speed", "0"], '--speed 0: "0" is a shaft that stands still'),
         (["--yes", "--sensor", "x.kind=none"], "--sensor x.kind= is not asked for"),
@@ -363,6 +377,13 @@ def test_what_is_missing_or_wrong_is_said_in_one_line_and_nothing_is_written(
     assert words in said.err
     assert said.err.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+def test_listening_to_what_cannot_be_heard_is_said_to_be_left_out(tmp_path, capsys):
+    assert main(["new", f"{tmp_path / 'rig.toml'}", "--yes", "--bus=virtual", "--listen"]) == 0
+    assert (
+        "--listen is left out: on a bus of this kind there is nothing to listen to" in capsys.readouterr().out
+    )
 
 
 def test_a_file_that_is_there_is_written_over_only_if_that_is_said(tmp_path, capsys):

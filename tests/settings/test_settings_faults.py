@@ -30,7 +30,14 @@ ONE_VALUE = [
     ("length = 64", "length = 64.0", "streams.shaft.layout.length", "64.0", "whole number", "length = 64"),
     ("length = 64", "length = 63", "streams.shaft.layout.length", "63", "not a length", "12, 16, 20"),
     ("length = 64", "length = true", "streams.shaft.layout.length", "true", "whole number", "length = 64"),
-    ("id = 0x101", "id = 0x2000_0000", "streams.shaft.layout.id", "0x2000_0000", "0x1fffffff", "0x101"),
+    (
+        "id = 0x101",
+        "id = 0x2000_0000",
+        "streams.shaft.layout.id",
+        "0x2000_0000",
+        "0x1fffffff",
+        "candump shows",
+    ),
     ("bits = 16", "bits = 12", "streams.shaft.layout.counter.bits", "12", "8, 16 or 32", "bits = 8"),
     ("bits = 16", 'bits = "16"', "streams.shaft.layout.counter.bits", '"16"', "8, 16 or 32", "bits = 16"),
     (

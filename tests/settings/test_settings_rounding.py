@@ -152,3 +152,10 @@ def test_check_shows_limits_of_a_plain_number_without_its_unit(tmp_path: Path) -
     file.write_text(STATE.replace("danger = 1.5", "danger = 300.0"))
     with pytest.raises(MachineFileError, match=r'channel of "state" carries 0 to 255\. Remedy'):
         load_machine_file(file)
+
+
+def test_what_concerns_a_whole_alarm_names_it(tmp_path: Path) -> None:
+    file = tmp_path / "machine.toml"
+    file.write_text(STATE.replace("alert = 0.5\ndanger = 1.5\n", ""))
+    with pytest.raises(MachineFileError, match=r'alarms\[0\] \("state"\): has neither alert nor danger'):
+        load_machine_file(file)

@@ -13,7 +13,7 @@ from daqsvc.errors.command_line import ANSWER
 from drivers.questions import SENSOR, Answers, Question
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from daqsvc.settings import MachineFile
@@ -130,9 +130,16 @@ class _Interview:
             self._typed.append(key)
         if self._answered is not None:
             self._answered(question, self.answers)
+        if self._listen is not None:
+            self._listen_behind(key, self._listen)
+
+    def _listen_behind(self, key: str, listen: Callable[[BusQuestions, Answers], Heard | None]) -> None:
+        """Listen if the bus can be found by the answers up to this one."""
         bus = bus_of(self.answers)
-        if self._listen is not None and key == bus.listens_behind:
-            self._heard = self._listen(bus, self.answers)
+        if key == "bus" and not bus.listens_behind:
+            self._say("--listen is left out: on a bus of this kind there is nothing to listen to")
+        if key == bus.listens_behind:
+            self._heard = listen(bus, self.answers)
 
     def _go_back(self) -> None:
         """Forget the last answer of a person, and what was taken by itself behind it."""
@@ -210,8 +217,7 @@ def refusal(answers: Answers, file: Path) -> str | None:
         if not known:
             return None
         problem = known[0]
-        subject = f"{problem.key} = {problem.value}" if problem.value else problem.key
-        return f"{subject}: {problem.message}. Remedy: {problem.remedy}"
+        return f"{problem.subject}: {problem.message}. Remedy: {problem.remedy}"
     except AssemblyError as error:
         return f"{error}"
     return None
@@ -258,8 +264,30 @@ def _refuse_others(given: Given, interview: _Interview) -> None:
     asked = interview.asked
     for key in given.texts:
         if key not in asked:
-            close = difflib.get_close_matches(key, asked, n=1)
-            hint = f"did you mean {option(close[0])}?" if close else "leave it out"
-            if key.endswith(".bearing"):
-                hint = why_no_bearing(interview.answers)
+            hint = _why_not_asked(key, asked, interview.answers)
             raise AnswerError(f"{option(key)} is not asked for with these answers; {hint}")
+
+
+_NEEDS = {
+    "username": "--broker",
+    "password-file": "--broker and --username",
+    "home-assistant": "--broker",
+    "class": "--limits iso",
+    "alert": "--limits own",
+    "danger": "--limits own",
+}
+"""Questions that only some answers lead to."""
+
+
+def _why_not_asked(key: str, asked: Sequence[str], answers: Answers) -> str:
+    """What is missing for a question, or what was meant instead."""
+    channels = bus_of(answers).channels(answers)
+    channel = key.removeprefix(f"{SENSOR}.").rpartition(".")[0]
+    if key.startswith(f"{SENSOR}.") and channel not in channels:
+        return f"there is no channel {channel}; there are {', '.join(channels)}"
+    if key.endswith(".bearing"):
+        return why_no_bearing(answers)
+    if key in _NEEDS:
+        return f"it needs {_NEEDS[key]}"
+    close = difflib.get_close_matches(key, asked, n=1)
+    return f"did you mean {option(close[0])}?" if close else "leave it out"
