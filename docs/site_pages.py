@@ -2,6 +2,7 @@
 
 - A link to a file of the repository leads to a copy of it, one to a folder to its README.md; where there is
   none, the words stay, without the link. A link that leads nowhere is left as it is: the build fails at it.
+  So it does at a link in raw HTML that leads nowhere, and at a reference that is defined nowhere.
 - index.md, and README.md of a folder, list pages; these lists are the contents at the side of the site.
 """
 
@@ -9,15 +10,19 @@ from __future__ import annotations
 
 import posixpath
 import re
+from html import unescape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import unquote
 
 from docutils import nodes
+from sphinx.util import logging
 
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
 
 ROOT = Path(__file__).parents[1]
+_log = logging.getLogger(__name__)
 STUBS = {
     "README.md": "docs/readme.md",
     "CONTRIBUTING.md": "docs/contributing.md",
@@ -30,6 +35,11 @@ IMAGE = re.compile(r"!\[([^\[\]]*)\]\(([^()\s]+)\)")
 ENTRY = re.compile(r"^(?:- \[(?P<title>[^\[\]]+)\]|\| \[[^\[\]]+\])\((?P<page>[^()\s#]+\.md)\)", re.MULTILINE)
 SECTION = re.compile(r"^(?=## )", re.MULTILINE)
 ANCHOR = re.compile(r'<a id="([^"]+)">')
+REFERENCE = re.compile(r"\[[^\[\]]+\]\[[^\[\]]*\]")
+RAW_LINK = re.compile(
+    r"""\b(?:href|src)\s*=\s*["'](?![a-z]+:|//)([^"'#?]*)(?:\?[^"'#]*)?(?:#([^"']*))?["']"""
+)
+IDS = re.compile(r'\b(?:id|name)="([^"]+)"')
 EXTERNAL = re.compile(r"^(?:[a-z]+:|#)")
 
 
@@ -100,9 +110,34 @@ def _note_anchors(app: Sphinx, doctree: nodes.document) -> None:
     slugs.update({name: (0, name, "") for name in anchors})
 
 
+def _find_undefined(app: Sphinx, doctree: nodes.document) -> None:
+    """A reference in brackets that nothing defines stays in the text as it is written."""
+    for text in doctree.findall(nodes.Text):
+        if not isinstance(text.parent, nodes.literal | nodes.literal_block | nodes.raw | nodes.comment):
+            for reference in REFERENCE.findall(text.astext()):
+                _log.warning("undefined reference: %s", reference, location=app.env.docname)
+
+
+def _find_dead_links(app: Sphinx, failure: Exception | None) -> None:
+    """What raw HTML links to must be in the site; Sphinx sees only links of Markdown."""
+    if failure is not None or app.builder.format != "html":
+        return
+    for name in sorted(app.env.found_docs):
+        raw = "".join(one.astext() for one in app.env.get_doctree(name).findall(nodes.raw))
+        page = Path(app.outdir) / f"{name}.html"
+        for path, anchor in RAW_LINK.findall(raw):
+            there = page.parent / unquote(unescape(path)) if path else page
+            if not there.exists():
+                _log.warning("a link in HTML leads nowhere: %s", path, location=name)
+            elif anchor and unescape(anchor) not in IDS.findall(there.read_text("utf-8")):
+                _log.warning("a link in HTML leads to no anchor: %s#%s", path, anchor, location=name)
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     """See Sphinx."""
     app.connect("source-read", _read)
     app.connect("include-read", _read_included)
     app.connect("doctree-read", _note_anchors)
+    app.connect("doctree-read", _find_undefined)
+    app.connect("build-finished", _find_dead_links)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -57,12 +57,19 @@ def test_the_build_fails_at_links_that_lead_nowhere_and_names_each(tmp_path: Pat
     docs = tree / "docs"
     with (docs / "history.md").open("a") as page:
         page.write("\n[a](no-page.md), [b](alarms.md#no-heading), [c](#not-here), [d](../config/no.toml)\n")
+        page.write('\n<a href="no-html.html">e</a> <img src="pictures/no.svg"> [f][no-reference]\n')
+        page.write('\n<a href="alarms.html#no-raw-anchor">g</a> <a href="alarms.html#states">h</a>\n')
     (docs / "forgotten.md").write_text("# In no list\n")
     with (docs / "search_questions.toml").open("a") as questions:
         questions.write('"alarms#no-such-section" = ["a question"]\n')
     made = make_docs(tree)
     assert made.returncode != 0
+    assert "alarms.html#states" not in made.stderr
     for what in (
+        "no-html.html",
+        "pictures/no.svg",
+        "[f][no-reference]",
+        "alarms.html#no-raw-anchor",
         "no such place: alarms#no-such-section",
         "no-page.md",
         "no-heading",
