@@ -1,7 +1,7 @@
 # make demo   the whole service against a simulated machine, live in the terminal
 # make venv   daqsvc itself, as .venv/bin/daqsvc; . .venv/bin/activate puts it on the PATH of a shell
 # make test   the tests; make test ROOM=rotor those of one room, a folder of tests/
-# make test-long  the long ones: statistics over hundreds of runs, soak, fuzz; of one room likewise
+# make test-long  the long ones: statistics over hundreds of runs, soak, fuzz; make test-long ROOM=rotor those of one room
 # make hil    tests on real CAN interfaces (vcan), and of the unit under systemd, in a guest kernel; as root
 # make check  formatting, lint, types, layers, spelling and plain English
 # make bench  speed, as ratios measured in one run
@@ -16,7 +16,7 @@
 # make pictures  docs/pictures, again from the product; make pictures ARGS=timebase one of them
 # make evaluation  the tables of docs/evaluate.md, again from the figures on the other pages
 # make deb    a Debian package of the service, in dist/; apt install ./dist/daqsvc_*.deb
-# make test-wheel  the everyday tests against the wheel in dist/, installed in a venv of its own
+# make test-wheel  the everyday tests against the wheel in dist/, installed in a separate venv
 # make hooks  have git check every commit
 # make reference  the pages of docs/reference, again from the code, and the schemas of docs/schemas
 # make proto  the module of the Sparkplug payload, again from its schema
@@ -24,7 +24,7 @@
 
 PYTHON ?= python3.11
 # Tests run side by side, in two processes more than there are cores, as tests of services wait for most of their
-# time; each from its end of the list until one helps the other.
+# time. Each process begins at its end of the list, until one helps the other.
 WORKERS ?= $(shell expr $$(nproc) + 2)
 # Without ROOM all of them.
 ROOMS = $(sort $(patsubst tests/%/,%,$(dir $(wildcard tests/*/test_*.py tests/*/*/test_*.py))))
@@ -83,7 +83,7 @@ bench: $(READY)
 	@missed=; for bench in tests/bench/bench_*.py; do PYTHONPATH=$(CURDIR):tests $(BIN)/python $$bench || missed="$$missed $$bench"; done; \
 	if [ -n "$$missed" ]; then echo "make: targets were missed by$$missed"; exit 1; fi
 
-# In an environment of its own: nothing of it is part of the service. The network is only needed to set that up.
+# In a separate environment: nothing of it is part of the service. The network is only needed to set that up.
 DOCS := build/docs/html
 DOCS_VENV := .venv-docs
 $(DOCS_VENV)/.ready: requirements-docs.lock
@@ -184,7 +184,7 @@ reference: $(READY)
 	@$(BIN)/python -m daqsvc.reference docs/reference
 	@$(BIN)/python -m daqsvc.publish.schemas docs/schemas
 
-# What is compiled needs a protobuf of this major version, no older than the compiler: pyproject.toml says which.
+# What is compiled needs a protobuf of this major version, no older than the compiler: it is stated in pyproject.toml.
 proto: $(READY)
 	@$(BIN)/python -m grpc_tools.protoc -I. --python_out=. --pyi_out=. daqsvc/publish/sparkplug/sparkplug_b.proto daqsvc/snapshots/samples.proto
 

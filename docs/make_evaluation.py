@@ -1,6 +1,6 @@
 """Make the tables of docs/evaluate.md from the figures on the other pages: ``make evaluation``.
 
-No figure is written here: each is looked up on the page where its measurement stands. A page that has lost
+No figure is written here: each is looked up on the page that has its measurement. A page that has lost
 what is looked up ends the program with its name.
 """
 
@@ -26,7 +26,7 @@ class FigureIsMissingError(Exception):
 
 
 class Page:
-    """A page of the documentation, and what stands on it.
+    """A page of the documentation, and what it has.
 
     Args:
         docs: the folder of all pages.
@@ -42,7 +42,7 @@ class Page:
 
         Args:
             first_cell: what its first cell holds.
-            after: a text that stands before the table.
+            after: a text before the table.
 
         Raises:
             FigureIsMissingError: there is none.
@@ -94,7 +94,7 @@ class Row(NamedTuple):
         measured: the figures.
         how: on what, in a few words.
         command: that measures again.
-        page: where all of it stands, with its heading.
+        page: the page that has all of it, with its heading.
     """
 
     what: str
@@ -445,4 +445,4 @@ if __name__ == "__main__":
     try:
         (DOCS / EVALUATION).write_text(evaluation(DOCS), "utf-8")
     except FigureIsMissingError as missing:
-        sys.exit(f"make_evaluation: {missing}; mend docs/make_evaluation.py or that page")
+        sys.exit(f"make_evaluation: {missing}; correct docs/make_evaluation.py or that page")

@@ -105,7 +105,7 @@ def messages() -> dict[str, set[str]]:
         for code in {code for place, code in FAR_AWAY.items() if file.startswith(place)}:
             found[code].update(_texts(tree))
         for node in ast.walk(tree) if not file.startswith(ERRORS) else ():
-            # What names one code only is about it, be it a whole module.
+            # What names one code only is about it, also a whole module.
             if isinstance(node, ast.Call | ast.Raise | ast.FunctionDef | ast.ClassDef | ast.Module):
                 names = {part.id for part in ast.walk(node) if isinstance(part, ast.Name)}
                 if len(codes := {ids[name] for name in names & ids.keys()}) == 1:

@@ -1,4 +1,4 @@
-"""Write what daqsvc says over MQTT into PostgreSQL: each alarm event once, however often it comes.
+"""Write what daqsvc sends over MQTT into PostgreSQL: each alarm event once, however often it comes.
 
     DATABASE=postgresql://daqsvc_ingest@db/plant python ingest.py --broker broker --id ingest-1
 
@@ -47,7 +47,7 @@ TIME = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d{1,9})?(Z|[+-]\d\d:\d\d)"
 """Times as daqsvc writes them. PostgreSQL takes others too: infinity, or tomorrow, whenever that is."""
 EXIT_USAGE = 2
 AWAY = {"08", "25", "28", "3D", "3F", "40", "53", "55", "57", "58"}
-"""Classes of SQLSTATE that tell of the server, not of a message: connection, read-only standby, login,
+"""Classes of SQLSTATE that are about the server, not about a message: connection, read-only standby, login,
 missing database or schema, serialization, resources, object in use, shutdown, system."""
 NOT_SET_UP = {"42501", "42P01", "42703"}
 """A right, a table or a column that is not there: schema.sql has not been run, or not with this version."""
@@ -155,8 +155,8 @@ def _check_key(*parts: str) -> None:
 def is_of_message(error: psycopg.Error) -> bool:
     """Whether a message is to blame; else PostgreSQL is away, and the message comes in when it is back.
 
-    What the server says of a value, or psycopg before it is sent, is of the message, whatever class of errors
-    it is: ProgramLimitExceeded is an OperationalError as a lost connection is.
+    What the server, or psycopg before it is sent, reports about a value is about the message. This holds for
+    any class of errors: ProgramLimitExceeded is an OperationalError as a lost connection is.
     """
     if error.sqlstate is None:
         return not isinstance(error, psycopg.OperationalError | psycopg.InterfaceError)
@@ -414,7 +414,7 @@ def _database() -> str:
     except psycopg.Error as error:
         reason = " ".join(f"{error}".split())
         _misused(
-            f"$DATABASE does not say where PostgreSQL is ({reason}); write postgresql://user@host/plant",
+            f"$DATABASE does not state where PostgreSQL is ({reason}); write postgresql://user@host/plant",
             "C02",
         )
     return database

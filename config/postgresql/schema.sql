@@ -51,7 +51,7 @@ DELETE FROM daqsvc.rejected AS later USING daqsvc.rejected AS first
     AND to_regclass('daqsvc.rejected_once') IS NULL;
 CREATE UNIQUE INDEX IF NOT EXISTS rejected_once ON daqsvc.rejected (md5(topic), sha256(payload));
 
--- How each alarm stands.
+-- The state of each alarm.
 CREATE OR REPLACE VIEW daqsvc.alarms_now AS
 SELECT DISTINCT ON (site, box, machine, alarm) *
 FROM daqsvc.alarm_events

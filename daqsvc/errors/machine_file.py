@@ -429,3 +429,12 @@ OF_A_PLUGIN = Code(
     example="machine.toml:14: buses.logger: is named by several streams. Remedy: name another bus in the "
     "others",
 )
+UNIT_UNKNOWN = Code(
+    "F44",
+    "A unit is not known",
+    "The unit of a value is made of no symbol that units have, so it may be the answer to another question.",
+    "Write the unit that the values have; or leave it if it is meant. It is shown beside values and limits.",
+    "machine-file.md",
+    example='machine.toml:78: sensors[2].unit = "float32": is not known as a unit. Remedy: write the unit of '
+    "its values, e.g. mm/s, degC, kW or 1; or leave it if it is one",
+)

@@ -10,8 +10,9 @@ from daqsvc.publish.home_assistant.settings import HomeAssistant
 from daqsvc.publish.mqtt.settings import MqttCommands
 from daqsvc.publish.output import Watched
 from daqsvc.publish.schemas import PAYLOADS, json_schemas
+from daqsvc.publish.sparkplug.host import PrimaryHost
 from daqsvc.publish.sparkplug.metrics import declared, node_properties, quiet_alarm
-from daqsvc.publish.sparkplug.node import BDSEQ, REBIRTH
+from daqsvc.publish.sparkplug.node import BDSEQ, REBIRTH, EdgeNode
 from daqsvc.publish.topics import ANSWER, Topics
 from daqsvc.reference.markdown import anchored, code, page, table
 
@@ -30,7 +31,7 @@ class Topic(NamedTuple):
 
     Attributes:
         topic: with words in capitals for names.
-        schema: of what goes there; empty for what is no JSON object.
+        schema: of what goes there; in words for what is no JSON object of daqsvc.
         qos: quality of service.
         retained: whether the broker keeps the latest.
         about: what goes there, and who sends it.
@@ -101,12 +102,65 @@ def topics() -> dict[str, Topic]:
         ),
         "live_feed": Topic(
             _BOX.live_feed("MACHINE", "VIEWER"),
-            "",
+            "pieces",
             1,
             "no",
             "from the box: waveforms, statements and alarms in pieces, while the lease lasts",
         ),
     }
+
+
+def other_topics() -> dict[str, Topic]:
+    """Topics of Home Assistant and of Sparkplug, by the name of what goes there."""
+    discovery = Discovery(HomeAssistant(prefix="PREFIX"), MqttCommands(), Watched("MACHINE"), _BOX)
+    # The id is made of ROOT, SITE, BOX and MACHINE.
+    found = f"{discovery.topic.rpartition('/device/')[0]}/device/ID/config"
+    node, host = EdgeNode("GROUP", "NODE"), PrimaryHost("HOST")
+    node_births = node.births(0, 0, (), {"DEVICE": ()})
+    sent = [
+        *node_births,
+        node.data(None, 0, ()),
+        node.data("DEVICE", 0, ()),
+        node.device_death("DEVICE", 0),
+        node.will(0, 0),
+    ]
+    by_kind = {one.topic.split("/")[2]: one for one in sent}
+    entities, metrics = "[entities](home-assistant.md)", "[metrics](sparkplug.md)"
+    rows = {
+        "discovery": Topic(found, entities, 1, "yes", "the machine as a device, with all its entities"),
+        "birth": Topic(
+            discovery.birth_topic,
+            "`online`",
+            1,
+            "as set there",
+            "to the box: Home Assistant has started, so all is sent again",
+        ),
+    }
+    rows |= {
+        kind: Topic(one.topic, metrics, one.qos, "no", _SPARKPLUG_ABOUT[kind])
+        for kind, one in by_kind.items()
+    }
+    for topic in (node.commands, node.command_topic("DEVICE")):
+        kind = topic.split("/")[2]
+        rows[kind] = Topic(topic, metrics, 1, "never", _SPARKPLUG_ABOUT[kind])
+    for number, topic in enumerate(host.topics):
+        version = "2.2" if number else "3.0"
+        state = "`ONLINE` or `OFFLINE`" if number else "`online` and `timestamp`, as JSON"
+        about = f"to the box: whether the `primary_host` is there, as of Sparkplug {version}"
+        rows["STATE-2.2" if number else "STATE"] = Topic(topic, state, 1, "by the host", about)
+    return rows
+
+
+_SPARKPLUG_ABOUT = {
+    "NBIRTH": "all metrics of the node: the box and its alarms, with names and values",
+    "DBIRTH": "all metrics of a device: the machine, with names and values",
+    "NDATA": "metrics of the node that have changed: every alarm event",
+    "DDATA": "metrics of the device that have changed",
+    "DDEATH": "the machine cannot be reached",
+    "NDEATH": "the session of the node has ended; its last will",
+    "NCMD": "to the box: a host writes metrics of the node",
+    "DCMD": "to the box: a host writes metrics of the device",
+}
 
 
 _OVER_THE_SOCKET = "daqsvc.service-status/1"
@@ -281,12 +335,17 @@ def pages() -> dict[str, str]:
     rows = [
         (
             f'<a id="{name}"></a>{code(one.topic)}',
-            f"[`{one.schema}`](payloads.md#{_anchor(one.schema)})" if one.schema else "",
+            f"[`{one.schema}`](payloads.md#{_anchor(one.schema)})" if one.schema in PAYLOADS else _PIECES,
             f"{one.qos}",
             one.retained,
             one.about,
         )
         for name, one in known.items()
+    ]
+    titles = ("topic", "payload", "QoS", "retained", "what")
+    others = [
+        (f'<a id="{name.lower()}"></a>{code(one.topic)}', one.schema, f"{one.qos}", one.retained, one.about)
+        for name, one in other_topics().items()
     ]
     by_schema = {one.schema: one.topic for one in known.values()}
     parts = []
@@ -319,7 +378,12 @@ def pages() -> dict[str, str]:
     ]
     return {
         "topics.md": page(
-            "MQTT topics", _TOPICS, table(("topic", "payload", "QoS", "retained", "what"), rows)
+            "MQTT topics",
+            _TOPICS,
+            table(titles, rows),
+            "## Home Assistant and Sparkplug",
+            _OTHERS,
+            table(titles, others),
         ),
         "payloads.md": page("Payloads", _PAYLOADS, *parts),
         "home-assistant.md": page(
@@ -347,6 +411,11 @@ def _sentence(text: str) -> str:
 _TOPICS = """Words in capitals are names: `ROOT` is `topic_root` of `[mqtt]` (`daqsvc` by default),
 `SITE`, `BOX` and `MACHINE` are those of the machine file. A name of an alarm or a detector may hold a `/`.
 What a consumer can rely on, and examples of payloads: [mqtt.md](../mqtt.md)."""
+_PIECES = "[pieces of a compressed stream](../mqtt.md#live-view)"
+_OTHERS = """With `[mqtt.home_assistant]` and `[mqtt.sparkplug]` only. `PREFIX` is `prefix` of
+`[mqtt.home_assistant]` (`homeassistant` by default), and `ID` is made of `ROOT`, `SITE`, `BOX` and `MACHINE`.
+`GROUP`, `NODE`, `DEVICE` and `HOST` are `group`, `edge_node`, `device` and `primary_host` of
+`[mqtt.sparkplug]`. More: [mqtt.md](../mqtt.md#home-assistant), [sparkplug.md](../sparkplug.md)."""
 _PAYLOADS = """Every field of every payload. A field is named by its path, with dots; `[]` means each
 entry of a list, `NAME` for a name. Examples: [mqtt.md](../mqtt.md). Fields may be added within a version:
 ignore what you do not know."""

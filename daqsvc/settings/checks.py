@@ -46,6 +46,7 @@ from daqsvc.settings.sensor_checks import (
     check_probe_angles,
     check_reach,
     check_sensitivity,
+    check_unit,
     check_voltages,
 )
 from daqsvc.settings.speed_signals import speed_signals
@@ -205,6 +206,7 @@ def _sensor_checks(draft: MachineFile, facts: Mapping[str, Any]) -> Iterator[Ite
             yield _check_sensor_channel(draft, sensor, at)
             yield check_voltages(draft, sensor, at)
             yield check_sensitivity(sensor, at)
+            yield check_unit(sensor, at)
             yield check_reach(draft, sensor, facts, at)
     yield _check_channel_use(draft)
     yield check_probe_angles(draft)

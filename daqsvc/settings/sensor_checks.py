@@ -12,6 +12,7 @@ from daqsvc.errors.machine_file import (
     GAP_VOLTAGE,
     INCOMPLETE,
     PROBES_IN_LINE,
+    UNIT_UNKNOWN,
     UNLIKELY_SENSITIVITY,
     WRONG_SCALE,
 )
@@ -21,7 +22,7 @@ from daqsvc.settings.measures import NOT_1X
 from daqsvc.settings.problems import Finding
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.sensors import Keyphasor, ProximityProbe, TrendValue
-from daqsvc.settings.units import factor_between
+from daqsvc.settings.units import factor_between, may_be_unit
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -144,6 +145,18 @@ def check_sensitivity(sensor: Sensor, at: KeyPath) -> Iterator[Finding]:
         fatal=not built,
         code=UNLIKELY_SENSITIVITY,
     )
+
+
+def check_unit(sensor: Sensor, at: KeyPath) -> Iterator[Finding]:
+    """The unit of a value is one; of other sensors it is one of a few."""
+    if isinstance(sensor, TrendValue) and not may_be_unit(sensor.unit):
+        yield Finding(
+            (*at, "unit"),
+            "is not known as a unit",
+            "write the unit of its values, e.g. mm/s, degC, kW or 1; or leave it if it is one",
+            fatal=False,
+            code=UNIT_UNKNOWN,
+        )
 
 
 def check_probe_angles(draft: MachineFile) -> Iterator[Finding]:

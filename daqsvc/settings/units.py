@@ -89,18 +89,66 @@ _SECONDS = re.compile(r"(?<![a-z])seconds?|(?<![a-z])sec(?![a-z])")
 _PER = re.compile(r"(?<=[a-z])per(?=[a-z])")
 
 
+_PREFIXES = ("", "da", *"yzafpnumcdhkgt")
+_PREFIXED = (
+    "m g s a k mol cd rad sr hz n pa j w c v f ohm wb t h lm lx",
+    "bq gy sv kat l eq wh va vah var varh ah ev bar b bit byte cal",
+    "p st gf gn vpp vrms ge gse nm wc hg",
+)
+"""Symbols of units that take a prefix such as k; in lower case."""
+_WORDS = (
+    "min hr hour hours day days d week weeks month months yr year years sec second seconds",
+    "in inch ft foot feet yd mi mile miles mil mils thou micron microns",
+    "lb lbs lbf oz ozf kip ton tonne tonnes psi psig psia bara barg atm torr inhg inwc",
+    "hp ps btu btuh tr gal gallon gallons gpm gph lpm lph slpm nlpm cfm scfm cmh",
+    "kph kmh kmph mph kn knot knots ips fps mps rpm rps rev revs r u turn turns cycle cycles cpm cps",
+    "deg degc degf degdh degree degrees grad arcmin arcsec kelvin celsius fahrenheit",
+    "db dba dbm dbv ppm ppb ph ntu fnu rh percent pct sone phon vol lux",
+    "count counts cnt cts step steps pulse pulses imp impulses event events pcs piece pieces item items",
+    "x pu raw lsb digit digits dig state status code bool on off yes no fraction ratio part parts",
+    "per squared",
+)
+"""Words and symbols that take no prefix, and what people write where there is no unit."""
+_WITH_PREFIX = frozenset(" ".join(_PREFIXED).split())
+_AS_THEY_ARE = frozenset(" ".join(_WORDS).split())
+_SYMBOLS = re.compile(r"[a-z]+")
+
+
+def may_be_unit(text: str) -> bool:
+    """Whether a text may be a unit: whether it is known, or made of symbols that units have.
+
+    What is no unit, e.g. a type or an address, has found its way into the wrong place.
+    """
+    if unit_of(text) is not None:
+        return True
+    plain = _plain(text).replace("ω", "ohm").replace("h2o", "wc")
+    symbols = _SYMBOLS.findall(plain)
+    if not symbols:
+        return plain in {"1", "-"} or any(sign in plain for sign in "%‰")
+    return all(
+        one in _AS_THEY_ARE
+        or any(one.startswith(prefix) and one[len(prefix) :] in _WITH_PREFIX for prefix in _PREFIXES)
+        for one in symbols
+    )
+
+
 def unit_of(text: str) -> Unit | None:
     """The unit that a text means; None if it is not known.
 
     Args:
         text: as somebody has written it, e.g. ``m/s²``, ``°C``, ``mm/s RMS``.
     """
+    plain = _DROPPED.sub("", _plain(text))
+    plain = _SECONDS.sub("s", _PER.sub("/", plain)).replace("squared", "2")
+    return _BY_SPELLING.get(plain)
+
+
+def _plain(text: str) -> str:
+    """A unit in lower case, in few signs, and without how a level was made."""
     plain = unicodedata.normalize("NFKC", text).replace("μ", "u").replace("\N{MINUS SIGN}", "-")
     plain = _QUALIFIER.sub("", plain.strip()) or plain
     # The case tells a unit in few places only, and people get it wrong in all of them.
-    plain = _DROPPED.sub("", plain.replace("°", "deg")).lower()
-    plain = _SECONDS.sub("s", _PER.sub("/", plain)).replace("squared", "2")
-    return _BY_SPELLING.get(plain)
+    return plain.replace("°", "deg").lower()
 
 
 def same_unit(one: str, other: str) -> bool:

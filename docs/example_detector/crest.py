@@ -35,7 +35,7 @@ class CrestDetector(WindowDetector):
 class CrestPlugin(DetectorPlugin[Crest]):
     """Knocks in an acceleration."""
 
-    settings, about, detector = Crest, "knocks in an acceleration", "crest"
+    settings, about, detector = Crest, "impacts in an acceleration", "crest"
 
     def checks(self, draft: MachineFile, settings: Crest) -> Iterator[Iterator[Finding]]:
         """There is such a sensor."""

@@ -13,7 +13,7 @@ FOLDER = Path(__file__).parents[1] / "pictures"
 
 def main() -> None:
     """Draw and save."""
-    parser = argparse.ArgumentParser(prog="make pictures", description="Make docs/pictures anew.")
+    parser = argparse.ArgumentParser(prog="make pictures", description="Make docs/pictures again.")
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of them ({', '.join(PICTURES)})")
     parser.add_argument("--out", type=Path, default=FOLDER, help="another folder")
     arguments = parser.parse_args()

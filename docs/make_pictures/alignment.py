@@ -1,4 +1,4 @@
-"""Two devices with clocks of their own on one grid: the same signal by arrival, and as the grid has it."""
+"""Two devices with different clocks on one grid: the same signal by arrival, and as the grid has it."""
 
 from __future__ import annotations
 

@@ -119,9 +119,9 @@ def flow() -> Figure:
 
 
 def people(axes: Axes, alarms: tuple[float, float], size: tuple[float, float]) -> None:
-    """Commands of people, which are written down before they are obeyed."""
+    """Commands of people, which are logged before they are carried out."""
     import_module("daqsvc.audit")
-    lines = ["commands of people", "written to the audit log, then obeyed"]
+    lines = ["commands of people", "written to the audit log, then carried out"]
     box(axes, (alarms[0], 45.0), (220.0, 52.0), lines, GOOD)
     arrow(axes, (alarms[0], 71.0), (alarms[0], alarms[1] - size[1] / 2), color=GOOD)
     name = import_module("daqsvc.alarms.commands").AlarmCommand.__name__

@@ -136,7 +136,7 @@ def probable(stated: Sequence[Diagnosis]) -> dict[str, str]:
 
 
 def named(diagnosis: Diagnosis) -> str:
-    """What a statement says, in words."""
+    """A statement in words."""
     return " or ".join(diagnosis.group or (diagnosis.decision,)).replace("_", " ")
 
 

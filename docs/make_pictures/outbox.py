@@ -23,7 +23,7 @@ ALARM_EVERY_S, LAST_S = 2, 46
 AWAY_S, OFF_S = (9, 31), (19, 25)
 """When the broker is away, and when the box is without power."""
 A_SECOND = 2
-"""So many messages go out in a second; slow, so that the picture shows their order."""
+"""Number of messages that go out in a second; slow, so that the picture shows their order."""
 UNMARKED_S = 8
 """The broker has this one, but the power goes before the journal knows: it comes twice."""
 

@@ -44,6 +44,8 @@ const nameIn = (title) => {
   const code = title.match(/^([A-Z]+\d\d): /);
   const name = code ? code[1] : withoutNumbers(title).split(/[ =,]/)[0];
   if (!code && !/[._/-]/.test(name)) return null;
+  /* What consists of names to be put in, as STATE/HOST, is the name of nothing in particular. */
+  if (!code && name.split(/[./]/).every((part) => /^[A-Z_]+$/.test(part))) return null;
   const pattern = name
     .split(/([./])/)
     .map((part) => (/^[A-Z_]+$/.test(part) ? "[^./\\s]+" : _escapeRegExp(part)))
@@ -98,15 +100,15 @@ const rankByWords = (text, scores) => {
 };
 
 /* A question of the list that has the words of the query, and few others, is the query. */
-const LEAST_LIKENESS = 0.3;
+const LEAST_SIMILARITY = 0.3;
 const SAME_QUESTION = 0.75;
 const QUESTION_WEIGHT = 2;
 
-/* Adds to the score of each entry that answers questions like the query; the likeness of the best one. */
+/* Adds to the score of each entry that answers questions like the query; the similarity of the best one. */
 const rankByQuestions = (text, scores) => {
   const { pages, titles, entries, questions, terms } = SITE_INDEX;
   const isAsked = new Set(questions.flatMap(([, those]) => those.flat()));
-  /* What is nowhere on the site tells nothing. */
+  /* Words that are nowhere on the site do not count. */
   const words = [...stemsOf(text)].filter((word) => isAsked.has(word) || Object.hasOwn(terms, word));
   const sum = (words) => words.reduce((sum, word) => sum + rarityOf(word), 0);
   const asked = sum(words);
@@ -118,10 +120,10 @@ const rankByQuestions = (text, scores) => {
     const nearest = Math.max(
       ...those.map((question) => sum(question.filter((word) => words.includes(word))) / (sum(question) || 1)),
     );
-    const likeness = share * Math.sqrt(nearest);
-    if (likeness < LEAST_LIKENESS) continue;
-    most = Math.max(most, likeness);
-    scores.set(entry, (scores.get(entry) || 0) + QUESTION_WEIGHT * (SATURATION + 1) * asked * likeness);
+    const similarity = share * Math.sqrt(nearest);
+    if (similarity < LEAST_SIMILARITY) continue;
+    most = Math.max(most, similarity);
+    scores.set(entry, (scores.get(entry) || 0) + QUESTION_WEIGHT * (SATURATION + 1) * asked * similarity);
   }
   return most;
 };

@@ -36,6 +36,11 @@ GIVEN: list[tuple[str, Path, list[tuple[str, str]]]] = [
     ("F31", TWO_BUSES, [("max_error_us = 200.0", "max_error_us = 2000.0")]),
     ("F41", LAVAL, [("static_sag_um = 10.0", "static_sag_um = 130.0")]),
     ("F42", LAVAL, [("speed_rpm = 600.0", "speed_rpm = 0.0")]),
+    (
+        "F44",
+        MACHINES / "modbus-vibration-temperature.toml",
+        [('"degC"\nok_between = [-40.0, 105.0]', '"float32"\nok_between = [-40.0, 105.0]')],
+    ),
     ("B04", CAN, [("valid_raw = [-32767, 32767]", "valid_raw = [-40000, 32767]")]),
     ("B16", MODBUS, [('table = "input"\nunit = 1', 'table = "input"\nunit = 250')]),
     ("B17", MODBUS, [("address = 16\ndepth = 1024", "address = 65000\ndepth = 1024")]),

@@ -11,7 +11,10 @@ from support.paths import ROOT
 
 from daqsvc.alarm_commands import CommandCounters
 from daqsvc.commands.status import StatusCommand
+from daqsvc.publish.home_assistant.discovery import Discovery
 from daqsvc.publish.payloads import AlarmPayload
+from daqsvc.publish.sparkplug.host import STATES
+from daqsvc.publish.sparkplug.node import NAMESPACE
 from daqsvc.publish.topics import Topics
 from daqsvc.reference import alarms, counters, keys, messages, metrics, pages, process, verbs
 from daqsvc.reference.__main__ import main
@@ -140,6 +143,28 @@ def test_a_metric_without_help_is_a_gap(monkeypatch):
 def test_metrics_of_the_process_are_listed_with_its_own(made):
     for name in ("process_open_fds", "process_resident_memory_bytes", "process_cpu_seconds_total"):
         assert f'<a id="{name}"></a>' in made["metrics.md"]
+
+
+def test_every_topic_of_home_assistant_and_sparkplug_is_listed(made):
+    """What their sources name, and what a run has published that has both of them."""
+    listed = {name: one.topic for name, one in messages.other_topics().items()}
+    sources = "".join(file.read_text("utf-8") for file in (ROOT / "daqsvc/publish/sparkplug").glob("*.py"))
+    kinds = set(re.findall(r'"([ND](?:BIRTH|DEATH|DATA|CMD))"', sources))
+    assert len(kinds) == 8
+    assert kinds < set(listed)
+    assert {f"{NAMESPACE}/STATE/HOST", "STATE/HOST"} == {f"{begin}HOST" for begin in STATES}
+    assert {f"{begin}HOST" for begin in STATES} <= {*listed.values()}
+    assert {name for name in dir(Discovery) if name.endswith("topic")} == {"topic", "birth_topic"}
+    known = [*listed.values(), *(one.topic for one in messages.topics().values())]
+    # A name of an alarm or a detector, which is the last one, may hold a `/`.
+    patterns = [
+        re.sub(r"(?!STATE|[ND](?:BIRTH|DEATH|DATA|CMD))\b[A-Z]+\b", "[^/]+", one) + "(/.+)?" for one in known
+    ]
+    golden = (ROOT / "tests/guard/golden/messages.txt").read_text("utf-8")
+    published = set(re.findall(r"\b(?:homeassistant|spBv1\.0|daqsvc)/(?!\d)[\w./-]+", golden))
+    assert {topic.partition("/")[0] for topic in published} == {"homeassistant", "spBv1.0", "daqsvc"}
+    assert [one for one in published if not any(re.fullmatch(pattern, one) for pattern in patterns)] == []
+    assert all(f"`{one}`" in made["topics.md"] for one in known)
 
 
 def test_a_topic_or_a_field_that_nothing_describes_is_a_gap(monkeypatch):

@@ -54,7 +54,7 @@ ELSEWHERE = {"sql", "yaml"}
 PROGRAMS = {
     *("daqsvc", "make", "pip", "python", "python3", "python3.11", "git"),
     *("apt", "apt-get", "systemctl", "systemd-sysusers", "ip", "candump", "mosquitto_sub", "psql", "dask"),
-    *("cd", "cp", "install", "mkdir", "rm", "sed", "sha256sum"),
+    *(".", "cd", "cp", "install", "mkdir", "rm", "sed", "sha256sum"),
 }
 """Else it is no command but what one has answered."""
 MAKEFILE = (ROOT / "Makefile").read_text("utf-8")

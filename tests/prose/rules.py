@@ -105,19 +105,30 @@ def rules(file: Path = VOCABULARY) -> Rules:
 
 
 def prose_files(root: Path = ROOT) -> list[Path]:
-    """Pages, machine files and sources that are held to the rules.
+    """Pages, sources, and all else with comments or texts for people that is held to the rules.
 
     The pages of docs/reference are made from the sources, whose messages have fewer rules than pages.
     """
     pages = [*root.glob("*.md"), *root.glob("docs/**/*.md")]
     machines = root.glob("config/**/*.toml")
     sources = [
-        file for package in ("daqsvc", "drivers", "sim_hw") for file in root.glob(f"{package}/**/*.py")
+        file
+        for folder in ("daqsvc", "drivers", "sim_hw", "docs", "config", "tests/support")
+        for file in root.glob(f"{folder}/**/*.py")
+    ]
+    others = [
+        *(root / "daqsvc/page").glob("**/*.html"),
+        *(root / "daqsvc/page/static").glob("*.js"),
+        *root.glob("docs/site_static/*.js"),
+        *(file for file in root.glob("config/**/*") if file.suffix in {".sql", ".yml", ".service", ".conf"}),
+        *(file for file in root.glob("packaging/debian/*") if file.is_file() and file.name != "copyright"),
+        *root.glob("Makefile"),
     ]
     return [
         *sorted(pages),
         *sorted(machines),
         *(file for file in sorted(sources) if not file.stem.endswith("_pb2")),
+        *sorted(others),
     ]
 
 

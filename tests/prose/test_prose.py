@@ -36,6 +36,16 @@ def found(file: Path) -> list[tuple[int, str]]:
         ("formatted.py", 'def f(x):\n    pass\n    raise ValueError(f"{x} and {x}: ', '")\n'),
         ("machine.toml", "x = 1\ny = 2\n# ", "\n"),
         ("remark.toml", "x = 1\ny = 2\nz = 3  # ", "\n"),
+        ("page.html", "{% if x %}\n<p>{{ x }}</p>\n<p class='a'>", " <b>{{ y }}</b></p>\n{% endif %}\n"),
+        ("hint.html", "{# A\nremark. #}\n<button title='", "'>x</button>\n"),
+        ("script.js", "let x = 1;\n/* ", " */\n"),
+        ("line.js", "const x = 'a'; // b\nx();\n  // ", "\n"),
+        ("shown.js", "const x = '//';\nshow(`", " ${x}`);\n"),
+        ("schema.sql", "-- A table.\n\n-- ", "\nCREATE TABLE x ();\n"),
+        ("remark.sql", "CREATE TABLE x (\n    y INT -- ", "\n);\n"),
+        ("Makefile", "# make x   the first thing\n# make y   ", "\nx:\n"),
+        ("unit.service", "[Unit]\n# ", "\nType=notify\n"),
+        ("postrm", "#!/bin/sh\n# ", "\nexit 0\n"),
     ],
 )
 @pytest.mark.parametrize("bad", [LONG, "It was made at need."])
@@ -157,6 +167,10 @@ def test_pages_machine_files_and_sources_are_all_read() -> None:
         "config/machines/laval-rig.toml",
     } <= files
     assert {"daqsvc/cli.py", "drivers/base.py", "sim_hw/sim_command.py"} <= files
+    assert {"Makefile", "docs/conf.py", "docs/make_pictures/style.py", "tests/support/waiting.py"} <= files
+    assert {"daqsvc/page/templates/alarms.html", "daqsvc/page/static/page.js"} <= files
+    assert {"docs/site_static/site_search.js", "config/postgresql/schema.sql"} <= files
+    assert {"config/systemd/daqsvc@.service", "packaging/debian/daqsvc.postrm"} <= files
 
 
 PAGES = sorted(page for page in (ROOT / "docs").glob("*.md") if page.stem not in {"index", *MADE_OF_OTHERS})

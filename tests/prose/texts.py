@@ -11,6 +11,8 @@ import io
 import re
 import tokenize
 from dataclasses import dataclass
+from functools import partial
+from html.parser import HTMLParser
 from typing import TYPE_CHECKING, TypeGuard
 
 from markdown_it import MarkdownIt
@@ -49,10 +51,19 @@ class Text:
 
 
 def texts_of(file: Path) -> Iterator[Text]:
-    """All prose of a page, a module or a TOML file."""
-    readers = {".md": _of_page, ".py": _of_module, ".toml": _of_toml}
+    """All prose of a page, a module, or another file with comments."""
+    readers = {
+        ".md": _of_page,
+        ".py": _of_module,
+        ".toml": _of_toml,
+        ".html": _of_template,
+        ".js": _of_script,
+        ".sql": partial(_of_lines, mark="--"),
+    }
+    # Others have comments as a shell has them: units of systemd, Makefile, rules of Debian.
+    reader = readers.get(file.suffix, partial(_of_lines, mark="#"))
     is_record = file.name == "CHANGELOG.md"
-    for line, found, words in readers[file.suffix](file.read_text("utf-8")):
+    for line, found, words in reader(file.read_text("utf-8")):
         kind = "record" if is_record and found == "page" else found
         if plain := " ".join(_LITERAL.sub(CODE, words).split()):
             yield Text(file, line, kind, plain)
@@ -157,3 +168,111 @@ def _of_toml(text: str) -> Iterator[tuple[int, str, str]]:
         first, words = 0, ""
         if match := _TOML_REMARK.search(row):
             yield number, "comment", match[1]
+
+
+_ENTRY = re.compile(r"\S.*?\S  +\S")
+"""A line of a list whose second column is aligned, as in the Makefile."""
+
+
+def _of_lines(text: str, mark: str) -> Iterator[tuple[int, str, str]]:
+    """Comments, those of adjacent lines as one; an empty one, or a command that is indented in it, ends it.
+
+    Args:
+        text: of the file.
+        mark: what a comment begins with.
+    """
+    comment = re.compile(rf"\s*{mark} ?(?=\S)(.*)")
+    remark = re.compile(rf"\s*\S.*?\s{mark} (.+)") if mark == "--" else None
+    first, words = 0, ""
+    for number, row in enumerate([*text.splitlines(), ""], 1):
+        match = comment.match(row)
+        if match and not row.startswith("#!"):
+            if words and (_ITEM.match(match[1]) or _ENTRY.match(match[1])):
+                yield first, "comment", words
+                first, words = 0, ""
+            first, words = (first or number), f"{words} {match[1]}"
+            continue
+        if words:
+            yield first, "comment", words
+        first, words = 0, ""
+        if remark is not None and (found := remark.match(row)):
+            yield number, "comment", found[1]
+
+
+_SCRIPT = re.compile(
+    r"""/\*(?P<block>.*?)\*/|(?<![:\w\\])//(?P<line>[^\n]*)"""
+    r"""|(?P<quote>["'])(?P<text>(?:\\.|(?!(?P=quote))[^\\\n])*)(?P=quote)|`(?P<template>(?:\\.|[^`\\])*)`""",
+    re.DOTALL,
+)
+_PUT_IN = re.compile(r"\$\{[^{}]*\}")
+
+
+def _of_script(text: str) -> Iterator[tuple[int, str, str]]:
+    """Comments and strings of some words; of a string, what is put in is code."""
+    for match in _SCRIPT.finditer(text):
+        line = text.count("\n", 0, match.start()) + 1
+        comment = match["block"] if match["block"] is not None else match["line"]
+        if comment is not None:
+            yield line, "comment", comment.strip("* /")
+        elif (words := _PUT_IN.sub(CODE, match["text"] or match["template"] or "")).count(" ") > 1:
+            yield line, "message", words
+
+
+_JINJA = re.compile(r"\{\{.*?\}\}|\{%.*?%\}", re.DOTALL)
+_JINJA_COMMENT = re.compile(r"\{#-?(.*?)-?#\}", re.DOTALL)
+_INLINE = frozenset(("a", "abbr", "b", "code", "em", "i", "small", "span", "strong", "time"))
+_SHOWN = ("title", "placeholder", "aria-label", "alt")
+"""Attributes that people see or hear."""
+
+
+class _Template(HTMLParser):
+    """The texts of a page, one for each element that is no part of a sentence."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[tuple[int, str, str]] = []
+        self._line, self._words = 0, ""
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        line = self.getpos()[0]
+        self.found += [(line, "message", value) for name, value in attrs if name in _SHOWN and value]
+        if tag == "code":
+            self._words += " ``"
+        elif tag not in _INLINE:
+            self.end()
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag == "code":
+            self._words += "`` "
+        elif tag not in _INLINE:
+            self.end()
+
+    def handle_data(self, data: str) -> None:
+        if not self._words.strip():
+            self._line = self.getpos()[0] + data[: len(data) - len(data.lstrip())].count("\n")
+        self._words += data
+
+    def handle_comment(self, data: str) -> None:
+        self.found.append((self.getpos()[0], "comment", data))
+
+    def end(self) -> None:
+        """What has come is a text by itself."""
+        if self._words.strip():
+            self.found.append((self._line, "message", self._words))
+        self._words = ""
+
+
+def _of_template(text: str) -> Iterator[tuple[int, str, str]]:
+    """What people read of a template of a page, and its comments; what is put in is code."""
+    for match in _JINJA_COMMENT.finditer(text):
+        yield text.count("\n", 0, match.start()) + 1, "comment", match[1]
+
+    def lines(match: re.Match[str]) -> str:
+        # Statements leave nothing but their lines, so that texts are found where they are.
+        return (CODE if match[0].startswith("{{") else "") + "\n" * match[0].count("\n")
+
+    template = _Template()
+    template.feed(_JINJA.sub(lines, _JINJA_COMMENT.sub(lines, text)))
+    template.close()
+    template.end()
+    yield from template.found

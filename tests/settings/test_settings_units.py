@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import pytest
+from support.machine_files import MACHINES, parsed
 
-from daqsvc.settings.units import factor_between, same_unit, unit_of
+from daqsvc.errors.machine_file import UNIT_UNKNOWN
+from daqsvc.settings.units import factor_between, may_be_unit, same_unit, unit_of
+
+TRENDS = MACHINES / "modbus-vibration-temperature.toml"
 
 
 @pytest.mark.parametrize(
@@ -51,3 +55,32 @@ def test_units_that_are_not_known_are_the_same_only_as_texts():
     assert same_unit("furlong", " furlong ")
     assert not same_unit("furlong", "fathom")
     assert not same_unit("furlong", "m")
+
+
+UNITS = """
+mm/s degC °C l/min m³/h Nm kNm N·m lbf·ft kWh kVA kvar % ‰ 1 - pH NTU µS/cm kΩ count t/h g/cm^3 cSt mm2/s
+bar(g) kg/h rpm 1/min gE inH2O W/m2 dB(A) mV/g Nm3/h GWh deg/s m/s²
+"""
+OTHERS = "float32 106 40001 uint16 CDAB holding none vibration 0.1"
+
+
+@pytest.mark.parametrize("text", UNITS.split())
+def test_what_is_made_of_symbols_of_units_may_be_one(text):
+    assert may_be_unit(text)
+    assert may_be_unit(f"{text} RMS")
+
+
+@pytest.mark.parametrize(
+    "text", ["float32", "106", "40001", "uint16", "CDAB", "holding", "none", "vibration", "0.1"]
+)
+def test_what_answers_another_question_is_no_unit(text):
+    assert not may_be_unit(text)
+
+
+@pytest.mark.parametrize(
+    ("unit", "warns"), [("float32", True), ("106", True), ("l/min", False), ("°C", False)]
+)
+def test_the_unit_of_a_value_that_is_none_is_a_warning(unit, warns):
+    machine = parsed(TRENDS, ('"temperature"\nunit = "degC"', f'"temperature"\nunit = "{unit}"'))
+    said = [warning for warning in machine.warnings if warning.code is UNIT_UNKNOWN]
+    assert [(one.key, one.message) for one in said] == warns * [("sensors[2].unit", "is not known as a unit")]

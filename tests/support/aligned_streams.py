@@ -1,4 +1,4 @@
-"""Devices that sample one signal on clocks of their own, and whose blocks come late by chance."""
+"""Devices that sample one signal on different clocks, and whose blocks come late by chance."""
 
 from __future__ import annotations
 

@@ -166,7 +166,7 @@ class TcpProxy:
     """Stands between a client and a broker.
 
     While it is ``blocked`` it ends every new connection; while it is ``deaf`` it swallows what the
-    broker says; `cut` ends the connections that there are.
+    broker sends; `cut` ends the connections that there are.
     """
 
     def __init__(self, target_port: int) -> None:

@@ -1,4 +1,4 @@
-"""A real browser for tests, and a page server of its own."""
+"""A real browser for tests, and a separate page server."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ async def page_served(
             process.terminate()
         _, err = await process.communicate()
     wrong = [line for line in err.decode().splitlines() if not may_say or may_say not in line]
-    assert not wrong, "\n".join(["the page's server has said:", *wrong])
+    assert not wrong, "\n".join(["the page's server has logged:", *wrong])
 
 
 @contextlib.asynccontextmanager

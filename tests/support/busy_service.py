@@ -127,7 +127,7 @@ def busy_machine(folder: Path, devices: Devices, broker: int) -> MachineFile:
 
 
 class Devices(threading.Thread):
-    """Two CAN devices, one that sends lines, and a Modbus server, in a thread with an event loop of its own.
+    """Two CAN devices, one that sends lines, and a Modbus server, in a thread with a separate event loop.
 
     Use it as a context manager; `play` begins, once the machine file is known.
     """

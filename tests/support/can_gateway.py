@@ -152,7 +152,7 @@ class CanGateway:
 
 @contextlib.asynccontextmanager
 async def daqsvc_run(file: Path, store: Path, *more: str) -> AsyncIterator[subprocess.Popen[bytes]]:
-    """``daqsvc run`` in a process of its own; it is stopped at the end. Its log is beside the store.
+    """``daqsvc run`` in a separate process; it is stopped at the end. Its log is beside the store.
 
     Args:
         file: the machine file.

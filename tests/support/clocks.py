@@ -8,7 +8,7 @@ from daqsvc.acquisition.clock import NS_PER_S, SystemClock
 
 
 class SettableClock:
-    """Both clocks stand still until the test moves them; nobody waits for them.
+    """Both clocks stand still until the test moves them, without waiting.
 
     Args:
         t_ns: first reading of the monotonic clock.

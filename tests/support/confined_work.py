@@ -54,7 +54,7 @@ def fail() -> NoReturn:
 
 
 def grow(rows: int) -> Answer:
-    # What JSON says is little, what is announced is much.
+    # The JSON is short, what it announces is large.
     return None, [np.zeros(1)] * rows
 
 

@@ -18,7 +18,7 @@ DIED, FAILED = 77, 78
 
 
 def dies_at(step: int, work: Callable[[], object]) -> int:
-    """Run ``work`` in a process of its own that dies before file operation number ``step``.
+    """Run ``work`` in a separate process that dies before file operation number ``step``.
 
     Returns:
         How many operations it did: fewer than ``step`` if it came to its end.

@@ -150,7 +150,7 @@ def _h5(**sets: tuple[tuple[int, ...], str]) -> bytes:
 
 
 def _tdms(count: int) -> bytes:
-    """A segment whose only channel says that it has so many samples,
+    """A segment whose only channel states that it has so many samples,
 
     Layout: NI, "TDMS File Format Internal Structure".
     """

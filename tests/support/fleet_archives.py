@@ -1,4 +1,4 @@
-"""Archives of a fleet, made up; and ``daqsvc analyze --cluster`` over them, as processes of their own."""
+"""Archives of a fleet, made up; and ``daqsvc analyze --cluster`` over them, as separate processes."""
 
 from __future__ import annotations
 

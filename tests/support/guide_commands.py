@@ -1,4 +1,4 @@
-"""The commands that a guide in ``docs/`` gives, as they stand there."""
+"""The commands that a guide in ``docs/`` gives, word for word."""
 
 from __future__ import annotations
 

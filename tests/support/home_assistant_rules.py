@@ -1,8 +1,8 @@
 """Home Assistant's rules for a device discovery message, as far as its documentation states them.
 
 After https://www.home-assistant.io/integrations/mqtt/#device-discovery-payload and the pages of the
-integrations ``binary_sensor.mqtt`` and ``sensor.mqtt``. There is no Home Assistant here: this stands in
-for its schema, and knows nothing of the code that it checks.
+integrations ``binary_sensor.mqtt`` and ``sensor.mqtt``. There is no Home Assistant here: this is used
+in place of its schema, and knows nothing of the code that it checks.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ TEMPLATE = re.compile(
 
 
 def rendered(template: str, payload: dict[str, Any]) -> str:
-    """What Jinja makes of the templates that are used; any other template fails."""
+    """The result of Jinja for the templates that are used; any other template fails."""
     match = TEMPLATE.fullmatch(template)
     assert match, f"a template beyond what these rules know: {template}"
     value: Any = payload

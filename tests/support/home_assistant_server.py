@@ -1,4 +1,4 @@
-"""A real Home Assistant, a release from PyPI in an environment of its own, set up by its REST interface.
+"""A real Home Assistant, a release from PyPI in a separate environment, set up by its REST interface.
 
 It needs a newer Python than the service. The environment is made once and kept in ``.cache``;
 ``DAQSVC_HOME_ASSISTANT`` names one that is there already.
@@ -82,7 +82,7 @@ def _python(major: int, minor: int) -> str | None:
         *map(str, Path.home().glob(f".pyenv/versions/{major}.{minor}.*/bin/{name}")),
     ]
     for found in filter(None, candidates):
-        # A shim may stand there and run nothing.
+        # It may be a shim that runs nothing.
         done = subprocess.run([found, "-c", "import ensurepip, venv"], capture_output=True, check=False)
         if done.returncode == 0:
             return found

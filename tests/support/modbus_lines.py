@@ -80,7 +80,7 @@ async def until(true: Callable[[], bool], what: str = "it to be so") -> None:
 
 
 class _JumpingSelector(selectors.DefaultSelector):
-    """Instead of waiting, says that the time has passed."""
+    """Instead of waiting, lets the time pass."""
 
     jump: Callable[[float], None]
 

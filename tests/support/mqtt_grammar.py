@@ -101,7 +101,7 @@ DISCOVERIES = (
 
 
 def payload(dice: random.Random) -> bytes:
-    """What might stand in a message."""
+    """What a message might contain."""
     made = dice.choice(
         (
             dice.randbytes(dice.choice((0, 1, 7, 100, 5000))),
@@ -145,7 +145,7 @@ def varint(number: int, least: int = 1) -> bytes:
 
 @dataclass
 class Grammar:
-    """What a broker says.
+    """What a broker sends.
 
     Attributes:
         dice: what makes each packet this one.

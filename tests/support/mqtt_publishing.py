@@ -38,7 +38,7 @@ RIG = Watched("rig")
 def mqtt(
     port: int, client_id: str = "daqsvc-test", host: str = "127.0.0.1", *, tls: bool = False, **given: Any
 ) -> Mqtt:
-    """The table [mqtt] for a broker; what is ``given`` is not held against its bounds."""
+    """The table [mqtt] for a broker; what is ``given`` is not compared with its bounds."""
     url = f"mqtt{'s' * tls}://{host}:{port}"
     return Mqtt(url="mqtt://broker", client_id=client_id).model_copy(update={"url": url} | given)
 

@@ -1,4 +1,4 @@
-"""The side of systemd in sd_notify(3): a datagram socket, and what a service has told it."""
+"""The side of systemd in sd_notify(3): a datagram socket, and what a service has sent to it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class NotifySocket:
-    """Takes what is told; use it as a context manager.
+    """Takes what is sent; use it as a context manager.
 
     Args:
         place: folder of the socket; None for an abstract one.
@@ -36,7 +36,7 @@ class NotifySocket:
         self._socket.close()
 
     def next(self, wait_s: float = PATIENCE_S) -> dict[str, str] | None:
-        """What is told next; None if nothing is."""
+        """What is sent next; None if nothing is."""
         self._socket.settimeout(wait_s)
         try:
             text = self._socket.recv(65_536).decode()
@@ -57,7 +57,7 @@ class NotifySocket:
         pytest.fail(f"{name}={holds} was never told, only {self.told[-20:]}")
 
     def has_told(self, name: str) -> bool:
-        """Whether anything of that name was told so far, after a look at what is there."""
+        """Whether anything of that name was sent so far; what has arrived is read first."""
         while self.next(0.0) is not None:
             pass
         return any(name in one for one in self.told)

@@ -64,7 +64,7 @@ def frames(
 
 
 def write(path: Path, messages: Iterable[can.Message]) -> Path:
-    """Write a log in the format that its name says."""
+    """Write a log in the format of its suffix."""
     plain = path.with_suffix("") if path.suffix == ".gz" else path
     with can.Logger(plain) as logger:
         for message in messages:

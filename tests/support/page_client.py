@@ -1,4 +1,4 @@
-"""A browser without a window, for the page's forms, and what stands in the audit log."""
+"""A browser without a window, for the page's forms, and what the audit log has."""
 
 from __future__ import annotations
 

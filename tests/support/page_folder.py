@@ -104,7 +104,7 @@ def _machine_files(made: Path) -> None:
 
 
 def _rig(home: Path, name: str, bus: str) -> str:
-    """The rig of the virtual bus, with a name and a bus of its own, and no broker."""
+    """The rig of the virtual bus, with another name and bus, and no broker."""
     text = _RIG[: _RIG.index("[mqtt]")].replace("virtual-rig", name).replace(SHARED_BUS, f"{home}/{bus}")
     return text.replace("can0]", f"{bus}]").replace('bus = "can0"', f'bus = "{bus}"')
 

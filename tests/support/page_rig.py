@@ -1,4 +1,4 @@
-"""A rotor that turns for as long as a page is looked at."""
+"""A rotor that turns for as long as a page is open."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A real PostgreSQL of its own for tests, on a socket and a loopback port."""
+"""A separate real PostgreSQL for tests, on a socket and a loopback port."""
 
 from __future__ import annotations
 

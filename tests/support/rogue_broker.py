@@ -1,7 +1,7 @@
 """Brokers as no plant should have.
 
 One takes some messages and not others, in whatever way brokers do that (MQTT 5 and 3.1.1); one takes what the
-box says, and between that sends whatever a grammar of packets yields.
+box sends, and between that sends whatever a grammar of packets yields.
 """
 
 from __future__ import annotations

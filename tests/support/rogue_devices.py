@@ -204,7 +204,7 @@ class Node:
 
 
 class RogueDevices(threading.Thread):
-    """All devices, in a thread with an event loop of its own; use it as a context manager, then `play`.
+    """All devices, in a thread with a separate event loop; use it as a context manager, then `play`.
 
     Args:
         folder: where ports and sockets are.

@@ -199,7 +199,7 @@ def genie_delays(
     threshold_nats: float,
     snr_db: float,
 ) -> list[float]:
-    """Delays of a detector that is told when each change happens, and to which mode.
+    """Delays of a detector that knows when each change happens, and to which mode.
 
     At the change the new mode's observer takes over the old one's estimate; the delay is over when the
     log-likelihood ratio of new against old reaches the threshold. Modes follow one another in their order.
@@ -219,7 +219,7 @@ def genie_delays(
     observers = discretise(modes, noise=sigma(snr_db), duration=DURATION)
     usable = np.ones(len(xy), dtype=bool)
     states = np.zeros((len(modes), 4))
-    # The observers of all modes run along; only the pair in question is looked at.
+    # The observers of all modes run along; only the pair in question is evaluated.
     edges = [0, *(math.ceil(at * PER_REV) for at in begins), len(xy)]
     delays: list[float] = []
     for old, (begin, end) in enumerate(itertools.pairwise(edges)):

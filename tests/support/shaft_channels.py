@@ -50,7 +50,7 @@ def windows(
 def feed(
     detector: Detector, samples: NDArray[np.float32], rate_hz: float, *, block: int, first_index: int = FIRST
 ) -> list[Diagnosis]:
-    """All that a detector says of samples."""
+    """All that a detector states about samples."""
     taken = windows(samples, rate_hz, block=block, first_index=first_index)
     return [said for window in taken for said in detector.process(window)]
 

@@ -1,7 +1,7 @@
-"""The devices of docs/sniff.md, as a process of their own: a serial one and a Modbus gateway.
+"""The devices of docs/sniff.md, as a separate process: a serial one and a Modbus gateway.
 
 ``python -m support.shown_devices LINK PORT``, LINK the serial port that it makes, PORT a free one of this
-computer. It says when both are there, and goes on until it is killed.
+computer. It reports when both are there, and goes on until it is killed.
 """
 
 from __future__ import annotations

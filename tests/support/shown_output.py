@@ -22,7 +22,7 @@ def differs(shown: str, output: str) -> str:
     """What is wrong with an output; "" if it has the lines that are shown, one behind the other.
 
     Args:
-        shown: as the page has it, "" for nothing. ``...`` as a line stands for any lines;
+        shown: as the page has it, "" for nothing. ``...`` as a line matches any lines;
             within a line, for any text.
         output: what came; it may have other lines before and behind them.
     """

@@ -1,4 +1,4 @@
-"""``daqsvc sim`` as a process of its own, for the tests of what it plays."""
+"""``daqsvc sim`` as a separate process, for the tests of what it plays."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def process(verb: str, *arguments: object, **options: Any) -> Iterator[subproces
 
 
 async def summary_of(sim: subprocess.Popen[str]) -> dict[str, Any]:
-    """What a simulator says at its end."""
+    """What a simulator prints at its end."""
     output, errors = await asyncio.to_thread(sim.communicate, timeout=PATIENCE_S)
     assert sim.returncode == 0, errors
     told: dict[str, Any] = json.loads(output)

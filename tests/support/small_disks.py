@@ -1,4 +1,4 @@
-"""A disk of its own that somebody fills, or that takes no more writes."""
+"""A separate disk that somebody fills, or that takes no more writes."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class SmallDisk:
 
 @contextlib.contextmanager
 def mounted(directory: Path, size: str) -> Iterator[SmallDisk]:
-    """A disk of its own, or the test is skipped: mounting is for root."""
+    """A separate disk, or the test is skipped: mounting is for root."""
     directory.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", f"size={size},mode=700", "none", str(directory)]
     if subprocess.run(mount, check=False, capture_output=True).returncode:
@@ -68,7 +68,7 @@ _SHUT_DOWN = 0x8004587D
 
 
 class FailingDisk:
-    """An ext4 of its own that can be made to fail as one does whose disk answers with errors.
+    """A separate ext4 that can be made to fail as one does whose disk answers with errors.
 
     Args:
         image: file that holds it.

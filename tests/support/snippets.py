@@ -1,4 +1,4 @@
-"""The fenced blocks of README, CONTRIBUTING and the pages of docs/, as they stand there.
+"""The fenced blocks of README, CONTRIBUTING and the pages of docs/, word for word.
 
 ``PYTHONPATH=tests python -m support.snippets`` lists them.
 """
@@ -35,7 +35,7 @@ class Snippet(NamedTuple):
         line: of that page, from 1.
         language: what follows the backticks.
         text: without the indentation of the fence.
-        why_not_run: what the comment before it says (``<!-- not run: ... -->``); "" if there is none.
+        why_not_run: the text of the comment before it (``<!-- not run: ... -->``); "" if there is none.
     """
 
     page: Path
@@ -75,7 +75,7 @@ def snippets(page: Path) -> list[Snippet]:
 
 
 def documented() -> list[Snippet]:
-    """The blocks of all pages but docs/tutorials, which has a reader of its own."""
+    """The blocks of all pages but docs/tutorials, which has a separate reader."""
     tutorials = ROOT / "docs" / "tutorials"
     return [one for page in PAGES if not page.is_relative_to(tutorials) for one in snippets(page)]
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 def fields_of(raw: bytes) -> Iterator[tuple[int, Any]]:
-    """Field numbers and what stands in them: an int, or bytes."""
+    """Field numbers and what they contain: an int, or bytes."""
     at = 0
 
     def varint() -> int:
@@ -102,7 +102,7 @@ def metric_of(raw: bytes) -> SeenMetric:
         keys = [content.decode() for number, content in pairs if number == 1]
         texts = [dict(fields_of(content)) for number, content in pairs if number == 2]
         assert len(keys) == len(texts)
-        assert all(text[1] == 12 for text in texts), "every property says that it is a string"
+        assert all(text[1] == 12 for text in texts), "every property has the type of a string"
         properties = {key: text[8].decode() for key, text in zip(keys, texts, strict=True)}
     name = fields.get(1)
     return SeenMetric(

@@ -30,7 +30,7 @@ RATE_HZ = 640
 OF_A_LOGIN = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "HOME": "/root", "LANG": "C.UTF-8"}
 """What root has on a box, and nothing of the tests."""
 IN_A_GUEST = pytest.mark.skipif(
-    os.environ.get("DAQSVC_HIL_SYSTEMD") != "1", reason="needs a systemd of its own: make hil"
+    os.environ.get("DAQSVC_HIL_SYSTEMD") != "1", reason="needs a separate systemd: make hil"
 )
 
 
@@ -52,7 +52,7 @@ def let_go_of_files() -> None:
 
 
 def shown(unit: str = UNIT) -> dict[str, str]:
-    """How systemd says that a unit stands."""
+    """The state of a unit for systemd."""
     keys = "ActiveState,SubState,MainPID,NRestarts,Result,StatusText,ExecMainStatus"
     return dict(line.split("=", 1) for line in sh("systemctl", "show", unit, "-p", keys).splitlines())
 
@@ -91,7 +91,7 @@ def messages(store: Path = STORE, history: int = 0) -> list[dict[str, Any]]:
 
 
 def alarm(name: str, store: Path = STORE) -> dict[str, Any] | None:
-    """How an alarm stands."""
+    """The state of an alarm."""
     stands = next((one for one in messages(store) if one.get("alarm") == name), None)
     return stands and {key: stands[key] for key in ("state", "level", "occurrence", "time")}
 

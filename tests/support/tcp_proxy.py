@@ -95,7 +95,7 @@ class _Link:
 
 
 class FaultyProxy:
-    """Forwards connections to a port, as well as it is told to.
+    """Forwards connections to a port, as well as it is configured to.
 
     Attributes:
         tap: what has passed.
@@ -149,7 +149,7 @@ class FaultyProxy:
         self._bytes_to_live = count
 
     def silence(self) -> None:
-        """From now on the connections that there are carry nothing, and nobody is told (half-open)."""
+        """From now on the connections that there are carry nothing, without a notice (half-open)."""
         for link in self._links:
             link.silent = True
 

@@ -1,4 +1,4 @@
-"""What the host does for units in the guest: compiles their kernels, and says how fast it is itself.
+"""What the host does for units in the guest: compiles their kernels, and measures how fast it is itself.
 
 ``python -m support.unit_kernels`` prints the latter.
 """
@@ -53,7 +53,7 @@ def put_kernels(tree: Path, kept: Path) -> None:
 
 
 def reference_s() -> float:
-    """How long a process takes that loads what the service stands on: the best of three."""
+    """How long a process takes that loads the libraries of the service: the best of three."""
     took_s = []
     for _ in range(3):
         begun_s = time.monotonic()

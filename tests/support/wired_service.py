@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 LAG_EVERY_S = 0.01
 LAG_SECONDS = 10.0
-"""How late the event loop is, is looked at more often than usual, so that its 99th percentile is sure."""
+"""The delay of the event loop is measured more often than usual, so that its 99th percentile is sure."""
 
 
 def run(wires: dict[str, int], arguments: list[str]) -> int:

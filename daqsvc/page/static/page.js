@@ -16,7 +16,7 @@ function inOwnZone(root) {
   }
 }
 
-// On a phone the rows of a table are cards, in which each cell says what it is.
+// On a phone the rows of a table are cards, in which each cell has its title.
 function labelled(rows) {
   for (const row of rows) {
     const heads = row.closest("table").tHead?.rows[0]?.cells ?? [];
@@ -38,7 +38,7 @@ function show(now) {
   }
   if (frozenAt) return;
   for (const [name, source] of Object.entries(sources)) {
-    // What is not told is not there: no old curve stays under a note.
+    // What was not sent is not there: no old curve stays under a note.
     const columns = now.sources?.[name] ?? Object.fromEntries(Object.keys(source.data).map((key) => [key, []]));
     source.data = Object.fromEntries(Object.entries(columns).map(([key, sent]) => [key, floats(sent)]));
   }
@@ -86,7 +86,7 @@ async function figures() {
     try {
       made = await (await fetch(`${live.dataset.figures}?${query}`)).json();
     } catch {
-      // The age says that nobody answers.
+      // The age shows that there is no answer.
     }
     if (!made.length) await new Promise((then) => setTimeout(then, 2000));
   }
@@ -109,7 +109,7 @@ async function figures() {
 let events = null;
 
 function listen() {
-  // A browser has few connections to a server: tabs that nobody sees let go of theirs.
+  // A browser has few connections to a server: tabs that are hidden close theirs.
   if (document.hidden) return;
   events = new EventSource(live.dataset.events + location.search);
   events.onmessage = (event) => {
@@ -124,7 +124,7 @@ function listen() {
 
 let good = heard;
 
-// The tiles anew, without the page jumping, or the keyboard losing its place.
+// The tiles again, without the page jumping, or the keyboard losing its place.
 async function renew(list) {
   const page = new DOMParser().parseFromString(await (await fetch(location.href)).text(), "text/html");
   const held = list.contains(document.activeElement) ? document.activeElement.getAttribute("href") : null;
@@ -142,7 +142,7 @@ async function watchPlant(list) {
     if (!now.why && list.dataset.shown !== undefined && list.dataset.shown !== text) await renew(list);
     if (!now.why || list.children.length === 0) list.dataset.shown = text;
   } catch {
-    // The age says it.
+    // The age shows it.
   }
   setTimeout(() => watchPlant(list), 2000);
 }
