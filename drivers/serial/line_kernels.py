@@ -169,6 +169,8 @@ def _text_begins(buffer: Bytes, start: int, stop: int, prefix: Bytes, separator:
     """Where the fields behind the prefix begin; -1 if it is different, or the first if there is none."""
     if not len(prefix):
         return start
+    while separator == SPACE and start < stop and buffer[start] == SPACE:
+        start += 1
     end = start + len(prefix)
     if end > stop or (end < stop and buffer[end] != separator):
         return -1
@@ -191,6 +193,9 @@ def _line(
 ) -> tuple[int, bool]:
     """Read the picked fields of one line.
 
+    A run of blanks that separate is one separator, and none at the ends: see
+    `drivers.serial.line_numbers.fields_of`.
+
     Returns:
         `BAD`, `READ` or `HARD`; and whether its first picked field is an integer. A later one may be absent.
     """
@@ -210,8 +215,9 @@ def _line(
                 mantissa = mantissa * 10 + byte - ZERO
                 exponent -= state == FRACTION
             continue
+        padding = separator == SPACE and begin == at
         for k in range(len(picks)):
-            if picks[k] == column:
+            if picks[k] == column and not padding:
                 value, outcome = _number(state, mantissa, exponent - power if down else exponent + power)
                 if outcome == BAD:
                     if k == 0 or not _is_absent(buffer, begin, at):
@@ -220,7 +226,7 @@ def _line(
                 values[k] = -value if negative else value
                 line = max(line, outcome)
                 counts |= k == 0 and WHOLE <= state <= AFTER_WHOLE
-        column, begin = column + 1, at + 1
+        column, begin = column + (not padding), at + 1
         state, negative, mantissa, exponent, power, down = START, False, 0, 0, 0, False
     return (line if column == columns else BAD), counts
 
@@ -244,7 +250,7 @@ def read_lines(
         starts: int64 ``[n]``, where each begins.
         stops: int64 ``[n]``, one past its last byte.
         prefix: uint8, the first field of each line of the stream; empty if it has none.
-        separator: the byte between fields.
+        separator: the byte between fields; if it is a blank, there may be several.
         classes: one of `CLASSES`, by the decimal mark of the stream.
         columns: how many fields there are, without the prefix.
         picks: int64 ``[p]``, which of them are read.

@@ -29,7 +29,7 @@ from drivers.serial.line_kernels import (
     count_stamps,
     read_lines,
 )
-from drivers.serial.line_numbers import ABSENT, NUMBER
+from drivers.serial.line_numbers import ABSENT, NUMBER, fields_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -136,7 +136,7 @@ class LineCodec:
         )
         for k in np.flatnonzero(states == HARD).tolist():
             text = buffer[starts[k] : stops[k]].tobytes().decode("ascii", "replace")
-            fields = [one.replace(layout.decimal, ".") for one in text.split(layout.separator)]
+            fields = [one.replace(layout.decimal, ".") for one in fields_of(text, layout.separator)]
             values[k] = [_value(fields[pick + bool(layout.prefix)]) for pick in self._picks.tolist()]
         places = values[:, 0]
         if self._units_per_s is None:
@@ -280,12 +280,12 @@ class LineFraming(DelimitedFraming):
             other = self._by_prefix.setdefault(key, name)
             if other != name or (None in self._by_prefix and len(layouts) > 1):
                 raise LayoutError(f"streams {other!r} and {name!r} cannot be told apart; give each a prefix")
-        self._separators = {layout.separator.encode("ascii") for layout in layouts.values()}
-        if len(self._separators) != 1:
+        separators = {layout.separator for layout in layouts.values()}
+        if len(separators) != 1:
             raise LayoutError(
                 "the streams of one port have different separators; they must have the same one"
             )
-        self._separator = next(iter(self._separators))
+        self._separator = separators.pop()
         self._times = {
             name: DeviceTime(rates_hz[name], (reorder_windows_ns or {}).get(name, REORDER_WINDOW_NS))
             for name, layout in layouts.items()
@@ -333,7 +333,7 @@ class LineFraming(DelimitedFraming):
                 why = f"checksum {sent.decode()}, its text makes {made.decode()}"
                 return NoFrame(f"{said}: {why}", "compare checksum with the device's")
             piece = text
-        fields = piece.decode("ascii").split(self._separator.decode("ascii"))
+        fields = fields_of(piece.decode("ascii"), self._separator)
         if None in self._by_prefix:
             why, remedy = self._codecs[self._by_prefix[None]].why_not(fields)
             return NoFrame(f"{said}: {why}", remedy)
@@ -376,9 +376,9 @@ class LineFraming(DelimitedFraming):
             arrival_ns = arrivals_of(pieces.ends[good])
             batch.frames[name] = DecodedFrames(counter, samples, sound, arrival_ns)
         for k in np.flatnonzero(strays).tolist():
-            text = pieces.buffer[pieces.starts[k] : pieces.stops[k]].tobytes()
-            prefix = text.partition(self._separator)[0]
-            if prefix.isascii() and prefix.decode("ascii").isprintable():
-                batch.unknown[prefix.decode("ascii")] += 1
+            text = pieces.buffer[pieces.starts[k] : pieces.stops[k]].tobytes().decode("ascii", "replace")
+            prefix = fields_of(text, self._separator)[0]
+            if prefix.isascii() and prefix.isprintable():
+                batch.unknown[prefix] += 1
                 in_step[k] = True
         return in_step

@@ -74,7 +74,9 @@ class SerialQuestions(BusQuestions):
         "line-end": Topic(
             "What ends a line?", "LF, with CR before it or not, is usual; some devices send CR alone."
         ),
-        "separator": Topic("Character between columns", "A comma, semicolon, blank or tab."),
+        "separator": Topic(
+            "Character between columns", "A comma, semicolon, tab, or a blank; there may be several blanks."
+        ),
         "decimal": Topic("Decimal mark of the numbers", 'A comma, where a device writes "0,25".'),
         "checksum": Topic(
             "Checksum at the end of a line", "Behind a *: xor as in NMEA 0183, crc16, or none."
@@ -241,7 +243,8 @@ def _columns(text: str) -> tuple[str, ...]:
 def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
     """What was heard, in a few lines."""
     rate = "" if found["rate_hz"] is None else f", {found['rate_hz']:.4g} a second"
-    line = f"{found['baud']} bit/s, {found['character']}"
+    baud = "any baud rate" if found["any_baud"] else f"{found['baud']} bit/s"
+    line = f"{baud}, {found['character']}"
     if found["framing"] != "lines":
         kind = "COBS frames" if found["framing"] == "cobs" else f"frames behind {found['sync_word']}"
         counter = found["counter"]

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drivers.serial.line_numbers import ABSENT, NUMBER
+from drivers.serial.line_numbers import ABSENT, NUMBER, fields_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -84,7 +84,7 @@ class TextLines:
     Attributes:
         lines: whole lines of this kind, oldest first, without their ends.
         delimiter: what ends one; a carriage return before a line feed is none of it.
-        separator: between columns; empty if there is one column.
+        separator: between columns, a blank for one or more of them; empty if there is one column.
         decimal: decimal mark of the numbers.
         prefix: the first field of each line, where it is the same word in all; else empty.
         checksum: behind a ``*``: "xor", "crc16", "unknown", or "none".
@@ -129,7 +129,9 @@ def _kinds_of(lines: Sequence[str], delimiter: str) -> TextLines:
     """Lines by the word that they begin with, where there are several of them."""
     separator, _ = _marks_of(lines[1:] or lines)
     words = (
-        [line.split(separator)[0].strip() if separator in line else "" for line in lines] if separator else []
+        [fields_of(line, separator)[0].strip() if separator in line else "" for line in lines]
+        if separator
+        else []
     )
     least = max(_LEAST_LINES, _LEAST_SHARE * len(lines))
     frequent = [
@@ -164,12 +166,12 @@ def _text(piece: bytes) -> str:
 def _is_header(first: str, second: str) -> bool:
     """Whether a line is a header: words, where the next one has numbers."""
     separator, decimal = _marks_of([second])
-    fields = first.split(separator) if separator else [first]
-    same = len(fields) == (len(second.split(separator)) if separator else 1)
+    fields = fields_of(first, separator) if separator else [first]
+    same = len(fields) == (len(fields_of(second, separator)) if separator else 1)
     return (
         same
         and not any(NUMBER[decimal].fullmatch(one) for one in fields)
-        and not second.startswith(fields[0])
+        and not second.strip().startswith(fields[0].strip())
     )
 
 
@@ -181,7 +183,7 @@ def _marks_of(lines: Sequence[str]) -> tuple[str, str]:
     """
     best, most = ("", "."), 0.0
     for separator in SEPARATORS:
-        rows = [line.split(separator) for line in lines]
+        rows = [fields_of(line, separator) for line in lines]
         width, agreeing = Counter(map(len, rows)).most_common(1)[0]
         if width == 1:
             continue
@@ -204,7 +206,8 @@ def _columns_of(lines: Sequence[str], delimiter: str) -> TextLines:
     plain = [_CHECKSUM.sub("", line) if checksum != "none" else line for line in lines]
     separator, decimal = _marks_of(plain[1:] or plain)
     rows = [
-        [field.strip() for field in line.split(separator)] if separator else [line.strip()] for line in plain
+        [field.strip() for field in fields_of(line, separator)] if separator else [line.strip()]
+        for line in plain
     ]
     width = Counter(len(row) for row in rows[1:] or rows).most_common(1)[0][0]
     number = NUMBER[decimal]

@@ -281,7 +281,8 @@ class LineLayout(Layout):
         ),
     ]
     separator: Annotated[str, AfterValidator(_separator), Field(min_length=1, max_length=1)] = Field(
-        default=",", description="character between two columns"
+        default=",",
+        description="character between two columns; of blanks there may be several, also in front",
     )
     decimal: Literal[".", ","] = Field(default=".", description="decimal mark of the numbers")
     prefix: Annotated[str, Field(pattern=r"^[!$]?[A-Za-z0-9_-]+$", max_length=16)] | None = Field(

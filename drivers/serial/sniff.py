@@ -116,7 +116,7 @@ class SerialSniffer(Sniffer):
             raise SniffError(wrong, usage=True)
         bauds = BAUDS if arguments.baud is None else (arguments.baud,)
         tried = _try_all(arguments.port, bauds, stop, tell) if arguments.baud is None else []
-        best = max(tried, key=lambda one: one.found.score, default=None)
+        best = tried[0] if _alike(tried) else max(tried, key=lambda one: one.found.score, default=None)
         silent = best is not None and not any(one.heard.received for one in tried)
         if (best is None or not (silent or best.heard.lost)) and not stop.is_set():
             baud, parity = (bauds[0], "none") if best is None else (best.baud, best.parity)
@@ -145,6 +145,14 @@ def _try_all(
         if not any(one.heard.errors for one in tried):
             break  # parity that is not expected shows as missing stop bits
     return tried
+
+
+def _alike(tried: Sequence[Tried]) -> bool:
+    """Whether the bytes have a meaning at all baud rates: the port does not use them.
+
+    A pseudo-terminal does not, nor do many devices that are the USB port themselves.
+    """
+    return len(tried) > 1 and all(one.found.sure for one in tried)
 
 
 def _try(port: str, baud: int, parity: str, seconds: float, enough: int, stop: threading.Event) -> Tried:
@@ -254,6 +262,11 @@ class _Report(NamedTuple):
         return self.best.found.what if self.best.found.sure else None
 
     @property
+    def _any_baud(self) -> bool:
+        """Whether all rates came out alike."""
+        return _alike(self.tried)
+
+    @property
     def _parity(self) -> str:
         return self.best.found.parity or self.best.parity
 
@@ -344,7 +357,7 @@ class _Report(NamedTuple):
             yield f"{self.port}: no byte came"
             return
         per_s = heard.received / max(heard.last_s - heard.first_s, 1e-3)
-        line = f"{self.best.baud} bit/s, {self._character}"
+        line = f"{'any baud rate' if self._any_baud else f'{self.best.baud} bit/s'}, {self._character}"
         yield f"{self.port} at {line}: {heard.received} bytes, {per_s:.0f}/s"
         begin = heard.data[: _ROW * _SHOWN_ROWS]
         yield f"The first bytes:\n{dump(begin)}"
@@ -361,7 +374,8 @@ class _Report(NamedTuple):
         shown = "\n".join(line[:_WIDEST] for line in what.lines[:_SHOWN_LINES])
         yield f"The first lines:\n{_printable(shown)}"
         words = [f"{len(what.columns)} columns" if len(what.columns) != 1 else "1 column"]
-        words += [f"separated by {quoted(what.separator)}"] * bool(what.separator)
+        between = "blanks" if what.separator == " " else quoted(what.separator)
+        words += [f"separated by {between}"] * bool(what.separator)
         words += ["numbers have a decimal comma"] * (what.decimal == ",")
         words += [f"each line begins with {what.prefix}"] * bool(what.prefix)
         words += ["the first line names them"] * what.header
@@ -433,6 +447,7 @@ class _Report(NamedTuple):
             "bus": "serial",
             "port": self.port,
             "baud": self.best.baud,
+            "any_baud": self._any_baud,
             "character": self._character,
             "bytes": heard.received,
             "framing_errors": heard.errors,
@@ -496,7 +511,7 @@ class _Report(NamedTuple):
             f"[buses.{name}]",
             'driver = "serial"',
             f"port = {quoted(lasting_name(self.port))}",
-            f"baud = {self.best.baud:_}",
+            f"baud = {self.best.baud:_}{'    # any: the port does not use it' if self._any_baud else ''}",
         ]
         head += ["data_bits = 7"] * (self.best.found.parity is not None)
         head += [f"parity = {quoted(self._parity)}"] * (self._parity != "none")

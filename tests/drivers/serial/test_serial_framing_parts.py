@@ -223,6 +223,19 @@ def test_a_line_that_is_none_is_quoted_with_what_is_wrong(spoilt, said, remedy):
     assert (again.notes["frames_malformed"], again.malformed) == (1, ""), "once"
 
 
+def test_lines_of_padded_columns_are_read_and_others_described():
+    columns = line_layout(("seq", "x", "y"), ("x", "y"), counter="seq", separator=" ", prefix="A")
+    framing = LineFraming({"a": columns}, {"a": 100.0})
+    framing.cut(b"half a line\n")
+    found = framing.cut(b"   A    7   -0.250    1.500\n  B    7    1.000\n")
+    assert found.frames["a"].counter.tolist() == [7]
+    assert found.frames["a"].samples[0, 0].tolist() == [-0.25, 1.5]
+    assert found.unknown == {"B": 1}
+    found = framing.cut(b"   A    8   -0.250\n")
+    assert "2 columns, the file lists 3 (seq, x, y)" in found.malformed
+    assert "no stream" in LineFraming({"a": columns}, {"a": 100.0})._why_no_frame(b"    ").why
+
+
 def test_the_other_decimal_mark_is_named():
     for mark, other, text in ((".", ",", b"1;0,5"), (",", ".", b"1;0.5")):
         columns = line_layout(("seq", "x"), ("x",), counter="seq", separator=";", decimal=mark)

@@ -81,6 +81,37 @@ def test_numbers_are_those_of_python_to_the_last_bit(rows: list[tuple[str, str, 
         np.testing.assert_array_equal(lines.samples[:, 0, 0], want.astype(np.float32))
 
 
+@given(
+    st.lists(
+        st.tuples(
+            st.integers(0, 99), st.floats(-1e6, 1e6), st.sampled_from(["nan", "--", "9007199254740993"])
+        ),
+        min_size=1,
+        max_size=8,
+    ),
+    st.integers(1, 12),
+    st.sampled_from(["", "   "]),
+    st.sampled_from([None, "A"]),
+)
+def test_columns_padded_with_blanks_are_those_with_commas(
+    rows: list[tuple[int, float, str]], width: int, end: str, prefix: str | None
+) -> None:
+    begin = [] if prefix is None else [prefix]
+    texts = [[*begin, f"{counter}", f"{value:.3f}", last] for counter, value, last in rows]
+    changes = {"channels": ("spare", "x"), "prefix": prefix}
+    want = codec(**changes).read(pieces([",".join(text).encode() for text in texts]))
+    padded = [" ".join(field.rjust(width) for field in text) + end for text in texts]
+    got = codec(separator=" ", **changes).read(pieces([line.encode() for line in padded]))
+    assert want.good.all()
+    for one, other in zip(want, got, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_a_column_more_or_less_between_blanks_is_no_line() -> None:
+    lines = codec(separator=" ").read(pieces([b"  1   2", b"  1   2   3", b" 1  2  3  4 ", b"   ", b""]))
+    assert lines.good.tolist() == [False, True, False, False, False]
+
+
 @given(st.lists(NUMBERS, min_size=1, max_size=8))
 def test_times_are_those_of_python_to_the_last_bit(stamps: list[str]) -> None:
     stream = codec(counter=None, time="seq", unit="ms")

@@ -17,7 +17,7 @@ from support.examples import examples
 from support.uart_waves import sampled, wave
 
 from drivers.serial.checksums import CHECKSUMS
-from drivers.serial.recognise import recognised
+from drivers.serial.recognise import CONCLUSIVE, recognised
 from drivers.serial.recognise_frames import BinaryFrames
 from drivers.serial.recognise_lines import TextLines
 from drivers.serial.sniff import BAUDS, TRY_BYTES
@@ -334,6 +334,39 @@ def test_a_count_that_begins_again_at_a_power_of_ten_is_seen(turns_at: int, lost
     damaged = recognised(b"".join(b"%s,%d\n" % (text, 7 * k % 11) for k, text in enumerate(texts))).what
     assert isinstance(damaged, TextLines)
     assert [column.turns_at for column in damaged.columns] == [0, 0]
+
+
+@settings(max_examples=examples(40), deadline=None)
+@given(
+    channels=st.integers(1, 6),
+    width=st.integers(6, 14),
+    decimal=st.sampled_from([".", ","]),
+    begin=st.integers(0, 30),
+    seed=st.integers(0, 1000),
+)
+def test_columns_padded_with_blanks_are_counted(
+    channels: int, width: int, decimal: str, begin: int, seed: int
+) -> None:
+    plain = lines(seed, frames=60, channels=channels, end="\n").decode().splitlines()
+    padded = [" ".join(field.rjust(width) for field in line.split(",")) for line in plain]
+    data = "\n".join(padded).replace(".", decimal).encode()
+    found = recognised(data[begin:])
+    assert found.score >= CONCLUSIVE
+    what = found.what
+    assert isinstance(what, TextLines)
+    assert (what.separator, what.decimal, len(what.columns)) == (" ", decimal, channels + 1)
+    assert all(column.numeric for column in what.columns)
+    assert what.columns[0].step == 1
+    assert not what.header
+    assert not what.damaged
+
+
+def test_a_header_over_padded_columns_names_them() -> None:
+    rows = "".join(f"{k:8d} {k % 7 / 4:8.3f}\n" for k in range(20))
+    what = recognised(b"\n     seq        x\n" + rows.encode()).what
+    assert isinstance(what, TextLines)
+    assert what.header
+    assert [column.name for column in what.columns] == ["seq", "x"]
 
 
 @settings(max_examples=examples(40), deadline=None)

@@ -130,6 +130,45 @@ def test_a_counter_whose_turn_was_not_seen_is_proposed_with_a_word(
     assert f"  c1 counts lines; {MUST_TURN}" in _in_words(found)
 
 
+def padded(number: int) -> bytes:
+    return b"%8d %8.3f %8.3f\n" % (number, number % 7 - 3.25, -1.5 * (number % 11))
+
+
+def test_columns_padded_with_blanks_are_proposed_as_they_are(
+    cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 0.6)
+    with talking(cable, padded):
+        found = figures(cable, capsys)
+        new_layout = new(cable, tmp_path / "new.toml")["streams"]["device"]["layout"]
+    assert (found["score"], found["lines_damaged"], found["any_baud"]) == (0.95, 0, False)
+    [stream] = check(tmp_path, found["machine_file"], capsys)["streams"].values()
+    for layout in (stream["layout"], new_layout):
+        assert layout["separator"] == " "
+        assert layout["counter"]["column"] == "c1"
+        assert [one["name"] for one in layout["channels"]] == ["c2", "c3"]
+
+
+def test_no_baud_rate_is_named_where_all_of_them_come_out_alike(
+    cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sniff, "TRY_S", 0.2)
+    monkeypatch.setattr(sniff, "BAUDS", (115_200, 9600, 2400))
+
+    def spoilt(number: int) -> bytes:
+        return line(number) if number % 3 else b"no line\r\n"
+
+    with talking(cable, spoilt):
+        assert main(["sniff", "serial", f"{cable.path}", "--seconds", "0.6"]) == 0
+        said = capsys.readouterr().out
+        found = figures(cable, capsys)
+    assert f"{cable.path} at any baud rate, 8N1: " in said
+    assert "baud = 115_200    # any: the port does not use it" in said
+    assert (found["baud"], found["any_baud"], len(found["tried"])) == (115_200, True, 3)
+    assert next(iter(_in_words(found))).startswith("any baud rate, 8N1: lines of text")
+    check(tmp_path, found["machine_file"], capsys)
+
+
 @pytest.mark.long
 def test_what_it_proposes_for_lines_passes_check(
     cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str]
