@@ -13,8 +13,10 @@ if TYPE_CHECKING:
 
 
 def parsers() -> Iterator[tuple[argparse.ArgumentParser, str]]:
-    """The parser of each verb, and of each verb below one, with its line in the list of verbs."""
-    yield from _below(parser(commands()))
+    """The parser of ``daqsvc`` itself, of each verb, and of each verb below one, with its line in the list."""
+    root = parser(commands())
+    yield root, root.description or ""
+    yield from _below(root)
 
 
 def _below(above: argparse.ArgumentParser) -> Iterator[tuple[argparse.ArgumentParser, str]]:
@@ -71,14 +73,12 @@ def pages() -> dict[str, str]:
 
 def _usage(verb: argparse.ArgumentParser) -> str:
     files = [_name(action) for _, action in options(verb) if not action.option_strings]
-    below = [name for name, _ in _verbs_below(verb)]
-    return " ".join([verb.prog, "[options]", *(["{" + ",".join(below) + "}"] if below else []), *files])
-
-
-def _verbs_below(verb: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.ArgumentParser]]:
-    for action in verb._actions:  # noqa: SLF001
-        if isinstance(action, argparse._SubParsersAction):  # noqa: SLF001
-            yield from action.choices.items()
+    below = [
+        "VERB" if action.metavar == "VERB" else "{" + ",".join(action.choices) + "}"
+        for action in verb._actions  # noqa: SLF001
+        if isinstance(action, argparse._SubParsersAction)  # noqa: SLF001
+    ]
+    return " ".join([verb.prog, "[options]", *below, *files])
 
 
 def _name(action: argparse.Action) -> str:

@@ -49,6 +49,10 @@ def test_options_that_help_does_not_show_are_not_there(made):
     assert "SUPPRESS" not in made["verbs.md"]
 
 
+def test_options_of_daqsvc_itself_are_listed(made):
+    assert '<a id="daqsvc--version"></a>`--version`' in made["verbs.md"]
+
+
 def test_no_page_has_two_anchors_of_one_name(made):
     for name, text in made.items():
         anchors = re.findall(r'<a id="([^"]+)">', text)
