@@ -14,6 +14,7 @@ from daqsvc.publish.sparkplug.host import PrimaryHost
 from daqsvc.publish.sparkplug.metrics import declared, node_properties, quiet_alarm
 from daqsvc.publish.sparkplug.node import BDSEQ, REBIRTH, EdgeNode
 from daqsvc.publish.topics import ANSWER, Topics
+from daqsvc.reference import figures
 from daqsvc.reference.markdown import anchored, code, page, table
 
 if TYPE_CHECKING:
@@ -320,6 +321,7 @@ def gaps() -> Iterator[str]:
     for _, metric in sparkplug():
         if metric.name not in SPARKPLUG_WORDS:
             yield f"Sparkplug metric {metric.name} is described nowhere: daqsvc.reference.messages"
+    yield from figures.gaps()
 
 
 _NO_TOPICS = {
@@ -385,7 +387,7 @@ def pages() -> dict[str, str]:
             _OTHERS,
             table(titles, others),
         ),
-        "payloads.md": page("Payloads", _PAYLOADS, *parts),
+        "payloads.md": page("Payloads", _PAYLOADS, *parts, figures.section()),
         "home-assistant.md": page(
             "Entities in Home Assistant", _ENTITIES, table(("entity", "platform", "name", "topic"), entities)
         ),

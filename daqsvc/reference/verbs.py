@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def parsers() -> Iterator[tuple[argparse.ArgumentParser, str]]:
-    """The parser of ``daqsvc`` itself, of each verb, and of each verb below one, with its line in the list."""
+    """The parser of ``daqsvc``, of each verb, and of each verb below one, with its line in the list."""
     root = parser(commands())
     yield root, root.description or ""
     yield from _below(root)

@@ -16,7 +16,7 @@ from daqsvc.publish.payloads import AlarmPayload
 from daqsvc.publish.sparkplug.host import STATES
 from daqsvc.publish.sparkplug.node import NAMESPACE
 from daqsvc.publish.topics import Topics
-from daqsvc.reference import alarms, counters, keys, messages, metrics, pages, process, verbs
+from daqsvc.reference import alarms, counters, figures, keys, messages, metrics, pages, process, verbs
 from daqsvc.reference.__main__ import main
 from daqsvc.reference.markdown import toml
 from daqsvc.settings.recorder import Recorder
@@ -169,6 +169,21 @@ def test_every_topic_of_home_assistant_and_sparkplug_is_listed(made):
     assert {topic.partition("/")[0] for topic in published} == {"homeassistant", "spBv1.0", "daqsvc"}
     assert [one for one in published if not any(re.fullmatch(pattern, one) for pattern in patterns)] == []
     assert all(f"`{one}`" in made["topics.md"] for one in known)
+
+
+def test_a_figure_of_a_detector_that_nothing_describes_is_a_gap(monkeypatch, made):
+    assert '<a id="figure-rotor-synchronous.departure.energy"></a>`departure.energy`' in made["payloads.md"]
+    listed = {
+        detector: {name: one for name, one in held.items() if not name.endswith((".energy", "PART.z", "rms"))}
+        for detector, held in figures.FIGURES.items()
+    }
+    listed[figures.ROTOR_BANK]["weight"] = figures.Figure("kg", "made nowhere")
+    del listed[figures.ROTOR_BANK]["paper.MODE"], listed[figures.ROTOR_SYNCHRONOUS]["FAULT.of_sag"]
+    monkeypatch.setattr(figures, "FIGURES", listed)
+    found = gaps_of(messages)
+    for name in ("departure.energy", "*.*.z", "rms", "velocity_rms", "paper.*", "*.of_sag"):
+        assert f"figure {name} of " in found
+    assert "figure weight of rotor-bank is made nowhere" in found
 
 
 def test_a_topic_or_a_field_that_nothing_describes_is_a_gap(monkeypatch):
