@@ -334,7 +334,7 @@ def test_each_unusable_message_stands_once_however_many_get_it(tmp_path, broker,
     ("arguments", "environment", "why"),
     [
         ((), {}, "$DATABASE is not set; write where"),
-        ((), {"DATABASE": "plant of ours"}, "$DATABASE does not say where PostgreSQL is ("),
+        ((), {"DATABASE": "plant of ours"}, "$DATABASE does not state where PostgreSQL is ("),
         (("--user", "x"), {"DATABASE": "dbname=plant"}, "--user needs the password of that user in $MQTT_P"),
         (("--ca", "nofile"), {"DATABASE": "dbname=plant"}, "--ca nofile cannot be used: No such file or dir"),
         (("--ca", __file__), {"DATABASE": "dbname=plant"}, "cannot be used: it holds no certificates; name"),
