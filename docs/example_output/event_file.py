@@ -20,26 +20,26 @@ class EventFileOutput(Output):
     """Goes on, also after a restart, with the event after the last one in the file."""
 
     def __init__(self, path: Path, port: OutputPort) -> None:
-        self._path, self._outbox, self._said, self._lines = path, port.outbox, list[str](), 0
+        self._path, self._outbox, self._statements, self._lines = path, port.outbox, list[str](), 0
 
     def report(self, diagnosis: Diagnosis) -> None:
         """Keep what a detector has changed its mind about."""
         if diagnosis.changed:
-            self._said.append(json.dumps({"detector": diagnosis.detector, "decision": diagnosis.decision}))
+            self._statements.append(json.dumps({"detector": diagnosis.detector, "decision": diagnosis.decision}))
 
     async def run(self) -> None:
         """Append what is new, at least once a second."""
-        told = await asyncio.to_thread(self._last_event)
+        written = await asyncio.to_thread(self._last_event)
         while True:
             try:
                 async with asyncio.timeout(1.0):
-                    events = await self._outbox.next_following(told, 100)
+                    events = await self._outbox.next_following(written, 100)
             except TimeoutError:
                 events = []
-            said = self._said[:]
-            await asyncio.to_thread(self._append, [*said, *(event.payload.decode() for event in events)])
-            del self._said[: len(said)]
-            told = max([told, *(event.sequence for event in events)])
+            statements = self._statements[:]
+            await asyncio.to_thread(self._append, [*statements, *(event.payload.decode() for event in events)])
+            del self._statements[: len(statements)]
+            written = max([written, *(event.sequence for event in events)])
 
     def figures(self) -> dict[str, int]:
         """How many lines this run has written."""
