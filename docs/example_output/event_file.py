@@ -20,12 +20,12 @@ class EventFileOutput(Output):
     """Goes on, also after a restart, with the event after the last one in the file."""
 
     def __init__(self, path: Path, port: OutputPort) -> None:
-        self._path, self._outbox, self._statements, self._lines = path, port.outbox, list[str](), 0
+        self._path, self._outbox, self._pending, self._lines = path, port.outbox, list[str](), 0
 
     def report(self, diagnosis: Diagnosis) -> None:
         """Keep what a detector has changed its mind about."""
         if diagnosis.changed:
-            self._statements.append(json.dumps({"detector": diagnosis.detector, "decision": diagnosis.decision}))
+            self._pending.append(json.dumps({"detector": diagnosis.detector, "decision": diagnosis.decision}))
 
     async def run(self) -> None:
         """Append what is new, at least once a second."""
@@ -36,9 +36,9 @@ class EventFileOutput(Output):
                     events = await self._outbox.next_following(written, 100)
             except TimeoutError:
                 events = []
-            statements = self._statements[:]
-            await asyncio.to_thread(self._append, [*statements, *(event.payload.decode() for event in events)])
-            del self._statements[: len(statements)]
+            pending = self._pending[:]
+            await asyncio.to_thread(self._append, [*pending, *(event.payload.decode() for event in events)])
+            del self._pending[: len(pending)]
             written = max([written, *(event.sequence for event in events)])
 
     def figures(self) -> dict[str, int]:
