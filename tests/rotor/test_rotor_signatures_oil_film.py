@@ -5,17 +5,20 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from support.oil_film_rotors import RATE_HZ, FilmMachine
+from support.oil_film_rotors import FilmMachine
+from support.two_mode_rotors import fitted
 
-from daqsvc.rotor.calibration.run_up import fit_run_up, revolutions_of
-from daqsvc.rotor.calibration.two_modes import TwoModeFit, fit_two_modes
 from daqsvc.rotor.laval import LavalRotor
 from daqsvc.rotor.synchronous.by_two_modes import stiffness_left
 from daqsvc.rotor.synchronous.signatures import likelihoods
-from daqsvc.rotor.synchronous.vectors import Healthy, synchronous_vectors
+from daqsvc.rotor.synchronous.vectors import Healthy
+
+if TYPE_CHECKING:
+    from daqsvc.rotor.calibration.two_modes import TwoModeFit
 
 MACHINE = FilmMachine()
 SOFTER = replace(MACHINE, pedestals=(3.0, 5.4))
@@ -24,14 +27,7 @@ AWAY_FROM_CRITICAL_HZ = [20.0, 38.0]
 
 @cache
 def identified() -> TwoModeFit:
-    position, angle = MACHINE.run_up(8.0, 50.0, 25.0)
-    nearest = fit_run_up(np.column_stack((position.real, position.imag)), angle, RATE_HZ)
-    return fit_two_modes(
-        synchronous_vectors(revolutions_of(position, angle)),
-        RATE_HZ,
-        natural_frequency_hz=nearest.natural_frequency_hz,
-        damping_ratio=nearest.damping_ratio,
-    )
+    return fitted(*MACHINE.run_up(8.0, 50.0, 25.0))[1]
 
 
 def leads(

@@ -5,18 +5,20 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from support.rotor_orbits import orbits
-from support.two_mode_rotors import RATE_HZ, Machine, run_up, touching, vector_of
+from support.two_mode_rotors import Machine, fitted, run_up, touching, vector_of
 
-from daqsvc.rotor.calibration.run_up import fit_run_up, revolutions_of
-from daqsvc.rotor.calibration.two_modes import TwoModeFit, fit_two_modes
 from daqsvc.rotor.laval import LavalRotor
 from daqsvc.rotor.synchronous.signatures import likelihoods
 from daqsvc.rotor.synchronous.vectors import Healthy, synchronous_vectors
 from daqsvc.rotor.synchronous.watch import RotorWatch
+
+if TYPE_CHECKING:
+    from daqsvc.rotor.calibration.two_modes import TwoModeFit
 
 MACHINE = Machine()
 STATED = LavalRotor(natural_frequency_hz=29.0, damping_ratio=0.1, static_sag_um=-MACHINE.rest.imag)
@@ -25,14 +27,7 @@ SPEEDS_HZ = [20.0, 28.0, 38.0]
 
 @cache
 def identified() -> TwoModeFit:
-    position, angle = run_up(MACHINE, 8.0, 50.0, 25.0)
-    nearest = fit_run_up(np.column_stack((position.real, position.imag)), angle, RATE_HZ)
-    return fit_two_modes(
-        synchronous_vectors(revolutions_of(position, angle)),
-        RATE_HZ,
-        natural_frequency_hz=nearest.natural_frequency_hz,
-        damping_ratio=nearest.damping_ratio,
-    )
+    return fitted(*run_up(MACHINE, 8.0, 50.0, 25.0))[1]
 
 
 def leads(

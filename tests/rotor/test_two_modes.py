@@ -8,9 +8,9 @@ from functools import cache
 
 import numpy as np
 import pytest
-from support.two_mode_rotors import RATE_HZ, UNIT_HZ, Machine, run_up
+from support.two_mode_rotors import RATE_HZ, UNIT_HZ, Machine, fitted, run_up
 
-from daqsvc.rotor.calibration.run_up import fit_run_up, revolutions_of
+from daqsvc.rotor.calibration.run_up import revolutions_of
 from daqsvc.rotor.calibration.two_modes import TwoModeFit, fit_two_modes
 from daqsvc.rotor.model import Film, Pedestal, RotorParameters
 from daqsvc.rotor.synchronous.baseline import NotCalibratableError
@@ -20,16 +20,6 @@ MACHINE = Machine()
 KNOWN = RotorParameters(
     natural_frequency_hz=1.0, damping_ratio=0.1, eccentricity_um=1.0, clearance_um=200.0, static_sag_um=40.0
 )
-
-
-def fitted(position, angle):
-    nearest = fit_run_up(np.column_stack((position.real, position.imag)), angle, RATE_HZ)
-    return nearest, fit_two_modes(
-        synchronous_vectors(revolutions_of(position, angle)),
-        RATE_HZ,
-        natural_frequency_hz=nearest.natural_frequency_hz,
-        damping_ratio=nearest.damping_ratio,
-    )
 
 
 @cache

@@ -11,9 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import brentq
-
-RATE_HZ = 4000.0
-UNIT_HZ = 30.0
+from support.two_mode_rotors import RATE_HZ, UNIT_HZ
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -12,7 +12,9 @@ import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.signal import cont2discrete, lfilter
 
-from daqsvc.rotor.synchronous.vectors import WITH_THRICE
+from daqsvc.rotor.calibration.run_up import RunUpFit, fit_run_up, revolutions_of
+from daqsvc.rotor.calibration.two_modes import TwoModeFit, fit_two_modes
+from daqsvc.rotor.synchronous.vectors import WITH_THRICE, synchronous_vectors
 
 RATE_HZ = 4000.0
 UNIT_HZ = 30.0
@@ -82,6 +84,17 @@ def run_up(machine: Machine, from_hz: float, to_hz: float, seconds: float) -> tu
     t = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
     angle = math.tau * (from_hz * t + 0.5 * (to_hz - from_hz) / seconds * t**2)
     return machine.move(angle), angle
+
+
+def fitted(position: np.ndarray, angle: np.ndarray) -> tuple[RunUpFit, TwoModeFit]:
+    """What ``daqsvc calibrate`` finds in a run-up: the nearest Laval rotor, and two modes."""
+    nearest = fit_run_up(np.column_stack((position.real, position.imag)), angle, RATE_HZ)
+    return nearest, fit_two_modes(
+        synchronous_vectors(revolutions_of(position, angle)),
+        RATE_HZ,
+        natural_frequency_hz=nearest.natural_frequency_hz,
+        damping_ratio=nearest.damping_ratio,
+    )
 
 
 def vector_of(machine: Machine, speed_hz: float) -> np.ndarray:
