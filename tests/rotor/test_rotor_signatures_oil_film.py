@@ -86,6 +86,16 @@ def test_on_springs_a_load_moves_no_1x():
     assert denied["stiffness_loss"] < -50.0
 
 
+def test_an_upright_shaft_has_no_weight_that_a_load_could_be_compared_with():
+    before = MACHINE.vector(20.0)
+    stated = LavalRotor(natural_frequency_hz=29.0, damping_ratio=0.1, static_sag_um=0.0, plain_bearings=True)
+    healthy = Healthy(before[:5], math.tau * 20.0, identified().beside(stated), laval=False)
+    variance = np.full(7, (0.01 * healthy.amplitude_um) ** 2)
+    pushed = before + np.array([30.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    scores = likelihoods(pushed - before, variance, healthy, pushed[:5])
+    assert max(scores, key=lambda name: scores[name]) == "static_load"
+
+
 @pytest.mark.parametrize("speed_hz", AWAY_FROM_CRITICAL_HZ)
 def test_what_is_left_of_the_stiffness_is_found(speed_hz):
     before = MACHINE.vector(speed_hz)

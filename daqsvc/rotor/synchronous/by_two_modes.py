@@ -95,7 +95,14 @@ def loaded(change: Complexes, variance: Floats, healthy: Healthy, rotor: RotorPa
     """Log marginal likelihood of both senses of 1X where oil films carry another load.
 
     How far the mean position moves shows by how much the load has grown and turned. A film gets stiffer the
-    more it carries, and turns with what it carries, and 1X follows.
+    more it carries, and turns with what it carries (Ocvirk's short bearing; Friswell, Penny, Garvey and Lees,
+    "Dynamics of Rotating Machines", 2010, section 5.5.2), and 1X follows. The mean position itself is free.
+
+    Args:
+        change: complex128 ``[5]``, um.
+        variance: float64 ``[5]``, um^2.
+        healthy: the machine before.
+        rotor: the same with its two modes.
     """
     speed_rpm = healthy.speed_rad_s * 30.0 / np.pi
     still = rotor.faulty(speed_rpm)

@@ -13,8 +13,9 @@ rotor's parameters are averaged over, so that a flexible hypothesis pays for its
   or an orbit that fills the clearance.
 * unmodelled: any components, each by itself. It pays `UNMODELLED_NATS` for explaining everything.
 
-Where a run-up has shown the rotor's two modes, they show how damping loss and stiffness loss move the vector
-(`daqsvc.rotor.synchronous.by_two_modes`), and the free shapes above are for what few machines do beside that.
+Where a run-up has shown the rotor's two modes, they show how damping loss and stiffness loss move the vector,
+and on oil films a load (`daqsvc.rotor.synchronous.by_two_modes`). The free shapes above are for what few
+machines do beside that. Where it is stated that no oil film carries the shaft, a load moves no 1X.
 
 From the likelihoods follows the name or the group of names (`identify`).
 """
