@@ -188,7 +188,7 @@ class AlarmService:
         await self.outbox.open()
 
     async def resume(self, active_detectors: Mapping[str, Mapping[str, Sequence[str]]]) -> None:
-        """Take over from the journal how the alarms stood when the service ended.
+        """Take over from the journal the states of the alarms when the service ended.
 
         Args:
             active_detectors: by machine, the detectors that will make statements, with the sensors that these
@@ -286,7 +286,7 @@ class AlarmService:
         return self.outbox.counters.quarantined + self.outbox.counters.vanished
 
     def _forget(self, events: Iterable[AlarmEvent]) -> list[asyncio.Future[int]]:
-        """Say of alarms that are no longer known that they are normal: the broker shows how they stood.
+        """Say of alarms that are no longer known that they are normal: the broker shows their last state.
 
         The broker has nothing about those that were never published.
         """

@@ -273,7 +273,7 @@ class _Open:
 
 @dataclass(slots=True)
 class _Kept:
-    """How things stood before the oldest item of the history.
+    """The states before the oldest item of the history.
 
     Attributes:
         alarms: by alarm, its newest event.
@@ -612,7 +612,7 @@ class MachineRecorder:
         return min(firsts), chosen
 
     def _trim(self, now_ns: int) -> None:
-        """Forget what no snapshot would begin with any more, but for how alarms and streams stood."""
+        """Forget what no snapshot would begin with any more, but for the states of alarms and streams."""
         self._trimmed_ns = now_ns
         oldest_ns = now_ns - self._before_ns - MEMORY_EVERY_NS - SPARE_NS
         if self._continuous is not None and self._continuous.waiting:

@@ -36,7 +36,7 @@ QUIET_NS = 60 * NS_PER_S
 
 
 class BusHealth(NamedTuple):
-    """How a bus stands, and what has befallen it so far.
+    """The state of a bus, and its failures so far.
 
     Attributes:
         overruns: what was lost because a buffer between the bus and this process was full.
@@ -105,8 +105,8 @@ def conditions(buses: Mapping[str, Collection[str]] = MappingProxyType({})) -> l
 class SelfCheck:
     """Remembers what was seen before, and states the present state.
 
-    What is not known yet is not said to be normal: an alarm that stood before a restart would return, and
-    come again. What happens now and then is known once it was watched for `QUIET_NS`.
+    What is not known yet is not said to be normal: an alarm that was active before a restart would return,
+    and come again. What happens now and then is known once it was watched for `QUIET_NS`.
 
     Args:
         store: the store's directory.
@@ -169,7 +169,7 @@ class SelfCheck:
         if condition.level is not Level.NORMAL:
             self._said.add(name)
         elif name not in self._said and name in vitals.conditions_reported:
-            # It stood before a restart.
+            # It was active before a restart.
             if not watched:
                 return
             begun_ns = self._begun_ns.setdefault(name, vitals.now_ns)

@@ -87,7 +87,7 @@ class LoopLag:
     """How late the event loop gets round to things: a timer's lateness, 10 times a second for a minute.
 
     Attributes:
-        suspensions: how often it stood still for longer than `SUSPENDED_S`.
+        suspensions: how often it did not run for longer than `SUSPENDED_S`.
     """
 
     def __init__(self) -> None:
@@ -105,7 +105,7 @@ class LoopLag:
             if late_s > SUSPENDED_S:
                 self.suspensions += 1
                 logger.warning(
-                    "the process stood still for %.1f s (suspended, or starved by the host); samples that no "
+                    "the process did not run for %.1f s (suspended, or starved by the host); samples that no "
                     "buffer could hold meanwhile are counted as lost",
                     late_s,
                     extra=coded(TOO_SLOW),
@@ -303,7 +303,7 @@ class Service:
         await self.alarms.open()
         for watch in self.watches.values():
             await self._prepare(watch)
-        # Take over from the journal how the alarms stood when the service ended.
+        # Take over from the journal the states of the alarms when the service ended.
         await self.alarms.resume({name: watch.active_detectors() for name, watch in self.watches.items()})
         for name, watch in self.watches.items():
             if watch.recorder is not None:

@@ -8,7 +8,7 @@ data; samples that cannot be placed well enough are left out.
 The grid begins when all streams can be placed, some seconds after their first samples, or after `SETTLE_NS`
 at the latest. From then on it never waits long for a stream that is silent: its columns are NaN, and if it is
 the reference, the grid goes on by its last known rate. Silent is what states nothing although it is listened
-to: after the process stood still, what the buffers hold of one stream is read before that of the next.
+to: after a pause of the process, what the buffers hold of one stream is read before that of the next.
 """
 
 from __future__ import annotations

@@ -53,14 +53,14 @@ class StreamCounters:
         frames_reordered: of those, overtaken by a later frame and put back in order.
         frames_late: of those, arriving after their samples had been declared lost.
         frames_rejected: of those, with a counter that fits nothing.
-        frames_set_aside: of those, come while the stream could not be placed: its counter stood still or made
-            no sense, or far more frames came than the file states.
+        frames_set_aside: of those, come while the stream could not be placed: its counter did not change or
+            made no sense, or far more frames came than the file states.
         frames_wrong_length: frames of the stream's id that are shorter or longer than its layout.
         samples_received: samples handed on.
         samples_lost: samples that were lost, by the device's counter, or by time if it sends none.
         gaps: how often samples were missing.
-        values_absent: values in the samples handed on, of any channel, that the device said it does not have,
-            or that are not finite.
+        values_absent: values in the samples handed on, of any channel, that the device marked as
+            absent, or that are not finite.
     """
 
     frames_received: int = 0

@@ -32,7 +32,7 @@ class StreamState(NamedTuple):
     Attributes:
         doubt: why nothing can be judged by its samples; empty if there is no evidence against them.
         proven: whether its rate seems to be the nominal one, or could not be found out in time.
-        silent: whether the doubt is that nothing comes at all, since another one stood.
+        silent: whether the doubt is that nothing comes at all, since another doubt was active.
     """
 
     doubt: str = ""

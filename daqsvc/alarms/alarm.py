@@ -36,12 +36,12 @@ class ChatterWatch:
     """Counts how often one alarm is raised, by the time of the data.
 
     A chattering alarm, which nobody can read, is neither dropped nor cleared: it stays active, at its worst
-    level, and states it, until its level has stood still for a while. Its many comings and goings are then
+    level, and states it, until its level has not changed for a while. Its many comings and goings are then
     one occurrence.
 
     Args:
         handling: how often it may be raised, escalated or recur within which time; once more is chatter,
-            until its level has stood still for long enough. Time over which no data came does not count.
+            until its level has not changed for long enough. Time over which no data came does not count.
     """
 
     def __init__(self, handling: AlarmHandling) -> None:
@@ -203,11 +203,11 @@ class Alarm:
 
         Args:
             event: that event.
-            finding: `RuleFinding.identity` of what stood; empty if not known.
+            finding: `RuleFinding.identity` of what was active; empty if not known.
             since: when it was, by the clocks as they are now.
             now: the time now. Shelving goes on by the wall clock, which may have been set since: what was
                 left of it at ``told`` is never exceeded.
-            sentence: what stood, in words, where ``told`` does not say it; empty if not known.
+            sentence: what was active, in words, where ``told`` does not have it; empty if not known.
         """
         self._state, self._level = event.own_state, event.to_level
         self._holds = {Hold(state) for state in event.holds}

@@ -36,7 +36,7 @@ class FloodWatch:
         self.flooding = False
 
     def resume(self, now_ns: int) -> None:
-        """A flood stood before a restart: it lasts until a whole window shows that it is over."""
+        """A flood was active before a restart: it lasts until a whole window shows that it is over."""
         if self._most:
             self.flooding = True
             self._called_ns.extend([now_ns] * (self._most + 1))

@@ -212,7 +212,7 @@ class AlarmManager:
         *,
         restarted: bool = True,
     ) -> list[AlarmEvent]:
-        """Go on from where the alarms stood when the service ended; before the first diagnosis.
+        """Go on from the states of the alarms when the service ended; before the first diagnosis.
 
         Every alarm takes over its state, level, occurrence and holds, and holds them until a good diagnosis
         comes, which continues the occurrence or returns it. A suppression holds until whoever asked for
@@ -463,7 +463,7 @@ class AlarmManager:
             self._resume_ruled(ruled, event)
         elif not _stands(event):
             if name in self._alarms and ours:
-                # In a replay, where it has stood.
+                # In a replay, where it was active.
                 self._doubts.settle(name)
                 self._resume_unruled(event)
             return True

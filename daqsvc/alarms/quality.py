@@ -214,7 +214,7 @@ class SensorHealth:
         """Go on from before a restart, by ``t_ns``: what was lacking is good again when that has lasted.
 
         Args:
-            doubts: what stood against the sensors.
+            doubts: what the doubts about the sensors were.
             t_ns: monotonic time now.
             finding: what the alarm was raised by, as `finding` names it: the same is no change.
             restarted: whether that may have been long ago. Else a silence is over with the first good

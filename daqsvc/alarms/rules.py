@@ -108,11 +108,11 @@ class Watch(Protocol):
         """Go on from before a restart.
 
         Args:
-            level: the level that stood; normal if the condition was gone.
+            level: the level that was active; normal if the condition was gone.
             event: the last event.
 
         Returns:
-            `RuleFinding.identity` of what stood; empty if ``told`` does not tell.
+            `RuleFinding.identity` of what was active; empty if ``told`` does not have it.
         """
         ...
 

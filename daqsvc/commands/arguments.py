@@ -36,7 +36,7 @@ EXIT_LOST = 3
 EXIT_HUNG = 4
 """Of `run`: something hung while the service stopped."""
 EXIT_STUCK = 5
-"""Of `run`: the event loop stood still."""
+"""Of `run`: the event loop was blocked."""
 
 
 _ALIKE = 0.7

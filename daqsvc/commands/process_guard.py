@@ -2,7 +2,7 @@
 
 A thread hears the signals, so that a stop is carried out whatever the event loop does, and sees that the loop
 turns and that a stop comes to its end. Time is counted in the thread's own turns: a process that was
-suspended has neither stood still nor stopped late.
+suspended was neither blocked nor late to stop.
 """
 
 from __future__ import annotations
@@ -193,11 +193,11 @@ class ProcessGuard:
         self._turns_still = (self._turns_still or 0) + 1
         if self._turns_still == self._turns_said:
             still_s = self._turns_said * TURN_S
-            self._say(f"the event loop has stood still for {still_s:g} s: {self._where_loop_is()}")
+            self._say(f"the event loop has been blocked for {still_s:g} s: {self._where_loop_is()}")
         if self._turns_still > STUCK_TURNS:
             still_s = STUCK_TURNS * TURN_S
             self._end(
-                EXIT_STUCK, f"the event loop has stood still for {still_s:g} s: {self._where_loop_is()}"
+                EXIT_STUCK, f"the event loop has been blocked for {still_s:g} s: {self._where_loop_is()}"
             )
 
     def _answer(self) -> None:

@@ -70,7 +70,7 @@ class RunCommand:
         "next start. Exit code 0: it was stopped. Exit code 1: it could not start. Exit code 2: the "
         "machine file has errors. Exit code 3: it lost something that it cannot work without, such as "
         f"the writer of the journal. Exit code {EXIT_HUNG}: it hung while it stopped, and was killed. "
-        f"Exit code {EXIT_STUCK}: its event loop stood still, and it was killed."
+        f"Exit code {EXIT_STUCK}: its event loop was blocked, and it was killed."
     )
 
     def __init__(

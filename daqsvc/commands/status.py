@@ -140,12 +140,12 @@ class _Picture:
             _write(f"{text}\n" if text.startswith("{") else f"{text}\n\n")
 
     def wait(self, why: str, last: str) -> None:
-        """Show why nothing is known by now, and how things stood."""
+        """Show why nothing is known by now, and the last state."""
         if self._is_live:
             from daqsvc.commands.tables import harmless, wrapped  # noqa: PLC0415 - as above
 
             lines = wrapped(harmless(why), shutil.get_terminal_size().columns)
-            self._draw("\n".join([*lines, "", "It stood last:", last]))
+            self._draw("\n".join([*lines, "", "The last state:", last]))
         elif not self._waits:
             complain("daqsvc status", why, NO_SERVICE)
         self._waits = True

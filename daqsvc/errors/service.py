@@ -104,7 +104,7 @@ TOO_SLOW = Code(
     "It was suspended, has other work, or more comes than it can compute. Samples may be lost.",
     "Take other work off the computer, lower rates, or use a faster one.",
     "status.md",
-    "the process stood still for 3.2 s (suspended, or starved by the host); samples that no buffer could "
+    "the process did not run for 3.2 s (suspended, or starved by the host); samples that no buffer could "
     "hold "
     "meanwhile are counted as lost",
 )

@@ -228,7 +228,7 @@ class _Page:
         return self._html(request, "snapshots.html", title=f"Snapshots: {name}", view=None, **about)
 
     async def _healthy(self, machine: str, kept: Sequence[KeptSnapshot]) -> str:
-        """The newest snapshot during which no alarm stood, by the journal; "" if there is none."""
+        """The newest snapshot during which no alarm was active, by the journal; "" if there is none."""
         try:
             events = await self._source.journal(machine, "", MOST_EVENTS)
         except OSError:
@@ -429,7 +429,7 @@ def _figures(view: MachineView, live: MachineLive, chosen: Mapping[str, str], th
 
 
 def _stood(events: Sequence[Mapping[str, Any]], snapshot: KeptSnapshot) -> bool:
-    """Whether an alarm stood when a snapshot was made, by its last event before; the newest event first."""
+    """Whether an alarm was active when a snapshot was made, by its last event before; newest first."""
     at_ns = datetime.fromisoformat(snapshot.time_utc).timestamp() * NS_PER_S
     last: dict[str, str] = {}
     for event in events:

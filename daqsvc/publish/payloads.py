@@ -117,7 +117,7 @@ class CausePayload(_Statement):
 
 
 class PreviousPayload(JsonPayload):
-    """How the alarm stood before the event."""
+    """The state of the alarm before the event."""
 
     state: AlarmState = Field(description="state before the event")
     level: Severity = Field(description="level before the event")
@@ -156,7 +156,7 @@ class AlarmPayload(Stamped):
     holds: tuple[AlarmState, ...] = Field((), description="what covers the alarm, strongest first")
     covered: AlarmState | None = Field(None, description="the state below; null if nothing covers it")
     shelved_until_wall_ns: int | None = Field(None, description="when shelving ends; null if not shelved")
-    first_out: bool = Field(default=False, description="whether it stood first in its group")
+    first_out: bool = Field(default=False, description="whether it was the first active alarm of its group")
     chattering: bool = Field(
         default=False, description="whether it is raised and returns so often that returns are held back"
     )

@@ -19,7 +19,7 @@ OWN: Mapping[str, str] = {
     "sensor-ok/": "samples of the sensor are missing, or it is not OK",
     "detector-ok/": "samples of the detector are missing, or a sensor that it rests on is not OK",
     ALARM_FLOOD: "more alarms came within `flood_window_s` than `flood_alarms` of `[alarm_handling]`, and "
-    "not yet fewer than half as many; its message names the alarms that stood first",
+    "not yet fewer than half as many; its message names the alarms that came first",
     TRIP_MULTIPLY: "a start-up has multiplied the limits of alarms for longer than it may last",
     "store/disk": "less is free on the disk than `reserve_mb` of `[store]`",
     "store/journal": "alarm events are not written to the disk",
@@ -66,8 +66,9 @@ EVENTS: Mapping[str, str] = {
 
 
 MARKS: Mapping[str, str] = {
-    "first_out": "the alarm stood first of those of its `first_out_group`, which is where to look for the "
-    "cause; `daqsvc alarms` writes `first out` behind its state. It stays until all of the group are normal",
+    "first_out": "the alarm was the first active one of its `first_out_group`, which is where to look for "
+    "the cause; `daqsvc alarms` writes `first out` behind its state. It stays until all of the group are "
+    "normal",
     "chattering": "the alarm came and went so often that its returns are held back until it is quiet",
 }
 """What is reported about an alarm beside its state."""

@@ -59,7 +59,7 @@ WORDS: Mapping[str, str] = {
     "loop_lag_ms.p50": "lateness of the event loop within the last minute, median, in ms",
     "loop_lag_ms.p99": "lateness of the event loop within the last minute, 99th percentile, in ms",
     "loop_lag_ms.max": "lateness of the event loop within the last minute, maximum, in ms",
-    "suspensions": "how often the process stood still for more than a second",
+    "suspensions": "how often the process did not run for more than a second",
     "failures.NAME": "how often that part of the service has failed and was started again",
     "alarms.active": "alarms that are active by now",
     "alarms.unacknowledged": "alarms that nobody has acknowledged by now",

@@ -66,8 +66,8 @@ EXIT_CODES = (
     ExitCode(
         "EXIT_STUCK",
         "`run`",
-        "the event loop stood still for 30 s, and the service was ended by force",
-        "start it again; the log states where it stood",
+        "the event loop was blocked for 30 s, and the service was ended by force",
+        "start it again; the log states where it was blocked",
     ),
     ExitCode(
         "EXIT_INTERRUPTED",
@@ -77,7 +77,7 @@ EXIT_CODES = (
     ),
 )
 SIGNALS: Mapping[str, str] = {
-    "SIGTERM": "ends the service, or a verb that goes on and on, in good order within two seconds",
+    "SIGTERM": "ends the service, or a verb that runs until it is stopped, in good order within two seconds",
     "SIGINT": "the same: Ctrl-C",
     "SIGHUP": "has the service read its machine files again ([edge-box.md](../edge-box.md#reload)); where "
     "its terminal is gone it ends the service, unless it was started with `nohup`",

@@ -73,7 +73,7 @@ def load_machine_file(path: Path) -> MachineFile:
 
 
 def parse_machine_file(text: str, path: Path) -> MachineFile:
-    """Read a machine file from its text, as if it stood at ``path``.
+    """Read a machine file from its text, as if it were at ``path``.
 
     Args:
         text: TOML.
@@ -91,7 +91,7 @@ def parse_machine_file(text: str, path: Path) -> MachineFile:
 
 
 def machine_file_of(values: dict[str, Any], path: Path) -> MachineFile:
-    """A machine file from its values, as if it stood at ``path``.
+    """A machine file from its values, as if it were at ``path``.
 
     Args:
         values: what TOML would give.

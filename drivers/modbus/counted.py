@@ -34,7 +34,7 @@ AT_ONCE_NS = NS_PER_S
 """Time whose samples a device may show at once."""
 
 STANDSTILL_NS = 2 * NS_PER_S
-"""A count that falls behind the clock by more than this has stood still, or has begun again."""
+"""A count that falls behind the clock by more than this has stopped, or has begun again."""
 
 STILL_PERIODS = 4
 """A count that stays for longer than that, and than this number of samples or reads, stands still."""

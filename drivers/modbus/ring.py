@@ -178,7 +178,7 @@ class DeviceRingReader(CountedReader[RingLayout]):
         self._known = look, self._index + (look.written - self._next) % self._modulus
 
     def _written_since(self, look: _Look, known: _Look, following: int) -> int:
-        """Samples that are new for sure, whether the device has begun again at 0 or has stood still."""
+        """Samples that are new for sure, whether the device has begun again at 0 or has stopped."""
         if look.written > self._sample_clock.most(look.seen_ns - known.asked_ns) + self._at_once:
             return 0  # it has not begun at 0, so where it has is not known
         return look.written - following if look.written >= following else look.written

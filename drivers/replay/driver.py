@@ -352,7 +352,7 @@ class ReplayDriver:
     def _is_of_another_clock(self, due_ns: int, now_ns: int) -> bool:
         """Whether a growing log goes on with times of another clock: of the future, or before it was written.
 
-        That it is read late, because the process stood still, shows nothing of its clock.
+        That it is read late, because the process did not run, shows nothing of its clock.
         """
         if self._newest_ns is None:
             return False

@@ -60,10 +60,10 @@ class SerialCounters(BusCounters):
         frames_malformed: pieces of the byte stream that should have been a frame.
         resyncs: how often a frame was found again after something malformed.
         stalls: how often the reader had to wait because the event loop was behind.
-        overruns: bytes that the UART or the kernel's buffer lost, as far as the UART's driver tells.
-        framing_errors: characters without a stop bit, as far as the UART's driver tells.
-        parity_errors: characters of wrong parity, as far as it tells.
-        breaks: break conditions, as far as it tells.
+        overruns: bytes that the UART or the kernel's buffer lost, as far as the UART's driver reports.
+        framing_errors: characters without a stop bit, as far as the UART's driver reports.
+        parity_errors: characters of wrong parity, as far as it reports.
+        breaks: break conditions, as far as it reports.
     """
 
     bytes_received: int = 0

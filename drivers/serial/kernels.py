@@ -276,7 +276,7 @@ def hunt(
         limits: bytes of the shortest body and of the longest.
         initial: what the CRC begins with; negative if there is none.
         swap: whether its low byte comes first.
-        step: where the last hunt stood, in places of this buffer.
+        step: where the last hunt ended, in places of this buffer.
     """
     taken, at, fresh, astray, stray = step
     resume = at

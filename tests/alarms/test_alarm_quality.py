@@ -303,8 +303,8 @@ def test_other_words_for_the_same_sensor_are_told_once_other_figures_are_not():
     def stuck(reason):
         return kinds(rig.rms(0.0, "not_ok", reason=reason))
 
-    assert ("sensor-ok/probe-x", "raised") in stuck("stood still at 0.431 g for 38 of 200 samples")
-    assert stuck("stood still at 0.432 g for 1e+02 of 200 samples") == []
+    assert ("sensor-ok/probe-x", "raised") in stuck("stuck at 0.431 g for 38 of 200 samples")
+    assert stuck("stuck at 0.432 g for 1e+02 of 200 samples") == []
     assert stuck("does not move at all (0.431 g)") == [("sensor-ok/probe-x", "changed")]
     assert rig.status("sensor-ok/probe-x").message.endswith("does not move at all (0.431 g)")
     for _ in range(20):

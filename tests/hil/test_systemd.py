@@ -206,7 +206,7 @@ def test_whatever_ends_it_it_is_started_again_and_its_alarms_stand_as_they_did(u
     assert "CRITICAL detector levels/shaft has stalled" in journal(least="crit")
     said = journal()
     assert "detector levels/shaft has stalled, without a step for 6 s" in said
-    still = r"the event loop has stood still for 3 s: the event loop is in (look|is_to_hang) \(unit_main\.py"
+    still = r"the event loop has been blocked for 3 s: the event loop is in (look|is_to_hang) \(unit_main\.py"
     assert re.search(still, said), said
     assert said.count("Watchdog timeout (limit 6s)!") == 2, said
     assert "works again" not in said

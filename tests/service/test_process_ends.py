@@ -213,7 +213,7 @@ def test_an_event_loop_that_stands_still_ends_the_process(tmp_path: Path) -> Non
         let_hang(tmp_path)
         said = rest_of(process)
         assert process.wait(PATIENCE_S) == 5, said
-    assert "the event loop has stood still for 1 s: the event loop is in " in said
+    assert "the event loop has been blocked for 1 s: the event loop is in " in said
     assert closed(tmp_path)
 
 

@@ -409,6 +409,6 @@ def _dead(channel: LevelChannel, count: int, still: Standstill | None) -> str:
             "check sensor, cable and supply"
         )
     return (
-        f"{channel.sensor} stood still at {value} for {still.samples} of {count} samples: dead or "
+        f"{channel.sensor} was stuck at {value} for {still.samples} of {count} samples: dead or "
         "disconnected for a part of the time; check sensor, cable and supply"
     )

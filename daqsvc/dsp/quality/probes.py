@@ -118,7 +118,7 @@ class RevolutionJudge:
             if not moves and stands_still(known[:, column : column + 1]):
                 return RevolutionQuality(
                     "not_ok",
-                    f"{probe.name}: stood still at {known[0, column]:.6g} um for a revolution; "
+                    f"{probe.name}: stuck at {known[0, column]:.6g} um for a revolution; "
                     "check the probe, its cable and driver",
                 )
             least = max(least_motion_um, DEAD * float(deviations[1 - column]))
@@ -139,7 +139,7 @@ class RevolutionJudge:
             if still is not None:
                 return RevolutionQuality(
                     "not_ok",
-                    f"{probe.name}: stood still at {still.value:.6g} um for {still.samples} of {len(known)} "
+                    f"{probe.name}: stuck at {still.value:.6g} um for {still.samples} of {len(known)} "
                     "samples of a revolution; check the probe, its cable and driver",
                 )
         return RevolutionQuality()

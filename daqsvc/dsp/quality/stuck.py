@@ -72,7 +72,7 @@ class Standstill(NamedTuple):
     Attributes:
         first: its first sample, counted from the beginning of the window.
         samples: how many of the window's samples it holds; all of them if the sensor never moved.
-        value: where the sensor stood, in the unit of the samples.
+        value: what the sensor repeated, in the unit of the samples.
     """
 
     first: int

@@ -102,7 +102,7 @@ def service_metrics(machine: str, figures: Figures, oldest_age_s: float | None) 
     words = "Lateness of the event loop within the last minute"
     yield make.gauge("event_loop_lag_p99_seconds", f"{words}: 99th percentile.", {(): lag["p99"] / 1000})
     yield make.gauge("event_loop_lag_max_seconds", f"{words}: maximum.", {(): lag["max"] / 1000})
-    words = "How often the process stood still for more than a second."
+    words = "How often the process did not run for more than a second."
     yield make.count("suspensions", words, {(): figures["suspensions"]})
     words = "How often a part of the service has failed and was started again."
     yield make.count("part_failures", words, {(): sum(figures["failures"].values())})

@@ -142,7 +142,7 @@ class MetricsOutput(Output, Collector):
         """Why the service is not healthy, a sentence each; on any thread."""
         late_s = time.monotonic() - self._looked_s
         if late_s > STALLED_S:
-            return [f"the event loop has stood still for {late_s:.0f} s"]
+            return [f"the event loop has been blocked for {late_s:.0f} s"]
         return [f"{part} has taken no step for {STALLED_S:g} s or more" for part in self._stalled]
 
     async def _listening(self) -> MetricsServer:

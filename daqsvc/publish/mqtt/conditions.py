@@ -56,8 +56,8 @@ class BrokerVitals:
 class BrokerCheck:
     """Remembers which certificates are about to end, and states the present state with the broker.
 
-    What is not known yet is not said to be normal: an alarm that stood before a restart would return, and
-    come again.
+    What is not known yet is not said to be normal: an alarm that was active before a restart would return,
+    and come again.
     """
 
     def __init__(self) -> None:

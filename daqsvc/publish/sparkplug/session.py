@@ -63,8 +63,8 @@ class SparkplugCounters:
         connected: whether there is a session now.
         connections: how many there have been.
         births: births of the node, by request or new metrics too.
-        alarms: alarm events told as they happened.
-        historical: alarm events told as history.
+        alarms: alarm events published as they happened.
+        historical: alarm events published as history.
         data: messages with figures of the device.
         commands: what hosts have written to alarms and was carried out.
         commands_refused: commands that ask for what cannot be had, or were refused.

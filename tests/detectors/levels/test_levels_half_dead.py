@@ -60,7 +60,7 @@ def test_a_contact_that_fails_within_a_window_is_told():
     samples[700:760] = 0.0
     said = statements(samples)
     assert [d.quality for d in said].count("not_ok") == 2
-    assert "probe-x stood still at 0 um for 50 of 150 samples" in said[4].reason
+    assert "probe-x was stuck at 0 um for 50 of 150 samples" in said[4].reason
 
 
 def test_a_service_that_starts_beside_a_dead_sensor_waits_for_a_window_that_is_alive():

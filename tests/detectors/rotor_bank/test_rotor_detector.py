@@ -183,7 +183,7 @@ def keyphasor_gone(part):
 @pytest.mark.parametrize(
     ("spoil", "quality", "reason"),
     [
-        (dead, "not_ok", "probe-x: stood still at 12.5 um"),
+        (dead, "not_ok", "probe-x: stuck at 12.5 um"),
         (nearly_dead, "not_ok", "probe-y: moved by"),
         (clipped, "not_ok", "probe-x: clipped at -15"),
         (at_the_rail, "not_ok", "probe-y: clipped at 5"),

@@ -265,7 +265,7 @@ def noise_for_keyphasor(part):
 
 
 BAD = [
-    (dead, "not_ok", "probe-x: stood still at 12.5 um"),
+    (dead, "not_ok", "probe-x: stuck at 12.5 um"),
     (unplugged, "not_ok", "probe-y: "),
     (clipped, "not_ok", "probe-x: clipped at"),
     (at_the_rail, "not_ok", "probe-y: clipped at -8 um"),

@@ -29,7 +29,7 @@ def test_a_revolution_with_a_dead_part_is_not_good(column, part, stands_at):
     verdict = RevolutionJudge(PROBES).judge(samples, 0.1)
     assert verdict.quality == "not_ok"
     still = part.stop - part.start
-    assert f"{PROBES[column].name}: stood still at {stands_at:g} um for {still} of 64" in verdict.reason
+    assert f"{PROBES[column].name}: stuck at {stands_at:g} um for {still} of 64" in verdict.reason
 
 
 @given(
@@ -45,4 +45,4 @@ def test_a_converter_of_any_coarseness_stands_still_nowhere(samples, steps, seco
     motion = np.cos(turn) + second * np.cos(2 * turn + offset)
     x, y = (np.round(steps * np.roll(motion, k) + offset) for k in (0, samples // 4))
     verdict = RevolutionJudge(PROBES).judge(np.column_stack((x, y)), 0.1)
-    assert "stood still" not in verdict.reason
+    assert "stuck at" not in verdict.reason

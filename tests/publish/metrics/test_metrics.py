@@ -250,7 +250,7 @@ async def test_an_event_loop_that_stands_still_is_said_all_the_same(
         time.sleep(0.4)  # noqa: ASYNC251 - that is what is tested
         status, words = get(port, "/healthz")
         assert status == 503
-        assert words.startswith("the event loop has stood still for ")
+        assert words.startswith("the event loop has been blocked for ")
 
 
 async def test_a_port_in_use_is_said_once_and_taken_when_it_is_free(
