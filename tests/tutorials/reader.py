@@ -12,6 +12,9 @@ A tutorial is Markdown. What the reader does is written in it like this:
 - "Save this as `NAME`" before a block: the reader writes that file.
 - "Open `URL` in a browser" before a block: the page has the words of each line of it.
 - "In `NAME`, replace" before a block, and "by" before the next one: the reader changes that file.
+- "These lines of `NAME`" before a block: that file has them.
+
+A block that is introduced in another way ends the reading with an error, unless `NOT_HERE` names it.
 
 Ports that other programs may have taken are replaced by free ones, and ``/tmp`` by a folder of this
 reader's own.
@@ -52,13 +55,31 @@ _FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _TERMINAL = re.compile(r"\b[Ii]n (?:a|the) (first|second|third|fourth) terminal")
 _SAVE = re.compile(r"[Ss]ave this as `([^`]+)`")
 _REPLACE = re.compile(r"[Ii]n `([^`]+)`, replace")
+_HAS = re.compile(r"[Tt]hese lines of `([^`]+)`")
 _OPEN = re.compile(r"[Oo]pen `http://([^`]+)` in a browser")
 _COLUMNS = 100
 _LOOK = re.compile(r"daqsvc (status|alarms|trend)\b(?!.*--watch)")
 
 
+NOT_HERE = {
+    (
+        "05-can.md",
+        "ip link set can0 up type can bitrate 500000\n",
+    ): "needs a CAN controller: tests/hil/test_vcan_shown.py::test_the_bit_rate_of_the_tutorial_is_set",
+    (
+        "08-broker-and-home-assistant.md",
+        '[mqtt]\nurl = "mqtts://broker.example:8883"\n',
+    ): "needs the broker of a plant: tests/tutorials/test_tutorials.py::test_a_part_of_a_machine_file_fits",
+}
+"""Blocks that the reader passes over, by page and begin: why, and the test that runs or reads them."""
+
+
 class NotAsShownError(AssertionError):
     """Something else came than the tutorial shows."""
+
+
+class UnreadBlockError(AssertionError):
+    """The reader does not know what to do with a block."""
 
 
 @dataclass
@@ -69,21 +90,44 @@ class Step:
         words: the paragraph.
         language: of the block.
         text: what is in it.
+        line: where it begins, from 1.
     """
 
     words: str
     language: str
     text: str
+    line: int
 
 
 def steps(markdown: str) -> list[Step]:
-    """The blocks of a tutorial, in order."""
+    """The blocks of a tutorial, in order.
+
+    Raises:
+        UnreadBlockError: a fence does not begin its line, or is of another kind.
+    """
     found, end = [], 0
     for match in _FENCE.finditer(markdown):
         between = markdown[end : match.start()].strip()
-        found.append(Step(between.split("\n\n")[-1].replace("\n", " "), match[1], match[2]))
+        line = markdown.count("\n", 0, match.start()) + 1
+        found.append(Step(between.split("\n\n")[-1].replace("\n", " "), match[1], match[2], line))
         end = match.end()
+    outside = re.compile(r"^[ \t>]*(?:```|~~~)", re.MULTILINE)
+    blank = _FENCE.sub(lambda match: "\n" * match[0].count("\n"), markdown)
+    if (other := outside.search(blank)) is not None:
+        line = blank.count("\n", 0, other.start()) + 1
+        raise UnreadBlockError(f"line {line}: the reader does not read this fence: {other[0]!r}")
     return found
+
+
+def is_introduced(step: Step) -> bool:
+    """Whether the paragraph before a block states what a reader does with it."""
+    found = any(known.search(step.words) for known in (_SAVE, _REPLACE, _HAS, _OPEN))
+    return found or step.words.strip(" :") == "by"
+
+
+def is_passed_over(page: str, step: Step) -> bool:
+    """Whether a block of a page is one of `NOT_HERE`."""
+    return any(page == where and step.text.startswith(begin) for where, begin in NOT_HERE)
 
 
 @dataclass
@@ -243,13 +287,20 @@ class Reader:
         self._terminals: dict[str, Terminal] = {}
         self._at = "first"
         self._replaced: tuple[Path, str] | None = None
+        self._page = ""
 
-    def follow(self, markdown: str) -> None:
+    def follow(self, markdown: str, page: str = "text") -> None:
         """Do all that a tutorial says.
+
+        Args:
+            markdown: its text.
+            page: its name, for messages.
 
         Raises:
             NotAsShownError: something else came than it shows.
+            UnreadBlockError: it has a block that the reader does not know what to do with.
         """
+        self._page = page
         for port, free in self._ports.items():
             markdown = re.sub(rf"\b{port}\b", free, markdown)
         markdown = markdown.replace(SHARED_TMP, self._own_tmp)
@@ -258,8 +309,10 @@ class Reader:
                 self._type(step)
             elif (address := _OPEN.search(step.words)) is not None:
                 self._look(address[1], step.text)
-            else:
+            elif not is_passed_over(page, step):
                 self._write(step)
+        if self._replaced is not None:
+            raise UnreadBlockError(f"{page}: no block follows with what is put in {self._replaced[0].name}")
         for terminal in self._terminals.values():
             terminal.finish()
 
@@ -296,14 +349,25 @@ class Reader:
                 raise NotAsShownError(f"{address} does not show {line!r}:\n{page}")
 
     def _write(self, step: Step) -> None:
+        if self._replaced is not None and step.words.strip(" :") != "by":
+            raise UnreadBlockError(f'{self._page}:{step.line}: "by" and a block have to follow "replace"')
         if (save := _SAVE.search(step.words)) is not None:
             (self.folder / save[1]).write_text(step.text, encoding="utf-8")
         elif (replace := _REPLACE.search(step.words)) is not None:
             self._replaced = (self.folder / replace[1], step.text)
-        elif self._replaced is not None and step.words.strip(" :") == "by":
+        elif (has := _HAS.search(step.words)) is not None:
+            self._found_once(self.folder / has[1], step.text)
+        elif self._replaced is not None:
             file, old = self._replaced
-            text = file.read_text(encoding="utf-8")
-            if text.count(old) != 1:
-                raise NotAsShownError(f"{file.name} has {text.count(old)} times:\n{old}")
-            file.write_text(text.replace(old, step.text), encoding="utf-8")
+            file.write_text(self._found_once(file, old).replace(old, step.text), encoding="utf-8")
             self._replaced = None
+        else:
+            where, after = f"{self._page}:{step.line}", step.words[-80:]
+            raise UnreadBlockError(f"{where}: nothing says what to do with this block, after {after!r}")
+
+    @staticmethod
+    def _found_once(file: Path, part: str) -> str:
+        text = file.read_text(encoding="utf-8")
+        if text.count(part) != 1:
+            raise NotAsShownError(f"{file.name} has {text.count(part)} times:\n{part}")
+        return text

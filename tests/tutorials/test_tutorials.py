@@ -5,12 +5,26 @@ from __future__ import annotations
 import re
 import shutil
 import tempfile
+import tomllib
 from pathlib import Path
 
 import pytest
 from support.brokers import mosquitto_program
+from support.machine_files import MACHINES
 from support.paths import ROOT
-from tutorials.reader import NotAsShownError, Reader, steps
+from support.snippets import completed
+from tutorials.reader import (
+    NOT_HERE,
+    NotAsShownError,
+    Reader,
+    Step,
+    UnreadBlockError,
+    is_introduced,
+    is_passed_over,
+    steps,
+)
+
+from daqsvc.settings.load import machine_file_of
 
 pytestmark = pytest.mark.integration
 TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("[0-9]*.md"))
@@ -44,7 +58,62 @@ def test_a_tutorial_is_true_word_for_word(reader: Reader, path: Path) -> None:
         mosquitto_program()
         mosquitto_program("mosquitto_sub", "mosquitto-clients")
     for one in (*goes_on_from(path), path):
-        reader.follow(one.read_text(encoding="utf-8"))
+        reader.follow(one.read_text(encoding="utf-8"), one.name)
+
+
+def passed_over() -> list[tuple[str, Step]]:
+    """The blocks that the reader passes over, each with its page."""
+    every = [(path.name, step) for path in TUTORIALS for step in steps(path.read_text(encoding="utf-8"))]
+    return [(page, step) for page, step in every if is_passed_over(page, step)]
+
+
+def test_few_blocks_are_passed_over_and_a_test_of_each_is_there() -> None:
+    assert len(NOT_HERE) <= 2
+    assert [page for page, _ in passed_over()] == [page for page, _ in NOT_HERE]
+    for why in NOT_HERE.values():
+        file, name = re.findall(r"(tests/\S+\.py)::(\w+)", why)[0]
+        assert f"\ndef {name}(" in (ROOT / file).read_text("utf-8")
+
+
+def test_a_part_of_a_machine_file_fits() -> None:
+    rig = MACHINES / "virtual-rig.toml"
+    [part] = [tomllib.loads(step.text) for _, step in passed_over() if step.language == "toml"]
+    machine = tomllib.loads(rig.read_text("utf-8"))
+    del machine["mqtt"]
+    assert machine_file_of(completed(machine, part), rig).mqtt.url == part["mqtt"]["url"]
+
+
+def test_each_block_is_one_that_the_reader_knows() -> None:
+    """Of the long ones, too: without doing what they state."""
+    for path in TUTORIALS:
+        for step in steps(path.read_text(encoding="utf-8")):
+            known = step.language == "console" or is_introduced(step) or is_passed_over(path.name, step)
+            assert known, f"{path.name}:{step.line}"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("In `f` replace\n\n```toml\nold\n```\n", "text:3: nothing says what to do with this block"),
+        ("As root:\n\n```sh\nip link set can0 upp\n```\n", "after 'As root:'"),
+        ("In `f`, replace\n\n```toml\nold\n```\n", "no block follows with what is put in f"),
+        ("In `f`, replace\n\n```\nold\n```\n\nthus\n\n```\nnew\n```\n", 'text:9: "by" and a block'),
+        ("- Type:\n\n  ```console\n  $ never\n  ```\n", "line 3: the reader does not read this fence"),
+        ("~~~\nnever\n~~~\n", "line 1: the reader does not read this fence"),
+    ],
+)
+def test_a_block_that_nothing_introduces_is_refused(reader: Reader, text: str, words: str) -> None:
+    (reader.folder / "f").write_text("old")
+    with pytest.raises(UnreadBlockError) as caught:
+        reader.follow(text)
+    assert words in f"{caught.value}"
+
+
+def test_lines_that_a_file_has_are_looked_for_there(reader: Reader) -> None:
+    (reader.folder / "f").write_text("one\ntwo\n")
+    reader.follow("These lines of `f` count:\n\n```text\ntwo\n```\n")
+    with pytest.raises(NotAsShownError, match="f has 0 times"):
+        reader.follow("These lines of `f` count:\n\n```text\nthree\n```\n")
 
 
 @pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)
