@@ -218,9 +218,8 @@ RING_DEPTH = Code(
     "If the depth is no power of two, the place of a sample is not known once the counter has wrapped.",
     "Set the device to a depth of 2, 4, 8, ... places.",
     "modbus.md",
-    example="machine.toml:74: streams.ring.layout.depth = 10000000000000: is not a power of two: where a "
-    "sample lies would not be known once the counter wraps. Remedy: set the device to 8796093022208 "
-    "or 17592186044416 places",
+    example="machine.toml:74: streams.ring.layout.depth = 1000: is not a power of two: where a sample lies "
+    "would not be known once the counter wraps. Remedy: set the device to 512 or 1024 places",
 )
 NOT_PLAYABLE = Code(
     "B23",

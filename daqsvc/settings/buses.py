@@ -107,6 +107,8 @@ class Layout(Hooks, Section):
     """The key by which a table is known to be of this kind; the first kind of all needs none."""
     channels_key: ClassVar[str] = "channels"
     """The key that lists the channels."""
+    usual_rate_hz: ClassVar[float] = 640.0
+    """The rate that a remedy shows for streams of this kind."""
     number_keys: ClassVar[str] = ""
     """The keys that say how bytes become numbers, e.g. ``"order and type"``; of texts there are none."""
 

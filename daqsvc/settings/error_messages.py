@@ -22,6 +22,7 @@ from daqsvc.errors.machine_file import (
     WRONG_TYPE,
 )
 from daqsvc.settings.aliases import meant_key
+from daqsvc.settings.buses import Layout
 from daqsvc.settings.registry import first_detector
 from daqsvc.settings.schema import (
     adapter,
@@ -51,6 +52,7 @@ _TRUE_WORDS = {"1", "on", "true", "y", "yes", "ja", "j", "oui", "si"}
 _FALSE_WORDS = {"0", "off", "false", "n", "no", "nein", "non"}
 _MOST_IN_A_ROW = 4
 """Values that belong together, e.g. the two ends of a range; whatever may be longer is a list."""
+_OF_CANDUMP = "write the id of the frames, which candump shows"
 _SECRET = re.compile(r"pass|secret|token|credential", re.IGNORECASE)
 
 
@@ -234,18 +236,22 @@ class ErrorFormatter:
         )
         if len(allowed) == 1:
             return message, f"write {self._key(path)} = {listed[0]}"
+        usual = self._example(path)
+        example = usual if usual in listed else listed[0]
         if isinstance(value, str):
             if value in {str(item) for item in allowed}:
                 return message, f"take the quotes away: {self._key(path)} = {value}"
             meant = _meant(value, [item for item in allowed if isinstance(item, str)])
             if meant is not None:
                 return message, f'did you mean "{meant}"?'
-        return message, f"write one of these, e.g. {self._key(path)} = {listed[0]}"
+        return message, f"write one of these, e.g. {self._key(path)} = {example}"
 
     def _greater_than(self, path: KeyPath, context: Mapping[str, Any]) -> tuple[str, str]:
         return f"must be greater than {context['gt']:g}", self._write_example(path)
 
     def _greater_than_equal(self, path: KeyPath, context: Mapping[str, Any]) -> tuple[str, str]:
+        if path[-1] == "id":
+            return f"must be {context['ge']} or more", _OF_CANDUMP
         return f"must be {_shown(context['ge'])} or more", self._write_example(path)
 
     def _less_than(self, path: KeyPath, context: Mapping[str, Any]) -> tuple[str, str]:
@@ -254,7 +260,7 @@ class ErrorFormatter:
     def _less_than_equal(self, path: KeyPath, context: Mapping[str, Any]) -> tuple[str, str]:
         limit = context["le"]
         if path[-1] == "id":
-            return f"must be {limit:#x} or less", "write the id of the frames, which candump shows"
+            return f"must be {limit:#x} or less", _OF_CANDUMP
         return f"must be {_shown(limit)} or less", self._write_example(path)
 
     def _string_pattern_mismatch(self, path: KeyPath, context: Mapping[str, Any]) -> tuple[str, str]:
@@ -335,7 +341,7 @@ class ErrorFormatter:
         if field is None:
             return None
         if field.examples:
-            example = field.examples[0]
+            example = self._usual_rate_hz(path) or field.examples[0]
             # Examples that are TOML already: arrays, inline tables, hexadecimal numbers.
             if isinstance(example, str) and example.startswith(("[", "{", "0x")):
                 return example
@@ -346,6 +352,17 @@ class ErrorFormatter:
         if isinstance(field.default, bool | int | float | str | tuple):
             return json.dumps(field.default)
         return None
+
+    def _usual_rate_hz(self, path: KeyPath) -> float | None:
+        """Of the rate of a stream whose layout is known: what is usual depends on that."""
+        if len(path) != 3 or (path[0], path[-1]) != ("streams", "rate_hz"):
+            return None
+        at = (*path[:-1], "layout")
+        try:
+            layout = section_of(declared_at(self._root, self._document, at), value_at(self._document, at))
+        except LookupError:
+            return None
+        return layout.usual_rate_hz if layout is not None and issubclass(layout, Layout) else None
 
     def _write_example(self, path: KeyPath) -> str:
         example = self._example(path)

@@ -93,8 +93,13 @@ _REGISTERS: dict[RegisterType, int] = {
 }
 
 
+_LEAST_DEPTH, _MOST_DEPTH = 2, 32_768
+"""Samples of a ring."""
+
+
 def _power_of_two(depth: int) -> int:
-    if depth & (depth - 1):
+    # Beyond its limits, these are what is to be corrected.
+    if _LEAST_DEPTH <= depth <= _MOST_DEPTH and depth & (depth - 1):
         below = 2 ** (depth.bit_length() - 1)
         raise PydanticCustomError(
             "ring_depth",
@@ -352,6 +357,8 @@ class _Sampled(_ModbusLayout):
 class RegistersLayout(_ModbusLayout):
     """Registers that always show the present values, polled on a schedule."""
 
+    usual_rate_hz: ClassVar[float] = 1.0
+
     kind: ClassVar[str] = 'a layout with way = "registers"'
 
     way: Annotated[
@@ -498,7 +505,7 @@ class RingLayout(_Sampled):
         int,
         AfterValidator(_power_of_two),
         InSchema(enum=[1 << exponent for exponent in range(1, 16)]),
-        Field(ge=2, le=32_768, description="samples that the ring holds", examples=[256]),
+        Field(ge=_LEAST_DEPTH, le=_MOST_DEPTH, description="samples that the ring holds", examples=[256]),
     ]
 
     @property

@@ -46,6 +46,7 @@ GIVEN: list[tuple[str, Path, list[tuple[str, str]]]] = [
     ("B17", MODBUS, [("address = 16\ndepth = 1024", "address = 65000\ndepth = 1024")]),
     ("B18", MODBUS, [('name = "t", address = 0,', 'name = "t", address = 100,')]),
     ("B21", MODBUS, [("bits = [0, 12], scale = 0.1", "bits = [30, 12], scale = 0.1")]),
+    ("B22", MODBUS, [("address = 16\ndepth = 1024", "address = 16\ndepth = 1000")]),
     ("B26", MODBUS, [('name = "t", address = 0,', 'name = "t", address = 40018,')]),
     (
         "B45",

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
-from support.machine_files import LAVAL, changed, only_problem, problems_of
+from support.machine_files import LAVAL, MACHINES, changed, only_problem, problems_of
 
 from daqsvc.settings import MachineFileError, load_machine_file, parse_machine_file
 
@@ -38,7 +38,8 @@ ONE_VALUE = [
         "0x1fffffff",
         "candump shows",
     ),
-    ("bits = 16", "bits = 12", "streams.shaft.layout.counter.bits", "12", "8, 16 or 32", "bits = 8"),
+    ("bits = 16", "bits = 12", "streams.shaft.layout.counter.bits", "12", "8, 16 or 32", "bits = 16"),
+    ("id = 0x101", "id = -1", "streams.shaft.layout.id", "-1", "must be 0 or more", "candump shows"),
     ("bits = 16", 'bits = "16"', "streams.shaft.layout.counter.bits", '"16"', "8, 16 or 32", "bits = 16"),
     (
         'type = "int16", scale = 0.001 }',
@@ -477,3 +478,23 @@ def test_dots_alone_are_no_name_and_are_not_proposed(name):
     assert problem.key == "machine.name"
     assert problem.message.endswith("dots alone are no name")
     assert problem.remedy == "give it a name"
+
+
+@pytest.mark.parametrize(
+    ("rate", "verb"), [("rate_hz = 0", "write"), ("rate_hz = -1.0", "write"), ("", "add")]
+)
+def test_the_rate_of_values_that_are_polled_is_that_of_no_waveform(rate, verb):
+    file = MACHINES / "modbus-vibration-temperature.toml"
+    text = file.read_text("utf-8")
+    assert "rate_hz = 1.0\n" in text
+    with pytest.raises(MachineFileError) as refused:
+        parse_machine_file(text.replace("rate_hz = 1.0\n", f"{rate}\n", 1), file)
+    assert f"Remedy: {verb} rate_hz = 1.0 " in str(refused.value)
+
+
+def test_a_remedy_shows_what_is_usual_of_what_is_allowed():
+    file = MACHINES / "serial-probes.toml"
+    text = file.read_text("utf-8")
+    with pytest.raises(MachineFileError) as refused:
+        parse_machine_file(text.replace('driver = "serial"\n', 'driver = "serial"\ndata_bits = 9\n', 1), file)
+    assert "e.g. data_bits = 8" in str(refused.value)

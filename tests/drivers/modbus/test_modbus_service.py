@@ -225,6 +225,7 @@ WAVEFORM = FIFO.replace('"fifo"', '"waveform"') + "block_id = 0\nsamples = 1024\
     ("layout", "key", "message"),
     [
         (RING.replace("64", "65"), "depth", "is not a power of two"),
+        (RING.replace("64", "65537"), "depth", "must be 32768 or less. Remedy: write depth = 256"),
         (
             RING.replace('place = 1, type = "int16"', 'place = 124, type = "int32"'),
             "channels",
