@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from cantools.database.can import Message
 
+_SOCKETCAN = "socketcan"
 _RATES_HZ = (2560.0, 1280.0, 640.0, 100.0, 10.0)
 _MOST_FRAMES_HZ = 500.0
 """Of a default: a CAN bus of 500 kbit/s has time for some 4000 short frames a second."""
@@ -32,6 +33,20 @@ _LISTEN_S = 5.0
 _SHOWN = 8
 _SURE_FRAMES = 20
 """Frames of a message without a signal that counts, after which it is taken to have none."""
+
+
+def _interface(text: str) -> str:
+    """An interface that python-can, or a plugin of it, knows."""
+    if text == _SOCKETCAN:
+        return text
+    from can.interfaces import BACKENDS  # noqa: PLC0415 - slow to import
+
+    from daqsvc.settings.problems import choice  # noqa: PLC0415 - brings the settings
+
+    if q.line(text) not in BACKENDS:
+        remedy = f"{choice(text, BACKENDS)}; or install the python-can plugin that brings it"
+        raise ValueError(f'"{text}" is no interface that python-can knows. Remedy: {remedy}')
+    return text
 
 
 class _CanQuestions(BusQuestions):
@@ -89,7 +104,7 @@ class _CanQuestions(BusQuestions):
         raise NotImplementedError
 
     def _interface(self) -> Iterator[Question]:
-        yield self.ask("interface", q.line, "socketcan", quiet=True)
+        yield self.ask("interface", _interface, _SOCKETCAN, quiet=True)
         yield self.ask("channel", q.line, "can0")
 
     def _bit_rates(self, answers: Answers, *, fd: bool) -> Iterator[Question]:

@@ -35,6 +35,7 @@ _READ_REGISTERS, _FIFO_REGISTERS = 125, 31
 _UNITS, _WHOLE = ("1-10", "11-247"), "1-247"
 """Most devices have one of the first addresses; to ask for all takes a minute."""
 _AUTO = "auto"
+_TIMEOUT_MS = 500.0
 _TABLES = {3: "holding", 4: "input"}
 _SHOWN = 12
 
@@ -46,6 +47,10 @@ class _ModbusQuestions(BusQuestions):
         "units": Topic(
             "Which units does --listen look for?",
             "auto: 1-10, and 11-247 if none of those answers. Else addresses, e.g. 1-247 or 5,17.",
+        ),
+        "timeout-ms": Topic(
+            "How long may the unit take to answer, in ms",
+            "500 is enough for most. A slow unit, or one behind a gateway, needs more, e.g. 1500.",
         ),
         "unit": Topic(
             "Address of the unit (slave id)", "1 to 247; set in the device, by switches or software."
@@ -84,8 +89,12 @@ class _ModbusQuestions(BusQuestions):
             "What do the registers of {channel} hold?",
             "The register map states it. One register: uint16 (UINT, WORD, unsigned) or int16 (INT, signed). "
             "Two: uint32 (UDINT, ULONG, DWORD), int32 (DINT, LONG) or float32 (REAL, FLOAT, IEEE 754). Four: "
-            "uint64, int64 or float64 (LREAL, DOUBLE). Of a status word take uint16; add bits to its channel "
-            "in the file for one bit of it.",
+            "uint64, int64 or float64 (LREAL, DOUBLE). Of a status word take uint16.",
+        ),
+        "bits": Topic(
+            "Which bits of {channel} are wanted?",
+            "Of a status or alarm word: the number of one bit, from 0 for the lowest, e.g. 3; or the first "
+            "and the last of several, e.g. 4-7. none takes the whole number.",
         ),
         "order": Topic("Byte order of {channel}", "ABCD is the usual one; CDAB has its words exchanged."),
         "no-value": Topic(
@@ -106,6 +115,8 @@ class _ModbusQuestions(BusQuestions):
         words = self._sniffed_as(answers)
         chosen: str = answers["units"]
         try:
+            if answers["timeout-ms"] != _TIMEOUT_MS:
+                words = ["--timeout-ms", f"{answers['timeout-ms']:g}", *words]
             first = _UNITS[0] if chosen == _AUTO else chosen
             found = sniffed(ModbusSniffer(), ["--units", first, *words], stop, tell)
         except NothingFoundError as error:
@@ -126,6 +137,9 @@ class _ModbusQuestions(BusQuestions):
         if chosen == _AUTO and found["units_asked"][0] == int(_UNITS[0].partition("-")[0]):
             lines.append(f"units {_UNITS[1]} were not asked: daqsvc new --listen --units {_WHOLE} asks all")
         return Heard(lines, lambda so_far: self._proposals(found, so_far))
+
+    def _ask_timeout(self) -> Question:
+        return self.ask("timeout-ms", q.number, f"{_TIMEOUT_MS:g}")
 
     def _ask_units(self) -> Question:
         """Which units are to be found; only an option is asked for them."""
@@ -252,6 +266,8 @@ class _ModbusQuestions(BusQuestions):
         default = "int16" if unit == "degC" else "uint16"
         yield self.ask_of(channel, "register-type", q.one_of(types), default, choices=types)
         wide = _width(answers[sensor_key(channel, "register-type")]) > 1
+        is_word = _WORD.search(channel) is not None and _is_unsigned(answers, channel)
+        yield self.ask_of(channel, "bits", _bits, NONE, quiet=not is_word)
         yield self.ask_of(channel, "order", q.exactly(orders), "ABCD", choices=orders, quiet=not wide)
         is_float = answers[sensor_key(channel, "register-type")].startswith("float")
         scale = "1" if is_float else _USUAL_SCALES.get(unit or "", "1")
@@ -294,7 +310,7 @@ class _ModbusQuestions(BusQuestions):
         yield f"[buses.{BUS}]"
         yield entry("driver", "modbus")
         yield from self._line_keys(answers)
-        yield entry("timeout_ms", 500.0, "how long the unit may take to answer")
+        yield entry("timeout_ms", answers["timeout-ms"], "how long the unit may take to answer")
         written = answers.get("acknowledge")
         if written is not None:
             count = int(answers["count-bits"]) // 16
@@ -358,6 +374,8 @@ class _ModbusQuestions(BusQuestions):
         for name in answers["channels"]:
             keys = {"address": "address", "type": "register-type", "order": "order", "scale": "scale"}
             tables.append({"name": name} | {k: answers[sensor_key(name, t)] for k, t in keys.items()})
+            if (bits := answers[sensor_key(name, "bits")]) is not None:
+                tables[-1]["bits"] = [*bits]
             mark = answers[sensor_key(name, "no-value")]
             if mark is not None:
                 tables[-1]["no_value"] = Hexadecimal(mark)
@@ -390,6 +408,7 @@ class TcpQuestions(_ModbusQuestions):
 
     def _line(self, answers: Answers) -> Iterator[Question]:
         yield self.ask("host", q.line)
+        yield self._ask_timeout()
         yield self._ask_units()
         yield self.ask("tcp-port", q.whole, _host_and_port(answers["host"])[1], quiet=True)
 
@@ -418,6 +437,7 @@ class RtuQuestions(_ModbusQuestions):
         del answers
         yield self.ask("port", q.line, only_port())
         yield self.ask("baud", q.bit_rate, "19200")
+        yield self._ask_timeout()
         yield self._ask_units()
         yield self.choose("parity", dict.fromkeys(("none", "even", "odd"), ""), "even")
 
@@ -447,6 +467,29 @@ def _host_and_port(text: str) -> tuple[str, str]:
     """The host and the port of an address, as the sniffer takes it too; 502 if there is no port."""
     both = _HOST_AND_PORT.fullmatch(text)
     return (text, "502") if both is None else (both[1].strip("[]"), both[2])
+
+
+_WORD = re.compile("stat|alarm|fault|error|flag|trip|warn|word|bits", re.IGNORECASE)
+"""In the name of a channel whose bits have meanings."""
+
+
+def _is_unsigned(answers: Answers, channel: str) -> bool:
+    """Whether the registers of a channel hold a number that has parts."""
+    kind: str = answers[sensor_key(channel, "register-type")]
+    return kind.startswith("uint")
+
+
+def _bits(text: str) -> tuple[int, int] | None:
+    """The lowest bit and the number of bits, of one bit or the first and the last; None for ``none``."""
+    if text.lower() == NONE:
+        return None
+    both = re.fullmatch(r"(\d{1,2})(?:\s*-\s*(\d{1,2}))?", text.strip())
+    first, last = (int(both[1]), int(both[2] or both[1])) if both else (0, -1)
+    if first > last:
+        raise ValueError(
+            f'"{text}" is no bit: write its number from 0, e.g. 3, or the first and last, e.g. 4-7'
+        )
+    return first, last - first + 1
 
 
 _USUAL_SCALES = {"degC": "0.1", "mm/s": "0.01"}

@@ -286,6 +286,47 @@ def test_the_mark_for_no_value_of_a_register_is_an_option_and_a_hint_in_the_file
     assert "int16 cannot hold 98304" in capsys.readouterr().err
 
 
+def test_bits_are_asked_of_a_word_only_and_written_as_the_file_has_them(tmp_path, capsys):
+    asked_of = []
+
+    def ask(question: Question) -> str:
+        asked_of.append(question.key)
+        texts = {"sensor.status.bits": "3", "sensor.alarm.register-type": "int16", "timeout-ms": "1500"}
+        assert question.key in texts or question.default is not None, question.key
+        return texts.get(question.key, f"{question.default}")
+
+    given = {"host": "h", "bus": "modbus-tcp", "channels": "power, status, alarm", "limits": "none"}
+    answers = conduct(tmp_path / "m.toml", Given(given, defaults=False), ask, print)
+    assert [key for key in asked_of if key.endswith(".bits")] == ["sensor.status.bits"]
+    machine = tomllib.loads(machine_text(answers, "m.toml"))
+    assert machine["buses"]["main"]["timeout_ms"] == 1500.0
+    channels = machine["streams"]["device"]["layout"]["channels"]
+    assert [channel.get("bits") for channel in channels] == [None, [3, 1], None]
+    words = ["new", f"{tmp_path / 'm.toml'}", "--yes", "--overwrite", "--bus=modbus-tcp", "--host=192.0.2.10"]
+    assert main([*words, "--channels=power", "--sensor=power.bits=4-7"]) == 0
+    assert "bits = [4, 4]" in (tmp_path / "m.toml").read_text()
+    for wrong, why in (
+        ("7-4", "is no bit: write its number"),
+        ("x", "is no bit"),
+        ("16", "are no part of uint16"),
+    ):
+        assert main([*words, "--channels=power", f"--sensor=power.bits={wrong}"]) == 2
+        assert why in capsys.readouterr().err
+    assert main([*words, "--timeout-ms=0"]) == 2
+    assert "--timeout-ms 0: buses.main.timeout_ms = 0.0: must be 1 or more" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("bus", ["can-dbc", "can"])
+def test_an_interface_that_python_can_does_not_know_is_refused_at_once(tmp_path, capsys, bus):
+    words = [f"--bus={bus}", "--interface=unixbsu", "--yes"]
+    assert main(["new", f"{tmp_path / 'm.toml'}", *words]) == 2
+    said = capsys.readouterr().err
+    assert (
+        '--interface unixbsu: "unixbsu" is no interface that python-can knows. Remedy: did you mean' in said
+    )
+    assert '"unixbus"?' in said
+
+
 def test_the_proposed_range_of_a_speed_holds_the_speed(tmp_path):
     file = tmp_path / "m.toml"
     words = ["--bus=modbus-tcp", "--host=192.0.2.10", "--channels=rpm", "--speed=-1473", "--limits=none"]
@@ -524,6 +565,8 @@ def test_a_wrong_answer_is_corrected_by_going_back(tmp_path):
     terminal.type("Pump")
     terminal.until(" : ")
     terminal.type("127.0.0.1:5020")
+    terminal.until("[500]: ")
+    terminal.type("")
     terminal.until("[1]: ")
     terminal.type("")
     terminal.until("[values]: ")
