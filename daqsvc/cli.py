@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from daqsvc.commands import early_signals  # before all that takes long
+from daqsvc.documentation import documented_in
 
 # isort: split
 import argparse
@@ -106,7 +107,8 @@ class CheckCommand:
         parser.add_argument(
             "--schema",
             action=_SchemaAction,
-            help="print the JSON Schema of machine files, for editors, and exit (docs/machine-file.md)",
+            help="print the JSON Schema of machine files, for editors, and exit: "
+            f"see {documented_in('machine-file')}",
         )
 
     def run(self, arguments: argparse.Namespace) -> int:

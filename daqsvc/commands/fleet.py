@@ -10,6 +10,7 @@ from daqsvc.commands.analyze_fleet import lacking_extra
 from daqsvc.commands.arguments import EXIT_OK, EXIT_USAGE, duration, not_negative
 from daqsvc.commands.complaint import complain
 from daqsvc.commands.tables import aligned, harmless, wrapped
+from daqsvc.documentation import documented_in
 from daqsvc.errors.command_line import EXTRA_MISSING
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ class FleetCommand:
     description = (
         "Report on the results that daqsvc analyze ARCHIVE --cluster has written: for each machine, "
         "where its verdict changed. With a CSV table of known faults, also report which faults were "
-        "missed, which alarms were false, and what those cost (docs/fleet.md)."
+        f"missed, which alarms were false, and what those cost. See {documented_in('fleet')}."
     )
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:

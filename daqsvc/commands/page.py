@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from daqsvc.commands.arguments import EXIT_OK, EXIT_REFUSED, EXIT_USAGE
 from daqsvc.commands.complaint import complain
 from daqsvc.commands.store_argument import BadFileError, StoreNotFoundError, add_store, chosen_store
+from daqsvc.documentation import documented_in
 from daqsvc.errors.command_line import EXTRA_MISSING
 from daqsvc.settings.addresses import MOST_PORT, Address, address_of
 
@@ -73,7 +74,9 @@ class PageCommand:
         # For a program that starts the page: it ends with that program, however that ends.
         parser.add_argument("--with-parent", action="store_true", help=argparse.SUPPRESS)
         _add_access(
-            parser.add_argument_group("who may see the page, and who may handle alarms (docs/page.md)")
+            parser.add_argument_group(
+                f"who may see the page, and who may handle alarms ({documented_in('page')})"
+            )
         )
         add_store(parser, of_a_machine=False)
 

@@ -28,6 +28,7 @@ from daqsvc.commands.arguments import (
     sampling_rate_hz,
     speed,
 )
+from daqsvc.documentation import documented_in
 from daqsvc.dsp.quality.unit import ACCELERATION_UNITS, LENGTH_UNITS
 
 if TYPE_CHECKING:
@@ -373,7 +374,7 @@ def _add_output(parser: argparse.ArgumentParser) -> None:
 
 def _add_fleet(parser: argparse.ArgumentParser) -> None:
     """What is stated of the archive of a fleet."""
-    fleet = parser.add_argument_group("the archive of a fleet (docs/fleet.md)")
+    fleet = parser.add_argument_group(f"the archive of a fleet ({documented_in('fleet')})")
     fleet.add_argument(
         "--cluster",
         type=cluster_address,

@@ -142,7 +142,7 @@ NOT_HEALTHY = Code(
     "A calibration needs a machine in good order at steady speed, or running up. This one is too short, "
     "not "
     "steady, or already shows a change.",
-    "Record the machine in good order, as docs/calibration.md describes.",
+    "Record the machine in good order, as the page on calibration describes.",
     "calibration.md",
     "not calibrated: only 12 usable revolutions; a baseline needs 50: give a longer recording",
 )

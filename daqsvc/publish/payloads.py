@@ -18,6 +18,7 @@ from daqsvc.alarms.codes import code_of_alarm
 from daqsvc.alarms.events import AlarmEvent, Doubt, EventKind, Identity
 from daqsvc.alarms.states import HOLDS, AlarmState, Level
 from daqsvc.diagnosis.record import Diagnosis, Severity
+from daqsvc.documentation import documented_in
 from daqsvc.dsp.quality import Quality  # noqa: TC001 - pydantic reads it
 from daqsvc.errors.code import coded
 from daqsvc.errors.service import NOT_REMEMBERED
@@ -191,7 +192,8 @@ class StatusPayload(Stamped):
     schema_: Literal["daqsvc.status/1"] = Field("daqsvc.status/1", alias="schema", description=SCHEMA_ABOUT)
     machines: tuple[str, ...] = Field((), description="those that the box watches, by their names in topics")
     figures: Figures = Field(
-        description="figures of the service, by what they belong to: docs/reference/counters.md"
+        description="figures of the service, by what they belong to: see "
+        f"{documented_in('reference/counters')}"
     )
 
 

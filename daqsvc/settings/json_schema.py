@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen
 from pydantic_core import PydanticUndefined, to_jsonable_python
 
+from daqsvc.documentation import documented_in
 from daqsvc.settings.buses import Bus, Layout
 from daqsvc.settings.models import machine_file_model
 from daqsvc.settings.registry import bus_tables, first_detector
@@ -35,7 +36,9 @@ DRAFT = "http://json-schema.org/draft-07/schema#"
 def machine_schema() -> Schema:
     """The JSON Schema (draft 7) of a machine file, with the tables of all plugins that are installed."""
     schema = _table(machine_file_model())
-    about = "Everything that a box knows about the machine that it watches; docs/machine-file.md tells more."
+    about = (
+        f"Everything that a box knows about the machine that it watches. See {documented_in('machine-file')}."
+    )
     return {"$schema": DRAFT, "title": "daqsvc machine file", **schema, "description": about}
 
 

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from daqsvc.documentation import documented_in
 from drivers.sniffing import (
     Sniffed,
     Sniffer,
@@ -644,8 +645,8 @@ def turn_words(name: str, turns_at: int) -> str:
     """What a column means for daqsvc that begins again at 0 after 99, 999, ..."""
     return (
         f"{name} begins again at 0 after {turns_at - 1}: daqsvc cannot count lines by it. It would report "
-        "each turn as a restarted counter [B37], and samples as lost that are not (docs/serial.md). Use a "
-        "column with the device's time, if there is one."
+        "each turn as a restarted counter [B37], and samples as lost that are not. Use a column with the "
+        f"device's time, if there is one. See {documented_in('serial')}."
     )
 
 

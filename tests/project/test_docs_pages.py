@@ -9,7 +9,10 @@ import re
 from typing import TYPE_CHECKING
 
 import pytest
+from prose.texts import texts_of
 from support.paths import ROOT
+
+from daqsvc.documentation import TITLES
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -19,6 +22,7 @@ PAGES = sorted(DOCS.rglob("*.md"))
 TEXTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *PAGES]
 LISTED = re.compile(r"^(?:- |\| )\[[^\[\]]+\]\(([^()\s#]+\.md)\)", re.MULTILINE)
 FENCED = re.compile(r"^ *(`{3,}).*?^ *\1 *$", re.MULTILINE | re.DOTALL)
+NAMED = re.compile(r"\bdocs/[\w/-]+\.md")
 LINK = re.compile(r"\]\(([^()\s#]+)(?:#[^()\s]*)?\)")
 
 
@@ -56,3 +60,21 @@ def test_the_glossary_has_the_words_that_are_not_explained_where_they_are() -> N
 def test_what_is_linked_is_there(text: Path) -> None:
     links = [link for link in LINK.findall(FENCED.sub("", text.read_text("utf-8"))) if ":" not in link]
     assert [link for link in links if not (text.parent / link).exists()] == []
+
+
+@pytest.mark.parametrize("page", TITLES)
+def test_texts_of_the_program_name_a_page_by_its_title(page: str) -> None:
+    title = (DOCS / f"{page}.md").read_text("utf-8").splitlines()[0]
+    assert title.replace("`", "") == f"# {TITLES[page]}"
+
+
+def test_no_text_that_a_user_reads_names_a_file_of_docs() -> None:
+    """A user of the package has the site, and no docs/*.md."""
+    program = [file for room in ("daqsvc", "drivers") for file in (ROOT / room).rglob("*.py")]
+    templates = [*(ROOT / "daqsvc/page").rglob("*.html")]
+    texts = [text for file in [*program, *templates] for text in texts_of(file) if text.kind == "message"]
+    machines = (ROOT / "config/machines").rglob("*.toml")
+    texts += [text for file in machines for text in texts_of(file)]
+    named = {f"{text.file.relative_to(ROOT)}: {text.words}" for text in texts if NAMED.search(text.words)}
+    # It looks where the pages are on this computer.
+    assert [text for text in sorted(named) if not text.startswith("daqsvc/commands/explain.py")] == []
