@@ -73,7 +73,8 @@ def test_what_docs_sniff_shows_of_can_runs(one: Shown, tmp_path: Path) -> None:
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout
-    assert differs(one.output or "", done.stdout) == ""
+    # What comes in some seconds is counted, and the clock of the guest is a slow one.
+    assert differs(one.output or "", done.stdout, figures=False) == ""
 
 
 @pytest.fixture

@@ -5,18 +5,18 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.io import savemat
 from support.bearing_signals import INNER, RATE_HZ, healthy, knocks
-from support.fleet_archives import add_machine, add_recordings
+from support.fleet_archives import REVOLUTIONS, add_machine
 from support.machine_files import MACHINES
-from support.orbit_files import Orbit
+from support.orbit_files import UNBALANCE, Orbit
 from support.orbit_logs import frames, machine_file, signals, write
 from support.paths import ROOT
 from support.ports import free_port
-from support.run_ups import RATE_HZ as RUN_UP_HZ
 from support.run_ups import record
 from support.tls_files import self_signed
 
@@ -24,12 +24,11 @@ from daqsvc.page.access.accounts import account_line, write_account
 from daqsvc.page.access.role import Role
 from sim_hw.plants import rotor as plant
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
 ACCOUNTS = "page.accounts"
 SHARED_BUS = "/tmp/daqsvc-can0"  # noqa: S108 - as it is in the file
 """The virtual bus of the pages; the folder has one of its own."""
+MEASURED = Path(os.environ["DAQSVC_DATA"]) / "cwru" if "DAQSVC_DATA" in os.environ else None
+"""Recordings that are not in the repository; without them, the folder has others under the same names."""
 CALIBRATED_LIVE = "feed-pump.toml"
 """A machine that is calibrated while it runs."""
 HEALTHY_PUMP = "healthy-pump.toml"
@@ -44,7 +43,17 @@ before_s = 2.0
 after_s = 1.0
 
 [history]
+
+[[alarms]]
+name = "shaft-vibration-x"
+sensor = "probe-x"
+measure = "rms"
+alert = 15.0
+danger = 200.0
+deadband = 2.0
 """
+_ROTOR: dict[str, Any] = {"rate_hz": 16_000.0, "natural_hz": 5111.0 / 60.0, "zeta": 0.18}
+"""Of the recordings of README."""
 _SPEED_RPM = 6000.0
 """Of the machine that is calibrated while it runs: 200 revolutions take two seconds."""
 _SCENARIO = f"""
@@ -131,6 +140,10 @@ def _recordings(made: Path) -> None:
     for number in ("105", "130"):
         savemat(made / f"{number}.mat", {f"X{number}_DE_time": bad})
     savemat(made / "97.mat", {"X097_DE_time": good})
+    if MEASURED is not None:
+        for number in ("97", "105", "130"):
+            (made / f"{number}.mat").unlink()
+            (made / f"{number}.mat").symlink_to(MEASURED / f"{number}.mat")
     np.savez(made / "105.npz", de=bad, fe=other, fs=RATE_HZ)
     both: dict[str, Any] = {"accel-de": good, "accel-fe": other, "de": good, "fe": other}
     np.savez(made / "healthy.npz", **both, fs=RATE_HZ)
@@ -155,15 +168,17 @@ def _rotor_recordings(made: Path) -> None:
     motion = plant.simulate(plant.PlantParameters(), changed, revolutions=140.0, samples_per_rev=64.0)
     x, y = motion.in_um(100.0)
     np.savez(made / "run.npz", x=x, y=y, fs=5111.0 / 60.0 * 64.0)
-    up, angle = record(noise_um=0.5)
+    up, angle = record(noise_um=0.5, speeds_hz=(20.0, 136.0), **_ROTOR)
     kph = plant.keyphasor_voltage(angle / (2.0 * np.pi))
-    np.savez(made / "run-up.npz", x=up[:, 0], y=up[:, 1], kph=kph, fs=RUN_UP_HZ)
+    np.savez(made / "run-up.npz", x=up[:, 0], y=up[:, 1], kph=kph, fs=_ROTOR["rate_hz"])
     # It begins at rest: the first half is left out.
-    still, angle = record(noise_um=0.5, speeds_hz=(50.0, 50.0), duration_s=6.0)
+    still, angle = record(noise_um=0.5, speeds_hz=(80.0, 80.0), duration_s=4.0, **_ROTOR)
     kph = plant.keyphasor_voltage(angle / (2.0 * np.pi))
     half = len(still) // 2
     for name in ("steady", "monday"):
-        np.savez(made / f"{name}.npz", x=still[half:, 0], y=still[half:, 1], kph=kph[half:], fs=RUN_UP_HZ)
+        np.savez(
+            made / f"{name}.npz", x=still[half:, 0], y=still[half:, 1], kph=kph[half:], fs=_ROTOR["rate_hz"]
+        )
 
 
 def _table(file: Path) -> None:
@@ -177,5 +192,8 @@ def _table(file: Path) -> None:
 def _archive(made: Path) -> None:
     """An archive of a fleet of one machine."""
     recordings = add_machine(made / "archive", "pump-1")
-    add_recordings(recordings, 3, changed_from=2)
-    (made / "faults.csv").write_text("machine,fault,first,last\npump-1,unbalance,2026-03-03,2026-03-03\n")
+    # Two false alarms, of a day each, and a fault.
+    for day in range(1, 11):
+        change = UNBALANCE if day in {3, 6, 9, 10} else 0.0
+        Orbit(REVOLUTIONS, change, seed=day).save(recordings / f"2026-03-{day:02}.npz")
+    (made / "faults.csv").write_text("machine,fault,first,last\npump-1,unbalance,2026-03-09,\n")
