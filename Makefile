@@ -183,6 +183,7 @@ bench-diagnosis: $(READY) $(PLANTS)/cases.json $(PLANTS)/bank.json
 reference: $(READY)
 	@$(BIN)/python -m daqsvc.reference docs/reference
 	@$(BIN)/python -m daqsvc.publish.schemas docs/schemas
+	@$(BIN)/python -m daqsvc.reference.formats docs/schemas
 
 # What is compiled needs a protobuf of this major version, no older than the compiler: it is stated in pyproject.toml.
 proto: $(READY)

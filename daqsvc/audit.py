@@ -23,7 +23,7 @@ import stat
 import uuid
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal, NotRequired, TypedDict
 
 from daqsvc.acquisition.clock import NS_PER_S, iso_utc
 from daqsvc.alarms.commands import AlarmCommand
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.clock import Clock
     from daqsvc.alarms.commands import CommandOutcome, SnapshotRequest
 
-SCHEMA = "daqsvc.audit/1"
+SCHEMA: Literal["daqsvc.audit/1"] = "daqsvc.audit/1"
 MODE = 0o600
 """As of the other files of a store: whoever else is to read it, is let by ``chmod g+r``."""
 QUOTA_BYTES = 32 * 1024 * 1024
@@ -46,6 +46,56 @@ REFUSED_EVERY_NS = 30 * NS_PER_S
 SOURCES = 5
 """Sources that a count of refused commands names; the rest are the others."""
 OTHERS = "others"
+
+
+class AuditLine(TypedDict):
+    """One line of the audit log, `audit.jsonl` in the store; a command has two of the same `id`.
+
+    Attributes:
+        schema: what the line is, and of which version.
+        id: the same in both lines of a command; nothing else has it.
+        time: when the line was written, ISO 8601, UTC.
+        wall_ns: the same by the wall clock, ns since the Unix epoch.
+        monotonic_ns: the same by the monotonic clock of the box, ns.
+        outcome: `asked` at first, then `accepted` or `refused`; `refused_many` counts a flood.
+        source: where the command came from, e.g. the user and the process.
+        by: the person, by the name that was given.
+        verb: what was asked for.
+        machine: name of the machine, if the command has named one.
+        alarm: name of the alarm; absent for a snapshot.
+        occurrence: id of the activation that was meant; null for whichever there is. Absent for a snapshot.
+        duration_s: how long it is to last, in s; words for what is no number. Absent for a snapshot.
+        reason: why, in the words of the person.
+        answer: the reason of a refusal, or what else was answered; of `refused_many` the last answer.
+        events: ids of the alarm events that came of it.
+        path: file of the snapshot that was made.
+        count: of `refused_many`: how many commands were refused.
+        since: of `refused_many`: when the first of them came, ISO 8601, UTC.
+        sources: of `refused_many`: how many came from where.
+        verbs: of `refused_many`: how many asked for what.
+    """
+
+    schema: Literal["daqsvc.audit/1"]
+    id: str
+    time: str
+    wall_ns: int
+    monotonic_ns: int
+    outcome: Literal["asked", "accepted", "refused", "refused_many"]
+    source: NotRequired[str]
+    by: NotRequired[str]
+    verb: NotRequired[str]
+    machine: NotRequired[str]
+    alarm: NotRequired[str]
+    occurrence: NotRequired[str | None]
+    duration_s: NotRequired[float | str | None]
+    reason: NotRequired[str]
+    answer: NotRequired[str]
+    events: NotRequired[list[str]]
+    path: NotRequired[str]
+    count: NotRequired[int]
+    since: NotRequired[str]
+    sources: NotRequired[dict[str, int]]
+    verbs: NotRequired[dict[str, int]]
 
 
 class AuditError(Exception):
@@ -100,8 +150,10 @@ class AuditLog:
         """
         what: Literal["accepted", "refused"] = "accepted" if outcome.accepted else "refused"
         line = self._line(entry, what, command, source)
-        made = {"path": outcome.path} if outcome.path else {}
-        await self._append(line | {"answer": outcome.reason, "events": list(outcome.events)} | made)
+        line["answer"], line["events"] = outcome.reason, list(outcome.events)
+        if outcome.path:
+            line["path"] = outcome.path
+        await self._append(line)
 
     async def refused(self, refusals: Refusals) -> None:
         """Write down how many commands were refused without a line of their own, if any, and forget them.
@@ -116,14 +168,16 @@ class AuditLog:
         if refused is None:
             return
         try:
-            await self._append(self._stamp(str(uuid.uuid4()), "refused_many") | refused.in_json())
+            line = self._stamp(str(uuid.uuid4()), "refused_many")
+            refused.add_to(line)
+            await self._append(line)
         except AuditError:
             refusals.put_back(refused)
             raise
 
     def _stamp(
         self, entry: str, outcome: Literal["asked", "accepted", "refused", "refused_many"]
-    ) -> dict[str, Any]:
+    ) -> AuditLine:
         wall_ns = self._clock.wall_ns()
         return {
             "schema": SCHEMA,
@@ -140,17 +194,18 @@ class AuditLog:
         outcome: Literal["asked", "accepted", "refused"],
         command: AlarmCommand | SnapshotRequest,
         source: str,
-    ) -> dict[str, Any]:
-        return self._stamp(entry, outcome) | {
-            "source": source,
-            "by": command.by,
-            "verb": command.verb.value,
-            **({} if command.machine is None else {"machine": command.machine}),
-            **(_of_alarm(command) if isinstance(command, AlarmCommand) else {}),
-            "reason": command.reason,
-        }
+    ) -> AuditLine:
+        line = self._stamp(entry, outcome)
+        line["source"], line["by"], line["verb"] = source, command.by, command.verb.value
+        if command.machine is not None:
+            line["machine"] = command.machine
+        if isinstance(command, AlarmCommand):
+            line["alarm"], line["occurrence"] = command.alarm, command.occurrence
+            line["duration_s"] = _in_json(command.duration_s)
+        line["reason"] = command.reason
+        return line
 
-    async def _append(self, line: dict[str, Any]) -> None:
+    async def _append(self, line: AuditLine) -> None:
         # ASCII only: no name or reason can smuggle a line separator in.
         text = json.dumps(line, allow_nan=False) + "\n"
         try:
@@ -181,15 +236,11 @@ class RefusedMany:
     verbs: Counter[str] = field(default_factory=Counter)
     answer: str = ""
 
-    def in_json(self) -> dict[str, Any]:
-        """As keys of a line of the log."""
-        return {
-            "count": self.count,
-            "since": iso_utc(self.since_ns),
-            "sources": dict(self.sources),
-            "verbs": dict(self.verbs),
-            "answer": self.answer,
-        }
+    def add_to(self, line: AuditLine) -> None:
+        """Write them into a line of the log."""
+        line["count"], line["since"] = self.count, iso_utc(self.since_ns)
+        line["sources"], line["verbs"] = dict(self.sources), dict(self.verbs)
+        line["answer"] = self.answer
 
 
 class Refusals:
@@ -241,14 +292,6 @@ class Refusals:
             earlier.verbs += later.verbs
             earlier.answer = later.answer
         self._many = earlier
-
-
-def _of_alarm(command: AlarmCommand) -> dict[str, Any]:
-    return {
-        "alarm": command.alarm,
-        "occurrence": command.occurrence,
-        "duration_s": _in_json(command.duration_s),
-    }
 
 
 def _in_json(number: float | None) -> float | str | None:

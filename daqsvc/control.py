@@ -20,7 +20,7 @@ import socket
 import stat
 import struct
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NotRequired, Protocol, TypedDict
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -44,6 +44,7 @@ from daqsvc.notice import notice
 from daqsvc.outbox.files import is_possessed, is_read_only
 from daqsvc.outbox.reading import JOURNAL_NAME
 from daqsvc.publish.looking import Looking
+from daqsvc.publish.payloads import SCHEMA_ABOUT
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Collection, Iterable, Iterator, Sequence
@@ -126,24 +127,30 @@ class UnreachableError(AbsentError):
 
 
 class ControlRequest(CommandMessage):
-    """What a person asks for.
-
-    ``via`` is for the audit log: how the person has asked a program that passes it on, such as the page.
-    ``denied`` is why that program has found that the person may not: then it is logged, and refused.
-    """
+    """What a person asks for."""
 
     model_config = ConfigDict(populate_by_name=True)
 
-    schema_: Literal["daqsvc.control/1"] = Field(alias="schema")
-    verb: Annotated[Verb, Field(strict=False)]
-    alarm: Annotated[Line, Field(min_length=1, max_length=200)]
-    by: Person
-    machine: Annotated[Line, Field(max_length=200)] | None = None
-    occurrence: Annotated[Line, Field(min_length=1, max_length=100)] | None = None
-    duration_s: DurationS | None = None
-    reason: Reason = ""
-    via: Annotated[Line, Field(max_length=200)] = ""
-    denied: Reason = ""
+    schema_: Literal["daqsvc.control/1"] = Field(alias="schema", description=SCHEMA_ABOUT)
+    verb: Annotated[Verb, Field(strict=False)] = Field(description="what is asked")
+    alarm: Annotated[Line, Field(min_length=1, max_length=200)] = Field(description="name of the alarm")
+    by: Person = Field(description="who asks")
+    machine: Annotated[Line, Field(max_length=200)] | None = Field(
+        default=None, description="name of the machine; null for the only one that has such an alarm"
+    )
+    occurrence: Annotated[Line, Field(min_length=1, max_length=100)] | None = Field(
+        default=None, description="refuse the command if another activation is present by now"
+    )
+    duration_s: DurationS | None = Field(default=None, description="how long to shelve; for shelve only")
+    reason: Reason = Field(default="", description="why")
+    via: Annotated[Line, Field(max_length=200)] = Field(
+        default="",
+        description="for the audit log: how the person asked a program that passes it on, such as the page",
+    )
+    denied: Reason = Field(
+        default="",
+        description="why that program has found that this person may not: it is logged, and refused",
+    )
 
 
 class LiveRequest(JsonCommand):
@@ -151,42 +158,69 @@ class LiveRequest(JsonCommand):
 
     model_config = ConfigDict(populate_by_name=True)
 
-    schema_: Literal["daqsvc.control/1"] = Field(alias="schema")
-    verb: Literal["live"]
-    machine: Annotated[Line, Field(max_length=200)] | None = None
-    streams: Annotated[tuple[Annotated[Line, Field(max_length=200)], ...], Field(strict=False)] = ()
+    schema_: Literal["daqsvc.control/1"] = Field(alias="schema", description=SCHEMA_ABOUT)
+    verb: Literal["live"] = Field(description="what is asked; it is the second key")
+    machine: Annotated[Line, Field(max_length=200)] | None = Field(
+        default=None, description="name of the machine; null for the only one"
+    )
+    streams: Annotated[tuple[Annotated[Line, Field(max_length=200)], ...], Field(strict=False)] = Field(
+        default=(), description="streams and grids whose samples are wanted"
+    )
+
+
+class Question(TypedDict):
+    """A question without a person; the keys are in this order, and without another space between them.
+
+    Attributes:
+        schema: what the object is, and of which version.
+        verb: what is asked.
+        machine: of `status` and `snapshot`: name of the machine; absent for the only one.
+        dry_run: of `reload`: true to change nothing; else it is absent.
+    """
+
+    schema: Literal["daqsvc.control/1"]
+    verb: Literal["status", "reload", "snapshot", "standing"]
+    machine: NotRequired[str]
+    dry_run: NotRequired[Literal[True]]
 
 
 class ControlAnswer(BaseModel):
-    """What came of it; ``code`` is that of the reason, None if there is none.
-
-    ``waiting`` counts the alarm events that are in the service's memory only.
-    """
+    """What came of it."""
 
     model_config = ConfigDict(frozen=True, strict=True, populate_by_name=True)
 
-    schema_: Literal["daqsvc.control-answer/1"] = Field(_ANSWER, alias="schema")
-    accepted: bool
-    reason: str
-    code: str | None = None
-    events: Annotated[tuple[str, ...], Field(strict=False)] = ()
-    waiting: int = 0
+    schema_: Literal["daqsvc.control-answer/1"] = Field(_ANSWER, alias="schema", description=SCHEMA_ABOUT)
+    accepted: bool = Field(description="whether it was carried out")
+    reason: str = Field(
+        description="why it was refused, or why a restart may undo it; empty if neither",
+    )
+    code: str | None = Field(default=None, description="code of that reason; null if there is none")
+    events: Annotated[tuple[str, ...], Field(strict=False)] = Field(
+        default=(), description="ids of the alarm events that followed"
+    )
+    waiting: int = Field(
+        default=0, description="answer to `standing`: alarm events that are in the memory of the service only"
+    )
 
 
 class WhichMachineAnswer(ControlAnswer):
     """The status was asked for of no machine, where there are several, or of one that is not watched."""
 
-    machines: Annotated[tuple[str, ...], Field(strict=False)]
+    machines: Annotated[tuple[str, ...], Field(strict=False)] = Field(
+        description="names of the machines that the service watches"
+    )
 
 
 class ReloadAnswer(ControlAnswer):
-    """What a reload has changed, or would; or why it was refused, a sentence each.
+    """What a reload has changed, or would."""
 
-    ``files`` are the machine files and directories that the service was started with, and reads again.
-    """
-
-    lines: Annotated[tuple[str, ...], Field(strict=False)]
-    files: Annotated[tuple[str, ...], Field(strict=False)] = ()
+    lines: Annotated[tuple[str, ...], Field(strict=False)] = Field(
+        description="what is different, or why it was refused, a sentence each"
+    )
+    files: Annotated[tuple[str, ...], Field(strict=False)] = Field(
+        default=(),
+        description="machine files and directories that the service was started with, and reads again",
+    )
 
 
 class Reload(Protocol):
@@ -204,7 +238,7 @@ class Reload(Protocol):
 class SnapshotAnswer(ControlAnswer):
     """Where the snapshot is that was made."""
 
-    path: str = ""
+    path: str = Field(default="", description="file of the snapshot; empty if none was made")
 
 
 class TakeSnapshot(Protocol):

@@ -12,7 +12,7 @@ import asyncio
 import base64
 from collections import deque
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, NotRequired, TypeAlias, TypedDict
 
 import numpy as np
 from pydantic_core import to_json
@@ -20,9 +20,10 @@ from pydantic_core import to_json
 from daqsvc import __version__
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import SampleBlock
+from daqsvc.acquisition.standing import StreamState
 from daqsvc.alarms.events import AlarmEvent
 from daqsvc.diagnosis.record import Diagnosis
-from daqsvc.machine_facts import fault_names, machine_values, stream_facts
+from daqsvc.machine_facts import StreamFacts, fault_names, machine_values, stream_facts
 from daqsvc.publish.payloads import alarm_document, statement_document
 
 if TYPE_CHECKING:
@@ -30,10 +31,9 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.clock import Clock
     from daqsvc.acquisition.ring import SampleRing
-    from daqsvc.acquisition.standing import StreamState
     from daqsvc.settings.models import MachineFile
 
-SCHEMA = "daqsvc.live/1"
+SCHEMA: Literal["daqsvc.live/1"] = "daqsvc.live/1"
 ALIVE_S = 1.0
 """Time without other lines after which a line shows that the service is there."""
 ALIVE = b'{"alive":true}\n'
@@ -45,6 +45,102 @@ MOST_WAITING = 2000
 """Items of every kind that wait for one who looks."""
 BEFORE_S = 20.0
 """Time before the request whose samples are sent first, as far as the rings hold them."""
+
+
+class LiveBegin(TypedDict):
+    """The first line: whose machine it is, what comes of it, and its state.
+
+    Attributes:
+        folder: folder of the machine file; only for processes on the box.
+        schema: what the lines are, and of which version.
+        version: version of daqsvc.
+        site: name of the site.
+        box: name of the box.
+        machine: name of the machine.
+        begun_ns: when the service began to watch it so, by the monotonic clock of the box, ns.
+        wall_ns_at_0: time by the wall clock at 0 of the monotonic clock, ns since the Unix epoch.
+        streams: what is known of each stream and grid.
+        values: what is in force of the machine file, but for outputs, store and recorder.
+        faults: by detector and decision the fault that it means.
+        statements: the last statement of each detector.
+        alarms: the last event of each alarm.
+        standings: how each stream stands.
+    """
+
+    folder: NotRequired[str]
+    schema: Literal["daqsvc.live/1"]
+    version: str
+    site: str
+    box: str
+    machine: str
+    begun_ns: int
+    wall_ns_at_0: int
+    streams: dict[str, StreamFacts]
+    values: dict[str, Any]
+    faults: dict[str, dict[str, str]]
+    statements: list[Annotated[dict[str, Any], "statement"]]
+    alarms: list[Annotated[dict[str, Any], "daqsvc.alarm/1"]]
+    standings: dict[str, Annotated[dict[str, Any], StreamState]]
+
+
+class LiveSamples(TypedDict):
+    """Samples of a stream or a grid that go on from each other.
+
+    Attributes:
+        stream: name of the stream or the grid.
+        first_index: number of the first sample.
+        t_first_ns: its time by the monotonic clock of the box, ns.
+        period_ns: time from sample to sample, ns.
+        lost_before: samples that were lost right before.
+        quality: 0 if the samples are good; else flags that are added up.
+        shape: how many samples, and how many channels.
+        values: the samples, of each all channels, as base64 of little-endian float32.
+    """
+
+    stream: str
+    first_index: int
+    t_first_ns: int
+    period_ns: float
+    lost_before: int
+    quality: int
+    shape: list[int]
+    values: str
+
+
+class LiveStanding(TypedDict):
+    """A stream stands otherwise.
+
+    Attributes:
+        stream: its name.
+        doubt: why nothing can be judged by its samples; empty if there is no evidence against them.
+        proven: whether its rate seems to be the nominal one, or could not be found out in time.
+        silent: whether the doubt is that nothing comes at all, since another one stood.
+    """
+
+    stream: str
+    doubt: str
+    proven: bool
+    silent: bool
+
+
+class LiveLine(TypedDict):
+    """A further line: it has one of these keys.
+
+    Attributes:
+        samples: samples have come.
+        statement: a detector has given a statement.
+        alarm: an alarm has changed.
+        standing: a stream stands otherwise.
+        left_out: how many samples and other things were left out, as they were not taken in time.
+        alive: nothing else has passed for a second.
+    """
+
+    samples: NotRequired[LiveSamples]
+    statement: NotRequired[Annotated[dict[str, Any], "statement"]]
+    alarm: NotRequired[Annotated[dict[str, Any], "daqsvc.alarm/1"]]
+    standing: NotRequired[LiveStanding]
+    left_out: NotRequired[int]
+    alive: NotRequired[Literal[True]]
 
 
 class _StreamStands(NamedTuple):
@@ -63,9 +159,9 @@ class Looker:
         streams: those whose samples are wanted.
     """
 
-    def __init__(self, about: Callable[[], dict[str, Any]], streams: Collection[str]) -> None:
+    def __init__(self, about: Callable[[], LiveBegin], streams: Collection[str]) -> None:
         self.streams = frozenset(streams)
-        self._about: Callable[[], dict[str, Any]] | None = about
+        self._about: Callable[[], LiveBegin] | None = about
         self._waiting: deque[_Happened] = deque()
         self._bytes = 0
         self._left_out = 0
@@ -127,7 +223,7 @@ class LiveFeed:
         standings: Mapping[str, StreamState],
         *,
         of_this_box: bool = True,
-    ) -> dict[str, Any]:
+    ) -> LiveBegin:
         """Whose machine it is, what comes of it, and its state.
 
         Args:
@@ -137,8 +233,7 @@ class LiveFeed:
             of_this_box: whether who looks is, and can use the files that the machine file names.
         """
         machine = self.machine
-        folder = {"folder": f"{machine.path.parent.absolute()}"} if of_this_box else {}
-        return folder | {
+        begin: LiveBegin = {
             "schema": SCHEMA,
             "version": __version__,
             "site": machine.site,
@@ -153,6 +248,7 @@ class LiveFeed:
             "alarms": [alarm_document(one) for one in alarms],
             "standings": {name: one._asdict() for name, one in standings.items()},
         }
+        return {"folder": f"{machine.path.parent.absolute()}", **begin} if of_this_box else begin
 
     def look(
         self,
@@ -231,16 +327,16 @@ def _before(ring: SampleRing, most_bytes: int) -> SampleBlock | None:
     return SampleBlock(ring.stream, first, ring.read(first, count), ring.time_of(first), ring.period_at(last))
 
 
-def _encoded(about: Callable[[], dict[str, Any]] | None, items: Iterable[_Happened], left_out: int) -> bytes:
+def _encoded(about: Callable[[], LiveBegin] | None, items: Iterable[_Happened], left_out: int) -> bytes:
     """Lines of JSON; on a thread."""
-    told = [] if about is None else [about()]
+    told: list[LiveBegin | LiveLine] = [] if about is None else [about()]
     told += _told(items)
     if left_out:
         told.append({"left_out": left_out})
     return b"".join(map(_line, told))
 
 
-def _told(items: Iterable[_Happened]) -> Iterator[dict[str, Any]]:
+def _told(items: Iterable[_Happened]) -> Iterator[LiveLine]:
     """Each thing that has happened; blocks of a stream that go on from each other are one."""
     held: dict[str, list[SampleBlock]] = {}
     for item in items:
@@ -255,7 +351,10 @@ def _told(items: Iterable[_Happened]) -> Iterator[dict[str, Any]]:
         elif isinstance(item, AlarmEvent):
             yield {"alarm": alarm_document(item)}
         else:
-            yield {"standing": {"stream": item.stream, **item.standing._asdict()}}
+            doubt, proven, silent = item.standing
+            yield {
+                "standing": {"stream": item.stream, "doubt": doubt, "proven": proven, "silent": silent},
+            }
     for blocks in held.values():
         if blocks:
             yield _samples(blocks)
@@ -265,7 +364,7 @@ def _goes_on(before: SampleBlock, block: SampleBlock) -> bool:
     return block.first_index == before.end_index and block.quality == before.quality
 
 
-def _samples(blocks: list[SampleBlock]) -> dict[str, Any]:
+def _samples(blocks: list[SampleBlock]) -> LiveLine:
     """Blocks that go on from each other, with the time of the newest one's first sample counted back."""
     first, last = blocks[0], blocks[-1]
     rows = np.concatenate([block.samples for block in blocks]).astype("<f4")
@@ -284,6 +383,6 @@ def _samples(blocks: list[SampleBlock]) -> dict[str, Any]:
     }
 
 
-def _line(document: dict[str, Any]) -> bytes:
+def _line(document: LiveBegin | LiveLine) -> bytes:
     # What JSON has no number for is null, as in all that the service publishes.
     return to_json(document, inf_nan_mode="null") + b"\n"

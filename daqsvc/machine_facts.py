@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 from daqsvc.detectors.make import plugins
 from daqsvc.errors.code import coded
@@ -26,6 +26,22 @@ LONGEST_FILE = 16_000_000
 _TABLES = ("pipeline", "streams")
 """Whose values may be paths: calibrations of detectors, DBC files of layouts."""
 _SUFFIXES = (".toml", ".dbc")
+
+
+class StreamFacts(TypedDict):
+    """What is known of a stream or a grid.
+
+    Attributes:
+        rate_hz: samples per second, by the machine file.
+        channels: names of its channels.
+        sensors: name of the sensor of each channel; empty for none.
+        units: unit of each channel's sensor; empty for none.
+    """
+
+    rate_hz: float
+    channels: list[str]
+    sensors: list[str]
+    units: list[str]
 
 
 def machine_values(machine: MachineFile) -> dict[str, Any]:
@@ -93,7 +109,7 @@ def fault_names(machine: MachineFile) -> dict[str, dict[str, str]]:
     return named
 
 
-def stream_facts(machine: MachineFile) -> Iterator[tuple[str, dict[str, Any]]]:
+def stream_facts(machine: MachineFile) -> Iterator[tuple[str, StreamFacts]]:
     """By stream and grid its rate, its channels, and the sensor and unit of each channel; "" for none."""
     sensors = {(one.stream, one.channel): one for one in machine.sensors}
     for name, stream in machine.streams.items():
@@ -112,7 +128,7 @@ def stream_facts(machine: MachineFile) -> Iterator[tuple[str, dict[str, Any]]]:
         yield grid.name, _of_grid(grid)
 
 
-def _of_grid(grid: Grid) -> dict[str, Any]:
+def _of_grid(grid: Grid) -> StreamFacts:
     names = list(grid.channel_names)
     nothing = ["" for _ in names]
     return {"rate_hz": grid.rate_hz, "channels": names, "sensors": nothing, "units": nothing}

@@ -13,11 +13,22 @@ import logging
 import math
 from collections import deque
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias, get_args
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Literal,
+    NamedTuple,
+    NotRequired,
+    TypeAlias,
+    TypedDict,
+    get_args,
+)
 
 from daqsvc import __version__
 from daqsvc.acquisition.clock import NS_PER_S, iso_utc
 from daqsvc.acquisition.samples import SampleBlock
+from daqsvc.acquisition.standing import StreamState
 from daqsvc.alarms.conditions import is_condition
 from daqsvc.alarms.events import ANNUNCIATIONS, AlarmEvent, Identity
 from daqsvc.diagnosis.memory import MemoryNotTakenError, taken_memory
@@ -25,7 +36,7 @@ from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.errors.code import coded
 from daqsvc.errors.command_line import NOT_ASKED
 from daqsvc.errors.service import SNAPSHOT_LOST
-from daqsvc.machine_facts import fault_names, files_named, machine_values, stream_facts
+from daqsvc.machine_facts import StreamFacts, fault_names, files_named, machine_values, stream_facts
 from daqsvc.notice import notice
 from daqsvc.publish.payloads import alarm_document, statement_document
 from daqsvc.settings.registry import configured
@@ -54,12 +65,10 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.clock import Clock
     from daqsvc.acquisition.samples import Window
-    from daqsvc.acquisition.standing import StreamState
     from daqsvc.diagnosis.detector import Detector
     from daqsvc.diagnosis.memory import DetectorMemory
     from daqsvc.settings.models import MachineFile
     from daqsvc.settings.recorder import Recorder as RecorderTable
-    from daqsvc.snapshots.contents import Document
     from daqsvc.snapshots.writing import SnapshotWriter
     from daqsvc.supervision import Supervisor
 
@@ -105,6 +114,122 @@ ENDS = "nothing more is recorded: the service ends, or goes on by another machin
 """What people who wait for a snapshot get then."""
 
 
+class SnapshotAbout(TypedDict):
+    """The message of `/about`, the first one: of which machine the file is, and the states at its begin.
+
+    Attributes:
+        at_ns: the begin, by the monotonic clock of the box, ns.
+        schema: what the file is, and of which version.
+        version: version of daqsvc.
+        site: name of the site.
+        box: name of the box.
+        machine: name of the machine.
+        begin_ns: the begin, by the monotonic clock of the box, ns.
+        begin: the begin, ISO 8601, UTC.
+        wall_ns_at_0: time by the wall clock at 0 of the monotonic clock, ns since the Unix epoch.
+        from_start: whether nothing came before the begin.
+        streams_from_start: streams and grids of which nothing came before the begin.
+        changed_ns: when the machine file in force was read, by the monotonic clock of the box, ns.
+        remembered: by detector up to which sample its state at the begin has gone.
+        streams: what is known of each stream and grid.
+        faults: by detector and decision the fault that it means.
+        standings: how each stream stood.
+        alarms: the last event of each alarm.
+        causes: the first cause of the file, in words.
+    """
+
+    at_ns: NotRequired[int]
+    schema: Literal["daqsvc.snapshot/1"]
+    version: str
+    site: str
+    box: str
+    machine: str
+    begin_ns: int
+    begin: str
+    wall_ns_at_0: int
+    from_start: bool
+    streams_from_start: list[str]
+    changed_ns: int | None
+    remembered: dict[str, int]
+    streams: dict[str, StreamFacts]
+    faults: dict[str, dict[str, str]]
+    standings: dict[str, Annotated[dict[str, Any], StreamState]]
+    alarms: list[Annotated[dict[str, Any], "daqsvc.alarm/1"]]
+    causes: list[str]
+
+
+class SnapshotCause(TypedDict):
+    """A message of `/causes`: a further cause of the file.
+
+    Attributes:
+        at_ns: when it came, by the monotonic clock of the box, ns.
+        kind: what kind of cause it is.
+        cause: the cause in words.
+    """
+
+    at_ns: NotRequired[int]
+    kind: Kind
+    cause: str
+
+
+class SnapshotWindow(TypedDict):
+    """A message of `/windows`: samples were handed to a detector.
+
+    Attributes:
+        at_ns: when, by the monotonic clock of the box, ns.
+        detector: name of the detector.
+        first_index: number of the first sample.
+        count: how many samples there were.
+        skipped: samples before these that the detector has not had, as it was too slow.
+        snapshot: whether the samples are the newest, and others before them were left out on purpose.
+        breaks: numbers of the samples before which some are missing.
+    """
+
+    at_ns: NotRequired[int]
+    detector: str
+    first_index: int
+    count: int
+    skipped: int
+    snapshot: bool
+    breaks: list[int]
+
+
+class SnapshotStanding(TypedDict):
+    """A message of `/standing`: a stream stands otherwise.
+
+    Attributes:
+        at_ns: when, by the monotonic clock of the box, ns.
+        stream: name of the stream.
+        doubt: why nothing can be judged by its samples; empty if there is no evidence against them.
+        proven: whether its rate seems to be the nominal one, or could not be found out in time.
+        silent: whether the doubt is that nothing comes at all, since another one stood.
+    """
+
+    at_ns: NotRequired[int]
+    stream: str
+    doubt: str
+    proven: bool
+    silent: bool
+
+
+class SnapshotState(TypedDict):
+    """A message of `/states`: the state of a detector at the begin of the file, which only daqsvc reads.
+
+    Attributes:
+        at_ns: when, by the monotonic clock of the box, ns.
+        detector: name of the detector.
+        end_index: number of the first sample that it had not had yet.
+        tree: what it remembered.
+        arrays: the arrays in that: type, shape, and the values as base64.
+    """
+
+    at_ns: NotRequired[int]
+    detector: str
+    end_index: int
+    tree: Any
+    arrays: list[list[Any]]
+
+
 class SnapshotRefusedError(Exception):
     """A snapshot that was asked for is not made; the text states why."""
 
@@ -142,7 +267,7 @@ class _Read(NamedTuple):
     """Samples were handed to a detector."""
 
     detector: str
-    window: Document
+    window: SnapshotWindow
 
 
 class _Stands(NamedTuple):
@@ -221,7 +346,7 @@ class _Open:
     begin_ns: int
     until_ns: int
     machine: MachineFile
-    about: Document
+    about: SnapshotAbout
     waiting: list[_Item]
     causes: int = 1
     came_bytes: int = 0
@@ -413,7 +538,7 @@ class MachineRecorder:
 
     def read(self, detector: str, window: Window) -> None:
         """Samples were handed to a detector."""
-        told = {
+        told: SnapshotWindow = {
             "detector": detector,
             "first_index": window.first_index,
             "count": len(window.samples),
@@ -584,7 +709,7 @@ class MachineRecorder:
         """A file that begins with an item of the history."""
         cause_ns, until_ns = cause_until_ns
         begin_ns = history[first].at_ns if first < len(history) else self._clock.monotonic_ns()
-        about = {**self._about(history[:first], begin_ns, memories), "causes": [words]}
+        about = self._about(history[:first], begin_ns, memories, words)
         waiting = [*(_Item(begin_ns, one) for one in memories), *history[first:]]
         return _Open(kind, cause_ns, begin_ns, until_ns, self._machine, about, waiting)
 
@@ -836,7 +961,9 @@ class MachineRecorder:
         finally:
             snapshot.answer(path or SnapshotRefusedError(ENDS))
 
-    def _about(self, before: Sequence[_Item], begin_ns: int, memories: Iterable[_Remembered]) -> Document:
+    def _about(
+        self, before: Sequence[_Item], begin_ns: int, memories: Iterable[_Remembered], cause: str
+    ) -> SnapshotAbout:
         """The first message of a snapshot: of which machine it is, and the states when it began."""
         wall_ns = self._clock.wall_ns() - self._clock.monotonic_ns()
         alarms, standings = dict(self._kept.alarms), dict(self._kept.standings)
@@ -864,6 +991,7 @@ class MachineRecorder:
             "faults": fault_names(self._machine),
             "standings": {name: one._asdict() for name, one in standings.items()},
             "alarms": [alarm_document(event) for event in alarms.values()],
+            "causes": [cause],
         }
 
     def _write(self, snapshot: _Open, items: Iterable[_Item], *, is_over: bool) -> Path | None:
@@ -956,14 +1084,27 @@ class MachineRecorder:
             case AlarmEvent() as event:
                 noted = Noted(ALARMS, alarm_document(event))
             case _Read() as read:
-                noted = Noted(WINDOWS, read.window)
+                noted = Noted(WINDOWS, {**read.window})
             case _Remembered() as one:
-                about = {"detector": one.detector, "end_index": one.end_index}
-                noted = Noted(STATES, {**about, **one.memory.document()})
-            case _Stands(stream, standing):
-                noted = Noted(STANDING, {"stream": stream, **standing._asdict()})
+                remembered = one.memory.document()
+                state: SnapshotState = {
+                    "detector": one.detector,
+                    "end_index": one.end_index,
+                    "tree": remembered["tree"],
+                    "arrays": remembered["arrays"],
+                }
+                noted = Noted(STATES, {**state})
+            case _Stands(stream, (doubt, proven, silent)):
+                stands: SnapshotStanding = {
+                    "stream": stream,
+                    "doubt": doubt,
+                    "proven": proven,
+                    "silent": silent,
+                }
+                noted = Noted(STANDING, {**stands})
             case _Caused(kind, words):
-                noted = Noted(CAUSES, {"kind": kind, "cause": words})
+                cause: SnapshotCause = {"kind": kind, "cause": words}
+                noted = Noted(CAUSES, {**cause})
         return Entry(item.at_ns, noted)
 
 

@@ -11,7 +11,7 @@ import json
 import os
 import pwd
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, alarm_id, count, duration, one_line
 from daqsvc.commands.complaint import complain
@@ -176,6 +176,32 @@ def _doubt(store: Path) -> str:
     )
 
 
+class AlarmVerbAnswer(TypedDict):
+    """What came of it, for one alarm.
+
+    Attributes:
+        verb: what was asked: `acknowledge`, `reset`, `shelve`, `unshelve`, `bypass`, `unbypass`.
+        alarm: name of the alarm.
+        machine: name of the machine; null if no machine was named, and there is only one with the alarm.
+        occurrence: id of the activation that was meant; null for whichever there is.
+        by: who has asked.
+        accepted: whether it was carried out.
+        reason: why it was refused, or why a restart may undo it; empty if neither.
+        code: code of that reason; null if there is none.
+        events: ids of the alarm events that followed.
+    """
+
+    verb: str
+    alarm: str
+    machine: str | None
+    occurrence: str | None
+    by: str
+    accepted: bool
+    reason: str
+    code: str | None
+    events: list[str]
+
+
 class AlarmVerb:
     """One verb for one alarm or several, carried out by the service that runs.
 
@@ -281,15 +307,18 @@ class AlarmVerb:
         )
         outcome = ask(store, request)
         if arguments.json:
-            answer = {"verb": self._verb, "alarm": alarm, "machine": machine, "occurrence": occurrence}
-            came = {
+            answer: AlarmVerbAnswer = {
+                "verb": self._verb,
+                "alarm": alarm,
+                "machine": machine,
+                "occurrence": occurrence,
                 "by": request.by,
                 "accepted": outcome.accepted,
                 "reason": outcome.reason,
                 "code": outcome.code,
                 "events": list(outcome.events),
             }
-            print(json.dumps(answer | came), flush=True)  # noqa: T201 - this is what the verb is for
+            print(json.dumps(answer), flush=True)  # noqa: T201 - this is what the verb is for
         elif outcome.accepted:
             which = f"{alarm} of {machine}" if several and machine else alarm
             said = harmless(f"{which}: {outcome.reason or _DONE[self._verb]}")

@@ -6,7 +6,7 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Literal, TypedDict
 
 from daqsvc.commands.arguments import EXIT_OK, EXIT_REFUSED, EXIT_USAGE, add_overwrite
 from daqsvc.commands.complaint import complain
@@ -137,7 +137,55 @@ class ExportCommand(VerbWithKernels):
         return EXIT_OK
 
 
-def _document(files: Mapping[Path, Sequence[RecordedStream]], notes: list[str]) -> dict[str, Any]:
+class ExportedStream(TypedDict):
+    """A stream in a file that was written.
+
+    Attributes:
+        stream: its name.
+        channels: names of its channels.
+        units: unit of each channel; empty if it is not known.
+        rate_hz: samples per second.
+        start_time: time of the first sample, ISO 8601; null if the recording does not state it.
+        samples: how many there are of a channel.
+        missing: how many of them are not there.
+    """
+
+    stream: str
+    channels: list[str]
+    units: list[str]
+    rate_hz: float
+    start_time: str | None
+    samples: int
+    missing: int
+
+
+class ExportedFile(TypedDict):
+    """A file that was written.
+
+    Attributes:
+        file: its path.
+        streams: the streams in it.
+    """
+
+    file: str
+    streams: list[ExportedStream]
+
+
+class Export(TypedDict):
+    """What was written.
+
+    Attributes:
+        schema: what the object is, and of which version.
+        files: the files that were written.
+        notes: what a person should know of them, in sentences.
+    """
+
+    schema: Literal["daqsvc.export/1"]
+    files: list[ExportedFile]
+    notes: list[str]
+
+
+def _document(files: Mapping[Path, Sequence[RecordedStream]], notes: list[str]) -> Export:
     return {
         "schema": "daqsvc.export/1",
         "files": [
@@ -162,7 +210,7 @@ def _document(files: Mapping[Path, Sequence[RecordedStream]], notes: list[str]) 
     }
 
 
-def _line(written: dict[str, Any]) -> str:
+def _line(written: ExportedFile) -> str:
     from daqsvc.recording.streams import printable  # noqa: PLC0415 - as above
 
     # The name of a file may be bytes that are no text.

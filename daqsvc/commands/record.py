@@ -8,7 +8,7 @@ import re
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypedDict
 
 from daqsvc import kernel_cache
 from daqsvc.commands.arguments import EXIT_OK, EXIT_USAGE, positive, signals_to_end
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from daqsvc.errors.code import Code
     from daqsvc.settings import MachineFile
     from drivers.base import Driver
+    from drivers.can.driver import CanDriver
     from drivers.can.settings import CanBus
 
 
@@ -100,7 +101,7 @@ class RecordCommand:
             return complain("daqsvc", error, error.code)
         files = sorted(_logs(arguments.out) - there)
         summary = _summary(name, driver, files)
-        print(json.dumps(summary))  # noqa: T201 - this is what the verb is for
+        print(json.dumps({**asdict(driver.counters), **summary}))  # noqa: T201 - this is what the verb is for
         if summary["frames_unrecorded"]:
             what = f"{summary['frames_unrecorded']} frames could not be recorded in {arguments.out}"
             return complain("daqsvc", what, CANNOT_WRITE)
@@ -209,16 +210,49 @@ async def _run_until_stopped(driver: Driver, duration_s: float | None, progress:
         raise ended[0]
 
 
-def _summary(bus: str, driver: Driver, files: list[Path]) -> dict[str, Any]:
-    counters = asdict(driver.counters)
+class StreamReceived(TypedDict):
+    """What came of a stream.
+
+    Attributes:
+        samples_received: samples that were received.
+        samples_lost: samples that were lost on the way.
+    """
+
+    samples_received: int
+    samples_lost: int
+
+
+class RecordSummary(TypedDict):
+    """What was recorded; the counters of the bus come with it.
+
+    Attributes:
+        bus: name of the bus.
+        files: recordings that were written.
+        bytes: their size.
+        frames_recorded: frames that are in them.
+        frames_unrecorded: frames that are not, because the disk refused them or was too slow.
+        losses: how often the bus went down after it had been up.
+        streams: what came of each stream.
+    """
+
+    bus: str
+    files: list[str]
+    bytes: int
+    frames_recorded: int
+    frames_unrecorded: int
+    losses: int
+    streams: dict[str, StreamReceived]
+
+
+def _summary(bus: str, driver: CanDriver, files: list[Path]) -> RecordSummary:
+    counted = driver.counters
     return {
         "bus": bus,
         "files": [str(path) for path in files],
         "bytes": sum(path.stat().st_size for path in files),
-        "frames_recorded": counters.pop("frames_recorded"),
-        "frames_unrecorded": counters.pop("frames_unrecorded"),
+        "frames_recorded": counted.frames_recorded,
+        "frames_unrecorded": counted.frames_unrecorded,
         "losses": driver.link.losses,
-        **counters,
         "streams": {
             name: {"samples_received": stream.samples_received, "samples_lost": stream.samples_lost}
             for name, (stream, _) in driver.streams.items()

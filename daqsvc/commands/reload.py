@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypedDict
 
 from daqsvc.commands.arguments import EXIT_OK, EXIT_USAGE
 from daqsvc.commands.complaint import complain
@@ -17,6 +17,22 @@ if TYPE_CHECKING:
 
     from daqsvc.commands.machine_files import Load
     from daqsvc.control import ReloadAnswer
+
+
+class Reloaded(TypedDict):
+    """What came of it.
+
+    Attributes:
+        accepted: whether the machine files were taken over, or could be.
+        dry_run: whether nothing was to be changed.
+        code: code of the reason of a refusal; null if there is none.
+        lines: what is different, or why it was refused, a sentence each.
+    """
+
+    accepted: bool
+    dry_run: bool
+    code: str | None
+    lines: list[str]
 
 
 class ReloadCommand:
@@ -61,8 +77,13 @@ class ReloadCommand:
                 where = f"; if {moved} were changed, the service must be restarted"
             return complain("daqsvc reload", f"{error}{where}", error.code)
         if arguments.json:
-            told = {"accepted": answer.accepted, "dry_run": arguments.dry_run, "code": answer.code}
-            print(json.dumps({**told, "lines": list(answer.lines)}))  # noqa: T201 - this is what the verb is for
+            told: Reloaded = {
+                "accepted": answer.accepted,
+                "dry_run": arguments.dry_run,
+                "code": answer.code,
+                "lines": list(answer.lines),
+            }
+            print(json.dumps(told))  # noqa: T201 - this is what the verb is for
         elif answer.accepted:
             print("\n".join(answer.lines) or "nothing is different")  # noqa: T201 - as above
         else:

@@ -6,7 +6,7 @@ import asyncio
 import json
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypedDict
 
 from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_REFUSED, EXIT_USAGE, positive
 from daqsvc.commands.complaint import complain
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from daqsvc.alarms.events import AlarmEvent
-    from daqsvc.offline.replay import Comparison, Replayed
+    from daqsvc.offline.replay import Replayed
 
 _SHOWN = 5
 """Differences that are shown one by one."""
@@ -125,27 +125,88 @@ def _in_short(document: dict[str, Any]) -> str:
     )
 
 
-def _document(replayed: Replayed) -> dict[str, Any]:
-    from daqsvc.publish.payloads import alarm_document, statement_document  # noqa: PLC0415 - only what is needed
+class ComparedStatements(TypedDict):
+    """The statements then and now.
 
-    def told(comparison: Comparison) -> dict[str, Any]:
-        return {"equal": comparison.equal, "only_then": comparison.changed, "only_now": comparison.added}
+    Attributes:
+        equal: how many are the same to the last bit.
+        only_then: those of the snapshot that do not come now.
+        only_now: those that come now and are not in the snapshot.
+    """
 
+    equal: int
+    only_then: list[Annotated[dict[str, Any], "statement"]]
+    only_now: list[Annotated[dict[str, Any], "statement"]]
+
+
+class ComparedAlarms(TypedDict):
+    """The alarm events then and now.
+
+    Attributes:
+        equal: how many are the same to the last bit.
+        only_then: those of the snapshot that do not come now.
+        only_now: those that come now and are not in the snapshot.
+    """
+
+    equal: int
+    only_then: list[Annotated[dict[str, Any], "daqsvc.alarm/1"]]
+    only_now: list[Annotated[dict[str, Any], "daqsvc.alarm/1"]]
+
+
+class Compared(TypedDict):
+    """What was compared.
+
+    Attributes:
+        statements: of the detectors.
+        alarms: events of the alarms.
+    """
+
+    statements: ComparedStatements
+    alarms: ComparedAlarms
+
+
+class ReplayReport(TypedDict):
+    """What came of the replay.
+
+    Attributes:
+        causes: why the snapshot was made, in words.
+        is_equal: whether what is stated now is what was stated then; false if nothing was compared.
+        is_compared: whether there was anything to compare.
+        anew: detectors that began from nothing, and why.
+        notes: what a person should know of the snapshot, in sentences.
+        alarms: events of the alarms, in order.
+        statements: of the detectors, in order.
+        compared: the same, compared with the snapshot.
+    """
+
+    causes: list[str]
+    is_equal: bool
+    is_compared: bool
+    anew: dict[str, str]
+    notes: list[str]
+    alarms: list[Annotated[dict[str, Any], "daqsvc.alarm/1"]]
+    statements: list[Annotated[dict[str, Any], "statement"]]
+    compared: Compared
+
+
+def _document(replayed: Replayed) -> ReplayReport:
     from pydantic_core import to_json  # noqa: PLC0415 - as above
 
-    document: dict[str, Any] = json.loads(
-        to_json(
-            {
-                "causes": replayed.causes,
-                "is_equal": replayed.is_equal,
-                "is_compared": replayed.is_compared,
-                "anew": replayed.anew,
-                "notes": replayed.notes,
-                "alarms": [alarm_document(event) for event in replayed.alarms],
-                "statements": [statement_document(one) for one in replayed.statements],
-                "compared": {"statements": told(replayed.said), "alarms": told(replayed.alarmed)},
-            },
-            inf_nan_mode="null",
-        )
-    )
-    return document
+    from daqsvc.publish.payloads import alarm_document, statement_document  # noqa: PLC0415 - only what is needed
+
+    said, alarmed = replayed.said, replayed.alarmed
+    report: ReplayReport = {
+        "causes": replayed.causes,
+        "is_equal": replayed.is_equal,
+        "is_compared": replayed.is_compared,
+        "anew": replayed.anew,
+        "notes": replayed.notes,
+        "alarms": [alarm_document(event) for event in replayed.alarms],
+        "statements": [statement_document(one) for one in replayed.statements],
+        "compared": {
+            "statements": {"equal": said.equal, "only_then": said.changed, "only_now": said.added},
+            "alarms": {"equal": alarmed.equal, "only_then": alarmed.changed, "only_now": alarmed.added},
+        },
+    }
+    finite: ReplayReport = json.loads(to_json(report, inf_nan_mode="null"))
+    return finite

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypedDict
 
 from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE
 from daqsvc.commands.complaint import complain
@@ -14,6 +14,22 @@ if TYPE_CHECKING:
     import argparse
 
     from daqsvc.commands.machine_files import Load
+
+
+class SnapshotTaken(TypedDict):
+    """What came of it.
+
+    Attributes:
+        accepted: whether a snapshot was made.
+        reason: why not; empty if one was.
+        code: code of that reason; null if there is none.
+        path: file of the snapshot; empty if none was made.
+    """
+
+    accepted: bool
+    reason: str
+    code: str | None
+    path: str
 
 
 class SnapshotCommand:
@@ -51,8 +67,12 @@ class SnapshotCommand:
         except (StoreNotFoundError, ControlError) as error:
             return complain("daqsvc snapshot", error, error.code)
         if arguments.json:
-            told = {"accepted": answer.accepted, "reason": answer.reason, "code": answer.code}
-            told["path"] = answer.path
+            told: SnapshotTaken = {
+                "accepted": answer.accepted,
+                "reason": answer.reason,
+                "code": answer.code,
+                "path": answer.path,
+            }
             print(json.dumps(told))  # noqa: T201 - this is what the verb is for
         elif answer.accepted:
             print(answer.path)  # noqa: T201 - as above

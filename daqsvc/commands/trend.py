@@ -17,7 +17,7 @@ import time
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypedDict
 
 from daqsvc.commands.arguments import EXIT_OK, EXIT_USAGE, add_overwrite, duration
 from daqsvc.commands.complaint import complain
@@ -54,6 +54,38 @@ EXTRAS = {"parquet": ("pyarrow", "parquet"), "plot": ("matplotlib", "plot")}
 PICTURES = (".png", ".svg", ".pdf")
 OF_STDOUT = {errno.EPIPE, errno.ENOSPC, errno.EIO}
 """What `daqsvc.cli.main` states of standard output in its own words."""
+
+
+class TrendLine(TypedDict):
+    """One figure over the time shown; lists of the same length have an entry for each point.
+
+    Attributes:
+        schema: what the line is, and of which version.
+        machine: name of the machine.
+        detector: name of the detector.
+        kind: what of its statements the figure is, e.g. `statistics` or `probabilities`.
+        key: name of the figure within that.
+        unit: unit of the figure; empty if it has none.
+        reading: detector and name of the figure, as `--reading` takes it.
+        step_s: time from point to point, in s.
+        t_s: begin of each point, s since the Unix epoch.
+        low: least value of each point.
+        mean: mean of each point.
+        high: greatest value of each point.
+    """
+
+    schema: Literal["daqsvc.trend/1"]
+    machine: str
+    detector: str
+    kind: str
+    key: str
+    unit: str
+    reading: str
+    step_s: int
+    t_s: list[int]
+    low: list[float]
+    mean: list[float]
+    high: list[float]
 
 
 class NoTrendError(Exception):
@@ -326,19 +358,26 @@ def _local(t_s: float) -> str:
     return datetime.fromtimestamp(t_s).astimezone().strftime("%Y-%m-%d %H:%M")
 
 
-def _document(one: _ShownSeries, step: Step) -> dict[str, Any]:
+def _document(one: _ShownSeries, step: Step) -> TrendLine:
     series, trend = one
     return {
         "schema": "daqsvc.trend/1",
-        **series._asdict(),
+        "machine": series.machine,
+        "detector": series.detector,
+        "kind": series.kind,
+        "key": series.key,
+        "unit": series.unit,
         "reading": series.name,
         "step_s": int(step),
         "t_s": trend.t_s.tolist(),
-        **{
-            name: [float(f"{value:.6g}") for value in getattr(trend, name)]
-            for name in ("low", "mean", "high")
-        },
+        "low": _in_short(trend.low),
+        "mean": _in_short(trend.mean),
+        "high": _in_short(trend.high),
     }
+
+
+def _in_short(values: Iterable[float]) -> list[float]:
+    return [float(f"{value:.6g}") for value in values]
 
 
 def _rows(shown: Iterable[_ShownSeries]) -> Iterator[tuple[Any, ...]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -29,7 +29,7 @@ MEASURED_RATE = "rate_measured_hz"
 """The rate by the clock of the box, which is not the rate that samples are counted by."""
 GROUP_TIME = "time of "
 """In front of a group's name, the name of its time."""
-WAV_SCHEMA = "daqsvc.wav/1"
+WAV_SCHEMA: Literal["daqsvc.wav/1"] = "daqsvc.wav/1"
 """Of the comment in its WAV files."""
 
 LONGEST_NAME = 80

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from daqsvc.diagnosis.reading import Reading
@@ -182,9 +184,14 @@ class Field(NamedTuple):
     about: str
 
 
-def fields(schema: Mapping[str, Any]) -> Iterator[Field]:
-    """Every field of a payload, from its JSON Schema."""
-    definitions = schema.get("$defs", {})
+def fields(schema: Mapping[str, Any], short: Mapping[str, str] | None = None) -> Iterator[Field]:
+    """Every field of a payload, from its JSON Schema.
+
+    Args:
+        schema: of the payload.
+        short: by title, words for the type of objects whose fields are listed elsewhere.
+    """
+    definitions, short = schema.get("$defs", {}), short or {}
 
     def solved(one: Mapping[str, Any]) -> Mapping[str, Any]:
         return definitions[one["$ref"].rpartition("/")[2]] if "$ref" in one else one
@@ -193,49 +200,60 @@ def fields(schema: Mapping[str, Any]) -> Iterator[Field]:
         for name, declared_at in below.get("properties", {}).items():
             one = solved(declared_at)
             about = declared_at.get("description") or ""
-            yield Field(f"{path}{name}", _kind(declared_at, definitions), about)
+            yield Field(f"{path}{name}", _kind(declared_at, definitions, short=short), about)
             yield from deeper(one, f"{path}{name}", within)
 
     def deeper(one: Mapping[str, Any], path: str, within: tuple[str, ...]) -> Iterator[Field]:
         title = one.get("title", "")
-        if title in within:
+        if title in within or title in short:
             return
+        inside = (*within, title) if title else within
         if "properties" in one:
-            yield from walk(one, f"{path}.", (*within, title))
+            yield from walk(one, f"{path}.", inside)
         if isinstance(items := one.get("items"), dict):
-            yield from deeper(solved(items), f"{path}[]", within)
+            yield from deeper(solved(items), f"{path}[]", inside)
         if isinstance(values := one.get("additionalProperties"), dict):
-            yield from deeper(solved(values), f"{path}.NAME", within)
+            yield from deeper(solved(values), f"{path}.NAME", inside)
+        for arm in one.get("anyOf", ()):
+            yield from deeper(solved(arm), path, inside)
 
     return walk(schema, "", ())
 
 
-def _kind(one: Mapping[str, Any], definitions: Mapping[str, Any], within: tuple[str, ...] = ()) -> str:
+def _kind(
+    one: Mapping[str, Any],
+    definitions: Mapping[str, Any],
+    within: tuple[str, ...] = (),
+    short: Mapping[str, str] = MappingProxyType({}),
+) -> str:
     """The type of a field in words.
 
     Args:
         one: its schema.
         definitions: what a ``$ref`` leads to.
         within: those that lead here: what holds its own kind is a group of groups.
+        short: words for objects, by title.
     """
+
+    def of(other: Mapping[str, Any], *names: str) -> str:
+        return _kind(other, definitions, (*within, *names), short)
+
     if "$ref" in one:
         name = one["$ref"].rpartition("/")[2]
-        return (
-            "a group of these" if name in within else _kind(definitions[name], definitions, (*within, name))
-        )
+        return "a group of these" if name in within else short.get(name) or of(definitions[name], name)
     if "const" in one:
-        return code(f'"{one["const"]}"')
+        return code(json.dumps(one["const"]))
     if "enum" in one:
         return "one of " + ", ".join(code(f'"{value}"') for value in one["enum"])
     if "anyOf" in one:
-        return " or ".join(dict.fromkeys(_kind(arm, definitions, within) for arm in one["anyOf"]))
+        return " or ".join(dict.fromkeys(of(arm) for arm in one["anyOf"]))
     kind, values = one.get("type"), one.get("additionalProperties")
     words = _KINDS.get(f"{kind}", "any value")
     if kind == "array":
         each = one.get("prefixItems") or [one.get("items", {})]
-        words = f"list, of each: {_kind(each[0], definitions, within)}"
+        words = f"list, of each: {of(each[0])}"
     elif kind == "object" and isinstance(values, dict):
-        words = f"by name, each: {_kind(values, definitions, within)}"
+        words = f"by name, each: {of(values)}"
     return words
 
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from daqsvc.reference import alarms, counters, errors, keys, messages, metrics, process, verbs
+from daqsvc.reference import alarms, counters, errors, formats, keys, messages, metrics, process, verbs
 from daqsvc.reference.markdown import NOTE, WordsMissingError, page
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-_MAKERS = (keys, verbs, counters, metrics, messages, alarms, process, errors)
+_MAKERS = (keys, verbs, counters, metrics, messages, formats, alarms, process, errors)
 LIST = "README.md"
 
 
@@ -69,6 +69,7 @@ _FIRST = (
     "alarms.md",
     "topics.md",
     "payloads.md",
+    "formats.md",
     "counters.md",
     "metrics.md",
 )

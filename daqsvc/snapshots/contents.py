@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from daqsvc.acquisition.samples import SampleBlock
 
-SCHEMA = "daqsvc.snapshot/1"
+SCHEMA: Literal["daqsvc.snapshot/1"] = "daqsvc.snapshot/1"
 """What the first message of a snapshot states that it is."""
 SUFFIX = ".mcap"
 """How its name ends."""

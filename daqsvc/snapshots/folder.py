@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.snapshots.contents import SUFFIX
@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
     from pathlib import Path
 
-    from daqsvc.snapshots.contents import Document
 
 FOLDER = "snapshots"
 """Of the machine's part of the store."""
@@ -44,7 +43,9 @@ class SnapshotFolder:
         self._keep_ns = round(keep_days * NS_PER_DAY)
         self._reserve_mb = reserve_mb
 
-    def new(self, kind: str, cause_ns: int, about: Document, files: Mapping[str, bytes]) -> SnapshotWriter:
+    def new(
+        self, kind: str, cause_ns: int, about: Mapping[str, Any], files: Mapping[str, bytes]
+    ) -> SnapshotWriter:
         """Make a file.
 
         Args:

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
     from pathlib import Path
 
-    from daqsvc.snapshots.contents import Document, Entry
+    from daqsvc.snapshots.contents import Entry
     from daqsvc.snapshots.mcap import Mark
 
 CHUNK_BYTES = 1 << 18
@@ -54,7 +54,9 @@ class SnapshotWriter:
         OSError: it cannot be written.
     """
 
-    def __init__(self, path: Path, about: Document, files: Mapping[str, bytes], wall_ns: int) -> None:
+    def __init__(
+        self, path: Path, about: Mapping[str, Any], files: Mapping[str, bytes], wall_ns: int
+    ) -> None:
         self.path = path
         self._wall_ns = wall_ns
         self._file: BinaryIO = os.fdopen(os.open(path, FLAGS, MODE), "wb")
@@ -139,7 +141,7 @@ class SnapshotWriter:
     def _wall(self, at_ns: int) -> int:
         return max(at_ns + self._wall_ns, 0)
 
-    def _note(self, topic: str, at_ns: int, document: Document) -> None:
+    def _note(self, topic: str, at_ns: int, document: Mapping[str, Any]) -> None:
         # Others read this as well, and no other JSON than the standard's.
         data = to_json({"at_ns": at_ns, **document}, inf_nan_mode="null")
         self._mcap.write(topic, self._wall(at_ns), self._wall(at_ns), data)

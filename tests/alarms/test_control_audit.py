@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support.formats import fits
 
 from daqsvc import audit
 from daqsvc.acquisition.clock import NS_PER_S, DrivenClock
@@ -34,7 +35,7 @@ def audit_log(tmp_path: Path) -> AuditLog:
 
 
 def lines(log: AuditLog) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in log.path.read_bytes().split(b"\n") if line]
+    return [fits("daqsvc.audit/1", json.loads(line)) for line in log.path.read_bytes().split(b"\n") if line]
 
 
 async def test_a_command_leaves_two_lines_that_say_all_of_it(tmp_path: Path) -> None:

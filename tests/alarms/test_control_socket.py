@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from support.formats import fits
 from support.small_disks import mounted
 from support.waiting import eventually
 
@@ -87,7 +88,7 @@ async def say(server: ControlServer, line: bytes) -> dict[str, Any]:
         writer.write(line)
         async with asyncio.timeout(10):
             answer: dict[str, Any] = json.loads(await reader.readline())
-        return answer
+        return fits("daqsvc.control-answer/1", answer)
     finally:
         writer.close()
 

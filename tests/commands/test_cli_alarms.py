@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from support.can_gateway import MACHINE, CanGateway, daqsvc_run
+from support.formats import fits
 from support.ports import free_port
 from support.waiting import PATIENCE_S, eventually
 from support.written_journals import write_journal
@@ -80,13 +81,14 @@ async def stands(store: Path, alarm: str, state: str) -> dict[str, Any]:
 
 
 def audited(store: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in (store / "audit.jsonl").read_text().splitlines()]
+    lines = (store / "audit.jsonl").read_text().splitlines()
+    return [fits("daqsvc.audit/1", json.loads(line)) for line in lines]
 
 
 def outcome(out: str) -> dict[str, Any]:
     (line,) = out.splitlines()
     told: dict[str, Any] = json.loads(line)
-    return told
+    return fits("daqsvc ack", told)
 
 
 @pytest.mark.long

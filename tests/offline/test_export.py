@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 import pytest
 import pyuff
 from scipy.io import loadmat, wavfile
+from support.formats import fits
 from support.orbit_files import OPTIONS, RATE_HZ, UNBALANCE, Orbit
 from support.small_disks import mounted
 from support.snapshot_files import BLOCK_ROWS, Sampled, write_snapshot
@@ -138,7 +139,7 @@ def test_streams_of_several_rates_are_a_file_each(gapped, tmp_path, capsys, suff
     snapshot, fast, slow = gapped
     assert export(snapshot, "--to", tmp_path / f"two{suffix}", "--json") == 0
     out, err = capsys.readouterr()
-    document = json.loads(out)
+    document = fits("daqsvc.export/1", json.loads(out))
     assert [one["file"] for one in document["files"]] == [
         str(tmp_path / f"two-shaft{suffix}"),
         str(tmp_path / f"two-oil{suffix}"),
@@ -216,7 +217,7 @@ def test_wav_is_float_in_the_units_of_the_sensors(snapshot, samples, tmp_path):
     content = (tmp_path / "a.wav").read_bytes()
     assert struct.unpack_from("<I", content, 4) == (len(content) - 8,)
     at = content.index(b"ICMT")
-    said = json.loads(content[at + 8 : content.index(b"\0", at + 8)])
+    said = fits("daqsvc.wav/1", json.loads(content[at + 8 : content.index(b"\0", at + 8)]))
     assert (said["channels"], said["units"], said["start_time"]) == (
         list(SENSORS),
         list(SENSORS.values()),

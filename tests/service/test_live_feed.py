@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from support.formats import fits
 from support.live_service import running, watch_of
 from support.recorded_rig import RATE_HZ, play, recorded_rig, recording
 from support.waiting import PATIENCE_S, eventually
@@ -49,7 +50,7 @@ async def looking(
 async def next_line(reader: asyncio.StreamReader) -> dict[str, Any]:
     async with asyncio.timeout(PATIENCE_S):
         told: dict[str, Any] = json.loads(await reader.readline())
-    return told
+    return told if told.get("schema") == "daqsvc.control-answer/1" else fits("daqsvc.live/1", told)
 
 
 def rows_of(told: dict[str, Any]) -> np.ndarray[Any, Any]:

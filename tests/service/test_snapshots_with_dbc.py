@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from support.formats import fits
 from support.live_service import watch_of
 from support.machine_files import TRIAXIAL, changed
 from support.recorded_rig import let_time_pass, play, recorder_of, recording
@@ -90,7 +91,8 @@ async def test_a_device_that_comes_and_goes_is_judged_again_where_its_dbc_is_not
     assert {("sensor-ok/accel-x", "raised"), ("sensor-ok/accel-x", "returned")} <= {*kinds}
 
     # By the same machine file in another folder, beside the same DBC, the detectors go on, too.
-    assert any(one.topic == STATES for one in noted)
+    states = [one.document for one in noted if one.topic == STATES]
+    assert [fits("daqsvc.snapshot/1", one) for one in states]
     moved = machine_at(elsewhere, f"{elsewhere / DBC}", "snapshot-dbc")
     by_moved = await judged(snapshot, moved, tmp_path / "moved")
     assert by_moved.is_equal

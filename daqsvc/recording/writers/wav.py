@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import struct
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, NotRequired, TypedDict
 
 import numpy as np
 
@@ -74,17 +74,46 @@ def write_wav(path: Path, streams: Sequence[RecordedStream], about: Mapping[str,
     return notes_on_gaps(path, streams, "WAV", [infinite])
 
 
+class WavComment(TypedDict):
+    """The comment `ICMT` in a WAV file of `daqsvc export`; after these keys come texts of the recording.
+
+    Attributes:
+        schema: what the comment is, and of which version.
+        stream: name of the stream.
+        channels: names of the channels, in the order of the file.
+        units: unit of each channel; empty if it is not known.
+        start_time: time of the first sample, ISO 8601; null if it is not known.
+        scale: what a sample of 1.0 is.
+        recording: name of the file that was exported.
+        written_by: program and version.
+        site: the site, if the recording states it.
+        box: the box, if the recording states it.
+        machine: the machine, if the recording states it.
+    """
+
+    schema: Literal["daqsvc.wav/1"]
+    stream: str
+    channels: list[str]
+    units: list[str]
+    start_time: str | None
+    scale: str
+    recording: NotRequired[str]
+    written_by: NotRequired[str]
+    site: NotRequired[str]
+    box: NotRequired[str]
+    machine: NotRequired[str]
+
+
 def _comment(stream: RecordedStream, about: Mapping[str, str]) -> bytes:
-    document = {
+    document: WavComment = {
         "schema": WAV_SCHEMA,
         "stream": stream.name,
         "channels": list(stream.names),
         "units": list(stream.units),
         "start_time": stream.start or None,
         "scale": "1.0 is one unit",
-        **about,
     }
-    return json.dumps(document).encode("ascii") + b"\0"
+    return json.dumps({**document, **about}).encode("ascii") + b"\0"
 
 
 def _head(rate_hz: int, channels: int, samples: int, comment: bytes) -> bytes:

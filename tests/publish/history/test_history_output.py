@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from support.clocks import SettableClock
+from support.formats import fits
 from support.live_service import play, running
 from support.machine_files import LAVAL, only_problem, parsed
 from support.mqtt_publishing import output_port
@@ -308,7 +309,7 @@ async def test_a_service_keeps_it_and_daqsvc_trend_shows_it(
     assert await asyncio.to_thread(main, ["trend", "--store", str(tmp_path), "--since", "1h", "--json"]) == 0
     found = {one["reading"]: one for one in map(json.loads, capsys.readouterr().out.splitlines())}
     assert {"levels/probe-x.rms", "levels/probe-y.rms"} <= found.keys()
-    rms = found["levels/probe-x.rms"]
+    rms = fits("daqsvc.trend/1", found["levels/probe-x.rms"])
     assert (rms["machine"], rms["unit"], rms["step_s"]) == (machine.machine.name, "um", 1)
     assert rms["low"] <= rms["mean"] <= rms["high"]
 

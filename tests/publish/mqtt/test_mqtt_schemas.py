@@ -17,6 +17,7 @@ from support.paths import ROOT
 from support.waiting import eventually
 
 from daqsvc.publish.schemas import MACHINE_FILE, PAYLOADS, schema_files
+from daqsvc.reference import formats
 from daqsvc.settings import parse_machine_file
 
 pytestmark = pytest.mark.integration
@@ -31,19 +32,19 @@ def validator(name):
     return Draft202012Validator(json.loads((DOCS / f"{name.replace('/', '-')}.json").read_text()))
 
 
-@pytest.mark.parametrize("name", sorted(PAYLOADS))
+@pytest.mark.parametrize("name", sorted([*PAYLOADS, *map(formats.slug, formats.FORMATS)]))
 def test_every_published_schema_is_one_itself(name):
     validator(name).check_schema(validator(name).schema)
 
 
-@pytest.mark.parametrize("name", sorted(schema_files()))
+@pytest.mark.parametrize("name", sorted({**schema_files(), **formats.schema_files()}))
 def test_the_published_schema_is_the_one_of_the_code(name):
-    remedy = "run python -m daqsvc.publish.schemas docs/schemas"
-    assert (DOCS / name).read_text(encoding="utf-8") == schema_files()[name], remedy
+    of_code = {**schema_files(), **formats.schema_files()}
+    assert (DOCS / name).read_text(encoding="utf-8") == of_code[name], "run make reference"
 
 
 def test_every_published_schema_is_one_of_the_code():
-    assert {path.name for path in DOCS.iterdir()} == {*schema_files(), MACHINE_FILE}
+    assert {path.name for path in DOCS.iterdir()} == {*schema_files(), *formats.schema_files(), MACHINE_FILE}
 
 
 def acknowledge(identifier, **changes):
