@@ -114,7 +114,7 @@ class LiveStanding(TypedDict):
         stream: its name.
         doubt: why nothing can be judged by its samples; empty if there is no evidence against them.
         proven: whether its rate seems to be the nominal one, or could not be found out in time.
-        silent: whether the doubt is that nothing comes at all, since another one stood.
+        silent: whether the doubt is that nothing comes at all, since another doubt was active.
     """
 
     stream: str

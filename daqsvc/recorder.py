@@ -133,7 +133,7 @@ class SnapshotAbout(TypedDict):
         remembered: by detector up to which sample its state at the begin has gone.
         streams: what is known of each stream and grid.
         faults: by detector and decision the fault that it means.
-        standings: how each stream stood.
+        standings: how each stream stands.
         alarms: the last event of each alarm.
         causes: the first cause of the file, in words.
     """
@@ -202,7 +202,7 @@ class SnapshotStanding(TypedDict):
         stream: name of the stream.
         doubt: why nothing can be judged by its samples; empty if there is no evidence against them.
         proven: whether its rate seems to be the nominal one, or could not be found out in time.
-        silent: whether the doubt is that nothing comes at all, since another one stood.
+        silent: whether the doubt is that nothing comes at all, since another doubt was active.
     """
 
     at_ns: NotRequired[int]

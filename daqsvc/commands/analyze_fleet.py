@@ -9,7 +9,7 @@ import json
 import os
 import signal
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 from daqsvc.commands.arguments import EXIT_OK, EXIT_REFUSED, EXIT_USAGE
 from daqsvc.commands.complaint import complain
@@ -88,6 +88,16 @@ def default_results(archive: str) -> str:
     return f"{place}-results"
 
 
+class WhereResults(TypedDict):
+    """Where the results of an archive are.
+
+    Attributes:
+        results: folder or URL of the results.
+    """
+
+    results: str
+
+
 def run_fleet(arguments: argparse.Namespace) -> int:
     """Judge the archive; returns the exit code."""
     if wrong := lacking_extra():
@@ -100,7 +110,8 @@ def run_fleet(arguments: argparse.Namespace) -> int:
     except FleetError as error:
         return complain("daqsvc analyze", error, error.code)
     if arguments.json:
-        print(json.dumps({**summary.as_json(), "results": results}))  # noqa: T201 - this is what the verb is for
+        document: WhereResults = {"results": results}
+        print(json.dumps({**summary.as_json(), **document}))  # noqa: T201 - this is what the verb is for
     else:
         print(_text(summary, results))  # noqa: T201
     return EXIT_REFUSED if summary.refused or summary.failed else EXIT_OK

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from daqsvc.bearing.baseline import BearingBaseline
+    from daqsvc.commands.calibrate_report import Refused
     from daqsvc.errors.code import Code
     from daqsvc.offline.runner import Runner
     from daqsvc.recording.recording import Recording
@@ -283,6 +284,7 @@ def _keep_bearings(baseline: BearingBaseline, arguments: argparse.Namespace) -> 
 
 def _refuse(why: str, code: Code, *, as_json: bool) -> int:
     if as_json:
-        print(json.dumps({"refused": why, "code": code.id}), flush=True)  # noqa: T201
+        refused: Refused = {"refused": why, "code": code.id}
+        print(json.dumps(refused), flush=True)  # noqa: T201
         return EXIT_REFUSED
     return complain("not calibrated", why, code, EXIT_REFUSED)

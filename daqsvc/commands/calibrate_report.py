@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypedDict
 
 from daqsvc.detectors.shaft.verdict import calibration_json
 from daqsvc.diagnosis.recorded import finite
@@ -22,6 +22,250 @@ if TYPE_CHECKING:
 _OF_CRITICAL = (0.5, 0.7, 0.95, 1.0)
 
 
+class Refused(TypedDict):
+    """The recordings do not suffice.
+
+    Attributes:
+        refused: why, in a sentence.
+        code: code of that reason.
+    """
+
+    refused: str
+    code: str
+
+
+class RotorFiguresJson(TypedDict):
+    """The rotor as a Laval rotor.
+
+    Attributes:
+        natural_frequency_hz: its natural frequency.
+        natural_frequency_tolerance: how far that may be off, as a share.
+        damping_ratio: its damping ratio.
+        damping_tolerance: how far that may be off, as a share.
+        clearance_um: clearance; null if it is not known.
+        static_sag_um: static sag; null if it is not known.
+    """
+
+    natural_frequency_hz: float
+    natural_frequency_tolerance: float
+    damping_ratio: float
+    damping_tolerance: float
+    clearance_um: float | None
+    static_sag_um: float | None
+
+
+class PredictedJson(TypedDict):
+    """1X as the run-up predicts it at a speed.
+
+    Attributes:
+        speed_rpm: the speed.
+        amplitude_um: amplitude of 1X.
+        phase_deg: phase of 1X.
+        uncertainty_um: its standard deviation.
+    """
+
+    speed_rpm: float
+    amplitude_um: float
+    phase_deg: float
+    uncertainty_um: float
+
+
+class RunUpJson(TypedDict):
+    """What the run-up shows.
+
+    Attributes:
+        source: name of the recording.
+        revolutions: revolutions that were fitted.
+        speed_range_rpm: least and greatest speed.
+        natural_frequency_hz: natural frequency.
+        natural_frequency_uncertainty_hz: its standard deviation.
+        critical_speed_rpm: the same as a speed.
+        damping_ratio: damping ratio.
+        damping_uncertainty: its standard deviation.
+        eccentricity_um: eccentricity of the mass.
+        eccentricity_uncertainty_um: its standard deviation.
+        heavy_spot_deg: where the heavy spot is.
+        heavy_spot_uncertainty_deg: its standard deviation.
+        centre_um: centre of the whirl, x and y.
+        centre_uncertainty_um: its standard deviation.
+        ellipticity: backward over forward whirl.
+        noise_um: noise of a sample, standard deviation.
+        fit_error: what the fit leaves, as a share.
+        laval: whether the machine is like a Laval rotor.
+        verdict: what the machine is like, in words.
+        predicted_1x: what 1X is at some speeds; null if the machine is no Laval rotor.
+    """
+
+    source: str
+    revolutions: int
+    speed_range_rpm: list[float]
+    natural_frequency_hz: float
+    natural_frequency_uncertainty_hz: float | None
+    critical_speed_rpm: float
+    damping_ratio: float
+    damping_uncertainty: float | None
+    eccentricity_um: float
+    eccentricity_uncertainty_um: float | None
+    heavy_spot_deg: float
+    heavy_spot_uncertainty_deg: float | None
+    centre_um: list[float]
+    centre_uncertainty_um: float | None
+    ellipticity: float
+    noise_um: float
+    fit_error: float
+    laval: bool
+    verdict: str
+    predicted_1x: list[PredictedJson] | None
+
+
+class TwoModesJson(TypedDict):
+    """The run-up with two modes: the rotor and its support.
+
+    Attributes:
+        natural_frequency_hz: natural frequency of the rotor.
+        damping_ratio: its damping ratio.
+        support_share: how much of the flexibility is that of the support.
+        anisotropy: how much the support differs by direction.
+        gyroscopic: how much the modes part with speed.
+        fit_error: what the fit leaves, as a share.
+        explains: whether two modes explain the run-up.
+        verdict: what the machine is like, in words.
+    """
+
+    natural_frequency_hz: float
+    damping_ratio: float
+    support_share: float
+    anisotropy: float
+    gyroscopic: float
+    fit_error: float
+    explains: bool
+    verdict: str
+
+
+class SteadyJson(TypedDict):
+    """The healthy machine at one speed.
+
+    Attributes:
+        source: name of the recording.
+        vector_um: by order the vector, real and imaginary part.
+        vector_uncertainty_um: by order its standard deviation.
+        eccentricity_um: eccentricity of the mass; null if the machine is no Laval rotor.
+        heavy_spot_deg: where the heavy spot is; null if the machine is no Laval rotor.
+        fit_error: what the fit of the run-up leaves, as a share; null without one.
+        off_prediction: how far 1X is from what the run-up predicts, as a share; null without one.
+        revolutions: healthy revolutions that were measured.
+        speed_rpm: mean speed of the shaft.
+        amplitude_um: amplitude of forward 1X.
+        phase_deg: phase of forward 1X.
+        ellipticity: backward over forward 1X.
+        noise_um: noise of a sample, standard deviation.
+        snr_db: whirl over noise.
+        laval: whether the machine is like a Laval rotor.
+        reference_revolutions: revolutions that the baseline rests on.
+        smallest_change_um: the smallest change that can be seen.
+        verdict: what the machine is like, in words.
+    """
+
+    source: str
+    vector_um: dict[str, list[float]]
+    vector_uncertainty_um: dict[str, float]
+    eccentricity_um: float | None
+    heavy_spot_deg: float | None
+    fit_error: float | None
+    off_prediction: float | None
+    revolutions: int
+    speed_rpm: float
+    amplitude_um: float
+    phase_deg: float
+    ellipticity: float
+    noise_um: float
+    snr_db: float | None
+    laval: bool
+    reference_revolutions: int
+    smallest_change_um: float | None
+    verdict: str
+
+
+class RotorCalibrationJson(TypedDict):
+    """The calibrated rotor; lengths in um, uncertainties are standard deviations.
+
+    Attributes:
+        refused: null.
+        out: file that it was written to; null if to none.
+        written: when, ISO 8601.
+        rotor: the rotor.
+        run_up: what the run-up shows; null without one.
+        two_modes: the run-up with two modes; null if one suffices.
+        steady: the healthy machine, one for each speed.
+    """
+
+    refused: None
+    out: str | None
+    written: str
+    rotor: RotorFiguresJson
+    run_up: RunUpJson | None
+    two_modes: TwoModesJson | None
+    steady: list[SteadyJson]
+
+
+class BearingModelJson(TypedDict):
+    """The model of the healthy signal of some channels.
+
+    Attributes:
+        channels: names of the channels.
+        order: order of the model.
+        spectral_radius: its largest pole.
+        whiteness_p: probability that what it does not predict is white.
+        predictable: share of that which can still be predicted.
+        windows: windows that were compared.
+        window_s: length of a window, in s.
+        spread_db: how much windows differ, in dB.
+    """
+
+    channels: list[str]
+    order: int
+    spectral_radius: float
+    whiteness_p: float
+    predictable: float
+    windows: int
+    window_s: float
+    spread_db: float
+
+
+class HealthyLineJson(TypedDict):
+    """The lines of a part of a healthy bearing.
+
+    Attributes:
+        z: their significance, in standard deviations of noise.
+        size: modulation by them in the whitened envelope.
+    """
+
+    z: float
+    size: float
+
+
+class BearingsCalibrationJson(TypedDict):
+    """The healthy state of bearings.
+
+    Attributes:
+        refused: null.
+        source: name of the recording.
+        written_to: file that it was written to; null if to none.
+        rate_hz: samples per second.
+        speed_rpm: speed of the shaft.
+        models: models of the healthy signals.
+        lines: by channel and part the lines of the healthy bearing.
+    """
+
+    refused: None
+    source: str
+    written_to: str | None
+    rate_hz: float
+    speed_rpm: float
+    models: list[BearingModelJson]
+    lines: dict[str, dict[str, HealthyLineJson]]
+
+
 def speeds_to_predict(fit: RunUpFit, asked: Sequence[float] | None) -> tuple[float, ...]:
     """Speeds in rpm at which the run-up states something; those asked for, or parts of the critical one."""
     if not fit.laval:
@@ -33,36 +277,34 @@ def speeds_to_predict(fit: RunUpFit, asked: Sequence[float] | None) -> tuple[flo
     return tuple(speed for speed in parts if low <= speed <= high)
 
 
-def as_json(record: CalibrationRecord, asked: Sequence[float] | None, out: Path | None) -> dict[str, Any]:
+def as_json(
+    record: CalibrationRecord, asked: Sequence[float] | None, out: Path | None
+) -> RotorCalibrationJson:
     """One JSON object: lengths in um, uncertainties are standard deviations."""
     rotor = record.rotor
-    document: dict[str, Any] = finite(
-        {
-            "refused": None,
-            "out": None if out is None else str(out),
-            "written": record.written,
-            "rotor": {
-                "natural_frequency_hz": rotor.natural_frequency_hz,
-                "natural_frequency_tolerance": rotor.natural_frequency_tolerance,
-                "damping_ratio": rotor.damping_ratio,
-                "damping_tolerance": rotor.damping_tolerance,
-                "clearance_um": rotor.clearance_um,
-                "static_sag_um": rotor.sag_um,
-            },
-            "run_up": None
-            if record.run_up is None
-            else {"source": record.run_up_source, **_run_up_json(record.run_up, asked)},
-            "two_modes": None if record.two_modes is None else _two_modes_json(record.two_modes),
-            "steady": [
-                {"source": source, **_steady_json(record, calibration)}
-                for calibration, source in zip(record.steady, record.steady_sources, strict=True)
-            ],
-        }
-    )
-    return document
+    document: RotorCalibrationJson = {
+        "refused": None,
+        "out": None if out is None else str(out),
+        "written": record.written,
+        "rotor": {
+            "natural_frequency_hz": rotor.natural_frequency_hz,
+            "natural_frequency_tolerance": rotor.natural_frequency_tolerance,
+            "damping_ratio": rotor.damping_ratio,
+            "damping_tolerance": rotor.damping_tolerance,
+            "clearance_um": rotor.clearance_um,
+            "static_sag_um": rotor.sag_um,
+        },
+        "run_up": None if record.run_up is None else _run_up_json(record.run_up, record.run_up_source, asked),
+        "two_modes": None if record.two_modes is None else _two_modes_json(record.two_modes),
+        "steady": [
+            _steady_json(record, calibration, source)
+            for calibration, source in zip(record.steady, record.steady_sources, strict=True)
+        ],
+    }
+    return finite(document)
 
 
-def bearings_as_json(baseline: BearingBaseline, out: object) -> dict[str, Any]:
+def bearings_as_json(baseline: BearingBaseline, out: object) -> BearingsCalibrationJson:
     """The healthy state of bearings, and where it was written to."""
     return {
         "refused": None,
@@ -106,8 +348,9 @@ def bearings_as_text(baseline: BearingBaseline, out: object) -> str:
     return "\n  ".join(lines)
 
 
-def _run_up_json(fit: RunUpFit, asked: Sequence[float] | None) -> dict[str, Any]:
+def _run_up_json(fit: RunUpFit, source: str, asked: Sequence[float] | None) -> RunUpJson:
     return {
+        "source": source,
         "revolutions": fit.revolutions,
         "speed_range_rpm": list(fit.speed_range_rpm),
         "natural_frequency_hz": fit.natural_frequency_hz,
@@ -141,7 +384,7 @@ def _run_up_json(fit: RunUpFit, asked: Sequence[float] | None) -> dict[str, Any]
     }
 
 
-def _two_modes_json(fit: TwoModeFit) -> dict[str, Any]:
+def _two_modes_json(fit: TwoModeFit) -> TwoModesJson:
     return {
         "natural_frequency_hz": fit.natural_frequency_hz,
         "damping_ratio": fit.damping_ratio,
@@ -154,9 +397,10 @@ def _two_modes_json(fit: TwoModeFit) -> dict[str, Any]:
     }
 
 
-def _steady_json(record: CalibrationRecord, calibration: Calibration) -> dict[str, Any]:
+def _steady_json(record: CalibrationRecord, calibration: Calibration, source: str) -> SteadyJson:
     deviations = _deviations(calibration)
     return {
+        "source": source,
         **calibration_json(calibration),
         "vector_um": {
             str(order): [value.real, value.imag]

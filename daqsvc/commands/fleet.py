@@ -196,7 +196,7 @@ def _fleet(report: FleetReport) -> str:
     lines = [f"Fleet: {machines}, {judged}, {years}, {alarms}"]
     if report.has_truth:
         lines.append(
-            f"{counted(fleet['known_faults'], 'known fault')}, {fleet['missed']:,} missed, "
+            f"{counted(fleet['known_faults'] or 0, 'known fault')}, {fleet['missed']:,} missed, "
             f"{fleet['without_recordings']:,} without a recording that was judged"
         )
         lines.append(_cost(report))

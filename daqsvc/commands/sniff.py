@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypedDict
 
 from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE
 from daqsvc.commands.complaint import complain
@@ -23,6 +23,18 @@ if TYPE_CHECKING:
     from drivers.sniffing import Sniffed, SniffTable
 
 SNIFFERS = "daqsvc.sniffers"
+
+
+class SniffEnd(TypedDict):
+    """What comes with the figures of every kind of bus.
+
+    Attributes:
+        machine_file: tables to begin a machine file with, in TOML; empty if there is nothing to propose.
+        problem: what is wrong, with what to check; empty if nothing is.
+    """
+
+    machine_file: str
+    problem: str
 
 
 class SniffCommand:
@@ -69,7 +81,8 @@ def sniffers() -> dict[str, Sniffer]:
 
 
 def _as_json(found: Sniffed) -> str:
-    return json.dumps({**found.figures, "machine_file": found.fragment, "problem": found.problem})
+    end: SniffEnd = {"machine_file": found.fragment, "problem": found.problem}
+    return json.dumps({**found.figures, **end})
 
 
 def _as_text(found: Sniffed) -> str:

@@ -5,7 +5,16 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeAlias, TypeVar
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    ClassVar,
+    Generic,
+    NotRequired,
+    TypeAlias,
+    TypedDict,
+    TypeVar,
+)
 
 import numpy as np
 
@@ -40,6 +49,7 @@ if TYPE_CHECKING:
     Progress: TypeAlias = Callable[[int, int], None]
 
 SettingsT = TypeVar("SettingsT", bound=Section)
+FiniteT = TypeVar("FiniteT")
 
 _SEVERITIES = ("normal", "alert", "danger")
 _BLOCKS = 256
@@ -307,6 +317,62 @@ def known(figure: float) -> float | None:
     return None if math.isnan(figure) else figure
 
 
+class StatementStepJson(TypedDict):
+    """A statement of a detector that differs from the one before.
+
+    Attributes:
+        sample: samples before the end of its window.
+        seconds: time before the end of its window, in s.
+        revolution: revolutions before the end of its window; null if they are not known.
+        onset_sample: samples before the begin of its window.
+        decision: what the detector decided.
+        severity: how bad that is.
+        quality: whether the samples and sensors are good, samples are missing, or a sensor is not OK.
+    """
+
+    sample: int
+    seconds: float
+    revolution: float | None
+    onset_sample: int
+    decision: str
+    severity: str
+    quality: str
+
+
+class StatementsJson(TypedDict):
+    """All statements of one detector, condensed; of one without a statement some keys are absent.
+
+    Attributes:
+        decision: what the detector decided last; null if it gave no statement.
+        severity: how bad that is.
+        group: modes that the evidence cannot tell apart from the decision.
+        probabilities: of the modes.
+        evidence: of the modes, in nats.
+        statistics: figures of the detector, by name.
+        units: unit of each of these that has one.
+        thresholds: where a figure becomes a decision.
+        quality: whether the samples and sensors were good at the end.
+        reason: why not; empty if they were.
+        sensors: names of the sensors that the last statement rests on.
+        worst: the first of the most severe statements that rest on good data; null without any.
+        history: the statements that differ from the one before.
+    """
+
+    decision: str | None
+    severity: NotRequired[str]
+    group: NotRequired[list[str]]
+    probabilities: NotRequired[dict[str, float | None]]
+    evidence: NotRequired[dict[str, float | None]]
+    statistics: NotRequired[dict[str, float | None]]
+    units: NotRequired[dict[str, str]]
+    thresholds: NotRequired[dict[str, float | None]]
+    quality: str
+    reason: str
+    sensors: NotRequired[list[str]]
+    worst: StatementStepJson | None
+    history: list[StatementStepJson]
+
+
 @dataclass(frozen=True, slots=True)
 class Statements:
     """All that a detector said.
@@ -341,7 +407,7 @@ class Statements:
                 yield diagnosis
             before = now
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> StatementsJson:
         """For the output."""
         last = self.last
         if last is None:
@@ -353,24 +419,22 @@ class Statements:
                 "history": [],
             }
         worst = self.worst
-        document: dict[str, Any] = finite(
-            {
-                "decision": last.decision,
-                "severity": last.severity,
-                "group": list(last.group),
-                "probabilities": dict(last.probabilities),
-                "evidence": dict(last.evidence),
-                "statistics": dict(last.statistics),
-                "units": dict(last.units),
-                "thresholds": dict(last.thresholds),
-                "quality": last.quality,
-                "reason": last.reason,
-                "sensors": list(last.sensors),
-                "worst": None if worst is None else self._step(worst),
-                "history": [self._step(change) for change in self.changes()],
-            }
-        )
-        return document
+        document: StatementsJson = {
+            "decision": last.decision,
+            "severity": last.severity,
+            "group": list(last.group),
+            "probabilities": dict(last.probabilities),
+            "evidence": dict(last.evidence),
+            "statistics": dict(last.statistics),
+            "units": dict(last.units),
+            "thresholds": dict(last.thresholds),
+            "quality": last.quality,
+            "reason": last.reason,
+            "sensors": list(last.sensors),
+            "worst": None if worst is None else self._step(worst),
+            "history": [self._step(change) for change in self.changes()],
+        }
+        return finite(document)
 
     def describe(self) -> str:
         """One line for a person."""
@@ -389,7 +453,7 @@ class Statements:
             before = f", {worst.severity} at {worst.first_index / self.rate_hz:.3f} s"
         return one_line(f"{self.detector}: {last.decision} ({last.severity}{before}){doubt}; {figures}")
 
-    def _step(self, diagnosis: Diagnosis) -> dict[str, Any]:
+    def _step(self, diagnosis: Diagnosis) -> StatementStepJson:
         return {
             "sample": diagnosis.end_index,
             "seconds": diagnosis.end_index / self.rate_hz,
@@ -462,12 +526,17 @@ def listen(
             yield from said_of_window(detector, Window(begin, part[:whole], end_ns, period_ns))
 
 
-def finite(value: Any) -> Any:
+def finite(document: FiniteT) -> FiniteT:
     """The same with every NaN and infinity as None, and NumPy's numbers as Python's."""
+    told: FiniteT = _finite(document)
+    return told
+
+
+def _finite(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: finite(part) for key, part in value.items()}
+        return {key: _finite(part) for key, part in value.items()}
     if isinstance(value, list | tuple):
-        return [finite(part) for part in value]
+        return [_finite(part) for part in value]
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):

@@ -8,7 +8,7 @@ from collections import Counter
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from itertools import islice
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict
 
 import daqsvc
 from daqsvc.fleet import FleetError
@@ -48,6 +48,32 @@ class Key(NamedTuple):
     version: str
 
 
+class CampaignJson(TypedDict):
+    """What came of an archive.
+
+    Attributes:
+        machines: machines in the archive.
+        recordings: recordings in the archive.
+        judged_before: recordings that an earlier run has judged.
+        judged_now: recordings that this run has judged.
+        not_judged: recordings that could not be judged.
+        verdicts: how many recordings have each verdict.
+        files_of_other_kinds: files among the recordings that are of no kind that is judged.
+        folders_left_out: folders that are no machine's.
+        machines_failed: machines that could not be examined, and why.
+    """
+
+    machines: int
+    recordings: int
+    judged_before: int
+    judged_now: int
+    not_judged: int
+    verdicts: dict[str, int]
+    files_of_other_kinds: int
+    folders_left_out: list[str]
+    machines_failed: dict[str, str]
+
+
 @dataclass
 class CampaignSummary:
     """What came of a run.
@@ -74,7 +100,7 @@ class CampaignSummary:
     left_out: list[str] = field(default_factory=list)
     failed: dict[str, str] = field(default_factory=dict)
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> CampaignJson:
         """A JSON object."""
         return {
             "machines": self.machines,

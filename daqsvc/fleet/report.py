@@ -13,7 +13,7 @@ import re
 from collections import Counter
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, TypedDict
 
 from daqsvc.fleet import FleetError
 from daqsvc.fleet.table import bound_at
@@ -110,6 +110,128 @@ class Changed:
     now: str
 
 
+class ChangedJson(TypedDict):
+    """Where the verdict of a machine changed.
+
+    Attributes:
+        file: the recording with the new verdict.
+        before: the verdict before; null at the first one.
+        now: the new verdict.
+    """
+
+    file: str
+    before: str | None
+    now: str
+
+
+class KnownFaultJson(TypedDict):
+    """A known fault.
+
+    Attributes:
+        fault: its name.
+        first: the first recording or time with it.
+        last: the last recording or time with it; empty if it is still there.
+        recordings: recordings with it.
+        alarming: how many of these alarm.
+        named: how many of these name it.
+        first_alarm: the first of these that alarms; null if none does.
+        missed: whether there are recordings with it, and none alarms.
+    """
+
+    fault: str
+    first: str
+    last: str
+    recordings: int
+    alarming: int
+    named: int
+    first_alarm: str | None
+    missed: bool
+
+
+class MachineReportJson(TypedDict):
+    """One machine.
+
+    Attributes:
+        machine: name of the machine.
+        recordings: recordings of it.
+        judged: how many of these were judged.
+        verdict: verdict of the last recording that was judged; null without one.
+        verdicts: how often each verdict was given.
+        changes: where the verdict changed, in order.
+        alarms: first recordings of runs of alarming ones.
+        false_alarms: those of them outside of every known fault; empty without known faults.
+        false_recordings: alarming recordings outside of every known fault.
+        false_alarm_cost: cost of the false alarms; null if it is not known.
+        known_faults: the known faults.
+        machine_years: years that the recordings represent; null if no time is known.
+        not_judged: why recordings were not judged, and how many.
+    """
+
+    machine: str
+    recordings: int
+    judged: int
+    verdict: str | None
+    verdicts: dict[str, int]
+    changes: list[ChangedJson]
+    alarms: list[str]
+    false_alarms: list[str]
+    false_recordings: int
+    false_alarm_cost: float | None
+    known_faults: list[KnownFaultJson]
+    machine_years: float | None
+    not_judged: dict[str, int]
+
+
+class FleetJson(TypedDict):
+    """All machines together.
+
+    Attributes:
+        machines: how many there are.
+        recordings: recordings of them.
+        judged: how many of these were judged.
+        verdicts: how often each verdict was given.
+        alarms: runs of alarming recordings.
+        machine_years: years that the recordings represent; null if no time is known.
+        known_faults: how many known faults there are; null if none were given.
+        missed: known faults that no recording alarms of; null without known faults.
+        without_recordings: known faults without a recording that was judged; null without known faults.
+        false_alarms: alarms outside of every known fault; null without known faults.
+        false_alarm_cost: their cost; null if it is not known.
+        times_not_known: machines of which it is not known how long they were watched.
+        false_alarms_per_machine_year: false alarms of a machine in a year; null if that is not known.
+        false_alarm_cost_per_machine_year: their cost; null if that is not known.
+        unknown_machines: machines with a known fault that the results do not have.
+    """
+
+    machines: int
+    recordings: int
+    judged: int
+    verdicts: dict[str, int]
+    alarms: int
+    machine_years: float | None
+    known_faults: int | None
+    missed: int | None
+    without_recordings: int | None
+    false_alarms: int | None
+    false_alarm_cost: float | None
+    times_not_known: list[str]
+    false_alarms_per_machine_year: float | None
+    false_alarm_cost_per_machine_year: float | None
+    unknown_machines: list[str]
+
+
+class FleetReportJson(TypedDict):
+    """What the results report.
+
+    Attributes:
+        machines: each machine.
+        fleet: all machines together.
+    """
+
+    machines: list[MachineReportJson]
+    fleet: FleetJson
+
+
 @dataclass
 class MachineReport:
     """What the results say of a machine.
@@ -149,7 +271,7 @@ class MachineReport:
         """The known faults that no recording with them alarms of."""
         return [one for one in self.seen if one.recordings and one.first_alarm is None]
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> MachineReportJson:
         """A JSON object."""
         return {
             "machine": self.machine,
@@ -230,7 +352,7 @@ class FleetReport:
         rate = self.false_alarms_per_year
         return None if rate is None or self.cost is None else rate * self.cost
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> FleetReportJson:
         """A JSON object."""
         seen = [one for machine in self.machines for one in machine.seen]
         verdicts = sum((machine.verdicts for machine in self.machines), Counter[str]())

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias, TypedDict, cast
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from daqsvc.detectors.shaft.verdict import VERDICTS
 from daqsvc.diagnosis.recorded import Evaluated, RecordedDetector, Verdict, finite
 from daqsvc.dsp.orders import OrderVectors, order_vectors
 from daqsvc.dsp.quality import RefusedError
-from daqsvc.dsp.quality.recorded import DataQuality, known_against, off_stated_speed
+from daqsvc.dsp.quality.recorded import DataQuality, DataQualityJson, known_against, off_stated_speed
 from daqsvc.dsp.quality.unit import M_S2_PER_UNIT
 from daqsvc.dsp.speed.lines import ORDERS
 from daqsvc.recording import RecordingError
@@ -131,6 +131,98 @@ class OrderSetup:
         return order_vectors(recording.samples, recording.rate_hz, self.speed_rpm, recording.names)
 
 
+class GrowthJson(TypedDict):
+    """How much 1X has grown.
+
+    Attributes:
+        ratio: 1X over that of the healthy recording.
+        uncertainty: of the ratio, standard deviation.
+        significant: whether it is more than chance.
+    """
+
+    ratio: float | None
+    uncertainty: float | None
+    significant: bool
+
+
+class OrderJson(TypedDict):
+    """One order of one channel.
+
+    Attributes:
+        healthy: amplitude in the healthy recording.
+        present: amplitude in this one.
+        ratio: of the two.
+        uncertainty: of the present amplitude, standard deviation.
+    """
+
+    healthy: float | None
+    present: float | None
+    ratio: float | None
+    uncertainty: float | None
+
+
+class OrderChannelJson(TypedDict):
+    """One channel.
+
+    Attributes:
+        orders: by order, such as `1X`.
+        residual_ratio: what no order explains, over that of the healthy recording.
+        velocity_1x_mm_s_rms: velocity of 1X in mm/s r.m.s.; null if the samples are no acceleration.
+    """
+
+    orders: dict[str, OrderJson]
+    residual_ratio: float | None
+    velocity_1x_mm_s_rms: float | None
+
+
+class OrderVerdictJson(TypedDict):
+    """The verdict about the rotor by orders, of a machine whose healthy recording is known.
+
+    Attributes:
+        recording: name of the recording.
+        baseline: name of the healthy recording.
+        verdict: the most likely change; null if the recording is refused.
+        group: all changes that the evidence cannot tell apart, the most likely first.
+        probabilities: of every change.
+        evidence: of every change, in nats.
+        severity: how large the change is; null if the recording is refused.
+        growth_1x: how much 1X has grown; null if the recording is refused.
+        departure_nats: evidence of any change; null if the recording is refused.
+        threshold_nats: evidence from which on it is a change; null if the recording is refused.
+        false_alarm_probability: chance of a false alarm that this is set for, for each recording.
+        unit: unit of the amplitudes.
+        channels: by channel.
+        speed_rpm: speed by the harmonics; null if it was not measured.
+        speed_uncertainty_rpm: its standard deviation; null if it was not measured.
+        speed_seen: whether an order stands out of the noise; null if that was not measured.
+        revolutions: whole revolutions in the recording.
+        data_quality: what is known against the samples.
+        refused: why the recording cannot be judged; null if it can.
+        code: code of that reason; null if there is none.
+    """
+
+    recording: str
+    baseline: str
+    verdict: str | None
+    group: list[str]
+    probabilities: dict[str, float]
+    evidence: dict[str, float | None]
+    severity: float | None
+    growth_1x: GrowthJson | None
+    departure_nats: float | None
+    threshold_nats: float | None
+    false_alarm_probability: float
+    unit: str
+    channels: dict[str, OrderChannelJson]
+    speed_rpm: float | None
+    speed_uncertainty_rpm: float | None
+    speed_seen: bool | None
+    revolutions: int
+    data_quality: DataQualityJson
+    refused: str | None
+    code: str | None
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OrderVerdict(Verdict):
     """What a recording reports about a machine whose healthy run is known; see `Verdict`.
@@ -153,39 +245,37 @@ class OrderVerdict(Verdict):
         """A JSON object: all figures finite, amplitudes in the unit of the samples."""
         orders, change = self.orders, self.change
         shares = {} if change is None else {str(name): p for name, p in change.probabilities.items()}
-        document: dict[str, Any] = finite(
-            {
-                "recording": self.recording,
-                "baseline": self.baseline,
-                "verdict": None if change is None else change.verdict,
-                "group": [] if change is None else list(change.group),
-                "probabilities": {} if change is None else {name: shares.get(name, 0.0) for name in VERDICTS},
-                "evidence": {} if change is None else dict(change.evidence),
-                "severity": None if change is None else change.severity,
-                "growth_1x": None
-                if change is None
-                else {
-                    "ratio": change.growth,
-                    "uncertainty": change.growth_uncertainty,
-                    "significant": change.growth_significant,
-                },
-                "departure_nats": None if change is None else change.departure,
-                "threshold_nats": None if change is None else change.departure_threshold,
-                "false_alarm_probability": self.setup.rules.false_alarm_probability,
-                "unit": self.setup.unit,
-                "channels": {} if change is None else self._channels(change),
-                "speed_rpm": None if orders is None else orders.speed_rpm,
-                "speed_uncertainty_rpm": None if orders is None else orders.speed_uncertainty_rpm,
-                "speed_seen": None if orders is None else orders.speed_seen,
-                "revolutions": 0 if orders is None else orders.revolutions,
-                "data_quality": self.quality.as_json(),
-                "refused": self.refused,
-                "code": self.refusal_code,
-            }
-        )
-        return document
+        document: OrderVerdictJson = {
+            "recording": self.recording,
+            "baseline": self.baseline,
+            "verdict": None if change is None else change.verdict,
+            "group": [] if change is None else list(change.group),
+            "probabilities": {} if change is None else {name: shares.get(name, 0.0) for name in VERDICTS},
+            "evidence": {} if change is None else {str(name): nats for name, nats in change.evidence.items()},
+            "severity": None if change is None else change.severity,
+            "growth_1x": None
+            if change is None
+            else {
+                "ratio": change.growth,
+                "uncertainty": change.growth_uncertainty,
+                "significant": change.growth_significant,
+            },
+            "departure_nats": None if change is None else change.departure,
+            "threshold_nats": None if change is None else change.departure_threshold,
+            "false_alarm_probability": self.setup.rules.false_alarm_probability,
+            "unit": self.setup.unit,
+            "channels": {} if change is None else self._channels(change),
+            "speed_rpm": None if orders is None else orders.speed_rpm,
+            "speed_uncertainty_rpm": None if orders is None else orders.speed_uncertainty_rpm,
+            "speed_seen": None if orders is None else orders.speed_seen,
+            "revolutions": 0 if orders is None else orders.revolutions,
+            "data_quality": self.quality.as_json(),
+            "refused": self.refused,
+            "code": self.refusal_code,
+        }
+        return {**finite(document)}
 
-    def _channels(self, change: OrderChange) -> dict[str, Any]:
+    def _channels(self, change: OrderChange) -> dict[str, OrderChannelJson]:
         velocity = self._velocity_mm_s(change)
         return {
             name: {

@@ -28,7 +28,8 @@ class Format(NamedTuple):
     """JSON that is written or read.
 
     Attributes:
-        kinds: its types, ``module:class``, if there are several any of them.
+        kinds: its types, ``module:class``, if there are several any of them; with ``+`` between them one that
+            has the keys of both.
         where: where it is.
         taken_in: whether the program reads it, and does with what has a default left out.
     """
@@ -89,11 +90,58 @@ FORMATS: dict[str, Format] = {
     "daqsvc snapshot": Format(("daqsvc.commands.snapshot:SnapshotTaken",), ""),
     "daqsvc ack": Format(("daqsvc.commands.alarms:AlarmVerbAnswer",), ""),
     "daqsvc replay": Format(("daqsvc.commands.replay:ReplayReport",), ""),
+    "daqsvc record": Format(
+        ("daqsvc.commands.record:RecordSummary+drivers.can.errors:CanCounters",),
+        "Printed by `daqsvc record`.",
+    ),
+    "daqsvc analyze": Format(
+        (
+            "daqsvc.detectors.shaft.verdict:RotorVerdictJson+daqsvc.offline.other_parts:OtherParts",
+            "daqsvc.offline.orders:OrderVerdictJson+daqsvc.offline.other_parts:OtherParts",
+            "daqsvc.detectors.bearing.verdict:BearingVerdictJson+daqsvc.offline.other_parts:OtherParts",
+            "daqsvc.fleet.campaign:CampaignJson+daqsvc.commands.analyze_fleet:WhereResults",
+        ),
+        "Printed by `daqsvc analyze --json`: the first of these that the machine file has a detector for, or "
+        "the last one with `--cluster`.",
+    ),
+    "daqsvc calibrate": Format(
+        (
+            "daqsvc.commands.calibrate_report:RotorCalibrationJson",
+            "daqsvc.commands.calibrate_report:BearingsCalibrationJson",
+            "daqsvc.commands.calibrate_report:Refused",
+        ),
+        "",
+    ),
+    "daqsvc detectability": Format(
+        (
+            "daqsvc.detectors.rotor_bank.detectability:BankDetectabilityJson",
+            "daqsvc.detectors.rotor_synchronous.detectability:VectorDetectabilityJson",
+        ),
+        "",
+    ),
+    "daqsvc fleet": Format(("daqsvc.fleet.report:FleetReportJson",), ""),
+    "daqsvc demo": Format(
+        (
+            "sim_hw.demo.session:DemoPage",
+            "sim_hw.demo.session:DemoMessage",
+            "sim_hw.demo.session:DemoSummary",
+        ),
+        "",
+    ),
+    "daqsvc reproduce": Format(("sim_hw.reproduce.results:ResultRow",), ""),
+    "daqsvc sniff can": Format(("drivers.can.sniff_json:CanFigures+daqsvc.commands.sniff:SniffEnd",), ""),
+    "daqsvc sniff serial": Format(
+        ("drivers.serial.sniff_json:SerialFigures+daqsvc.commands.sniff:SniffEnd",), ""
+    ),
+    "daqsvc sniff modbus": Format(
+        ("drivers.modbus.scan_json:ModbusFigures+daqsvc.commands.sniff:SniffEnd",), ""
+    ),
 }
 """By the value of ``schema``, or by the verb that prints it."""
 PRINTED: dict[str, tuple[str, ...]] = {
     "daqsvc alarms": ("daqsvc.alarm/1",),
     "daqsvc trend": ("daqsvc.trend/1",),
+    "daqsvc trend --events": ("daqsvc.alarm/1",),
     "daqsvc status": ("daqsvc.service-status/1",),
     "daqsvc export": ("daqsvc.export/1",),
     **dict.fromkeys(
@@ -101,12 +149,14 @@ PRINTED: dict[str, tuple[str, ...]] = {
         ("daqsvc ack",),
     ),
 }
-"""By verb the formats of ``--json``, where they are not called by the verb."""
+"""By verb the formats of ``--json``, where they are not called by the verb; and of other options."""
 _NAMED = re.compile(r"daqsvc\.[a-z-]+/[0-9]+")
 
 
-def printed(verb: str) -> tuple[str, ...]:
-    """The formats that a verb prints with ``--json``; none if it is not known."""
+def printed(verb: str, option: str = "--json") -> tuple[str, ...]:
+    """The formats that a verb prints with an option; none if it is not known."""
+    if option != "--json":
+        return PRINTED.get(f"{verb} {option}", ())
     return PRINTED.get(verb, (verb,) if verb in FORMATS else ())
 
 
@@ -122,9 +172,11 @@ def link(name: str) -> str:
 
 
 @cache
-def types(name: str) -> tuple[type[Any], ...]:
-    """The types of a format."""
-    return tuple(pkgutil.resolve_name(kind) for kind in FORMATS[name].kinds)
+def types(name: str) -> tuple[tuple[type[Any], ...], ...]:
+    """The types of a format, each with others whose keys it has, too."""
+    return tuple(
+        tuple(pkgutil.resolve_name(kind) for kind in joined.split("+")) for joined in FORMATS[name].kinds
+    )
 
 
 @cache
@@ -163,7 +215,7 @@ def pages() -> dict[str, str]:
         where = one.where or f"Printed by {_listed([f'{verb} --json' for verb in sorted(verbs)])}."
         parts.append(anchored(f"## `{name}`", slug(name)))
         parts.append(f"{where} [JSON Schema](../schemas/{slug(name)}.json).")
-        for kind in types(name):
+        for kind, *_ in types(name):
             held = schema["$defs"][kind.__name__] if "anyOf" in schema else schema
             anchor = f"{slug(name)}.{kind.__name__}" if "anyOf" in schema else slug(name)
             parts.append(about(kind))
@@ -181,6 +233,7 @@ def _listed(verbs: list[str]) -> str:
 
 
 SHORT = {
+    "BearingVerdictJson": "object as the verdict about the bearings below",
     "AlarmPayload": "object as [`daqsvc.alarm/1`](payloads.md#daqsvc.alarm-1)",
     "Statement": "object as [`daqsvc.diagnosis/1`](payloads.md#daqsvc.diagnosis-1), without `schema`, "
     "`site`, `box`, `time` and `wall_ns`",

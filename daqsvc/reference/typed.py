@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import types
+from collections.abc import Mapping
 from typing import (
     TYPE_CHECKING,
     Annotated,
@@ -29,7 +30,7 @@ from daqsvc.publish.schemas import PAYLOADS
 from daqsvc.reference.counters import attributes
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 _PLAIN = {
@@ -43,19 +44,24 @@ STATEMENT = "statement"
 """A statement of a detector in `Annotated`: of a machine, without the time by the wall clock."""
 
 
-def schema_of(name: str, kinds: Sequence[type[Any]], *, taken_in: bool = False) -> dict[str, Any]:
+def schema_of(name: str, kinds: Sequence[tuple[type[Any], ...]], *, taken_in: bool = False) -> dict[str, Any]:
     """The schema of what is any of some types.
 
     Args:
         name: what it is called.
-        kinds: the types of the whole object.
+        kinds: the types of the whole object, each with others whose keys it has, too.
         taken_in: whether the program reads it, and does with what has a default left out.
     """
     held: dict[str, Any] = {}
-    arms = [_schema(kind, held, taken_in=taken_in) for kind in kinds]
-    whole = dict(held[kinds[0].__name__]) if len(kinds) == 1 else {"anyOf": arms}
-    if len(kinds) == 1 and f'"{arms[0]["$ref"]}"' not in f"{held}".replace("'", '"'):
-        del held[kinds[0].__name__]
+    arms = []
+    for kind, *others in kinds:
+        arms.append(_schema(kind, held, taken_in=taken_in))
+        for other in others:
+            _schema(other, held, taken_in=taken_in)
+            joined, more = held[kind.__name__], held.pop(other.__name__)
+            joined["properties"] |= more["properties"]
+            joined["required"] = list(dict.fromkeys([*joined["required"], *more["required"]]))
+    whole = {"anyOf": arms} if len(kinds) > 1 else held.pop(kinds[0][0].__name__)
     return {"$schema": DIALECT, "$id": name.replace(" ", "-"), **whole, **({"$defs": held} if held else {})}
 
 
@@ -86,7 +92,7 @@ def _schema(kind: Any, held: dict[str, Any], *, taken_in: bool) -> dict[str, Any
         made = {"anyOf": [of(one) for one in given]}
     elif origin is list:
         made = {"type": "array", "items": of(given[0])}
-    elif origin is dict:
+    elif origin in {dict, Mapping}:
         made = {"type": "object", "additionalProperties": True if given[1] is Any else of(given[1])}
     elif origin is Annotated:
         made = _payload(given[1], held) if isinstance(given[1], str) else of(given[1])

@@ -6,6 +6,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from daqsvc.cli import commands, parser
+from daqsvc.reference import formats
 from daqsvc.reference.markdown import anchored, code, page, table
 
 if TYPE_CHECKING:
@@ -47,6 +48,8 @@ def gaps() -> Iterator[str]:
         for _, action in options(verb):
             if not action.help:
                 yield f"{verb.prog} {_name(action)} has no help"
+            if "--json" in action.option_strings and not formats.printed(verb.prog):
+                yield f"{verb.prog} --json prints what is described nowhere: daqsvc.reference.formats"
 
 
 def pages() -> dict[str, str]:
@@ -62,8 +65,11 @@ def pages() -> dict[str, str]:
         for titled, action in options(verb):
             mark = f'<a id="{anchor}{action.option_strings[-1]}"></a>' if action.option_strings else ""
             name = f"{mark}{code(_name(action))}"
+            told = _help(verb, action)
+            if action.option_strings and (printed := formats.printed(verb.prog, action.option_strings[-1])):
+                told += f": {', '.join(map(formats.link, printed))}"
             title = "arguments" if titled == "positional arguments" else titled
-            groups.setdefault(title, []).append((name, _help(verb, action), _default(action)))
+            groups.setdefault(title, []).append((name, told, _default(action)))
         parts += [
             f"{title[:1].upper()}{title[1:]}:\n\n{table(('argument', 'what it does', 'default'), rows)}"
             for title, rows in groups.items()

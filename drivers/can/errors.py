@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drivers.base import BusCounters
+from drivers.base import BusCounters, ControllerState
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from drivers.base import ControllerState
 
 TX_TIMEOUT = 0x001
 ARBITRATION_LOST = 0x002

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from drivers.can.batches import CanSource
     from drivers.can.dbc_traffic import DbcTraffic, MessageTraffic, SignalTraffic
     from drivers.can.settings import CanBus
+    from drivers.can.sniff_json import CanFigures, CanIdFigures, DbcFigures
     from drivers.can.traffic import IdTraffic, Traffic
 
 SECONDS = 5.0
@@ -433,9 +434,9 @@ class _Report(NamedTuple):
             named = [_id(one.arbitration_id, extended=one.extended) for one in strange]
             yield f"Heard, but not in the DBC file: {', '.join(named)}"
 
-    def _figures(self) -> dict[str, Any]:
+    def _figures(self) -> CanFigures:
         load = self._load
-        return {
+        figures: CanFigures = {
             "bus": "can",
             "interface": self.bus.interface,
             "channel": self.bus.channel,
@@ -449,10 +450,12 @@ class _Report(NamedTuple):
             "data_bitrate": self.bus.data_bitrate,
             "load": None if load is None else {"least": load[0], "most": load[1]},
             "ids": [self._id_figures(one) for one in self._ids],
-            **({} if self.dbc is None else {"dbc": self._dbc_figures(self.dbc)}),
         }
+        if self.dbc is not None:
+            figures["dbc"] = self._dbc_figures(self.dbc)
+        return figures
 
-    def _id_figures(self, one: IdTraffic) -> dict[str, Any]:
+    def _id_figures(self, one: IdTraffic) -> CanIdFigures:
         message = None if self.dbc is None else self.dbc.message_of(one.frame_id)
         return {
             "id": one.arbitration_id,
@@ -473,7 +476,7 @@ class _Report(NamedTuple):
             "message": None if message is None else message.name,
         }
 
-    def _dbc_figures(self, dbc: DbcTraffic) -> dict[str, Any]:
+    def _dbc_figures(self, dbc: DbcTraffic) -> DbcFigures:
         return {
             "messages": [
                 {

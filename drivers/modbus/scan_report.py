@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from drivers.modbus.readings import chosen, is_signed, readings
 from drivers.modbus.replies import EXCEPTIONS
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from drivers.modbus.readings import Reading
     from drivers.modbus.scan import FoundTable, Scan
+    from drivers.modbus.scan_json import ModbusFigures, TableFigures
     from drivers.modbus.settings import ModbusBus
 
 _FEW = 12
@@ -200,7 +201,7 @@ class ScanReport:
         seen = {these[address] for these in table.rounds if address in these}
         return "no value?" if len(seen) == 1 and seen <= NO_VALUE and address not in _covered(numbers) else ""
 
-    def _figures(self) -> dict[str, Any]:
+    def _figures(self) -> ModbusFigures:
         scan = self._scan
         return {
             "bus": "modbus",
@@ -238,7 +239,7 @@ def _only_refusal(table: FoundTable) -> int | None:
     return codes.pop() if is_all and len(codes) == 1 else None
 
 
-def _table_figures(table: FoundTable, numbers: Sequence[Reading]) -> dict[str, Any]:
+def _table_figures(table: FoundTable, numbers: Sequence[Reading]) -> TableFigures:
     last = table.again[-1] if table.again else {}
     return {
         "unit": table.unit,
@@ -250,7 +251,10 @@ def _table_figures(table: FoundTable, numbers: Sequence[Reading]) -> dict[str, A
         "silent": table.silent,
         "max_count": table.max_count,
         "moved": sorted(table.moved),
-        "channels": [one._asdict() for one in _channels(table, numbers)],
+        "channels": [
+            {"name": one.name, "address": one.address, "type": one.type, "order": one.order}
+            for one in _channels(table, numbers)
+        ],
         "registers": [
             {
                 "address": address,

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from drivers.serial.recognise import Recognised
     from drivers.serial.recognise_frames import BinaryFrames
     from drivers.serial.recognise_lines import Column, TextLines
+    from drivers.serial.sniff_json import SerialFigures
 
 BAUDS = (115_200, 9600, 19_200, 57_600, 38_400, 230_400, 460_800, 921_600, 4800, 2400, 1200)
 """Tried in this order, until one is beyond doubt."""
@@ -440,11 +441,11 @@ class _Report(NamedTuple):
             f"{counter} (bytes of the payload count from 0){stray}"
         )
 
-    def _figures(self) -> dict[str, Any]:
+    def _figures(self) -> SerialFigures:
         from drivers.serial.recognise_lines import TextLines  # noqa: PLC0415 - only for who listens
 
         heard, what = self.best.heard, self._what
-        figures: dict[str, Any] = {
+        figures: SerialFigures = {
             "bus": "serial",
             "port": self.port,
             "baud": self.best.baud,

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from daqsvc.settings import MachineFile
     from sim_hw.demo.machines import AlarmLimits
     from sim_hw.demo.page import PageAddress
-    from sim_hw.demo.session import DemoOutcome, DemoSession, Received, Script
+    from sim_hw.demo.session import DemoOutcome, DemoPage, DemoSession, DemoSummary, Received, Script
     from sim_hw.scenario import BearingScenario
 
 SCENARIO = "paper"
@@ -211,7 +211,7 @@ def _sigterm_interrupts() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _play(script: Script, arguments: argparse.Namespace) -> dict[str, Any]:
+def _play(script: Script, arguments: argparse.Namespace) -> DemoSummary:
     from sim_hw.demo.session import DemoSession, summarise  # noqa: PLC0415
 
     def play(on_message: Callable[[Received], None], on_page: Callable[[PageAddress], None]) -> DemoOutcome:
@@ -241,7 +241,8 @@ def _play(script: Script, arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _print_page(address: PageAddress) -> None:
-    _print_json({"type": "page", "address": address.look, "operator": address.act})
+    page: DemoPage = {"type": "page", "address": address.look, "operator": address.act}
+    _print_json(page)
 
 
 def _print_message(message: Received) -> None:

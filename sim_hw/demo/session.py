@@ -14,7 +14,7 @@ import shutil
 import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypedDict, TypeVar
 from urllib.parse import urlsplit
 
 import aiomqtt
@@ -501,7 +501,161 @@ async def _task(work: Coroutine[Any, Any, T]) -> AsyncIterator[asyncio.Task[T]]:
             task.exception()
 
 
-def summarise(script: Script, outcome: DemoOutcome, *, speed: float) -> dict[str, Any]:
+class DemoOnset(TypedDict):
+    """A mode that the machine came into.
+
+    Attributes:
+        mode: name of the mode.
+        onset_rev: revolution at which it came.
+        declared_rev: revolution at which it was declared; null if it never was.
+        delay_rev: revolutions between the two; null if it never was declared.
+    """
+
+    mode: str
+    onset_rev: float
+    declared_rev: float | None
+    delay_rev: float | None
+
+
+class DemoSamples(TypedDict):
+    """What became of the samples.
+
+    Attributes:
+        sent: samples that the device sent.
+        left_over: samples at the end that do not fill a frame.
+        received: samples that the service received.
+        lost: samples that were lost on the way.
+        skipped_by_detectors: samples that detectors left out, as they were too slow.
+    """
+
+    sent: int
+    left_over: int
+    received: int
+    lost: int
+    skipped_by_detectors: int
+
+
+class DemoFaultsCounted(TypedDict):
+    """Frames by what was wrong with them, as the service counted.
+
+    Attributes:
+        dropped: frames that did not come.
+        duplicated: frames that came twice.
+        reordered: frames that came behind a later one.
+        corrupted: frames that were damaged.
+    """
+
+    dropped: int
+    duplicated: int
+    reordered: int
+    corrupted: int
+
+
+class DemoFrames(TypedDict):
+    """What became of the frames.
+
+    Attributes:
+        sent: frames that the device sent.
+        received: frames that the service received.
+        injected: what the link did to frames, by fault.
+        counted: the same as the service counted it.
+        not_sent: when the device sent nothing, in words.
+        late: frames that came too late.
+        rejected: frames that were no frames of the device.
+    """
+
+    sent: int
+    received: int
+    injected: dict[str, int]
+    counted: DemoFaultsCounted
+    not_sent: list[str]
+    late: int
+    rejected: int
+
+
+class DemoClock(TypedDict):
+    """The clock of the device, as the service measured it.
+
+    Attributes:
+        drift_ppm: how far it runs off its rate.
+        jitter_ms: how irregularly blocks arrived.
+    """
+
+    drift_ppm: float
+    jitter_ms: float
+
+
+class DemoSummary(TypedDict):
+    """The last line.
+
+    Attributes:
+        type: what the line is.
+        title: what was shown.
+        seed: seed of the random numbers.
+        speed: speed over real time; 0 for as fast as it goes.
+        simulated_s: time that was simulated, in s.
+        real_s: time that it took, in s.
+        declared: modes that were declared, in order.
+        onsets: modes that the machine came into, in order.
+        wrong_declarations: declarations while the machine was in another mode.
+        samples: what became of the samples.
+        frames: what became of the frames.
+        clock: the clock of the device, as the service measured it.
+        loop_lag_ms: lateness of the event loop, by percentile.
+        alarm_events: events of alarms.
+        messages: messages that came over the broker.
+        snapshots: files of snapshots that were made.
+        snapshots_gone: snapshots that were deleted again, as there were too many.
+        complete: whether the demo went on to its end.
+    """
+
+    type: Literal["summary"]
+    title: str
+    seed: int
+    speed: float
+    simulated_s: float
+    real_s: float
+    declared: list[str]
+    onsets: list[DemoOnset]
+    wrong_declarations: int
+    samples: DemoSamples
+    frames: DemoFrames
+    clock: DemoClock
+    loop_lag_ms: dict[str, float]
+    alarm_events: int
+    messages: int
+    snapshots: list[str]
+    snapshots_gone: int
+    complete: bool
+
+
+class DemoMessage(TypedDict):
+    """A message of the service, with all keys of its payload: `schema` has its name.
+
+    Attributes:
+        type: kind of the message.
+        topic: topic of the message.
+    """
+
+    type: Literal["diagnosis", "alarm", "status"]
+    topic: str
+
+
+class DemoPage(TypedDict):
+    """Where the page is, with `--page` only.
+
+    Attributes:
+        type: what the line is.
+        address: address to look at the machine.
+        operator: address to handle alarms.
+    """
+
+    type: Literal["page"]
+    address: str
+    operator: str
+
+
+def summarise(script: Script, outcome: DemoOutcome, *, speed: float) -> DemoSummary:
     """The summary as one JSON object.
 
     A declaration is a change of the decision of the script's detector. Its delay counts from the onset of the
@@ -570,8 +724,8 @@ def _not_sent(script: Script) -> list[str]:
     return [f"{length:g} s of {what}" for what, length in seconds.items() if length > 0.0]
 
 
-def _onsets(script: Script, declared: Sequence[tuple[str, int]]) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = []
+def _onsets(script: Script, declared: Sequence[tuple[str, int]]) -> list[DemoOnset]:
+    rows: list[DemoOnset] = []
     per_rev = script.samples_per_rev or 1.0
     for i, onset in enumerate(script.onsets):
         end = script.onsets[i + 1].sample if i + 1 < len(script.onsets) else len(script.samples)

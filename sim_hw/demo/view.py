@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from typing import Self
 
     from sim_hw.demo.page import PageAddress
-    from sim_hw.demo.session import Received, Script
+    from sim_hw.demo.session import DemoSummary, Received, Script
 
 LAST_ALARMS = 8
 BAR = 28
@@ -211,7 +211,7 @@ class View:
         lines.append(Text(f"{played_s:.1f} of {self._script.duration_s:.1f} s, speed {self._speed:g}"))
         return Group(*lines)
 
-    def show_summary(self, summary: dict[str, Any], console: Console | None = None) -> None:
+    def show_summary(self, summary: DemoSummary, console: Console | None = None) -> None:
         """Print the summary, to another console if one is given."""
         console = console or self._console
         if summary["onsets"]:
@@ -259,7 +259,7 @@ class View:
             f"through the broker; {summary['simulated_s']:.1f} s played in {summary['real_s']:.1f} s"
         )
 
-    def show_snapshots(self, summary: dict[str, Any]) -> None:
+    def show_snapshots(self, summary: DemoSummary) -> None:
         """Print where the snapshots of alarms are, and what they are good for."""
         for path in summary["snapshots"]:
             self._console.print("snapshot of an alarm, to be judged again with:")

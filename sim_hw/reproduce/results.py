@@ -5,11 +5,12 @@ from __future__ import annotations
 import csv
 import shutil
 import textwrap
+from collections.abc import Mapping  # noqa: TC003 - the page of formats reads the types
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Sequence
     from pathlib import Path
 
     from matplotlib.figure import Figure
@@ -28,7 +29,7 @@ class ResultRow:
         figure: figure or section of the paper that it belongs to.
         paper: what the paper states; empty where it is silent.
         obtained: what was obtained, in words and figures.
-        agrees: whether the two agree; None where there is nothing to compare.
+        agrees: whether the two agree; null in JSON where there is nothing to compare.
         remark: what the reader should know about it.
         values: the numbers behind ``obtained``, units in their names.
     """

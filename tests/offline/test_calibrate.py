@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import can
 import numpy as np
 import pytest
+from support.formats import fits
 from support.machine_files import MACHINES
 from support.paths import ROOT
 from support.run_ups import ECCENTRICITY, OMEGA, RATE_HZ, record
@@ -42,6 +43,10 @@ SPECIMENS = ROOT / "tests" / "guard" / "specimens"
 
 
 @cache
+def told_by(said):
+    return fits("daqsvc calibrate", json.loads(said))
+
+
 def pump() -> np.ndarray:
     """The example's pump at 0.8 of its critical speed, 120 revolutions."""
     scenario = Scenario.model_validate(
@@ -111,7 +116,7 @@ def test_a_run_up_and_two_speeds_make_one_file(tmp_path: Path, capsys) -> None:
     ]
     code, said, _ = calibrate(capsys, *recordings, *OPTIONS, "--clearance-um", "400", "--out", out, "--json")
     assert code == 0
-    found = json.loads(said)
+    found = fits("daqsvc calibrate", json.loads(said))
     assert found["refused"] is None
     assert found["out"] == str(out)
     told = found["run_up"]
@@ -178,12 +183,12 @@ def test_an_even_sweep_needs_no_keyphasor(tmp_path: Path, capsys) -> None:
     sweep = ["--probes", "x,y", "--sweep-rpm", "720,4500", "--predict-rpm", "1200,2400"]
     code, said, _ = calibrate(capsys, recording, *sweep, "--json")
     assert code == 0
-    told = json.loads(said)["run_up"]
+    told = fits("daqsvc calibrate", json.loads(said))["run_up"]
     assert told["natural_frequency_hz"] == pytest.approx(40.0, rel=2e-3)
     assert [one["speed_rpm"] for one in told["predicted_1x"]] == [1200.0, 2400.0]
     code, said, _ = calibrate(capsys, recording, *sweep[:-1], "9000", "--json")
     assert code == 3
-    assert "1X at 9000 rpm cannot be predicted: the run-up went from" in json.loads(said)["refused"]
+    assert "1X at 9000 rpm cannot be predicted: the run-up went from" in told_by(said)["refused"]
 
 
 @pytest.mark.long
@@ -193,7 +198,7 @@ def test_no_speed_is_predicted_for_a_machine_that_is_no_laval_rotor(tmp_path: Pa
     out = tmp_path / "rotor.toml"
     code, said, _ = calibrate(capsys, recording, *OPTIONS, "--predict-rpm", "2400", "--out", out, "--json")
     assert code == 0
-    told = json.loads(said)["run_up"]
+    told = fits("daqsvc calibrate", json.loads(said))["run_up"]
     assert told["laval"] is False
     assert told["predicted_1x"] is None
     assert "no Laval rotor explains the orbit" in told["verdict"]
@@ -240,14 +245,14 @@ def test_refuses_two_recordings_of_one_kind(tmp_path: Path, capsys) -> None:
     one, two = (save(tmp_path / f"{i}.npz", steady(30.0), RATE_HZ) for i in range(2))
     code, said, _ = calibrate(capsys, one, two, *OPTIONS, *ROTOR, "--json")
     assert code == 3
-    assert "there is another recording at 1800.0 rpm; give one for each speed" in json.loads(said)["refused"]
+    assert "there is another recording at 1800.0 rpm; give one for each speed" in told_by(said)["refused"]
     up, again = (save(tmp_path / f"up{i}.npz", run_up(), RATE_HZ) for i in range(2))
     code, said, _ = calibrate(capsys, up, again, *OPTIONS, "--json")
     assert code == 3
-    assert json.loads(said)["refused"] == f"{up} and {again} are run-ups; give one of them"
+    assert told_by(said)["refused"] == f"{up} and {again} are run-ups; give one of them"
     code, said, _ = calibrate(capsys, one, *OPTIONS, "--json")
     assert code == 3
-    assert "are not known: add a run-up, or give --natural-frequency-hz" in json.loads(said)["refused"]
+    assert "are not known: add a run-up, or give --natural-frequency-hz" in told_by(said)["refused"]
 
 
 @pytest.mark.parametrize(
@@ -300,7 +305,7 @@ def test_channels_may_be_mapped_one_by_one(tmp_path: Path, capsys) -> None:
     maps = ["--map", "x=a,y=b", "--map", "kph=c"]
     code, said, _ = calibrate(capsys, recording, *OPTIONS, *ROTOR, *maps, "--json")
     assert code == 0
-    assert json.loads(said)["steady"][0]["speed_rpm"] == pytest.approx(1800.0, rel=1e-3)
+    assert told_by(said)["steady"][0]["speed_rpm"] == pytest.approx(1800.0, rel=1e-3)
     code, _, error = calibrate(capsys, recording, *OPTIONS, *ROTOR, *maps, "--map", "x=b", "--json")
     assert code == 2
     assert "--map names 'x' twice" in error

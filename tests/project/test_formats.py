@@ -9,7 +9,7 @@ from support.paths import ROOT
 
 from daqsvc.audit import AuditLine
 from daqsvc.publish.schemas import PAYLOADS, schema_files
-from daqsvc.reference import formats, messages
+from daqsvc.reference import formats, messages, verbs
 from daqsvc.reference.typed import schema_of
 
 pytestmark = pytest.mark.unit
@@ -44,6 +44,18 @@ def test_a_format_or_a_field_that_nothing_describes_is_a_gap(monkeypatch):
     assert "field AuditLine.wall_ns of daqsvc.audit/1 has no description" in found
 
 
+def test_a_verb_whose_json_nothing_describes_is_a_gap(monkeypatch):
+    known = {name: one for name, one in formats.FORMATS.items() if name != "daqsvc fleet"}
+    monkeypatch.setattr(formats, "FORMATS", known)
+    assert "daqsvc fleet --json prints what is described nowhere" in "; ".join(verbs.gaps())
+
+
+def test_every_verb_with_json_names_its_format_on_the_page_of_verbs():
+    rows = [row for row in verbs.pages()["verbs.md"].splitlines() if "`--json`" in row]
+    assert len(rows) > 20
+    assert [row for row in rows if not re.search(r"\((formats|payloads)\.md#daqsvc", row)] == []
+
+
 def test_a_type_that_json_has_not_is_refused():
     with pytest.raises(TypeError, match="no type of JSON"):
-        schema_of("name", (set,))
+        schema_of("name", ((set,),))

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.formats import fits
 from support.machine_files import LAVAL, MOTOR, changed
 
 from daqsvc.cli import load
@@ -258,7 +259,7 @@ def test_verb_tells_what_looks_the_same_and_where_it_does_not(two_look_alike, ca
 
 def test_verb_as_json_in_the_units_of_the_file(two_look_alike, capsys):
     assert verb(two_look_alike, "--json", "--false-alarms-per-1000-rev", 0.5, "--process-noise", 1e-9) == 0
-    output = json.loads(capsys.readouterr().out)
+    output = fits("daqsvc detectability", json.loads(capsys.readouterr().out))
     assert (output["machine"], output["speed_rpm"], output["noise_um"]) == ("laval-rig", 600.0, 2.0)
     assert output["modes"] == ["N", "F1", "U2"]
     assert output["false_alarms_per_1000_rev"] == pytest.approx(0.5)

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.formats import fits
 from support.paths import ROOT
 
 from daqsvc.cli import main
@@ -136,7 +137,7 @@ def test_the_command_tells_stated_noise_in_text_and_json(capsys):
     assert "noise 1 um, 50 revolutions of calibration; a change is an alarm at 20.3 nats" in text
     assert f"one group at 1500 rpm; at {FOUND.opens_at_rpm:.6g} rpm a grown unbalance is told from it" in text
     assert main([*arguments, "--json"]) == 0
-    output = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    output = fits("daqsvc detectability", json.loads(capsys.readouterr().out, parse_constant=pytest.fail))
     assert output["smallest_um"]["1"] == pytest.approx(FOUND.smallest_um[1])
     assert output["ambiguous"][0]["opens_at_rpm"] == pytest.approx(FOUND.opens_at_rpm)
     assert [one["fault"] for one in output["smallest_change"]] == [one.fault for one in FOUND.faults]
@@ -150,7 +151,7 @@ def test_a_calibration_tells_noise_and_variance(tmp_path, capsys):
     text = MACHINE.read_text().replace("calibrate_revolutions = 50", 'calibration = "healthy.toml"')
     (tmp_path / "machine.toml").write_text(re.sub(r"clearance_um = [\d.]+", "clearance_um = 100.0", text))
     assert main(["detectability", str(tmp_path / "machine.toml"), "--json"]) == 0
-    output = json.loads(capsys.readouterr().out)
+    output = fits("daqsvc detectability", json.loads(capsys.readouterr().out))
     assert output["calibration_rev"] == 200
     expected = vector_detectability(noisier, THRESHOLD_NATS).smallest_um[1]
     assert output["smallest_um"]["1"] == pytest.approx(expected)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from support.formats import fits
 
 from daqsvc.cli import main
 from daqsvc.dsp.orders import order_vectors
@@ -253,7 +254,9 @@ def command(files: Path, *recordings: str) -> list[str]:
 def test_the_command_judges_each_recording(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
     baseline = ["--baseline", str(files / "healthy.csv"), "--json"]
     assert main([*command(files, "again", "heavy", "short"), *baseline]) == 3
-    again, heavy, short = (json.loads(line) for line in capsys.readouterr().out.splitlines())
+    again, heavy, short = (
+        fits("daqsvc analyze", json.loads(line)) for line in capsys.readouterr().out.splitlines()
+    )
     assert (again["verdict"], again["group"]) == ("normal", ["normal"])
     assert (heavy["verdict"], heavy["group"]) == ("unbalance", ["unbalance", "damping_loss"])
     assert heavy["growth_1x"]["ratio"] == pytest.approx(3.0, rel=0.1)

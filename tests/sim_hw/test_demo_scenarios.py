@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support.formats import fits
 from support.paths import ROOT
 
 from daqsvc.cli import main
@@ -26,6 +27,9 @@ def demo(capsys: pytest.CaptureFixture[str], *options: str) -> tuple[int, dict[s
     code = main(["demo", "--speed", "1000", "--json", *options])
     heard = capsys.readouterr()
     messages = [json.loads(line) for line in heard.out.splitlines()]
+    for one in messages:
+        if one["type"] in {"page", "summary"}:  # the others are payloads
+            fits("daqsvc demo", one)
     return code, messages[-1] if messages else {}, heard.err
 
 

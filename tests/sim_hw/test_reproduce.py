@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
+from support.formats import fits
 from support.paths import ROOT
 
 from daqsvc import cli
@@ -49,7 +50,7 @@ def rows(out: Path) -> dict[str, dict[str, Any]]:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     said = [line for line in done.stderr.splitlines() if "compiling kernels" not in line]
     assert (done.returncode, said) == (0, [])
-    table = [json.loads(line) for line in done.stdout.splitlines()]
+    table = [fits("daqsvc reproduce", json.loads(line)) for line in done.stdout.splitlines()]
     return {row["name"]: row for row in table}
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from support.brokers import running_mosquitto
+from support.formats import fits
 from support.sim_processes import BAD_LINK
 
 from daqsvc.acquisition.clock import SystemClock
@@ -33,7 +34,8 @@ def verb(capsys: pytest.CaptureFixture[str]) -> Run:
         except SystemExit as stopped:
             code = int(stopped.code or 0)
         out, err = capsys.readouterr()
-        return code, [json.loads(line, parse_constant=pytest.fail) for line in out.splitlines()], err
+        told = [json.loads(line, parse_constant=pytest.fail) for line in out.splitlines()]
+        return code, [fits(f"daqsvc {arguments[0]}", one) for one in told], err
 
     return run
 

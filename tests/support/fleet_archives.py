@@ -15,6 +15,7 @@ from typing import Any
 import psutil
 import pyarrow.parquet as pq
 from support.file_bombs import write as write_bomb
+from support.formats import fits
 from support.machine_files import MACHINES
 from support.orbit_files import SPEED_RPM, UNBALANCE, Orbit
 from support.paths import ROOT
@@ -93,7 +94,7 @@ def start_analyze(
 def ended(process: subprocess.Popen[str]) -> tuple[int, dict[str, Any], str]:
     """Exit code, summary and stderr of a process that `start_analyze` started."""
     out, err = process.communicate(timeout=240)
-    return process.returncode, json.loads(out) if out else {}, err
+    return process.returncode, fits("daqsvc analyze", json.loads(out)) if out else {}, err
 
 
 def workers_of(process: subprocess.Popen[str]) -> list[int]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, NotRequired, TypedDict
 
 from daqsvc.bearing.identify import ChangeRules
 from daqsvc.bearing.race.verdict import PARTS, RaceRules
 from daqsvc.detectors.bearing.finding import WORDS, severity_of
 from daqsvc.diagnosis.recorded import Verdict, finite
+from daqsvc.dsp.quality.recorded import DataQualityJson  # noqa: TC001 - the page of formats reads the types
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -21,6 +22,226 @@ if TYPE_CHECKING:
     from daqsvc.dsp.quality.unit import AccelerationUnit
 
 _TOLD_LINES = 4
+
+
+class RaceEvidenceJson(TypedDict):
+    """The evidence for damage of one part.
+
+    Attributes:
+        z: significance of its kinematic lines, in standard deviations of noise.
+        z_limit: the significance from which the part may be named.
+        size: modulation by its lines in the whitened envelope.
+        severity: `z` times `size`.
+        severity_limit: the severity from which the part is named.
+        steadiness: size in the logarithm of the envelope over size in its square; small for a few transients.
+        steadiness_limit: the steadiness from which a race may be named; 0 for a ball.
+        false_alarm_probability: chance of such a `z` or a larger one in noise.
+        order: its events in a revolution of the shaft, as found.
+        testable: whether the recording is long enough to tell its lines from harmonics of the shaft.
+        reason: why the part is not testable; null if it is.
+    """
+
+    z: float | None
+    z_limit: float | None
+    size: float | None
+    severity: float | None
+    severity_limit: float | None
+    steadiness: float | None
+    steadiness_limit: float | None
+    false_alarm_probability: float | None
+    order: float | None
+    testable: bool
+    reason: str | None
+
+
+class RaceLineJson(TypedDict):
+    """A kinematic line that stands out of the envelope spectrum.
+
+    Attributes:
+        part: the part whose damage makes such a line.
+        harmonic: multiple of the part's fundamental; 0 for a line of the cage alone.
+        sideband: offset in multiples of the modulating rate; 0 for the harmonic itself.
+        frequency_hz: where it was found.
+        order: the same for each revolution of the shaft.
+        evidence_nats: evidence against noise.
+        size: modulation by the line in the whitened envelope.
+    """
+
+    part: str
+    harmonic: int
+    sideband: int
+    frequency_hz: float
+    order: float
+    evidence_nats: float
+    size: float
+
+
+class DriveJson(TypedDict):
+    """A gear or a motor whose lines stand out, and are taken for no part's.
+
+    Attributes:
+        kind: what it is.
+        frequency_hz: its fundamental.
+        order: the same for each revolution of the shaft.
+        teeth: teeth of the gear on this shaft; null if it is not one.
+        mate_teeth: teeth of the other gear; null if they are not known.
+        sideband_spacing: distance of the sidebands, for each revolution of the shaft; null without sidebands.
+        poles: poles of the motor; null if it is not one.
+    """
+
+    kind: str
+    frequency_hz: float
+    order: float
+    teeth: int | None
+    mate_teeth: int | None
+    sideband_spacing: float | None
+    poles: int | None
+
+
+class ResidualBandJson(TypedDict):
+    """A band of frequencies.
+
+    Attributes:
+        low_hz: its lower end.
+        high_hz: its upper end.
+        rise_db: how much more is in it than in the healthy machine.
+        limit_db: the rise from which on it is a change.
+    """
+
+    low_hz: float
+    high_hz: float
+    rise_db: float | None
+    limit_db: float | None
+
+
+class ResidualJson(TypedDict):
+    """What the model of the healthy bearing does not predict.
+
+    Attributes:
+        changed: whether it is more than chance.
+        ratio: its level over that of the healthy machine.
+        rise_db: the same in dB.
+        limit_db: the rise from which on it is a change.
+        departure: how far it is from the healthy machine.
+        bands: the same by bands of frequencies.
+        windows: windows of the recording that were compared.
+        model_order: order of the model.
+        healthy_windows: windows that the limits were learned from.
+    """
+
+    changed: bool
+    ratio: float | None
+    rise_db: float | None
+    limit_db: float | None
+    departure: float | None
+    bands: list[ResidualBandJson]
+    windows: int
+    model_order: int
+    healthy_windows: int
+
+
+class BearingOrdersJson(TypedDict):
+    """Events of the bearing in a revolution of the shaft.
+
+    Attributes:
+        name: designation of the bearing; null if it is not known.
+        bpfi: passes of balls over the inner race.
+        bpfo: passes of balls over the outer race.
+        bsf: revolutions of a ball.
+        ftf: revolutions of the cage.
+    """
+
+    name: str | None
+    bpfi: float
+    bpfo: float
+    bsf: float
+    ftf: float
+
+
+class BearingChannelJson(TypedDict):
+    """The verdict of one channel by itself; of one that is refused some keys are absent.
+
+    Attributes:
+        bearing: the bearing that the channel is at.
+        verdict: the verdict as one word; null if the channel is refused.
+        group: parts that the evidence cannot tell apart, the verdict among them.
+        severity: how bad it is; null if the channel is refused.
+        margin: how far the decision is from another, as a factor of severity, 10 at most.
+        evidence: by part.
+        lines: kinematic lines that were found, the strongest first.
+        level_db: level over that of the healthy machine; null without one.
+        speed_rpm: speed of the shaft by its harmonics.
+        notes: what a person should know, in sentences.
+        refused: why the channel cannot be judged; null if it can.
+    """
+
+    bearing: BearingOrdersJson
+    verdict: str | None
+    group: list[str]
+    severity: float | None
+    margin: NotRequired[float | None]
+    evidence: NotRequired[dict[str, RaceEvidenceJson]]
+    lines: NotRequired[list[RaceLineJson]]
+    level_db: NotRequired[float | None]
+    speed_rpm: NotRequired[float]
+    notes: NotRequired[list[str]]
+    refused: str | None
+
+
+class BearingVerdictJson(TypedDict):
+    """The verdict about the bearings.
+
+    Attributes:
+        recording: name of the recording.
+        baseline: name of the healthy recording; null without one.
+        verdict: the verdict as one word; null if the recording is refused.
+        group: parts that the evidence cannot tell apart, the verdict among them.
+        channel: the channel that the verdict is about; null if the recording is refused.
+        probabilities: of each verdict.
+        severity: how bad it is; null if the recording is refused.
+        margin: how far the decision is from another, as a factor of severity, 10 at most.
+        evidence: by part, of that channel.
+        lines: kinematic lines that were found, the strongest first, of that channel.
+        residual: what the model of the healthy bearing does not predict; null without one.
+        false_alarm_probability: chance of a false alarm that the test of the residual is set for.
+        race_false_alarm_probability: chance of a false alarm that the test of the races is set for.
+        channels: by channel the verdict of each by itself.
+        speed_rpm: speed of the shaft by its harmonics; null if the recording is refused.
+        speed_stated_rpm: speed by the machine file or `--speed-rpm`.
+        speed_seen: whether harmonics of the shaft stand out; null if the recording is refused.
+        revolutions: revolutions of the shaft in the evidence.
+        unit: unit of the samples.
+        notes: what a person should know, in sentences.
+        drives: gears and motors whose lines stand out.
+        data_quality: what is known against the samples.
+        refused: why the recording cannot be judged; null if it can.
+        code: code of that reason; null if there is none.
+    """
+
+    recording: str
+    baseline: str | None
+    verdict: str | None
+    group: list[str]
+    channel: str | None
+    probabilities: dict[str, float]
+    severity: float | None
+    margin: float | None
+    evidence: dict[str, RaceEvidenceJson]
+    lines: list[RaceLineJson]
+    residual: ResidualJson | None
+    false_alarm_probability: float
+    race_false_alarm_probability: float | None
+    channels: dict[str, BearingChannelJson]
+    speed_rpm: float | None
+    speed_stated_rpm: float | None
+    speed_seen: bool | None
+    revolutions: float
+    unit: str
+    notes: list[str]
+    drives: list[DriveJson]
+    data_quality: DataQualityJson
+    refused: str | None
+    code: str | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,43 +303,35 @@ class BearingVerdict(Verdict):
     def as_json(self) -> dict[str, Any]:
         """A JSON object: all figures finite."""
         finding, race = self.finding, self.leading
-        document: dict[str, Any] = finite(
-            {
-                "recording": self.recording,
-                "baseline": self.baseline,
-                "verdict": None if finding is None else finding.verdict,
-                "group": [] if finding is None else list(finding.group),
-                "channel": None if finding is None else finding.where,
-                "probabilities": {}
-                if finding is None
-                else {word: finding.probabilities[word] for word in WORDS},
-                "severity": None if finding is None else finding.severity,
-                "margin": None if race is None else race.margin,
-                "evidence": {} if race is None else evidence_json(race),
-                "lines": [] if race is None else [line_json(line) for line in race.lines],
-                "residual": self._residual(),
-                "false_alarm_probability": self.setup.change.false_alarm_probability,
-                "race_false_alarm_probability": None if race is None else race.false_alarm_probability,
-                "channels": {name: self._channel(name) for name in self.setup.channels},
-                "speed_rpm": None if race is None else race.speed_rpm,
-                "speed_stated_rpm": self.setup.speed_rpm,
-                "speed_seen": None if race is None else race.speed_seen,
-                "revolutions": 0 if race is None else race.revolutions,
-                "unit": self.setup.unit,
-                "notes": [] if race is None else list(race.notes),
-                "drives": [] if race is None else [drive_json(drive) for drive in race.drives],
-                "data_quality": self.quality.as_json(),
-                "refused": self.refused,
-                "code": self.refusal_code,
-            }
-        )
-        return document
+        document: BearingVerdictJson = {
+            "recording": self.recording,
+            "baseline": self.baseline,
+            "verdict": None if finding is None else finding.verdict,
+            "group": [] if finding is None else list(finding.group),
+            "channel": None if finding is None else finding.where,
+            "probabilities": {} if finding is None else {word: finding.probabilities[word] for word in WORDS},
+            "severity": None if finding is None else finding.severity,
+            "margin": None if race is None else race.margin,
+            "evidence": {} if race is None else evidence_json(race),
+            "lines": [] if race is None else [line_json(line) for line in race.lines],
+            "residual": self._residual(),
+            "false_alarm_probability": self.setup.change.false_alarm_probability,
+            "race_false_alarm_probability": None if race is None else race.false_alarm_probability,
+            "channels": {name: self._judged(name) for name in self.setup.channels},
+            "speed_rpm": None if race is None else race.speed_rpm,
+            "speed_stated_rpm": self.setup.speed_rpm,
+            "speed_seen": None if race is None else race.speed_seen,
+            "revolutions": 0 if race is None else race.revolutions,
+            "unit": self.setup.unit,
+            "notes": [] if race is None else list(race.notes),
+            "drives": [] if race is None else [drive_json(drive) for drive in race.drives],
+            "data_quality": self.quality.as_json(),
+            "refused": self.refused,
+            "code": self.refusal_code,
+        }
+        return {**finite(document)}
 
-    def _channel(self, name: str) -> dict[str, Any]:
-        """What one channel states by itself."""
-        return {"bearing": self._bearing(name), **self._judged(name)}
-
-    def _bearing(self, name: str) -> dict[str, Any]:
+    def _bearing(self, name: str) -> BearingOrdersJson:
         orders = self.setup.bearings[name]
         return {
             "name": self.setup.designations.get(name),
@@ -128,16 +341,19 @@ class BearingVerdict(Verdict):
             "ftf": orders.cage,
         }
 
-    def _judged(self, name: str) -> dict[str, Any]:
+    def _judged(self, name: str) -> BearingChannelJson:
+        """What one channel states by itself."""
         race = self.races.get(name)
         if race is None:
             return {
+                "bearing": self._bearing(name),
                 "verdict": None,
                 "group": [],
                 "severity": None,
                 "refused": self.unfit.get(name, self.refused),
             }
         return {
+            "bearing": self._bearing(name),
             "verdict": race.verdict,
             "group": list(race.group),
             "severity": severity_of(race),
@@ -150,7 +366,7 @@ class BearingVerdict(Verdict):
             "refused": None,
         }
 
-    def _residual(self) -> dict[str, Any] | None:
+    def _residual(self) -> ResidualJson | None:
         if self.change is None or self.healthy is None:
             return None
         change, healthy = self.change, self.healthy
@@ -237,7 +453,7 @@ class BearingVerdict(Verdict):
         return f"{sentence} at {finding.where}, severity {finding.severity:.1f}"
 
 
-def evidence_json(race: RaceVerdict) -> dict[str, Any]:
+def evidence_json(race: RaceVerdict) -> dict[str, RaceEvidenceJson]:
     """The evidence for each part, for the output."""
     return {
         part: {
@@ -257,7 +473,7 @@ def evidence_json(race: RaceVerdict) -> dict[str, Any]:
     }
 
 
-def line_json(line: RaceLine) -> dict[str, Any]:
+def line_json(line: RaceLine) -> RaceLineJson:
     """A line, for the output."""
     return {
         "part": line.part,
@@ -270,7 +486,7 @@ def line_json(line: RaceLine) -> dict[str, Any]:
     }
 
 
-def drive_json(drive: DriveLines) -> dict[str, Any]:
+def drive_json(drive: DriveLines) -> DriveJson:
     """A gear or a motor, for the output."""
     return {
         "kind": drive.kind,

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypedDict
 
 from daqsvc.rotor.detectability.prediction import detectability
 
@@ -54,7 +53,97 @@ def bank_detectability(
     )
 
 
-def as_json(prediction: BankDetectability, machine: MachineFile) -> dict[str, Any]:
+class PairJson(TypedDict):
+    """How clearly the true mode differs from one rival.
+
+    Attributes:
+        truth: name of the mode that the machine is in.
+        rival: name of the other mode.
+        nats_per_rev: expected evidence of the truth over the rival in a revolution.
+        delay_rev: revolutions until half of all abrupt changes are declared; null if they never are.
+        threshold_nats: evidence for that.
+        simulated: whether these figures are from simulated runs; else they are computed.
+    """
+
+    truth: str
+    rival: str
+    nats_per_rev: float
+    delay_rev: float | None
+    threshold_nats: float
+    simulated: bool
+
+
+class AmbiguityJson(TypedDict):
+    """Modes that look the same at this speed.
+
+    Attributes:
+        modes: names of the modes.
+        nats_per_rev: the weaker of the two directions of evidence.
+        opens_at_rpm: nearest speed that tells them apart; null if there is none.
+        open_nats_per_rev: the weaker direction there; null without one.
+    """
+
+    modes: list[str]
+    nats_per_rev: float
+    opens_at_rpm: float | None
+    open_nats_per_rev: float | None
+
+
+class SmallestChangeJson(TypedDict):
+    """The smallest change of one kind that can be seen.
+
+    Attributes:
+        fault: the kind.
+        quantity: what changes.
+        unit: unit of that; empty if it has none.
+        healthy: the quantity of the healthy machine; null if it is not known.
+        by_bank: the quantity that the bank finds within `within_rev`; null if it never does.
+        by_vector: the quantity that the synchronous vector finds; null if it never does.
+    """
+
+    fault: str
+    quantity: str
+    unit: str
+    healthy: float | None
+    by_bank: float | None
+    by_vector: float | None
+
+
+class BankDetectabilityJson(TypedDict):
+    """What the bank can tell apart.
+
+    Attributes:
+        machine: name of the machine.
+        speed_rpm: speed that the figures are for.
+        samples_per_rev: samples in a revolution.
+        noise_um: noise of a sample, standard deviation.
+        process_noise: how much the machine shakes of itself, normalised.
+        false_alarms_per_1000_rev: bound on false alarms.
+        modes: names of the modes, the healthiest first.
+        pairs: every ordered pair of modes.
+        ambiguous: modes that look the same at this speed.
+        smallest_change: the smallest visible change of each kind.
+        within_rev: revolutions that `by_bank` is for.
+        calibration_rev: revolutions that the baseline of the synchronous vector is taken from.
+        touching: modes without rub whose orbits reach the housing all the same.
+    """
+
+    machine: str
+    speed_rpm: float
+    samples_per_rev: float
+    noise_um: float
+    process_noise: float
+    false_alarms_per_1000_rev: float
+    modes: list[str]
+    pairs: list[PairJson]
+    ambiguous: list[AmbiguityJson]
+    smallest_change: list[SmallestChangeJson]
+    within_rev: float
+    calibration_rev: float
+    touching: list[str]
+
+
+def as_json(prediction: BankDetectability, machine: MachineFile) -> BankDetectabilityJson:
     """The figures in the units of the machine file; what is never reached is null.
 
     Args:
@@ -70,7 +159,17 @@ def as_json(prediction: BankDetectability, machine: MachineFile) -> dict[str, An
         "process_noise": prediction.process_noise,
         "false_alarms_per_1000_rev": prediction.false_alarms_per_1000_rev,
         "modes": list(prediction.modes),
-        "pairs": [asdict(pair) | {"delay_rev": _finite(pair.delay_rev)} for pair in prediction.pairs],
+        "pairs": [
+            {
+                "truth": pair.truth,
+                "rival": pair.rival,
+                "nats_per_rev": pair.nats_per_rev,
+                "delay_rev": _finite(pair.delay_rev),
+                "threshold_nats": pair.threshold_nats,
+                "simulated": pair.simulated,
+            }
+            for pair in prediction.pairs
+        ],
         "ambiguous": [
             {
                 "modes": list(ambiguity.modes),

@@ -120,7 +120,7 @@ class RotorBankPlugin(DetectorPlugin[RotorBank]):
             # Who asks names the file.
             raise ValueError(str(error).removeprefix(f"{machine.path}: ")) from error
         prediction = bank.bank_detectability(machine, settings, detector, options.process_noise)
-        return Detectability(bank.as_json(prediction, machine), bank.as_text(prediction, machine))
+        return Detectability({**bank.as_json(prediction, machine)}, bank.as_text(prediction, machine))
 
     def readings(self, machine: MachineFile, settings: RotorBank) -> Iterator[Reading]:
         """See `DetectorPlugin.readings`."""

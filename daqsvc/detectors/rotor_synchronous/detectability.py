@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypedDict
 
 from daqsvc.detectors.rotor_synchronous.build import healthy_rotor
 from daqsvc.rotor.detectability.vector import stated_calibration, vector_detectability
@@ -75,9 +75,89 @@ def synchronous_detectability(
     )
 
 
+class DelayJson(TypedDict):
+    """How soon a larger change is an alarm.
+
+    Attributes:
+        size: the quantity after the change.
+        delay_rev: revolutions until half of all are an alarm; null if they never are.
+    """
+
+    size: float
+    delay_rev: float | None
+
+
+class VisibleFaultJson(TypedDict):
+    """How small a fault of one kind is seen.
+
+    Attributes:
+        fault: the kind.
+        quantity: what changes.
+        unit: unit of that; empty if it has none.
+        healthy: the quantity of the healthy machine.
+        by_vector: the quantity at which the change is seen at last; null if it never is.
+        change_um: change of the synchronous vector there; null with it.
+        delays: how soon larger ones are an alarm.
+    """
+
+    fault: str
+    quantity: str
+    unit: str
+    healthy: float
+    by_vector: float | None
+    change_um: float | None
+    delays: list[DelayJson]
+
+
+class OneGroupJson(TypedDict):
+    """Faults that look the same at this speed.
+
+    Attributes:
+        modes: names of the faults.
+        misfit_nats: evidence that tells them apart.
+        opens_at_rpm: nearest speed that tells them apart; null if there is none.
+        told_by_transient: whether the transient after an abrupt change tells them apart.
+    """
+
+    modes: list[str]
+    misfit_nats: float | None
+    opens_at_rpm: float | None
+    told_by_transient: bool
+
+
+class VectorDetectabilityJson(TypedDict):
+    """What the calibrated rotor can see.
+
+    Attributes:
+        machine: name of the machine.
+        speed_rpm: speed that the figures are for, negative if clockwise.
+        samples_per_rev: samples in a revolution.
+        noise_um: noise of a sample, standard deviation.
+        amplitude_um: amplitude of 1X of the healthy machine.
+        calibration_rev: revolutions of the calibration.
+        false_alarms_per_1000_rev: the rate of false alarms that the threshold is set for.
+        threshold_nats: evidence for an alarm.
+        smallest_um: by order the smallest change of the vector that can be seen; null if it never is.
+        smallest_change: the smallest visible change of each kind.
+        ambiguous: faults that look the same at this speed.
+    """
+
+    machine: str
+    speed_rpm: float
+    samples_per_rev: float
+    noise_um: float
+    amplitude_um: float
+    calibration_rev: float
+    false_alarms_per_1000_rev: float
+    threshold_nats: float
+    smallest_um: dict[str, float | None]
+    smallest_change: list[VisibleFaultJson]
+    ambiguous: list[OneGroupJson]
+
+
 def as_json(
     prediction: VectorDetectability, machine: MachineFile, settings: RotorSynchronous
-) -> dict[str, Any]:
+) -> VectorDetectabilityJson:
     """The figures; what is never reached is null.
 
     Args:

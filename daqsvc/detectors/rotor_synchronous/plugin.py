@@ -91,7 +91,7 @@ class RotorSynchronousPlugin(DetectorPlugin[RotorSynchronous]):
             machine, settings, noise_um=options.noise_um, eccentricity_um=options.eccentricity_um
         )
         return Detectability(
-            vector.as_json(prediction, machine, settings), vector.as_text(prediction, machine)
+            {**vector.as_json(prediction, machine, settings)}, vector.as_text(prediction, machine)
         )
 
     def readings(self, machine: MachineFile, settings: RotorSynchronous) -> Iterator[Reading]:

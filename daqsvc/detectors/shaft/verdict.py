@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, ClassVar, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, TypedDict, get_args
 
 from daqsvc.diagnosis.recorded import Verdict, finite
-from daqsvc.dsp.quality.recorded import DataQuality
+from daqsvc.dsp.quality.recorded import DataQuality, DataQualityJson
 from daqsvc.rotor.synchronous.signatures import RotorFault
 from daqsvc.rotor.synchronous.vectors import HARMONICS
 
@@ -20,6 +20,138 @@ if TYPE_CHECKING:
     from daqsvc.rotor.synchronous.watch import WatchReport
 
 VERDICTS: tuple[RotorFault, ...] = get_args(RotorFault)
+
+
+class InstantJson(TypedDict):
+    """A place in the recording.
+
+    Attributes:
+        sample: samples before it.
+        seconds: time before it, in s.
+        revolution: whole revolutions before it.
+    """
+
+    sample: int
+    seconds: float
+    revolution: int
+
+
+class RotorAlarmJson(TypedDict):
+    """A departure, and what came of it.
+
+    Attributes:
+        departure: where the alarm was raised.
+        onset: estimated begin of the change.
+        declaration: where its last group was first named; null if it never was.
+        returned: where the machine was found healthy again; null if it was not.
+        verdict: the most likely fault; null if it was over before there was an evaluation.
+        group: all faults that could not be told apart, the most likely first.
+    """
+
+    departure: InstantJson | None
+    onset: InstantJson | None
+    declaration: InstantJson | None
+    returned: InstantJson | None
+    verdict: str | None
+    group: list[str]
+
+
+class ModeStepJson(TypedDict):
+    """A change of the verdict, at the end of a revolution.
+
+    Attributes:
+        revolution: number of the revolution.
+        verdict: the most likely fault; null between a departure and the first evaluation.
+        group: all faults that cannot be told apart.
+        named: whether two evaluations agree.
+    """
+
+    revolution: int
+    verdict: str | None
+    group: list[str]
+    named: bool
+
+
+class CalibrationJson(TypedDict):
+    """The healthy machine that the verdict rests on.
+
+    Attributes:
+        revolutions: healthy revolutions that were measured.
+        speed_rpm: mean speed of the shaft then.
+        amplitude_um: amplitude of forward 1X.
+        phase_deg: phase of forward 1X.
+        ellipticity: backward over forward 1X.
+        noise_um: noise of a sample, standard deviation.
+        snr_db: whirl over noise.
+        laval: whether the machine is like a Laval rotor.
+        reference_revolutions: healthy revolutions that the baseline has grown to.
+        smallest_change_um: the smallest change that can be seen.
+        verdict: what the machine is like, in words.
+    """
+
+    revolutions: int
+    speed_rpm: float
+    amplitude_um: float
+    phase_deg: float
+    ellipticity: float
+    noise_um: float
+    snr_db: float | None
+    laval: bool
+    reference_revolutions: int
+    smallest_change_um: float | None
+    verdict: str
+
+
+class RotorVerdictJson(TypedDict):
+    """The verdict about the rotor, by the calibrated rotor or by the bank; lengths in um.
+
+    Attributes:
+        recording: name of the recording.
+        verdict: the most likely fault; null if the recording is refused, or is not about the rotor.
+        group: all faults that the evidence cannot tell apart, the most likely first.
+        named: whether two evaluations in a row agreed, or the machine is normal.
+        probabilities: of every fault; empty if there was no evaluation.
+        evidence: of every fault over normal, in nats.
+        severity: size of the change over the amplitude of the healthy whirl; null if healthy.
+        level: by fault of the group how large it would be, in its own terms.
+        change_um: by order the change of the vector, real and imaginary part; null if healthy.
+        onset: estimated begin of the change; null if there is none.
+        departure: where the alarm was raised; null if it was not.
+        declaration: where the last group was first named; null if it was not.
+        alarms: every alarm that was raised, those that returned included.
+        false_alarms_per_1000_rev: the rate of false alarms that the threshold is set for; null if not known.
+        threshold_nats: evidence for an alarm; null if not known.
+        calibration: the healthy machine; null if there is none.
+        speed_rpm: mean speed of the shaft, negative if clockwise; null if not known.
+        revolutions: whole revolutions in the recording.
+        data_quality: what is known against the samples.
+        refused: why the recording cannot be judged; null if it can.
+        code: code of that reason; null if there is none.
+        history: every change of the verdict.
+    """
+
+    recording: str
+    verdict: str | None
+    group: list[str]
+    named: bool
+    probabilities: dict[str, float]
+    evidence: dict[str, float | None]
+    severity: float | None
+    level: dict[str, dict[str, float | None]]
+    change_um: dict[str, list[float]] | None
+    onset: InstantJson | None
+    departure: InstantJson | None
+    declaration: InstantJson | None
+    alarms: list[RotorAlarmJson]
+    false_alarms_per_1000_rev: float | None
+    threshold_nats: float | None
+    calibration: CalibrationJson | None
+    speed_rpm: float | None
+    revolutions: int
+    data_quality: DataQualityJson
+    refused: str | None
+    code: str | None
+    history: list[ModeStepJson]
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +168,7 @@ class Instant:
     seconds: float
     revolution: int
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> InstantJson:
         """For the output."""
         return {"sample": self.sample, "seconds": self.seconds, "revolution": self.revolution}
 
@@ -61,18 +193,16 @@ class RotorAlarm:
     group: tuple[RotorFault, ...]
     returned: Instant | None
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> RotorAlarmJson:
         """For the output."""
-        instants = {
-            "departure": self.departure,
-            "onset": self.onset,
-            "declaration": self.declaration,
-            "returned": self.returned,
+        return {
+            "departure": _json_of(self.departure),
+            "onset": _json_of(self.onset),
+            "declaration": _json_of(self.declaration),
+            "returned": _json_of(self.returned),
+            "verdict": self.verdict,
+            "group": list(self.group),
         }
-        document: dict[str, Any] = {
-            name: None if instant is None else instant.as_json() for name, instant in instants.items()
-        }
-        return document | {"verdict": self.verdict, "group": list(self.group)}
 
     def describe(self) -> str:
         """One line for a person."""
@@ -105,7 +235,7 @@ class ModeStep:
     named: bool = False
     probabilities: Mapping[RotorFault, float] = field(default_factory=dict)
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> ModeStepJson:
         """For the output."""
         return {
             "revolution": self.revolution,
@@ -187,42 +317,40 @@ class RotorVerdict(Verdict):
     def as_json(self) -> dict[str, Any]:
         """A JSON object: all figures finite, lengths in um."""
         change = None if self.identification is None else self.identification.change
-        document: dict[str, Any] = finite(
-            {
-                "recording": self.recording,
-                "verdict": self.verdict,
-                "group": list(self.group),
-                "named": self.named,
-                "probabilities": {name: self.probabilities.get(name, 0.0) for name in VERDICTS}
-                if self.probabilities
-                else {},
-                "evidence": dict(self.evidence),
-                "severity": self.severity,
-                "level": {fault: dict(level) for fault, level in self.level.items()},
-                "change_um": None
-                if change is None
-                else {
-                    str(order): [value.real, value.imag]
-                    for order, value in zip(HARMONICS, change.tolist(), strict=True)
-                },
-                "onset": _json_of(self.onset),
-                "departure": _json_of(self.departure),
-                "declaration": _json_of(self.declaration),
-                "alarms": [alarm.as_json() for alarm in self.alarms],
-                "false_alarms_per_1000_rev": self.false_alarms_per_1000_rev,
-                "threshold_nats": self.threshold_nats,
-                "calibration": None
-                if self.calibration is None
-                else calibration_json(self.calibration, self.reference_revolutions),
-                "speed_rpm": self.speed_rpm,
-                "revolutions": self.revolutions,
-                "data_quality": self.quality.as_json(),
-                "refused": self.refused,
-                "code": self.refusal_code,
-                "history": [step.as_json() for step in self.history],
-            }
-        )
-        return document
+        document: RotorVerdictJson = {
+            "recording": self.recording,
+            "verdict": self.verdict,
+            "group": list(self.group),
+            "named": self.named,
+            "probabilities": {name: self.probabilities.get(name, 0.0) for name in VERDICTS}
+            if self.probabilities
+            else {},
+            "evidence": {str(name): nats for name, nats in self.evidence.items()},
+            "severity": self.severity,
+            "level": {fault: {**level} for fault, level in self.level.items()},
+            "change_um": None
+            if change is None
+            else {
+                str(order): [value.real, value.imag]
+                for order, value in zip(HARMONICS, change.tolist(), strict=True)
+            },
+            "onset": _json_of(self.onset),
+            "departure": _json_of(self.departure),
+            "declaration": _json_of(self.declaration),
+            "alarms": [alarm.as_json() for alarm in self.alarms],
+            "false_alarms_per_1000_rev": self.false_alarms_per_1000_rev,
+            "threshold_nats": self.threshold_nats,
+            "calibration": None
+            if self.calibration is None
+            else calibration_json(self.calibration, self.reference_revolutions),
+            "speed_rpm": self.speed_rpm,
+            "revolutions": self.revolutions,
+            "data_quality": self.quality.as_json(),
+            "refused": self.refused,
+            "code": self.refusal_code,
+            "history": [step.as_json() for step in self.history],
+        }
+        return {**finite(document)}
 
     def describe(self) -> str:
         """A few lines for a person."""
@@ -298,7 +426,7 @@ class RotorVerdict(Verdict):
         )
 
 
-def calibration_json(calibration: Calibration, reference_revolutions: int | None = None) -> dict[str, Any]:
+def calibration_json(calibration: Calibration, reference_revolutions: int | None = None) -> CalibrationJson:
     """A calibration for the output.
 
     Args:
@@ -325,7 +453,7 @@ def _grown(calibration: Calibration, revolutions: int | None) -> Calibration:
     return calibration if revolutions is None else replace(calibration, revolutions=revolutions)
 
 
-def _json_of(instant: Instant | None) -> dict[str, Any] | None:
+def _json_of(instant: Instant | None) -> InstantJson | None:
     return None if instant is None else instant.as_json()
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol, TypedDict
 
 import numpy as np
 
@@ -61,6 +61,42 @@ def off_stated_speed(seen_rpm: float, stated_rpm: float) -> str:
     )
 
 
+class KeyphasorJson(TypedDict):
+    """The pulses of the keyphasor.
+
+    Attributes:
+        accepted: pulses that were used.
+        missing: pulses that are not there.
+        rejected: pulses that were left out.
+    """
+
+    accepted: int
+    missing: int
+    rejected: int
+
+
+class DataQualityJson(TypedDict):
+    """What is known against the samples.
+
+    Attributes:
+        samples: how many there are of a channel.
+        missing: samples that are not there, by channel.
+        infinite: samples that are infinite, by channel; they count as missing.
+        clipped: samples at the end of the probe's range in clipped revolutions, by channel.
+        unusable_revolutions: revolutions that could not be fitted.
+        keyphasor: its pulses; null without one.
+        problems: what a person should know, in sentences.
+    """
+
+    samples: int
+    missing: dict[str, int]
+    infinite: dict[str, int]
+    clipped: dict[str, int]
+    unusable_revolutions: int
+    keyphasor: KeyphasorJson | None
+    problems: list[str]
+
+
 @dataclass(frozen=True, slots=True)
 class DataQuality:
     """What is known against the samples.
@@ -97,7 +133,7 @@ class DataQuality:
             problems=tuple(dict.fromkeys((*self.problems, *other.problems))),
         )
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> DataQualityJson:
         """For the output."""
         marks = self.keyphasor
         return {

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import can
 import pytest
+from support.formats import fits
 from support.paths import ROOT
 from support.waiting import PATIENCE_S
 
@@ -74,7 +75,7 @@ def words(tmp_path: Path, *more: str) -> list[str]:
 
 
 def figures(text: str) -> dict[str, Any]:
-    found = json.loads(text)
+    found = fits("daqsvc sniff can", json.loads(text))
     assert isinstance(found, dict)
     return found
 

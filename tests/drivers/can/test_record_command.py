@@ -15,6 +15,7 @@ import can
 import pytest
 from support.can_recordings import numbers
 from support.examples import first_of
+from support.formats import fits
 from support.paths import ROOT
 from support.ports import free_port
 from support.waiting import PATIENCE_S, eventually, eventually_blocking
@@ -108,7 +109,7 @@ def test_what_is_recorded_is_printed_when_it_is_stopped(
     assert process.returncode == 0, said
     assert said.startswith("recording CAN bus 'can0' ")
     assert f" in {log}; Ctrl-C ends it\n" in said
-    summary = json.loads(output)
+    summary = fits("daqsvc record", json.loads(output))
     found = numbers(log)
     assert [number for number in found if number] == list(range(1, FRAMES + 1))
     assert len(found) <= sent + FRAMES

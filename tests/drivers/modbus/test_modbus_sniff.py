@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from support.formats import fits
 from support.ports import free_port
 from support.waiting import PATIENCE_S
 
@@ -100,7 +101,7 @@ def words(target: str, *more: str) -> list[str]:
 
 
 def figures(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    found: dict[str, Any] = fits("daqsvc sniff modbus", json.loads(capsys.readouterr().out))
     return found
 
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 import serial
+from support.formats import fits
 from support.waiting import PATIENCE_S
 
 from daqsvc.cli import main
@@ -71,7 +72,7 @@ def frame(number: int) -> bytes:
 
 def figures(cable: PseudoTerminal, capsys: pytest.CaptureFixture[str], *more: str) -> dict[str, Any]:
     assert main(["sniff", "serial", f"{cable.path}", "--seconds", "0.6", "--json", *more]) == 0
-    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    found: dict[str, Any] = fits("daqsvc sniff serial", json.loads(capsys.readouterr().out))
     return found
 
 
