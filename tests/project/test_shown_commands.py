@@ -6,11 +6,13 @@ docs/tutorials has a reader of its own (tests/tutorials). Other programs: test_s
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import pty
 import re
 import shutil
 import signal
+import socket
 import ssl
 import subprocess
 import sys
@@ -18,7 +20,7 @@ import tempfile
 import time
 import urllib.request
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from project.test_quoted_messages import is_said
@@ -30,6 +32,7 @@ from support.shown_lines import Shown, shown_lines
 from support.shown_output import differs
 from support.shown_tables import unlike
 from support.sim_processes import process
+from support.snippets import documented
 from support.waiting import PATIENCE_S, eventually_blocking
 
 from daqsvc.acquisition.samples import SampleBlock
@@ -159,6 +162,7 @@ def test_what_is_shown_of_a_service_runs(home: Path) -> None:
         live = [one for one in SHOWN if is_live(one)]
         heard: list[str] = []
         found = complaints(live, folder, heard)
+        found += refusals(folder / "store" / "control.sock")
     for one in filter(of_the_hour, live):
         if wrong := unlike(one.output or "", "\n".join(heard), is_said):
             found.append(f"{one.page}: {one.line}: {wrong!r} is nowhere")
@@ -170,6 +174,32 @@ def test_lines_that_are_not_run_here_are_run_there() -> None:
         file, _, name = place.partition("::")
         assert [one for one in SHOWN if one.line.startswith(begin)], begin
         assert f"\ndef {name}(" in (ROOT / file).read_text("utf-8")
+
+
+def refusals(control: Path) -> list[str]:
+    """The lines that the pages show for the control socket, and that the service does not accept."""
+    found = []
+    for block in documented():
+        if block.language == "json" and '"daqsvc.control/1"' in block.text:
+            for line in filter(lambda line: '"daqsvc.control/1"' in line, block.text.splitlines()):
+                answer = answered(control, line)
+                if answer.get("accepted") is False and "machine" not in line:
+                    # The page has one machine.
+                    answer = answered(control, json.dumps({**json.loads(line), "machine": "pump"}))
+                if answer.get("accepted") is False:
+                    found.append(f"{block.name}: {line}: {answer}")
+    return found
+
+
+def answered(control: Path, line: str) -> dict[str, Any]:
+    """The first line that a service answers."""
+    with socket.socket(socket.AF_UNIX) as client:
+        client.settimeout(PATIENCE_S)
+        client.connect(f"{control}")
+        client.sendall(f"{line}\n".encode())
+        with client.makefile() as lines:
+            answer: dict[str, Any] = json.loads(lines.readline())
+    return answer
 
 
 def of_the_hour(one: Shown) -> bool:

@@ -29,6 +29,33 @@ from support.waiting import PATIENCE_S
 pytestmark = [pytest.mark.integration, pytest.mark.mosquitto]
 FOLDER = ROOT / "config" / "postgresql"
 EVENTS = 4000
+TIMESCALE = """
+CREATE TABLE hypertables (relation regclass PRIMARY KEY);
+CREATE FUNCTION create_hypertable(
+    relation regclass, time_column_name name,
+    if_not_exists boolean DEFAULT false, migrate_data boolean DEFAULT false
+) RETURNS void LANGUAGE plpgsql AS $$
+DECLARE at_number smallint := (
+    SELECT attnum FROM pg_attribute WHERE attrelid = relation AND attname = time_column_name
+);
+BEGIN
+    IF at_number IS NULL OR EXISTS (
+        SELECT FROM pg_index WHERE indrelid = relation AND indisunique AND at_number <> ALL (indkey::int2[])
+    ) THEN
+        RAISE EXCEPTION 'each unique index has to have the time';
+    END IF;
+    INSERT INTO hypertables VALUES (relation);
+END $$;
+CREATE FUNCTION add_retention_policy(
+    relation regclass, drop_after interval, if_not_exists boolean DEFAULT false
+) RETURNS void LANGUAGE plpgsql AS $$
+BEGIN
+    IF NOT EXISTS (SELECT FROM hypertables AS made WHERE made.relation = add_retention_policy.relation) THEN
+        RAISE EXCEPTION 'no hypertable';
+    END IF;
+END $$;
+"""
+"""Functions called like those of TimescaleDB, which Debian does not have, and with arguments of theirs."""
 
 
 @pytest.fixture(scope="module")
@@ -72,10 +99,11 @@ def postgres(guide, base, cluster):
 @pytest.fixture
 def broker(tmp_path):
     """A broker that keeps sessions and messages over a restart, as the documentation asks for."""
-    lines = f"persistence_location {tmp_path}/\nmax_queued_messages 0\n"
-    mosquitto = Mosquitto(tmp_path, config=lines)
+    text = (ROOT / "docs" / "postgresql.md").read_text(encoding="utf-8")
+    [lines] = re.findall(r"```\n(persistence true\n.*?)```", text, flags=re.DOTALL)
+    mosquitto = Mosquitto(tmp_path, config=lines.replace("/var/lib/mosquitto/", f"{tmp_path}/"))
     conf = tmp_path / "mosquitto.conf"
-    conf.write_text(conf.read_text().replace("persistence false", "persistence true"))
+    conf.write_text(conf.read_text().replace("persistence false\n", ""))
     mosquitto.start()
     try:
         yield mosquitto
@@ -97,6 +125,36 @@ def ingesters(broker, postgres):
     for process in running.values():
         process.terminate()
         process.communicate(timeout=PATIENCE_S)
+
+
+def test_what_the_page_shows_of_psql_and_timescale_runs(postgres):
+    """The functions are ours: names, arguments and the rule about unique indexes are those of TimescaleDB."""
+    text = (ROOT / "docs" / "postgresql.md").read_text("utf-8")
+    [line] = re.findall(r"(?m)^(psql plant -f \S+)", text)
+    _, statements = re.findall(r"```sql\n(.*?)```", text, flags=re.DOTALL)
+    with psycopg.connect(postgres.url, autocommit=True) as owner:
+        owner.execute("CREATE DATABASE plant")
+    at = {"PGHOST": LOOPBACK, "PGPORT": f"{postgres.port}", "PGUSER": "owner"}
+    subprocess.run(
+        [*line.split(), "-v", "ON_ERROR_STOP=1"],
+        cwd=ROOT, env={**os.environ, **at}, check=True, capture_output=True,
+    )  # fmt: skip
+    with psycopg.connect(postgres.url.replace("/postgres", "/plant")) as plant:
+        plant.execute(TIMESCALE)
+        plant.commit()
+        for right, wrong in (
+            ("add_retention_policy", "add_retention_polcy"),
+            ("'at'", "'time'"),
+            ("migrate_data", "migrate"),
+            ("daqsvc.diagnoses", "daqsvc.diagnosis"),
+            ("'daqsvc.diagnoses', 'at'", "'daqsvc.alarm_events', 'at'"),
+            ("13 months", "13 moons"),
+        ):
+            assert right in statements
+            with pytest.raises(psycopg.Error):
+                plant.execute(statements.replace(right, wrong))
+            plant.rollback()
+        plant.execute(statements)
 
 
 def alarm(number):
