@@ -34,6 +34,21 @@ def unit_behind(unit: str) -> str:
     return f" {unit}" if unit not in {"", "1"} else ""
 
 
+def counted(number: int, what: str) -> str:
+    """A number of things: ``1 machine``, ``2 machines``, ``1,000 known faults``.
+
+    Args:
+        number: of them.
+        what: one of them is called; its plural ends with an s.
+    """
+    return f"{number:,} {what}{'' if number == 1 else 's'}"
+
+
+def counted_are(number: int, what: str) -> str:
+    """The same with its verb: ``1 sample is``, ``2 samples are``."""
+    return f"{counted(number, what)} {'is' if number == 1 else 'are'}"
+
+
 def rounded_up(value: float, digits: int = 3) -> str:
     """The least figure of so many digits that is no less: for "or more".
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.alarms.states import AlarmState
+from daqsvc.rounding import counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -70,7 +71,7 @@ class FloodWatch:
             self._called_ns.popleft()
         if self.flooding and 2 * count < self._most:
             self.flooding = False
-            return f"only {count} alarms in the last {minutes:g} min"
+            return f"only {counted(count, 'alarm')} in the last {minutes:g} min"
         return None
 
 

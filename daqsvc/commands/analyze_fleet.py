@@ -143,7 +143,7 @@ def _judged(arguments: argparse.Namespace) -> tuple[CampaignSummary, str]:
 
 
 def _text(summary: CampaignSummary, results: str) -> str:
-    from daqsvc.fleet.wording import counted  # noqa: PLC0415 - each verb imports what it needs
+    from daqsvc.rounding import counted  # noqa: PLC0415 - each verb imports what it needs
 
     recordings, machines = counted(summary.recordings, "recording"), counted(summary.machines, "machine")
     lines = [

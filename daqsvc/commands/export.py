@@ -14,6 +14,7 @@ from daqsvc.commands.recording_options import add_channel_map, split_files
 from daqsvc.commands.with_kernels import VerbWithKernels
 from daqsvc.errors.command_line import CANNOT_WRITE, THERE_ALREADY
 from daqsvc.errors.recordings import NO_SUCH_CHANNEL
+from daqsvc.rounding import counted
 
 if TYPE_CHECKING:
     import argparse
@@ -218,6 +219,6 @@ def _line(written: ExportedFile) -> str:
     return "\n".join(
         f"{file}: {one['stream']}, {', '.join(one['channels'])} at {one['rate_hz']:g} Hz, "
         f"{one['samples'] / one['rate_hz']:.4g} s"
-        + (f", {one['missing']:,} samples missing" if one["missing"] else "")
+        + (f", {counted(one['missing'], 'sample')} missing" if one["missing"] else "")
         for one in written["streams"]
     )

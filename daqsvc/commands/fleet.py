@@ -142,7 +142,7 @@ def _changes(report: FleetReport) -> str:
 
 
 def _missed(report: FleetReport) -> str:
-    from daqsvc.fleet.wording import counted  # noqa: PLC0415 - each verb imports what it needs
+    from daqsvc.rounding import counted  # noqa: PLC0415 - each verb imports what it needs
 
     rows = [
         [
@@ -187,7 +187,7 @@ def _not_judged(report: FleetReport) -> str:
 
 
 def _fleet(report: FleetReport) -> str:
-    from daqsvc.fleet.wording import counted  # noqa: PLC0415 - each verb imports what it needs
+    from daqsvc.rounding import counted  # noqa: PLC0415 - each verb imports what it needs
 
     fleet = report.as_json()["fleet"]
     years = "times not known" if report.years is None else f"{report.years:,.3g} machine-years"
@@ -215,7 +215,7 @@ def _fleet(report: FleetReport) -> str:
 
 def _cost(report: FleetReport) -> str:
     """How many false alarms there were and what they cost, first what is certain and then a year of it."""
-    from daqsvc.fleet.wording import counted  # noqa: PLC0415 - each verb imports what it needs
+    from daqsvc.rounding import counted  # noqa: PLC0415 - each verb imports what it needs
 
     said = counted(report.false_alarms, "false alarm")
     if report.false_alarm_cost is not None:

@@ -14,6 +14,7 @@ from daqsvc import kernel_cache
 from daqsvc.commands.arguments import EXIT_OK, EXIT_USAGE, positive, signals_to_end
 from daqsvc.commands.complaint import complain
 from daqsvc.errors.command_line import ARGUMENTS, CANNOT_WRITE, NOTHING_ON_BUS, THERE_ALREADY, WRONG_VALUE
+from daqsvc.rounding import counted
 
 if TYPE_CHECKING:
     import argparse
@@ -102,8 +103,8 @@ class RecordCommand:
         files = sorted(_logs(arguments.out) - there)
         summary = _summary(name, driver, files)
         print(json.dumps({**asdict(driver.counters), **summary}))  # noqa: T201 - this is what the verb is for
-        if summary["frames_unrecorded"]:
-            what = f"{summary['frames_unrecorded']} frames could not be recorded in {arguments.out}"
+        if unrecorded := summary["frames_unrecorded"]:
+            what = f"{counted(unrecorded, 'frame')} could not be recorded in {arguments.out}"
             return complain("daqsvc", what, CANNOT_WRITE)
         if not files:
             what = (
@@ -182,7 +183,7 @@ class _Progress:
 
     def _words(self) -> str:
         link, counters = self._driver.link, asdict(self._driver.counters)
-        frames = f"{counters['frames_recorded']:,} frames recorded"
+        frames = f"{counted(counters['frames_recorded'], 'frame')} recorded"
         if counters["frames_unrecorded"]:
             frames += f", {counters['frames_unrecorded']:,} not"
         if link.reason:

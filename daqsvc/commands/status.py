@@ -14,6 +14,7 @@ from daqsvc.commands.arguments import EXIT_OK, EXIT_USAGE, signals_to_end
 from daqsvc.commands.complaint import complain
 from daqsvc.commands.store_argument import BadFileError, StoreNotFoundError, add_store, chosen_store
 from daqsvc.errors.command_line import NO_SERVICE
+from daqsvc.rounding import counted
 
 if TYPE_CHECKING:
     import argparse
@@ -157,7 +158,7 @@ class _Picture:
         if len(lines) > size.lines:
             hidden = len(lines) - size.lines + 1
             lines[size.lines - 1 :] = [
-                f"... and {hidden} more lines: daqsvc status shows all"[: size.columns]
+                f"... and {counted(hidden, 'more line')}: daqsvc status shows all"[: size.columns]
             ]
         body = f"{END_OF_LINE}\n".join(lines)
         _write(f"{HOME}{body}{END_OF_LINE}{END_OF_SCREEN}")

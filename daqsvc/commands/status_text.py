@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.commands.tables import ago, aligned, harmless, local_time, wrapped
-from daqsvc.rounding import with_unit
+from daqsvc.rounding import counted, with_unit
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -168,7 +168,7 @@ def _outbox(status: Document) -> str:
     waits = "waits" if events == 1 else "wait"
     # Without a broker they wait for one that a later machine file may have.
     what = f"{waits} for the broker" if "mqtt" in status["outputs"] else "kept for a broker"
-    said = "outbox: " + (f"{events:,} alarm event{'s' * (events != 1)} {what}" if events else "nothing waits")
+    said = "outbox: " + (f"{counted(events, 'alarm event')} {what}" if events else "nothing waits")
     if outbox["oldest_age_s"] is not None:
         said += f", the oldest for {_age(outbox['oldest_age_s'])}"
     if outbox["waiting"]:

@@ -153,7 +153,7 @@ NOT_IN_ONE_FRAME = Code(
     "of a multiplexer never come in one frame.",
     "Make a stream of each group that comes together.",
     _PAGE,
-    example='machine.toml:31: streams.housing.layout.channels[1].signals = ["AccelY"]: has 1 samples in a '
+    example='machine.toml:31: streams.housing.layout.channels[1].signals = ["AccelY"]: has 1 sample in a '
     'frame, but channel "x" has 2. Remedy: name as many signals for every channel of the stream',
 )
 UNIT_ADDRESS = Code(

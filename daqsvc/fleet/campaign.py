@@ -17,7 +17,7 @@ from daqsvc.fleet.judging import OtherVersionError, RecordingBatch, describe_mac
 from daqsvc.fleet.report import VERDICT_COLUMNS, verdict_of
 from daqsvc.fleet.results import folder_of
 from daqsvc.fleet.table import KEYS, begun_row
-from daqsvc.fleet.wording import counted
+from daqsvc.rounding import counted
 from daqsvc.settings.failures import one_line
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from daqsvc.dsp.phase import deviation_deg
 from daqsvc.page.text import level_mark, row, time_mark
-from daqsvc.rounding import readable, with_unit
+from daqsvc.rounding import counted_are, readable, with_unit
 
 if TYPE_CHECKING:
     from daqsvc.page.machine_live import MachineLive
@@ -32,7 +32,7 @@ def value_rows(live: MachineLive) -> str:
             statements.setdefault(name, []).append(one)
     rows = [_row_of(live, name, about) for name, about in [*statements.items()][:MOST_ROWS]]
     if (more := len(statements) - MOST_ROWS) > 0:
-        rows.append(f'<tr><td colspan="5">{more} more sensors are not listed.</td></tr>')
+        rows.append(f'<tr><td colspan="5">{counted_are(more, "more sensor")} not listed.</td></tr>')
     return "".join(rows) or '<tr><td colspan="5">No sensor has reported yet.</td></tr>'
 
 

@@ -21,6 +21,7 @@ from daqsvc.errors.machine_file import (
     WRONG_LENGTH,
     WRONG_TYPE,
 )
+from daqsvc.rounding import counted
 from daqsvc.settings.aliases import meant_key
 from daqsvc.settings.buses import Layout
 from daqsvc.settings.registry import first_detector
@@ -291,9 +292,11 @@ class ErrorFormatter:
 
     def _too_long(self, path: KeyPath, context: Mapping[str, Any]) -> tuple[str, str]:
         most = context["max_length"]
+        if isinstance(value_at(self._document, path), str):
+            return f"must be {counted(most, 'character')}", self._write_example(path)
         if most > _MOST_IN_A_ROW:
             return f"has more than {most:,} entries", "leave some out, or watch the rest with another service"
-        return f"must have {most} values", self._write_example(path)
+        return f"must have {counted(most, 'value')}", self._write_example(path)
 
     def _tuple_type(self, path: KeyPath, _context: Mapping[str, Any]) -> tuple[str, str]:
         field = self._field(path)

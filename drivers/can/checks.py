@@ -6,6 +6,7 @@ from contextlib import suppress
 from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
+from daqsvc import rounding
 from daqsvc.errors.buses import (
     BUS_TOO_SLOW,
     CAN_ID,
@@ -138,7 +139,7 @@ def check_signals(layout: DbcLayout, at: KeyPath) -> Iterator[Finding]:
         if len(channel.signals) != layout.samples_per_frame:
             yield Finding(
                 path,
-                f"has {len(channel.signals)} samples in a frame, but channel "
+                f"has {rounding.counted(len(channel.signals), 'sample')} in a frame, but channel "
                 f'"{layout.channels[0].name}" has {layout.samples_per_frame}',
                 "name as many signals for every channel of the stream",
                 code=NOT_IN_ONE_FRAME,

@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from daqsvc.rounding import counted
 from drivers import packed_questions as packed
 from drivers import questions as q
 from drivers.bus_questions import BUS, BusQuestions, Heard, by_name, is_count
@@ -304,7 +305,7 @@ class DbcQuestions(_CanQuestions):
                 "consecutive",
                 q.yes_no,
                 "yes" if _most_likely_samples(message.signals, answers["signals"]) else "no",
-                choices={"yes": together, "no": f"{len(answers['signals'])} channels"},
+                choices={"yes": together, "no": counted(len(answers["signals"]), "channel")},
             )
 
     listens_behind = "dbc"
@@ -588,7 +589,7 @@ def _signals(known: tuple[str, ...], signals: Mapping[str, Any], text: str) -> t
 def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
     """What was heard, in a few lines: the ids that come most often."""
     ids = sorted(found["ids"], key=lambda one: -(one["rate_hz"] or 0.0))
-    yield f"{found['frames']} frames of {len(ids)} {'id' if len(ids) == 1 else 'ids'}:"
+    yield f"{counted(found['frames'], 'frame')} of {counted(len(ids), 'id')}:"
     for one in ids[:_SHOWN]:
         lengths = ", ".join(map(str, one["lengths"]))
         rate = "once" if one["rate_hz"] is None else f"{one['rate_hz']:.4g} a second"

@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from daqsvc.rounding import counted
 from drivers.sniffing import (
     Sniffed,
     Sniffer,
@@ -360,7 +361,7 @@ class _Report(NamedTuple):
             summary += "; give --bitrate to see the load of the bus"
         yield summary
         if self.traffic.dropped:
-            yield f"{self.traffic.dropped} frames were dropped: this computer was too slow for them."
+            yield f"{counted(self.traffic.dropped, 'frame')} dropped: this computer was too slow."
         if self.traffic.error_frames:
             yield self._errors()
         if ids:
@@ -402,7 +403,7 @@ class _Report(NamedTuple):
         errors = self.traffic.errors
         counts = ", ".join(f"{name} {count}" for name, count in errors.counts.items())
         state = "" if errors.state is None else f"; the controller is {errors.state}"
-        return f"{self.traffic.error_frames} error frames: {counts or 'of no known class'}{state}"
+        return f"{counted(self.traffic.error_frames, 'error frame')}: {counts or 'of no known class'}{state}"
 
     def _dbc_parts(self, dbc: DbcTraffic) -> Iterator[str | SniffTable]:
         rows = [

@@ -22,7 +22,7 @@ from daqsvc.errors.buses import (
     WRONG_LAYOUT,
 )
 from daqsvc.errors.machine_file import WRONG_ORDER
-from daqsvc.rounding import with_unit
+from daqsvc.rounding import counted, with_unit
 from daqsvc.settings.alarms import LevelAlarm, VotingAlarm
 from daqsvc.settings.buses import BUSY
 from daqsvc.settings.problems import Finding
@@ -354,7 +354,7 @@ def _clash(
     yield Finding(
         at,
         f'is part of {one.type} "{one.name}" too, which takes {registers}',
-        f"correct the two: {one.type} takes {one.registers} register{'s' if one.registers > 1 else ''}, "
+        f"correct the two: {one.type} takes {counted(one.registers, 'register')}, "
         f"so the next number begins at {end} or later",
         fatal=not whole and (floats or not within),
         code=REGISTERS_OVERLAP,

@@ -8,6 +8,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
 from pydantic_core import PydanticCustomError
 
 from daqsvc.errors.buses import MANUALS_NUMBER, RING_DEPTH
+from daqsvc.rounding import counted
 from daqsvc.settings.addresses import DevicePath, Host, serial_port
 from daqsvc.settings.buses import Block, Bus, Device, Layout, WireRange
 from daqsvc.settings.packing import Scale  # noqa: TC001 - pydantic reads the annotations
@@ -330,7 +331,7 @@ class _Sampled(_ModbusLayout):
     @property
     def channels_in_words(self) -> str:
         """How many channels there are."""
-        return f"{len(self.channels)} channel{'s' * (len(self.channels) > 1)}"
+        return counted(len(self.channels), "channel")
 
     @property
     def sample_registers(self) -> int:
@@ -398,7 +399,7 @@ class RegistersLayout(_ModbusLayout):
     @property
     def summary(self) -> str:
         """What a person should know about it, in a few words."""
-        return f"{len(self.channels)} values polled in {self.table} registers"
+        return f"{counted(len(self.channels), 'value')} polled in {self.table} registers"
 
     @property
     def polled(self) -> bool:

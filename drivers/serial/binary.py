@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import numpy as np
 from cobs import cobs
 
+from daqsvc.rounding import counted
 from drivers.frames import DecodedBatch, LayoutError
 from drivers.serial.framing import SHOWN_BYTES, DelimitedFraming, NoFrame, in_place
 from drivers.serial.kernels import CRC_BYTES, SyncSearch, crcs_match, gather, hunt, scaled, unstuff
@@ -306,6 +307,6 @@ class SyncFraming(_BinaryFraming):
         count, begin = int(gaps[few[0]]), int(ends[few[0]])
         shown = buffer[begin : begin + count].tobytes().hex(" ")
         return NoFrame(
-            f"the first are between two whole frames, {count} byte{'s' * (count > 1)}: {shown}",
+            f"the first are between two whole frames, {counted(count, 'byte')}: {shown}",
             "the device sends them behind each frame, and no frame is lost by them",
         )

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.rounding import counted
 from drivers.frames import DecodedFrames, LayoutError
 from drivers.serial.framing import DelimitedFraming, NoFrame
 from drivers.serial.line_kernels import (
@@ -106,7 +107,7 @@ class LineCodec:
         for name in (place.column, *layout.channel_names):
             if layout.line.count(name) != 1:
                 raise LayoutError(
-                    f"column {name!r} is there {layout.line.count(name)} times among "
+                    f"column {name!r} is there {counted(layout.line.count(name), 'time')} among "
                     f"{', '.join(layout.line)}; name it once"
                 )
         self._layout = layout
@@ -153,7 +154,7 @@ class LineCodec:
         """Why the fields of a line, its prefix left out, are no sample."""
         columns, decimal = self._layout.line, self._layout.decimal
         if len(fields) != len(columns):
-            many = f"{len(fields)} column{'s' * (len(fields) != 1)}"
+            many = counted(len(fields), "column")
             why = f"{many}, the file lists {len(columns)} ({', '.join(columns)})"
             return NoFrame(why, self._other_columns(len(fields) - len(columns)))
         for name in (self._place, *self._layout.channel_names):
@@ -183,7 +184,7 @@ class LineCodec:
 
     def _other_columns(self, more: int) -> str:
         """What to do if lines have so many columns more than the file lists; fewer if it is negative."""
-        many = f"{abs(more)} column{'s' * (abs(more) != 1)}"
+        many = counted(abs(more), "column")
         if more > 0:
             change = f"list {many} more in line of the layout: all that the device sends, in their order"
         else:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from daqsvc.rounding import counted
 from drivers import packed_questions as packed
 from drivers import questions as q
 from drivers.bus_questions import BUS, BusQuestions, Heard, is_count, only_port
@@ -256,7 +257,7 @@ def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
         return
     prefix = f", each begins with {found['prefix']}" if found["prefix"] else ""
     comma = ", numbers with a decimal comma" if found["decimal"] == "," else ""
-    yield f"{line}: lines of text{rate}, {len(found['columns'])} columns{prefix}{comma}"
+    yield f"{line}: lines of text{rate}, {counted(len(found['columns']), 'column')}{prefix}{comma}"
     if found["lines_damaged"]:
         yield f"  {found['lines_damaged']} of {found['lines_heard']} lines are damaged"
     yield from (f"  {one}" for one in found["lines"][:_SHOWN_LINES])

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from daqsvc.documentation import documented_in
+from daqsvc.rounding import counted
 from drivers.sniffing import (
     Sniffed,
     Sniffer,
@@ -375,7 +376,7 @@ class _Report(NamedTuple):
     def _lines(self, what: TextLines) -> Iterator[str | SniffTable]:
         shown = "\n".join(line[:_WIDEST] for line in what.lines[:_SHOWN_LINES])
         yield f"The first lines:\n{_printable(shown)}"
-        words = [f"{len(what.columns)} columns" if len(what.columns) != 1 else "1 column"]
+        words = [counted(len(what.columns), "column")]
         between = "blanks" if what.separator == " " else quoted(what.separator)
         words += [f"separated by {between}"] * bool(what.separator)
         words += ["numbers have a decimal comma"] * (what.decimal == ",")

@@ -216,5 +216,5 @@ def test_no_delay_goes_on_over_samples_that_nobody_looked_at():
         assert watched.take(0.3 * machine(rng, WINDOW), skipped=int(5 * RATE_HZ)) == []
     skipped = watched.said[-2]
     assert (skipped.decision, skipped.missing_share) == ("normal", 1.0)
-    assert "10000 samples of a were not judged" in skipped.reason
+    assert "10,000 samples of a were not judged" in skipped.reason
     assert ("high", "returned") in watched.take(0.3 * machine(rng, 9 * WINDOW))

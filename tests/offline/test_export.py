@@ -119,7 +119,7 @@ def test_streams_of_several_rates_are_in_one_file(gapped, tmp_path, capsys, suff
     (shaft, oil), _ = load_all(target)
     err = capsys.readouterr().err
     if suffix == ".uff":
-        assert f"{BLOCK_ROWS} samples of stream shaft are missing and 0 there, as a UFF file" in err
+        assert f"stream shaft lacks {BLOCK_ROWS} samples, 0 in the file, as a UFF file" in err
         fast = np.nan_to_num(fast)
     else:
         assert err == ""
@@ -159,7 +159,7 @@ def test_streams_of_several_rates_are_a_file_each(gapped, tmp_path, capsys, suff
     (read_oil,), _ = load_all(tmp_path / f"two-oil{suffix}")
     assert np.array_equal(read_oil.samples[:, 0].astype(np.float32), slow)
     if suffix == ".wav":
-        assert f"{BLOCK_ROWS} samples of stream shaft are missing and 0 there, as a WAV file" in err
+        assert f"stream shaft lacks {BLOCK_ROWS} samples, 0 in the file, as a WAV file" in err
         assert not read.samples[2 * BLOCK_ROWS : 3 * BLOCK_ROWS].any()
     else:
         assert err == ""

@@ -46,9 +46,9 @@ def test_infinite_values_that_become_0_are_counted(tmp_path, capsys, suffix, for
     assert export(tmp_path / "in.npz", "--to", target) == 0
     lost = 3 if suffix == ".wav" else 2  # 1e300 is none of float32
     begin = f"daqsvc export: out{suffix}: "
-    missing = f"1 samples of stream in are missing and 0 there, as a {format_name} file has no gaps"
+    missing = f"stream in lacks 1 sample, 0 in the file, as a {format_name} file has no gaps"
     why = f"as a {format_name} file holds finite numbers only"
-    infinite = f"{lost} values of stream in are infinite or too large, and 0 there, {why}"
+    infinite = f"stream in has 0 in place of {lost} values that cannot be written, {why}"
     assert capsys.readouterr().err == f"{begin}{missing}\n{begin}{infinite}\n"
     (stream,), _ = load_all(target)
     assert np.flatnonzero(stream.samples[:, 0] == 0.0).tolist() == [3, 4, 5]

@@ -189,7 +189,7 @@ def test_an_unknown_rate_is_asked_for(tmp_path):
         ("a.csv", b"one\ntwo\n", "no numeric channel: its first line is 'one', and no line behind it"),
         ("a.csv", b"t,a\n0.1,two\nthree,four\n", "no numeric channel: its first line is 't,a'"),
         ("a.csv", b"1,2\n3,4\n5,x\n7,8\n", r"a.csv, line 3, column 2: 'x' is not a number"),
-        ("a.csv", b"x,y\n" + b"1,2\n" * 30 + b"1\n", r"a.csv, line 32 has 1 columns where the others have 2"),
+        ("a.csv", b"x,y\n" + b"1,2\n" * 30 + b"1\n", r"a.csv, line 32 has 1 column where the others have 2"),
         ("a.csv", b"\xff\xfe1", "cannot be read"),
         ("a.csv.gz", b"1,2\n", "cannot be read.*gzip"),
         ("a.mat", b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + bytes(400), "save it in MATLAB with"),

@@ -144,7 +144,7 @@ def test_what_the_dbc_file_says():
         ('["AccelX"]', '["AccelQ"]', "layout.channels[0].signals[0]", "no such signal", "AccelX"),
         ('"Sequence"', '"Counter"', "layout.counter.signal", "no such signal", "Sequence"),
         ('"Sequence"', '"AccelX"', "layout.channels[0].signals[0]", "taken by the counter", "once"),
-        ('["AccelX"]', '["AccelX", "Status"]', "layout.channels[1].signals", "has 1 samples", "as many"),
+        ('["AccelX"]', '["AccelX", "Status"]', "layout.channels[1].signals", "has 1 sample in", "as many"),
     ],
 )
 def test_a_layout_that_the_dbc_file_does_not_bear_out(old, new, key, message, remedy):

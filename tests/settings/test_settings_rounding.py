@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from support.machine_files import LAVAL, MACHINES, changed
 from support.paths import ROOT
 
-from daqsvc.rounding import readable, rounded_down, rounded_up, with_unit
+from daqsvc.rounding import counted, counted_are, readable, rounded_down, rounded_up, with_unit
 from daqsvc.settings import MachineFileError, load_machine_file, parse_machine_file
 from daqsvc.settings.describe import describe
 
@@ -159,3 +159,22 @@ def test_what_concerns_a_whole_alarm_names_it(tmp_path: Path) -> None:
     file.write_text(STATE.replace("alert = 0.5\ndanger = 1.5\n", ""))
     with pytest.raises(MachineFileError, match=r'alarms\[0\] \("state"\): has neither alert nor danger'):
         load_machine_file(file)
+
+
+def test_one_thing_is_counted_in_the_singular():
+    assert [counted(n, "missing sample") for n in (0, 1, 1000)] == [
+        "0 missing samples",
+        "1 missing sample",
+        "1,000 missing samples",
+    ]
+    assert [counted_are(n, "sample") for n in (1, 2)] == ["1 sample is", "2 samples are"]
+
+
+COUNTED = re.compile(r"(?<!\.)\b1 (missing |lost |more )?(samples|frames|values|columns|channels|lines)\b")
+
+
+def test_no_message_that_tests_have_had_counts_one_thing_in_the_plural():
+    known = [*(ROOT / "tests/guard/golden").glob("*.txt"), ROOT / "tests/errors/messages.txt"]
+    lines = [line for file in known for line in file.read_text("utf-8").splitlines()]
+    # Headings have the values of the tests in them.
+    assert [line for line in lines if COUNTED.search(line) and not line.startswith("==")] == []

@@ -19,7 +19,7 @@ from daqsvc.dsp.quality.missing import ACCELEROMETER_SHARE
 from daqsvc.dsp.quality.outliers import Prewhitening, blanked, despiked, find_transients, merged, runs
 from daqsvc.dsp.quality.stuck import DEAD_SHARE, dropouts
 from daqsvc.dsp.quality.unit import refuse_beyond_any_unit, refuse_still
-from daqsvc.rounding import rounded_up
+from daqsvc.rounding import counted, counted_are, rounded_up
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -139,7 +139,7 @@ def _bridged(x: Real, rate_hz: float) -> tuple[Real, list[Stretch], list[str], l
     if held.any():
         dropped = runs(np.flatnonzero(held), 1)
         first_s = dropped[0][0] / rate_hz
-        what = f"{len(dropped)} times ({held.mean():.1%} of its samples), first at {first_s:.4g} s"
+        what = f"{counted(len(dropped), 'time')} ({held.mean():.1%} of its samples), first at {first_s:.4g} s"
         if lost.mean() > ACCELEROMETER_SHARE:
             raise UnfitError("channel", f"stands still {what}", "check what drops its samples out")
         sentences.append(f"the channel stands still {what}: bridged; check what drops its samples out")
@@ -149,7 +149,7 @@ def _bridged(x: Real, rate_hz: float) -> tuple[Real, list[Stretch], list[str], l
     long = merged((max(first - taper, 0), min(last + taper, len(x))) for first, last in long)
     x = blanked(x, long, rate_hz)
     notes = (
-        [f"{int((~good).sum())} samples are missing: bridged; check the bus and the device"]
+        [f"{counted_are(int((~good).sum()), 'sample')} missing: bridged; check the bus and the device"]
         if missing
         else []
     )
@@ -240,9 +240,8 @@ def repaired(samples: Real, rate_hz: float, revolution: int, band_hz: tuple[floa
         values = blanked(values, events, rate_hz)
     if len(spikes) > MOST_SPIKES * len(samples):
         _refuse_empty_band(samples, rate_hz, band_hz)
-        raise UnfitError(
-            "channel", f"has {len(spikes)} wrong samples of {len(samples)}", "check cable and converter"
-        )
+        wrong = f"{counted(len(spikes), 'wrong sample')} of {len(samples)}"
+        raise UnfitError("channel", f"has {wrong}", "check cable and converter")
     repairs = []
     if spikes:
         repairs.append(_told_spikes(sorted(spikes), rate_hz))

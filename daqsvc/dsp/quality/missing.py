@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
+from daqsvc.rounding import counted
+
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
@@ -135,7 +137,8 @@ def nothing_known(measures: Iterable[str]) -> dict[str, tuple[float, float]]:
 
 def not_judged(sensor: str, samples: int) -> str:
     """Why measures of a sensor are held that were there and not examined, in words for a person."""
-    return f"{samples} samples of {sensor} were not judged: this computer was too slow, or they were lost"
+    many = f"{counted(samples, 'sample')} of {sensor} {'was' if samples == 1 else 'were'} not judged"
+    return f"{many}: this computer was too slow, or the bus lost {'it' if samples == 1 else 'them'}"
 
 
 def partly_missing(sensor: str, missing: int, count: int, held: Bounds) -> str:

@@ -24,6 +24,7 @@ from daqsvc.dsp.quality.clipped import (
     ends_cut_off,
 )
 from daqsvc.dsp.quality.missing import RECORDING_SHARE
+from daqsvc.rounding import counted_are
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -175,7 +176,7 @@ def count_bad(names: Sequence[str], samples: Floats) -> DataQuality:
     for name in names:
         if quality.infinite[name]:
             quality = quality.with_problem(
-                f"{name}: {quality.infinite[name]} infinite samples are taken as missing"
+                f"{name}: {counted_are(quality.infinite[name], 'infinite sample')} taken as missing"
             )
     return quality
 
@@ -292,8 +293,8 @@ def _peaks_cut_off(quality: DataQuality, name: str, signal: Floats) -> DataQuali
     clipped = {**quality.clipped, name: sum(ends.values())}
     at = " and ".join(f"{value:.6g} um" for value in ends)
     return replace(quality, clipped=clipped).with_problem(
-        f"{name} is clipped now and then: {sum(ends.values())} samples are at {at}; check the gap and the "
-        "range of the converter"
+        f"{name} is clipped now and then: {counted_are(sum(ends.values()), 'sample')} at {at}; check the gap "
+        "and the range of the converter"
     )
 
 

@@ -30,6 +30,7 @@ from daqsvc.recording.formats.written_times import (
     times_of,
 )
 from daqsvc.recording.rate import PER_SECOND
+from daqsvc.rounding import counted
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Mapping
@@ -324,7 +325,7 @@ class _DelimitedTable:
             where = f"{self._path}, line {i}"
             if len(cells) < layout.width:
                 raise RecordingError(
-                    f"{where} has {len(cells)} columns where the others have {layout.width}; "
+                    f"{where} has {counted(len(cells), 'column')} where the others have {layout.width}; "
                     "correct the file",
                     NOT_NUMBERS,
                 )

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.recording.streams import unique
+from daqsvc.rounding import counted
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -46,13 +47,13 @@ def notes_on_gaps(
     for stream, count in zip(streams, infinite, strict=True):
         if missing := stream.missing():
             notes.append(
-                f"{path.name}: {missing:,} samples of stream {stream.name} are missing and 0 there, as a "
+                f"{path.name}: stream {stream.name} lacks {counted(missing, 'sample')}, 0 in the file, as a "
                 f"{format_name} file has no gaps"
             )
         if count:
             notes.append(
-                f"{path.name}: {count:,} values of stream {stream.name} are infinite or too large, and 0 "
-                f"there, as a {format_name} file holds finite numbers only"
+                f"{path.name}: stream {stream.name} has 0 in place of {counted(count, 'value')} that cannot "
+                f"be written, as a {format_name} file holds finite numbers only"
             )
     return notes
 
