@@ -41,6 +41,7 @@ class MachineWatch:
         bus_over: why nothing more can come from a bus; empty if something can.
         stream_silent: why nothing comes of a stream, as far as its bus knows; empty if it does not.
         is_prepared_for: whether the driver of a stream still makes itself ready to read it.
+        bus_quiet: that nothing at all comes over the bus of a stream, in a clause; empty if something may.
         kernels: threads that its detectors compute in.
         make_reader: makes what hands the samples of a ring to a detector.
         listens: whether its pipeline finds out by itself that a stream is silent.
@@ -72,6 +73,7 @@ class MachineWatch:
         kernels: KernelThreads,
         make_reader: Callable[[SampleRing], RingReader] = RingReader,
         is_prepared_for: Callable[[str], bool] = lambda _stream: False,
+        bus_quiet: Callable[[str], str] = lambda _stream: "",
         *,
         listens: bool = True,
     ) -> None:
@@ -82,6 +84,7 @@ class MachineWatch:
         self._bus_over = bus_over
         self._stream_silent = stream_silent
         self._is_prepared_for = is_prepared_for
+        self._bus_quiet = bus_quiet
         watching = detectors(machine, store)
         grids = [*(Grid({name: stream}) for name, stream in machine.streams.items()), *machine.grids]
         self._grids = grids
@@ -107,6 +110,7 @@ class MachineWatch:
             fall_silent=self._fall_silent,
             why_over=self._why_over,
             why_silent=self._why_silent,
+            bus_quiet=self._quiet,
             is_prepared_for=self._is_prepared,
             make_reader=make_reader,
             on_read=self._on_read,
@@ -220,6 +224,11 @@ class MachineWatch:
         """What the bus of a stream or grid knows of why nothing comes; else empty."""
         streams = next(grid.streams for grid in self._grids if grid.name == stream)
         return next(filter(None, (self._stream_silent(name) for name in streams)), "")
+
+    def _quiet(self, stream: str) -> str:
+        """That nothing at all comes over the bus of a stream; of a grid one of its buses is enough."""
+        streams = next(grid.streams for grid in self._grids if grid.name == stream)
+        return next(filter(None, map(self._bus_quiet, streams)), "")
 
     def _is_prepared(self, stream: str) -> bool:
         """Whether the driver of a stream, or of one of a grid, still makes itself ready."""

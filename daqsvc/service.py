@@ -221,6 +221,7 @@ class Service:
             partial(self._why_silent, name),
             self._kernels,
             is_prepared_for=partial(self._is_prepared_for, name),
+            bus_quiet=partial(self._bus_quiet, name),
         )
 
     def _join_streams(self) -> None:
@@ -580,6 +581,11 @@ class Service:
         bus = self.box.machines[machine].streams[stream].bus
         links = (one.link for one in self.driver_reports if one.name == bus)
         return next((link.why_silent(self.box.stream_key(machine, stream)) for link in links), "")
+
+    def _bus_quiet(self, machine: str, stream: str) -> str:
+        """That nothing at all comes over the bus of a stream of a machine; empty if that is not known."""
+        bus = self.box.machines[machine].streams[stream].bus
+        return next((one.link.quiet() for one in self.driver_reports if one.name == bus), "")
 
     def _is_prepared_for(self, machine: str, stream: str) -> bool:
         """Whether the driver of a stream of a machine still makes itself ready."""

@@ -16,7 +16,7 @@ from daqsvc.notice import notice
 from daqsvc.settings.failures import cause_of, in_words
 
 if TYPE_CHECKING:
-    from collections.abc import Hashable, Mapping
+    from collections.abc import Callable, Hashable, Mapping
 
     from daqsvc.errors.code import Code
 
@@ -137,6 +137,7 @@ class Link:
             so several times a second. 0 where the event loop reads.
         faults: by stream, why no samples of it come while the link is up, in a clause, e.g. that the device
             refuses what is asked.
+        quiet: that nothing at all comes over it, in a clause; empty if something does, or that is not known.
         preparing: whether the driver still makes itself ready, so that nothing can have come yet.
     """
 
@@ -148,6 +149,7 @@ class Link:
     over: str = ""
     turns: int = 0
     faults: Mapping[str, str] = field(default_factory=dict)
+    quiet: Callable[[], str] = field(default=str, repr=False)
     preparing: bool = False
     _ever_up: bool = field(default=False, repr=False)
     _said_down: bool = field(default=False, repr=False)

@@ -278,6 +278,7 @@ class Pipeline:
             more; who reports the state of streams passes it on. None: it is passed on at once.
         why_over: why nothing more can come of a stream, in a clause; empty if something may.
         why_silent: what the bus of a stream states of why nothing comes, in a clause; empty if nothing.
+        bus_quiet: that nothing else comes over the bus of a stream, in a clause; empty if something may.
         is_prepared_for: whether the driver of a stream still makes itself ready to read it.
         make_reader: makes what hands the samples of a ring to a detector.
         on_read: called on the event loop with a detector's name and each window that is read for it.
@@ -298,6 +299,7 @@ class Pipeline:
         fall_silent: Tell | None = None,
         why_over: Callable[[str], str] = lambda _stream: "",
         why_silent: Callable[[str], str] = lambda _stream: "",
+        bus_quiet: Callable[[str], str] = lambda _stream: "",
         is_prepared_for: Callable[[str], bool] = lambda _stream: False,
         make_reader: Callable[[SampleRing], RingReader] = RingReader,
         on_read: Callable[[str, Window], None] = lambda _detector, _window: None,
@@ -319,6 +321,7 @@ class Pipeline:
         self._fall_silent = fall_silent or self.stand
         self._why_over = why_over
         self._why_silent = why_silent
+        self._bus_quiet = bus_quiet
         self._is_prepared_for = is_prepared_for
         self._doubts_told = dict.fromkeys(rings, 0)
         self._changes = dict.fromkeys(rings, 0)
@@ -484,11 +487,11 @@ class Pipeline:
         """Have the detectors of a stream say that nothing comes; returns why, if that is known."""
         silence_s = silence_ns / NS_PER_S
         standing = self._standings[stream]
-        over, why = self._why_over(stream), self._why_silent(stream)
+        over, why, beside = self._why_over(stream), self._why_silent(stream), self._bus_quiet(stream)
         reason = (
             f"no more samples of stream {stream!r}: {over}"
             if over
-            else silence_reason(stream, silence_s, why)
+            else silence_reason(stream, silence_s, why, beside)
         )
         if standing.doubt:
             # What the stream was doubted for is no longer what is wrong.
@@ -503,7 +506,9 @@ class Pipeline:
                     _part(detector), "the other detectors report that nothing comes"
                 ):
                     for diagnosis in said_of_silence(detector, silence_s, now_ns):
-                        self._report(replace(diagnosis, reason=reason) if over or why else diagnosis)
+                        self._report(
+                            replace(diagnosis, reason=reason) if over or why or beside else diagnosis
+                        )
         return over or why
 
     async def _follow(self, detector: Detector) -> None:

@@ -80,17 +80,19 @@ class Diagnosis:
         return self.quality == "missing" and bool(self.bounds)
 
 
-def silence_reason(stream: str, silence_s: float, why: str = "") -> str:
+def silence_reason(stream: str, silence_s: float, why: str = "", beside: str = "") -> str:
     """Why a statement about a silent stream is not good.
 
     Args:
         stream: its name.
         silence_s: how long nothing has come of it.
         why: what its bus states of that, in a clause; empty if it states nothing.
+        beside: what else does not come, in a clause; empty if that is not known.
     """
     if why:
         return f"no samples of stream {stream!r}: {why}"
-    return f"no samples of stream {stream!r} for more than {silence_s:.1f} s; check bus and device"
+    also = f", and {beside}" if beside else ""
+    return f"no samples of stream {stream!r} for more than {silence_s:.1f} s{also}; check bus and device"
 
 
 def is_text(value: object, longest: int) -> bool:

@@ -213,6 +213,9 @@ class CanDriver:
         self._open_source = open_source or self._open_bus
         self._faults = StreamFaults(port.name, port.streams, port.clock)
         self.link.faults = self._faults
+        # SocketCAN may leave out frames of other ids, so that they are not known to come.
+        if bus.interface != "socketcan" or bus.filter is False:
+            self.link.quiet = self._faults.quiet
         self._said: set[str] = set()
         self._is_fresh = False
         """Whether nothing has come since the bus was opened: its controller's state is then not known."""

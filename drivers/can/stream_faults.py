@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from drivers.base import StreamSpec
     from drivers.frames import FrameLayout
 
+QUIET_NS = NS_PER_S
+"""A bus without a frame for so long is quiet."""
 RECENT_NS = 10 * NS_PER_S
 """Time for which frames of other ids count as coming."""
 MOST_NAMED = 5
@@ -37,6 +39,7 @@ class StreamFaults(Mapping[str, str]):
         self._other_pages: dict[str, Sequence[str]] = {}
         self._heard_ns: dict[str, int] = {}
         self._wrong_length: dict[str, int] = {}
+        self._wrong_ns: dict[str, int] = {}
 
     def heard(self, stream: str) -> None:
         """Frames of a stream have come that can be read."""
@@ -56,6 +59,16 @@ class StreamFaults(Mapping[str, str]):
     def has_wrong_length(self, stream: str, length: int) -> None:
         """Frames with the id of a stream have come, of another length in bytes."""
         self._wrong_length[stream] = length
+        self._wrong_ns[stream] = self._clock.monotonic_ns()
+
+    def quiet(self) -> str:
+        """That no frame at all comes, in a clause; empty if one came within `QUIET_NS`."""
+        newest_ns = max(
+            [*self._heard_ns.values(), *self._others_ns.values(), *self._wrong_ns.values()], default=None
+        )
+        if newest_ns is not None and self._clock.monotonic_ns() - newest_ns < QUIET_NS:
+            return ""
+        return f"no frame at all on {self._bus} for {QUIET_NS // NS_PER_S} s"
 
     def __getitem__(self, stream: str) -> str:
         spec = self._specs[stream]

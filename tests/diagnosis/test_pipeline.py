@@ -373,6 +373,30 @@ async def test_what_the_bus_knows_of_a_silence_is_said_also_when_it_comes_later(
     await running
 
 
+async def test_a_bus_on_which_nothing_comes_is_named_and_what_comes_later_too() -> None:
+    clock, ring = DrivenClock(), SampleRing("s", ("a",), 50)
+    said: list[Diagnosis] = []
+    known = {"s": ""}
+    pipeline = Pipeline(
+        {"s": ring},
+        [Listener("one", 10)],
+        said.append,
+        clock,
+        why_silent=lambda stream: known[stream],
+        bus_quiet=lambda stream: "" if known[stream] else "no frame at all on can0 for 1 s",
+    )
+    running = asyncio.create_task(pipeline.run())
+    for quarter in range(1, 41):
+        known["s"] = "the bus works" if quarter > 20 else ""
+        await asyncio.sleep(0.005)
+        clock.advance_to(clock.monotonic_ns() + 250_000_000)
+    nothing, other = (one.reason for one in said)
+    assert nothing.endswith("for more than 2.0 s, and no frame at all on can0 for 1 s; check bus and device")
+    assert other == "no samples of stream 's': the bus works"
+    ring.close()
+    await running
+
+
 async def test_silence_counts_from_when_the_driver_is_ready_but_not_for_ever() -> None:
     clock, ring = DrivenClock(), SampleRing("s", ("a",), 50)
     said: list[Diagnosis] = []

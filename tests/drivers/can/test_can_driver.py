@@ -132,6 +132,7 @@ async def test_a_silent_stream_says_what_comes_in_its_place() -> None:
     async with begun(driver):
         await eventually(lambda: driver.link.state == "up")
         assert driver.link.why_silent("shaft") == ""
+        assert driver.link.quiet() == "no frame at all on can0 for 1 s"
         for frame_id in (0x320, 0x7A0):
             FaultyBus.inbox.put(message(0, arbitration_id=frame_id))
         await eventually(lambda: driver.counters.frames_unknown == 2)
@@ -139,6 +140,7 @@ async def test_a_silent_stream_says_what_comes_in_its_place() -> None:
             "the bus works, as other frames come on can0: 0x320 (11 bit), 0x7a0 (11 bit); "
             "compare the id 0x101 (11 bit), or check the device"
         )
+        assert driver.link.quiet() == ""
         FaultyBus.inbox.put(message(1, data=message(1).data[:40]))
         await eventually(lambda: driver.streams["shaft"][0].frames_wrong_length == 1)
         said = "its frames 0x101 have 40 bytes, the layout 64; correct the layout"
@@ -149,6 +151,14 @@ async def test_a_silent_stream_says_what_comes_in_its_place() -> None:
         assert "have 40 bytes" not in driver.link.why_silent("shaft")
         clock.advance(11.0)
         assert dict(driver.link.faults) == {}, "nothing comes any more"
+        assert driver.link.quiet() == "no frame at all on can0 for 1 s"
+
+
+@pytest.mark.parametrize("filter_", [None, True, False])
+def test_what_the_kernel_leaves_out_is_not_taken_for_silence(*, filter_: bool | None) -> None:
+    bus = can_bus(interface="socketcan", channel="can0", filter=filter_)
+    driver = CanDriver(bus, port([], streams=[StreamSpec("shaft", layout(), 1000.0)], clock=SettableClock()))
+    assert driver.link.quiet() == ("no frame at all on can0 for 1 s" if filter_ is False else "")
 
 
 def paged(page: int) -> FrameLayout:
