@@ -53,7 +53,16 @@ def shell(command: str, folder: Path, **environment: str) -> str:
 
 def test_what_is_run_here_is_in_the_list() -> None:
     lines = {line for line, why in ALLOWED.items() if why == RUN_HERE}
-    assert {words.split()[0] for words in lines} == {*FILES, "git", "cd", "sha256sum", "apt-get", "dask"} | {
+    assert {words.split()[0] for words in lines} == {
+        *FILES,
+        "systemctl",
+        "systemd-sysusers",
+        "git",
+        "cd",
+        "sha256sum",
+        "apt-get",
+        "dask",
+    } | {
         "mosquitto_sub",
         "python3",
     }
@@ -97,6 +106,15 @@ def test_lines_that_change_files_run_below_another_root(tmp_path: Path) -> None:
             assert f"/var/lib/daqsvc/{Path(name).stem}" in (tmp_path / name).read_text()
     kept = sorted(f"{file.relative_to(tmp_path)}" for file in tmp_path.rglob("*") if file.is_file())
     assert kept == ["etc/systemd/system/daqsvc@.service", "etc/sysusers.d/daqsvc.conf"]
+    if shutil.which("systemctl") is None or shutil.which("systemd-sysusers") is None:
+        pytest.skip("there is no systemd on this computer")
+    shell(f"systemd-sysusers --root={tmp_path}", ROOT)
+    assert (tmp_path / "etc/passwd").read_text().startswith("daqsvc:")
+    for line in {line for _, line, words in others() if words[:2] == ["systemctl", "enable"]}:
+        # It is not started: that is for the guest.
+        shell(line.replace("systemctl", f"systemctl --root={tmp_path}").replace(" --now", ""), ROOT)
+        unit = tmp_path / f"etc/systemd/system/multi-user.target.wants/{line.split()[-1]}.service"
+        assert unit.is_symlink()
 
 
 def test_debian_has_what_is_installed_from_it() -> None:
