@@ -22,7 +22,7 @@ import struct
 import sys
 import time
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, TypedDict
 
 import can
 
@@ -269,6 +269,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return run_hub(parsed.path, parsed.queue_frames)
 
 
+class BusAddress(TypedDict):
+    """What a virtual bus has carried, with `--bus`.
+
+    Attributes:
+        bus: its address.
+    """
+
+    bus: str
+
+
 def run_hub(path: str, queue_frames: int = QUEUE_FRAMES) -> int:
     """Run a bus in this process until SIGTERM or SIGINT; then print its counters as JSON. The exit code."""
     try:
@@ -279,7 +289,8 @@ def run_hub(path: str, queue_frames: int = QUEUE_FRAMES) -> int:
         signal.signal(number, lambda *_: hub.stop())
     print(f"bus {path} is up", file=sys.stderr, flush=True)  # noqa: T201
     hub.run()
-    print(json.dumps({"bus": path, **asdict(hub.counters)}), flush=True)  # noqa: T201 - this is the output
+    address: BusAddress = {"bus": path}
+    print(json.dumps({**address, **asdict(hub.counters)}), flush=True)  # noqa: T201 - this is the output
     return 0
 
 

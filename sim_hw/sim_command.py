@@ -11,13 +11,14 @@ import signal
 import sys
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypedDict
 
 from daqsvc.commands.arguments import EXIT_OK, EXIT_USAGE, ArgumentParser
 from daqsvc.commands.complaint import complain
 from daqsvc.confined.small_toml import TomlFileError, read_toml
 from daqsvc.errors.command_line import SIMULATION
 from sim_hw.arguments import add_random, add_recording, add_speed, misplaced, positive, whole
+from sim_hw.played import PlayedStream
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -144,6 +145,20 @@ def _misuse(arguments: argparse.Namespace) -> str | None:
     return misplaced(arguments, OF_RECORDINGS, OF_PLANTS)
 
 
+class SimSummary(TypedDict):
+    """What was played.
+
+    Attributes:
+        complete: whether all was played.
+        buses: by bus the address that it was played at.
+        streams: by stream what was played.
+    """
+
+    complete: bool
+    buses: dict[str, str]
+    streams: dict[str, Annotated[dict[str, Any], PlayedStream]]
+
+
 async def _simulate(arguments: argparse.Namespace) -> int:
     from daqsvc.acquisition.clock import SystemClock  # noqa: PLC0415
     from sim_hw.nodes.pacing import RealTimePacer  # noqa: PLC0415
@@ -172,7 +187,7 @@ async def _simulate(arguments: argparse.Namespace) -> int:
             _say(f"playing {', '.join(s.stream for s in wanted)} on {nodes[bus].address}")
         pacer = _Faster(RealTimePacer(SystemClock()), arguments.speed)
         complete = await _until_played(list(nodes.values()), pacer, stop)
-        summary: dict[str, Any] = {"complete": complete, "buses": {}, "streams": {}}
+        summary: SimSummary = {"complete": complete, "buses": {}, "streams": {}}
         for bus, node in nodes.items():
             summary["buses"][bus] = node.address
             summary["streams"] |= node.figures()

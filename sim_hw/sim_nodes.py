@@ -198,7 +198,7 @@ class CanNodes:
 
     def figures(self) -> dict[str, dict[str, Any]]:
         """See `SimNode.figures`."""
-        return {name: node.figures() for name, node in self._nodes.items()}
+        return {name: {**node.figures()} for name, node in self._nodes.items()}
 
     async def close(self) -> None:
         """See `SimNode.close`."""
@@ -413,7 +413,7 @@ class SerialNodes:
 
     def figures(self) -> dict[str, dict[str, Any]]:
         """See `SimNode.figures`."""
-        return {name: node.figures() for name, node in self._nodes.items()}
+        return {name: {**node.figures()} for name, node in self._nodes.items()}
 
     async def close(self) -> None:
         """See `SimNode.close`."""

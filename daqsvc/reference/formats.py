@@ -128,6 +128,13 @@ FORMATS: dict[str, Format] = {
         ),
         "",
     ),
+    "daqsvc sim": Format(
+        (
+            "sim_hw.sim_command:SimSummary",
+            "sim_hw.bus_socket:BusAddress+sim_hw.bus_socket_hub:HubCounters",
+        ),
+        "Printed by `daqsvc sim` at the end.",
+    ),
     "daqsvc reproduce": Format(("sim_hw.reproduce.results:ResultRow",), ""),
     "daqsvc sniff can": Format(("drivers.can.sniff_json:CanFigures+daqsvc.commands.sniff:SniffEnd",), ""),
     "daqsvc sniff serial": Format(
@@ -243,7 +250,8 @@ SHORT = {
 _ABOUT = """Every field of the JSON that daqsvc writes or reads beside MQTT messages, which are in
 [payloads.md](payloads.md). A field is named by its path, with dots; `[]` means each entry of a list, `NAME`
 for a name. Where a format has a `schema` with its name and version, fields may be added within a version:
-ignore what you do not know. What has no `schema` is named by the verb that prints it."""
+ignore what you do not know. What has no `schema` is named by the verb that prints it. What the page sends
+to its own scripts in a browser is no interface, and not listed."""
 
 
 def main(arguments: list[str]) -> int:

@@ -11,7 +11,7 @@ import math
 import time
 from abc import ABC, abstractmethod
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.clock import Clock, DrivenClock
     from sim_hw.link_faults import FaultCounts
     from sim_hw.node_faults import NodePlan
+    from sim_hw.played import PlayedStream
 
 
 STEP_NS = 2_000_000
@@ -224,8 +225,8 @@ class PlannedNode(ABC):
         """Simulated time from the first sample to the last frame."""
         return int(self._plan.t_ns[-1])
 
-    def figures(self) -> dict[str, Any]:
-        """What has been done so far, by name."""
+    def figures(self) -> PlayedStream:
+        """What has been done so far."""
         return {
             "samples_sent": self.samples_sent,
             "frames_sent": self.frames_sent,

@@ -18,6 +18,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support.examples import examples
+from support.formats import fits
 from support.unix_buses import frame, numbers, running
 from support.waiting import PATIENCE_S, eventually_blocking
 
@@ -195,7 +196,7 @@ def test_a_hub_of_its_own_says_what_it_carried(bus_path: str, number: int) -> No
         assert numbers(other, until=2) == [1, 2]
     hub.send_signal(number)
     output, errors = hub.communicate(timeout=PATIENCE_S)
-    assert json.loads(output) == {
+    assert fits("daqsvc sim", json.loads(output)) == {
         "bus": bus_path,
         "frames": 2,
         "delivered": 2,

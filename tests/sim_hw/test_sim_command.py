@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from support.brokers import Consumer
+from support.formats import fits
 from support.live_service import running, watch_of
 from support.machine_files import MACHINES, MOTOR
 from support.sim_processes import DOCUMENTATION, PER_FRAME, SCENARIOS, VIRTUAL_RIG, process, summary_of
@@ -149,7 +150,7 @@ def test_sim_alone_plays_for_any_client_of_the_bus(tmp_path: Path) -> None:
         output, errors = sim.communicate(timeout=PATIENCE_S)
         assert time.monotonic() - begun_s < PATIENCE_S
     assert (sim.returncode, errors) == (0, f"daqsvc sim: playing shaft on unixbus {path}\n")
-    summary = json.loads(output)
+    summary = fits("daqsvc sim", json.loads(output))
     assert not summary["complete"]
     assert 0 < summary["streams"]["shaft"]["frames_sent"] < 3438
 

@@ -214,7 +214,7 @@ def test_the_service_records_while_it_watches(machine: Path, tmp_path: Path) -> 
             eventually_blocking((tmp_path / "bus").exists, "the service does not open its bus")
             command = [*daqsvc, "sim", str(machine), "--scenario", "healthy", "--duration", "2"]
             done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=True)
-            sent = json.loads(done.stdout)["streams"]["shaft"]["samples_sent"]
+            sent = fits("daqsvc sim", json.loads(done.stdout))["streams"]["shaft"]["samples_sent"]
             eventually_blocking(lambda: _last_count(folder) == sent - 10, "the last frame is not recorded")
             service.send_signal(signal.SIGTERM)
             assert service.wait(PATIENCE_S) == 0
