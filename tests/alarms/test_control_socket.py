@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from support.formats import fits
+from support.given_codes import had
 from support.small_disks import mounted
 from support.waiting import eventually
 
@@ -172,6 +173,8 @@ async def test_what_is_no_request_is_refused_with_the_reason_counted_and_does_no
         assert answer["accepted"] is False
         assert why in answer["reason"]
         assert answer["code"] == ("C04" if "watches" in why else "C07")
+        if why == "colour":
+            had("C07", answer["reason"])
         assert len(answer["reason"].splitlines()) == 1
         assert (server.counters.malformed, server.counters.requests) == (1, 0)
         assert not desk.told

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from support.given_codes import had
 from support.written_journals import write_journal
 
 from daqsvc.cli import main
@@ -26,3 +27,4 @@ async def test_what_has_changed_on_the_disk_is_left_out_and_told(
     assert ("it is hot" in out, "SHAKES" in out) == (True, False)
     assert err.startswith(f"{tmp_path}: ")
     assert err.endswith("messages of the journal have changed on the disk and are left out [S07]\n")
+    had("S07", err)

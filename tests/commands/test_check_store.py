@@ -15,6 +15,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import pytest
+from support.given_codes import had
 from support.live_service import running
 from support.machine_files import LAVAL, parsed
 from support.paths import ROOT
@@ -315,6 +316,7 @@ def test_a_copy_of_a_store_that_belongs_to_root_is_a_warning_with_its_remedy(
     assert f"could not start as nobody: {owned}/outbox.sqlite belongs to root, and the user of the" in out
     assert f"chown -R nobody {owned}" in out
     assert "[S02]" in out
+    had("S02", out.partition("Warnings: 1 ")[2])
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can be somebody else for a while")

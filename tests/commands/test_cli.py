@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from support.examples import first_of
+from support.given_codes import had
 from support.paths import ROOT
 from support.ports import free_port
 
@@ -176,6 +177,7 @@ def test_output_that_cannot_be_written_is_said_in_one_line() -> None:
         )
     assert done.returncode == 1
     assert done.stderr == "daqsvc: No space left on device: the output is not complete [C16]\n"
+    had("C16", done.stderr)
 
 
 def test_a_reader_that_has_had_enough_is_no_error() -> None:

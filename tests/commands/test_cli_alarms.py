@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from support.can_gateway import MACHINE, CanGateway, daqsvc_run
 from support.formats import fits
+from support.given_codes import had
 from support.ports import free_port
 from support.waiting import PATIENCE_S, eventually
 from support.written_journals import write_journal
@@ -124,6 +125,7 @@ async def test_a_day_in_the_life_of_a_latching_alarm(tmp_path: Path) -> None:
             assert err.startswith("daqsvc reset: refused: ")
             assert "condition is still present" in err
             assert err.endswith("[C08]\n")
+            had("C08", err)
             assert (await stands(store, "shaking", "active_acknowledged"))["id"] == acknowledged["id"]
 
             # Shelved, in JSON, and taken back.
@@ -279,6 +281,7 @@ async def test_the_beginning_of_an_id_must_be_one_alarms(tmp_path: Path) -> None
     assert code == 1
     assert "'0d8c' begins the ids of shaking, rotor-fault: write more of the id" in err
     assert err.endswith("[C05]\n")
+    had("C05", err)
     code, _, err = await daqsvc("ack", "0d8c1", "--store", tmp_path)
     assert "no daqsvc runs on the store" in err, "that was one, but nobody is there to obey"
 
@@ -487,6 +490,7 @@ async def test_what_the_disk_has_not_got_is_told(tmp_path: Path) -> None:
         assert code == 0
         assert "3 events wait in the service's memory" in err
         assert err.endswith("[S06]\n")
+        had("S06", err)
         code, out, _ = await daqsvc("ack", "shaking", "--store", tmp_path)
         assert out.endswith("cannot be written yet [S06]\n")
         assert code == 1, "0 says that it is on disk"

@@ -7,6 +7,7 @@ import json
 from typing import TYPE_CHECKING
 
 import pytest
+from support.given_codes import had
 from support.machine_files import LAVAL
 from support.written_journals import write_journal
 
@@ -108,6 +109,7 @@ async def test_a_machine_that_is_none_of_the_store_is_refused(tmp_path: Path, ca
         code, out, err = verb(capsys, "alarms", "--machine", "pmup", named)
         assert (code, out) == (1, "")
         assert err == f"daqsvc alarms: the store {store} has alarms of {known}, not of pmup [C04]\n"
+        had("C04", err)
     code, out, err = await Service(store, "new").asked(capsys, "alarms", "--store", store, "--machine", "new")
     assert (code, out) == (0, "every alarm is normal\n")
     assert (
@@ -186,6 +188,8 @@ async def test_verbs_go_on_by_the_sound_files_if_these_tell_one_store(
     assert (f"{plant}: the store is taken from the other machine files: {plant / 'store'} [C27]" in err) == (
         not code
     )
+    if not code:
+        had("C27", err)
     assert verb(capsys, "reload", plant)[0] == 2, "which is about all files"
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.given_codes import had
 
 from drivers.can.dbc import layout_from_dbc
 from drivers.frames import Field, FrameLayout, LayoutError
@@ -138,6 +139,7 @@ def test_dbc_problems_name_the_file_and_what_it_has(tmp_path: Path) -> None:
     with pytest.raises(LayoutError, match="message 'N'") as refused:
         layout_from_dbc(path, "N", counter="Seq", counts="frames", channels={})
     assert refused.value.code.id == "B28"
+    had("B28", refused.value)
 
 
 @pytest.mark.parametrize("value", [20_000.0, float("nan"), float("inf")])

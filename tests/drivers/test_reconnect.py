@@ -12,6 +12,7 @@ import weakref
 from typing import TYPE_CHECKING
 
 import pytest
+from support.given_codes import had
 
 from daqsvc.acquisition.link import Link
 from drivers import reconnect
@@ -125,6 +126,7 @@ async def test_an_absent_device_is_an_error_only_at_the_start_and_only_where_tha
     with pytest.raises(DeviceAbsentError, match=r"^CAN bus 'can0': nobody is there$") as absent:
         await _kept([ABSENT], start="error")
     assert absent.value.code.id == "B27"
+    had("B27", absent.value)
     for there_once in (USEFUL, USELESS):
         _, waits_ns, _ = await _kept([there_once, ABSENT, None], start="error")
         assert len(waits_ns) == 2

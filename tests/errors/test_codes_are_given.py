@@ -7,10 +7,11 @@ and fail without them.
 from __future__ import annotations
 
 import re
+from functools import cache
 from typing import TYPE_CHECKING
 
 import pytest
-from support.given_codes import codes_of_marks, unknown
+from support.given_codes import codes_of_marks, in_one_line, messages, unknown
 from support.machine_files import LAVAL, MACHINES, changed
 from support.paths import ROOT
 
@@ -117,6 +118,11 @@ ELSEWHERE = {
 }
 """What takes more than a text of a machine file: the test that asserts the code."""
 
+OTHER_MESSAGE = "correct the message in tests/errors/messages.txt (DAQSVC_TAKE_MESSAGES=1 adds it)"
+WITHOUT_MESSAGE = {"O23"}
+"""Codes whose message no test hands over: the tests of `ELSEWHERE` assert the code only."""
+
+
 COMMANDS: list[tuple[str, list[str]]] = [
     ("C01", ["trend", "--since", "1h", "--until", "2h"]),
     ("C02", ["shelve", "housing", "--for", "5 min"]),
@@ -185,7 +191,7 @@ def test_the_command_is_answered_with_the_code(
     out, err = capsys.readouterr()
     given = re.findall(rf"^(.*) \[{code}\]$", (err or out).rstrip(), re.MULTILINE)
     assert given, (out, err)
-    assert not unknown(code, set(given)), "correct the message in tests/errors/messages.txt"
+    assert not unknown(code, set(given)), OTHER_MESSAGE
 
 
 def said_of(path: Path, edits: list[tuple[str, str]]) -> list[str]:
@@ -207,7 +213,9 @@ def test_the_broken_machine_file_is_answered_with_the_code(
     code: str, path: Path, edits: list[tuple[str, str]]
 ) -> None:
     said = said_of(path, edits)
-    assert any(one.endswith(f"[{code}]") for one in said), said
+    given = {one.removesuffix(f" [{code}]") for one in said if one.endswith(f"[{code}]")}
+    assert given, said
+    assert not unknown(code, {in_one_line(one) for one in given}), OTHER_MESSAGE
 
 
 @pytest.mark.parametrize(("code", "place"), ELSEWHERE.items())
@@ -216,10 +224,26 @@ def test_the_test_elsewhere_asserts_the_code(code: str, place: str) -> None:
     assert f"[{code}]" in text or f'"{code}"' in text
 
 
+@cache
+def shown() -> dict[str, set[str]]:
+    """By code the messages of the golden texts of the guard, which holds the program to them."""
+    found: dict[str, set[str]] = {}
+    for file in (ROOT / "tests" / "guard" / "golden").glob("*.txt"):
+        text = re.sub(r"\n    (?! )", " ", file.read_text("utf-8"))  # warnings go on below themselves
+        for message, code in re.findall(r"^(?:! |  )?(.*) \[([A-Z]\d\d)\]$", text, re.MULTILINE):
+            found.setdefault(code, set()).add(in_one_line(message.removeprefix("machines/")))
+    return found
+
+
+@pytest.mark.parametrize("code", sorted({*shown()} - {one[0] for one in COMMANDS} - codes_of_marks()))
+def test_a_message_of_the_golden_texts_is_among_those_that_tests_have_had(code: str) -> None:
+    assert not unknown(code, shown()[code]), OTHER_MESSAGE
+
+
 def test_every_code_is_given_by_something() -> None:
-    golden = (ROOT / "tests" / "guard" / "golden").glob("*.txt")
-    shown = {
-        code for file in golden for code in re.findall(r"\[([A-Z]\d\d)\]", file.read_text(encoding="utf-8"))
-    }
     given = {one[0] for one in [*GIVEN, *COMMANDS]} | set(ELSEWHERE) | codes_of_marks()
-    assert [code for code in CODES if code not in shown | given] == []
+    assert [code for code in CODES if code not in given and code not in shown()] == []
+
+
+def test_every_code_has_a_message_that_the_program_has_given() -> None:
+    assert {code for code in CODES if code not in messages()} == set(WITHOUT_MESSAGE)

@@ -151,6 +151,7 @@ def test_a_link_has_the_code_of_why_it_is_down(caplog: pytest.LogCaptureFixture)
     assert codes_of_faults(caplog) == ["B29", "B31", "B30"]
 
 
+@pytest.mark.gives("O10", "O11")
 def test_what_keeps_a_broker_away_has_a_code(caplog: pytest.LogCaptureFixture) -> None:
     refused = ReasonCode(PacketTypes.CONNACK, "Not authorized")
     for error in (

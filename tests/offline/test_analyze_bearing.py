@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from support.bearing_signals import BALL, INNER, OPTIONS, OUTER, RATE_HZ, Housing, healthy
+from support.given_codes import had
 from support.orbit_files import SPEED_RPM, Orbit
 from support.paths import ROOT
 
@@ -247,6 +248,7 @@ def test_what_cannot_be_judged_is_refused_by_name(verb: Run, tmp_path: Path, kin
     assert found["refused"].startswith("de: ")
     assert said in found["refused"]
     assert found["code"] == "R14"
+    had("R14", found["refused"])
     assert found["data_quality"]["samples"] == len(damaged(kind))
 
 

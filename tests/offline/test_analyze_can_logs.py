@@ -12,6 +12,7 @@ import time
 import can
 import numpy as np
 import pytest
+from support.given_codes import had
 from support.orbit_files import RATE_HZ, UNBALANCE, Orbit
 from support.orbit_logs import EPOCH_S, frames, machine_file, signals, write
 
@@ -187,6 +188,7 @@ def test_logs_without_samples_of_the_machine_are_refused(analyze, machine, tmp_p
     assert (code, err) == (3, "")
     refused = [one["refused"] for one in found]
     assert [one["code"] for one in found][:2] == ["R13", "R01"]
+    had("R13", found[0]["refused"])
     assert "has no frame of a stream of" in refused[0]
     assert "but frames of 0x123 (29 bit)" in refused[0]
     assert "is a folder without a CAN log" in refused[1]

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from support.given_codes import had
 from support.orbit_files import AMPLITUDE_UM, RATE_HZ, SPEED_RPM, Orbit
 
 from daqsvc.commands.arguments import SpeedOption, speed
@@ -198,6 +199,7 @@ def test_a_process_that_is_killed_is_told() -> None:
     with pytest.raises(WorkerLostError, match="fewer --jobs") as lost:
         list(judge_all(Sleepless("1"), ["0", "1", "2"], [None] * 3, processes=2))
     assert lost.value.code.id == "C25"
+    had("C25", lost.value)
 
 
 def test_each_sensor_of_a_level_detector_has_a_statement_of_its_own_and_the_worst_is_told() -> None:

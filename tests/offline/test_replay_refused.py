@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from support.given_codes import had
 from support.machine_files import TRIAXIAL
 from support.paths import ROOT
 from support.recorded_rig import recorded_rig
@@ -135,6 +136,7 @@ def test_what_is_refused_is_shown_and_not_obeyed(tmp_path: Path, capsys: pytest.
     err = capsys.readouterr().err
     assert "a \N{REPLACEMENT CHARACTER}[31mmood" in err
     assert err.endswith("[R18]\n")
+    had("R18", err)
 
 
 def test_what_is_no_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,6 +13,7 @@ import time
 
 import pytest
 from support.clocks import SettableClock
+from support.given_codes import had
 from support.waiting import eventually
 
 import daqsvc
@@ -372,6 +373,7 @@ async def test_a_store_belongs_to_one_service_at_a_time(tmp_path):
     ) as refused:
         await second.open()
     assert refused.value.code.id == "S03"
+    had("S03", refused.value)
     await second.close()
     await first.close()
     third = Outbox(tmp_path / "outbox.sqlite", SystemClock())

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from support.browsers import page_served
+from support.given_codes import had
 from support.waiting import PATIENCE_S
 
 from daqsvc.cli import main
@@ -74,7 +75,9 @@ def test_a_port_that_is_taken_is_one_sentence(tmp_path: Path, capsys: pytest.Cap
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         assert main(["page", "--store", f"{tmp_path}", "--port", f"{port}"]) == 1
-    assert capsys.readouterr().err == (
+    err = capsys.readouterr().err
+    had("C17", err)
+    assert err == (
         f"daqsvc page: cannot listen at 127.0.0.1:{port}: Address already in use; end what listens there, or "
         "give another --port [C17]\n"
     )

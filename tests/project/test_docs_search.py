@@ -25,7 +25,7 @@ pytestmark = [pytest.mark.integration, pytest.mark.long, pytest.mark.sources]
 GOLDEN = ROOT / "tests" / "guard" / "golden"
 QUESTIONS = ROOT / "docs" / "search_questions.toml"
 FIRST_THREE = "query => siteSearch(query).slice(0, 3).map(([page, , anchor]) => `${page}.html${anchor}`)"
-BY_OTHERS = {"O17", "O25"}
+BY_OTHERS = {"B28", "O10", "O11", "O17", "O25", "S05"}
 """Codes whose messages are put together far from where the code is named, or by a library."""
 MESSAGE = re.compile(r"^! machines/(.+ \[([A-Z]\d\d)\])$", re.MULTILINE)
 
@@ -238,7 +238,13 @@ async def test_a_message_without_its_code_leads_to_the_errors(site: Path) -> Non
 
 async def test_a_message_that_a_test_has_had_leads_to_its_code(site: Path) -> None:
     """With the figures and names that it had then; its words alone, as daqsvc alarms printed them."""
-    had = [(code, message) for code, those in known_messages().items() for message in those]
+    # Those about a machine file name keys and values of that file, and daqsvc check prints their codes.
+    had = [
+        (code, message)
+        for code, those in known_messages().items()
+        for message in those
+        if not re.match(r"[\w-]+\.toml\b", message)
+    ]
     had += [
         ("A17", "alarm vib-de raised: vib-de danger: value of vib-de is 8.301 mm/s, zone D of ISO 20816-3"),
         ("D22", "vib-de cannot be judged: the last 3 values of vib-de did not arrive, or are no numbers"),

@@ -14,6 +14,7 @@ import pytest
 from can.io.blf import LOG_CONTAINER, LOG_CONTAINER_STRUCT, OBJ_HEADER_BASE_STRUCT, BLFWriter
 from support import file_bombs
 from support.bus_tables import replay_bus, table_layout
+from support.given_codes import had
 from support.orbit_files import OPTIONS, Orbit
 
 from daqsvc.acquisition.clock import SystemClock
@@ -141,6 +142,7 @@ def test_a_replayed_table_may_take_what_the_bus_says(tmp_path):
         SampleTable(path, spec, {}, ResourceLimits(100_000_000))
     assert isinstance(refused.value.__cause__, RecordingError)
     assert refused.value.__cause__.code.id == "R04"
+    had("R04", refused.value.__cause__)
     SampleTable(path, spec, {}, ResourceLimits(400_000_000)).close()
 
 

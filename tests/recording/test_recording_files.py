@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.io import savemat, wavfile
+from support.given_codes import had
 from support.paths import ROOT
 
 from daqsvc.errors.recordings import TOO_SHORT
@@ -162,6 +163,8 @@ def test_channels_that_cannot_be_played(mat, channels, message, code):
     with pytest.raises(RecordingError, match=message) as refused:
         load_recording(mat, channels, 100)
     assert refused.value.code.id == code
+    if code == "R10":
+        had("R10", refused.value)
 
 
 @pytest.mark.parametrize("rate_hz", [0, -1, 0.9, 1.1e7, float("nan"), float("inf")])

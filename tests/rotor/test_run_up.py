@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from support.given_codes import had
 from support.run_ups import CENTRE, ECCENTRICITY, RATE_HZ, record
 
 from daqsvc.rotor.calibration.run_up import NotLavalError, fit_run_up
@@ -108,6 +109,7 @@ def test_refuses_a_steady_speed() -> None:
     with pytest.raises(NotCalibratableError, match=r"the speed goes from 1800 to 183. rpm only") as refused:
         fit_run_up(xy, angle, RATE_HZ)
     assert refused.value.code.id == "R16"
+    had("R16", refused.value)
 
 
 def test_refuses_a_handful_of_revolutions() -> None:

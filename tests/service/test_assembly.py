@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from support.given_codes import had
 from support.paths import ROOT
 
 from daqsvc import cli
@@ -75,4 +76,6 @@ def test_a_verb_that_cannot_be_loaded_is_left_out(
     known = cli.commands()
     assert "orbit" not in known
     assert {"analyze", "calibrate", "check", "detectability", "run"} <= set(known)
-    assert "verb 'orbit' is left out: No module named 'no_such_module' [C26]" in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert "verb 'orbit' is left out: No module named 'no_such_module' [C26]" in err
+    had("C26", err)

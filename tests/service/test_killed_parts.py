@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from support.brokers import Consumer
 from support.busy_service import Devices, busy_machine
+from support.given_codes import had
 from support.waiting import PATIENCE_S, eventually
 
 from daqsvc.acquisition.link import Backoff
@@ -263,3 +264,4 @@ async def test_without_the_writer_of_its_journal_the_service_ends(
             with pytest.raises(EssentialLostError, match="no alarm can reach the disk any more") as lost:
                 await there.running
             assert lost.value.code.id == "S05"
+            had("S05", lost.value)

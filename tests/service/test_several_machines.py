@@ -20,6 +20,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from support.brokers import Consumer, running_mosquitto
 from support.can_gateway import daqsvc_run
+from support.given_codes import had
 from support.live_service import running_box
 from support.machine_files import LAVAL, MACHINES
 from support.ports import LOOPBACK, free_port
@@ -114,6 +115,7 @@ def test_files_that_do_not_make_one_box_are_refused_with_what_is_wrong() -> None
     said = refused(machine("one", 1), machine("two", 2, sparkplug))
     assert 'mqtt.sparkplug.device: "fan" names one device' in said, said
     assert said.endswith("[O06]")
+    had("O06", said)
     with pytest.MonkeyPatch.context() as small:
         small.setattr("daqsvc.box.memory_bytes", lambda: 20_000_000)
         said = refused(machine("one", 1, "", long), machine("two", 2))
@@ -380,6 +382,7 @@ def test_a_directory_is_checked_as_one_box(
     assert main(["check", f"{empty}"]) == 2
     assert f"{empty}: no machine file (*.toml) is in this directory. Remedy: " in caplog.text
     assert "daqsvc example [F26]" in caplog.text
+    had("F26", "\n".join(caplog.messages))
 
 
 @pytest.mark.long

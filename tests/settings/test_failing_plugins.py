@@ -20,6 +20,7 @@ from unittest.mock import MagicMock
 import pytest
 from pydantic import field_validator
 from support.example_packages import DETECTOR, DRIVER, OUTPUT, installed
+from support.given_codes import had
 from support.live_service import watch_of
 from support.machine_files import MOTOR, problems_of
 
@@ -597,6 +598,7 @@ def test_what_a_plugin_finds_without_a_code_gets_the_one_for_that(monkeypatch: p
     monkeypatch.setattr(class_at("crest.CrestPlugin"), "checks", checks)
     [problem] = problems_of(TABLES, MACHINE)
     assert f"{problem}".endswith("pipeline.crest: is odd. Remedy: make it even [F43]")
+    had("F43", problem)
     assert f"{AssemblyError('the licence has ended')}" == "the licence has ended [F43]"
 
 
@@ -657,6 +659,7 @@ def test_words_that_fail_end_check_with_an_error(
         said = capsys.readouterr()
         assert said.err.startswith(f"{file}: {table}: {failed}")
         assert said.err.endswith(f" fix it, or remove [{table}] [F23]\n")
+        had("F23", said.err)
         assert "128 bytes, 30 x 2 channels" in " ".join(said.out.split())
 
 
@@ -681,6 +684,7 @@ def test_an_option_that_a_driver_cannot_use_is_named_with_its_bus(monkeypatch: p
     with pytest.raises(AssemblyError) as caught:
         bus_drivers(machine, SystemClock(), lambda _: None)
     assert f"{caught.value}" == f"{MACHINE}: buses.logger: depth is odd; write an even one [B25]"
+    had("B25", caught.value)
 
 
 def test_a_detector_that_cannot_be_made_is_named_with_its_table(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -735,3 +739,4 @@ def test_words_of_a_validator_are_said_as_they_are(monkeypatch: pytest.MonkeyPat
     [problem] = [one for one in problems_of(MACHINE.read_text(), MACHINE) if one.key == "buses.logger.host"]
     assert problem.message == "is not valid: 127.0.0.1 is no address"
     assert f"{problem}".endswith("[F25]")
+    had("F25", problem)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from support.given_codes import had
 from support.machine_files import LAVAL, MACHINES, MOTOR, TRIAXIAL, changed, problems_of
 
 from daqsvc.settings import MachineFileError, load_machine_file, parse_machine_file
@@ -371,6 +372,8 @@ def test_scales_of_a_dbc_file_that_cannot_be_meant(tmp_path, old, new, key, mess
     assert message in problem.message
     assert "DBC file" in problem.remedy
     assert f"{problem}".endswith("[B06]" if key == "counter.signal" and "scale" in message else "[B14]")
+    if key != "counter.signal":
+        had("B14", problem)
     assert problem.line
 
 

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 from support.examples import first_of
+from support.given_codes import had
 
 from daqsvc import service as service_module
 from daqsvc.outbox.journal import Journal
@@ -311,6 +312,7 @@ def test_signals_end_it_in_order(number: int, tmp_path: Path) -> None:
         running.send_signal(number)
         _, errors = running.communicate()
         assert without_delays(errors) == ["daqsvc demo: interrupted [C15]"]
+        had("C15", without_delays(errors)[0])
         assert running.returncode == 1
     assert left_behind(tmp_path) == []
 

@@ -97,6 +97,32 @@ def unknown(code: str, given: set[str]) -> bool:
     return not TAKE
 
 
+def in_one_line(message: str) -> str:
+    """A message as it is in `MESSAGES`: without line breaks, and without the folder of a file."""
+    return re.sub(r"(?<!\S)/\S*/(?=[\w.-]+)", "", " ".join(message.split()))
+
+
+def had(code: str, said: object) -> None:
+    """Make sure that a message with this code is one that tests have had before.
+
+    Args:
+        code: of the message.
+        said: the message without the code, or lines of which one ends with it.
+
+    Raises:
+        AssertionError: no test has had it, or no line has the code.
+    """
+    text = re.sub(r"\n    (?! )", " ", f"{said}")  # warnings go on below themselves
+    given = re.findall(rf"^(?:  )?(.*) \[{code}\]$", text.rstrip(), re.MULTILINE)
+    if not given and not re.search(r"\[[A-Z]\d\d\]$", text.strip(), re.MULTILINE):
+        given = [text]
+    assert given, f"no line has {code}: {text}"
+    assert not unknown(code, {in_one_line(one) for one in given}), (
+        f"the message of {code} is another than in tests/errors/messages.txt: correct it there "
+        "(DAQSVC_TAKE_MESSAGES=1 adds it)"
+    )
+
+
 def is_had(code: str, example: str) -> bool:
     """Whether a test has had this message, or one that begins so, from the program; one name may differ."""
     words = shape(example).split()

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from support.given_codes import had
 from support.machine_files import MACHINES, changed, only_problem
 from support.two_mode_rotors import RATE_HZ, Machine, run_up
 
@@ -125,6 +126,7 @@ def test_a_run_up_needs_healthy_revolutions_beside_it(calibrated):
     )
     assert "calibrate_revolutions" in str(problem)
     assert str(problem).endswith("write e.g. calibrate_revolutions = 50 [D14]")
+    had("D14", problem)
 
 
 def test_the_eccentricity_need_not_be_stated(calibrated):

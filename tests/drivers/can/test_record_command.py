@@ -16,6 +16,7 @@ import pytest
 from support.can_recordings import numbers
 from support.examples import first_of
 from support.formats import fits
+from support.given_codes import had
 from support.paths import ROOT
 from support.ports import free_port
 from support.waiting import PATIENCE_S, eventually, eventually_blocking
@@ -179,6 +180,7 @@ def test_it_ends_after_the_time_that_is_given(bus: UnixBus, machine: Path, tmp_p
     assert process.returncode == 1
     assert "has carried no frame" in said
     assert said.endswith("[C20]\n")
+    had("C20", said)
     assert json.loads(output)["files"] == []
     assert not (tmp_path / "run.log").exists()
     assert bus.recv(0) is None

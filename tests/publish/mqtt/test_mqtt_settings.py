@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from support.given_codes import had
 from support.machine_files import LAVAL, only_problem, parsed
 
 from daqsvc.alarms.commands import Verb
@@ -102,6 +103,7 @@ def test_a_password_that_everybody_can_read_is_warned_of(tmp_path):
     (warning,) = machine((PASSWORD, f'password_file = "{path}"')).warnings
     assert "can be read by every user" in warning.message
     assert str(warning).endswith("[O02]")
+    had("O02", warning)
     path.chmod(0o640)
     assert machine((PASSWORD, f'password_file = "{path}"')).warnings == ()
 

@@ -21,6 +21,7 @@ from paho.mqtt.enums import CallbackAPIVersion
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.reasoncodes import ReasonCode
 from support.brokers import Mosquitto
+from support.given_codes import had
 from support.paths import ROOT
 from support.ports import LOOPBACK, free_port
 from support.postgres import Postgres, make_cluster
@@ -569,3 +570,4 @@ def test_a_database_that_is_away_is_said_with_its_code(ingest, caplog, monkeypat
     [line] = caplog.messages
     assert line.startswith("PostgreSQL is away, and nothing is acknowledged: connection ")
     assert line.endswith(" [O24]")
+    had("O24", " ".join(line.split()))
