@@ -54,6 +54,9 @@ FIGURES: Mapping[str, Mapping[str, Figure]] = {
     ROTOR_BANK: {
         "speed": Figure("rpm", "speed of the shaft"),
         "paper.MODE": Figure("", "conditional probability of the mode, as the paper defines it"),
+        "misfit": Figure(
+            "", "part of a steady change that the declared mode does not explain, with two modes"
+        ),
     },
     ROTOR_SYNCHRONOUS: {
         "speed": Figure("rpm", "speed of the shaft in the last revolution"),

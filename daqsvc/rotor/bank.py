@@ -131,6 +131,8 @@ __all__ = ["UNDETERMINED", "BankReport", "ModelBank"]
 # A block of a quarter revolution takes three microseconds: looking these up takes a tenth of one.
 _contiguous, _FLOAT = np.ascontiguousarray, np.float64
 
+_EXCLUDED_NATS = 1000.0
+"""What a mode that is excluded loses with every sample."""
 UNDETERMINED = kernels.UNDETERMINED
 """Index of the decision while there is none."""
 
@@ -181,6 +183,8 @@ class ModelBank:
         if not UNDETERMINED <= decision < count:
             raise ValueError(f"rotor bank: there is no mode {decision}; the {count} modes count from 0")
         self._duration = duration
+        self._excluded = np.zeros(count, dtype=np.bool_)
+        self._close = np.zeros((count, count), dtype=np.bool_)
         self._memory = BankMemory.new(self.observers, self.couplings, self.rules.log_priors(names))
         self._memory.set_rules(
             self.rules,
@@ -229,8 +233,28 @@ class ModelBank:
             self._memory.set_states(fields, states)
         self.observers, self.couplings = moved, couplings
         self.speed = speed
-        self._memory.set_observers(moved, couplings)
+        self._put_observers()
         self._compare()
+
+    def exclude(self, excluded: Flags, close: Flags) -> None:
+        """Take in what else is known of the modes; it holds until it is called again.
+
+        Args:
+            excluded: bool ``[M]``, modes that cannot be true; the decision leaves them.
+            close: bool ``[M, M]``, symmetric, modes that are not to be told apart.
+        """
+        if (excluded == self._excluded).all() and (close == self._close).all():
+            return
+        self._excluded, self._close = excluded.copy(), close.copy()
+        self._put_observers()
+        self._compare()
+
+    def _put_observers(self) -> None:
+        couplings = self.couplings
+        if self._excluded.any():
+            couplings = couplings.copy()
+            couplings["log_norm"] += _EXCLUDED_NATS * self._excluded
+        self._memory.set_observers(self.observers, couplings)
 
     def process(self, xy: Floats, cos: Floats, sin: Floats) -> BankReport:
         """Take in a block of samples.
@@ -265,5 +289,5 @@ class ModelBank:
             evidence = coupled_evidence(self.couplings, self.observers, self._duration)
         else:
             evidence = steady_evidence(self.observers, self._duration)
-        self._alike = within(evidence, self.rules.alike_nats_per_rev)
+        self._alike = within(evidence, self.rules.alike_nats_per_rev) | self._close
         self._memory.set_thresholds(np.where(self._alike, math.inf, self.rules.thresholds(len(self.modes))))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -15,6 +16,9 @@ from scipy.signal import cont2discrete, lfilter
 from daqsvc.rotor.calibration.run_up import RunUpFit, fit_run_up, revolutions_of
 from daqsvc.rotor.calibration.two_modes import TwoModeFit, fit_two_modes
 from daqsvc.rotor.synchronous.vectors import WITH_THRICE, synchronous_vectors
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 RATE_HZ = 4000.0
 UNIT_HZ = 30.0
@@ -103,7 +107,7 @@ def vector_of(machine: Machine, speed_hz: float) -> np.ndarray:
 
 
 def touching(machine: Machine, speed_hz: float, wall: complex, stiffness: float) -> np.ndarray:
-    """The same where it touches a flat wall, by its equations of motion.
+    """Synchronous vector of the machine where it touches a flat wall, by its equations of motion.
 
     Args:
         machine: the machine.
@@ -111,24 +115,64 @@ def touching(machine: Machine, speed_hz: float, wall: complex, stiffness: float)
         wall: the point of the wall that is nearest to the origin, um; its normal points to the origin.
         stiffness: of the wall, in that of the unit.
     """
+    normal = np.array([wall.real, wall.imag]) / abs(wall)
+
+    def push(place: np.ndarray) -> np.ndarray:
+        return -stiffness * max(0.0, float(place @ normal) - abs(wall)) * normal
+
+    z, theta = pushed(machine, speed_hz, push, settled=60, seen=40)
+    return np.array([np.mean(z * np.exp(-1j * k * theta)) for k in WITH_THRICE])
+
+
+def rubbing(
+    machine: Machine, speed_hz: float, clearance_um: float, stiffness: float, friction: float, seen: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Position and angle where it touches a round stator about the origin, 64 samples a revolution.
+
+    Args:
+        machine: the machine.
+        speed_hz: of the shaft.
+        clearance_um: of the stator.
+        stiffness: of the stator, in that of the unit.
+        friction: Coulomb's; the surface slips against the whirl's direction, as that of a wide shaft does.
+        seen: revolutions, after sixty in which it settles.
+    """
+
+    def push(place: np.ndarray) -> np.ndarray:
+        x, y = place
+        radius = math.hypot(x, y)
+        force = stiffness * max(0.0, radius - clearance_um)
+        return -force / radius * np.array([x - friction * y, y + friction * x]) if force else np.zeros(2)
+
+    return pushed(machine, speed_hz, push, settled=60, seen=seen)
+
+
+def pushed(
+    machine: Machine, speed_hz: float, push: Callable[[np.ndarray], np.ndarray], *, settled: int, seen: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Position and angle under a force that depends on the position, 64 samples a revolution.
+
+    Args:
+        machine: the machine.
+        speed_hz: of the shaft.
+        push: the force at a place, both float64 ``[2]``, um and um of the unit stiffness.
+        settled: revolutions before the first sample.
+        seen: revolutions of samples.
+    """
     w = speed_hz / UNIT_HZ
     springs, dampers = np.array(machine.supports), np.array(machine.dampers)
-    normal = np.array([wall.real, wall.imag]) / abs(wall)
 
     def moved(t: float, state: np.ndarray) -> np.ndarray:
         place, speed, foot = state[:2], state[2:4], state[4:]
         bent = machine.shaft * (place - foot)
         turning = machine.eccentricity_um * w**2 * np.exp(1j * w * t) + machine.load
-        push = stiffness * max(0.0, float(place @ normal) - abs(wall))
-        force = np.array([turning.real, turning.imag]) - bent - push * normal
+        force = np.array([turning.real, turning.imag]) - bent + push(place)
         return np.concatenate((speed, force, (bent - springs * foot) / dampers))
 
     rest = machine.rest
     feet = [machine.load.real / springs[0], machine.load.imag / springs[1]]
     begin = np.array([rest.real, rest.imag, 0.0, 0.0, *feet])
-    settled, seen = 60, 40
     theta = math.tau * np.arange(64 * seen) / 64.0
     at = (math.tau * settled + theta) / w
     found = solve_ivp(moved, (0.0, at[-1]), begin, t_eval=at, rtol=1e-7, atol=1e-6, max_step=0.2 / w)
-    z = found.y[0] + 1j * found.y[1]
-    return np.array([np.mean(z * np.exp(-1j * k * theta)) for k in WITH_THRICE])
+    return found.y[0] + 1j * found.y[1], theta

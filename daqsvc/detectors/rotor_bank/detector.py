@@ -25,6 +25,7 @@ from daqsvc.dsp.speed.keyphasor import KeyphasorProbe, KeyphasorTracker
 from daqsvc.rotor.adaptation import MODEL_ERROR, VARIANCE_FACTOR, SteadyFit, adapted
 from daqsvc.rotor.bank import UNDETERMINED, BankReport, ModelBank
 from daqsvc.rotor.decision import DecisionRules
+from daqsvc.rotor.misfit import misfit, steady_change, steady_motions
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -63,6 +64,10 @@ class RotorBankDetector:
     decision is then ``departure`` with the candidates as group, at once and until the cause is known.
     The declared mode has not changed by that.
 
+    A rotor with two modes is only nearly the machine. There the steady motion after a change is compared
+    with where each fault takes the machine, see `daqsvc.rotor.misfit`: what is too far from it is left out,
+    and what is not told apart by more than the model's own error is one group.
+
     A gap of up to a revolution is predicted through; after a longer one, and after one whose length is a
     guess, the observers start again. While the quality is not good there is no evidence, and the decision is
     held.
@@ -77,7 +82,8 @@ class RotorBankDetector:
         rotor: the rotor; its exponent and friction are those of the rub observer.
         modes: the modes, healthiest first.
         noise_um: standard deviation of the sensor noise, the same in every mode.
-        process_noise: power spectral density q of the linear observers, normalised.
+        process_noise: power spectral density q of the linear observers, normalised; see
+            `usual_process_noise` if not given.
         rub_process_noise: that of the rub observers; large, so that they follow what they do not know.
         rules: decision rule and thresholds.
         calibrate_revolutions: healthy revolutions at the start over which unbalance and static position are
@@ -101,7 +107,7 @@ class RotorBankDetector:
         rotor: RotorParameters,
         modes: Sequence[RotorMode],
         noise_um: float,
-        process_noise: float = 1e-4,
+        process_noise: float | None = None,
         rub_process_noise: float = 0.1,
         rules: DecisionRules | None = None,
         calibrate_revolutions: int = 0,
@@ -179,6 +185,8 @@ class RotorBankDetector:
         self._calibrate_revolutions = calibrate_revolutions
         self._calibration = SteadyFit() if calibrate_revolutions else None
         self._departed = False
+        self._steady_motions, self._steady_speed = np.empty((0, 3), dtype=np.complex128), math.nan
+        self._misfit = math.nan
         self._last_revolution = np.empty((0, 3))
         self._next_index: int | None = None
         self._revolutions = 0.0
@@ -230,6 +238,8 @@ class RotorBankDetector:
         bank = self._new_bank()
         bank.process(np.zeros((n, 2)), np.ones(n), np.zeros(n))
         bank.retune(bank.speed, 0.0)
+        if len(bank.couplings):
+            steady_motions(bank.observers, bank.couplings, self._duration)
 
     def process(self, window: Window) -> Sequence[Diagnosis]:
         """See `Detector.process`."""
@@ -313,6 +323,7 @@ class RotorBankDetector:
             diagnosis = self._changes(report, verdict, first_index, len(samples), before, t_ns, period_ns)
             diagnosis += self._departures(report, verdict, end_index, t_ns, period_ns)
         if math.floor(self._revolutions) > math.floor(before):
+            self._compare_steady(report)
             began, self._progress_index = self._progress_index, end_index
             diagnosis.append(
                 self._diagnosis(report, verdict, began, end_index, t_ns, self._bank.decision, changed=False)
@@ -356,6 +367,27 @@ class RotorBankDetector:
             self._diagnosis(report, verdict, min(onset, end - 1), end, at_ns, report.decision, changed=False)
         ]
 
+    def _compare_steady(self, report: BankReport) -> None:
+        """Leave out the faults that the steady motion after a change is too far from."""
+        bank, count = self._bank, len(self._modes)
+        if not len(bank.couplings) or self._rules.rule != "cusum":
+            return
+        if bank.decision in {UNDETERMINED, 0} and report.departure is None:
+            self._misfit = math.nan
+            bank.exclude(np.zeros(count, dtype=np.bool_), np.zeros((count, count), dtype=np.bool_))
+            return
+        if self._steady_speed != bank.speed:
+            self._steady_motions = steady_motions(bank.observers, bank.couplings, self._duration)
+            self._steady_speed = bank.speed
+        motions = self._steady_motions
+        change = steady_change(self._watch.motions, motions[0])
+        if change is None:
+            return
+        off = misfit(change, motions, list(self._faults.values()), self._noise)
+        nats = self._rules.group_nats
+        bank.exclude(off.excluded(nats), off.pairs(nats))
+        self._misfit = float(off.part[max(bank.decision, 0)])
+
     def _calibrate(
         self, xy: Floats, cos: Floats, sin: Floats, verdict: RevolutionQuality, end_index: int, t_ns: int
     ) -> list[Diagnosis]:
@@ -368,6 +400,7 @@ class RotorBankDetector:
         speed = self._direction * 2.0 * math.pi / self._tracker.period_samples / self._duration
         self._bank_modes = adapted(self._bank_modes, motion, speed)
         self._bank = self._new_bank(variance_factor=self.variance_factor, decision=0)
+        self._steady_speed = math.nan
         self._calibration = None
         self._decision = self._modes[0].name
         report = self._bank.process(np.empty((0, 2)), np.empty(0), np.empty(0))
@@ -432,5 +465,6 @@ class RotorBankDetector:
             decision=decision,
             stated=self._decision,
             changed=changed,
+            misfit=self._misfit,
             missing_share=float(np.isnan(self._last_revolution[:, :2]).any(axis=1).mean()),
         )

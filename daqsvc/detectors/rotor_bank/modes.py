@@ -12,7 +12,12 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from daqsvc.diagnosis.record import Severity
-    from daqsvc.rotor.model import RotorParameters
+    from daqsvc.rotor.model import NormalisedRotor, RotorParameters
+
+_PROCESS_NOISE = 1e-4
+"""That of the paper's rotor."""
+_USUAL_ORBIT = 0.1
+"""Orbit, in clearances, from which it holds for any rotor."""
 
 Fault = Literal["unbalance", "damping_loss", "static_load", "stiffness_loss", "rub"]
 
@@ -70,12 +75,26 @@ def fault_of(mode: RotorMode, rotor: RotorParameters) -> Fault | Literal["normal
     return mode.fault or next(named, None) or "normal"
 
 
+def usual_process_noise(healthy: NormalisedRotor) -> float:
+    """Power spectral density q of observers for which none is given, normalised.
+
+    What shakes a shaft goes with its whirl. On long rotors the orbit is a hundredth of the clearance, which
+    the sag fills: an observer that allows for the shaking of a large orbit follows every change there.
+
+    Args:
+        healthy: the healthy rotor, with the orbit that it has.
+    """
+    if healthy.isotropic:
+        return _PROCESS_NOISE
+    return _PROCESS_NOISE * min(1.0, abs(healthy.orbit()) / _USUAL_ORBIT) ** 2
+
+
 def bank_modes(
     modes: Sequence[RotorMode],
     rotor: RotorParameters,
     speed_rpm: float,
     *,
-    process_noise: float = 1e-4,
+    process_noise: float | None = None,
     rub_process_noise: float = 0.1,
     ac_coupled: bool = False,
 ) -> tuple[BankMode, ...]:
@@ -85,7 +104,8 @@ def bank_modes(
         modes: the modes, healthy first.
         rotor: the healthy rotor; exponent and friction are those of the rub observers.
         speed_rpm: speed of the shaft; negative if it turns clockwise.
-        process_noise: power spectral density q of the linear observers, normalised.
+        process_noise: power spectral density q of the linear observers, normalised; `usual_process_noise`
+            if not given.
         rub_process_noise: that of the rub observers.
         ac_coupled: whether the probes show no static position, so that every orbit lies about 0.
 
@@ -109,5 +129,7 @@ def bank_modes(
         )
         if ac_coupled:
             changed = replace(changed, load_x=0.0, g=0.0)
+        if process_noise is None:
+            process_noise = usual_process_noise(changed)
         made.append(BankMode(mode.name, changed, rub_process_noise if mode.rub else process_noise, mode.rub))
     return tuple(made)

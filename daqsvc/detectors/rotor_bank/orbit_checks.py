@@ -90,6 +90,11 @@ class OrbitWatch:
         """
         return self._forward
 
+    @property
+    def motions(self) -> list[SteadyMotion]:
+        """Of the last revolutions, 32 at most, the oldest first."""
+        return list(self._motions)
+
     def doubt(self) -> str:
         """What cannot be true, with the remedy; empty if nothing is wrong."""
         return self._doubt

@@ -74,7 +74,12 @@ class RotorBank(Section):
         float,
         Field(ge=1e-3, le=10_000, description="standard deviation of the sensor noise", examples=[2.0]),
     ]
-    process_noise: ProcessNoise = Field(default=1e-4, description="PSD q of the linear observers, normalised")
+    process_noise: ProcessNoise | None = Field(
+        default=None,
+        description="PSD q of the linear observers, normalised; if not given, it is 0.0001, and less for a "
+        "rotor with two modes whose orbit is small in its clearance",
+        examples=[1e-4],
+    )
     rub_process_noise: ProcessNoise = Field(default=0.1, description="PSD q3 of the rub observer, normalised")
     rule: Literal["cusum", "paper"] = Field(
         default="cusum", description="cusum raises alarms; paper shows probabilities only"

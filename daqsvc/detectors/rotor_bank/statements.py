@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -79,6 +80,7 @@ class BankDiagnosisBuilder:
         decision: int,
         stated: str,
         changed: bool,
+        misfit: float,
         missing_share: float,
     ) -> Diagnosis:
         """A diagnosis.
@@ -90,6 +92,7 @@ class BankDiagnosisBuilder:
             decision: index of the declared mode, -1 while undetermined.
             stated: its name, as it was last stated.
             changed: whether this states a change.
+            misfit: part of the steady change that the declared mode does not explain; NaN if not known.
             missing_share: share of the samples of the last revolution that are missing.
         """
         names = [mode.name for mode in self.modes]
@@ -105,6 +108,8 @@ class BankDiagnosisBuilder:
             severity = _SEVERITIES[max(mildest, _SEVERITIES.index(severity))]
         statistics = {"speed": moment.speed_rpm}
         statistics |= {f"paper.{name}": float(p) for name, p in zip(names, paper, strict=True)}
+        if not math.isnan(misfit):
+            statistics["misfit"] = misfit
         return Diagnosis(
             machine=self.machine,
             detector=self.detector,

@@ -1,0 +1,229 @@
+"""Which modes the steady motion after a change excludes, where the model is only nearly the machine's.
+
+The innovations of an observer count every sample as new evidence. But what a model misses is the same in
+every revolution: after a hundred of them a lead of thousands of nats may only show which of two wrong
+predictions is nearer. So the motion is looked at as a whole: how far is it from where each fault takes the
+machine, compared with how far the best of them is? What the best one misses is the size of the model's error
+(it is learnt from the misfit itself), and nothing that is within it may be excluded, or preferred.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daqsvc.kernels import njit
+from daqsvc.rotor import coupled_kernels
+from daqsvc.rotor.adaptation import SteadyFit
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from daqsvc.rotor.adaptation import SteadyMotion
+
+    Complexes = NDArray[np.complex128]
+    Flags = NDArray[np.bool_]
+    Floats = NDArray[np.float64]
+    Observers = NDArray[np.void]
+    Couplings = NDArray[np.void]
+
+LEAST_MODEL_ERROR = 0.02
+"""Part of a change by which the best model is taken to be off, however well it fits."""
+LEAST_REVOLUTIONS = 8
+"""Revolutions that a motion has to be steady for."""
+_PARTS = 3
+"""Of a motion, each of which the model may miss."""
+_FROM_A_LEVEL = frozenset({"normal", "rub"})
+"""What has no size from healthy on: a shaft touches or not."""
+_SETTLING_REV, _STEADY_REV = 60, 10
+_SAMPLES_PER_REV = 64
+_UNSTEADY = 0.1
+"""Part of a simulated motion that may change from ten revolutions to the next."""
+
+
+def steady_motions(observers: Observers, couplings: Couplings, duration: float) -> Complexes:
+    """Where the machine ends in each mode: forward and backward 1X and mean position, in clearances.
+
+    Of a rub the motion is simulated, from the mode's own orbit on. Where it does not become steady, or does
+    not touch, it is NaN.
+
+    Args:
+        observers: ``[M]`` of `discretise.OBSERVER`.
+        couplings: ``[M]`` of `coupled.COUPLED`.
+        duration: normalised time between samples.
+
+    Returns:
+        complex128 ``[M, 3]``.
+    """
+    motions = np.stack(
+        [
+            observers["a"] + 1j * observers["b"],
+            couplings["back_a"] + 1j * couplings["back_b"],
+            observers["rest_x"] + 1j * observers["rest_y"],
+        ],
+        axis=1,
+    )
+    for i in np.flatnonzero(observers["substeps"]):
+        motions[i] = _of_rub(observers[i], couplings[i], duration)
+    return motions
+
+
+def _of_rub(observer: np.void, coupling: np.void, duration: float) -> Complexes:
+    turn = float(observer["speed"]) * duration
+    per_rev = math.tau / abs(turn)
+    count = round((_SETTLING_REV + 2 * _STEADY_REV) * per_rev)
+    angle = turn * np.arange(count)
+    cos, sin = np.cos(angle), np.sin(angle)
+    xy = np.empty((count, 2))
+    _move(observer, coupling, cos, sin, xy)
+    halves = []
+    for begin in (_SETTLING_REV, _SETTLING_REV + _STEADY_REV):
+        part = slice(round(begin * per_rev), round((begin + _STEADY_REV) * per_rev))
+        fit = SteadyFit()
+        fit.add(xy[part], cos[part], sin[part])
+        whole = fit.samples == part.stop - part.start
+        if not whole or np.hypot(*xy[part].T).max() < 1.0:
+            return np.full(3, np.nan, dtype=np.complex128)
+        motion = fit.solve()
+        halves.append(np.array([motion.forward, motion.backward, motion.rest]))
+    before, after = halves
+    if not np.linalg.norm(after - before) <= _UNSTEADY * np.linalg.norm(after):
+        return np.full(3, np.nan, dtype=np.complex128)
+    return np.asarray((before + after) / 2.0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _move(observer: np.void, coupling: np.void, cos: Floats, sin: Floats, xy: Floats) -> None:
+    """Positions of a rotor that is left to itself on its reference orbit, float64 ``[n, 2]``, out."""
+    state = (0.0, 0.0, 0.0, 0.0)
+    for k in range(len(xy)):
+        x, _, y, _ = coupled_kernels.orbit(observer, coupling, cos[k], sin[k])
+        xy[k, 0], xy[k, 1] = x + state[0], y + state[2]
+        state = coupled_kernels.predict(observer, coupling, cos[k], sin[k], state)
+
+
+@dataclass(frozen=True, slots=True)
+class SteadyChange:
+    """How far the motion of some revolutions is from healthy.
+
+    Attributes:
+        moved: complex128 ``[3]``, forward and backward 1X and mean position, in clearances.
+        samples: that it is the mean of.
+    """
+
+    moved: Complexes
+    samples: int
+
+
+def steady_change(motions: Sequence[SteadyMotion], healthy: Complexes) -> SteadyChange | None:
+    """The change over as many of the last revolutions as it has been steady for; None while it still moves.
+
+    Args:
+        motions: of whole revolutions, the oldest first.
+        healthy: complex128 ``[3]``, the healthy mode's.
+    """
+    count = len(motions)
+    while count >= LEAST_REVOLUTIONS:
+        latest = motions[-count:]
+        parts = np.array([[one.forward, one.backward, one.rest] for one in latest]) - healthy
+        moved = parts.mean(axis=0)
+        drift = parts[count // 2 :].mean(axis=0) - parts[: count // 2].mean(axis=0)
+        if np.linalg.norm(drift) <= _UNSTEADY * np.linalg.norm(moved):
+            return SteadyChange(moved, sum(one.samples for one in latest))
+        count //= 2
+    return None
+
+
+@dataclass(frozen=True, slots=True)
+class Misfit:
+    """How each mode misses a steady change.
+
+    Attributes:
+        faults: ``[M]``, what each mode is called.
+        missed: float64 ``[M]``, distance of its fault from the change, in clearances; NaN where not known.
+        size: of the change, in clearances.
+        model_variance: of each part of a motion, by what the models miss.
+        noise_variance: of each part, by the noise of the samples.
+    """
+
+    faults: Sequence[str]
+    missed: Floats
+    size: float
+    model_variance: float
+    noise_variance: float
+
+    @property
+    def part(self) -> Floats:
+        """Part of the change that each mode's fault does not explain, float64 ``[M]``."""
+        return self.missed / self.size
+
+    def excluded(self, nats: float) -> Flags:
+        """Modes that the change speaks against by more than this, bool ``[M]``."""
+        return self._behind(self.model_variance + self.noise_variance) > nats
+
+    def pairs(self, nats: float) -> Flags:
+        """Modes of different faults that the model's error alone does not tell apart, bool ``[M, M]``.
+
+        Each is within this of the best. The noise is left out: it is in the evidence of the observers. The
+        healthy mode is in no pair: the machine has changed.
+        """
+        close = self._behind(self.model_variance) < nats
+        close[0] = False
+        faults = np.array(self.faults)
+        return np.asarray(np.logical_and.outer(close, close) & (faults[:, np.newaxis] != faults))
+
+    def _behind(self, variance: float) -> Floats:
+        squared = self.missed**2
+        return np.asarray((squared - np.nanmin(squared)) / (2.0 * variance))
+
+
+def misfit(change: SteadyChange, motions: Complexes, faults: Sequence[str], noise: float) -> Misfit:
+    """How far a steady change is from where each fault takes the machine.
+
+    A fault may have any size from healthy on, also beyond its worst mode; a rub only between its modes. So
+    all levels of a fault miss it by the same. What the best one misses is the model's error, learnt.
+
+    Args:
+        change: the change.
+        motions: complex128 ``[M, 3]``, of `steady_motions`; the first is healthy.
+        faults: ``[M]``, what each mode is called: ``"normal"``, ``"rub"``, ...
+        noise: standard deviation of the measured position, in clearances.
+    """
+    levels: dict[str, list[Complexes]] = {}
+    for fault, motion in zip(faults, motions - motions[0], strict=True):
+        levels.setdefault(fault, [] if fault in _FROM_A_LEVEL else [np.zeros(3, complex)]).append(motion)
+    off = {
+        fault: _distance(change.moved, points, beyond=fault not in _FROM_A_LEVEL)
+        for fault, points in levels.items()
+    }
+    missed = np.array([off[fault] for fault in faults])
+    noise_variance = 2.0 * noise**2 / change.samples
+    size = float(np.linalg.norm(change.moved))
+    learnt = float(np.nanmin(missed)) ** 2 / _PARTS - noise_variance
+    return Misfit(faults, missed, size, max((LEAST_MODEL_ERROR * size) ** 2, learnt), noise_variance)
+
+
+def _distance(change: Complexes, points: Sequence[Complexes], *, beyond: bool) -> float:
+    """From a change to the nearest point of a line through the levels of a fault.
+
+    Args:
+        change: the change.
+        points: where the levels are.
+        beyond: whether the line goes on behind the last of them.
+    """
+    if len(points) == 1:
+        return float(np.linalg.norm(change - points[0]))
+    nearest, last = math.inf, len(points) - 2
+    for k, (begin, end) in enumerate(itertools.pairwise(points)):
+        along, to = end - begin, change - begin
+        length = float(np.vdot(along, along).real)
+        part = float(np.vdot(along, to).real) / length if length > 0.0 else 0.0
+        part = max(0.0, part if beyond and k == last else min(1.0, part))
+        nearest = min(nearest, float(np.linalg.norm(to - part * along)))
+    return nearest if nearest < math.inf else math.nan

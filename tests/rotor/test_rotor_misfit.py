@@ -1,0 +1,198 @@
+"""What the steady motion after a change excludes, and what it leaves together, where no model is exact."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from daqsvc.rotor.adaptation import SteadyFit, SteadyMotion
+from daqsvc.rotor.bank import ModelBank
+from daqsvc.rotor.coupled import couple
+from daqsvc.rotor.decision import DecisionRules
+from daqsvc.rotor.discretise import BankMode, discretise
+from daqsvc.rotor.misfit import SteadyChange, misfit, steady_change, steady_motions
+from daqsvc.rotor.model import NormalisedRotor
+
+PER_REV = 64
+DURATION = math.tau / PER_REV
+NOISE = 0.01
+NATS = 5.0
+ROTOR = NormalisedRotor(
+    w=0.8, e=0.1, zeta=0.12, g=0.1, contact_stiffness=2.0, mu=0.1, anisotropy=0.08 + 0.03j, gyroscopic=0.05
+)
+FAULTS = ("normal", "unbalance", "unbalance", "static_load", "stiffness_loss")
+MOTIONS = np.array(
+    [[0.2, 0.02, -0.1j], [0.3, 0.03, -0.1j], [0.5, 0.05, -0.1j], [0.2, 0.02, -0.3j], [0.24, 0.02, -0.2j]]
+)
+MANY = 10**6
+
+
+def names(flags):
+    return {fault for fault, flag in zip(FAULTS, flags, strict=True) if flag}
+
+
+def off(moved, samples=MANY):
+    return misfit(SteadyChange(np.array(moved, complex), samples), MOTIONS, FAULTS, NOISE)
+
+
+@pytest.mark.parametrize("size", [0.3, 1.0, 2.0, 5.0])
+def test_a_fault_of_any_size_is_met_and_excludes_the_others(size):
+    found = off(size * (MOTIONS[1] - MOTIONS[0]))
+    assert found.missed[1] == pytest.approx(0.0, abs=1e-12)
+    assert found.missed[2] == found.missed[1]
+    assert found.part[0] == pytest.approx(1.0)
+    assert names(found.excluded(NATS)) == {"normal", "static_load", "stiffness_loss"}
+    assert not found.pairs(NATS).any()
+
+
+def test_what_the_best_one_misses_is_what_the_others_may_miss():
+    load, softer = MOTIONS[3] - MOTIONS[0], MOTIONS[4] - MOTIONS[0]
+    exact = off(load)
+    assert names(exact.excluded(NATS)) == {"normal", "unbalance", "stiffness_loss"}
+    # The same with a backward whirl that no mode has: nothing of the kind tells a load from a softer support.
+    beside = np.linalg.norm(load) * np.array([0.0, 0.4, 0.0])
+    strange = off(load + beside)
+    assert strange.missed[3] == pytest.approx(np.linalg.norm(beside))
+    pairs = strange.pairs(NATS)
+    assert names(pairs[3]) == {"stiffness_loss"}
+    assert names(pairs[4]) == {"static_load"}
+    assert (pairs == pairs.T).all()
+    assert "stiffness_loss" not in names(strange.excluded(NATS))
+    assert {"normal"} <= names(strange.excluded(NATS))
+    assert off(softer).missed[4] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_levels_of_one_fault_and_the_healthy_mode_are_in_no_pair():
+    found = off([0.0, 0.3, 0.0])
+    pairs = found.pairs(NATS)
+    assert not pairs[0].any()
+    assert not pairs[1, 2]
+    assert pairs[1, 3]
+
+
+def test_noise_excludes_nothing_that_it_may_have_made():
+    softer = MOTIONS[4] - MOTIONS[0]
+    rng = np.random.default_rng(0)
+    kept = 0
+    for _ in range(200):
+        noise = NOISE * 10.0 / math.sqrt(64) * (rng.standard_normal(3) + 1j * rng.standard_normal(3))
+        found = misfit(SteadyChange(softer + noise, 64), MOTIONS, FAULTS, 10.0 * NOISE)
+        kept += "stiffness_loss" not in names(found.excluded(NATS))
+    # The truth is 5 nats behind by chance with three complex parts in fewer than 2 % of the runs.
+    assert kept >= 196
+
+
+def test_a_motion_that_is_not_known_is_neither_excluded_nor_near():
+    motions = np.vstack((MOTIONS, np.full(3, np.nan)))
+    found = misfit(SteadyChange(MOTIONS[3] - MOTIONS[0], MANY), motions, (*FAULTS, "rub"), NOISE)
+    assert math.isnan(found.missed[-1])
+    assert not found.excluded(NATS)[-1]
+    assert not found.pairs(NATS)[-1].any()
+
+
+def revolutions(*parts):
+    return [SteadyMotion(*motion, PER_REV) for motion, count in parts for _ in range(count)]
+
+
+def test_a_change_is_steady_as_long_as_its_halves_agree():
+    before, after = MOTIONS[0], MOTIONS[3]
+    assert steady_change(revolutions((before, 20), (after, 4)), MOTIONS[0]) is None
+    assert steady_change(revolutions((after, 7)), MOTIONS[0]) is None
+    some = steady_change(revolutions((before, 20), (after, 12)), MOTIONS[0])
+    assert some is not None
+    assert some.samples == 8 * PER_REV
+    np.testing.assert_allclose(some.moved, after - before)
+    long = steady_change(revolutions((after, 32)), MOTIONS[0])
+    assert long is not None
+    assert long.samples == 32 * PER_REV
+
+
+def bank_modes(rub_unbalance=6.0):
+    return [
+        BankMode("N", ROTOR),
+        BankMode("U", replace(ROTOR, e=2.0 * ROTOR.e)),
+        BankMode("L", replace(ROTOR, load_x=0.1)),
+        BankMode("R", replace(ROTOR, e=rub_unbalance * ROTOR.e), process_noise=0.1, rub=True),
+    ]
+
+
+def motions_of(modes):
+    observers = discretise(modes, noise=NOISE, duration=DURATION)
+    couplings = couple(modes, observers, noise=NOISE, duration=DURATION)
+    return steady_motions(observers, couplings, DURATION)
+
+
+def test_modes_without_contact_end_on_their_orbits():
+    for mode, motion in zip(bank_modes()[:3], motions_of(bank_modes()), strict=False):
+        rotor = mode.rotor
+        np.testing.assert_allclose(motion, [rotor.orbit(), rotor.backward_orbit(), rotor.rest])
+
+
+def test_a_rub_ends_where_its_equation_of_motion_does():
+    rotor = replace(ROTOR, e=6.0 * ROTOR.e)
+
+    def flow(t, y):
+        z, v = complex(y[0], y[1]), complex(y[2], y[3])
+        force = rotor.e * rotor.w**2 * np.exp(1j * rotor.w * t) + complex(rotor.load_x, -rotor.g)
+        sprung = complex(rotor.k, rotor.cross_stiffness) * z + rotor.anisotropy * np.conj(z)
+        a = force - complex(2.0 * rotor.zeta, -rotor.gyroscopic * rotor.w) * v - sprung
+        if abs(z) > 1.0:
+            slip = rotor.w * rotor.contact_radius + (np.conj(z) * v).imag / abs(z)
+            push = rotor.contact_stiffness * (abs(z) - 1.0) ** rotor.alpha * z / abs(z)
+            a -= push * (1.0 + 1j * rotor.mu * np.sign(slip))
+        return [v.real, v.imag, a.real, a.imag]
+
+    n = 80 * PER_REV
+    angle = math.tau / PER_REV * np.arange(n)
+    path = solve_ivp(
+        flow, (0.0, angle[-1] / rotor.w), np.zeros(4), t_eval=angle / rotor.w, rtol=1e-8, atol=1e-9
+    )
+    fit, part = SteadyFit(), slice(60 * PER_REV, None)
+    fit.add(path.y[:2, part].T, np.cos(angle[part]), np.sin(angle[part]))
+    expected = fit.solve()
+    assert np.hypot(*path.y[:2, part]).max() > 1.0
+    found = motions_of(bank_modes())[3]
+    np.testing.assert_allclose(found, [expected.forward, expected.backward, expected.rest], atol=0.01)
+
+
+def test_a_rub_that_does_not_touch_is_none():
+    assert np.isnan(motions_of(bank_modes(rub_unbalance=1.5))[3]).all()
+
+
+def course(rotor, revs, seed=0):
+    angle = DURATION * rotor.w * np.arange(round(revs * PER_REV / rotor.w))
+    turn = np.exp(1j * angle)
+    z = rotor.orbit() * turn + rotor.backward_orbit() / turn + rotor.rest
+    noise = NOISE * np.random.default_rng(seed).standard_normal((len(z), 2))
+    return np.column_stack((z.real, z.imag)) + noise, np.cos(angle), np.sin(angle)
+
+
+def test_the_decision_leaves_a_mode_that_is_excluded_and_comes_back():
+    modes = bank_modes()[:3]
+    bank = ModelBank(modes, noise=NOISE, duration=DURATION, decision=0, rules=DecisionRules())
+    none, no_pairs = np.zeros(3, bool), np.zeros((3, 3), bool)
+    assert bank.process(*course(modes[1].rotor, 20)).decision == 1
+    bank.exclude(np.array([True, True, False]), no_pairs)
+    excluded = bank.process(*course(modes[1].rotor, 20, seed=1))
+    assert excluded.decision == 2
+    bank.retune(1.001 * bank.speed, 0.0)
+    assert bank.process(*course(modes[1].rotor, 2, seed=2)).decision == 2
+    bank.retune(bank.speed / 1.001, 0.0)
+    bank.exclude(none, no_pairs)
+    assert bank.process(*course(modes[1].rotor, 20, seed=3)).decision == 1
+
+
+def test_modes_that_are_not_told_apart_are_one_group_and_do_not_change():
+    modes = bank_modes()[:3]
+    bank = ModelBank(modes, noise=NOISE, duration=DURATION, decision=0, rules=DecisionRules())
+    pairs = np.zeros((3, 3), bool)
+    pairs[1, 2] = pairs[2, 1] = True
+    assert bank.process(*course(modes[1].rotor, 20)).group == ()
+    bank.exclude(np.array([True, False, False]), pairs)
+    report = bank.process(*course(modes[2].rotor, 20, seed=1))
+    assert report.decision == 1
+    assert report.group == (1, 2)
