@@ -2,8 +2,8 @@
 
 The innovations of an observer count every sample as new evidence. But what a model misses is the same in
 every revolution: after a hundred of them a lead of thousands of nats may only show which of two wrong
-predictions is nearer. So the motion is looked at as a whole: how far is it from where each fault takes the
-machine, compared with how far the best of them is? What the best one misses is the size of the model's error
+predictions is nearer. So the steady motion is compared as a whole: how far is it from where each fault takes
+the machine, and how far from the best of them? What the best one misses is the size of the model's error
 (it is learnt from the misfit itself), and nothing that is within it may be excluded, or preferred.
 """
 
@@ -164,7 +164,7 @@ class Misfit:
         return self.missed / self.size
 
     def excluded(self, nats: float) -> Flags:
-        """Modes that the change speaks against by more than this, bool ``[M]``."""
+        """Modes that are further than this behind the best one, bool ``[M]``."""
         return self._behind(self.model_variance + self.noise_variance) > nats
 
     def pairs(self, nats: float) -> Flags:

@@ -65,8 +65,8 @@ class RotorBankDetector:
     The declared mode has not changed by that.
 
     A rotor with two modes is only nearly the machine. There the steady motion after a change is compared
-    with where each fault takes the machine, see `daqsvc.rotor.misfit`: what is too far from it is left out,
-    and what is not told apart by more than the model's own error is one group.
+    with where each fault takes the machine (`daqsvc.rotor.misfit`). What is too far from it is left out; what
+    is not told apart by more than the model's own error is one group.
 
     A gap of up to a revolution is predicted through; after a longer one, and after one whose length is a
     guess, the observers start again. While the quality is not good there is no evidence, and the decision is
