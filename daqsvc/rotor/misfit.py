@@ -3,7 +3,7 @@
 The innovations of an observer count every sample as new evidence. But what a model misses is the same in
 every revolution: after a hundred of them a lead of thousands of nats may only show which of two wrong
 predictions is nearer. So the steady motion is compared as a whole: how far is it from where each fault takes
-the machine, and how far from the best of them? What the best one misses is the size of the model's error
+the machine, compared with the best of them? What the best one misses is the size of the model's error
 (it is learnt from the misfit itself), and nothing that is within it may be excluded, or preferred.
 """
 
