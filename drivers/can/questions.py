@@ -92,7 +92,8 @@ class _CanQuestions(BusQuestions):
             if answers["interface"] == "socketcan":
                 raise
             found = sniffed(CanSniffer(), [*words, *line], stop, tell)
-        return Heard(list(_in_words(found)), lambda so_far: self._proposals(found, so_far))
+        lines = [*_in_words(found), *self.remarks(found, answers)]
+        return Heard(lines, lambda so_far: self._proposals(found, so_far))
 
     def _proposals(self, found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
         fd = any(one["fd"] for one in found["ids"])
@@ -103,6 +104,11 @@ class _CanQuestions(BusQuestions):
     def proposals(self, found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
         """Those that are about frames; see `Heard.proposals`."""
         raise NotImplementedError
+
+    def remarks(self, found: Mapping[str, Any], answers: Answers) -> Iterator[str]:
+        """Lines behind what was heard: what of it does not fit the answers so far."""
+        del found, answers
+        yield from ()
 
     def _interface(self) -> Iterator[Question]:
         yield self.ask("interface", _interface, _SOCKETCAN, quiet=True)
@@ -312,7 +318,7 @@ class DbcQuestions(_CanQuestions):
 
     def proposals(self, found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
         """See `Heard.proposals`."""
-        heard = [one for one in found["dbc"]["messages"] if one["signals"]]
+        heard = _decoded(found)
         if not heard:
             return {}
 
@@ -340,6 +346,14 @@ class DbcQuestions(_CanQuestions):
             in_frame = self._samples_in_frame(answers) if "signals" in answers else 1
             proposed["rate"] = f"{usual_rate(rates[0]) * share * in_frame:g}"
         return proposed
+
+    def remarks(self, found: Mapping[str, Any], answers: Answers) -> Iterator[str]:
+        """See `_CanQuestions.remarks`."""
+        if not _decoded(found):
+            yield (
+                f"No frame is as {answers['dbc']} describes: it is most likely the file of another device. "
+                "What is proposed below comes from that file, and was not heard."
+            )
 
     def _messages(self, answers: Answers) -> dict[str, Message]:
         return _with_signals(answers["dbc-folder"] / answers["dbc"])
@@ -586,6 +600,11 @@ def _signals(known: tuple[str, ...], signals: Mapping[str, Any], text: str) -> t
     return chosen
 
 
+def _decoded(found: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Messages of the DBC file whose signals were heard."""
+    return [one for one in found["dbc"]["messages"] if one["signals"]]
+
+
 def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
     """What was heard, in a few lines: the ids that come most often."""
     ids = sorted(found["ids"], key=lambda one: -(one["rate_hz"] or 0.0))
@@ -595,6 +614,8 @@ def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
         rate = "once" if one["rate_hz"] is None else f"{one['rate_hz']:.4g} a second"
         counter, message = one["counter"], one["message"]
         counts = f", byte {counter['byte']} counts" if counter else ""
+        if message is None and "dbc" in found:
+            message = "not in the DBC file"
         yield f"  {one['id']:#x}: {lengths} bytes, {rate}{counts}{f', {message}' if message else ''}"
     if len(ids) > _SHOWN:
         yield f"  ... and {len(ids) - _SHOWN} more: daqsvc sniff can shows them"

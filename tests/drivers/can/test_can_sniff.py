@@ -498,14 +498,33 @@ def test_new_proposes_the_frames_that_it_hears(
 
 
 @pytest.mark.usefixtures("hub")
-def test_new_proposes_the_message_that_comes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_new_proposes_the_message_that_comes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(questions, "_LISTEN_S", 0.5)
     with talking(tmp_path / "bus", accelerations):
         tables = new(tmp_path, "--bus=can-dbc", f"--dbc={DBC}")
+    said = capsys.readouterr().out
+    assert ", Acceleration\n" in said
+    assert ", not in the DBC file\n" in said
+    assert "another device" not in said
     layout = tables["streams"]["device"]["layout"]
     assert layout["message"] == "Acceleration"
     assert layout["counter"] == {"signal": "Sequence", "counts": "frames"}
     assert 50 < tables["streams"]["device"]["rate_hz"] < 300
+
+
+@pytest.mark.usefixtures("hub")
+def test_new_says_that_the_dbc_file_is_of_another_device(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 0.5)
+    (tmp_path / "other.dbc").write_text(COUNTED)
+    with talking(tmp_path / "bus", accelerations):
+        new(tmp_path, "--bus=can-dbc", "--dbc=other.dbc")
+    said = capsys.readouterr().out
+    assert said.count(", not in the DBC file\n") == 2
+    assert "No frame is as other.dbc describes: it is most likely the file of another device." in said
 
 
 @pytest.mark.usefixtures("hub")
