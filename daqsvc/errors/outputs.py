@@ -210,7 +210,8 @@ CERTIFICATE_ENDS = Code(
     "With a certificate that has ended, TLS with the broker fails.",
     "Renew the certificate. The service reads new files by itself.",
     "mqtt.md",
-    "certificate broker ends at 2026-12-07T09:00:00Z, in less than 14 days: renew it",
+    "alarm certificate/broker raised: certificate/broker alert: certificate broker ends at "
+    "2026-12-07T09:00:00.000000Z, in less than 14 days: renew it",
 )
 DATABASE_AWAY = Code(
     "O24",

@@ -300,6 +300,7 @@ async def test_shelving_ends_by_itself_and_survives_a_restart(tmp_path: Path) ->
         assert await kinds(desk) == ["raised", "shelved", "unshelved"]
 
 
+@pytest.mark.gives("O23")
 async def test_a_certificate_that_ends_soon_is_an_alarm_until_it_is_renewed(tmp_path: Path) -> None:
     clock = DrivenClock()
     async with desk_in(tmp_path, clock, outputs(mqtt(8883, "box", "localhost", tls=True))) as desk:
