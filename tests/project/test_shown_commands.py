@@ -132,12 +132,16 @@ def home() -> Iterator[Path]:
 
 
 @pytest.mark.parametrize("page", pages([one for one in SHOWN if not is_live(one)]))
-def test_what_a_page_shows_runs(page: str, home: Path) -> None:
+def test_what_a_page_shows_runs(page: str, home: Path, subtests: pytest.Subtests) -> None:
     """One line after the other, as some need what one before has made."""
     folder = home.with_name(re.sub(r"\W", "-", page))
     copy(home, folder)
     lines = [one for one in SHOWN if one.page == page and not is_live(one)]
     assert not (found := complaints(lines, folder)), "\n".join(found)
+    for one in lines:
+        if one.output and not has_its_recordings(one):
+            with subtests.test("figures", line=one.line):
+                pytest.skip("only words were compared: set DAQSVC_DATA to where the recordings are")
 
 
 def test_what_is_shown_of_a_service_runs(home: Path) -> None:
