@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from difflib import get_close_matches
-from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
+from typing import TYPE_CHECKING, Any, get_origin
 
 from pydantic import ValidationError
 
@@ -30,11 +30,13 @@ from daqsvc.settings.schema import (
     declared_at,
     homes_of,
     is_table,
+    kinds_by_word,
     kinds_of,
     may_be_table,
     plural_of,
     section_of,
     value_at,
+    words_of,
 )
 from daqsvc.settings.section import NamesDetector
 from daqsvc.settings.written_numbers import as_toml, number_meant
@@ -333,10 +335,11 @@ class ErrorFormatter:
         return None
 
     def _allowed(self, path: KeyPath) -> tuple[Any, ...]:
-        declared = declared_at(self._root, self._document, path)
-        while get_origin(declared) is not Literal:
-            declared = get_args(declared)[0]
-        return get_args(declared)
+        """The words that may be at ``path``; if they decide on the kind of the table, those of all kinds."""
+        kinds = kinds_of(declared_at(self._root, self._document, path[:-1]))
+        if kinds is None:
+            return words_of(declared_at(self._root, self._document, path))
+        return tuple(kinds_by_word(kinds, value_at(self._document, path[:-1]), str(path[-1])))
 
     def _example(self, path: KeyPath) -> str | None:
         """A valid value as TOML, from the field's examples or its default."""

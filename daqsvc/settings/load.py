@@ -28,7 +28,15 @@ from daqsvc.settings.registry import (
     detector_tables,
     driver_of_layout,
 )
-from daqsvc.settings.schema import declared_at, is_table, only_follows, section_of, valid_part, value_at
+from daqsvc.settings.schema import (
+    declared_at,
+    is_table,
+    only_follows,
+    section_of,
+    valid_part,
+    value_at,
+    without_guesses,
+)
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.toml_text import MOST_BYTES, TomlTextError, decoded, parse
 from daqsvc.settings.units import factor_between
@@ -288,7 +296,8 @@ def _validated(document: dict[str, Any]) -> tuple[MachineFile | None, list[Error
     try:
         return machine_file_model().model_validate(document), []
     except ValidationError as error:
-        return None, [item for item in error.errors(include_url=False) if not only_follows(item, document)]
+        found = [item for item in error.errors(include_url=False) if not only_follows(item, document)]
+        return None, [*without_guesses(found, machine_file_model(), document)]
 
 
 def _copy(value: Any) -> Any:

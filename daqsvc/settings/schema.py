@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from functools import cache
 from types import UnionType
-from typing import TYPE_CHECKING, Annotated, Any, TypeGuard, Union, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeGuard, Union, get_args, get_origin
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from daqsvc.settings.section import FrozenTables, Kinds, Section
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping, Sequence
 
     from pydantic.fields import FieldInfo
     from pydantic_core import ErrorDetails
@@ -65,6 +65,26 @@ def kinds_of(declared: Any) -> Kinds | None:
     if get_origin(declared) is not Annotated:
         return None
     return next((mark for mark in declared.__metadata__ if isinstance(mark, Kinds)), None)
+
+
+def words_of(declared: Any) -> tuple[Any, ...]:
+    """The words that a value of type ``declared`` may be; none if it may be others."""
+    while get_origin(declared) is not Literal:
+        if not (parts := get_args(declared)):
+            return ()
+        declared = parts[0]
+    return get_args(declared)
+
+
+def kinds_by_word(kinds: Kinds, table: Mapping[str, Any], key: str) -> dict[Any, type[Section]]:
+    """By the words that a key of a table may be: the kind that the table then is of."""
+
+    def words(section: type[Section]) -> tuple[Any, ...]:
+        return words_of(field_type(section.model_fields[key])) if key in section.model_fields else ()
+
+    listed = dict.fromkeys(word for section in kinds.sections for word in words(section))
+    chosen = {word: kinds.choose({**table, key: word}) for word in listed}
+    return {word: section for word, section in chosen.items() if word in words(section)}
 
 
 def declared_at(root: type[Section], document: Any, path: KeyPath) -> Any:
@@ -173,6 +193,38 @@ def only_follows(error: ErrorDetails, document: Any) -> bool:
         return False
     least: int = error["ctx"]["min_length"]
     return len(value_at(document, error["loc"])) >= least
+
+
+def without_guesses(
+    errors: Sequence[ErrorDetails], root: type[Section], document: Any
+) -> Iterator[ErrorDetails]:
+    """Errors without those that a table has only if it is of the kind that was assumed.
+
+    Where the key that decides on the kind is wrong or missing, only what holds for all kinds is an error.
+    """
+    undecided: dict[KeyPath, tuple[str, list[type[Section]]]] = {}
+    for error in errors:
+        if error["type"] in {"literal_error", "missing"}:
+            *_, key = path = error["loc"]
+            kinds = kinds_of(declared_at(root, document, path[:-1]))
+            possible = kinds_by_word(kinds, value_at(document, path[:-1]), str(key)) if kinds else {}
+            if len({*possible.values()}) > 1:
+                undecided[path[:-1]] = (str(key), [*possible.values()])
+
+    def is_guess(path: KeyPath, *, missing: bool) -> bool:
+        for depth, key in enumerate(path):
+            deciding, sections = undecided.get(path[:depth], (key, []))
+            if key != deciding:
+                fields = [section.model_fields.get(str(key)) for section in sections]
+                of_itself = missing and depth == len(path) - 1
+                declared = [
+                    field and (field.is_required() if of_itself else field.annotation) for field in fields
+                ]
+                if any(one != declared[0] for one in declared):
+                    return True
+        return False
+
+    return (error for error in errors if not is_guess(error["loc"], missing=error["type"] == "missing"))
 
 
 def valid_part(section: type[Section], table: Mapping[str, Any]) -> Section:

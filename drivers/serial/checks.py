@@ -37,6 +37,8 @@ _NUMBERED = re.compile(r"/dev/tty(USB|ACM)\d+")
 def check_serial(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[Finding]:
     """The layout belongs to the bus, and its parts fit each other."""
     bus, layout, path = draft.buses.get(stream.bus), stream.layout, (*at, "layout")
+    if isinstance(bus, CobsBus | SyncBus | LinesBus):
+        _ = bus.framing  # unusable if it is wrong: no layout is wrong then
     if isinstance(bus, LinesBus):
         if not isinstance(layout, LineLayout):
             yield Finding(

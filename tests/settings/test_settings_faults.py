@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from support.machine_files import LAVAL, MACHINES, changed, only_problem, problems_of
+from support.paths import ROOT
 
 from daqsvc.settings import MachineFileError, load_machine_file, parse_machine_file
 
@@ -50,7 +51,7 @@ ONE_VALUE = [
         'did you mean "int16"',
     ),
     ("scale = 0.001", "scale = 0", "streams.shaft.layout.channels[0].scale", "0", "same", "0.0005"),
-    ('driver = "can"', "driver = 3", "buses.can0.driver", "3", 'must be "can"', 'driver = "can"'),
+    ('driver = "can"', "driver = 3", "buses.can0.driver", "3", 'must be "can", "modbus",', "of these"),
     ('channel = "can0"', "channel = 0", "buses.can0.channel", "0", "text in quotes", 'channel = "0"'),
     ('channel = "can0"', 'channel = ""', "buses.can0.channel", '""', "must not be empty", 'channel = "can0"'),
     ('site = "lab"', 'site = "lab 2"', "site", '"lab 2"', "letters, digits", '"lab-2"'),
@@ -215,6 +216,35 @@ def test_a_wrong_value_is_named(old, new, key, value, message, remedy):
     assert (problem.key, problem.value, problem.line) == (key, value, line)
     assert message in problem.message
     assert remedy in problem.remedy
+
+
+@pytest.mark.parametrize(
+    ("specimen", "old", "new", "message", "remedy"),
+    [
+        ("serial", 'framing = "lines"', 'framing = "line"', '"cobs", "sync" or "lines"', '"lines"?'),
+        ("serial", 'framing = "lines"', "", "is missing", "add framing"),
+        ("modbus", 'transport = "rtu"', 'transport = "rut"', '"tcp" or "rtu"', '"rtu"?'),
+        ("modbus", 'way = "ring"', 'way = "rings"', '"registers", "fifo", "ring" or "waveform"', '"ring"?'),
+    ],
+)
+def test_a_wrong_word_that_decides_on_the_kind_of_a_table_is_the_only_mistake(
+    specimen: str, old: str, new: str, message: str, remedy: str
+) -> None:
+    path = ROOT / "tests" / "guard" / "specimens" / f"specimen-{specimen}.toml"
+    (problem,) = problems_of(path.read_text("utf-8").replace(old, new, 1), path)
+    assert message in problem.message
+    assert remedy in problem.remedy
+
+
+def test_what_no_kind_of_a_table_may_hold_is_wrong_whatever_the_kind() -> None:
+    path = ROOT / "tests" / "guard" / "specimens" / "specimen-serial.toml"
+    text = path.read_text("utf-8").replace('framing = "lines"', 'framing = "line"\ncolour = 1\nbaud = "x"', 1)
+    text = text.replace("baud = 115_200\n", "", 1)
+    assert {one.key for one in problems_of(text, path)} == {
+        "buses.lines.framing",
+        "buses.lines.colour",
+        "buses.lines.baud",
+    }
 
 
 @pytest.mark.parametrize(("old", "new", "key", "message", "remedy"), UNKNOWN_KEYS)
