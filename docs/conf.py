@@ -23,6 +23,9 @@ root_doc = "index"
 exclude_patterns = ["example_*"]
 highlight_language = "text"
 
+# An option that is copied from a page begins with two hyphens, and quotes are those of TOML.
+smartquotes = False
+
 # Anchors are those that a forge makes of headings.
 myst_heading_anchors = 5
 

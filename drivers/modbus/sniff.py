@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drivers.sniffing import Sniffed, Sniffer, SniffError
@@ -200,6 +201,8 @@ def _bus(arguments: argparse.Namespace) -> ModbusBus:
 
     common = {"driver": "modbus", "timeout_ms": arguments.timeout_ms}
     target: str = arguments.target
+    if Path(target).is_char_device():
+        target = f"{Path(target).absolute()}"
     model: type[ModbusTcpBus | ModbusRtuBus] = ModbusTcpBus
     if target.startswith("/"):
         model = ModbusRtuBus

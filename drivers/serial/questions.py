@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from daqsvc.rounding import counted
 from drivers import packed_questions as packed
 from drivers import questions as q
-from drivers.bus_questions import BUS, BusQuestions, Heard, is_count, only_port
+from drivers.bus_questions import BUS, BusQuestions, Heard, only_port
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
 from drivers.serial.sniff import MUST_TURN, SerialSniffer, turn_words
 from drivers.sniffing import sniffed, table_name, unused, usual_rate
@@ -133,9 +133,9 @@ class SerialQuestions(BusQuestions):
         columns = dict.fromkeys(answers["columns"], "")
         first = answers["columns"][0]
         yield self.ask("counter", q.exactly(columns), first, choices=columns)
-        counted = is_count(answers["counter"])
+        is_time = _is_time(answers["counter"])
         kinds = {"count": "it counts lines", "s": "time in s", "ms": "time in ms", "us": "time in us"}
-        yield self.choose("counts", kinds, "count" if counted else "ms")
+        yield self.choose("counts", kinds, "ms" if is_time else "count")
 
     def channels(self, answers: Answers) -> tuple[str, ...]:
         """See `BusQuestions.channels`."""
@@ -232,6 +232,12 @@ def _sync_word(text: str) -> str:
 
 def _character(text: str) -> str:
     return "\t" if text == r"\t" else q.line(text) if text != " " else text
+
+
+def _is_time(name: str) -> bool:
+    """Whether the name of a column suggests a time."""
+    words = ("time", "stamp", "milli", "micro", "clock")
+    return name.lower() in {"t", "ts", "s", "ms", "us"} or any(word in name.lower() for word in words)
 
 
 def _columns(text: str) -> tuple[str, ...]:

@@ -273,6 +273,14 @@ def test_the_unit_that_a_name_suggests_is_the_same_on_every_bus(tmp_path):
         assert answers["sensor.rpm.unit"] == "rpm", bus
 
 
+@pytest.mark.parametrize(
+    ("name", "counts"), [("n", "count"), ("seq", "count"), ("t", "ms"), ("Timestamp", "ms"), ("x1", "count")]
+)
+def test_a_column_is_a_time_only_if_its_name_means_one(tmp_path, name, counts):
+    texts = {"bus": "serial", "port": "/dev/ttyUSB0", "columns": f"{name}, x", "counter": name}
+    assert conduct(tmp_path / "m.toml", Given(texts, defaults=True), None, print)["counts"] == counts
+
+
 def test_the_mark_for_no_value_of_a_register_is_an_option_and_a_hint_in_the_file(tmp_path, capsys):
     file = tmp_path / "m.toml"
     words = ["new", f"{file}", "--yes", "--overwrite", "--bus=modbus-tcp", "--host=192.0.2.10"]
@@ -397,6 +405,10 @@ def test_answers_of_a_file_are_those_of_the_options(tmp_path, capsys):
             "Remedy: write the id of the frames, which candump shows",
         ),
         (["--yes", "--host", "a"], "--host is not asked for with these answers; leave it out"),
+        (
+            ["--yes", "--bus=serial", "--port=/dev/ttyS0", "--channels=x"],
+            "--channels is not asked for with these answers; write --columns instead",
+        ),
         (["--yes", "--speed", "0"], '--speed 0: "0" is a shaft that stands still'),
         (["--yes", "--sensor", "x.kind=none"], "--sensor x.kind= is not asked for"),
         (["--yes", "--sensor", "x"], "write CHANNEL.TOPIC=ANSWER"),

@@ -34,6 +34,11 @@ def test_all_that_the_pages_need_is_in_the_site(site: Path) -> None:
         assert not re.search(r"(?:url\(|@import)\W*(?:https?:)?//", style.read_text("utf-8")), style
 
 
+def test_options_keep_their_two_hyphens(site: Path) -> None:
+    for page in site.rglob("*.html"):
+        assert re.findall(r"[–—][a-z][a-z-]+|[“”]", page.read_text("utf-8")) == [], page  # noqa: RUF001
+
+
 def test_links_of_the_readme_lead_to_pages_and_copies_of_files(site: Path) -> None:
     text = (site / "readme.html").read_text("utf-8")
     assert 'href="edge-box.html#reload"' in text

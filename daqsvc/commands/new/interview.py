@@ -277,6 +277,8 @@ _NEEDS = {
     "danger": "--limits own",
 }
 """Questions that only some answers lead to."""
+_INSTEAD = {"channels": "columns"}
+"""Questions that ask for the same where the first of them is not asked."""
 
 
 def _why_not_asked(key: str, asked: Sequence[str], answers: Answers) -> str:
@@ -289,5 +291,8 @@ def _why_not_asked(key: str, asked: Sequence[str], answers: Answers) -> str:
         return why_no_bearing(answers)
     if key in _NEEDS:
         return f"it needs {_NEEDS[key]}"
+    other = _INSTEAD.get(key, key)
+    if other in asked:
+        return f"write {option(other)} instead"
     close = difflib.get_close_matches(key, asked, n=1)
     return f"did you mean {option(close[0])}?" if close else "leave it out"

@@ -340,6 +340,15 @@ def test_units_on_a_serial_line_are_found(tmp_path: Path, capsys: pytest.Capture
     assert (bus["transport"], bus["serial_port"], bus["baud"]) == ("rtu", f"{port}", 19_200)
 
 
+def test_a_port_may_be_named_by_where_it_lies(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with serving(lambda: ModbusRtuServer({9: pump()}, tmp_path / "ttyS0")):
+        assert main(words("ttyS0", "--units", "1")) == 1
+    assert f"{tmp_path / 'ttyS0'}" in capsys.readouterr().err
+
+
 def test_nobody_and_nothing_are_failures_that_say_what_to_check(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
