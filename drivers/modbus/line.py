@@ -483,7 +483,7 @@ class ModbusLine:
     def _miss(self, asked: UnitHealth, health: RequestHealth, why: str) -> None:
         asked.missed(health, why, self._clock.monotonic_ns())
         if all(unit.dead for unit in self._units.values()):
-            self._lose(f"no unit answers any more, the last one to answer was: {why}")
+            self._lose(f"no unit answers; the last one asked: {why}")
 
     def _lose(self, why: str) -> None:
         if not self.lost.done():

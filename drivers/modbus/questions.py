@@ -33,7 +33,7 @@ ADDRESSES = 65_536
 _READ_REGISTERS, _FIFO_REGISTERS = 125, 31
 """Of one reply."""
 _UNITS, _WHOLE = ("1-10", "11-247"), "1-247"
-"""Most devices have one of the first addresses; to ask for all takes a minute."""
+"""Most devices have one of the first addresses; to ask for all takes two minutes."""
 _AUTO = "auto"
 _TIMEOUT_MS = 500.0
 _TABLES = {3: "holding", 4: "input"}
@@ -112,11 +112,9 @@ class _ModbusQuestions(BusQuestions):
     ) -> Heard:
         """See `BusQuestions.listen`: units are asked for their registers, and nothing is written."""
         del folder
-        words = self._sniffed_as(answers)
+        words = ["--timeout-ms", f"{answers['timeout-ms']:g}", *self._sniffed_as(answers)]
         chosen: str = answers["units"]
         try:
-            if answers["timeout-ms"] != _TIMEOUT_MS:
-                words = ["--timeout-ms", f"{answers['timeout-ms']:g}", *words]
             first = _UNITS[0] if chosen == _AUTO else chosen
             found = sniffed(ModbusSniffer(), ["--units", first, *words], stop, tell)
         except NothingFoundError as error:
@@ -204,7 +202,8 @@ class _ModbusQuestions(BusQuestions):
         """See `BusQuestions.questions`."""
         del folder
         yield from self._line(answers)
-        yield self.ask("unit", q.whole, "1")
+        chosen: str = answers["units"]
+        yield self.ask("unit", q.whole, "1" if chosen == _AUTO else f"{units_of(chosen)[0]}")
         yield self.choose("way", _WAYS, "values")
         way = answers["way"]
         if way != "fifo":

@@ -247,7 +247,7 @@ async def test_a_message_that_a_test_has_had_leads_to_its_code(site: Path) -> No
     ]
     had += [
         ("A17", "alarm vib-de raised: vib-de danger: value of vib-de is 8.301 mm/s, zone D of ISO 20816-3"),
-        ("D22", "vib-de cannot be judged: the last 3 values of vib-de did not arrive, or are no numbers"),
+        ("D22", "oil cannot be judged: the last 3 values of oil did not arrive, or the device had none"),
         ("B37", "the device has restarted its counter, or has not counted for a while"),
     ]
     led = [

@@ -152,8 +152,8 @@ class TrendDetector:
                 return None
             missed = self._missed[channel.sensor]
             reason = (
-                f"the last {missed} values of {channel.sensor} did not arrive, or are no numbers; check bus "
-                "and device"
+                f"the last {missed} values of {channel.sensor} did not arrive, or the device had none; check "
+                "sensor, device and bus"
             )
             return self._missing(channel, evidence, reason)
         self._missed[channel.sensor] = 0

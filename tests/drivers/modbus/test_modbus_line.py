@@ -365,7 +365,7 @@ def test_a_line_on_which_nobody_answers_is_lost_and_opened_again():
         async with responding(marked_units([1]), plan, serial=False), rig.running() as driver:
             await asyncio.sleep(60)
             assert driver.link.state == "down"
-            assert "no unit answers any more" in driver.link.reason
+            assert "no unit answers; the last one asked: unit " in driver.link.reason
             await asyncio.sleep(90)
             assert driver.link.state == "up"
             assert driver.link.losses == 1

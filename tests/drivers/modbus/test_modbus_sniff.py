@@ -555,6 +555,22 @@ def test_new_says_what_to_do_when_nobody_answers_and_goes_on(
     ]
 
 
+def test_new_waits_for_replies_as_long_as_was_answered(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That the default was taken makes no difference."""
+    monkeypatch.setattr(sniff, "REGISTERS", "0-0")
+    late = lambda *_: PlannedReply(delay_ns=350_000_000)  # noqa: E731
+    with serving(lambda: ModbusTcpServer({5: InputOnly()}, plan=late)) as server:
+        new(tmp_path, f"127.0.0.1:{server.port}", "--units=5")
+    assert "units that answer: 5" in capsys.readouterr().out
+
+
+def test_new_proposes_a_unit_that_was_to_be_asked_although_it_does_not_answer(tmp_path: Path) -> None:
+    tables = new(tmp_path, f"127.0.0.1:{free_port()}", "--units=15-18")
+    assert tables["streams"]["device"]["layout"]["unit"] == 15
+
+
 class Short(Watched):
     """A unit that answers for few registers at once."""
 
