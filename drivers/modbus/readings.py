@@ -235,7 +235,8 @@ class _Numbers(NamedTuple):
         """Digits of the shortest decimal number that is this float."""
         import numpy as np  # noqa: PLC0415 - only for who scans
 
-        text = f"{np.float32(value) if self.kind == 'float32' else np.float64(value)}"
+        # Formatted, a float32 has the digits of the double that it is converted to.
+        text = str(np.float32(value) if self.kind == "float32" else np.float64(value))
         return len(text.partition("e")[0].replace(".", "").replace("-", "").strip("0"))
 
     @property

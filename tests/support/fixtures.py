@@ -35,7 +35,7 @@ def verb(capsys: pytest.CaptureFixture[str]) -> Run:
             code = int(stopped.code or 0)
         out, err = capsys.readouterr()
         told = [json.loads(line, parse_constant=pytest.fail) for line in out.splitlines()]
-        return code, [fits(f"daqsvc {arguments[0]}", one) for one in told], err
+        return code, [fits(one.get("schema", f"daqsvc {arguments[0]}"), one) for one in told], err
 
     return run
 

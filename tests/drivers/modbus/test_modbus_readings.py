@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import struct
 from typing import TYPE_CHECKING
 
@@ -181,6 +182,13 @@ def test_kinds_beside_each_other_are_told_apart(order: str) -> None:
         right, wrong = right + len(fits), wrong + len(chosen(rounds)) - len(fits)
     assert right >= 0.9 * 4 * UNITS
     assert wrong <= 0.2 * UNITS
+
+
+@pytest.mark.parametrize("order", ["ABCD", "CDAB"])
+@pytest.mark.parametrize("value", [23.5, 2.35, 4.71, 0.123])
+def test_a_float_of_three_digits_that_does_not_move_is_found(value: float, order: str) -> None:
+    (found,) = chosen(numbers(itertools.repeat([value]), ">f", order))
+    assert (found.type, found.order) == ("float32", order)
 
 
 def test_a_float_whose_upper_register_stands_still_is_found() -> None:
