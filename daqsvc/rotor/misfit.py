@@ -21,7 +21,7 @@ from daqsvc.rotor import coupled_kernels
 from daqsvc.rotor.adaptation import SteadyFit
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Collection, Sequence
 
     from numpy.typing import NDArray
 
@@ -39,8 +39,12 @@ LEAST_REVOLUTIONS = 8
 """Revolutions that a motion has to be steady for."""
 _PARTS = 3
 """Of a motion, each of which the model may miss."""
+_EXPLAINS = 0.4
+"""Part of a change that a fault may miss and still be taken for its cause."""
 _FROM_A_LEVEL = frozenset({"normal", "rub"})
 """What has no size from healthy on: a shaft touches or not."""
+_SIGNIFICANT = 2.0
+"""Standard deviations of noise that a motion may drift by."""
 _SETTLING_REV, _STEADY_REV = 60, 10
 _SAMPLES_PER_REV = 64
 _UNSTEADY = 0.1
@@ -121,12 +125,13 @@ class SteadyChange:
     samples: int
 
 
-def steady_change(motions: Sequence[SteadyMotion], healthy: Complexes) -> SteadyChange | None:
+def steady_change(motions: Sequence[SteadyMotion], healthy: Complexes, noise: float) -> SteadyChange | None:
     """The change over as many of the last revolutions as it has been steady for; None while it still moves.
 
     Args:
         motions: of whole revolutions, the oldest first.
         healthy: complex128 ``[3]``, the healthy mode's.
+        noise: standard deviation of the measured position, in clearances.
     """
     count = len(motions)
     while count >= LEAST_REVOLUTIONS:
@@ -134,56 +139,41 @@ def steady_change(motions: Sequence[SteadyMotion], healthy: Complexes) -> Steady
         parts = np.array([[one.forward, one.backward, one.rest] for one in latest]) - healthy
         moved = parts.mean(axis=0)
         drift = parts[count // 2 :].mean(axis=0) - parts[: count // 2].mean(axis=0)
-        if np.linalg.norm(drift) <= _UNSTEADY * np.linalg.norm(moved):
-            return SteadyChange(moved, sum(one.samples for one in latest))
+        samples = sum(one.samples for one in latest)
+        # The mean of half the samples has a variance of 4 noise^2 / samples in each of its parts.
+        by_noise = _SIGNIFICANT * noise * math.sqrt(8.0 * _PARTS / samples)
+        if np.linalg.norm(drift) <= max(_UNSTEADY * float(np.linalg.norm(moved)), by_noise):
+            return SteadyChange(moved, samples)
         count //= 2
     return None
 
 
 @dataclass(frozen=True, slots=True)
 class Misfit:
-    """How each mode misses a steady change.
+    """How the modes miss a steady change.
 
     Attributes:
-        faults: ``[M]``, what each mode is called.
-        missed: float64 ``[M]``, distance of its fault from the change, in clearances; NaN where not known.
-        size: of the change, in clearances.
-        model_variance: of each part of a motion, by what the models miss.
-        noise_variance: of each part, by the noise of the samples.
+        part: float64 ``[M]``, of the change that each mode's fault does not explain; NaN where not known.
+        excluded: bool ``[M]``, modes that are too far behind the best one.
+        pairs: bool ``[M, M]``, modes of different faults that the model's error alone does not tell apart.
+            The noise is left out of this: it is in the evidence of the observers. The healthy mode is in no
+            pair, as the machine has changed.
     """
 
-    faults: Sequence[str]
-    missed: Floats
-    size: float
-    model_variance: float
-    noise_variance: float
-
-    @property
-    def part(self) -> Floats:
-        """Part of the change that each mode's fault does not explain, float64 ``[M]``."""
-        return self.missed / self.size
-
-    def excluded(self, nats: float) -> Flags:
-        """Modes that are further than this behind the best one, bool ``[M]``."""
-        return self._behind(self.model_variance + self.noise_variance) > nats
-
-    def pairs(self, nats: float) -> Flags:
-        """Modes of different faults that the model's error alone does not tell apart, bool ``[M, M]``.
-
-        Each is within this of the best. The noise is left out: it is in the evidence of the observers. The
-        healthy mode is in no pair: the machine has changed.
-        """
-        close = self._behind(self.model_variance) < nats
-        close[0] = False
-        faults = np.array(self.faults)
-        return np.asarray(np.logical_and.outer(close, close) & (faults[:, np.newaxis] != faults))
-
-    def _behind(self, variance: float) -> Floats:
-        squared = self.missed**2
-        return np.asarray((squared - np.nanmin(squared)) / (2.0 * variance))
+    part: Floats
+    excluded: Flags
+    pairs: Flags
 
 
-def misfit(change: SteadyChange, motions: Complexes, faults: Sequence[str], noise: float) -> Misfit:
+def misfit(
+    change: SteadyChange,
+    motions: Complexes,
+    faults: Sequence[str],
+    *,
+    noise: float,
+    nats: float,
+    exact: Collection[str] = (),
+) -> Misfit:
     """How far a steady change is from where each fault takes the machine.
 
     A fault may have any size from healthy on, also beyond its worst mode; a rub only between its modes. So
@@ -194,6 +184,10 @@ def misfit(change: SteadyChange, motions: Complexes, faults: Sequence[str], nois
         motions: complex128 ``[M, 3]``, of `steady_motions`; the first is healthy.
         faults: ``[M]``, what each mode is called: ``"normal"``, ``"rub"``, ...
         noise: standard deviation of the measured position, in clearances.
+        nats: evidence behind the best fault from which a fault is excluded, and below which it is not told
+            apart.
+        exact: faults of which the model knows where they take the machine, whatever else it misses: on
+            springs, a load moves no 1X. They have no part in its error.
     """
     levels: dict[str, list[Complexes]] = {}
     for fault, motion in zip(faults, motions - motions[0], strict=True):
@@ -203,10 +197,23 @@ def misfit(change: SteadyChange, motions: Complexes, faults: Sequence[str], nois
         for fault, points in levels.items()
     }
     missed = np.array([off[fault] for fault in faults])
-    noise_variance = 2.0 * noise**2 / change.samples
     size = float(np.linalg.norm(change.moved))
-    learnt = float(np.nanmin(missed)) ** 2 / _PARTS - noise_variance
-    return Misfit(faults, missed, size, max((LEAST_MODEL_ERROR * size) ** 2, learnt), noise_variance)
+    by_noise, least = 2.0 * noise**2 / change.samples, (LEAST_MODEL_ERROR * size) ** 2
+    wrong = np.isin(faults, list(exact)) & (missed**2 > 2.0 * nats * (least + by_noise))
+    rest = np.where(wrong, np.nan, missed**2)
+    best = float(np.nanmin(rest))
+    by_model = max(least, best / _PARTS - by_noise)
+    if best > (_EXPLAINS * size) ** 2:  # no fault takes the machine there: which one is nearest means nothing
+        by_model = size**2
+    behind = rest - best
+    close = behind < 2.0 * nats * by_model
+    close[0] = False
+    named = np.array(faults)
+    return Misfit(
+        part=missed / size,
+        excluded=wrong | (behind > 2.0 * nats * (by_model + by_noise)),
+        pairs=np.logical_and.outer(close, close) & (named[:, np.newaxis] != named),
+    )
 
 
 def _distance(change: Complexes, points: Sequence[Complexes], *, beyond: bool) -> float:

@@ -190,6 +190,8 @@ class Pedestal(NamedTuple):
     anisotropy: float = 0.0
 
 
+_FILM = 0.05
+"""Above this stiffness across the deflection, over the static one, an oil film carries the shaft."""
 SAME_FILM, SAME_PEDESTAL = Film(), Pedestal()
 
 
@@ -222,6 +224,11 @@ class TwoModes:
     gyroscopic: float = 0.0
     higher_modes: complex = 0j
     runout_um: tuple[complex, complex] = (0j, 0j)
+
+    @property
+    def on_film(self) -> bool:
+        """Whether the supports push so much across the deflection as only oil films do."""
+        return abs(self.cross_stiffness) > _FILM
 
     def damping_ratio(self) -> float:
         """Damping ratio zeta, mean of both directions, at the natural frequency."""
@@ -356,6 +363,7 @@ class RotorParameters:
         contact_radius_um: radius of the rubbing surface.
         static_load_x_um: how far a static load bends the healthy shaft towards +x.
         two_modes: what makes it differ from a Laval rotor; None: it is one.
+        plain_bearings: whether oil films carry the shaft; None: as its two modes show.
     """
 
     natural_frequency_hz: float
@@ -370,6 +378,7 @@ class RotorParameters:
     contact_radius_um: float = 25_000.0
     static_load_x_um: float = 0.0
     two_modes: TwoModes | None = None
+    plain_bearings: bool | None = None
 
     def __post_init__(self) -> None:
         _require_positive(
@@ -384,6 +393,13 @@ class RotorParameters:
     def natural_frequency_rad_s(self) -> float:
         """The unit of normalised time: omega_s in rad/s."""
         return 2.0 * math.pi * self.natural_frequency_hz
+
+    @property
+    def on_film(self) -> bool:
+        """Whether oil films carry the shaft, as stated, or else as its two modes show."""
+        if self.plain_bearings is not None or self.two_modes is None:
+            return bool(self.plain_bearings)
+        return self.two_modes.on_film
 
     def normalised(self, speed_rpm: float, damping_ratio: float | None = None) -> NormalisedRotor:
         """The same rotor at a speed, in normalised quantities (paper, section II).

@@ -141,6 +141,7 @@ def judge_bank(folder: Path, seed: int, job: tuple[Case, int]) -> BankSaid:
             static_sag_um=1e6 * STANDARD_GRAVITY_M_S2 / (math.tau * fit.natural_frequency_hz) ** 2,
             contact_stiffness=_STATOR,
             friction=_FRICTION,
+            plain_bearings="journals" in str(case["geometry"]),
         )
     )
     rate_hz = speed_rpm / 60.0 * PER_REV

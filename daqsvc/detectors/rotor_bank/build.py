@@ -96,6 +96,7 @@ def healthy_rotor(machine: MachineFile, bank: RotorBank) -> RotorParameters:
         contact_stiffness=rotor.contact_stiffness,
         contact_radius_um=rotor.contact_radius_um,
         static_load_x_um=rotor.static_load_x_um,
+        plain_bearings=rotor.plain_bearings,
     )
     if bank.calibration is None:
         return stated

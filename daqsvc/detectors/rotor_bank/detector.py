@@ -159,6 +159,7 @@ class RotorBankDetector:
             rules=self._rules,
         )
         self._judge = RevolutionJudge(probes, missing=OBSERVED_SHARE, pooled=1)
+        self._exact = set() if rotor.on_film else {"static_load"}
         self._faults = {mode.name: fault_of(mode, rotor) for mode in self._modes}
         # Probes that are not at right angles share the noise unevenly; this is the mean of both axes.
         self._noise = noise_um / rotor.clearance_um / abs(spread)
@@ -380,12 +381,18 @@ class RotorBankDetector:
             self._steady_motions = steady_motions(bank.observers, bank.couplings, self._duration)
             self._steady_speed = bank.speed
         motions = self._steady_motions
-        change = steady_change(self._watch.motions, motions[0])
+        change = steady_change(self._watch.motions, motions[0], self._noise)
         if change is None:
             return
-        off = misfit(change, motions, list(self._faults.values()), self._noise)
-        nats = self._rules.group_nats
-        bank.exclude(off.excluded(nats), off.pairs(nats))
+        off = misfit(
+            change,
+            motions,
+            list(self._faults.values()),
+            noise=self._noise,
+            nats=self._rules.group_nats,
+            exact=self._exact,
+        )
+        bank.exclude(off.excluded, off.pairs)
         self._misfit = float(off.part[max(bank.decision, 0)])
 
     def _calibrate(

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 from daqsvc.rotor.discretise import BankMode
+from daqsvc.rotor.model import SAME_PEDESTAL, Pedestal
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -120,11 +121,14 @@ def bank_modes(
                 f"mode {mode.name!r} is a static load of {list(mode.static_load_um)} um, but the probes are "
                 "AC-coupled and show no static position; use DC-coupled probes, or remove the mode"
             )
+        # What gives way below an oil film has no damper beside it: both, and the shaft, are in series.
+        in_series = rotor.on_film and rotor.two_modes is not None
         changed = rotor.faulty(
             speed_rpm,
             damping_ratio=mode.damping_ratio,
             unbalance_ratio=mode.unbalance_ratio,
-            stiffness_ratio=mode.stiffness_ratio,
+            stiffness_ratio=1.0 if in_series else mode.stiffness_ratio,
+            pedestal=Pedestal(1.0 / mode.stiffness_ratio - 1.0) if in_series else SAME_PEDESTAL,
             static_load_um=complex(*mode.static_load_um),
         )
         if ac_coupled:

@@ -28,10 +28,8 @@ _LOSSES = np.geomspace(0.01, 1.5, 32)
 """1 / k - 1 of the static stiffness."""
 _SEEN = np.array([0.5, 0.7, 1.0, 1.4, 2.0])
 """How far the shaft sinks at the probes, over what the modes predict: it may sink more elsewhere."""
-_FILM = 0.05
-"""Above this stiffness across the deflection, over the static one, an oil film carries the shaft ..."""
 _ASIDE = np.exp(1j * np.radians([-40.0, -20.0, 0.0, 20.0, 40.0]))
-"""... so that its way down need not be the one that the modes predict."""
+"""On an oil film its way down need not be the one that the modes predict."""
 _PEDESTALS = (-0.25, 0.0, 0.25)
 """Compliance of a pedestal along x less that along y, over their sum: most are softer along x."""
 _LEFT = np.linspace(0.05, 0.97, 32)
@@ -88,7 +86,7 @@ def on_film(rotor: LavalRotor) -> bool:
     """Whether oil films carry the shaft: as stated, else by how much its supports push across the sag."""
     if rotor.plain_bearings is not None or rotor.two_modes is None or rotor.two_modes.two_modes is None:
         return bool(rotor.plain_bearings)
-    return abs(rotor.two_modes.two_modes.cross_stiffness) > _FILM
+    return rotor.two_modes.two_modes.on_film
 
 
 def loaded(change: Complexes, variance: Floats, healthy: Healthy, rotor: RotorParameters) -> float:

@@ -14,11 +14,12 @@ from support.machine_files import MACHINES, changed, only_problem
 from support.two_mode_rotors import RATE_HZ, Machine, rubbing, run_up
 
 from daqsvc.cli import main
-from daqsvc.detectors.rotor_bank.build import bank_detector
+from daqsvc.detectors.rotor_bank.build import bank_detector, healthy_rotor
 from daqsvc.detectors.rotor_bank.plugin import RotorBankPlugin
 from daqsvc.detectors.rotor_bank.settings import RotorBank
 from daqsvc.diagnosis.detector import Window
 from daqsvc.rotor.calibration.file import load_record, save_record
+from daqsvc.rotor.model import Pedestal
 from daqsvc.settings import parse_machine_file
 from daqsvc.settings.problems import AssemblyError
 
@@ -220,3 +221,34 @@ def test_what_can_be_told_apart_is_known_beforehand(calibrated, capsys):
     assert pairs["U3", "N"]["delay_rev"] < pairs["U1", "N"]["delay_rev"]
     smallest = {change["fault"]: change for change in told["smallest_change"]}
     assert 1.0 < smallest["unbalance"]["by_bank"] < 1.3
+
+
+def softest(machine):
+    detector = bank_detector(machine, settings_of(machine))
+    (mode,) = (mode for mode in detector.bank_modes if mode.name == "K2")
+    return mode.rotor, healthy_rotor(machine, settings_of(machine))
+
+
+def test_on_oil_films_a_softer_support_is_in_series_with_the_film(calibrated):
+    known = "[machine.rotor]                  #"
+    springs, rotor = softest(machine_of(calibrated))
+    assert springs.k == rotor.faulty(60.0 * SPEED_HZ, stiffness_ratio=0.9).k
+    films, rotor = softest(machine_of(calibrated, (known, known.replace("#", "\nplain_bearings = true\n#"))))
+    assert films.k == rotor.faulty(60.0 * SPEED_HZ, pedestal=Pedestal(1.0 / 0.9 - 1.0)).k
+    assert films.k != springs.k
+    assert films.rest == pytest.approx(springs.rest, rel=1e-6)
+
+
+def test_observers_of_a_small_orbit_in_its_clearance_are_less_noisy(calibrated):
+    def of(clearance_um, *more):
+        size = ("clearance_um = 250.0", f"clearance_um = {clearance_um}")
+        machine = machine_of(calibrated, size, *more)
+        modes = bank_detector(machine, settings_of(machine)).bank_modes
+        return modes[0].rotor, modes[0].process_noise
+
+    assert of(250.0)[1] == 1e-4
+    rotor, noise = of(2500.0)
+    assert abs(rotor.orbit()) < 0.02
+    assert noise == pytest.approx(1e-4 * (abs(rotor.orbit()) / 0.1) ** 2)
+    stated = ("calibrate_revolutions = 20", "calibrate_revolutions = 20\nprocess_noise = 3e-4")
+    assert of(2500.0, stated)[1] == 3e-4
