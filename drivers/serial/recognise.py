@@ -6,6 +6,7 @@ tells the right rate, too.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Literal
 
@@ -26,6 +27,9 @@ MOST_BYTES = 65_536
 _TEXT = frozenset(range(0x20, 0x7F)) | {0x09, 0x0A, 0x0D}
 _LEAST_PRINTABLE = 0.95
 _SAME_PARITY = 0.98
+_ENCLOSED = re.compile(rb"\x02[\t\x20-\x7e]{3,}\x03")
+_LEAST_ENCLOSED = 3
+_MOSTLY = 0.75
 
 Parity = Literal["none", "even", "odd"]
 
@@ -39,12 +43,14 @@ class Recognised:
         what: the finding; None if there is none.
         parity: of characters of 7 bits; None if characters have 8.
         printable: share of the bytes that are text.
+        is_enclosed: whether it is text between STX and ETX, which the driver cannot read.
     """
 
     score: float
     what: TextLines | BinaryFrames | None = None
     parity: Parity | None = None
     printable: float = 0.0
+    is_enclosed: bool = False
 
     @property
     def sure(self) -> bool:
@@ -65,6 +71,9 @@ def recognised(data: bytes, line_errors: int = 0) -> Recognised:
     parity = seven_bits(data)
     text = bytes(byte & 0x7F for byte in data) if parity else data
     printable = sum(byte in _TEXT for byte in text) / len(text)
+    if _is_enclosed(text):
+        # Of one length, such text looks like frames whose sync word is part of it.
+        return Recognised(CONCLUSIVE, None, parity, printable, is_enclosed=True)
     candidates = [Recognised(0.3 * printable**2, None, None, printable)]
     if printable >= _LEAST_PRINTABLE and (lines := text_lines(text)) is not None:
         damaged = sum(len(kind.damaged) for kind in lines.kinds)
@@ -81,6 +90,12 @@ def recognised(data: bytes, line_errors: int = 0) -> Recognised:
     return Recognised(
         best.score * max(0.0, 1 - 5 * line_errors / len(data)), best.what, best.parity, printable
     )
+
+
+def _is_enclosed(data: bytes) -> bool:
+    """Whether nearly all bytes are text between STX and ETX; check bytes may follow each."""
+    found = _ENCLOSED.findall(data)
+    return len(found) >= _LEAST_ENCLOSED and sum(map(len, found)) >= _MOSTLY * len(data)
 
 
 def seven_bits(data: bytes) -> Parity | None:

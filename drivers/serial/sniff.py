@@ -325,6 +325,12 @@ class _Report(NamedTuple):
                 f"{self.port}: only {heard.received} bytes came, which are too few to tell what they are. "
                 "Remedy: listen longer by --seconds, with --baud if the device's rate is known"
             )
+        if self.best.found.is_enclosed:
+            return (
+                f"{self.port}: text comes between the bytes 02 (STX) and 03 (ETX), which daqsvc does not "
+                "read. Remedy: set the device to lines that end with a line feed or a carriage return; else "
+                "write a driver"
+            )
         if self._what is None:
             tried = f"--baud {self.best.baud}" if self.asked else "each of the usual baud rates"
             return (

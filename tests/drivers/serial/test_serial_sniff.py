@@ -5,7 +5,9 @@ from __future__ import annotations
 import binascii
 import contextlib
 import errno
+import functools
 import json
+import operator
 import os
 import signal
 import subprocess
@@ -518,3 +520,19 @@ def test_new_proposes_the_frames_that_it_hears(
     assert layout["samples_per_frame"] == 1
     assert len(layout["channels"]) == (8 - layout["first_byte"]) // 2
     assert 50 < stream["rate_hz"] < 400
+
+
+@pytest.mark.parametrize("has_check", [False, True])
+def test_text_between_stx_and_etx_is_named_and_nothing_is_proposed(
+    cable: PseudoTerminal, capsys: pytest.CaptureFixture[str], *, has_check: bool
+) -> None:
+    def enclosed(number: int) -> bytes:
+        text = b"%04d;%+08.3f;%+08.3f\x03" % (number % 10_000, number % 7 - 3.5, number % 11 / 7)
+        check = bytes([functools.reduce(operator.xor, text)]) if has_check else b""
+        return b"\x02" + text + check
+
+    with talking(cable, enclosed):
+        assert main(["sniff", "serial", f"{cable.path}", "--seconds", "0.6"]) == 1
+    out, err = capsys.readouterr()
+    assert "text comes between the bytes 02 (STX) and 03 (ETX), which daqsvc does not read" in err
+    assert "[buses." not in out
