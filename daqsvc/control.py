@@ -910,8 +910,8 @@ def _absence(store: Path) -> AbsentError:
     """Why no service listens at the control socket of a store."""
     if not is_possessed(store / f"{JOURNAL_NAME}.lock"):
         return NotRunningError(
-            f"no daqsvc runs on the store {store}: start it with daqsvc run, or name its store with --store; "
-            "one that was started just now needs some seconds"
+            f"no daqsvc runs on the store {store}: start it with daqsvc run, or name its store with --store "
+            "in place of FILE; one that was started just now needs some seconds"
         )
     if is_read_only(store):
         why = "it cannot make it on a read-only file system: mount it writable again, or ask over MQTT"

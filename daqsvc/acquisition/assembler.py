@@ -488,7 +488,7 @@ def note_gap(counters: StreamCounters, stream: str, lost: int, first: int) -> No
     """
     if not counters.gaps:
         logger.warning(
-            "stream %r: samples are missing before index %d, by now %d; gaps are counted from now on",
+            "stream %r: samples are missing before index %d, by now %d; further gaps are only counted",
             stream,
             first,
             lost,

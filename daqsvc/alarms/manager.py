@@ -6,6 +6,7 @@ import uuid
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
+from difflib import get_close_matches
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
@@ -451,6 +452,8 @@ class AlarmManager:
             return self._made(name, latching=False)
         known = {*self._alarms, *self._expected.names}
         there_are = f"there are: {', '.join(sorted(known)) or 'none'}"
+        if close := get_close_matches(name, sorted(known)[:MOST_NAMED], n=1):
+            there_are = f"did you mean {close[0]!r}? There are: {', '.join(sorted(known))}"
         if len(known) > MOST_NAMED:
             there_are = f"there are {len(known)} others; daqsvc check lists those of the machine file"
         raise UnknownAlarmError(f"no alarm is named {name!r}; {there_are}")

@@ -256,7 +256,7 @@ def _tell(
     if not path.is_file():
         raise NoTrendError(
             f"there is no history in {store}; write [history] into the machine file, and start the service "
-            "with it, or name its store with --store"
+            "with it, or name its store with --store in place of FILE"
         )
     reader = HistoryReader(path)
     try:

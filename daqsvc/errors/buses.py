@@ -349,7 +349,7 @@ SAMPLES_MISSING = Code(
     "Look at the load of the bus, its cables and this computer. daqsvc status shows how many are missing. If "
     "they are polled, lower rate_hz, or look at timeouts and exceptions of the bus in daqsvc status.",
     "status.md",
-    "stream 'shaft': samples are missing before index 81920, by now 24; gaps are counted from now on",
+    "stream 'shaft': samples are missing before index 81920, by now 24; further gaps are only counted",
 )
 NO_MEASUREMENT = Code(
     "B36",

@@ -161,5 +161,5 @@ def test_gaps_are_told_once(caplog: pytest.LogCaptureFixture) -> None:
     feed(unit, [0, 1, 2, 4, 5, 6, 7, 8, 9, 11, 12, 13, 14, 15, 16])
     assert unit.counters.gaps == 2
     assert [r.message for r in caplog.records] == [
-        "stream 's': samples are missing before index 16, by now 4; gaps are counted from now on"
+        "stream 's': samples are missing before index 16, by now 4; further gaps are only counted"
     ]

@@ -106,7 +106,10 @@ async def test_a_command_is_in_the_log_before_it_is_obeyed_and_on_disk_before_it
     [
         (AlarmCommand(verb=Verb.RESET, alarm=RUB, by="ann"), "condition is still present"),
         (AlarmCommand(verb=Verb.RESET, alarm="one", by="ann"), "cannot reset one: "),
-        (AlarmCommand(verb=Verb.ACKNOWLEDGE, alarm="none", by="ann"), "no alarm is named 'none'; there are"),
+        (
+            AlarmCommand(verb=Verb.ACKNOWLEDGE, alarm="none", by="ann"),
+            "no alarm is named 'none'; did you mean 'one'? There are: one, ",
+        ),
         (
             AlarmCommand(verb=Verb.ACKNOWLEDGE, alarm=RUB, by="ann", occurrence="0d8c"),
             "occurrence 0d8c is over",

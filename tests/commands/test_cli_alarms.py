@@ -160,7 +160,7 @@ async def test_a_day_in_the_life_of_a_latching_alarm(tmp_path: Path) -> None:
             await stands(store, "peak", "out_of_service")
             code, _, err = await daqsvc("ack", "shakin", file, "--by", "Ann")
             assert code == 1
-            assert "no alarm is named 'shakin'; there are: alarm-flood, " in err
+            assert "no alarm is named 'shakin'; did you mean 'shaking'? There are: alarm-flood, " in err
             assert ", shaking, " in err
 
         kinds = ["raised", "acknowledged", "shelved", "unshelved", "latched", "reset"]

@@ -181,7 +181,7 @@ def test_without_a_history_the_remedy_is_said(tmp_path, capsys) -> None:
     assert main(["trend", "--store", str(tmp_path)]) == 1
     said = capsys.readouterr().err
     assert "write [history] into the machine file" in said
-    assert "or name its store with --store" in said
+    assert "or name its store with --store in place of FILE" in said
     (tmp_path / NAME).touch()
     assert main(["trend", "--store", str(tmp_path)]) == 1
     said = capsys.readouterr().err
