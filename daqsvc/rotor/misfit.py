@@ -46,36 +46,51 @@ _FROM_A_LEVEL = frozenset({"normal", "rub"})
 _SIGNIFICANT = 2.0
 """Standard deviations of noise that a motion may drift by."""
 _SETTLING_REV, _STEADY_REV = 60, 10
-_SAMPLES_PER_REV = 64
+_SAME_SPEED = 0.02
+"""Relative change of speed from which a rub is simulated again: a revolution at many samples takes long."""
 _UNSTEADY = 0.1
 """Part of a simulated motion that may change from ten revolutions to the next."""
 
 
-def steady_motions(observers: Observers, couplings: Couplings, duration: float) -> Complexes:
+class SteadyMotions:
     """Where the machine ends in each mode: forward and backward 1X and mean position, in clearances.
 
-    Of a rub the motion is simulated, from the mode's own orbit on. Where it does not become steady, or does
-    not touch, it is NaN.
-
     Args:
-        observers: ``[M]`` of `discretise.OBSERVER`.
-        couplings: ``[M]`` of `coupled.COUPLED`.
         duration: normalised time between samples.
-
-    Returns:
-        complex128 ``[M, 3]``.
     """
-    motions = np.stack(
-        [
-            observers["a"] + 1j * observers["b"],
-            couplings["back_a"] + 1j * couplings["back_b"],
-            observers["rest_x"] + 1j * observers["rest_y"],
-        ],
-        axis=1,
-    )
-    for i in np.flatnonzero(observers["substeps"]):
-        motions[i] = _of_rub(observers[i], couplings[i], duration)
-    return motions
+
+    def __init__(self, duration: float) -> None:
+        self._duration = duration
+        self._rubs: Complexes = np.empty((0, 3), dtype=np.complex128)
+        self._speed = math.nan
+
+    def of(self, observers: Observers, couplings: Couplings) -> Complexes:
+        """The motions at the speed of the observers.
+
+        Of a rub the motion is simulated, from the mode's own orbit on, and held while the speed changes
+        little. Where it does not become steady, or does not touch, it is NaN.
+
+        Args:
+            observers: ``[M]`` of `discretise.OBSERVER`.
+            couplings: ``[M]`` of `coupled.COUPLED`.
+
+        Returns:
+            complex128 ``[M, 3]``.
+        """
+        rubs, speed = np.flatnonzero(observers["substeps"]), float(observers["speed"][0])
+        if not abs(self._speed / speed - 1.0) < _SAME_SPEED:
+            simulated = [_of_rub(observers[i], couplings[i], self._duration) for i in rubs]
+            self._rubs, self._speed = np.array(simulated).reshape(-1, 3), speed
+        motions = np.stack(
+            [
+                observers["a"] + 1j * observers["b"],
+                couplings["back_a"] + 1j * couplings["back_b"],
+                observers["rest_x"] + 1j * observers["rest_y"],
+            ],
+            axis=1,
+        )
+        motions[rubs] = self._rubs
+        return motions
 
 
 def _of_rub(observer: np.void, coupling: np.void, duration: float) -> Complexes:
@@ -181,7 +196,7 @@ def misfit(
 
     Args:
         change: the change.
-        motions: complex128 ``[M, 3]``, of `steady_motions`; the first is healthy.
+        motions: complex128 ``[M, 3]``, of `SteadyMotions`; the first is healthy.
         faults: ``[M]``, what each mode is called: ``"normal"``, ``"rub"``, ...
         noise: standard deviation of the measured position, in clearances.
         nats: evidence behind the best fault from which a fault is excluded, and below which it is not told

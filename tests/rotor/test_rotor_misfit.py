@@ -11,10 +11,10 @@ from scipy.integrate import solve_ivp
 
 from daqsvc.rotor.adaptation import SteadyFit, SteadyMotion
 from daqsvc.rotor.bank import ModelBank
-from daqsvc.rotor.coupled import couple
+from daqsvc.rotor.coupled import couple, couplings_at_speed
 from daqsvc.rotor.decision import DecisionRules
-from daqsvc.rotor.discretise import BankMode, discretise
-from daqsvc.rotor.misfit import SteadyChange, misfit, steady_change, steady_motions
+from daqsvc.rotor.discretise import BankMode, at_speed, discretise
+from daqsvc.rotor.misfit import SteadyChange, SteadyMotions, misfit, steady_change
 from daqsvc.rotor.model import NormalisedRotor
 
 PER_REV = 64
@@ -162,7 +162,7 @@ def bank_modes(rub_unbalance=6.0):
 def motions_of(modes):
     observers = discretise(modes, noise=NOISE, duration=DURATION)
     couplings = couple(modes, observers, noise=NOISE, duration=DURATION)
-    return steady_motions(observers, couplings, DURATION)
+    return SteadyMotions(DURATION).of(observers, couplings)
 
 
 def test_modes_without_contact_end_on_their_orbits():
@@ -196,6 +196,20 @@ def test_a_rub_ends_where_its_equation_of_motion_does():
     assert np.hypot(*path.y[:2, part]).max() > 1.0
     found = motions_of(bank_modes())[3]
     np.testing.assert_allclose(found, [expected.forward, expected.backward, expected.rest], atol=0.01)
+
+
+def test_a_rub_is_simulated_again_where_the_speed_has_changed():
+    modes = bank_modes()
+    observers = discretise(modes, noise=NOISE, duration=DURATION)
+    couplings = couple(modes, observers, noise=NOISE, duration=DURATION)
+    steady = SteadyMotions(DURATION)
+    before = steady.of(observers, couplings)
+    for times, again in ((1.01, False), (1.03, True)):
+        moved = at_speed(observers, modes, times * ROTOR.w, duration=DURATION)
+        coupled = couplings_at_speed(couplings, moved, modes, times * ROTOR.w, duration=DURATION)
+        after = steady.of(moved, coupled)
+        assert after[1, 0] == pytest.approx(modes[1].rotor.orbit(times * ROTOR.w))
+        assert (after[3] != before[3]).all() == again
 
 
 def test_a_rub_that_does_not_touch_is_none():

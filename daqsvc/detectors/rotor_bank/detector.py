@@ -25,7 +25,7 @@ from daqsvc.dsp.speed.keyphasor import KeyphasorProbe, KeyphasorTracker
 from daqsvc.rotor.adaptation import MODEL_ERROR, VARIANCE_FACTOR, SteadyFit, adapted
 from daqsvc.rotor.bank import UNDETERMINED, BankReport, ModelBank
 from daqsvc.rotor.decision import DecisionRules
-from daqsvc.rotor.misfit import misfit, steady_change, steady_motions
+from daqsvc.rotor.misfit import SteadyMotions, misfit, steady_change
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -186,7 +186,7 @@ class RotorBankDetector:
         self._calibrate_revolutions = calibrate_revolutions
         self._calibration = SteadyFit() if calibrate_revolutions else None
         self._departed = False
-        self._steady_motions, self._steady_speed = np.empty((0, 3), dtype=np.complex128), math.nan
+        self._steady_motions = SteadyMotions(self._duration)
         self._misfit = math.nan
         self._last_revolution = np.empty((0, 3))
         self._next_index: int | None = None
@@ -240,7 +240,7 @@ class RotorBankDetector:
         bank.process(np.zeros((n, 2)), np.ones(n), np.zeros(n))
         bank.retune(bank.speed, 0.0)
         if len(bank.couplings):
-            steady_motions(bank.observers, bank.couplings, self._duration)
+            SteadyMotions(self._duration).of(bank.observers, bank.couplings)
 
     def process(self, window: Window) -> Sequence[Diagnosis]:
         """See `Detector.process`."""
@@ -377,10 +377,7 @@ class RotorBankDetector:
             self._misfit = math.nan
             bank.exclude(np.zeros(count, dtype=np.bool_), np.zeros((count, count), dtype=np.bool_))
             return
-        if self._steady_speed != bank.speed:
-            self._steady_motions = steady_motions(bank.observers, bank.couplings, self._duration)
-            self._steady_speed = bank.speed
-        motions = self._steady_motions
+        motions = self._steady_motions.of(bank.observers, bank.couplings)
         change = steady_change(self._watch.motions, motions[0], self._noise)
         if change is None:
             return
@@ -407,7 +404,7 @@ class RotorBankDetector:
         speed = self._direction * 2.0 * math.pi / self._tracker.period_samples / self._duration
         self._bank_modes = adapted(self._bank_modes, motion, speed)
         self._bank = self._new_bank(variance_factor=self.variance_factor, decision=0)
-        self._steady_speed = math.nan
+        self._steady_motions = SteadyMotions(self._duration)
         self._calibration = None
         self._decision = self._modes[0].name
         report = self._bank.process(np.empty((0, 2)), np.empty(0), np.empty(0))
