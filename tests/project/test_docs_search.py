@@ -122,6 +122,11 @@ PLAIN = {
     "what is a keyphasor": "glossary.html#keyphasor",
     "mqtt login": "mqtt.html#credentials",
     "service does not start": "edge-box.html",
+    "sensor unplugged": "alarms.html#alarms-that-daqsvc-adds",
+    "install without internet": "install.html#the-package",
+    "multiplexed CAN message": "can.html#the-frames",
+    "multiplexed frame": "can.html#the-frames",
+    "enum state alarm": "alarms.html#a-state-or-an-enum-signal",
 }
 """What engineers ask in plain words, and how the addresses begin of which one must be among the first three.
 
