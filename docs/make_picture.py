@@ -19,12 +19,11 @@ WIDTH = 110
 PICTURE = Path(__file__).with_name("demo.svg")
 
 
-def main() -> None:
-    """Play the paper's scenario in real time and save the last view and the summary."""
-    kernel_cache.prepare()
+def drawn() -> str:
+    """The last view and the summary of the paper's scenario, played in real time."""
     parser = argparse.ArgumentParser()
     DemoCommand().add_arguments(parser)
-    arguments = parser.parse_args()
+    arguments = parser.parse_args([])
     script = script_of(arguments)
     console = Console(record=True, width=WIDTH, file=io.StringIO())
     view = View(script, arguments.speed, Console(file=io.StringIO()))
@@ -36,8 +35,9 @@ def main() -> None:
     view.show_summary(summarise(script, outcome, speed=arguments.speed), console)
     svg = console.export_svg(title="make demo")
     # The fonts would be fetched from the web by whoever looks at it.
-    PICTURE.write_text(re.sub(r"@font-face \{.*?\}\s*", "", svg, flags=re.DOTALL), "utf-8")
+    return re.sub(r"@font-face \{.*?\}\s*", "", svg, flags=re.DOTALL)
 
 
 if __name__ == "__main__":
-    main()
+    kernel_cache.prepare()
+    PICTURE.write_text(drawn(), "utf-8")

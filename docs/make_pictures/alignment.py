@@ -105,6 +105,7 @@ def picture() -> Figure:
     for column, color, size in ((0, HEALTHY, 6), (1, FAULTY, 2.5)):
         axes["grid"].plot(taken[shown], samples[shown, column], ".", color=color, markersize=size)
     axes["arrival"].set_title("placed by arrival")
+    axes["arrival"].set_ylabel("signal, amplitudes")
     axes["arrival"].legend(loc="lower center", ncols=2)
     axes["grid"].set_title("on the grid")
     for name in ("arrival", "grid"):
@@ -127,8 +128,8 @@ def error(axes: Axes, taken: Floats, values: Floats, blocks: list[AlignedBlock])
     stated = "error that it states, 95 %"
     axes.fill_between(taken[::period], -band, band, color=HEALTHY, alpha=0.2, linewidth=0, label=stated)
     axes.plot(at, 1e6 * phase / (2.0 * np.pi * SIGNAL_HZ), color=FAULTY, linewidth=1.4, label="true error")
-    axes.set_ylim(-200.0, 200.0)
+    axes.set_ylim(-320.0, 200.0)
     axes.set_xlim(0.0, SECONDS)
-    axes.set_ylabel("us")
+    axes.set_ylabel("error, us")
     axes.set_xlabel("s since the start; before the first value the grid has not begun")
     axes.legend(loc="lower right", ncols=2)

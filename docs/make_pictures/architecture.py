@@ -80,10 +80,11 @@ def given(step: Step) -> str:
 
 
 def wrapped(names: Iterable[str], width: int = 24) -> list[str]:
-    """Names of plugins in lines that fit into a box."""
+    """Names of plugins in lines that fit into a box; a comma ends each line but the last."""
     lines = [""]
     for name in names:
         if lines[-1] and len(lines[-1]) + len(name) + 2 > width:
+            lines[-1] += ","
             lines.append("")
         lines[-1] += f"{', ' if lines[-1] else ''}{name}"
     return lines

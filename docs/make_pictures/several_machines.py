@@ -34,7 +34,7 @@ class Panel(NamedTuple):
 
 PANELS = (
     Panel("CPU seconds a second", 1, (1.0, 1.0), "one core"),
-    Panel("resident memory, MB", 3, (150.0, 150.0 + 63 * 3.0), "150 MB, 3 MB for each further"),
+    Panel("resident memory, MB", 3, (150.0, 150.0 + 63 * 3.0), "150 MB, 3 MB\nfor each further"),
     Panel("loop lag p99, ms", 5, (10.0, 10.0), "10 ms"),
 )
 
