@@ -5,8 +5,9 @@ Anchors, and what the site makes of it all: test_docs_site.py.
 
 from __future__ import annotations
 
+import functools
 import re
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from prose.texts import texts_of
@@ -14,15 +15,24 @@ from support.paths import ROOT
 
 from daqsvc.documentation import TITLES
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
 DOCS = ROOT / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))
 TEXTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *PAGES]
+WRITTEN = [
+    ROOT / "README.md",
+    *(page for page in PAGES if page.parent.name not in {"reference", "decisions"}),
+]
+"""The pages that nothing generates and that are of today."""
 LISTED = re.compile(r"^(?:- |\| )\[[^\[\]]+\]\(([^()\s#]+\.md)\)", re.MULTILINE)
 FENCED = re.compile(r"^ *(`{3,}).*?^ *\1 *$", re.MULTILINE | re.DOTALL)
 NAMED = re.compile(r"\bdocs/[\w/-]+\.md")
+NAME = re.compile(r"(?<![\w/.-])(?:[a-z][a-z0-9]*(?:_[a-z0-9]+)+|--[a-z][a-z0-9-]+)(?![\w/-])")
+"""A key, a counter or a file of two words, or an option."""
+OF_OTHERS = {
+    *("buffer_strategy", "purge_keep_days", "hive_partitioning", "autosave_interval", "pg_hba"),
+    *("accel_g", "probe_x", "make_run_up", "mosquitto_sub"),
+}
+"""Names of other programs, and of files and channels of a reader."""
 LINK = re.compile(r"\]\(([^()\s#]+)(?:#[^()\s]*)?\)")
 
 
@@ -60,6 +70,31 @@ def test_the_glossary_has_the_words_that_are_not_explained_where_they_are() -> N
 def test_what_is_linked_is_there(text: Path) -> None:
     links = [link for link in LINK.findall(FENCED.sub("", text.read_text("utf-8"))) if ":" not in link]
     assert [link for link in links if not (text.parent / link).exists()] == []
+
+
+@functools.cache
+def names_of_the_tree() -> set[str]:
+    """All names in the program, its tests, examples and reference, and those of the files."""
+    rooms = ("daqsvc", "drivers", "sim_hw", "tests", "config", "packaging", "docs/reference")
+    files = [file for room in rooms for file in (ROOT / room).rglob("*.*")] + [*DOCS.rglob("*.py")]
+    found = {file.stem for file in files}
+    texts = {".py", ".toml", ".md", ".js", ".sql", ".yaml", ".service"}
+    for file in files:
+        if file.suffix in texts and file != Path(__file__):
+            found |= {*re.findall(r"--[a-z][a-z0-9-]+|\w+", file.read_text("utf-8"))}
+    return found
+
+
+@pytest.mark.sources
+@pytest.mark.parametrize("page", WRITTEN, ids=lambda page: f"{page.relative_to(ROOT)}")
+def test_a_key_a_counter_and_an_option_that_a_page_names_is_somewhere(page: Path) -> None:
+    marked = re.findall(r"`([^`\n]+)`", FENCED.sub("", page.read_text("utf-8")))
+    named = {name for text in marked for name in NAME.findall(text)}
+    assert named - names_of_the_tree() - OF_OTHERS == set()
+
+
+def test_a_name_of_others_is_on_a_page() -> None:
+    assert [name for name in OF_OTHERS if not any(name in page.read_text("utf-8") for page in WRITTEN)] == []
 
 
 @pytest.mark.parametrize("page", TITLES)
