@@ -547,6 +547,8 @@ class _Report(NamedTuple):
         if place is None or not numbers or rate_hz is None:
             if what.prefix:
                 yield f"# Lines that begin with {what.prefix}:"
+            if not any(one.numeric for one in what.columns):
+                yield "# No column is a number alone, such as 22.5: NAME=22.5, JSON and hex are not read."
             yield "# A stream needs a column that counts lines, or one with the device's time, and a column"
             yield "# of numbers beside it; have the device send them."
             return
@@ -579,6 +581,8 @@ class _Report(NamedTuple):
         if what.sync:
             yield f"sync_word = {quoted(what.sync.hex())}"
         driver_checks = what.crc in {"ibm-3740", "xmodem"} and what.crc_from == len(what.sync)
+        if what.crc and not driver_checks:
+            yield f"# The driver does not check {what.crc}: a damaged frame is taken for a good one."
         yield f"crc = {quoted(what.crc if driver_checks else 'none')}"
         if driver_checks and what.crc_order == "little":
             yield 'crc_order = "little"'

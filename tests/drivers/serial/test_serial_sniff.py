@@ -522,6 +522,28 @@ def test_new_proposes_the_frames_that_it_hears(
     assert 50 < stream["rate_hz"] < 400
 
 
+@pytest.mark.parametrize("text", ["T=%.2f P=6.967 S=OK\n", '{"x":%.3f,"y":-0.352}\n'])
+def test_why_text_without_numbers_gives_no_stream_is_stated(
+    cable: PseudoTerminal, capsys: pytest.CaptureFixture[str], text: str
+) -> None:
+    with talking(cable, lambda number: (text % (number % 7 + 0.25)).encode()):
+        assert main(["sniff", "serial", f"{cable.path}", "--seconds", "0.6"]) == 0
+    assert "# No column is a number alone, such as 22.5: NAME=22.5, JSON" in capsys.readouterr().out
+
+
+def test_the_file_states_that_the_driver_does_not_check_a_sum(
+    cable: PseudoTerminal, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def summed(number: int) -> bytes:
+        payload = number.to_bytes(2, "little") + bytes([number * 7 % 256, 1, number * 31 % 256, 2])
+        return b"\xa5\x5a" + payload + bytes([sum(payload) % 256])
+
+    with talking(cable, summed):
+        assert main(["sniff", "serial", f"{cable.path}", "--seconds", "0.6"]) == 0
+    said = capsys.readouterr().out
+    assert '# The driver does not check sum-8: a damaged frame is taken for a good one.\ncrc = "none"' in said
+
+
 @pytest.mark.parametrize("has_check", [False, True])
 def test_text_between_stx_and_etx_is_named_and_nothing_is_proposed(
     cable: PseudoTerminal, capsys: pytest.CaptureFixture[str], *, has_check: bool
