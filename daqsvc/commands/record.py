@@ -102,7 +102,10 @@ class RecordCommand:
             return complain("daqsvc", error, error.code)
         files = sorted(_logs(arguments.out) - there)
         summary = _summary(name, driver, files)
-        print(json.dumps({**asdict(driver.counters), **summary}))  # noqa: T201 - this is what the verb is for
+        counters = {key: value for key, value in asdict(driver.counters).items() if key not in summary}
+        streams = {"streams": summary["streams"]}  # they come last, behind all that is of the bus
+        printed = {key: value for key, value in summary.items() if key not in streams} | counters | streams
+        print(json.dumps(printed))  # noqa: T201 - this is what the verb is for
         if unrecorded := summary["frames_unrecorded"]:
             what = f"{counted(unrecorded, 'frame')} could not be recorded in {arguments.out}"
             return complain("daqsvc", what, CANNOT_WRITE)

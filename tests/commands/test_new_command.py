@@ -66,6 +66,8 @@ FREE = {
     "port": WORDS.map("/dev/tty{}".format),
     "baud": st.sampled_from(["9600", "19200", "115200", "3000000"]),
     "unit": st.integers(1, 247).map(str),
+    "timeout-ms": st.one_of(st.sampled_from(["500", "1500", "20"]), NUMBERS),
+    "bits": st.sampled_from(["none", "0", "3", "4-7", "7-4", "15-16", "all"]),
     "block-id": st.integers(0, 65_535).map(str),
     "block-address": st.integers(0, 65_535).map(str),
     "samples": st.sampled_from(["64", "1024", "8192"]),

@@ -92,9 +92,11 @@ def start_analyze(
 
 
 def ended(process: subprocess.Popen[str]) -> tuple[int, dict[str, Any], str]:
-    """Exit code, summary and stderr of a process that `start_analyze` started."""
+    """Exit code, summary and stderr of a process that `start_analyze` or `start_program` started."""
     out, err = process.communicate(timeout=240)
-    return process.returncode, fits("daqsvc analyze", json.loads(out)) if out else {}, err
+    summary = json.loads(out) if out else {}
+    # Of the verb, the summary names the file of its results as well.
+    return process.returncode, fits("daqsvc analyze", summary) if "results" in summary else summary, err
 
 
 def workers_of(process: subprocess.Popen[str]) -> list[int]:
