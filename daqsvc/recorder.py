@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import copy
 import json
 import logging
 import math
@@ -31,6 +32,7 @@ from daqsvc.acquisition.samples import SampleBlock
 from daqsvc.acquisition.standing import StreamState
 from daqsvc.alarms.conditions import is_condition
 from daqsvc.alarms.events import ANNUNCIATIONS, AlarmEvent, Identity
+from daqsvc.alarms.quality import Lacking, SensorHealth
 from daqsvc.diagnosis.memory import MemoryNotTakenError, taken_memory
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.errors.code import coded
@@ -135,6 +137,7 @@ class SnapshotAbout(TypedDict):
         faults: by detector and decision the fault that it means.
         standings: how each stream stands.
         alarms: the last event of each alarm.
+        lacking: by detector what it had lacked in the last seconds.
         causes: the first cause of the file, in words.
     """
 
@@ -155,6 +158,7 @@ class SnapshotAbout(TypedDict):
     faults: dict[str, dict[str, str]]
     standings: dict[str, Annotated[dict[str, Any], StreamState]]
     alarms: list[Annotated[dict[str, Any], "daqsvc.alarm/1"]]
+    lacking: dict[str, Annotated[dict[str, Any], Lacking]]
     causes: list[str]
 
 
@@ -403,12 +407,14 @@ class _Kept:
     Attributes:
         alarms: by alarm, its newest event.
         standings: by stream.
+        health: what detectors have against their sensors.
         streams: those of which samples have been forgotten.
         since_begin: whether nothing has been forgotten yet.
     """
 
     alarms: dict[str, AlarmEvent] = field(default_factory=dict)
     standings: dict[str, StreamState] = field(default_factory=dict)
+    health: SensorHealth = field(default_factory=SensorHealth)
     streams: set[str] = field(default_factory=set)
     since_begin: bool = True
 
@@ -503,8 +509,10 @@ class MachineRecorder:
 
     def take_over(self, events: Iterable[AlarmEvent]) -> None:
         """Take in the states of alarms from before the recorder was made."""
+        now_ns = self._clock.monotonic_ns()
         for event in events:
             self._kept.alarms.setdefault(event.alarm, event)
+            self._kept.health.resume(event.doubts, now_ns, event.finding)
 
     def processed(self, detector: Detector, window: Window) -> None:
         """A detector has processed a window; on the thread that it computes in."""
@@ -751,6 +759,8 @@ class MachineRecorder:
                 kept.alarms[what.alarm] = what
             elif isinstance(what, _Stands):
                 kept.standings[what.stream] = what.standing
+            elif isinstance(what, Diagnosis):
+                kept.health.update(what)
             elif isinstance(what, SampleBlock):
                 kept.streams.add(what.stream)
 
@@ -968,12 +978,14 @@ class MachineRecorder:
         wall_ns = self._clock.wall_ns() - self._clock.monotonic_ns()
         alarms, standings = dict(self._kept.alarms), dict(self._kept.standings)
         known = self._kept.streams | {one.what.stream for one in before if isinstance(one.what, SampleBlock)}
-        streams = dict(stream_facts(self._machine))
+        streams, health = dict(stream_facts(self._machine)), copy.deepcopy(self._kept.health)
         for item in before:
             if isinstance(item.what, AlarmEvent):
                 alarms[item.what.alarm] = item.what
             elif isinstance(item.what, _Stands):
                 standings[item.what.stream] = item.what.standing
+            elif isinstance(item.what, Diagnosis):
+                health.update(item.what)
         return {
             "schema": SCHEMA,
             "version": __version__,
@@ -991,6 +1003,7 @@ class MachineRecorder:
             "faults": fault_names(self._machine),
             "standings": {name: one._asdict() for name, one in standings.items()},
             "alarms": [alarm_document(event) for event in alarms.values()],
+            "lacking": {name: one._asdict() for name, one in health.lacking().items()},
             "causes": [cause],
         }
 

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.clock import Clock
     from daqsvc.alarms.commands import AlarmCommand
+    from daqsvc.alarms.quality import Lacking
     from daqsvc.alarms.rules import Rule
     from daqsvc.alarms.status import AlarmStatus
     from daqsvc.diagnosis.record import Diagnosis
@@ -247,6 +248,14 @@ class AlarmManager:
             ):
                 self._doubts.unsettle(ruled.rule)
         return withdrawn
+
+    def remember(self, lacking: Mapping[str, Lacking]) -> None:
+        """Have quality alarms return when they would without a break, by the same clock; after `resume`.
+
+        Args:
+            lacking: by detector what it had lacked until now.
+        """
+        self._doubts.remember(lacking)
 
     def follow(self, before: AlarmManager) -> list[AlarmEvent]:
         """Say of each alarm that stands if its limits are others than they were; after `resume`.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections import defaultdict, deque
 from typing import TYPE_CHECKING, NamedTuple
@@ -48,6 +49,24 @@ UNHEARD_NS = 30 * NS_PER_S
 """After a restart a quality alarm waits at most so long for a statement of each of its detectors."""
 
 
+class Lacking(NamedTuple):
+    """What a detector has lacked in the last seconds: on this depends when its quality alarm returns.
+
+    Attributes:
+        weight: excess of partial statements over good ones, 0 to `LASTING`.
+        lasts: whether partial statements prevail.
+        times_ns: of its statements about samples in the last `SHARE_NS`, by the monotonic clock, ns.
+        shares: share of the samples that was missing, 0 to 1, by statement.
+        blind_ns: when it could judge nothing the last time, by the monotonic clock; None if that is over.
+    """
+
+    weight: int
+    lasts: bool
+    times_ns: list[int]
+    shares: list[float]
+    blind_ns: int | None
+
+
 class Touched(NamedTuple):
     """What a statement is about.
 
@@ -68,15 +87,15 @@ class _Patience:
     """
 
     def __init__(self, *, lasting: bool) -> None:
-        self._weight = LASTING if lasting else 0
-        self._lasts = lasting
+        self.weight = LASTING if lasting else 0
+        self.is_lasting = lasting
 
     def lasts(self, *, partial: bool) -> bool:
         """Take in a statement; whether samples are missing for good."""
-        self._weight = min(max(self._weight + (1 if partial else -1), 0), LASTING)
-        if self._weight in {0, LASTING}:
-            self._lasts = self._weight > 0
-        return self._lasts
+        self.weight = min(max(self.weight + (1 if partial else -1), 0), LASTING)
+        if self.weight in {0, LASTING}:
+            self.is_lasting = self.weight > 0
+        return self.is_lasting
 
 
 class _Shortage:
@@ -87,31 +106,30 @@ class _Shortage:
     """
 
     def __init__(self) -> None:
-        self._shares: deque[tuple[int, float]] = deque()
-        self._sum = 0.0
-        self._blind_ns: int | None = None
+        self.shares: deque[tuple[int, float]] = deque()
+        self.blind_ns: int | None = None
 
     def resume(self, t_ns: int) -> None:
         """Go on from before a restart at ``t_ns``: samples were lacking then."""
-        self._blind_ns = t_ns
+        self.blind_ns = t_ns
 
     def update(self, diagnosis: Diagnosis, share: float) -> None:
         """Take in a statement about samples, and what share of them is missing."""
         t_ns = diagnosis.t_ns
         if diagnosis.quality == "missing" and not diagnosis.partial:
-            self._blind_ns = t_ns
-        self._shares.append((t_ns, share))
-        self._sum += share
-        while t_ns - self._shares[0][0] >= SHARE_NS:
-            self._sum -= self._shares.popleft()[1]
+            self.blind_ns = t_ns
+        self.shares.append((t_ns, share))
+        while t_ns - self.shares[0][0] >= SHARE_NS:
+            self.shares.popleft()
 
     def lasts(self, t_ns: int) -> bool:
         """Whether a detector that can judge the samples until ``t_ns`` may soon be unable to."""
-        if self._blind_ns is None:
+        if self.blind_ns is None:
             return False
-        lasts = t_ns - self._blind_ns < GOOD_NS or self._sum > MOST_LACKED * len(self._shares)
+        lacked = math.fsum(share for _, share in self.shares)
+        lasts = t_ns - self.blind_ns < GOOD_NS or lacked > MOST_LACKED * len(self.shares)
         if not lasts:
-            self._blind_ns = None
+            self.blind_ns = None
         return lasts
 
 
@@ -231,6 +249,28 @@ class SensorHealth:
             self._forget(doubt.detector)
             self._unheard.discard(doubt.detector)
             self._remember(quality_alarm(doubt.detector, doubt.sensors), doubt)
+
+    def lacking(self) -> dict[str, Lacking]:
+        """What each detector has lacked in the last seconds, by its name; for `remember`."""
+        found: dict[str, Lacking] = {}
+        for detector in sorted(self._patience.keys() | self._shortage.keys()):
+            patience = self._patience.get(detector) or _Patience(lasting=False)
+            shortage = self._shortage.get(detector) or _Shortage()
+            times_ns, shares = [t_ns for t_ns, _ in shortage.shares], [share for _, share in shortage.shares]
+            found[detector] = Lacking(
+                patience.weight, patience.is_lasting, times_ns, shares, shortage.blind_ns
+            )
+        return found
+
+    def remember(self, lacking: Mapping[str, Lacking]) -> None:
+        """Go on from what detectors have lacked until now, by the same clock; after `resume`."""
+        for detector, was in lacking.items():
+            patience = self._patience[detector] = _Patience(lasting=was.lasts)
+            patience.weight = was.weight
+            shortage = self._shortage[detector] = _Shortage()
+            shortage.shares.extend(zip(was.times_ns, was.shares, strict=True))
+            shortage.blind_ns = was.blind_ns
+            self._lacked_at_restart.pop(detector, None)
 
     def settle(self, name: str) -> None:
         """Forget all that is said against the subject of the quality alarm ``name``."""

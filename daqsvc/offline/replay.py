@@ -27,6 +27,7 @@ from daqsvc.alarms.conditions import SERVICE
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.make import alarm_rule
 from daqsvc.alarms.manager import AlarmManager
+from daqsvc.alarms.quality import Lacking
 from daqsvc.diagnosis.memory import DetectorMemory, MemoryNotFittingError, put
 from daqsvc.diagnosis.pipeline import THREADS, KernelThreads, kernel_failed
 from daqsvc.diagnosis.statements import said_of_silence
@@ -283,6 +284,7 @@ class Replay:
             iso_utc(self._begin_ns + self._wall_ns)  # there is such a time
             self._standings = {n: StreamState(**one) for n, one in dict(about["standings"]).items()}
             before = [alarm_event(json.dumps(one).encode()) for one in about["alarms"]]
+            lacking = {name: Lacking(**one) for name, one in dict(about.get("lacking", {})).items()}
             changed_ns = about.get("changed_ns")
             if changed_ns is not None and int(changed_ns) > self._begin_ns:
                 self._result.notes.append(
@@ -307,7 +309,7 @@ class Replay:
             self._clock,
             handling=named.alarm_handling,
         )
-        self._before = before
+        self._before, self._lacking = before, lacking
         self._names = {
             name: detector.name
             for detector in self._watch.pipeline.detectors
@@ -371,6 +373,7 @@ class Replay:
         watch, pipeline = self._watch, self._watch.pipeline
         await pipeline.warm()
         self._alarms.resume(self._before, watch.active_detectors(), restarted=False)
+        self._alarms.remember(self._lacking)
         for stream, standing in self._standings.items():
             if stream in watch.standings:
                 watch.stand(stream, standing)

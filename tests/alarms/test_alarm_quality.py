@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from itertools import pairwise
 
 import numpy as np
 import pytest
-from support.alarm_rig import SECOND_NS, AlarmRig, alarm_handling, kinds
+from support.alarm_rig import RIG, SECOND_NS, AlarmRig, alarm_handling, kinds
+from support.clocks import SettableClock
 
 from daqsvc.alarms.commands import Verb
-from daqsvc.alarms.quality import UNHEARD_NS
+from daqsvc.alarms.manager import AlarmManager
+from daqsvc.alarms.quality import UNHEARD_NS, Lacking, SensorHealth
 from daqsvc.alarms.rules import DiagnosisRule, LevelRule
 from daqsvc.alarms.setpoints import Setpoint
 
@@ -218,6 +221,30 @@ def test_a_restart_does_not_cut_short_how_long_samples_must_be_good(says_share):
         rig = rig.restarted({"bearing": ("accel-de", "accel-fe")})
         events = bearing(rig, "good", ("accel-de", "accel-fe"))
     assert [kind for _, kind in kinds(events)] == ["returned"]
+
+
+@pytest.mark.parametrize("cut", range(1, 75, 3))
+def test_a_replay_from_amid_a_shortage_returns_the_alarm_when_it_returned(cut):
+    """The service is never asked: what the statements until then come to is all that the replay gets."""
+    rng = np.random.default_rng(cut)
+    rig, until_then = AlarmRig(BEARING), SensorHealth()
+    there = [rng.random(6) >= 0.45 for _ in range(30)] + [np.ones(6)] * 60
+    taken = []
+    for number, one in enumerate(there):
+        revolution(rig, one)
+        taken.append(rig.last)
+        if number < cut:
+            until_then.update(rig.last)
+    before = [event for event in rig.events if event.t_ns <= taken[cut - 1].t_ns]
+    replayed = AlarmManager(RIG, (BEARING,), SettableClock())
+    replayed.resume(before[-1:], {"bank": ("probe-x", "probe-y")}, restarted=False)
+    lacking = json.loads(json.dumps({name: one._asdict() for name, one in until_then.lacking().items()}))
+    replayed.remember({name: Lacking(**one) for name, one in lacking.items()})
+    events = [event for one in taken[cut:] for event in replayed.take(one)]
+    assert [(e.alarm, e.kind, e.t_ns) for e in events] == [
+        (e.alarm, e.kind, e.t_ns) for e in rig.events[len(before) :]
+    ]
+    assert len(rig.events) == 2
 
 
 def test_lost_frames_do_not_keep_a_sensor_not_ok_that_samples_show_to_be_ok():

@@ -19,6 +19,7 @@ from daqsvc.acquisition.clock import NS_PER_S, DrivenClock
 from daqsvc.acquisition.samples import SampleBlock, Window
 from daqsvc.acquisition.standing import StreamState
 from daqsvc.alarms.events import AlarmEvent, EventKind, Identity
+from daqsvc.alarms.quality import Lacking, SensorHealth
 from daqsvc.alarms.states import AlarmState, Level
 from daqsvc.confined.limits import ResourceLimits
 from daqsvc.diagnosis.record import Diagnosis
@@ -812,3 +813,29 @@ async def test_a_snapshot_has_the_first_samples_of_a_stream_that_has_just_come(t
     abouts = [held(path)[0] for path in (first, second)]
     assert [about["streams_from_start"] for about in abouts] == [["shaft"], []]
     assert [about["from_start"] for about in abouts] == [False, False]
+
+
+@pytest.mark.parametrize("since_s", [0.8, 9.0])
+async def test_a_snapshot_states_what_detectors_had_lacked_when_it_begins(
+    tmp_path: Path, since_s: float
+) -> None:
+    """Also if that is so long ago that the history of the recorder does not have it any more."""
+    until_then, blind_ns = SensorHealth(), 0
+    async with bench(tmp_path, before_s=0.5) as one:
+        await one.passes(20.0)
+        for share in (1.0, 0.25, 0.0, 0.5, 0.0, 0.0):
+            await one.passes(0.1)
+            quality = "missing" if share == 1.0 else "good"
+            said = Diagnosis("laval-rig", "levels/x", one.clock.monotonic_ns(), "shaft", 0, 1, "normal")
+            said = replace(said, quality=quality, missing_share=share, sensors=("probe-x",))
+            one.recorder.diagnosis(said)
+            until_then.update(said)
+            blind_ns = said.t_ns if share == 1.0 else blind_ns
+        await one.passes(since_s)
+        one.alarm()
+        await one.passes(2.0)
+        [path] = one.files
+    about, _, _, _ = held(path)
+    assert {name: Lacking(**told) for name, told in about["lacking"].items()} == until_then.lacking()
+    assert about["lacking"]["levels/x"]["shares"] == [1.0, 0.25, 0.0, 0.5, 0.0, 0.0]
+    assert about["lacking"]["levels/x"]["blind_ns"] == blind_ns

@@ -85,7 +85,8 @@ class AlarmRig:
     def take(self, seconds: float = 1.0, **fields: Any) -> Sequence[AlarmEvent]:
         self.clock.advance(seconds)
         fields = {"machine": "rig", "stream": "shaft", "first_index": 0, "end_index": 64, **fields}
-        return self.told(self.manager.take(Diagnosis(t_ns=self.clock.t_ns, **fields)))
+        self.last = Diagnosis(t_ns=self.clock.t_ns, **fields)
+        return self.told(self.manager.take(self.last))
 
     def rms(
         self,
