@@ -55,10 +55,12 @@ class Heard:
         lines: what it is, for a person; a few lines.
         proposals: answers by the key of their question, as they would be typed, that fit the answers so far;
             one that cannot be used is not offered.
+        missed: whether what is looked for was not there, so that an answer before may have to be corrected.
     """
 
     lines: Sequence[str]
     proposals: Callable[[Answers], Mapping[str, str]]
+    missed: bool = False
 
 
 class BusQuestions(ABC):
@@ -71,6 +73,7 @@ class BusQuestions(ABC):
         channel_topics: what is asked about one channel; ``{channel}`` is filled in.
         listens_behind: key of the question behind which it is known where the device is, so that `listen` can
             look at it; empty if nothing can.
+        for_listening: keys of questions that only `listen` uses; without it they are neither asked nor given.
         simulated: whether ``daqsvc sim`` plays the device, so that most defaults need no question.
     """
 
@@ -78,6 +81,7 @@ class BusQuestions(ABC):
     topics: ClassVar[Mapping[str, Topic]] = {}
     channel_topics: ClassVar[Mapping[str, Topic]] = {}
     listens_behind: ClassVar[str] = ""
+    for_listening: ClassVar[Sequence[str]] = ()
     simulated: ClassVar[bool] = False
 
     @abstractmethod

@@ -92,8 +92,9 @@ class _CanQuestions(BusQuestions):
             if answers["interface"] == "socketcan":
                 raise
             found = sniffed(CanSniffer(), [*words, *line], stop, tell)
-        lines = [*_in_words(found), *self.remarks(found, answers)]
-        return Heard(lines, lambda so_far: self._proposals(found, so_far))
+        remarks = [*self.remarks(found, answers)]
+        lines = [*_in_words(found), *remarks]
+        return Heard(lines, lambda so_far: self._proposals(found, so_far), missed=bool(remarks))
 
     def _proposals(self, found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
         fd = any(one["fd"] for one in found["ids"])

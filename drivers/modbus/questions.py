@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from drivers import questions as q
 from drivers.bus_questions import BUS, BusQuestions, Heard, only_port, unit_by_name
-from drivers.modbus.sniff import ModbusSniffer, units_of
+from drivers.modbus.sniff import LAST_REGISTER, ModbusSniffer, registers_of, units_of
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
 from drivers.sniffing import WAVEFORM_HZ, NothingFoundError, SniffError, sniffed
 from drivers.toml_lines import Hexadecimal, array, entry
@@ -43,10 +43,17 @@ _SHOWN = 12
 class _ModbusQuestions(BusQuestions):
     """Registers of a unit."""
 
+    listens_behind = "registers"
+    for_listening = ("registers",)
     topics: ClassVar[Mapping[str, Topic]] = {
         "units": Topic(
             "Which units does --listen look for?",
             "auto: 1-10, and 11-247 if none of those answers. Else addresses, e.g. 1-247 or 5,17.",
+        ),
+        "registers": Topic(
+            "Which registers does --listen read, e.g. 4000-4100?",
+            "As on the wire, from 0: see the register map of the device. auto: 0 to 200, and on if the last "
+            "one exists.",
         ),
         "timeout-ms": Topic(
             "How long may the unit take to answer, in ms",
@@ -112,14 +119,15 @@ class _ModbusQuestions(BusQuestions):
     ) -> Heard:
         """See `BusQuestions.listen`: units are asked for their registers, and nothing is written."""
         del folder
-        words = ["--timeout-ms", f"{answers['timeout-ms']:g}", *self._sniffed_as(answers)]
         chosen: str = answers["units"]
+        registers = [] if answers["registers"] == _AUTO else ["--registers", answers["registers"]]
+        words = ["--timeout-ms", f"{answers['timeout-ms']:g}", *registers, *self._sniffed_as(answers)]
         try:
             first = _UNITS[0] if chosen == _AUTO else chosen
             found = sniffed(ModbusSniffer(), ["--units", first, *words], stop, tell)
         except NothingFoundError as error:
             if error.figures.get("units"):
-                return _without_registers(error.figures)
+                return _without_registers(error.figures, answers["registers"])
             if stop.is_set() or chosen != _AUTO:
                 raise
             tell(f"none of units {_UNITS[0]} answers: {_UNITS[1]} are asked, too; Ctrl-C ends that")
@@ -127,7 +135,7 @@ class _ModbusQuestions(BusQuestions):
                 found = sniffed(ModbusSniffer(), ["--units", _UNITS[1], *words], stop, tell)
             except NothingFoundError as other:
                 if other.figures.get("units"):
-                    return _without_registers(other.figures)
+                    return _without_registers(other.figures, answers["registers"])
                 raise
         except SniffError as error:
             raise SniffError(f"{error}".replace("TARGET", "its address")) from error
@@ -142,6 +150,10 @@ class _ModbusQuestions(BusQuestions):
     def _ask_units(self) -> Question:
         """Which units are to be found; only an option is asked for them."""
         return self.ask("units", _units, _AUTO, quiet=True)
+
+    def _ask_registers(self) -> Question:
+        """Which registers are to be read; only who listens is asked for them."""
+        return self.ask("registers", _registers, _AUTO, doubt=_doubt_of_registers)
 
     def _sniffed_as(self, answers: Answers) -> Sequence[str]:
         """Arguments of the sniffer that say where the units are."""
@@ -259,7 +271,9 @@ class _ModbusQuestions(BusQuestions):
 
         types, orders = dict.fromkeys(REGISTERS, ""), dict.fromkeys(("ABCD", "CDAB", "BADC", "DCBA"), "")
         following = f"{self._next_address(answers, channel)}"
-        doubt = partial(_doubt_of_channel, self._taken(answers, channel), following)
+        doubt = partial(
+            _doubt_of_channel, self._taken(answers, channel), following, _to_read(answers["registers"])
+        )
         yield self.ask_of(channel, "address", q.whole, following, doubt=doubt)
         unit = _unit(channel)
         default = "int16" if unit == "degC" else "uint16"
@@ -395,7 +409,6 @@ class TcpQuestions(_ModbusQuestions):
     """Units behind a Modbus TCP server."""
 
     about = "Modbus TCP"
-    listens_behind = "tcp-port"
     topics: ClassVar[Mapping[str, Topic]] = {
         "host": Topic(
             "Address of the Modbus device",
@@ -410,6 +423,7 @@ class TcpQuestions(_ModbusQuestions):
         yield self._ask_timeout()
         yield self._ask_units()
         yield self.ask("tcp-port", q.whole, _host_and_port(answers["host"])[1], quiet=True)
+        yield self._ask_registers()
 
     def _sniffed_as(self, answers: Answers) -> Sequence[str]:
         host, _ = _host_and_port(answers["host"])
@@ -426,7 +440,6 @@ class RtuQuestions(_ModbusQuestions):
     """Units on a serial line."""
 
     about = "Modbus RTU on a serial line (RS-485)"
-    listens_behind = "parity"
     topics: ClassVar[Mapping[str, Topic]] = {
         "parity": Topic("Parity of the line", "As the device is set: none, even or odd."),
         **_ModbusQuestions.topics,
@@ -439,6 +452,7 @@ class RtuQuestions(_ModbusQuestions):
         yield self._ask_timeout()
         yield self._ask_units()
         yield self.choose("parity", dict.fromkeys(("none", "even", "odd"), ""), "even")
+        yield self._ask_registers()
 
     def _sniffed_as(self, answers: Answers) -> Sequence[str]:
         line = ["--baud", f"{answers['baud']}", "--parity", answers["parity"]]
@@ -507,8 +521,29 @@ def _units(text: str) -> str:
         if text != _AUTO:
             units_of(text)
     except SniffError as error:
-        raise ValueError(f"{error}") from None
+        raise ValueError(f"{error}".partition(": ")[2]) from None
     return text
+
+
+def _registers(text: str) -> str:
+    """Registers as the sniffer takes them, or `_AUTO`."""
+    if text == _AUTO:
+        return text
+    try:
+        registers = registers_of(text)
+    except SniffError as error:
+        raise ValueError(f"{error}".partition(": ")[2]) from None
+    if registers.end > LAST_REGISTER:
+        raise ValueError(f"{registers.reason}: write {registers.there}")
+    return text
+
+
+def _to_read(registers: str) -> range:
+    """The registers that --listen was to read; none if it was to choose them."""
+    if registers == _AUTO:
+        return range(0)
+    asked = registers_of(registers)
+    return range(asked.begin, asked.end + 1)
 
 
 def _width(raw_type: str) -> int:
@@ -526,30 +561,27 @@ def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
     """What was found, in a few lines: which units answer, and the registers that are worth reading."""
     from drivers.modbus.scan_report import NO_VALUE  # noqa: PLC0415 - brings the settings
 
-    first, last = found["units_asked"]
-    yield f"units that answer: {', '.join(map(str, found['units']))} (units {first} to {last} were asked)"
+    yield _units_in_words(found)
     for table in found["tables"]:
         if not table["registers"]:
             continue
         runs = ", ".join(f"{low}" if low == high else f"{low} to {high}" for low, high in table["runs"])
         asked = " to ".join(map(str, table["asked"]))
         name = f"unit {table['unit']} has {_TABLES[table['function']]} registers {runs}"
-        yield f"{name} ({asked} were asked; daqsvc sniff modbus --registers looks further):"
+        yield f"{name} ({asked} were asked; --registers looks further):"
         if table["max_count"] is not None:
             yield f"  registers in a request: {table['max_count']} at most"
         by_address = {one["address"]: one for one in table["registers"]}
         wide = {one["address"]: one for one in table["channels"] if not one["type"].endswith("int16")}
         behind = {
-            address + number
-            for address, one in wide.items()
-            for number in range(1, 4 if one["type"].endswith("64") else 2)
+            address + number for address, one in wide.items() for number in range(1, _width(one["type"]))
         }
         shown = [address for address in by_address if address not in behind]
         if len(shown) > _SHOWN:
             shown = [address for address in shown if address in wide or address in table["moved"]]
         for address in shown[:_SHOWN]:
-            numbers = 1 + sum(address + number in behind for number in range(1, 4)) if address in wide else 1
-            moved = any(address + number in table["moved"] for number in range(numbers))
+            width = _width(wide[address]["type"]) if address in wide else 1
+            moved = any(address + number in table["moved"] for number in range(width))
             moves = ", moves" if moved else ""
             value, meant = f"{by_address[address]['int16']}", ""
             if address in wide:
@@ -566,12 +598,18 @@ def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
             yield f"  ... and {len(shown) - _SHOWN} more: daqsvc sniff modbus shows them"
 
 
-def _without_registers(found: Mapping[str, Any]) -> Heard:
+def _units_in_words(found: Mapping[str, Any]) -> str:
+    """Which units answer, of those that were asked."""
+    first, last = found["units_asked"]
+    asked = f"unit {first} was" if first == last else f"units {first} to {last} were"
+    return f"units that answer: {', '.join(map(str, found['units']))} ({asked} asked)"
+
+
+def _without_registers(found: Mapping[str, Any], registers: str) -> Heard:
     """Units that answer, although none of the registers that were asked for is there."""
     from drivers.modbus.scan import ILLEGAL_FUNCTION  # noqa: PLC0415 - only for who listens
 
-    first, last = found["units_asked"]
-    lines = [f"units that answer: {', '.join(map(str, found['units']))} (units {first} to {last} were asked)"]
+    lines = [_units_in_words(found)]
     proposed = {"unit": f"{found['units'][0]}"}
     by_unit: dict[int, list[str]] = {}
     for table in found["tables"]:
@@ -582,13 +620,18 @@ def _without_registers(found: Mapping[str, Any]) -> Heard:
         elif table["asked"]:
             tables.append(name)
             asked = " to ".join(map(str, table["asked"]))
-            lines.append(f"unit {unit} answers for {name} registers, but has none of {asked}: see its manual")
+            lines.append(
+                f"unit {unit} answers for {name} registers, but has none of {asked}: see its manual for "
+                "their addresses (--registers)"
+            )
+    if registers != _AUTO and (note := registers_of(registers).note("both")):
+        lines.append(note)
 
     def proposals(so_far: Answers) -> dict[str, str]:
         tables = by_unit.get(so_far.get("unit", found["units"][0]), [])
         return proposed | ({"table": tables[0]} if tables else {})
 
-    return Heard(lines, proposals)
+    return Heard(lines, proposals, missed=True)
 
 
 def _doubt(address: int | None) -> tuple[str, str] | None:
@@ -608,10 +651,24 @@ def _doubt(address: int | None) -> tuple[str, str] | None:
     return reason, f"{meant}"
 
 
-def _doubt_of_channel(taken: Mapping[int, str], free: str, address: int) -> tuple[str, str] | None:
-    """The same of a channel's register, which may be that of another channel, too."""
+def _doubt_of_registers(text: str) -> tuple[str, str] | None:
+    """The same of the registers that --listen is to read."""
+    registers = _AUTO if text == _AUTO else registers_of(text)
+    if isinstance(registers, str) or not registers.reason:
+        return None
+    again = f"Enter takes {registers.there}; type {text} again if the device has such addresses"
+    return f"{registers.reason}. {again}", registers.there
+
+
+def _doubt_of_channel(
+    taken: Mapping[int, str], free: str, to_read: range, address: int
+) -> tuple[str, str] | None:
+    """The same of a channel's register, which may be that of another channel, too.
+
+    Whoever has such registers read, or has given another channel such an address, means them.
+    """
     if address not in taken:
-        return _doubt(address)
+        return None if address in to_read or any(map(_doubt, taken)) else _doubt(address)
     reason = (
         f'register {address} holds "{taken[address]}" already. Enter takes {free}; type {address} again '
         "if both are in it"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from drivers.sniffing import Sniffed, Sniffer, SniffError
 
@@ -21,7 +21,7 @@ UNITS = "1-247"
 REGISTERS = "0-200"
 _AUTO = "auto"
 _FUNCTIONS = {_AUTO: (3, 4), "3": (3,), "4": (4,), "both": (3, 4)}
-_LAST_REGISTER = 65_535
+LAST_REGISTER = 65_535
 _LONG_MANUALS_FIRST = (300_001, 400_001)
 """What manuals with six digits call the first input register and the first holding register."""
 _INPUT = (30_001, 300_001)
@@ -102,7 +102,11 @@ class ModbusSniffer(Sniffer):
         from drivers.modbus.scan_report import ScanReport  # noqa: PLC0415
 
         units = units_of(arguments.units)
-        begin, end, note = _registers(arguments.registers or REGISTERS)
+        registers = registers_of(arguments.registers or REGISTERS)
+        begin, end = registers.begin, registers.end
+        note = registers.note(arguments.function)
+        if end > LAST_REGISTER:
+            raise SniffError(note, usage=True)
         if not 0 <= arguments.pause_ms <= 10_000:
             raise SniffError(f"--pause-ms {arguments.pause_ms:g}: give 0 to 10000 ms", usage=True)
         bus = _bus(arguments)
@@ -133,29 +137,59 @@ class ModbusSniffer(Sniffer):
         return ScanReport(bus, scan, functions, note, all_orders=arguments.all_orders).sniffed()
 
 
-def _registers(text: str) -> tuple[int, int, str]:
-    """First and last register, and what to say if they look like the numbers of a manual.
+class RegisterRange(NamedTuple):
+    """Registers to look at.
+
+    Attributes:
+        begin: the first one.
+        end: the last one; beyond the address space only if they look like the numbers of a manual.
+        manuals_first: the number that manuals give the first register, if they look so.
+    """
+
+    begin: int
+    end: int
+    manuals_first: int | None
+
+    @property
+    def there(self) -> str:
+        """The same on the line, if they are numbers of a manual."""
+        first = self.manuals_first or 0
+        return f"{self.begin - first}-{self.end - first}"
+
+    @property
+    def reason(self) -> str:
+        """Why they are most likely numbers of a manual; empty if they are not."""
+        if self.manuals_first is None:
+            return ""
+        kind = "input" if self.manuals_first in _INPUT else "holding"
+        return (
+            f"registers {self.begin} to {self.end} look like numbers of a manual, where {kind} registers "
+            f"begin at {self.manuals_first}; on the line they are {self.there}"
+        )
+
+    def note(self, function: str) -> str:
+        """The same with its remedy, where one of the functions, or all, are to be asked for."""
+        if not self.reason:
+            return ""
+        other = self.manuals_first in _INPUT and function != "both"
+        return f"{self.reason}. Remedy: write --registers {self.there}{' --function 4' if other else ''}"
+
+
+def registers_of(text: str) -> RegisterRange:
+    """The registers of ``A-B``, or ``A``.
 
     Raises:
         SniffError: they are no registers.
     """
     from drivers.modbus.checks import manuals_first  # noqa: PLC0415 - brings the settings
 
-    begin, end = _range(text, "--registers", _LONG_MANUALS_FIRST[-1] + _LAST_REGISTER)
+    begin, end = _range(text, "--registers", _LONG_MANUALS_FIRST[-1] + LAST_REGISTER)
     first = manuals_first(begin) or next(
-        (one for one in _LONG_MANUALS_FIRST if one <= begin <= one + _LAST_REGISTER), None
+        (one for one in _LONG_MANUALS_FIRST if one <= begin <= one + LAST_REGISTER), None
     )
-    note = ""
-    if first is not None:
-        kind, function = ("input", " --function 4") if first in _INPUT else ("holding", "")
-        there = f"{begin - first}-{max(end - first, begin - first)}"
-        note = (
-            f"registers {begin} to {end} look like numbers of a manual, where {kind} registers begin at "
-            f"{first}; on the line they are {there}. Remedy: write --registers {there}{function}"
-        )
-    if end <= _LAST_REGISTER:
-        return begin, end, note
-    raise SniffError(note or _no_range("--registers", text, _LAST_REGISTER), usage=True)
+    if first is None and end > LAST_REGISTER:
+        raise SniffError(_no_range("--registers", text, LAST_REGISTER), usage=True)
+    return RegisterRange(begin, end, first)
 
 
 def units_of(text: str) -> list[int]:
@@ -180,7 +214,7 @@ def _range(text: str, option: str, most: int) -> tuple[int, int]:
     low, _, high = text.partition("-")
     if low.isdecimal() and (high or low).isdecimal() and int(low) <= int(high or low) <= most:
         return int(low), int(high or low)
-    raise SniffError(_no_range(option, text, _LAST_REGISTER if option == "--registers" else most), usage=True)
+    raise SniffError(_no_range(option, text, LAST_REGISTER if option == "--registers" else most), usage=True)
 
 
 def _no_range(option: str, text: str, most: int) -> str:

@@ -92,6 +92,7 @@ FREE = {
     "username": st.one_of(st.just("none"), WORDS),
     "password-file": WORDS,
     "units": st.sampled_from(["auto", "1-247", "5,17", "0-300", "all"]),
+    "registers": st.sampled_from(["auto", "4000-4019", "17", "30001-30010", "400001-400010", "9-3"]),
     "no-value": st.sampled_from(["none", "0x7FFF", "0xFFFF", "-1", "70000", "0xFFFFFFFF"]),
     "address": st.integers(0, 65_535).map(str),
     "sensitivity": st.sampled_from(["none", "7.87", "100", "4", "10.2"]),
@@ -406,7 +407,27 @@ def test_answers_of_a_file_are_those_of_the_options(tmp_path, capsys):
             ["--yes", "--bus=can", "--id=0x123456789"],
             "Remedy: write the id of the frames, which candump shows",
         ),
-        (["--yes", "--host", "a"], "--host is not asked for with these answers; leave it out"),
+        (["--yes", "--host", "a"], "--host is not asked for with these answers; it needs --bus modbus-tcp"),
+        (
+            ["--yes", "--bus=modbus-tcp", "--host=a", "--registers=4000-4100"],
+            "--registers 4000-4100 is for --listen only; add --listen, or leave it out [C22]",
+        ),
+        (
+            ["--yes", "--listen", "--bus=serial", "--registers=4000-4100"],
+            "--registers is not asked for with these answers; it needs --bus modbus-tcp or modbus-rtu [C22]",
+        ),
+        (
+            ["--yes", "--listen", "--bus=modbus-tcp", "--host=a", "--registers=4100-4000"],
+            "--registers 4100-4000: write FIRST-LAST from 0 to 65535, e.g. 1-10 [C22]",
+        ),
+        (
+            ["--yes", "--listen", "--bus=modbus-tcp", "--host=a", "--registers=400101-400110"],
+            "holding registers begin at 400001; on the line they are 100-109: write 100-109 [C22]",
+        ),
+        (
+            ["--yes", "--bus=modbus-tcp", "--host=a", "--units=0-300"],
+            "--units 0-300: write FIRST-LAST from 0 to 255, e.g. 1-10 [C22]",
+        ),
         (
             ["--yes", "--bus=serial", "--port=/dev/ttyS0", "--channels=x"],
             "--channels is not asked for with these answers; write --columns instead",
@@ -667,6 +688,14 @@ def test_a_number_of_the_manual_is_asked_again_with_the_address_that_it_means():
     assert answers["sensor.a.address"] == 30_001
     assert len(said) == 1
     assert asked(["30000"], "modbus-tcp")[1] == []
+
+
+def test_whoever_has_such_addresses_is_asked_once_only():
+    """The channel behind one at 30001 most likely has such an address, too: Enter must not take another."""
+    answers, said, shown = asked(["30001", "30001"], "modbus-tcp", channels="a, b")
+    assert (answers["sensor.a.address"], answers["sensor.b.address"]) == (30_001, 30_002)
+    assert len(said) == 1
+    assert shown == ["0", "0"]
 
 
 @pytest.mark.parametrize(

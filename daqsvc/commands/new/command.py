@@ -271,7 +271,7 @@ def _heard(folder: Path, bus: BusQuestions, answers: Answers) -> Heard | None:
     except SniffError as error:
         _say(f"  Nothing was found: {error}")
         return None
-    _say("  Found, and proposed below:")
+    _say("  Found:" if heard.missed else "  Found, and proposed below:")
     for line in heard.lines:
         _say(f"    {line}")
     return heard

@@ -6,10 +6,12 @@ import difflib
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from daqsvc.commands.new.buses import bus_of
+from daqsvc.commands.new.buses import bus_of, buses
 from daqsvc.commands.new.machine_text import machine_text, questions
 from daqsvc.commands.new.sensors import why_no_bearing
+from daqsvc.commands.new.topics import TOPICS
 from daqsvc.errors.command_line import ANSWER
+from drivers.bus_questions import SHARED
 from drivers.questions import SENSOR, Answers, Question
 
 if TYPE_CHECKING:
@@ -60,6 +62,8 @@ def conduct(
     Raises:
         AnswerError: what was given cannot be used, or something is missing.
     """
+    if listen is None:
+        _refuse_for_listening(given)
     interview = _Interview(file, given, ask, say, listen, answered)
     while not interview.is_over():
         pass
@@ -119,7 +123,7 @@ class _Interview:
                 self._say(refused)
                 _answer(question, self._ask, self._say, self.answers, self._file)
                 self._typed.append(key)
-        elif question.default is not None and (self._given.defaults or question.quiet):
+        elif question.default is not None and (self._given.defaults or self._is_quiet(question)):
             reason = take(question, question.default, self.answers, self._file)
             if reason is not None:
                 raise AnswerError(f"{option(key)} must be given: {question.default} cannot be used: {reason}")
@@ -130,6 +134,18 @@ class _Interview:
             self._typed.append(key)
         if self._answered is not None:
             self._answered(question, self.answers)
+        self._behind(key)
+
+    def _is_quiet(self, question: Question) -> bool:
+        """Whether the default is taken; of what is looked for, unless a person listens."""
+        if question.key != "bus" and question.key in bus_of(self.answers).for_listening:
+            return self._listen is None or self._ask is None
+        return question.quiet
+
+    def _behind(self, key: str) -> None:
+        """What follows the answer to a question."""
+        if key == "bus":
+            _refuse_of_other_buses(self._given, self.answers)
         if self._listen is not None:
             self._listen_behind(key, self._listen)
 
@@ -140,6 +156,8 @@ class _Interview:
             self._say("--listen is left out: on a bus of this kind there is nothing to listen to")
         if key == bus.listens_behind:
             self._heard = listen(bus, self.answers)
+            if self._typed and (self._heard is None or self._heard.missed):
+                self._say("< goes back to correct an answer; then it listens again")
 
     def _go_back(self) -> None:
         """Forget the last answer of a person, and what was taken by itself behind it."""
@@ -259,6 +277,31 @@ def _missing(question: Question) -> str:
     return f"{words}{more}; there is no terminal to ask at"
 
 
+def _refuse_for_listening(given: Given) -> None:
+    """What tells where to look is of no use to who does not look."""
+    for key in {key for bus in buses().values() for key in bus.for_listening}:
+        if key in given.texts:
+            raise AnswerError(
+                f"{given_as(key, given.texts[key])} is for --listen only; add --listen, or leave it out"
+            )
+
+
+def _refuse_of_other_buses(given: Given, answers: Answers) -> None:
+    """The same as `_refuse_others`, as soon as the bus is known and before a person has answered more."""
+    for key in given.texts:
+        if _buses_of(key, answers):
+            raise AnswerError(
+                f"{option(key)} is not asked for with these answers; {_why_not_asked(key, (), answers)}"
+            )
+
+
+def _buses_of(key: str, answers: Answers) -> list[str]:
+    """On which buses a question is asked that is not asked on this one; none if it is asked on any."""
+    if key in SHARED or key in TOPICS or key in bus_of(answers).topics:
+        return []
+    return [word for word, bus in buses().items() if key in bus.topics]
+
+
 def _refuse_others(given: Given, interview: _Interview) -> None:
     """An answer to no question is a slip of the pen, or is of another bus."""
     asked = interview.asked
@@ -283,6 +326,8 @@ _INSTEAD = {"channels": "columns"}
 
 def _why_not_asked(key: str, asked: Sequence[str], answers: Answers) -> str:
     """What is missing for a question, or what was meant instead."""
+    if other_buses := _buses_of(key, answers):
+        return f"it needs --bus {' or '.join(other_buses)}"
     channels = bus_of(answers).channels(answers)
     channel = key.removeprefix(f"{SENSOR}.").rpartition(".")[0]
     if key.startswith(f"{SENSOR}.") and channel not in channels:

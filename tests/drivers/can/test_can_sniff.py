@@ -525,6 +525,8 @@ def test_new_says_that_the_dbc_file_is_of_another_device(
     said = capsys.readouterr().out
     assert said.count(", not in the DBC file\n") == 2
     assert "No frame is as other.dbc describes: it is most likely the file of another device." in said
+    assert "\n  Found:\n" in said
+    assert "Found, and proposed" not in said
 
 
 @pytest.mark.usefixtures("hub")

@@ -20,6 +20,7 @@ from support.ports import free_port
 from support.waiting import PATIENCE_S
 
 from daqsvc.cli import main
+from daqsvc.commands.new.interview import BackError, Given, conduct
 from drivers.modbus import questions, scan, sniff
 from sim_hw.nodes.modbus_node import ModbusRtuServer, ModbusTcpServer, PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit
@@ -27,6 +28,9 @@ from sim_hw.nodes.modbus_unit import ModbusUnit
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
     from pathlib import Path
+
+    from drivers.bus_questions import BusQuestions, Heard
+    from drivers.questions import Answers, Question
 
 pytestmark = pytest.mark.integration
 BEGIN = 'schema_version = 1\nsite = "lab"\nbox = "edge-1"\n\n[machine]\nname = "fan"\nspeed_rpm = 1480.0\n\n'
@@ -526,7 +530,91 @@ def test_new_proposes_the_unit_and_the_table_of_a_device_whose_registers_are_els
         said = capsys.readouterr().out
         assert "Nothing was found" not in said
         assert "unit 5 has no holding registers: it refuses function 3" in said
-        assert "unit 5 answers for input registers, but has none of 0 to 45: see its manual" in said
+        assert "unit 5 answers for input registers, but has none of 0 to 45: see its manual for " in said
+        assert "\n  Found:\n" in said
+
+
+class Elsewhere(ModbusUnit):
+    """A unit whose values are beyond the registers that are read unless others are asked for."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._count = 0
+
+    def answer(self, pdu: bytes) -> bytes:
+        self._count += 1
+        self.put("holding", 4000, struct.pack(">4f", 2.35, 61.5, 1480.0 + 0.01 * self._count, 0.87))
+        self.put("input", 30_001, struct.pack(">2f", 2.35, 61.5))
+        return super().answer(pdu)
+
+
+def test_new_looks_at_the_registers_that_it_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with tcp({3: Elsewhere()}) as target:
+        holding = new(tmp_path, target, "--units=3", "--registers=4000-4009")["streams"]["device"]["layout"]
+        said = capsys.readouterr().out
+        inputs = new(tmp_path, target, "--units=3", "--registers=30001-30004")["streams"]["device"]["layout"]
+        capsys.readouterr()
+        new(tmp_path, target, "--units=3", "--registers=40001-40004")
+    assert "units that answer: 3 (unit 3 was asked)" in said
+    assert "unit 3 has holding registers 4000 to 4007 (4000 to 4009 were asked; --registers looks" in said
+    assert "  4002: 61.5 as float32 ABCD\n" in said  # the next number moves, this one does not
+    assert said.count(", moves\n") == 1
+    assert [(one["address"], one["type"]) for one in holding["channels"]] == [
+        (address, "float32") for address in (4000, 4002, 4004, 4006)
+    ]
+    assert (inputs["unit"], inputs["table"]) == (3, "input")
+    assert [(one["address"], one["type"]) for one in inputs["channels"]] == [
+        (30_001, "float32"),
+        (30_003, "float32"),
+    ]
+    said = capsys.readouterr().out
+    assert "answers for holding registers, but has none of 40001 to 40004: see its manual for their" in said
+    assert "on the line they are 0-3. Remedy: write --registers 0-3\n" in said
+
+
+def test_at_a_terminal_it_asks_which_registers_and_going_back_asks_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever reads registers with numbers as in manuals has them in the device."""
+    monkeypatch.setattr(sniff, "REGISTERS", "0-3")
+    texts = {"registers": ["", "30001-30004", "30001-30004"], "unit": ["<", ""]}
+    shown: list[tuple[str, str | None]] = []
+    said: list[str] = []
+
+    def ask(question: Question) -> str:
+        shown.append((question.key, question.default))
+        text = texts[question.key].pop(0) if question.key in texts else ""
+        if text == "<":
+            raise BackError
+        return text or f"{question.default}"
+
+    def listen(bus: BusQuestions, answers: Answers) -> Heard:
+        return bus.listen(answers, tmp_path, threading.Event(), lambda _line: None)
+
+    with tcp({3: Elsewhere()}) as target:
+        given = Given({"bus": "modbus-tcp", "host": target, "units": "3"}, defaults=False)
+        answers = conduct(tmp_path / "m.toml", given, ask, said.append, listen)
+    registers = [default for key, default in shown if key == "registers"]
+    assert registers == ["auto", "auto", "0-3"]  # the numbers of a manual are doubted once
+    assert said[0] == "< goes back to correct an answer; then it listens again"
+    assert "where input registers begin at 30001; on the line they are 0-3. Enter takes 0-3; type" in said[1]
+    assert len(said) == 2
+    assert [answers[f"sensor.{name}.address"] for name in answers["channels"]] == [30_001, 30_003]
+
+
+def test_without_listening_nobody_is_asked_for_registers_to_look_at(tmp_path: Path) -> None:
+    asked: list[str] = []
+
+    def ask(question: Question) -> str:
+        asked.append(question.key)
+        return f"{question.default}"
+
+    given = Given({"bus": "modbus-rtu", "port": "/dev/ttyS0"}, defaults=False)
+    conduct(tmp_path / "m.toml", given, ask, asked.append)
+    assert "parity" in asked
+    assert "registers" not in asked
 
 
 def test_units_may_be_a_list(capsys: pytest.CaptureFixture[str]) -> None:
