@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import defaultdict, deque
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.standing import cause_of
@@ -53,11 +53,12 @@ class Lacking(NamedTuple):
     """What a detector has lacked in the last seconds: on this depends when its quality alarm returns.
 
     Attributes:
-        weight: excess of partial statements over good ones, 0 to `LASTING`.
+        weight: excess of partial statements over good ones, 0 to 8.
         lasts: whether partial statements prevail.
-        times_ns: of its statements about samples in the last `SHARE_NS`, by the monotonic clock, ns.
+        times_ns: of its statements about samples in the last 5 s, by the monotonic clock of the box, ns.
         shares: share of the samples that was missing, 0 to 1, by statement.
-        blind_ns: when it could judge nothing the last time, by the monotonic clock; None if that is over.
+        blind_ns: when it could judge nothing the last time, by the monotonic clock of the box, ns; null if
+            that is over.
     """
 
     weight: int
@@ -65,6 +66,30 @@ class Lacking(NamedTuple):
     times_ns: list[int]
     shares: list[float]
     blind_ns: int | None
+
+    @classmethod
+    def of(cls, told: Mapping[str, Any]) -> Self:
+        """What a file states.
+
+        Raises:
+            KeyError: something is missing.
+            TypeError: something is of another type.
+            ValueError: something cannot be.
+        """
+        blind_ns = told["blind_ns"]
+        made = cls(
+            int(told["weight"]),
+            bool(told["lasts"]),
+            [int(one) for one in told["times_ns"]],
+            [float(one) for one in told["shares"]],
+            None if blind_ns is None else int(blind_ns),
+        )
+        in_range = 0 <= made.weight <= LASTING and all(0.0 <= share <= 1.0 for share in made.shares)
+        if not in_range or len(made.times_ns) != len(made.shares):
+            raise ValueError(
+                f"lacking: weight {made.weight}, {len(made.times_ns)} times: such shares cannot be"
+            )
+        return made
 
 
 class Touched(NamedTuple):

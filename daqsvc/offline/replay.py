@@ -284,7 +284,7 @@ class Replay:
             iso_utc(self._begin_ns + self._wall_ns)  # there is such a time
             self._standings = {n: StreamState(**one) for n, one in dict(about["standings"]).items()}
             before = [alarm_event(json.dumps(one).encode()) for one in about["alarms"]]
-            lacking = {name: Lacking(**one) for name, one in dict(about.get("lacking", {})).items()}
+            lacking = {name: Lacking.of(one) for name, one in dict(about.get("lacking", {})).items()}
             changed_ns = about.get("changed_ns")
             if changed_ns is not None and int(changed_ns) > self._begin_ns:
                 self._result.notes.append(

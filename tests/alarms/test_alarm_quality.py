@@ -239,7 +239,7 @@ def test_a_replay_from_amid_a_shortage_returns_the_alarm_when_it_returned(cut):
     replayed = AlarmManager(RIG, (BEARING,), SettableClock())
     replayed.resume(before[-1:], {"bank": ("probe-x", "probe-y")}, restarted=False)
     lacking = json.loads(json.dumps({name: one._asdict() for name, one in until_then.lacking().items()}))
-    replayed.remember({name: Lacking(**one) for name, one in lacking.items()})
+    replayed.remember({name: Lacking.of(one) for name, one in lacking.items()})
     events = [event for one in taken[cut:] for event in replayed.take(one)]
     assert [(e.alarm, e.kind, e.t_ns) for e in events] == [
         (e.alarm, e.kind, e.t_ns) for e in rig.events[len(before) :]

@@ -36,6 +36,8 @@ ABOUT: dict[str, Any] = {
     "streams": {},
 }
 
+LACKED = {"weight": 0, "lasts": False, "times_ns": [10**9], "shares": [0.5], "blind_ns": None}
+
 
 def machine_json() -> bytes:
     return json.dumps(machine_values(recorded_rig("unused")[0])).encode()
@@ -50,6 +52,12 @@ def machine_json() -> bytes:
         ({"begin_ns": float("inf")}, None),
         ({"wall_ns_at_0": 10**21}, None),
         ({"standings": {"shaft": {"mood": 1}}}, None),
+        ({"lacking": {"bank": 7}}, None),
+        ({"lacking": {"bank": {"weight": 1}}}, None),
+        ({"lacking": {"bank": {**LACKED, "shares": []}}}, None),
+        ({"lacking": {"bank": {**LACKED, "shares": [float("inf")]}}}, None),
+        ({"lacking": {"bank": {**LACKED, "weight": 10**9}}}, None),
+        ({"lacking": {"bank": {**LACKED, "blind_ns": "soon"}}}, None),
         ({"alarms": [{"schema": "daqsvc.alarm/1"}]}, None),
         ({"version": None, "alarms": 7}, None),
     ],

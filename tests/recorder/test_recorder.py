@@ -18,7 +18,7 @@ from support.waiting import PATIENCE_S, eventually
 from daqsvc.acquisition.clock import NS_PER_S, DrivenClock
 from daqsvc.acquisition.samples import SampleBlock, Window
 from daqsvc.acquisition.standing import StreamState
-from daqsvc.alarms.events import AlarmEvent, EventKind, Identity
+from daqsvc.alarms.events import AlarmEvent, Doubt, EventKind, Identity
 from daqsvc.alarms.quality import Lacking, SensorHealth
 from daqsvc.alarms.states import AlarmState, Level
 from daqsvc.confined.limits import ResourceLimits
@@ -109,12 +109,18 @@ class Bench:
         self.recorder.diagnosis(replace(told, statistics={"speed": speed_rpm}, units={"speed": "rpm"}))
 
     def alarm(self, name: str = "rotor-fault", kind: EventKind = EventKind.RAISED) -> None:
+        self.recorder.alarm(self.event(name, kind))
+
+    def event(
+        self, name: str, kind: EventKind = EventKind.RAISED, doubts: tuple[Doubt, ...] = ()
+    ) -> AlarmEvent:
         now_ns = self.clock.monotonic_ns()
         cause = Diagnosis("laval-rig", "rotor-bank", now_ns, "shaft", 0, 1, "F1")
         states = AlarmState.NORMAL, AlarmState.ACTIVE_UNACKNOWLEDGED
         levels = Level.NORMAL, Level.ALERT
         identity = Identity("demo", "virtual", "laval-rig")
-        self.recorder.alarm(AlarmEvent(identity, name, "1", kind, *states, *levels, now_ns, 0, cause, "bad"))
+        event = AlarmEvent(identity, name, "1", kind, *states, *levels, now_ns, 0, cause, "bad")
+        return replace(event, doubts=doubts)
 
     @property
     def files(self) -> list[Path]:
@@ -836,6 +842,23 @@ async def test_a_snapshot_states_what_detectors_had_lacked_when_it_begins(
         await one.passes(2.0)
         [path] = one.files
     about, _, _, _ = held(path)
-    assert {name: Lacking(**told) for name, told in about["lacking"].items()} == until_then.lacking()
+    assert {name: Lacking.of(told) for name, told in about["lacking"].items()} == until_then.lacking()
     assert about["lacking"]["levels/x"]["shares"] == [1.0, 0.25, 0.0, 0.5, 0.0, 0.0]
     assert about["lacking"]["levels/x"]["blind_ns"] == blind_ns
+
+
+async def test_a_snapshot_soon_after_a_restart_states_what_was_lacking_before(tmp_path: Path) -> None:
+    async with bench(tmp_path, before_s=0.5) as one:
+        await one.passes(20.0)
+        doubt = Doubt("levels/x", "missing", False, "lost", ("probe-x",))
+        one.recorder.take_over([one.event("sensor-ok/probe-x", doubts=(doubt,))])
+        restarted_ns = one.clock.monotonic_ns()
+        await one.passes(0.1)
+        said = Diagnosis("laval-rig", "levels/x", one.clock.monotonic_ns(), "shaft", 0, 1, "normal")
+        one.recorder.diagnosis(replace(said, missing_share=0.0, sensors=("probe-x",)))
+        await one.passes(0.8)
+        one.alarm()
+        await one.passes(2.0)
+        [path] = one.files
+    about, _, _, _ = held(path)
+    assert about["lacking"]["levels/x"]["blind_ns"] == restarted_ns
