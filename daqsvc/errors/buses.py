@@ -445,3 +445,17 @@ NO_VALUE_MARK = Code(
     "into its channel if the device's manual has it, or ok_between with the least and the greatest value "
     "that the sensor can measure",
 )
+TIMES_SHARED = Code(
+    "B46",
+    "Several lines may have the same time",
+    "The unit of the device's time is longer than the time between two lines. If the device sends whole "
+    "numbers, several lines have the same time. Each of them is a sample, in the order of arrival. But a "
+    "single lost line is mostly not noticed, and of several lost in a row one may not be counted.",
+    "Have the device send a counter, or its time in a finer unit. Leave it if the device sends decimals that "
+    "are finer than the time between lines.",
+    "serial.md#lines-of-text",
+    example='machine.toml:97: streams.timed.layout.time.unit = "s": is longer than the 0.01 s from line to '
+    "line: if the device sends whole s, several lines have the same time. A single lost line is then mostly "
+    'not noticed. Remedy: have the device send a counter, or ms with unit = "ms"; if it sends decimals, e.g. '
+    "12.345 s, leave it",
+)

@@ -14,13 +14,22 @@ from daqsvc.errors.buses import (
     LOSS_UNNOTICED,
     NOT_TOLD_APART,
     PORT_MAY_CHANGE,
+    TIMES_SHARED,
     WRONG_LAYOUT,
 )
 from daqsvc.errors.machine_file import CONTRADICTION, INCOMPLETE, NAMED_TWICE, NO_EFFECT, NO_SUCH_NAME
 from daqsvc.settings.buses import BUSY
 from daqsvc.settings.problems import Finding, choice
 from daqsvc.settings.section import UnusableValueError
-from drivers.serial.settings import CobsBus, LineLayout, LinesBus, SerialBus, SerialLayout, SyncBus
+from drivers.serial.settings import (
+    UNITS_PER_S,
+    CobsBus,
+    LineLayout,
+    LinesBus,
+    SerialBus,
+    SerialLayout,
+    SyncBus,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -30,6 +39,9 @@ if TYPE_CHECKING:
 
 _CHECKSUM_CHARACTERS = {"none": 0, "xor": 3, "crc16": 5}
 """An asterisk and hexadecimal digits."""
+
+EXACT_STAMPS = 4.0
+"""How many times finer than the time between lines stamps must be for every gap to be exact."""
 
 _NUMBERED = re.compile(r"/dev/tty(USB|ACM)\d+")
 
@@ -75,6 +87,7 @@ def check_serial(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[Fi
         return
     if isinstance(layout, LineLayout):
         yield from _check_columns(layout, path)
+        yield from _check_time(layout, stream.rate_hz, (*path, "time", "unit"))
     elif isinstance(layout, SerialLayout):
         yield from _check_room(layout, path)
 
@@ -188,6 +201,26 @@ def _check_columns(layout: LineLayout, path: KeyPath) -> Iterator[Finding]:
                 choice(channel.name, layout.line),
                 code=NO_SUCH_NAME,
             )
+
+
+def _check_time(layout: LineLayout, rate_hz: float, path: KeyPath) -> Iterator[Finding]:
+    """The device's time may tell each line from the next one; whether it has decimals is not known here."""
+    if layout.time is None or layout.counter is not None:
+        return
+    unit = layout.time.unit
+    period = UNITS_PER_S[unit] / rate_hz
+    if period >= 1.0:
+        return
+    finer = next((one for one, per_s in UNITS_PER_S.items() if per_s >= EXACT_STAMPS * rate_hz), "us")
+    yield Finding(
+        path,
+        f"is longer than the {period:.4g} {unit} from line to line: if the device sends whole {unit}, "
+        "several lines have the same time. A single lost line is then mostly not noticed",
+        f'have the device send a counter, or {finer} with unit = "{finer}"; if it sends decimals, e.g. '
+        f"12.345 {unit}, leave it",
+        fatal=False,
+        code=TIMES_SHARED,
+    )
 
 
 def _check_streams(draft: MachineFile, name: str, bus: SerialBus) -> Iterator[Finding]:

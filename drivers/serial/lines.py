@@ -31,6 +31,7 @@ from drivers.serial.line_kernels import (
     read_lines,
 )
 from drivers.serial.line_numbers import ABSENT, NUMBER, fields_of
+from drivers.serial.settings import UNITS_PER_S
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -48,7 +49,6 @@ RETURN = b"\r"
 LONGEST_LINE = 1024
 """Bytes; a line that is longer is garbage."""
 
-UNITS_PER_S: Mapping[str, float] = {"s": 1.0, "ms": 1e3, "us": 1e6}
 TIME_COUNTER_BITS = 32
 LATEST_S = 1e12
 """A device's time in s that is later than this is no time."""

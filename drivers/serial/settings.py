@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
@@ -20,8 +20,13 @@ from daqsvc.settings.packing import (
 )
 from daqsvc.settings.section import MOST_CHANNELS, Name, Quantity, Section
 
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
 LONGEST_PAYLOAD = 4096
 LONGEST_SYNC_WORD = 8
+UNITS_PER_S: Mapping[str, float] = {"s": 1.0, "ms": 1e3, "us": 1e6}
+"""What the time of a line may be in, the coarsest first."""
 
 
 def _sync_word(text: str) -> str:

@@ -54,6 +54,7 @@ GIVEN: list[tuple[str, Path, list[tuple[str, str]]]] = [
         MACHINES / "modbus-vibration-temperature.toml",
         [('"degC"\nok_between = [-40.0, 105.0]', '"degC"')],
     ),
+    ("B46", SERIAL, [('column = "t", unit = "ms"', 'column = "t", unit = "s"')]),
     ("B24", SERIAL, [('"/dev/serial/by-id/usb-a"', '"/dev/ttyUSB0"')]),
     ("D10", LAVAL, [("noise_um = 2.0", "noise_um = 200.0")]),
     (

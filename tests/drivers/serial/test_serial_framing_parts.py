@@ -352,6 +352,15 @@ def test_lines_that_share_a_stamp_are_samples_each(grain_s, rate_error):
     assert counts[8000] - counts[6000] > 2040 - grain_s / 0.01
 
 
+def test_a_single_lost_line_does_not_show_in_stamps_that_lines_share():
+    """The check of the machine file warns of it."""
+    stamps = np.floor(np.arange(20_000) / 2.0) / 1e3
+    one_lost = np.delete(stamps, np.arange(1000, 20_000, 500))
+    assert DeviceTime(2000.0).count(one_lost)[-1] == len(one_lost) - 1
+    ten_lost = np.delete(stamps, np.arange(1000, 1010))
+    assert DeviceTime(2000.0).count(ten_lost)[-1] in {20_000 - 1, 20_000 - 2}
+
+
 def test_overtaken_lines_go_back_to_their_places():
     stamps = np.arange(100) * 0.01
     order = np.arange(100)

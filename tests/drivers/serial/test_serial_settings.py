@@ -145,6 +145,36 @@ def test_a_port_with_a_number_is_a_warning():
     assert "/dev/serial/by-id" in str(warning)
 
 
+TIMED = 'line = ["t", "v", "h"]\n', 'time = {{ column = "t", unit = "{}" }}\n'
+
+
+@pytest.mark.parametrize(
+    ("unit", "rate_hz", "period", "finer"),
+    [
+        ("ms", 1000.5, "0.9995", "us"),
+        ("ms", 2000.0, "0.5", "us"),
+        ("s", 200.0, "0.005", "ms"),
+        ("s", 400.0, "0.0025", "us"),
+    ],
+)
+def test_a_time_that_several_lines_may_share_is_a_warning(unit, rate_hz, period, finer):
+    line, time = TIMED
+    edits = ((LINE, line), (COUNTER, time.format(unit)), ("rate_hz = 200.0", f"rate_hz = {rate_hz}"))
+    (warning,) = parsed(SERIAL, *edits, ("baud = 115_200", "baud = 921_600")).warnings
+    assert f'streams.casing.layout.time.unit = "{unit}": is longer than the {period} {unit} from' in str(
+        warning
+    )
+    assert f"if the device sends whole {unit}, several lines have the same time" in str(warning)
+    assert f'{finer} with unit = "{finer}"' in str(warning)
+
+
+@pytest.mark.parametrize(("unit", "rate_hz"), [("ms", 1000.0), ("us", 2000.0)])
+def test_a_time_that_tells_each_line_from_the_next_is_no_warning(unit, rate_hz):
+    line, time = TIMED
+    edits = ((LINE, line), (COUNTER, time.format(unit)), ("rate_hz = 200.0", f"rate_hz = {rate_hz}"))
+    assert not parsed(SERIAL, *edits, ("baud = 115_200", "baud = 921_600")).warnings
+
+
 def test_a_port_belongs_to_one_bus():
     text, _ = changed(
         SERIAL, (PORT, '"/dev/serial/by-id/usb-FTDI_USB__-__Serial_Converter_FT1AB2C3-if00-port0"')
