@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import inspect
 import os
 import signal
@@ -49,6 +50,18 @@ KINDS = ("property", "integration", "statistical", "hil", "conformance")
 # A shell's background job, and nohup, ignore these, and what the tests start would inherit it.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """What is imported stays: to look through it for garbage each time takes seconds in each process."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.collect()  # once: what a module leaves unclosed is found, as what a test does is
+        gc.freeze()
+        gc.enable()
 
 
 @pytest.fixture(scope="session")
@@ -116,11 +129,13 @@ def _encodable(text: str) -> str:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: item.get_closest_marker("first") is None)
     for item in items:
+        marks = {mark.name for mark in item.iter_markers()}
         if (suite := item.path.parent.name) in KINDS:
             item.add_marker(suite)
-        if not any(item.get_closest_marker(kind) for kind in KINDS):
+            marks.add(suite)
+        if marks.isdisjoint(KINDS):
             item.add_marker(pytest.mark.unit)
-        if item.get_closest_marker("statistical"):
+        if "statistical" in marks:
             item.add_marker(pytest.mark.long)
         if isinstance(item, pytest.Function) and inspect.iscoroutinefunction(item.obj):
             item.fixturenames.insert(0, "_no_leaked_tasks")

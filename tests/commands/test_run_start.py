@@ -33,6 +33,7 @@ async def test_what_the_start_has_made_is_not_looked_through_for_garbage_again(m
             self.alarms = SimpleNamespace(outbox=SimpleNamespace(close_from_outside=None))
             self.supervisor = Supervisor()
             self.streams = {}
+            self.made = [[] for _ in range(2000)]
 
         async def run(self, stop):
             frozen.append(gc.get_freeze_count())

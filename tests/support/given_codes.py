@@ -57,15 +57,19 @@ def codes_logged() -> Iterator[Codes]:
         logging.getLogger().removeHandler(listening)
 
 
-def codes_of_marks() -> set[str]:
+@functools.cache
+def codes_of_marks() -> frozenset[str]:
     """Those that tests are marked with, e.g. ``@pytest.mark.gives("B29")``."""
-    return {
+    # Most files have none, and are not parsed: each process of a run needs these codes to know its tests.
+    texts = (file.read_text(encoding="utf-8") for file in (ROOT / "tests").rglob("test_*.py"))
+    return frozenset(
         ast.literal_eval(argument)
-        for file in (ROOT / "tests").rglob("test_*.py")
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        for text in texts
+        if "pytest.mark.gives" in text
+        for node in ast.walk(ast.parse(text))
         if isinstance(node, ast.Call) and ast.unparse(node.func) == "pytest.mark.gives"
         for argument in node.args
-    }
+    )
 
 
 def shape(message: str) -> str:
