@@ -236,11 +236,16 @@ class ModelBank:
         self._put_observers()
         self._compare()
 
+    def look_alike(self, mode: int) -> Flags:
+        """Modes that the observers do not tell from this one at the present speed, bool ``[M]``."""
+        return np.array(self._look_alike[mode])
+
     def exclude(self, excluded: Flags, close: Flags) -> None:
         """Take in what else is known of the modes; it holds until it is called again.
 
         Args:
-            excluded: bool ``[M]``, modes that cannot be true; the decision leaves them.
+            excluded: bool ``[M]``, modes that cannot be true; the decision leaves them, also for one that
+                looks alike.
             close: bool ``[M, M]``, symmetric, modes that are not to be told apart.
         """
         if (excluded == self._excluded).all() and (close == self._close).all():
@@ -289,5 +294,7 @@ class ModelBank:
             evidence = coupled_evidence(self.couplings, self.observers, self._duration)
         else:
             evidence = steady_evidence(self.observers, self._duration)
-        self._alike = within(evidence, self.rules.alike_nats_per_rev) | self._close
+        self._look_alike = within(evidence, self.rules.alike_nats_per_rev)
+        told = np.logical_or.outer(self._excluded, self._excluded)
+        self._alike = (self._look_alike & ~told) | self._close
         self._memory.set_thresholds(np.where(self._alike, math.inf, self.rules.thresholds(len(self.modes))))

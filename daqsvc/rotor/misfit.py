@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.rotor.adaptation import SteadyMotion
+    from daqsvc.rotor.model import NormalisedRotor
 
     Complexes = NDArray[np.complex128]
     Flags = NDArray[np.bool_]
@@ -45,6 +46,14 @@ _FROM_A_LEVEL = frozenset({"normal", "rub"})
 """What has no size from healthy on: a shaft touches or not."""
 _SIGNIFICANT = 2.0
 """Standard deviations of noise that a motion may drift by."""
+_LEAST_CHANGE = 0.1
+"""Part of the healthy 1X by which that of a healthy machine at its speed does not change."""
+_AS_BEFORE = 0.05
+"""Part of it within which the machine is as it was."""
+_CERTAIN = 6.0
+"""Standard deviations of noise that a change of 1X must have to be one by itself."""
+_HUNTING = 1.0 + 0.02 * np.linspace(-1.0, 1.0, 9)
+"""Parts of the speed that a healthy machine may turn at: it hunts by 1 % while it is calibrated, and now."""
 _SETTLING_REV, _STEADY_REV = 60, 10
 _SAME_SPEED = 0.02
 """Relative change of speed from which a rub is simulated again: a revolution at many samples takes long."""
@@ -93,6 +102,35 @@ class SteadyMotions:
         return motions
 
 
+def hunting(healthy: NormalisedRotor, speed: float) -> Complexes:
+    """Where the healthy machine moves at the speeds about one that it is said to turn at.
+
+    Args:
+        healthy: the healthy mode's rotor.
+        speed: normalised speed.
+
+    Returns:
+        complex128 ``[P, 3]``, as of `SteadyMotions.of`; at the speed itself in the middle.
+    """
+    return np.array([_motion(healthy, w) for w in (speed * _HUNTING).tolist()])
+
+
+def _motion(rotor: NormalisedRotor, w: float) -> tuple[complex, complex, complex]:
+    return rotor.orbit(w), rotor.backward_orbit(w), rotor.rest
+
+
+def differs_from(healthy: NormalisedRotor, faulty: NormalisedRotor, speed: float) -> bool:
+    """Whether a bank that measured the healthy 1X is certain of a fault by its steady 1X, but for noise.
+
+    Args:
+        healthy: the healthy mode's rotor.
+        faulty: of a mode that does not touch.
+        speed: normalised speed.
+    """
+    moved = np.array(_motion(faulty, speed)) - np.array(_motion(healthy, speed))
+    return SteadyChange(moved, samples=1).is_certain(hunting(healthy, speed), noise=0.0)
+
+
 def _of_rub(observer: np.void, coupling: np.void, duration: float) -> Complexes:
     turn = float(observer["speed"]) * duration
     per_rev = math.tau / abs(turn)
@@ -138,6 +176,28 @@ class SteadyChange:
 
     moved: Complexes
     samples: int
+
+    def is_certain(self, hunting: Complexes, noise: float) -> bool:
+        """Whether no healthy machine moves so, though the observers may see it as well as the healthy one.
+
+        An observer that may err by much follows an orbit that has grown by half, and its innovations hardly
+        do. Only 1X counts: the mean position also drifts with the probes. A machine that hunts by a percent
+        moves along its own curve of 1X over speed, near a critical speed by as much as a fault does.
+
+        Args:
+            hunting: complex128 ``[P, 3]``, of the healthy mode at the speeds about the present one.
+            noise: standard deviation of the measured position, in clearances.
+        """
+        healthy = hunting[len(_HUNTING) // 2]
+        along = [one[:2] for one in hunting - healthy]
+        off = _distance(self.moved[:2], along, beyond=False)
+        orbit = float(np.linalg.norm(healthy[:2]))
+        return off > max(_LEAST_CHANGE * orbit, _CERTAIN * noise * math.sqrt(4.0 / self.samples))
+
+    def is_over(self, healthy: Complexes) -> bool:
+        """Whether 1X is that of the healthy machine again."""
+        moved, orbit = (float(np.linalg.norm(one[:2])) for one in (self.moved, healthy))
+        return moved < _AS_BEFORE * orbit
 
 
 def steady_change(motions: Sequence[SteadyMotion], healthy: Complexes, noise: float) -> SteadyChange | None:

@@ -14,7 +14,14 @@ from daqsvc.rotor.bank import ModelBank
 from daqsvc.rotor.coupled import couple, couplings_at_speed
 from daqsvc.rotor.decision import DecisionRules
 from daqsvc.rotor.discretise import BankMode, at_speed, discretise
-from daqsvc.rotor.misfit import SteadyChange, SteadyMotions, misfit, steady_change
+from daqsvc.rotor.misfit import (
+    SteadyChange,
+    SteadyMotions,
+    differs_from,
+    hunting,
+    misfit,
+    steady_change,
+)
 from daqsvc.rotor.model import NormalisedRotor
 
 PER_REV = 64
@@ -249,3 +256,54 @@ def test_modes_that_are_not_told_apart_are_one_group_and_do_not_change():
     report = bank.process(*course(modes[2].rotor, 20, seed=1))
     assert report.decision == 1
     assert report.group == (1, 2)
+
+
+@pytest.mark.parametrize("w", [0.8, -0.8])
+def test_the_healthy_machine_nearby_is_the_one_of_the_observers(w):
+    rotor = replace(ROTOR, w=w)
+    modes = [BankMode("N", rotor)]
+    observers = discretise(modes, noise=NOISE, duration=DURATION)
+    couplings = couple(modes, observers, noise=NOISE, duration=DURATION)
+    nearby = hunting(rotor, w)
+    assert nearby[len(nearby) // 2] == pytest.approx(SteadyMotions(DURATION).of(observers, couplings)[0])
+
+
+RESONANT = replace(ROTOR, w=1.0, zeta=0.04, anisotropy=0.0, cross_stiffness=0.001)
+
+
+def certain(forward, w=1.0, noise=1e-4):
+    moved = np.array([forward - RESONANT.orbit(w), 0.0, 0.0])
+    return SteadyChange(moved, samples=640).is_certain(hunting(RESONANT, w), noise)
+
+
+def test_a_machine_moves_along_its_own_curve_while_it_hunts():
+    orbit, hunted = RESONANT.orbit(1.0), RESONANT.orbit(1.015)
+    turned = abs(hunted - orbit)
+    assert turned > 0.3 * abs(orbit)
+    assert not certain(hunted)
+    # As far, but grown; and further along the curve than hunting takes it.
+    assert certain(orbit * (1.0 + turned / abs(orbit)))
+    assert certain(RESONANT.orbit(1.05))
+
+
+def test_a_change_of_a_tenth_of_the_orbit_above_the_noise_is_certain():
+    w = 0.5
+    orbit = RESONANT.orbit(w)
+    # Below the critical speed the orbit grows with the speed, and hardly turns.
+    turned = orbit * (1.0 + 0.11j)
+    assert certain(turned, w)
+    assert not certain(orbit * (1.0 + 0.09j), w)
+    # Six standard deviations of a vector from 640 samples.
+    as_large = 0.11 * abs(orbit) / 6.0 / math.sqrt(4.0 / 640)
+    assert certain(turned, w, noise=0.97 * as_large)
+    assert not certain(turned, w, noise=1.01 * as_large)
+
+
+def test_which_faults_the_steady_motion_tells_from_healthy():
+    grown = replace(RESONANT, e=1.2 * RESONANT.e)
+    loaded = replace(RESONANT, g=3.0 * RESONANT.g)
+    assert differs_from(RESONANT, grown, 1.0)
+    assert not differs_from(RESONANT, replace(RESONANT, e=1.05 * RESONANT.e), 1.0)
+    # The mean position also drifts with the probes; and 1 % of stiffness is half a percent of speed.
+    assert not differs_from(RESONANT, loaded, 1.0)
+    assert not differs_from(RESONANT, replace(RESONANT, k=0.99), 1.0)

@@ -81,12 +81,15 @@ class AmbiguityJson(TypedDict):
         nats_per_rev: the weaker of the two directions of evidence.
         opens_at_rpm: nearest speed that tells them apart; null if there is none.
         open_nats_per_rev: the weaker direction there; null without one.
+        by_steady_1x: whether the other mode is seen all the same, as a change of the healthy steady 1X. Only
+            a bank from a run-up does this, near the speed that it calibrated at.
     """
 
     modes: list[str]
     nats_per_rev: float
     opens_at_rpm: float | None
     open_nats_per_rev: float | None
+    by_steady_1x: bool
 
 
 class SmallestChangeJson(TypedDict):
@@ -176,6 +179,7 @@ def as_json(prediction: BankDetectability, machine: MachineFile) -> BankDetectab
                 "nats_per_rev": ambiguity.nats_per_rev,
                 "opens_at_rpm": None if ambiguity.opens_at_w is None else units.rpm(ambiguity.opens_at_w),
                 "open_nats_per_rev": ambiguity.open_nats_per_rev,
+                "by_steady_1x": ambiguity.by_steady_1x,
             }
             for ambiguity in prediction.ambiguities
         ],
@@ -308,8 +312,12 @@ def _ambiguity(prediction: BankDetectability, ambiguity: Ambiguity, rpm: str, un
     sentence = f"{one} and {other} cannot be told apart at {rpm}"
     if prediction.pair(one, other).simulated:
         return f"{sentence}; a rub is not simulated at other speeds."
+    nowhere = "nor at any speed within 30 % of it"
+    if ambiguity.by_steady_1x:
+        sentence = f"The observers take {other} for {one} at {rpm}, but it is seen in the steady 1X"
+        nowhere = "and they do so at every speed within 30 % of it"
     if ambiguity.opens_at_w is None or ambiguity.open_nats_per_rev is None:
-        return f"{sentence}, nor at any speed within 30 % of it."
+        return f"{sentence}, {nowhere}."
     return (
         f"{sentence}; at {units.rpm(ambiguity.opens_at_w):.6g} rpm they differ by "
         f"{_figure(ambiguity.open_nats_per_rev)} nats a revolution."

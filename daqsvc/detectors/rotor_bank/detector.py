@@ -25,7 +25,7 @@ from daqsvc.dsp.speed.keyphasor import KeyphasorProbe, KeyphasorTracker
 from daqsvc.rotor.adaptation import MODEL_ERROR, VARIANCE_FACTOR, SteadyFit, adapted
 from daqsvc.rotor.bank import UNDETERMINED, BankReport, ModelBank
 from daqsvc.rotor.decision import DecisionRules
-from daqsvc.rotor.misfit import SteadyMotions, misfit, steady_change
+from daqsvc.rotor.misfit import SteadyMotions, hunting, misfit, steady_change
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -45,6 +45,8 @@ _MIN_PROBE_SPREAD = 0.5
 """Least |sin| of the angle between the probes: 30 degrees apart they still see both axes."""
 _RETUNE = 0.003
 """Relative change of speed that the reference orbits follow; smaller ones are jitter of the edges."""
+_SAME_SPEED = 0.02
+"""Relative difference from the speed of the calibration up to which its motion is the healthy one."""
 _BLIND_REVOLUTIONS = 3.0
 """Time for which the angle is trusted without an edge."""
 
@@ -186,6 +188,7 @@ class RotorBankDetector:
         self._calibrate_revolutions = calibrate_revolutions
         self._calibration = SteadyFit() if calibrate_revolutions else None
         self._departed = False
+        self._calibrated_speed = math.nan
         self._steady_motions = SteadyMotions(self._duration)
         self._misfit = math.nan
         self._last_revolution = np.empty((0, 3))
@@ -369,28 +372,42 @@ class RotorBankDetector:
         ]
 
     def _compare_steady(self, report: BankReport) -> None:
-        """Leave out the faults that the steady motion after a change is too far from."""
+        """Leave out the modes that the steady motion is too far from, also the healthy one."""
         bank, count = self._bank, len(self._modes)
-        if not len(bank.couplings) or self._rules.rule != "cusum":
+        if not len(bank.couplings) or self._rules.rule != "cusum" or bank.decision == UNDETERMINED:
             return
-        if bank.decision in {UNDETERMINED, 0} and report.departure is None:
+        nearby = hunting(self._bank_modes[0].rotor, bank.speed)
+        healthy = nearby[len(nearby) // 2]
+        change = steady_change(self._watch.motions, healthy, self._noise)
+        certain = change is not None and self._at_calibrated_speed and change.is_certain(nearby, self._noise)
+        if bank.decision == 0 and report.departure is None and not certain:
             self._misfit = math.nan
             bank.exclude(np.zeros(count, dtype=np.bool_), np.zeros((count, count), dtype=np.bool_))
             return
-        motions = self._steady_motions.of(bank.observers, bank.couplings)
-        change = steady_change(self._watch.motions, motions[0], self._noise)
         if change is None:
+            return
+        healthy_like = bank.look_alike(0)
+        if healthy_like[bank.decision] and change.is_over(healthy):
+            # The observers would never go back to healthy from a mode that looks like it.
+            healthy_like[0] = False
+            bank.exclude(healthy_like, np.zeros((count, count), dtype=np.bool_))
             return
         off = misfit(
             change,
-            motions,
+            self._steady_motions.of(bank.observers, bank.couplings),
             list(self._faults.values()),
             noise=self._noise,
             nats=self._rules.group_nats,
             exact=self._exact,
         )
+        off.excluded[0] |= certain
         bank.exclude(off.excluded, off.pairs)
-        self._misfit = float(off.part[max(bank.decision, 0)])
+        self._misfit = float(off.part[bank.decision])
+
+    @property
+    def _at_calibrated_speed(self) -> bool:
+        """Whether the healthy motion needs no model to be known."""
+        return abs(self._bank.speed / self._calibrated_speed - 1.0) < _SAME_SPEED
 
     def _calibrate(
         self, xy: Floats, cos: Floats, sin: Floats, verdict: RevolutionQuality, end_index: int, t_ns: int
@@ -402,7 +419,7 @@ class RotorBankDetector:
             return []
         motion = self._calibration.solve()
         speed = self._direction * 2.0 * math.pi / self._tracker.period_samples / self._duration
-        self._bank_modes = adapted(self._bank_modes, motion, speed)
+        self._bank_modes, self._calibrated_speed = adapted(self._bank_modes, motion, speed), speed
         self._bank = self._new_bank(variance_factor=self.variance_factor, decision=0)
         self._steady_motions = SteadyMotions(self._duration)
         self._calibration = None

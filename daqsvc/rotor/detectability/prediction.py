@@ -29,6 +29,7 @@ from daqsvc.rotor.detectability.evidence import (
     simulate_rubs,
     steady_growth,
 )
+from daqsvc.rotor.misfit import differs_from
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -330,12 +331,15 @@ class Ambiguity:
         opens_at_w: nearest normalised speed within 30 % that tells them apart; None if there is none, or
             if one of them rubs and no other speed was simulated.
         open_nats_per_rev: the weaker direction there.
+        by_steady_1x: whether a bank from a run-up sees the one in its steady 1X, as a change from the other,
+            the healthy mode, which its observers take for the same.
     """
 
     modes: tuple[str, str]
     nats_per_rev: float
     opens_at_w: float | None
     open_nats_per_rev: float | None
+    by_steady_1x: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -546,6 +550,7 @@ def _of_two_modes(
                 nats_per_rev=float(weakest[i, j]),
                 opens_at_w=opens and opens[0],
                 open_nats_per_rev=opens and opens[1],
+                by_steady_1x=i == 0 and not modes[j].rub and differs_from(modes[0].rotor, modes[j].rotor, w),
             )
         )
 

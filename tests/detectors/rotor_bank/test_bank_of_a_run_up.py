@@ -85,13 +85,16 @@ def said_of(machine, parts, seed=0):
     position = np.concatenate(
         [of(angle[k * n : k * n + n]) for k, one in enumerate(parts) for of in (positions_of(one),)]
     )
-    samples = channels(position, angle, seed).astype(np.float32)
+    return detector, said_by(detector, channels(position, angle, seed).astype(np.float32))
+
+
+def said_by(detector, samples):
     said = []
     for begin in range(0, len(samples), detector.block):
         part = samples[begin : begin + detector.block]
         last = begin + len(part) - 1
         said += detector.process(Window(begin, part, round(last * 1e9 / RATE_HZ), 1e9 / RATE_HZ))
-    return detector, said
+    return said
 
 
 def positions_of(part):
@@ -163,6 +166,55 @@ def test_what_no_mode_explains_leaves_the_faults_together(calibrated):
     assert said[-1].decision != "N"
     assert {"stiffness_loss", "damping_loss"} <= {detector.faults[name] for name in said[-1].group}
     assert said[-1].statistics["misfit"] > 0.3
+
+
+FOLLOWING = ("calibrate_revolutions = 20", "calibrate_revolutions = 20\nprocess_noise = 0.05")
+"""Observers that are so unsure of their machine that they follow whatever it does."""
+
+
+def grown(part):
+    return replace(MACHINE, eccentricity_um=part * MACHINE.eccentricity_um)
+
+
+def test_an_orbit_that_observers_follow_is_seen_by_its_steady_motion(calibrated):
+    machine = machine_of(calibrated, FOLLOWING)
+    detector, said = said_of(machine, [MACHINE, grown(1.5), MACHINE])
+    begin, end = (k * 60.0 * RATE_HZ / SPEED_HZ for k in (1, 2))
+    healthy_again = said[-1]
+    during = [one for one in said if begin < one.end_index <= end]
+    # By themselves they take it for the healthy machine, whatever it does.
+    assert detector._bank.look_alike(0)[[mode.name for mode in detector.bank_modes].index("U1")]
+    assert {one.decision for one in said if one.end_index <= begin and one.revolutions > 25} == {"N"}
+    assert detector.faults[during[-1].decision] == "unbalance"
+    assert "N" not in during[-1].group
+    assert healthy_again.decision == "N"
+
+
+def test_what_only_the_steady_motion_shows_is_predicted(calibrated, capsys):
+    machine_of(calibrated, FOLLOWING)
+    arguments = ["detectability", str(calibrated / "machine.toml")]
+    assert main([*arguments, "--json"]) == 0
+    predicted = json.loads(capsys.readouterr().out)
+    seen = {tuple(one["modes"]): one["by_steady_1x"] for one in predicted["ambiguous"]}
+    assert seen["N", "U1"]
+    # Of two faults neither is the healthy machine, and a load moves no 1X.
+    assert not any(shown for (first, _), shown in seen.items() if first != "N")
+    assert main(arguments) == 0
+    printed = capsys.readouterr().out
+    assert "The observers take U1 for N at 1680.97 rpm, but it is seen in the steady 1X" in printed
+
+
+@pytest.mark.parametrize("part", [1.0, 1.05])
+def test_a_machine_that_hunts_about_its_critical_speed_is_healthy(calibrated, part):
+    machine = machine_of(calibrated, FOLLOWING)
+    detector = bank_detector(machine, settings_of(machine))
+    turns = np.arange(round(400.0 * RATE_HZ / SPEED_HZ)) * SPEED_HZ / RATE_HZ
+    angle = math.tau * (turns + 0.01 * 50.0 / math.tau * np.sin(math.tau * turns / 50.0))
+    position = MACHINE.move(angle)
+    position[len(position) // 2 :] = grown(part).move(angle)[len(position) // 2 :]
+    samples = channels(position, angle).astype(np.float32)
+    said = said_by(detector, samples[round(30.0 * RATE_HZ / SPEED_HZ) :])
+    assert {one.decision for one in said if one.revolutions > 25} == {"N"}
 
 
 def test_a_run_up_needs_healthy_revolutions_beside_it(calibrated):
