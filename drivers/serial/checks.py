@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from contextlib import suppress
 from itertools import combinations
@@ -67,6 +68,7 @@ def check_serial(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[Fi
                 "correct one of them, as the device sends it",
                 code=CONTRADICTION,
             )
+        yield from _check_suffixes(layout, bus.delimiter, path)
     elif isinstance(bus, CobsBus | SyncBus):
         if not isinstance(layout, SerialLayout):
             yield Finding(
@@ -203,6 +205,19 @@ def _check_columns(layout: LineLayout, path: KeyPath) -> Iterator[Finding]:
             )
 
 
+def _check_suffixes(layout: LineLayout, delimiter: str, path: KeyPath) -> Iterator[Finding]:
+    """A text behind numbers has neither a separator nor the end of the line in it."""
+    for index, channel in enumerate(layout.channels):
+        for what, mark in (("separator", layout.separator), ("delimiter", delimiter)):
+            if channel.suffix is not None and mark in channel.suffix:
+                yield Finding(
+                    (*path, "channels", index, "suffix"),
+                    f"has the {what} {json.dumps(mark)} in it",
+                    "correct one of them; what comes behind a separator is a separate column in line",
+                    code=CONTRADICTION,
+                )
+
+
 def _check_time(layout: LineLayout, rate_hz: float, path: KeyPath) -> Iterator[Finding]:
     """The device's time may tell each line from the next one; whether it has decimals is not known here."""
     if layout.time is None or layout.counter is not None:
@@ -270,7 +285,8 @@ def _least_characters(bus: SerialBus, layout: LineLayout | SerialLayout) -> int:
         # A digit in each column, separators between them, and an end.
         prefix = 0 if layout.prefix is None else len(layout.prefix) + 1
         checksum = _CHECKSUM_CHARACTERS[bus.checksum] if isinstance(bus, LinesBus) else 0
-        return prefix + 2 * len(layout.line) + checksum
+        suffixes = sum(len(channel.suffix or "") for channel in layout.channels)
+        return prefix + 2 * len(layout.line) + suffixes + checksum
     if not isinstance(bus, CobsBus | SyncBus):
         return layout.payload_length
     length = layout.payload_length + bus.crc_bytes + bus.stream_ids

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     Bytes = NDArray[np.uint8]
     Places = NDArray[np.int64]
     Values = NDArray[np.float64]
+    Far = tuple[int, bool, int, int, int, bool]
+    """State; whether it is negative; mantissa; exponents by decimal mark and by letter; whether that is."""
 
 OTHER, BAD, READ, HARD = range(4)
 """A line of another stream; no line; numbers that have been read; numbers to be read by Python."""
@@ -139,15 +141,50 @@ _GRAMMAR = _grammar()
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _number(state: int, mantissa: int, exponent: int) -> tuple[float, int]:
-    """The number ``mantissa * 10^exponent``; and `BAD`, `READ` or `HARD`."""
+def _number(far: Far) -> tuple[float, int]:
+    """The number that has been read; and `BAD`, `READ` or `HARD`."""
+    state, negative, mantissa, exponent, power, down = far
     if state <= WRONG:
         return 0.0, BAD
+    exponent += -power if down else power
     if abs(mantissa) > EXACT or abs(exponent) >= len(_POWERS):
         return 0.0, HARD
-    if exponent < 0:
-        return mantissa / _POWERS[-exponent], READ
-    return mantissa * _POWERS[exponent], READ
+    value = mantissa / _POWERS[-exponent] if exponent < 0 else mantissa * _POWERS[exponent]
+    return -value if negative else value, READ
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _next(byte: int, kind: int, far: Far) -> Far:
+    """How far a number has been read when its next byte is read, too."""
+    state, negative, mantissa, exponent, power, down = far
+    state = _GRAMMAR[state, kind]
+    if kind != _DIGIT:
+        negative |= byte == MINUS and state == SIGNED
+        down |= byte == MINUS and state == EXPONENT_SIGNED
+    elif state == POWER:
+        power = min(power * 10 + byte - ZERO, _LARGEST)
+    elif mantissa < _LARGEST:
+        mantissa = mantissa * 10 + byte - ZERO
+        exponent -= state == FRACTION
+    return state, negative, mantissa, exponent, power, down
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _suffixed(buffer: Bytes, start: int, stop: int, suffix: Bytes, classes: Bytes) -> tuple[Far, int]:
+    """A number with a text behind it: how far it has been read, and where it ends; -1 without that text."""
+    far = (START, False, 0, 0, 0, False)
+    while start < stop and buffer[stop - 1] == SPACE:
+        stop -= 1
+    length = 0
+    while length < len(suffix) and suffix[length]:
+        length += 1
+    end = stop - length
+    for k in range(length):
+        if end < start or buffer[end + k] != suffix[k]:
+            return far, -1
+    for at in range(start, end):
+        far = _next(buffer[at], classes[buffer[at]], far)
+    return far, end
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -189,6 +226,7 @@ def _line(
     classes: Bytes,
     columns: int,
     picks: Places,
+    suffixes: Bytes,
     values: Values,
 ) -> tuple[int, bool]:
     """Read the picked fields of one line.
@@ -200,34 +238,28 @@ def _line(
         `BAD`, `READ` or `HARD`; and whether its first picked field is an integer. A later one may be absent.
     """
     line, counts, column, begin = READ, False, 0, start
-    state, negative, mantissa, exponent, power, down = START, False, 0, 0, 0, False
+    far = (START, False, 0, 0, 0, False)
     for at in range(start, stop + 1):
         if at < stop and buffer[at] != separator:
-            byte = buffer[at]
-            kind = classes[byte]
-            state = _GRAMMAR[state, kind]
-            if kind != _DIGIT:
-                negative |= byte == MINUS and state == SIGNED
-                down |= byte == MINUS and state == EXPONENT_SIGNED
-            elif state == POWER:
-                power = min(power * 10 + byte - ZERO, _LARGEST)
-            elif mantissa < _LARGEST:
-                mantissa = mantissa * 10 + byte - ZERO
-                exponent -= state == FRACTION
+            far = _next(buffer[at], classes[buffer[at]], far)
             continue
         padding = separator == SPACE and begin == at
         for k in range(len(picks)):
             if picks[k] == column and not padding:
-                value, outcome = _number(state, mantissa, exponent - power if down else exponent + power)
+                end = at
+                if suffixes[k, 0]:
+                    # Without the text it is another unit: then it must not be read.
+                    far, end = _suffixed(buffer, begin, at, suffixes[k], classes)
+                value, outcome = _number(far)
                 if outcome == BAD:
-                    if k == 0 or not _is_absent(buffer, begin, at):
+                    if k == 0 or not _is_absent(buffer, begin, at if end < 0 else end):
                         return BAD, False
                     value, outcome = np.nan, READ
-                values[k] = -value if negative else value
+                values[k] = value
                 line = max(line, outcome)
-                counts |= k == 0 and WHOLE <= state <= AFTER_WHOLE
+                counts |= k == 0 and WHOLE <= far[0] <= AFTER_WHOLE
         column, begin = column + (not padding), at + 1
-        state, negative, mantissa, exponent, power, down = START, False, 0, 0, 0, False
+        far = (START, False, 0, 0, 0, False)
     return (line if column == columns else BAD), counts
 
 
@@ -241,6 +273,7 @@ def read_lines(
     classes: Bytes,
     columns: int,
     picks: Places,
+    suffixes: Bytes,
     counted: bool,  # noqa: FBT001 - numba
 ) -> tuple[NDArray[np.int8], NDArray[np.float64]]:
     """Read the numbers of the lines of one stream.
@@ -254,6 +287,8 @@ def read_lines(
         classes: one of `CLASSES`, by the decimal mark of the stream.
         columns: how many fields there are, without the prefix.
         picks: int64 ``[p]``, which of them are read.
+        suffixes: uint8 ``[p, m]``, the text behind the number of each, such as its unit, and zeros; zeros
+            only where a field is the number alone.
         counted: whether the first of those must be an integer.
 
     Returns:
@@ -267,7 +302,9 @@ def read_lines(
         if start < 0:
             states[k] = OTHER
             continue
-        state, integer = _line(buffer, start, stops[k], separator, classes, columns, picks, values[k])
+        state, integer = _line(
+            buffer, start, stops[k], separator, classes, columns, picks, suffixes, values[k]
+        )
         states[k] = BAD if counted and not integer else state
     return states, values
 

@@ -15,6 +15,10 @@ NUMBER: Mapping[str, re.Pattern[str]] = {
 """A number, by decimal mark."""
 ABSENT = re.compile(r" *(-*|nan) *", re.IGNORECASE)
 """What devices write where they have no value: nothing, dashes, or ``nan``."""
+_UNIT = r"[A-Za-z%]+[23]?(?:/[A-Za-z]+[23]?)?|[A-Za-z]+\^[23]|[A-Za-z]+/[A-Za-z]+\^[23]|1/[A-Za-z]+"
+_WITH_UNIT: Mapping[str, re.Pattern[str]] = {
+    mark: re.compile(rf"({number.pattern})({_UNIT}) *") for mark, number in NUMBER.items()
+}
 BLANK = " "
 RUN_OF_BLANKS = re.compile(" +")
 
@@ -28,3 +32,19 @@ def fields_of(text: str, separator: str) -> list[str]:
     if separator == BLANK:
         return RUN_OF_BLANKS.split(text.strip(BLANK))
     return text.split(separator)
+
+
+def number_before(text: str, suffix: str) -> str | None:
+    """The text of a number in a field that has another text behind it, such as its unit.
+
+    A field that states that there is no value may lack that text. None if any other one does not end with it.
+    """
+    if suffix and not text.rstrip(BLANK).endswith(suffix):
+        return text if ABSENT.fullmatch(text) else None
+    return text.rstrip(BLANK).removesuffix(suffix) if suffix else text
+
+
+def unit_behind(text: str, decimal: str) -> str:
+    """What looks like a unit behind the number of a field, with that decimal mark; empty if nothing does."""
+    found = _WITH_UNIT[decimal].fullmatch(text)
+    return "" if found is None else found[found.re.groups]

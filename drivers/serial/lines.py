@@ -30,7 +30,7 @@ from drivers.serial.line_kernels import (
     count_stamps,
     read_lines,
 )
-from drivers.serial.line_numbers import ABSENT, NUMBER, fields_of
+from drivers.serial.line_numbers import ABSENT, NUMBER, fields_of, number_before, unit_behind
 from drivers.serial.settings import UNITS_PER_S
 
 if TYPE_CHECKING:
@@ -118,6 +118,10 @@ class LineCodec:
         self._offset = np.array([channel.offset for channel in layout.channels])
         names = (self._place, *layout.channel_names)
         self._picks = np.array([layout.line.index(name) for name in names], np.int64)
+        self._suffixes = {one.name: one.suffix or "" for one in layout.channels}
+        texts = [self._suffixes.get(name, "").encode("ascii") for name in names]
+        padded = [text.ljust(max(1, *map(len, texts)), b"\0") for text in texts]
+        self._texts = np.array([list(text) for text in padded], np.uint8)
         self._prefix = np.frombuffer((layout.prefix or "").encode("ascii"), np.uint8).copy()
 
     def read(self, lines: Pieces) -> Lines:
@@ -133,12 +137,16 @@ class LineCodec:
             CLASSES[layout.decimal],
             len(layout.line),
             self._picks,
+            self._texts,
             self._units_per_s is None,
         )
         for k in np.flatnonzero(states == HARD).tolist():
             text = buffer[starts[k] : stops[k]].tobytes().decode("ascii", "replace")
-            fields = [one.replace(layout.decimal, ".") for one in fields_of(text, layout.separator)]
-            values[k] = [_value(fields[pick + bool(layout.prefix)]) for pick in self._picks.tolist()]
+            fields = fields_of(text, layout.separator)[bool(layout.prefix) :]
+            values[k] = [
+                _value((number_before(fields[pick], suffix) or "").replace(layout.decimal, "."))
+                for pick, suffix in zip(self._picks.tolist(), ("", *self._suffixes.values()), strict=True)
+            ]
         places = values[:, 0]
         if self._units_per_s is None:
             fits = (places >= 0) & (places < self._counts)
@@ -152,17 +160,16 @@ class LineCodec:
 
     def why_not(self, fields: Sequence[str]) -> NoFrame:
         """Why the fields of a line, its prefix left out, are no sample."""
-        columns, decimal = self._layout.line, self._layout.decimal
+        columns = self._layout.line
         if len(fields) != len(columns):
             many = counted(len(fields), "column")
             why = f"{many}, the file lists {len(columns)} ({', '.join(columns)})"
             return NoFrame(why, self._other_columns(len(fields) - len(columns)))
         for name in (self._place, *self._layout.channel_names):
-            text = fields[columns.index(name)]
-            absent = name != self._place and ABSENT.fullmatch(text)
-            if not absent and not NUMBER[decimal].fullmatch(text):
-                return NoFrame(f"column {name} is {text!r}, no number", self._other_number(text))
-        place = fields[columns.index(self._place)].replace(decimal, ".")
+            why_no_number = self._why_no_number(name, fields[columns.index(name)])
+            if why_no_number is not None:
+                return why_no_number
+        place = fields[columns.index(self._place)].replace(self._layout.decimal, ".")
         if self._units_per_s is not None:
             return NoFrame(
                 f"time {self._place} is {place}, later than any", "correct column and unit of time"
@@ -175,8 +182,23 @@ class LineCodec:
             return NoFrame(f"counter {self._place} is {place}, {most}", "correct bits of counter")
         return NoFrame("it cannot be read")
 
-    def _other_number(self, text: str) -> str:
+    def _why_no_number(self, name: str, text: str) -> NoFrame | None:
+        """Why a column has no number; None if it has one, or none need be there."""
+        suffix = self._suffixes.get(name, "")
+        number = number_before(text, suffix)
+        if number is None:
+            return NoFrame(f"column {name} is {text!r}, without {suffix!r} at its end", _other_unit(text))
+        if name != self._place and ABSENT.fullmatch(number):
+            return None
+        if NUMBER[self._layout.decimal].fullmatch(number):
+            return None
+        return NoFrame(f"column {name} is {text!r}, no number", self._other_number(name, text))
+
+    def _other_number(self, name: str, text: str) -> str:
         """What to do if all lines have such a text where a number should be."""
+        unit = unit_behind(text, self._layout.decimal)
+        if unit and name in self._suffixes:
+            return f"write suffix = {json.dumps(unit)} in the channel {name} of the layout"
         other = "." if self._layout.decimal == "," else ","
         if other != self._layout.separator and NUMBER[other].fullmatch(text):
             return f"write decimal = {json.dumps(other)} in the layout"
@@ -204,14 +226,20 @@ class LineCodec:
         fields = [] if layout.prefix is None else [layout.prefix]
         for name in layout.line:
             if name != self._place:
-                fields.append(f"{values.get(name, 0.0):.6f}")
+                number = f"{values.get(name, 0.0):.6f}".replace(".", layout.decimal)
+                fields.append(f"{number}{self._suffixes.get(name, '')}")
             elif self._units_per_s is None:
                 fields.append(str(int(place) % int(self._counts)))
             else:
-                fields.append(f"{place * self._units_per_s:.4f}")
-        first = layout.prefix is not None
-        numbers = [one.replace(".", layout.decimal) for one in fields[first:]]
-        return layout.separator.join(fields[:first] + numbers).encode("ascii")
+                fields.append(f"{place * self._units_per_s:.4f}".replace(".", layout.decimal))
+        return layout.separator.join(fields).encode("ascii")
+
+
+def _other_unit(text: str) -> str:
+    """What to do if all lines have such a text where a number and another text should be."""
+    if any(number.fullmatch(text) for number in NUMBER.values()):
+        return "remove suffix of the channel"
+    return "correct suffix of the channel, and unit of its sensor, if the device has another unit now"
 
 
 def _value(field: str) -> float:

@@ -10,8 +10,8 @@ from drivers import packed_questions as packed
 from drivers import questions as q
 from drivers.bus_questions import BUS, BusQuestions, Heard, only_port
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
-from drivers.serial.sniff import MUST_TURN, SerialSniffer, turn_words
-from drivers.sniffing import sniffed, table_name, unused, usual_rate
+from drivers.serial.sniff import MUST_TURN, SerialSniffer, turn_words, unit_of_suffix
+from drivers.sniffing import WAVEFORM_HZ, sniffed, table_name, unused, usual_rate
 from drivers.toml_lines import array, entry
 
 if TYPE_CHECKING:
@@ -43,6 +43,13 @@ _UNNAMED = re.compile(r"c\d+")
 _RATES_HZ = (12_800.0, 2560.0, 1280.0, 640.0, 100.0, 10.0, 1.0, 0.1)
 _LONGEST_PAYLOAD = 4096
 _LONGEST_SYNC_WORD = 8
+_TYPE_OF = {
+    "g": "accelerometer",
+    "m/s2": "accelerometer",
+    "mm/s": "velocity",
+    **dict.fromkeys(("um", "mm", "mil"), "proximity"),
+}
+"""Type of a sensor by the unit of its samples, if they are a waveform."""
 _KINDS = dict.fromkeys(_CHARACTERS, "")
 _LISTEN_S = 3.0
 """Behind the search of the baud rate, which takes some seconds itself."""
@@ -93,6 +100,13 @@ class SerialQuestions(BusQuestions):
         ),
     }
 
+    channel_topics: ClassVar[Mapping[str, Topic]] = {
+        "suffix": Topic(
+            "What is behind the number of {channel}?",
+            "A unit that the device writes there, e.g. mm/s in 12.3 mm/s; none if the number is alone. "
+            "A line with another text there is not read.",
+        ),
+    }
     listens_behind = "port"
 
     def listen(
@@ -148,8 +162,18 @@ class SerialQuestions(BusQuestions):
         if answers["framing"] != "lines":
             return packed.guess(answers, channel)
         kind, unit = super().guess(answers, channel)
+        suffix = answers.get(sensor_key(channel, "suffix"))
+        if suffix is not None:
+            unit = unit_of_suffix(suffix)
+            usual = _TYPE_OF if answers["rate"] >= WAVEFORM_HZ else {}
+            return kind if kind == "keyphasor" else usual.get(unit, "trend"), unit
         # A column without a name may be anything: limits of vibration are not for it.
         return kind, "1" if unit is None and _UNNAMED.fullmatch(channel) else unit
+
+    def of_channel(self, answers: Answers, channel: str) -> Iterator[Question]:
+        """See `BusQuestions.of_channel`."""
+        if answers["framing"] == "lines":
+            yield self.ask_of(channel, "suffix", q.text_or_none, NONE, quiet=True)
 
     def in_volts(self, answers: Answers, channel: str) -> bool:
         """See `BusQuestions.in_volts`."""
@@ -210,7 +234,13 @@ class SerialQuestions(BusQuestions):
             time = {"column": answers["counter"], "unit": answers["counts"]}
             yield entry("time", time, "the device's own clock: it places the lines in time")
         yield "# scale = 0.01 behind a name if the device sends hundredths"
-        yield from array("channels", [{"name": name} for name in self._measured(answers)])
+        channels = []
+        for name in self._measured(answers):
+            suffix = answers.get(sensor_key(name, "suffix"))
+            channels.append({"name": name} if suffix is None else {"name": name, "suffix": suffix})
+        if any("suffix" in one for one in channels):
+            yield "# suffix: what the device writes behind the number; a line in another unit is not read"
+        yield from array("channels", channels)
 
     def _measured(self, answers: Answers) -> tuple[str, ...]:
         """The columns that become channels: those with a sensor, as others may be no numbers."""
@@ -272,6 +302,8 @@ def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
             yield f"  {turn_words(one['name'], one['turns_at'])}"
         elif one["counts"]:
             yield f"  {one['name']} counts lines; {MUST_TURN}"
+        elif one["unit"]:
+            yield f"  {one['name']} is in {one['unit']}, as the device writes it behind the number"
     if found["other_prefixes"]:
         others = ", ".join(found["other_prefixes"])
         yield f"  Lines that begin with {others} come, too. The file reads one kind of line; add a stream for"
@@ -305,6 +337,8 @@ def _proposals(found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
             proposed = {"counter": name, "counts": "count"} | proposed
         elif not one["numeric"]:
             proposed[sensor_key(name, "type")] = NONE
+        elif one["unit"]:
+            proposed[sensor_key(name, "suffix")] = one["unit"]
     return proposed
 
 

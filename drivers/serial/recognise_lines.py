@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drivers.serial.line_numbers import ABSENT, NUMBER, fields_of
+from drivers.serial.line_numbers import ABSENT, NUMBER, fields_of, number_before, unit_behind
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -57,6 +57,7 @@ class Column:
     Attributes:
         name: as the header has it, else ``c1``, ``c2`` ...
         numeric: whether it is a number, or absent, in all lines that are not damaged.
+        unit: the text behind the number that is the same in all of them, such as a unit; else empty.
         least: least value; 0 of a text.
         most: largest one.
         step: by how much it counts, if it is whole numbers that do; else 0.
@@ -75,6 +76,7 @@ class Column:
     grows: bool = False
     per_line: float = 0.0
     last: str = ""
+    unit: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,11 +169,20 @@ def _is_header(first: str, second: str) -> bool:
     """Whether a line is a header: words, where the next one has numbers."""
     separator, decimal = _marks_of([second])
     fields = fields_of(first, separator) if separator else [first]
-    same = len(fields) == (len(fields_of(second, separator)) if separator else 1)
+    others = fields_of(second, separator) if separator else [second]
     return (
-        same
-        and not any(NUMBER[decimal].fullmatch(one) for one in fields)
+        len(fields) == len(others)
+        and _only_words(fields, others, decimal)
         and not second.strip().startswith(fields[0].strip())
+    )
+
+
+def _only_words(fields: Sequence[str], others: Sequence[str], decimal: str) -> bool:
+    """Whether the fields of a line are words, as in a header: no numbers, with or without a unit."""
+    return not any(
+        NUMBER[decimal].fullmatch(one)
+        or ((unit := unit_behind(one, decimal)) and unit == unit_behind(other, decimal))
+        for one, other in zip(fields, others, strict=True)
     )
 
 
@@ -189,7 +200,10 @@ def _marks_of(lines: Sequence[str]) -> tuple[str, str]:
             continue
         fields = [field for row in rows if len(row) == width for field in row]
         for decimal in (mark for mark in (".", ",") if mark != separator):
-            numbers = sum(NUMBER[decimal].fullmatch(field) is not None for field in fields)
+            numbers = sum(
+                NUMBER[decimal].fullmatch(field) is not None or bool(unit_behind(field, decimal))
+                for field in fields
+            )
             score = agreeing / len(lines) * (1 + numbers / len(fields))
             if score > most + 0.02:
                 best, most = (separator, decimal), score
@@ -212,9 +226,9 @@ def _columns_of(lines: Sequence[str], delimiter: str) -> TextLines:
     width = Counter(len(row) for row in rows[1:] or rows).most_common(1)[0][0]
     number = NUMBER[decimal]
     header = (
-        len(rows[0]) == width
-        and not any(number.fullmatch(one) for one in rows[0])
-        and any(number.fullmatch(one) for one in rows[1])
+        len(rows[0]) == len(rows[1]) == width
+        and _only_words(rows[0], rows[1], decimal)
+        and any(number.fullmatch(one) or unit_behind(one, decimal) for one in rows[1])
         and rows[0][0] != rows[1][0]
     )
     names = [name.lstrip("#").strip() for name in rows[0]] if header else []
@@ -225,18 +239,18 @@ def _columns_of(lines: Sequence[str], delimiter: str) -> TextLines:
     sound[0] &= not header
     prefix = _prefix_of([row for row, good in zip(rows, sound, strict=True) if good], width)
     first = 1 if prefix else 0
-    numeric = []
-    for k in range(first, width):
-        there = [number.fullmatch(row[k]) is not None for row, good in zip(rows, sound, strict=True) if good]
-        numeric.append(bool(there) and sum(there) >= MAJORITY * len(there))
+    units = [
+        _unit_of([row[k] for row, good in zip(rows, sound, strict=True) if good], decimal)
+        for k in range(first, width)
+    ]
     for at, row in enumerate(rows):
         sound[at] = (
             sound[at]
             and (not prefix or row[0] == prefix)
             and all(
-                number.fullmatch(row[first + k]) or ABSENT.fullmatch(row[first + k])
-                for k, is_number in enumerate(numeric)
-                if is_number
+                _is_number(text, unit, number)
+                for text, unit in zip(row[first:], units, strict=True)
+                if unit is not None
             )
         )
     places = np.flatnonzero(sound)
@@ -245,12 +259,35 @@ def _columns_of(lines: Sequence[str], delimiter: str) -> TextLines:
             [rows[at][first + k] for at in places.tolist()],
             places,
             names[first + k] if names else f"c{k + 1}",
-            decimal if is_number else "",
+            decimal if unit is not None else "",
+            unit or "",
         )
-        for k, is_number in enumerate(numeric)
+        for k, unit in enumerate(units)
     ]
     damaged = [line for line, good in zip(lines[header:], sound[header:], strict=True) if not good]
     return TextLines(lines, delimiter, separator, decimal, prefix, checksum, columns, header, damaged)
+
+
+def _unit_of(texts: Sequence[str], decimal: str) -> str | None:
+    """The unit behind the number of a column; empty if it is the number alone, None if it is no number.
+
+    A word that is always the same, such as 0A, is none: the numbers before a unit change, have decimals, or a
+    blank behind them.
+    """
+    units = ["" if NUMBER[decimal].fullmatch(text) else unit_behind(text, decimal) or None for text in texts]
+    unit, times = Counter(units).most_common(1)[0] if units else (None, 0)
+    if unit is None or times < MAJORITY * len(units):
+        return None
+    numbers = {text.removesuffix(unit) for text, one in zip(texts, units, strict=True) if one == unit}
+    if unit and len(numbers) == 1 and not any(mark in one for one in numbers for mark in (decimal, " ")):
+        return None
+    return unit
+
+
+def _is_number(text: str, unit: str, number: re.Pattern[str]) -> bool:
+    """Whether a field has a number, with that unit behind it if it is not empty; it may be absent."""
+    bare = number_before(text, unit)
+    return bare is not None and bool(number.fullmatch(bare) or ABSENT.fullmatch(bare))
 
 
 def _prefix_of(rows: Sequence[Sequence[str]], width: int) -> str:
@@ -261,7 +298,7 @@ def _prefix_of(rows: Sequence[Sequence[str]], width: int) -> str:
     return word if times >= MAJORITY * len(rows) and _PREFIX.fullmatch(word) else ""
 
 
-def _column(texts: Sequence[str], places: NDArray[np.int64], name: str, decimal: str) -> Column:
+def _column(texts: Sequence[str], places: NDArray[np.int64], name: str, decimal: str, unit: str) -> Column:
     """One column.
 
     Args:
@@ -269,15 +306,19 @@ def _column(texts: Sequence[str], places: NDArray[np.int64], name: str, decimal:
         places: int64 ``[n]``, which lines those are.
         name: of the column.
         decimal: decimal mark of the numbers; empty if it is text.
+        unit: behind the numbers.
     """
+    last = texts[-1] if texts else ""
+    texts = [(number_before(text, unit) or "").strip() for text in texts] if decimal else texts
     if not decimal or all(map(ABSENT.fullmatch, texts)):
-        return Column(name, numeric=False, last=texts[-1] if texts else "")
+        return Column(name, numeric=False, last=last)
     there = [k for k, text in enumerate(texts) if not ABSENT.fullmatch(text)]
     texts, places = [texts[k] for k in there], places[there]
     values = np.array([float(text.replace(decimal, ".")) for text in texts])
-    whole = all(text.isdigit() for text in texts)
+    # The driver reads neither a counter nor a time with a text behind it.
+    whole = not unit and all(text.isdigit() for text in texts)
     rises = np.diff(values) >= 0
-    grows = bool(len(rises) and rises.mean() >= 0.98 and values[-1] > values[0])
+    grows = bool(not unit and len(rises) and rises.mean() >= 0.98 and values[-1] > values[0])
     ends = min(_ENDS, len(values) // 2)
     per_line = 0.0
     if ends:
@@ -287,7 +328,7 @@ def _column(texts: Sequence[str], places: NDArray[np.int64], name: str, decimal:
     step = _step_of(values, places) if whole else 0.0
     turns_at = _turn_of(values, step)
     least, most = float(values.min()), float(values.max())
-    return Column(name, True, least, most, step, turns_at, grows, per_line, texts[-1])
+    return Column(name, True, least, most, step, turns_at, grows, per_line, last if unit else texts[-1], unit)
 
 
 def _step_of(values: NDArray[np.float64], places: NDArray[np.int64]) -> float:

@@ -27,6 +27,7 @@ LONGEST_PAYLOAD = 4096
 LONGEST_SYNC_WORD = 8
 UNITS_PER_S: Mapping[str, float] = {"s": 1.0, "ms": 1e3, "us": 1e6}
 """What the time of a line may be in, the coarsest first."""
+_OF_NUMBERS = frozenset("0123456789+-., ")
 
 
 def _sync_word(text: str) -> str:
@@ -257,6 +258,19 @@ class LineTime(Section):
     unit: Annotated[Literal["s", "ms", "us"], Field(description="unit of that time", examples=["ms"])]
 
 
+def _suffix(text: str) -> str:
+    if not text.isascii() or not text.isprintable() or text != text.strip() or not set(text) - _OF_NUMBERS:
+        raise PydanticCustomError(
+            "suffix",
+            "cannot be the text behind a number",
+            {
+                "remedy": 'write what the device puts there, without blanks around it, e.g. "mm/s"',
+                "code": BAD_TEXT,
+            },
+        )
+    return text
+
+
 class LineChannel(Section):
     """One quantity of a line: wire value = value * scale + offset, as for a channel of a frame."""
 
@@ -266,6 +280,11 @@ class LineChannel(Section):
     )
     offset: Quantity = Field(
         default=0.0, description="what a 0 in the line is worth, in V or the unit of the sensor"
+    )
+    suffix: Annotated[str, AfterValidator(_suffix), Field(min_length=1, max_length=16)] | None = Field(
+        default=None,
+        description="text behind the number, such as its unit; a line with another text there is not read",
+        examples=["mm/s"],
     )
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from daqsvc.documentation import documented_in
 from daqsvc.rounding import counted
+from daqsvc.settings.units import may_be_unit, unit_of
 from drivers.sniffing import (
     Sniffed,
     Sniffer,
@@ -404,6 +405,7 @@ class _Report(NamedTuple):
             ]
             use = "counts" if one is counter else "time" if one is time_column else ""
             use = f"counts to {one.turns_at - 1}" if one.turns_at else use
+            use = f"in {one.unit}" if one.unit else use
             rows.append((one.name, "number" if one.numeric else "text", *limits, one.last[:24], use))
         yield SniffTable(("column", "kind", "min", "max", "last", ""), rows)
         yield from (turn_words(one.name, one.turns_at) for one in what.columns if one.turns_at)
@@ -480,6 +482,7 @@ class _Report(NamedTuple):
                     {
                         "name": one.name,
                         "numeric": one.numeric,
+                        "unit": one.unit or None,
                         "min": one.least,
                         "max": one.most,
                         "counts": one is counter,
@@ -572,9 +575,18 @@ class _Report(NamedTuple):
         else:
             unit = self._time_unit(what, place)
             yield f'time = {{ column = {quoted(names[place])}, unit = "{unit}" }}'
-        yield f"channels = [{', '.join(f'{{ name = {quoted(names[one])} }}' for one in numbers)}]"
-        channels = {names[one]: "1" for one in numbers}
-        yield from sensor_lines(stream, channels, sensors, by_stream=bool(what.prefix) and stream != "lines")
+        suffixes = [f", suffix = {quoted(one.unit)}" if one.unit else "" for one in numbers]
+        listed = [
+            f"{{ name = {quoted(names[one])}{suffix} }}"
+            for one, suffix in zip(numbers, suffixes, strict=True)
+        ]
+        comment = (
+            "    # a line in another unit is not read: it is counted as damaged" if any(suffixes) else ""
+        )
+        yield f"channels = [{', '.join(listed)}]{comment}"
+        channels = {names[one]: unit_of_suffix(one.unit) for one in numbers}
+        by_stream = bool(what.prefix) and stream != "lines"
+        yield from sensor_lines(stream, channels, sensors, rate_hz, by_stream=by_stream)
 
     def _frames_tables(self, what: BinaryFrames, bus: str) -> Iterator[str]:
         yield f"framing = {quoted(what.framing)}"
@@ -666,6 +678,14 @@ def _counter(what: TextLines) -> Column | None:
     """The column that counts lines: whole numbers, always by 1, to a power of two."""
     counts = (one for one in what.columns if one.numeric and one.step == 1 and one.least >= 0)
     return next((one for one in counts if not one.turns_at), None)
+
+
+def unit_of_suffix(suffix: str) -> str:
+    """The unit that a text behind numbers means, as a machine file spells it; ``1`` if it is none."""
+    known = unit_of(suffix)
+    if known is not None:
+        return known.name
+    return suffix if suffix and may_be_unit(suffix) else "1"
 
 
 def _prefixes(what: TextLines) -> str:

@@ -25,6 +25,7 @@ class ColumnFigures(TypedDict):
     Attributes:
         name: as the header has it, else `c1`, `c2`, ...
         numeric: whether it is a number in all lines that are not damaged.
+        unit: text behind the number that is the same in all of them, such as a unit; null without one.
         min: the least value.
         max: the greatest value.
         counts: whether it counts the lines.
@@ -34,6 +35,7 @@ class ColumnFigures(TypedDict):
 
     name: str
     numeric: bool
+    unit: str | None
     min: float
     max: float
     counts: bool

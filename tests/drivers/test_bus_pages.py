@@ -53,15 +53,23 @@ def test_another_message_is_another_stream(tmp_path):
 
 
 def test_the_keys_of_a_serial_port_are_all_shown_with_their_defaults():
-    bus, lines, _ = blocks("serial.md")
+    bus, lines, *_ = blocks("serial.md")
     shown = machine(bus + lines[lines.index("[streams") :], "casing", "v").buses["casing"]
     least = machine(lines.replace('checksum = "xor"', ""), "casing", "v").buses["casing"]
     assert shown == least
 
 
-@pytest.mark.parametrize(("place", "stream", "channel"), [(1, "casing", "h"), (2, "shaft", "kph")])
+@pytest.mark.parametrize(("place", "stream", "channel"), [(1, "casing", "h"), (3, "shaft", "kph")])
 def test_a_serial_port_of_the_page_has_a_stream(place, stream, channel):
     assert machine(blocks("serial.md")[place], stream, channel).streams[stream].rate_hz > 100
+
+
+def test_the_channels_with_a_unit_behind_the_number_fit_a_line():
+    _, lines, channels, _ = blocks("serial.md")
+    start = lines.index("line = ")
+    text = f'{lines[:start]}line = ["seq", "v", "temp"]\ncounter = {{ column = "seq" }}\n{channels}'
+    layout = machine(text, "casing", "v").streams["casing"].layout
+    assert [channel.suffix for channel in layout.channels] == ["mm/s", "C"]
 
 
 def test_a_table_is_replayed_as_the_page_shows():

@@ -223,6 +223,37 @@ def test_a_line_that_is_none_is_quoted_with_what_is_wrong(spoilt, said, remedy):
     assert (again.notes["frames_malformed"], again.malformed) == (1, ""), "once"
 
 
+@pytest.mark.parametrize(
+    ("text", "said", "remedy"),
+    [
+        (b"0.48 in/s", "column x is '0.48 in/s', without 'mm/s' at its end", "unit of its sensor"),
+        (b"12.3", "column x is '12.3', without 'mm/s' at its end", "remove suffix of the channel"),
+        (b"what mm/s", "column x is 'what mm/s', no number", "names in line in the order"),
+    ],
+)
+def test_a_value_in_another_unit_is_no_sample_and_is_told(text, said, remedy):
+    columns = line_layout(("seq", "x"), [{"name": "x", "suffix": "mm/s"}], counter="seq")
+    framing = LineFraming({"a": columns}, {"a": 100.0})
+    framing.cut(b"half a line\n")
+    found = framing.cut(b"0,12.2 mm/s\n1," + text + b"\n2,12.4mm/s \n3,-- mm/s\n4,\n")
+    assert found.frames["a"].counter.tolist() == [0, 2, 3, 4]
+    np.testing.assert_array_equal(
+        found.frames["a"].samples[:, 0, 0], np.float32([12.2, 12.4, np.nan, np.nan])
+    )
+    assert found.notes["frames_malformed"] == 1
+    assert said in found.malformed
+    assert remedy in found.remedy
+
+
+def test_the_key_is_named_for_a_number_with_a_unit():
+    columns = line_layout(("seq", "x"), ["x"], counter="seq")
+    framing = LineFraming({"a": columns}, {"a": 100.0})
+    framing.cut(b"half a line\n")
+    found = framing.cut(b"1,45.1 degC\n")
+    assert "column x is '45.1 degC', no number" in found.malformed
+    assert found.remedy == 'write suffix = "degC" in the channel x of the layout'
+
+
 def test_lines_of_padded_columns_are_read_and_others_described():
     columns = line_layout(("seq", "x", "y"), ("x", "y"), counter="seq", separator=" ", prefix="A")
     framing = LineFraming({"a": columns}, {"a": 100.0})

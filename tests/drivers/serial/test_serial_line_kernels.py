@@ -134,6 +134,46 @@ def test_decimal_commas_are_read_as_points_are(rows: list[tuple[str, str]]) -> N
     np.testing.assert_array_equal(got.samples, want.samples)
 
 
+@given(
+    st.lists(
+        st.tuples(
+            NUMBERS | ABSENT, st.sampled_from(["", " ", "  "]), st.sampled_from(["mm/s", "C", "E", ""])
+        ),
+        min_size=1,
+        max_size=8,
+    ),
+    st.sampled_from(["mm/s", "C", "E"]),
+)
+@example(
+    [("12.5", " ", "mm/s"), ("12.5", "", "in/s"), ("-- ", "", "mm/s"), ("9007199254740993", "", "mm/s")],
+    "mm/s",
+)
+@example([("1e5", "", "E"), ("1E", "", "E"), ("", "", "E"), ("nan", " ", ""), ("7", " ", "E ")], "E")
+def test_a_number_is_read_with_the_text_behind_it_and_with_no_other(
+    rows: list[tuple[str, str, str]], suffix: str
+) -> None:
+    stream = codec(channels=[{"name": "x", "suffix": suffix}])
+    fields = ["".join(row) for row in rows]
+    lines = stream.read(pieces([f"1,,{field}".encode() for field in fields]))
+    values: list[float | None] = []
+    for field in fields:
+        bare = field.rstrip(" ")
+        other = np.nan if value(field) is not None and np.isnan(value(field)) else None
+        values.append(value(bare.removesuffix(suffix)) if bare.endswith(suffix) else other)
+    assert lines.good.tolist() == [one is not None for one in values]
+    with np.errstate(over="ignore"):
+        want = np.array([one for one in values if one is not None], float).astype(np.float32)
+    np.testing.assert_array_equal(lines.samples[:, 0, 0], want)
+
+
+def test_what_is_written_with_a_text_behind_it_is_read_again() -> None:
+    stream = codec(separator=";", decimal=",", channels=[{"name": "x", "suffix": "m/s^2"}])
+    text = stream.write(17, np.array([-0.5]))
+    assert text == b"17;0,000000;-0,500000m/s^2"
+    lines = stream.read(pieces([text]))
+    assert (lines.places.tolist(), lines.samples.ravel().tolist()) == ([17.0], [-0.5])
+
+
 def test_a_point_is_no_decimal_comma_nor_a_comma_a_point() -> None:
     cut = pieces([b"1;;0,249", b"2;;0.249", b"3;;249"])
     for mark, good in ((",", [True, False, True]), (".", [False, True, True])):

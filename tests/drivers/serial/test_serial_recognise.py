@@ -19,7 +19,7 @@ from support.uart_waves import sampled, wave
 from drivers.serial.checksums import CHECKSUMS
 from drivers.serial.recognise import CONCLUSIVE, recognised
 from drivers.serial.recognise_frames import BinaryFrames
-from drivers.serial.recognise_lines import TextLines
+from drivers.serial.recognise_lines import TextLines, text_lines
 from drivers.serial.sniff import BAUDS, TRY_BYTES
 
 if TYPE_CHECKING:
@@ -405,3 +405,51 @@ def test_noise_and_silence_are_nothing() -> None:
         found = recognised(data)
         assert found.what is None
         assert found.score < 0.5
+
+
+UNITS = {
+    "units behind a counter": ("{k},{v:.1f} mm/s,{t:.1f}C", ["", "mm/s", "C"]),
+    "units only, with blanks behind commas": ("{v:.1f} mm/s, {t:.1f} %", ["mm/s", "%"]),
+    "exponents": ("{k};{v:.1f} m/s^2;{t:.1f} m/s2;{t:.0f} 1/min", ["", "m/s^2", "m/s2", "1/min"]),
+    "blanks between columns": ("{k} {v:.1f}g {t:.1f}degC", ["", "g", "degC"]),
+    "a value that stands still": ("{k},45.1C,45 C", ["", "C", "C"]),
+    "absent values": ("{k},{a} mm/s,{t:.1f} C", ["", "mm/s", "C"]),
+    "hexadecimal numbers and versions": ("{k},0x{k:02X},3A,v1.2,1.2rc1,{v:.1f}", ["", *[None] * 4, ""]),
+}
+
+
+@pytest.mark.parametrize("decimal", [".", ","])
+@pytest.mark.parametrize("header", [False, True])
+@pytest.mark.parametrize(("form", "units"), UNITS.values(), ids=UNITS)
+def test_units_behind_numbers_are_found(
+    form: str, units: list[str | None], decimal: str, *, header: bool
+) -> None:
+    if decimal == "," and "," in form:
+        form = form.replace(", ", ",").replace(",", ";")
+    rows = [
+        form.format(k=k, v=12 + k % 7 / 10, t=45 + k % 5 / 10, a="--" if k % 9 == 0 else k % 6)
+        for k in range(60)
+    ]
+    rows = [row.replace(".", decimal) for row in rows]
+    separator = next(mark for mark in ("," if decimal == "." else ";", ";", " ") if mark in rows[0])
+    names = [f"n{k}" for k in range(len(units))] if header else [f"c{k + 1}" for k in range(len(units))]
+    rows = [separator.join(names), *rows] if header else rows
+    what = text_lines("".join(f"{row}\r\n" for row in rows).encode())
+    assert what is not None
+    assert (what.separator, what.header, list(what.damaged)) == (separator, header, [])
+    assert [column.name for column in what.columns] == names
+    assert [column.unit if column.numeric else None for column in what.columns] == units
+
+
+def test_lines_in_another_unit_are_damaged() -> None:
+    rows = [f"{k},{k % 7}.5 {'in/s' if k > 55 else 'mm/s'}" for k in range(60)]
+    what = text_lines("".join(f"{row}\n" for row in rows).encode())
+    assert what is not None
+    assert (what.columns[1].unit, what.columns[1].most) == ("mm/s", 6.5)
+    assert list(what.damaged) == rows[56:]
+
+
+def test_what_grows_with_a_unit_behind_it_is_no_counter_and_no_time() -> None:
+    what = text_lines("".join(f"{10 * k} ms,{k % 7}.5\n" for k in range(60)).encode())
+    assert what is not None
+    assert (what.columns[0].unit, what.columns[0].step, what.columns[0].grows) == ("ms", 0.0, False)

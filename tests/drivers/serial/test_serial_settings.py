@@ -121,6 +121,21 @@ def test_the_driver_is_found_by_its_name():
             "own name",
         ),
         (LINE, LINE + 'decimal = ","\n', "streams.casing.layout.decimal", "is the separator too", '";"'),
+        *(
+            (
+                '{ name = "v" }',
+                f'{{ name = "v", suffix = "{suffix}" }}',
+                "streams.casing.layout.channels[0].suffix",
+                message,
+                remedy,
+            )
+            for suffix, message, remedy in (
+                ("mm,s", 'has the separator "," in it', "a separate column in line"),
+                (" mm/s", "cannot be the text behind a number", 'e.g. "mm/s"'),
+                ("12", "cannot be the text behind a number", 'e.g. "mm/s"'),
+                ("°C", "cannot be the text behind a number", 'e.g. "mm/s"'),
+            )
+        ),
         (LINE, LINE + 'separator = "."\n', "streams.casing.layout.separator", "cannot stand between", '";"'),
         (
             LINE,

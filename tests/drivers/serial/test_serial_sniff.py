@@ -488,6 +488,51 @@ def test_new_leaves_out_the_columns_that_are_no_numbers(
     assert layout["channels"] == [{"name": "c3"}]
 
 
+def with_units(number: int) -> bytes:
+    return b"%d,%d.5 mm/s,45.%d C,ok\r\n" % (number, number % 9, number % 3)
+
+
+def test_units_behind_numbers_are_in_words_and_in_what_is_proposed(
+    cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with talking(cable, with_units):
+        assert main(["sniff", "serial", f"{cable.path}", "--seconds", "0.6"]) == 0
+        said = capsys.readouterr().out
+        found = figures(cable, capsys)
+    rows = [text.split() for text in said.splitlines() if text[:3] in {"c2 ", "c3 "}]
+    assert [row[-2:] for row in rows] == [["in", "mm/s"], ["in", "C"]]
+    assert [one["unit"] for one in found["columns"]] == [None, "mm/s", "C", None]
+    proposed = check(tmp_path, found["machine_file"], capsys)
+    assert proposed["streams"]["lines"]["layout"]["channels"] == [
+        {"name": "c2", "suffix": "mm/s"},
+        {"name": "c3", "suffix": "C"},
+    ]
+    assert [(one["type"], one["unit"]) for one in proposed["sensors"]] == [
+        ("velocity", "mm/s"),
+        ("trend", "degC"),
+    ]
+
+
+@pytest.mark.parametrize(("rate", "kind"), [("200", "velocity"), ("10", "trend")])
+def test_new_proposes_the_units_that_it_hears(
+    cable: PseudoTerminal,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    rate: str,
+    kind: str,
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 0.6)
+    with talking(cable, with_units):
+        file = new(cable, tmp_path / "units.toml", "--rate", rate)
+    assert "c2 is in mm/s, as the device writes it behind the number" in capsys.readouterr().out
+    assert file["streams"]["device"]["layout"]["channels"] == [
+        {"name": "c2", "suffix": "mm/s"},
+        {"name": "c3", "suffix": "C"},
+    ]
+    assert [(one["type"], one["unit"]) for one in file["sensors"]] == [(kind, "mm/s"), ("trend", "degC")]
+
+
 def test_new_says_what_to_do_when_it_hears_nothing_and_goes_on(
     cable: PseudoTerminal,
     tmp_path: Path,
