@@ -60,6 +60,9 @@ NO_FAULT = {
 }
 """Functions that print to stderr what ends no command."""
 WRITES_TO_STDERR = {"sys.stderr.write", "warnings.warn", "traceback.print_exc", "traceback.print_exception"}
+SHOWS = re.compile(rf"\b(?:{'|'.join(CODE_AT)})\b")
+PRINTS = re.compile(r"stderr|SystemExit|\bexit\b|\bwarn\b|\bprint_exc")
+"""Words without which nothing is found in a text: to parse the others would take seconds."""
 
 
 def raised(tree: ast.AST) -> Iterator[tuple[ast.Call, str]]:
@@ -86,6 +89,8 @@ def code_of(call: ast.Call, kind: str) -> ast.expr | None:
 
 def without_code(text: str) -> list[tuple[int, str]]:
     """What users are shown without a code: the line, and what is made there."""
+    if not SHOWS.search(text):
+        return []
     return [(call.lineno, kind) for call, kind in raised(ast.parse(text)) if code_of(call, kind) is None]
 
 
@@ -131,6 +136,8 @@ def prints_to_stderr(node: ast.AST) -> bool:
 
 def printing(text: str) -> set[str]:
     """The functions that write to stderr by themselves; ``<module>`` is what no function does."""
+    if not PRINTS.search(text):
+        return set()
     tree = ast.parse(text)
     functions = [one for one in ast.walk(tree) if isinstance(one, ast.FunctionDef | ast.AsyncFunctionDef)]
     within = {node: one.name for one in functions for node in ast.walk(one)}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import io
 import logging
+import re
 import ssl
 from typing import TYPE_CHECKING
 
@@ -30,11 +31,13 @@ if TYPE_CHECKING:
 
 LEVELS = {"warning", "warn", "error", "exception", "critical", "fatal"}
 QUIET = {"logging.DEBUG", "logging.INFO", "NOTICE"}
+CALLS = re.compile(rf"\b(?:{'|'.join(LEVELS)}|log)\b\s*\(")
+"""Without one of these calls, a text is not parsed: that would take seconds for all of them."""
 
 
 def lines(text: str) -> Iterator[tuple[ast.Call, ast.expr]]:
     """The calls that may write a line of the log from WARNING on, with their messages."""
-    for node in ast.walk(ast.parse(text)):
+    for node in ast.walk(ast.parse(text)) if CALLS.search(text) else ():
         if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.args):
             continue
         logger = ast.unparse(node.func.value)
