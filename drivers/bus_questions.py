@@ -55,12 +55,15 @@ class Heard:
         lines: what it is, for a person; a few lines.
         proposals: answers by the key of their question, as they would be typed, that fit the answers so far;
             one that cannot be used is not offered.
-        missed: whether what is looked for was not there, so that an answer before may have to be corrected.
+        missed: what is looked for and was not there, so that an answer before may have to be corrected, with
+            its remedy; empty if all was there. Without a person, ``daqsvc new`` then writes nothing.
+        unheard: the same of the answers so far: what they state and was not heard.
     """
 
     lines: Sequence[str]
     proposals: Callable[[Answers], Mapping[str, str]]
-    missed: bool = False
+    missed: str = ""
+    unheard: Callable[[Answers], str] = lambda _answers: ""
 
 
 class BusQuestions(ABC):

@@ -15,7 +15,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
-from daqsvc.errors.command_line import NOT_OPENED, WRONG_VALUE
+from daqsvc.errors.command_line import NOT_OPENED, NOTHING_ON_BUS, WRONG_VALUE
 from daqsvc.settings.units import unit_of
 
 if TYPE_CHECKING:
@@ -53,6 +53,7 @@ class NothingFoundError(SniffError):
 
     def __init__(self, message: str, figures: Mapping[str, Any] | None = None) -> None:
         super().__init__(message)
+        self.code = NOTHING_ON_BUS
         self.figures: Mapping[str, Any] = figures or {}
 
 

@@ -92,9 +92,12 @@ class _CanQuestions(BusQuestions):
             if answers["interface"] == "socketcan":
                 raise
             found = sniffed(CanSniffer(), [*words, *line], stop, tell)
-        remarks = [*self.remarks(found, answers)]
-        lines = [*_in_words(found), *remarks]
-        return Heard(lines, lambda so_far: self._proposals(found, so_far), missed=bool(remarks))
+        return Heard(
+            list(_in_words(found)),
+            lambda so_far: self._proposals(found, so_far),
+            self.missed(found, answers),
+            lambda so_far: self.unheard(found, so_far),
+        )
 
     def _proposals(self, found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
         fd = any(one["fd"] for one in found["ids"])
@@ -106,10 +109,14 @@ class _CanQuestions(BusQuestions):
         """Those that are about frames; see `Heard.proposals`."""
         raise NotImplementedError
 
-    def remarks(self, found: Mapping[str, Any], answers: Answers) -> Iterator[str]:
-        """Lines behind what was heard: what of it does not fit the answers so far."""
+    def missed(self, found: Mapping[str, Any], answers: Answers) -> str:
+        """See `Heard.missed`."""
         del found, answers
-        yield from ()
+        return ""
+
+    def unheard(self, found: Mapping[str, Any], answers: Answers) -> str:
+        """See `Heard.unheard`."""
+        raise NotImplementedError
 
     def _interface(self) -> Iterator[Question]:
         yield self.ask("interface", _interface, _SOCKETCAN, quiet=True)
@@ -201,6 +208,14 @@ class PackedQuestions(_CanQuestions):
         if "samples-per-frame" in answers:
             proposed["rate"] = f"{usual_rate(chosen['rate_hz'] * answers['samples-per-frame']):g}"
         return proposed
+
+    def unheard(self, found: Mapping[str, Any], answers: Answers) -> str:
+        """See `Heard.unheard`."""
+        heard = [one["id"] for one in found["ids"]]
+        if answers.get("id", heard[0]) in heard:
+            return ""
+        others = ", ".join(f"{one:#x}" for one in heard[:_SHOWN])
+        return f"{answers['id']:#x} was not heard. Remedy: correct --id; those that come: {others}"
 
     def tables(self, answers: Answers) -> Iterator[str]:
         """See `BusQuestions.tables`."""
@@ -348,13 +363,24 @@ class DbcQuestions(_CanQuestions):
             proposed["rate"] = f"{usual_rate(rates[0]) * share * in_frame:g}"
         return proposed
 
-    def remarks(self, found: Mapping[str, Any], answers: Answers) -> Iterator[str]:
-        """See `_CanQuestions.remarks`."""
-        if not _decoded(found):
-            yield (
-                f"No frame is as {answers['dbc']} describes: it is most likely the file of another device. "
-                "What is proposed below comes from that file, and was not heard."
-            )
+    def missed(self, found: Mapping[str, Any], answers: Answers) -> str:
+        """See `Heard.missed`."""
+        if _decoded(found):
+            return ""
+        return (
+            f"No frame is as {answers['dbc']} describes: it is most likely the file of another device. "
+            "Remedy: give the file of the device that sends"
+        )
+
+    def unheard(self, found: Mapping[str, Any], answers: Answers) -> str:
+        """See `Heard.unheard`."""
+        heard = [one["message"] for one in _decoded(found)]
+        if not heard or answers.get("message", heard[0]) in heard:
+            return ""
+        return (
+            f"{answers['message']} was not heard. Remedy: correct --message; those that come: "
+            f"{', '.join(heard)}"
+        )
 
     def _messages(self, answers: Answers) -> dict[str, Message]:
         return _with_signals(answers["dbc-folder"] / answers["dbc"])

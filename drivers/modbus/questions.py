@@ -142,7 +142,11 @@ class _ModbusQuestions(BusQuestions):
         lines = list(_in_words(found))
         if chosen == _AUTO and found["units_asked"][0] == int(_UNITS[0].partition("-")[0]):
             lines.append(f"units {_UNITS[1]} were not asked: daqsvc new --listen --units {_WHOLE} asks all")
-        return Heard(lines, lambda so_far: self._proposals(found, so_far))
+        return Heard(
+            lines,
+            lambda so_far: self._proposals(found, so_far),
+            unheard=lambda so_far: _unheard(found, so_far),
+        )
 
     def _ask_timeout(self) -> Question:
         return self.ask("timeout-ms", q.number, f"{_TIMEOUT_MS:g}")
@@ -605,6 +609,17 @@ def _units_in_words(found: Mapping[str, Any]) -> str:
     return f"units that answer: {', '.join(map(str, found['units']))} ({asked} asked)"
 
 
+def _unheard(found: Mapping[str, Any], answers: Answers) -> str:
+    """See `Heard.unheard`: the unit that was answered has sent nothing."""
+    if found["units_alike"] or answers.get("unit", found["units"][0]) in found["units"]:
+        return ""
+    unit, others = answers["unit"], ", ".join(map(str, found["units"]))
+    first, last = found["units_asked"]
+    if not first <= unit <= last:
+        return f"Unit {unit} was not asked. Remedy: write --units {unit}, too; those that answer: {others}"
+    return f"Unit {unit} has not answered. Remedy: correct --unit; those that answer: {others}"
+
+
 def _without_registers(found: Mapping[str, Any], registers: str) -> Heard:
     """Units that answer, although none of the registers that were asked for is there."""
     from drivers.modbus.scan import ILLEGAL_FUNCTION  # noqa: PLC0415 - only for who listens
@@ -620,18 +635,16 @@ def _without_registers(found: Mapping[str, Any], registers: str) -> Heard:
         elif table["asked"]:
             tables.append(name)
             asked = " to ".join(map(str, table["asked"]))
-            lines.append(
-                f"unit {unit} answers for {name} registers, but has none of {asked}: see its manual for "
-                "their addresses (--registers)"
-            )
-    if registers != _AUTO and (note := registers_of(registers).note("both")):
-        lines.append(note)
+            lines.append(f"unit {unit} answers for {name} registers, but has none of {asked}")
+    note = "" if registers == _AUTO else registers_of(registers).note("both")
+    remedy = "Remedy: write the addresses of its manual, counted from 0, as --registers, e.g. 4000-4100"
+    missed = note or f"No register that was asked for is there. {remedy}"
 
     def proposals(so_far: Answers) -> dict[str, str]:
         tables = by_unit.get(so_far.get("unit", found["units"][0]), [])
         return proposed | ({"table": tables[0]} if tables else {})
 
-    return Heard(lines, proposals, missed=True)
+    return Heard(lines, proposals, missed)
 
 
 def _doubt(address: int | None) -> tuple[str, str] | None:

@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from daqsvc.commands.arguments import EXIT_OK, EXIT_USAGE
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE
 from daqsvc.commands.complaint import complain
 from daqsvc.commands.new.buses import bus_of
 from daqsvc.commands.new.topics import all_topics
@@ -19,11 +19,13 @@ from daqsvc.commands.plugged import foreign_words
 from daqsvc.errors.command_line import CANNOT_WRITE, INTERRUPTED
 from daqsvc.errors.machine_file import PLUGIN_FAILED
 from drivers.questions import SENSOR, short_name
+from drivers.sniffing import SniffError
 
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Callable, Iterator, Mapping
 
+    from daqsvc.commands.new.interview import AnswerError
     from drivers.bus_questions import BusQuestions, Heard
     from drivers.questions import Answers, Question
 
@@ -92,14 +94,14 @@ class NewCommand:
             target.see()
             if ask is not None:
                 _say(_HOW_TO_ANSWER)
-            listen = partial(_heard, target.folder) if arguments.listen else None
+            listen = partial(_heard, target.folder, person=ask is not None) if arguments.listen else None
             answers = conduct(
                 target.file, given, ask, lambda reason: _say(f"  {reason}"), listen, target.named
             )
             text = machine_text(answers, shlex.quote(target.file.name))
             _write(target.file, text)
-        except AnswerError as error:
-            return complain("daqsvc new", error, error.code, EXIT_USAGE)
+        except (AnswerError, SniffError) as error:
+            return _refused(error)
         except KeyboardInterrupt:
             return complain("daqsvc new", "interrupted; nothing was written", INTERRUPTED)
         except EOFError:
@@ -260,21 +262,34 @@ def _ask(question: Question) -> str:
             _say("  there is no default: type an answer, or ? for help")
 
 
-def _heard(folder: Path, bus: BusQuestions, answers: Answers) -> Heard | None:
-    """What is on the bus, which is shown to the person, too; None if nothing was found."""
+def _heard(folder: Path, bus: BusQuestions, answers: Answers, *, person: bool) -> Heard | None:
+    """What is on the bus, which is shown to the person, too; None if nothing was found.
+
+    Raises:
+        SniffError: nothing was found, and nobody is there who could correct an answer.
+    """
     from daqsvc.commands.stopping import stopping  # noqa: PLC0415 - only for who listens
-    from drivers.sniffing import SniffError  # noqa: PLC0415
 
     try:
         with stopping() as stop:
             heard = bus.listen(answers, folder, stop, lambda line: _say(f"  {line}"))
     except SniffError as error:
+        if not person:
+            raise
         _say(f"  Nothing was found: {error}")
         return None
     _say("  Found:" if heard.missed else "  Found, and proposed below:")
     for line in heard.lines:
         _say(f"    {line}")
     return heard
+
+
+def _refused(error: AnswerError | SniffError) -> int:
+    """Say why nothing is written: an answer cannot be used, or the bus does not have what it states."""
+    if isinstance(error, SniffError):
+        exit_code = EXIT_USAGE if error.usage else EXIT_FAILED
+        return complain("daqsvc new", f"nothing was written: {error}", error.code, exit_code)
+    return complain("daqsvc new", error, error.code, EXIT_USAGE)
 
 
 def _write(file: Path, text: str) -> None:
@@ -296,11 +311,14 @@ def _report(file: Path, text: str, answers: Answers) -> int:
     """Say what was written, and what to type next."""
     from daqsvc.box import Box  # noqa: PLC0415 - slow to import
     from daqsvc.commands.new.interview import checked  # noqa: PLC0415
+    from daqsvc.commands.new.machine_text import NOTES  # noqa: PLC0415
     from daqsvc.commands.store_argument import doubts_of_owner  # noqa: PLC0415
 
     machine = checked(text, file)
     quoted = shlex.quote(f"{file}")
     _say(f"\n{file} is written; daqsvc check finds no error in it.")
+    for note in answers.get(NOTES, ()):
+        _say(note)
     for warning in (*machine.warnings, *doubts_of_owner(Box.single(machine))):
         _say(f"{warning}")
     beside, about = bus_of(answers).beside(quoted)

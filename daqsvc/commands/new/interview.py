@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from daqsvc.commands.new.buses import bus_of, buses
-from daqsvc.commands.new.machine_text import machine_text, questions
+from daqsvc.commands.new.machine_text import NOTES, machine_text, questions
 from daqsvc.commands.new.sensors import why_no_bearing
 from daqsvc.commands.new.topics import TOPICS
 from daqsvc.errors.command_line import ANSWER
 from drivers.bus_questions import SHARED
 from drivers.questions import SENSOR, Answers, Question
+from drivers.sniffing import NothingFoundError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -61,6 +62,7 @@ def conduct(
 
     Raises:
         AnswerError: what was given cannot be used, or something is missing.
+        NothingFoundError: what was looked for was not heard, and nobody can be asked.
     """
     if listen is None:
         _refuse_for_listening(given)
@@ -68,7 +70,7 @@ def conduct(
     while not interview.is_over():
         pass
     _refuse_others(given, interview)
-    return interview.answers
+    return interview.answers | {NOTES: interview.notes()}
 
 
 class BackError(Exception):
@@ -94,6 +96,21 @@ class _Interview:
         self._typed: list[str] = []
         """Keys of what a person has answered, the last one last."""
         self._heard: Heard | None = None
+        self._has_listened = False
+        self._assumed: set[str] = set()
+        """Keys of questions whose default was taken, and was not heard."""
+        self._unheard = ""
+
+    def notes(self) -> list[str]:
+        """What in the file was neither answered nor heard, where it was listened for."""
+        example = any(key in _OF_CHANNELS or key.endswith(".address") for key in self._assumed)
+        if not self._has_listened or not example:
+            return []
+        if self._heard is None:
+            return ["Nothing was heard on the bus; the channels are an example."]
+        if self._heard.missed:
+            return ["None of these channels was heard on the bus; they are an example."]
+        return []
 
     def is_over(self) -> bool:
         """Ask what is not answered yet; False if a person goes back, and the rest must be asked again."""
@@ -132,9 +149,30 @@ class _Interview:
         else:
             _answer(question, self._ask, self._say, self.answers, self._file)
             self._typed.append(key)
+        heard = self._heard is not None and question.default != plain.default
+        if key not in texts and not heard and self._is_default(question):
+            self._assumed.add(key)
         if self._answered is not None:
             self._answered(question, self.answers)
+        self._see_unheard()
         self._behind(key)
+
+    def _is_default(self, question: Question) -> bool:
+        default = question.default
+        return default is not None and self.answers[question.key] == question.read(default)
+
+    def _see_unheard(self) -> None:
+        """Say that what the answers state was not heard.
+
+        Raises:
+            NothingFoundError: it was not, and nobody can be asked.
+        """
+        unheard = "" if self._heard is None else self._heard.unheard(self.answers)
+        if unheard and self._ask is None:
+            raise NothingFoundError(unheard)
+        if unheard and unheard != self._unheard:
+            self._say(unheard)
+        self._unheard = unheard
 
     def _is_quiet(self, question: Question) -> bool:
         """Whether the default is taken; of what is looked for, unless a person listens."""
@@ -156,6 +194,11 @@ class _Interview:
             self._say("--listen is left out: on a bus of this kind there is nothing to listen to")
         if key == bus.listens_behind:
             self._heard = listen(bus, self.answers)
+            self._has_listened = True
+            if self._heard is not None and self._heard.missed:
+                if self._ask is None:
+                    raise NothingFoundError(self._heard.missed)
+                self._say(self._heard.missed)
             if self._typed and (self._heard is None or self._heard.missed):
                 self._say("< goes back to correct an answer; then it listens again")
 
@@ -168,8 +211,13 @@ class _Interview:
         keys = list(self.answers)
         for key in keys[keys.index(self._typed.pop()) :]:
             del self.answers[key]
+            self._assumed.discard(key)
         if listens_behind not in self.answers:
-            self._heard = None
+            self._heard, self._has_listened = None, False
+
+
+_OF_CHANNELS = {"channels", "columns", "signals"}
+"""Questions that say what is measured."""
 
 
 def _answer(

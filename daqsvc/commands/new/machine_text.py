@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+NOTES = "notes"
+"""Key, beside the answers, of sentences on what in the file was neither answered nor heard."""
 SCHEMA_FILE = "machine.schema.json"
 """Beside the machine file, so that it is found without a network, wherever daqsvc is installed."""
 SCHEMA_COMMAND = f"daqsvc check --schema > {SCHEMA_FILE}"
@@ -85,6 +87,9 @@ def _head(answers: Answers, file: str) -> Iterator[str]:
     yield "#"
     yield "# Change first: the sensors (sensitivities, places), then the limits of the alarms."
     yield "# Units are part of every name. Relative paths start at the folder of this file."
+    if notes := answers.get(NOTES):
+        yield "#"
+        yield from (f"# {note}" for note in notes)
     yield ""
 
 

@@ -474,6 +474,15 @@ def new(tmp_path: Path, *more: str) -> dict[str, Any]:
     return tomllib.loads(file.read_text("utf-8"))
 
 
+def not_written(tmp_path: Path, *more: str) -> int:
+    """The exit code of the same where it writes no file."""
+    file = tmp_path / "new.toml"
+    words = ["--listen", "--interface=unixbus", f"--channel={tmp_path / 'bus'}", *more]
+    code = main(["new", f"{file}", "--yes", *words])
+    assert not file.exists()
+    return code
+
+
 @pytest.mark.long
 @pytest.mark.usefixtures("hub")
 def test_new_proposes_the_frames_that_it_hears(
@@ -521,21 +530,49 @@ def test_new_says_that_the_dbc_file_is_of_another_device(
     monkeypatch.setattr(questions, "_LISTEN_S", 0.5)
     (tmp_path / "other.dbc").write_text(COUNTED)
     with talking(tmp_path / "bus", accelerations):
-        new(tmp_path, "--bus=can-dbc", "--dbc=other.dbc")
-    said = capsys.readouterr().out
-    assert said.count(", not in the DBC file\n") == 2
-    assert "No frame is as other.dbc describes: it is most likely the file of another device." in said
-    assert "\n  Found:\n" in said
-    assert "Found, and proposed" not in said
+        assert not_written(tmp_path, "--bus=can-dbc", "--dbc=other.dbc") == 1
+    said = capsys.readouterr()
+    assert said.out.count(", not in the DBC file\n") == 2
+    assert (
+        "nothing was written: No frame is as other.dbc describes: it is most likely the file of" in said.err
+    )
+    assert "Remedy: give the file of the device that sends [C20]" in said.err
+    assert "\n  Found:\n" in said.out
+    assert "Found, and proposed" not in said.out
 
 
 @pytest.mark.usefixtures("hub")
-def test_new_says_what_to_do_when_no_frame_comes_and_goes_on(
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (("--bus=can", "--id=0x7f0"), "0x7f0 was not heard. Remedy: correct --id; those that come: 0x"),
+        (
+            ("--bus=can-dbc", "--dbc=two.dbc", "--message=Environment"),
+            "Environment was not heard. Remedy: correct --message; those that come: Acceleration",
+        ),
+    ],
+)
+def test_new_writes_nothing_about_frames_that_it_did_not_hear(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    given: tuple[str, ...],
+    words: str,
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 0.5)
+    other = '\nBO_ 1000 Environment: 8 Vector__XXX\n SG_ Humidity : 0|16@1+ (0.1,0) [0|100] "%" Vector__XXX\n'
+    (tmp_path / "two.dbc").write_text(DBC.read_text("utf-8") + other)
+    with talking(tmp_path / "bus", accelerations):
+        assert not_written(tmp_path, *given) == 1
+    assert words in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("hub")
+def test_new_says_what_to_do_when_no_frame_comes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(questions, "_LISTEN_S", 0.2)
-    tables = new(tmp_path, "--bus=can")
-    said = capsys.readouterr().out
-    assert "Nothing was found: " in said
+    assert not_written(tmp_path, "--bus=can") == 1
+    said = capsys.readouterr().err
+    assert said.startswith("daqsvc new: nothing was written: ")
     assert "Remedy: start the program that sends there" in said
-    assert tables["streams"]["device"]["layout"]["id"] == 0x101

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import json
 import os
 import signal
@@ -20,7 +21,9 @@ from support.ports import free_port
 from support.waiting import PATIENCE_S
 
 from daqsvc.cli import main
+from daqsvc.commands.new.command import _heard
 from daqsvc.commands.new.interview import BackError, Given, conduct
+from daqsvc.commands.new.machine_text import machine_text
 from drivers.modbus import questions, scan, sniff
 from sim_hw.nodes.modbus_node import ModbusRtuServer, ModbusTcpServer, PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit
@@ -452,6 +455,28 @@ def new(tmp_path: Path, target: str, *more: str) -> dict[str, Any]:
     return tomllib.loads(file.read_text("utf-8"))
 
 
+def not_written(tmp_path: Path, target: str, *more: str) -> int:
+    """The exit code of the same where it writes no file."""
+    file = tmp_path / "none.toml"
+    code = main(["new", f"{file}", "--yes", "--bus=modbus-tcp", f"--host={target}", "--listen", *more])
+    assert not file.exists()
+    return code
+
+
+def as_asked(tmp_path: Path, target: str, **given: str) -> tuple[Answers, list[str], dict[str, str | None]]:
+    """Answers of a person who listens and types nothing but Enter, what is said, and the defaults shown."""
+    said: list[str] = []
+    shown: dict[str, str | None] = {}
+
+    def ask(question: Question) -> str:
+        shown[question.key] = question.default
+        return f"{question.default}"
+
+    listen = functools.partial(_heard, tmp_path, person=True)
+    beforehand = Given({"bus": "modbus-tcp", "host": target, **given}, defaults=False)
+    return conduct(tmp_path / "m.toml", beforehand, ask, said.append, listen), said, shown
+
+
 @pytest.mark.long
 @pytest.mark.usefixtures("_few_registers")
 def test_new_proposes_the_registers_that_it_finds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -529,13 +554,30 @@ def test_new_proposes_the_unit_and_the_table_of_a_device_whose_registers_are_els
     for units in (("3-5", "6-7"), ("3-4", "5-6")):
         monkeypatch.setattr(questions, "_UNITS", units)
         with tcp({5: InputOnly()}) as target:
-            layout = new(tmp_path, target)["streams"]["device"]["layout"]
-        assert (layout["unit"], layout["table"]) == (5, "input")
-        said = capsys.readouterr().out
-        assert "Nothing was found" not in said
-        assert "unit 5 has no holding registers: it refuses function 3" in said
-        assert "unit 5 answers for input registers, but has none of 0 to 45: see its manual for " in said
-        assert "\n  Found:\n" in said
+            answers, told, _ = as_asked(tmp_path, target)
+            assert (answers["unit"], answers["table"]) == (5, "input")
+            assert answers["notes"] == ["None of these channels was heard on the bus; they are an example."]
+            said = capsys.readouterr().out
+            assert "Nothing was found" not in said
+            assert "unit 5 has no holding registers: it refuses function 3" in said
+            assert "unit 5 answers for input registers, but has none of 0 to 45\n" in said
+            assert "  Found:\n" in said
+            assert "No register that was asked for is there. Remedy: write the addresses of its" in told[0]
+            assert not_written(tmp_path, target) == 1
+        assert f"daqsvc new: nothing was written: {told[0]} [C20]" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("_few_registers")
+def test_new_writes_nothing_about_a_unit_that_did_not_answer(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(questions, "_UNITS", ("1-2", "3-4"))
+    with tcp({2: pump()}) as target:
+        assert not_written(tmp_path, target, "--unit=1") == 1
+        assert not_written(tmp_path, target, "--unit=9") == 1
+    said = capsys.readouterr().err
+    assert "Unit 1 has not answered. Remedy: correct --unit; those that answer: 2 [C20]" in said
+    assert "Unit 9 was not asked. Remedy: write --units 9, too; those that answer: 2 [C20]" in said
 
 
 class Elsewhere(ModbusUnit):
@@ -560,7 +602,7 @@ def test_new_looks_at_the_registers_that_it_is_told(
         said = capsys.readouterr().out
         inputs = new(tmp_path, target, "--units=3", "--registers=30001-30004")["streams"]["device"]["layout"]
         capsys.readouterr()
-        new(tmp_path, target, "--units=3", "--registers=40001-40004")
+        assert not_written(tmp_path, target, "--units=3", "--registers=40001-40004") == 1
     assert "units that answer: 3 (unit 3 was asked)" in said
     assert "unit 3 has holding registers 4000 to 4007 (4000 to 4009 were asked; --registers looks" in said
     assert "  4002: 61.5 as float32 ABCD\n" in said  # the next number moves, this one does not
@@ -573,9 +615,9 @@ def test_new_looks_at_the_registers_that_it_is_told(
         (30_001, "float32"),
         (30_003, "float32"),
     ]
-    said = capsys.readouterr().out
-    assert "answers for holding registers, but has none of 40001 to 40004: see its manual for their" in said
-    assert "on the line they are 0-3. Remedy: write --registers 0-3\n" in said
+    shown = capsys.readouterr()
+    assert "answers for holding registers, but has none of 40001 to 40004\n" in shown.out
+    assert "on the line they are 0-3. Remedy: write --registers 0-3 [C20]\n" in shown.err
 
 
 def test_at_a_terminal_it_asks_which_registers_and_going_back_asks_again(
@@ -602,9 +644,12 @@ def test_at_a_terminal_it_asks_which_registers_and_going_back_asks_again(
         answers = conduct(tmp_path / "m.toml", given, ask, said.append, listen)
     registers = [default for key, default in shown if key == "registers"]
     assert registers == ["auto", "auto", "0-3"]  # the numbers of a manual are doubted once
-    assert said[0] == "< goes back to correct an answer; then it listens again"
-    assert "where input registers begin at 30001; on the line they are 0-3. Enter takes 0-3; type" in said[1]
-    assert len(said) == 2
+    assert said[0].startswith(
+        "No register that was asked for is there. Remedy: write the addresses of its manual"
+    )
+    assert said[1] == "< goes back to correct an answer; then it listens again"
+    assert "where input registers begin at 30001; on the line they are 0-3. Enter takes 0-3; type" in said[2]
+    assert len(said) == 3
     assert [answers[f"sensor.{name}.address"] for name in answers["channels"]] == [30_001, 30_003]
 
 
@@ -632,19 +677,24 @@ def test_units_may_be_a_list(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.usefixtures("_few_registers")
-def test_new_says_what_to_do_when_nobody_answers_and_goes_on(
+def test_new_says_what_to_do_when_nobody_answers(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(questions, "_UNITS", ("1-1", "2-2"))
-    tables = new(tmp_path, f"127.0.0.1:{free_port()}")
-    assert "nobody listens there; start the server, or correct its address" in capsys.readouterr().out
+    nobody = f"127.0.0.1:{free_port()}"
+    assert not_written(tmp_path, nobody) == 1
+    assert "nobody listens there; start the server, or correct its address" in capsys.readouterr().err
     with tcp({9: pump()}) as target:
-        new(tmp_path, target)
-    assert "no unit answers (unit 2 was asked). Remedy: check that 127.0.0.1 is" in capsys.readouterr().out
-    assert [one["name"] for one in tables["streams"]["device"]["layout"]["channels"]] == [
-        "vibration",
-        "temperature",
-    ]
+        assert not_written(tmp_path, target) == 1
+    assert "no unit answers (unit 2 was asked). Remedy: check that 127.0.0.1 is" in capsys.readouterr().err
+    answers, _, _ = as_asked(tmp_path, nobody)
+    assert "Nothing was found: " in capsys.readouterr().out
+    assert answers["channels"] == ("vibration", "temperature")
+    text = machine_text(answers, "m.toml")
+    assert "\n# Nothing was heard on the bus; the channels are an example.\n" in text
+    # Whoever names the channels and their registers needs no such comment.
+    own = {"channels": "a", "sensor.a.address": "7"}
+    assert "example" not in machine_text(as_asked(tmp_path, nobody, **own)[0], "m.toml").partition("[")[0]
 
 
 def test_new_waits_for_replies_as_long_as_was_answered(
@@ -654,13 +704,13 @@ def test_new_waits_for_replies_as_long_as_was_answered(
     monkeypatch.setattr(sniff, "REGISTERS", "0-0")
     late = lambda *_: PlannedReply(delay_ns=350_000_000)  # noqa: E731
     with serving(lambda: ModbusTcpServer({5: InputOnly()}, plan=late)) as server:
-        new(tmp_path, f"127.0.0.1:{server.port}", "--units=5")
+        assert not_written(tmp_path, f"127.0.0.1:{server.port}", "--units=5") == 1
     assert "units that answer: 5" in capsys.readouterr().out
 
 
 def test_new_proposes_a_unit_that_was_to_be_asked_although_it_does_not_answer(tmp_path: Path) -> None:
-    tables = new(tmp_path, f"127.0.0.1:{free_port()}", "--units=15-18")
-    assert tables["streams"]["device"]["layout"]["unit"] == 15
+    answers, _, _ = as_asked(tmp_path, f"127.0.0.1:{free_port()}", units="15-18")
+    assert answers["unit"] == 15
 
 
 class Short(Watched):

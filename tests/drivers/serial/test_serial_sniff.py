@@ -533,18 +533,23 @@ def test_new_proposes_the_units_that_it_hears(
     assert [(one["type"], one["unit"]) for one in file["sensors"]] == [(kind, "mm/s"), ("trend", "degC")]
 
 
-def test_new_says_what_to_do_when_it_hears_nothing_and_goes_on(
+def test_new_says_what_to_do_when_it_hears_nothing(
     cable: PseudoTerminal,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(sniff, "TRY_S", 0.01)
-    layout = new(cable, tmp_path / "silent.toml")["streams"]["device"]["layout"]
-    said = capsys.readouterr().out
-    assert "Nothing was found: " in said
-    assert "no byte came. Remedy: check that the device is powered" in said
-    assert layout["line"] == ["t", "x", "y"]
+    for port, words in (
+        (f"{cable.path}", "no byte came. Remedy: check that the device is powered"),
+        ("/dev/ttyS99", "there is no /dev/ttyS99"),
+    ):
+        file = tmp_path / "silent.toml"
+        assert main(["new", f"{file}", "--yes", "--listen", "--bus=serial", f"--port={port}"]) == 1
+        said = capsys.readouterr().err
+        assert said.startswith("daqsvc new: nothing was written: ")
+        assert words in said
+        assert not file.exists()
 
 
 def test_new_proposes_the_frames_that_it_hears(
