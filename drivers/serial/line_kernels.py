@@ -309,14 +309,26 @@ def read_lines(
     return states, values
 
 
-COUNT, STAMP, DUE, GRAIN, SHARED = range(5)
+COUNT, STAMP, DUE, GRAIN, SHARED, TICKS, LOSING, CREDIT = range(8)
 """What is known of a device's time stamps: count, stamp and instant of its newest sample in s, how coarse the
-stamps are in s, and whether several samples share one."""
-KNOWN = SHARED + 1
-_SLACK = 0.6
+stamps are in s, and whether several samples share one. Of such stamps also: how many there were, which share
+of the last samples was missing, and how late in s a sample may be without any missing before it."""
+KNOWN = CREDIT + 1
+_SETTLING_TICKS = 32
+"""Stamps that samples share until it is known where in its grain the device samples."""
+_SLACK_AT_FIRST, _SLACK = 0.6, 0.25
 """How many periods late, beside the half one, a sample must be for a shared stamp to show missing ones."""
 _NOT_BEFORE_STAMP = 0.5
-"""In place of `tracking`, for samples that are due before the stamp that they share with others."""
+"""In place of `tracking`, for samples that are due before the stamp that they share, at first."""
+_DRIFT, _MOST_DRIFT = 0.0125, 0.5
+"""By how much slower than stated a device may be, as a share of its rate, without any sample missing. How
+many periods of that may be unseen, until a sample falls to the next stamp."""
+_MOST_JITTER = 4.0
+"""Periods by which samples may be late at times, after which others are too early for their stamp."""
+_LOSING = 0.015
+"""Share of missing samples from which what is late is no drift: no device is slow at times."""
+_PART_OF_SHARE, _MOST_AT_ONCE = 1.0 / 200.0, 2.0
+"""In samples; and how many of a gap count for that share, which is of losses that go on."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -327,20 +339,35 @@ def _next_stamp(state: Values, time_s: float, period_s: float, tracking: float) 
         state[SHARED] = 1.0
     else:
         state[GRAIN] = min(state[GRAIN], passed_s)
+        state[TICKS] += state[SHARED]
+    state[STAMP] = time_s
+    settled = state[TICKS] > _SETTLING_TICKS
     # It was taken when it is due, or some samples are missing before it.
-    slack = _SLACK if state[SHARED] else 0.0
+    slack = _SLACK + state[CREDIT] / period_s if settled else _SLACK_AT_FIRST * state[SHARED]
     steps = max(np.rint((time_s - state[DUE]) / period_s - slack), 1.0)
     state[COUNT] = (state[COUNT] + steps % _COUNTS) % _COUNTS
     state[DUE] += steps * period_s
-    state[STAMP] = time_s
     ahead_s = time_s - state[DUE]
     if not state[SHARED]:
         state[DUE] += tracking * ahead_s
-    elif ahead_s > 0.0:
-        state[DUE] += _NOT_BEFORE_STAMP * ahead_s
-    else:
+    elif ahead_s <= 0.0:
         # The samples that share a stamp were taken within its grain.
-        state[DUE] += tracking * min(ahead_s + state[GRAIN], 0.0)
+        back_s = tracking * max(-ahead_s - state[GRAIN], 0.0)
+        state[DUE] -= back_s
+        if state[CREDIT] < _MOST_JITTER * period_s:
+            state[CREDIT] += back_s
+    elif settled:
+        drift_s = min(ahead_s, state[CREDIT])
+        state[DUE] += drift_s
+        state[CREDIT] -= drift_s
+    else:
+        state[DUE] += _NOT_BEFORE_STAMP * ahead_s
+    if settled:
+        state[LOSING] += _PART_OF_SHARE * (min(steps - 1.0, _MOST_AT_ONCE) - state[LOSING])
+        # Towards what drift may be unseen: of a faster device samples are too early all the time.
+        unseen_s = _MOST_DRIFT * period_s if state[LOSING] < _LOSING else 0.0
+        step_s = _DRIFT * passed_s
+        state[CREDIT] += min(max(unseen_s - state[CREDIT], -step_s), step_s)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -380,6 +407,6 @@ def count_stamps(
             earlier = max(np.rint((now[DUE] - time_s) / period_s), 1.0)
             counts[k] = np.int64((now[COUNT] - earlier) % _COUNTS)
         else:
-            now[:] = np.array([0.0, time_s, time_s, np.inf, 0.0])
+            now[:] = np.array([0.0, time_s, time_s, np.inf, 0.0, 0.0, 0.0, 0.0])
             counts[k] = 0
     return counts

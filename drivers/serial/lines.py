@@ -254,7 +254,8 @@ class DeviceTime:
     not quite the nominal one gains or loses no sample over the hours. Stamps may be rounded to a quarter
     of a sampling period for every gap to be known exactly. Coarser ones, which several lines share, show
     gaps that are longer than their grain; a line is a sample all the same, so without a counter a repeated
-    line cannot be known.
+    line cannot be known. Where lines go missing again and again, they fall behind the stamps by more than a
+    device that is slower than stated by up to 1.25 %: all of these are counted then.
 
     A line that was overtaken goes back to its place within the reorder window. Time that goes back farther
     means that the device was restarted: the count begins at 0 again. One damaged stamp moves no other.
