@@ -65,11 +65,10 @@ def test_a_serial_port_of_the_page_has_a_stream(place, stream, channel):
 
 
 def test_the_channels_with_a_unit_behind_the_number_fit_a_line():
-    _, lines, channels, _ = blocks("serial.md")
-    start = lines.index("line = ")
-    text = f'{lines[:start]}line = ["seq", "v", "temp"]\ncounter = {{ column = "seq" }}\n{channels}'
+    _, lines, changed, _ = blocks("serial.md")
+    text = lines[: lines.index("[streams.casing.layout]")] + changed
     layout = machine(text, "casing", "v").streams["casing"].layout
-    assert [channel.suffix for channel in layout.channels] == ["mm/s", "C"]
+    assert [channel.suffix for channel in layout.channels] == ["mm/s", "mm/s"]
 
 
 def test_a_table_is_replayed_as_the_page_shows():
