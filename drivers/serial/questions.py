@@ -10,7 +10,15 @@ from drivers import packed_questions as packed
 from drivers import questions as q
 from drivers.bus_questions import BUS, BusQuestions, Heard, only_port
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
-from drivers.serial.sniff import MUST_TURN, SerialSniffer, turn_words, unit_of_suffix
+from drivers.serial.sniff import (
+    LINES_NEED,
+    MUST_TURN,
+    NO_NUMBERS,
+    SerialSniffer,
+    frames_need,
+    turn_words,
+    unit_of_suffix,
+)
 from drivers.sniffing import WAVEFORM_HZ, sniffed, table_name, unused, usual_rate
 from drivers.toml_lines import array, entry
 
@@ -115,7 +123,7 @@ class SerialQuestions(BusQuestions):
         """See `BusQuestions.listen`."""
         del folder
         found = sniffed(SerialSniffer(), ["--seconds", f"{_LISTEN_S:g}", "--", answers["port"]], stop, tell)
-        return Heard(list(_in_words(found)), lambda so_far: _proposals(found, so_far))
+        return Heard(list(_in_words(found)), lambda so_far: _proposals(found, so_far), _missed(found))
 
     def questions(self, answers: Answers, folder: Path) -> Iterator[Question]:
         """See `BusQuestions.questions`."""
@@ -342,12 +350,35 @@ def _proposals(found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
     return proposed
 
 
+def _missed(found: Mapping[str, Any]) -> str:
+    """See `Heard.missed`: what a stream needs, and the device does not send."""
+    if found["framing"] != "lines":
+        if found["counter"] is not None and found["counter_bits"] is not None:
+            return ""
+        return f"{frames_need(_payload_length(found))}. Remedy: see the manual of the device"
+    places = [one for one in found["columns"] if one["counts"] or one["time_unit"]]
+    numbers = [one for one in found["columns"] if one["numeric"]]
+    if places and len(numbers) > 1:
+        return ""
+    begin = "" if numbers else f"{NO_NUMBERS} "
+    return f"{begin}{LINES_NEED}. Remedy: have the device send them"
+
+
+def _is_known_crc(found: Mapping[str, Any]) -> bool:
+    """Whether it is one of the two that the driver knows, which leave out the sync word."""
+    return found["crc"] in _CRCS and found["crc_from"] == len(found["sync_word"]) // 2
+
+
+def _payload_length(found: Mapping[str, Any]) -> int:
+    """Bytes of the payload for the driver; a check that it does not know is a part of it."""
+    length: int = found["payload_length"]
+    return length + (0 if _is_known_crc(found) else found["crc_bytes"])
+
+
 def _frame_proposals(found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
     """Those of binary frames; see `Heard.proposals`."""
-    # The driver knows two CRCs, which leave out the sync word; another check is a part of the payload for it.
-    known = found["crc"] in _CRCS and found["crc_from"] == len(found["sync_word"]) // 2
-    length = found["payload_length"] + (0 if known else found["crc_bytes"])
-    proposed = {"crc": found["crc"] if known else "none", "payload-length": f"{length}"}
+    known = _is_known_crc(found)
+    proposed = {"crc": found["crc"] if known else "none", "payload-length": f"{_payload_length(found)}"}
     if found["sync_word"]:
         proposed["sync-word"] = found["sync_word"]
     if known:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import select
+import textwrap
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -551,9 +552,10 @@ class _Report(NamedTuple):
             if what.prefix:
                 yield f"# Lines that begin with {what.prefix}:"
             if not any(one.numeric for one in what.columns):
-                yield "# No column is a number alone, such as 22.5: NAME=22.5, JSON and hex are not read."
-            yield "# A stream needs a column that counts lines, or one with the device's time, and a column"
-            yield "# of numbers beside it; have the device send them."
+                yield f"# {NO_NUMBERS}"
+            yield from (
+                f"# {line}" for line in textwrap.wrap(f"{LINES_NEED}; have the device send them.", 90)
+            )
             return
         names = _names(what.columns)
         yield f"[streams.{stream}]"
@@ -603,8 +605,8 @@ class _Report(NamedTuple):
         counter, packed = what.counter, _packed(what)
         rate_hz = self._rate_hz(what)
         if counter is None or packed is None or rate_hz is None:
-            yield f"# A stream needs a counter: none was found in the {payload} bytes of payload, or nothing"
-            yield "# behind it. See the manual of the device."
+            needed = f"{frames_need(payload)}. See the manual of the device."
+            yield from (f"# {line}" for line in textwrap.wrap(needed, 90))
             return
         samples = packed.samples_per_frame
         yield "[streams.frames]"
@@ -659,6 +661,19 @@ def _tried_row(one: Tried) -> Sequence[str]:
         f"{100 * found.printable:.0f} %",
         f"{found.score:.2f}",
     )
+
+
+NO_NUMBERS = "No column is a number alone, such as 22.5: NAME=22.5, JSON and hex are not read."
+LINES_NEED = (
+    "A stream needs a column that counts lines, or one with the device's time, and a column of numbers "
+    "beside it"
+)
+"""Why nothing is proposed of lines."""
+
+
+def frames_need(payload: int) -> str:
+    """The same of binary frames with so many bytes between sync word and CRC."""
+    return f"A stream needs a counter: none was found in the {payload} bytes of payload, or nothing behind it"
 
 
 MUST_TURN = "one that begins again at 0 after 999, 9999 or the like is no counter for daqsvc"

@@ -104,13 +104,16 @@ class _Interview:
     def notes(self) -> list[str]:
         """What in the file was neither answered nor heard, where it was listened for."""
         example = any(key in _OF_CHANNELS or key.endswith(".address") for key in self._assumed)
-        if not self._has_listened or not example:
+        if not self._has_listened:
             return []
         if self._heard is None:
-            return ["Nothing was heard on the bus; the channels are an example."]
-        if self._heard.missed:
+            return ["Nothing was heard on the bus; the channels are an example."] * example
+        if not self._heard.missed:
+            return []
+        if example:
             return ["None of these channels was heard on the bus; they are an example."]
-        return []
+        counter = bool(self._assumed & {"counter", "counter-byte"})
+        return ["Nothing was heard that counts or tells a time; the counter is an example."] * counter
 
     def is_over(self) -> bool:
         """Ask what is not answered yet; False if a person goes back, and the rest must be asked again."""

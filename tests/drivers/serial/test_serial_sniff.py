@@ -22,8 +22,9 @@ from support.formats import fits
 from support.waiting import PATIENCE_S
 
 from daqsvc.cli import main
+from daqsvc.commands.new.interview import Given, conduct
 from drivers.serial import questions, sniff
-from drivers.serial.questions import _in_words, _proposals
+from drivers.serial.questions import SerialQuestions, _in_words, _proposals
 from drivers.serial.recognise import recognised
 from drivers.serial.recognise_lines import TextLines
 from drivers.serial.sniff import MUST_TURN
@@ -550,6 +551,63 @@ def test_new_says_what_to_do_when_it_hears_nothing(
         assert said.startswith("daqsvc new: nothing was written: ")
         assert words in said
         assert not file.exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (
+            b"1.%d mm/s, 45.%d C\r\n",
+            "A stream needs a column that counts lines, or one with the device's time",
+        ),
+        (b"V=1.%d T=45.%d\r\n", "No column is a number alone, such as 22.5: NAME=22.5, JSON and hex are not"),
+    ],
+)
+def test_new_makes_no_counter_of_a_measured_column(
+    cable: PseudoTerminal,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    text: bytes,
+    words: str,
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 0.6)
+    file = tmp_path / "no-counter.toml"
+    with talking(cable, lambda number: text % (number * 7 % 10, number * 3 % 10)):
+        assert main(["new", f"{file}", "--yes", "--listen", "--bus=serial", f"--port={cable.path}"]) == 1
+        said = capsys.readouterr()
+        heard = SerialQuestions().listen(
+            {"port": f"{cable.path}"}, tmp_path, threading.Event(), lambda _line: None
+        )
+    assert words in said.err
+    assert "Remedy: have the device send them [C20]" in said.err
+    assert "\n  Found:\n" in said.out
+    assert not file.exists()
+    # A person is told the same, goes on, and finds it in the file.
+    told: list[str] = []
+    given = Given({"bus": "serial", "port": f"{cable.path}"}, defaults=False)
+    answers = conduct(file, given, lambda question: f"{question.default}", told.append, lambda *_: heard)
+    assert words in told[0]
+    assert answers["notes"] == ["Nothing was heard that counts or tells a time; the counter is an example."]
+
+
+def test_new_proposes_no_counter_for_frames_without_one(
+    cable: PseudoTerminal,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 0.6)
+
+    def uncounted(number: int) -> bytes:
+        payload = bytes([number * 7 % 256, 1, number * 31 % 256, 2, number * 57 % 256, 3])
+        return b"\xa5\x5a" + payload + binascii.crc_hqx(payload, 0xFFFF).to_bytes(2, "big")
+
+    file = tmp_path / "no-counter.toml"
+    with talking(cable, uncounted):
+        assert main(["new", f"{file}", "--yes", "--listen", "--bus=serial", f"--port={cable.path}"]) == 1
+    assert "A stream needs a counter: none was found in the 6 bytes of payload" in capsys.readouterr().err
+    assert not file.exists()
 
 
 def test_new_proposes_the_frames_that_it_hears(
