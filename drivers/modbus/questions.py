@@ -126,11 +126,15 @@ class _ModbusQuestions(BusQuestions):
             first = _UNITS[0] if chosen == _AUTO else chosen
             found = sniffed(ModbusSniffer(), ["--units", first, *words], stop, tell)
         except NothingFoundError as error:
-            if error.figures.get("units"):
+            # A server that answers for units that it does not have answers alike for all of these.
+            alike = error.figures.get("units_alike", False) and error.figures["units_asked"] == _first_units()
+            further = chosen == _AUTO and not stop.is_set()
+            if error.figures.get("units") and not (alike and further):
                 return _without_registers(error.figures, answers["registers"])
-            if stop.is_set() or chosen != _AUTO:
+            if not further:
                 raise
-            tell(f"none of units {_UNITS[0]} answers: {_UNITS[1]} are asked, too; Ctrl-C ends that")
+            why = "has such registers" if alike else "answers"
+            tell(f"none of units {_UNITS[0]} {why}: {_UNITS[1]} are asked, too; Ctrl-C ends that")
             try:
                 found = sniffed(ModbusSniffer(), ["--units", _UNITS[1], *words], stop, tell)
             except NothingFoundError as other:
@@ -565,7 +569,7 @@ def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
     """What was found, in a few lines: which units answer, and the registers that are worth reading."""
     from drivers.modbus.scan_report import NO_VALUE  # noqa: PLC0415 - brings the settings
 
-    yield _units_in_words(found)
+    yield from _units_in_words(found)
     for table in found["tables"]:
         if not table["registers"]:
             continue
@@ -602,11 +606,23 @@ def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
             yield f"  ... and {len(shown) - _SHOWN} more: daqsvc sniff modbus shows them"
 
 
-def _units_in_words(found: Mapping[str, Any]) -> str:
-    """Which units answer, of those that were asked."""
+def _units_in_words(found: Mapping[str, Any]) -> Iterator[str]:
+    """Which units answer, of those that were asked, and which of these were not read."""
     first, last = found["units_asked"]
     asked = f"unit {first} was" if first == last else f"units {first} to {last} were"
-    return f"units that answer: {', '.join(map(str, found['units']))} ({asked} asked)"
+    yield f"units that answer: {', '.join(map(str, found['units']))} ({asked} asked)"
+    if found["units_alike"]:
+        yield f"all answer alike, so only unit {found['units'][0]} was read: --units N reads unit N"
+    elif left_out := found["units_left_out"]:
+        yield (
+            f"the others from {left_out[0]} to {left_out[-1]} all refuse with one exception, as if they were "
+            "not there: --units N reads unit N"
+        )
+
+
+def _first_units() -> list[int]:
+    """The first and the last of the units that are asked at first."""
+    return [int(one) for one in _UNITS[0].split("-")]
 
 
 def _unheard(found: Mapping[str, Any], answers: Answers) -> str:
@@ -617,14 +633,15 @@ def _unheard(found: Mapping[str, Any], answers: Answers) -> str:
     first, last = found["units_asked"]
     if not first <= unit <= last:
         return f"Unit {unit} was not asked. Remedy: write --units {unit}, too; those that answer: {others}"
-    return f"Unit {unit} has not answered. Remedy: correct --unit; those that answer: {others}"
+    said = "has refused, like most units" if unit in found["units_left_out"] else "has not answered"
+    return f"Unit {unit} {said}. Remedy: correct --unit; those that answer: {others}"
 
 
 def _without_registers(found: Mapping[str, Any], registers: str) -> Heard:
     """Units that answer, although none of the registers that were asked for is there."""
     from drivers.modbus.scan import ILLEGAL_FUNCTION  # noqa: PLC0415 - only for who listens
 
-    lines = [_units_in_words(found)]
+    lines = list(_units_in_words(found))
     proposed = {"unit": f"{found['units'][0]}"}
     by_unit: dict[int, list[str]] = {}
     for table in found["tables"]:
@@ -638,7 +655,8 @@ def _without_registers(found: Mapping[str, Any], registers: str) -> Heard:
             lines.append(f"unit {unit} answers for {name} registers, but has none of {asked}")
     note = "" if registers == _AUTO else registers_of(registers).note("both")
     remedy = "Remedy: write the addresses of its manual, counted from 0, as --registers, e.g. 4000-4100"
-    missed = note or f"No register that was asked for is there. {remedy}"
+    others = "; or name other units with --units" if found["units_alike"] or found["units_left_out"] else ""
+    missed = note or f"No register that was asked for is there. {remedy}{others}"
 
     def proposals(so_far: Answers) -> dict[str, str]:
         tables = by_unit.get(so_far.get("unit", found["units"][0]), [])

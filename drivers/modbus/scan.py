@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -20,7 +21,7 @@ from drivers.modbus.settings import ModbusRtuBus
 
 if TYPE_CHECKING:
     import threading
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from daqsvc.acquisition.clock import Clock
     from drivers.modbus.settings import ModbusBus
@@ -29,7 +30,7 @@ ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE = 1, 2, 3
 BLOCK = 100
 """Registers in a request at first."""
 ALIKE = 8
-"""Addresses in a row that all answer, from which on the server is taken to ignore the address."""
+"""Addresses that all answer alike, from which on the server is taken to ignore the address."""
 QUIET_S = 0.1
 """Silence on a serial line after a request without reply, which may still come."""
 ROUNDS, ROUND_S = 5, 0.3
@@ -152,9 +153,11 @@ class Scan:
         to_ask: all of them.
         asked: the last one that was; None if none was.
         searched: whether all were asked, or the answers tell that the others need not be.
-        units: those that answered, in order.
+        units: those that answered, in order, without those that are left out.
         gateway: addresses of which a gateway reported that no unit is behind them.
-        alike: whether every address answered, so that only the first is taken for a unit.
+        alike: whether every address answered alike, so that only the first is taken for a unit.
+        left_out: addresses that answered like most, where every one answered, and few answered differently.
+        exception: the one that those gave; None if there are none.
         tables: what was read.
         lost: why the line was lost; empty if it was not.
         counters: of the line.
@@ -173,6 +176,8 @@ class Scan:
     units: list[int] = field(default_factory=list)
     gateway: list[int] = field(default_factory=list)
     alike: bool = False
+    left_out: list[int] = field(default_factory=list)
+    exception: int | None = None
     tables: list[FoundTable] = field(default_factory=list)
     lost: str = ""
     counters: ModbusCounters = field(default_factory=ModbusCounters)
@@ -215,7 +220,7 @@ class Scan:
         most = min(end + READ_ON, LAST_REGISTER) if read_on else end
         await self._connect()
         try:
-            await self._find(units, functions[0], begin)
+            await self._find(units, functions, begin)
             for unit in self.units:
                 for function in functions:
                     table = FoundTable(unit, function, begin)
@@ -230,8 +235,9 @@ class Scan:
         finally:
             await self._close()
 
-    async def _find(self, units: Sequence[int], function: int, address: int) -> None:
+    async def _find(self, units: Sequence[int], functions: Sequence[int], address: int) -> None:
         self.first_unit, self.to_ask = units[0], units
+        answers: dict[int, bytes | int] = {}
         for tried, unit in enumerate(units, 1):
             if self.stop.is_set():
                 return
@@ -239,19 +245,74 @@ class Scan:
             answered = ", ".join(map(str, self.units)) or "none"
             self._progress(f"asking unit {unit}, at most {rest_s} s to go; units that answer: {answered}")
             self.asked = unit
-            try:
-                await self._ask(unit, function, address, 1)
-            except NoReplyError:
-                continue
-            except RequestRefusedError as error:
-                if error.code in GATEWAY_CODES:
-                    self.gateway.append(unit)
-                    continue
-            self.units.append(unit)
-            if tried == ALIKE == len(self.units) and not isinstance(self.bus, ModbusRtuBus):
+            answer = await self._answer(unit, functions[0], address)
+            if isinstance(answer, int) and answer in GATEWAY_CODES:
+                self.gateway.append(unit)
+            elif answer is not None:
+                self.units.append(unit)
+                answers[unit] = answer
+            if (
+                tried == ALIKE
+                and self._answer_all(tried)
+                and await self._is_one(answers, functions[0], address)
+            ):
                 self.alike, self.units = True, self.units[:1]
-                break
+                self.searched = True
+                return
         self.searched = True
+        if len(units) >= ALIKE and self._answer_all(len(units)):
+            await self._leave_out(answers, functions, address)
+
+    async def _answer(self, unit: int, function: int, address: int) -> bytes | int | None:
+        """What a unit answers for one register: its value, or the code of an exception; None if nothing."""
+        try:
+            return await self._ask(unit, function, address, 1)
+        except NoReplyError:
+            return None
+        except RequestRefusedError as error:
+            return error.code
+
+    def _answer_all(self, asked: int) -> bool:
+        """Whether so many addresses all answered, as with a server that answers for any address."""
+        return len(self.units) == asked and not isinstance(self.bus, ModbusRtuBus)
+
+    async def _is_one(self, answers: Mapping[int, bytes | int], function: int, address: int) -> bool:
+        """Whether values that were read in the name of several units are of one register, which may move."""
+        first, *others = answers
+        if any(isinstance(answer, int) for answer in answers.values()):
+            return False
+        for unit in others:
+            if answers[unit] != answers[first]:
+                before = await self._answer(first, function, address)
+                other = await self._answer(unit, function, address)
+                after = await self._answer(first, function, address)
+                if before == after != other:
+                    return False
+        return True
+
+    async def _leave_out(
+        self, answers: dict[int, bytes | int], functions: Sequence[int], address: int
+    ) -> None:
+        """Leave out the addresses that give the exception that most give; of all, keep the first.
+
+        A server may answer so for a unit that it does not have.
+        """
+        for function in functions:
+            if function != functions[0]:
+                for unit in self.units:
+                    if self.stop.is_set():
+                        return
+                    self._progress(f"asking unit {unit} by function {function}")
+                    answers[unit] = await self._answer(unit, function, address) or b""
+            common, times = Counter(answers.values()).most_common(1)[0]
+            if not isinstance(common, int) or 2 * times <= len(answers):
+                return
+            if times < len(answers):
+                self.exception = common
+                self.left_out = [unit for unit in self.units if answers[unit] == common]
+                self.units = [unit for unit in self.units if answers[unit] != common]
+                return
+        self.alike, self.units = True, self.units[:1]
 
     def _progress(self, words: str) -> None:
         now_ns = self.clock.monotonic_ns()

@@ -95,7 +95,8 @@ class ModbusFigures(TypedDict):
         units: units that answered.
         units_asked: first and last unit that was asked; empty if none was.
         units_gateway: units of which a gateway reported that there is none.
-        units_alike: whether every address answered, so that only the first is taken for a unit.
+        units_alike: whether every address answered alike, so that only the first is taken for a unit.
+        units_left_out: addresses that were not read, as they gave the exception that most addresses gave.
         tables: what was read.
     """
 
@@ -106,4 +107,5 @@ class ModbusFigures(TypedDict):
     units_asked: list[int]
     units_gateway: list[int]
     units_alike: bool
+    units_left_out: list[int]
     tables: list[TableFigures]

@@ -69,8 +69,15 @@ class ScanReport:
             last = max((table.last for table in scan.tables if table.last is not None), default=None)
             asked = f"registers {scan.tables[0].begin} to {last}"
             other = ", and for its tables (--function both)" if len(self._functions) == 1 else ""
+            others = (
+                ", and for its unit address (--units N), as others may have some"
+                if scan.alike or scan.left_out
+                else ""
+            )
+            whose = f" of {units_in_words(scan.units)}" if others else ""
             more = self._note or (
-                f"{asked} were asked. Remedy: see the device's manual for its addresses (--registers){other}"
+                f"{asked}{whose} were asked. Remedy: see the device's manual for its addresses (--registers)"
+                f"{other}{others}"
             )
             return f"{where}: no register could be read by function {functions}; {more}"
         return ""
@@ -115,7 +122,15 @@ class ScanReport:
         asked = f"{self._asked}{early}"
         yield f"{self._bus.where}: {scan.requests} requests; units that answer: {found} ({asked})"
         if scan.alike:
-            yield "It answers in the name of every unit, so it is one device; only the first one was read."
+            yield (
+                "It answers in the name of every unit, and alike, so it is taken for one device: only unit "
+                f"{scan.units[0]} was read; --units N reads unit N."
+            )
+        if scan.exception is not None:
+            yield (
+                f"Units {_runs(scan.left_out)} all answer with {_exception(scan.exception)}, as for units "
+                "that are not there: they were not read; --units N reads unit N."
+            )
         if scan.gateway:
             many = f"{len(scan.gateway)} address{'es' * (len(scan.gateway) != 1)}"
             yield f"A gateway reports that no unit answers behind it at {many}."
@@ -132,8 +147,7 @@ class ScanReport:
             elif units[0] == table.unit:
                 whose = units_in_words(units)
                 name = f"{whose[0].upper()}{whose[1:]}, {TABLES[table.function]} registers"
-                said = f"exception {code}, {EXCEPTIONS.get(code, 'unknown')}"
-                yield f"{name} (function {table.function}): none; each answers with {said}"
+                yield f"{name} (function {table.function}): none; each answers with {_exception(code)}"
 
     def _refusing(self) -> dict[tuple[int, int], list[int]]:
         """Units that answer with nothing but one exception, by function and exception."""
@@ -152,7 +166,7 @@ class ScanReport:
         runs = f"{len(table.first)} at {_runs(table.first)}" if table.first else none
         lines = [f"{name}: {runs}", *self._range(table)]
         for address, code in table.refused.items():
-            lines.append(f"refused from {address} on: exception {code}, {EXCEPTIONS.get(code, 'unknown')}")
+            lines.append(f"refused from {address} on: {_exception(code)}")
         if table.silent:
             lines.append(f"no reply to requests from {', '.join(map(str, table.silent))} on")
         if table.max_count is not None:
@@ -211,6 +225,7 @@ class ScanReport:
             "units_asked": [] if scan.asked is None else [scan.first_unit, scan.asked],
             "units_gateway": scan.gateway,
             "units_alike": scan.alike,
+            "units_left_out": scan.left_out,
             "tables": [_table_figures(table, numbers) for table, numbers in self._tables],
         }
 
@@ -230,6 +245,10 @@ class ScanReport:
         for table, numbers in tables:
             lines += ["", *_stream(table, numbers, sensors)]
         return "\n".join(lines)
+
+
+def _exception(code: int) -> str:
+    return f"exception {code}, {EXCEPTIONS.get(code, 'unknown')}"
 
 
 def _only_refusal(table: FoundTable) -> int | None:

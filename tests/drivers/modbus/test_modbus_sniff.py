@@ -323,9 +323,98 @@ def test_a_server_that_ignores_the_unit_is_one_device(capsys: pytest.CaptureFixt
     with tcp(dict.fromkeys(range(1, 248), unit)) as target:
         assert main(words(target, "--registers", "0-9", *PATIENT)) == 0
     said = capsys.readouterr().out
-    assert "It answers in the name of every unit" in said
+    assert "It answers in the name of every unit, and alike" in said
+    assert "only unit 1 was read; --units N reads unit N.\n" in said
     assert "units that answer: 1 (units 1 to 8 were asked)\n" in said
     assert len(unit.asked) < 60
+
+
+def test_a_server_that_ignores_the_unit_is_one_device_although_its_value_moves(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with tcp(dict.fromkeys(range(1, 248), pump())) as target:
+        assert main(words(target, "--registers", "41-42", "--json")) == 0
+    found = figures(capsys)
+    assert (found["units"], found["units_alike"], found["units_asked"]) == ([1], True, [1, 8])
+
+
+def test_units_whose_values_differ_are_several_devices(capsys: pytest.CaptureFixture[str]) -> None:
+    units = {unit: ModbusUnit() for unit in range(1, 11)}
+    for unit, one in units.items():
+        one.put("holding", 0, struct.pack(">H", 500 + unit // 5))
+    with tcp(units) as target:
+        assert main(words(target, "--units", "1-10", "--registers", "0-1", "--json")) == 0
+    found = figures(capsys)
+    assert (found["units"], found["units_alike"]) == (list(range(1, 11)), False)
+    assert len(found["tables"]) == 10
+
+
+def all_refuse_but(number: int, unit: ModbusUnit, code: int = 4) -> dict[int, ModbusUnit]:
+    """A server that gives an exception for each unit that it does not have."""
+    return {one: unit if one == number else Watched(code) for one in range(1, 248)}
+
+
+@pytest.mark.parametrize("code", [2, 4])
+def test_a_unit_is_found_where_the_server_refuses_all_others(
+    code: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    inputs = ModbusUnit()
+    inputs.put("input", 0, struct.pack(">2H", 11, 12))
+    for unit, function in ((pump(), 3), (inputs, 4)):
+        with tcp(all_refuse_but(7, unit, code)) as target:
+            assert main(words(target, "--units", "1-10", "--registers", "0-3")) == 0
+        said = capsys.readouterr().out
+        assert "units that answer: 7 (units 1 to 10 were asked)\n" in said
+        assert f"Units 1-6, 8-10 all answer with exception {code}, " in said
+        assert "they were not read; --units N reads unit N.\n" in said
+        assert "every unit" not in said
+        assert f"(function {function}): {4 if function == 3 else 2} at 0-" in said
+    with tcp(all_refuse_but(7, pump(), code)) as target:
+        assert main(words(target, "--registers", "0-3", "--json")) == 0
+    found = figures(capsys)
+    assert (found["units"], len(found["units_left_out"])) == ([7], 246)
+
+
+def test_where_nothing_is_read_of_units_that_answer_alike_others_are_named(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with tcp(all_refuse_but(20, pump())) as target:
+        assert main(words(target, "--units", "1-10", "--registers", "0-3")) == 1
+    shown = capsys.readouterr()
+    assert "It answers in the name of every unit, and alike" in shown.out
+    assert "registers 0 to 3 of unit 1 were asked. Remedy: " in shown.err
+    assert "and for its unit address (--units N), as others may have some" in shown.err
+
+
+def test_new_finds_the_unit_where_the_server_refuses_all_others(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(questions, "_UNITS", ("1-10", "11-22"))
+    with tcp(all_refuse_but(7, Elsewhere())) as target:
+        layout = new(tmp_path, target, "--registers=4000-4020")["streams"]["device"]["layout"]
+    assert (layout["unit"], layout["channels"][0]["address"]) == (7, 4000)
+    said = capsys.readouterr().out
+    assert "units that answer: 7 (units 1 to 10 were asked)" in said
+    assert "the others from 1 to 10 all refuse with one exception, as if they were not there" in said
+    with tcp(all_refuse_but(20, Elsewhere())) as target:
+        layout = new(tmp_path, target, "--registers=4000-4020")["streams"]["device"]["layout"]
+        assert layout["unit"] == 20
+        said = capsys.readouterr().out
+        assert "none of units 1-10 has such registers: 11-22 are asked, too" in said
+        line = [
+            "new",
+            f"{tmp_path / 'none.toml'}",
+            "--yes",
+            "--bus=modbus-tcp",
+            f"--host={target}",
+            "--listen",
+        ]
+        assert main([*line, "--registers=4000-4020", "--units=1-10"]) == 1
+        shown = capsys.readouterr()
+        assert "all answer alike, so only unit 1 was read: --units N reads unit N\n" in shown.out
+        assert "e.g. 4000-4100; or name other units with --units" in shown.err
+        assert main([*line, "--registers=4000-4020", "--units=1-20", "--unit=3"]) == 1
+        assert "Unit 3 has refused, like most units. Remedy: correct --unit; " in capsys.readouterr().err
 
 
 def test_units_that_answer_with_one_exception_only_share_a_line(capsys: pytest.CaptureFixture[str]) -> None:
