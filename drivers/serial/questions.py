@@ -16,6 +16,7 @@ from drivers.serial.sniff import (
     NO_NUMBERS,
     SerialSniffer,
     frames_need,
+    overrun_words,
     turn_words,
     unit_of_suffix,
 )
@@ -290,6 +291,8 @@ def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
     rate = "" if found["rate_hz"] is None else f", {found['rate_hz']:.4g} a second"
     baud = "any baud rate" if found["any_baud"] else f"{found['baud']} bit/s"
     line = f"{baud}, {found['character']}"
+    if found["overrun_baud"] is not None:
+        yield overrun_words(found["overrun_baud"], found["baud"])
     if found["framing"] != "lines":
         kind = "COBS frames" if found["framing"] == "cobs" else f"frames behind {found['sync_word']}"
         counter = found["counter"]

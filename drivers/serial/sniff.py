@@ -51,6 +51,11 @@ _SHOWN_ROWS = 8
 _ROW = 16
 _WIDEST = 100
 _PER_S = {"s": 1.0, "ms": 1e3, "us": 1e6}
+_FAST = (9600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_800, 921_600, 2_000_000, 4_000_000, 12_000_000)
+"""Baud rates to propose where the port has none."""
+_WAITING = 4096
+"""Bytes that Linux keeps of a port until they are read."""
+_SURELY = 1.05
 _WHOLE = 0.995
 """Share of the bytes in frames from which on the rest is not worth a word."""
 BY_ID = Path("/dev/serial/by-id")
@@ -268,8 +273,29 @@ class _Report(NamedTuple):
 
     @property
     def _any_baud(self) -> bool:
-        """Whether all rates came out alike."""
-        return _alike(self.tried)
+        """Whether all rates came out alike, or one brings more than it can carry."""
+        return _alike(self.tried) or self._is_overrun
+
+    @property
+    def _bits_per_s(self) -> float:
+        """What comes; what had been waiting in the port is left out."""
+        heard = self.best.heard
+        bits = 2 + (7 if self.best.found.parity else 8) + (self._parity != "none")
+        return bits * max(heard.received - _WAITING, 0) / max(heard.last_s - heard.first_s, 1e-3)
+
+    @property
+    def _is_overrun(self) -> bool:
+        """Whether more bytes come than the baud rate carries: a port that is USB itself has none."""
+        return self._bits_per_s > _SURELY * self.best.baud
+
+    @property
+    def _baud(self) -> int:
+        """The baud rate for the machine file: the least usual one that carries what comes."""
+        from daqsvc.settings.buses import BUSY  # noqa: PLC0415 - brings the settings
+
+        if not self._is_overrun:
+            return self.best.baud
+        return next((baud for baud in _FAST if BUSY * baud >= self._bits_per_s), _FAST[-1])
 
     @property
     def _parity(self) -> str:
@@ -370,6 +396,8 @@ class _Report(NamedTuple):
         per_s = heard.received / max(heard.last_s - heard.first_s, 1e-3)
         line = f"{'any baud rate' if self._any_baud else f'{self.best.baud} bit/s'}, {self._character}"
         yield f"{self.port} at {line}: {heard.received} bytes, {per_s:.0f}/s"
+        if self._is_overrun:
+            yield overrun_words(self.best.baud, self._baud)
         begin = heard.data[: _ROW * _SHOWN_ROWS]
         yield f"The first bytes:\n{dump(begin)}"
         what = self._what
@@ -458,7 +486,8 @@ class _Report(NamedTuple):
         figures: SerialFigures = {
             "bus": "serial",
             "port": self.port,
-            "baud": self.best.baud,
+            "baud": self._baud,
+            "overrun_baud": self.best.baud if self._is_overrun else None,
             "any_baud": self._any_baud,
             "character": self._character,
             "bytes": heard.received,
@@ -524,7 +553,7 @@ class _Report(NamedTuple):
             f"[buses.{name}]",
             'driver = "serial"',
             f"port = {quoted(lasting_name(self.port))}",
-            f"baud = {self.best.baud:_}{'    # any: the port does not use it' if self._any_baud else ''}",
+            f"baud = {self._baud:_}{'    # any: the port does not use it' if self._any_baud else ''}",
         ]
         head += ["data_bits = 7"] * (self.best.found.parity is not None)
         head += [f"parity = {quoted(self._parity)}"] * (self._parity != "none")
@@ -674,6 +703,14 @@ LINES_NEED = (
 def frames_need(payload: int) -> str:
     """The same of binary frames with so many bytes between sync word and CRC."""
     return f"A stream needs a counter: none was found in the {payload} bytes of payload, or nothing behind it"
+
+
+def overrun_words(baud: int, proposed: int) -> str:
+    """What it means that more bytes come than a baud rate carries."""
+    return (
+        f"More bytes come than {baud} bit/s carry: the port does not use its baud rate, as USB devices often "
+        f"do not. {proposed} bit/s, which carry them, are proposed."
+    )
 
 
 MUST_TURN = "one that begins again at 0 after 999, 9999 or the like is no counter for daqsvc"

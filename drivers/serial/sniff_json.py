@@ -50,6 +50,7 @@ class SerialFigures(TypedDict):
         bus: kind of the bus.
         port: name of the port.
         baud: the baud rate that fits best.
+        overrun_baud: baud rate at which more bytes came than it carries; `baud` then carries them; else null.
         any_baud: whether the port brings the same at every baud rate.
         character: bits of a character, e.g. `8N1`.
         bytes: bytes that were heard.
@@ -85,6 +86,7 @@ class SerialFigures(TypedDict):
     bus: str
     port: str
     baud: int
+    overrun_baud: int | None
     any_baud: bool
     character: str
     bytes: int

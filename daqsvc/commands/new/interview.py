@@ -132,6 +132,7 @@ class _Interview:
         question = plain
         if self._heard is not None:
             question = _offered(plain, self._heard, self.answers, self._file)
+            self._see_rate(question, self._heard)
         key, texts = question.key, self._given.texts
         if key in texts:
             reason = take(question, texts[key], self.answers, self._file)
@@ -163,6 +164,23 @@ class _Interview:
     def _is_default(self, question: Question) -> bool:
         default = question.default
         return default is not None and self.answers[question.key] == question.read(default)
+
+    def _see_rate(self, question: Question, heard: Heard) -> None:
+        """Say that the rate that was heard cannot be taken: no other one takes its place in silence.
+
+        Raises:
+            AnswerError: it cannot, and nobody can be asked.
+        """
+        rate = heard.proposals(self.answers).get(question.key) if question.key == "rate" else None
+        if rate is None or question.key in self._given.texts:
+            return
+        reason = take(question, rate, dict(self.answers), self._file)
+        if reason is None:
+            return
+        said = f"{rate} samples a second were heard, which cannot be used: {reason}"
+        if self._ask is None:
+            raise AnswerError(f"{option(question.key)}: {said}")
+        self._say(said)
 
     def _see_unheard(self) -> None:
         """Say that what the answers state was not heard.

@@ -478,6 +478,39 @@ def test_new_proposes_the_lines_that_it_hears(
     assert 50 < heard["streams"]["device"]["rate_hz"] < 400
 
 
+def test_a_port_that_brings_more_than_its_baud_rate_is_proposed_with_one_that_carries_it(
+    cable: PseudoTerminal,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As devices do that are the USB port themselves."""
+    monkeypatch.setattr(questions, "_LISTEN_S", 1.0)
+
+    def many(number: int) -> bytes:
+        return b"".join(
+            b"%d,%d.25,-1.53125,10%d\n" % (one, one % 7, one % 3) for one in range(8 * number, 8 * number + 8)
+        )
+
+    words = "More bytes come than 115200 bit/s carry: the port does not use its baud rate"
+    with talking(cable, many):
+        file = new(cable, tmp_path / "fast.toml")
+        said = capsys.readouterr().out
+        found = figures(cable, capsys)
+        assert main(["sniff", "serial", f"{cable.path}", "--seconds", "0.6"]) == 0
+        assert words in capsys.readouterr().out
+        slow = ["new", f"{tmp_path / 'slow.toml'}", "--yes", "--listen", "--bus=serial", "--baud=9600"]
+        assert main([*slow, f"--port={cable.path}"]) == 2
+    refused = capsys.readouterr().err
+    assert words in said
+    assert file["buses"]["main"]["baud"] in {460_800, 921_600}
+    assert 800 < file["streams"]["device"]["rate_hz"] < 2100
+    assert (found["any_baud"], found["overrun_baud"]) == (True, 115_200)
+    proposed = check(tmp_path, found["machine_file"], capsys)
+    assert proposed["buses"]["ttyusb0"]["baud"] == found["baud"]
+    assert "samples a second were heard, which cannot be used: buses.main.baud = 9600: is too slow" in refused
+
+
 def test_new_leaves_out_the_columns_that_are_no_numbers(
     cable: PseudoTerminal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
