@@ -257,8 +257,8 @@ MANUALS_NUMBER = Code(
     "it is.",
     "modbus.md",
     example="machine.toml:48: streams.trend.layout.channels[0].address = 40018: looks like a number of the "
-    "manual, where registers begin at 40001. Remedy: write address = 17, as registers begin at 0 "
-    "here; leave it if the device has such addresses",
+    'manual, where registers begin at 40001. Remedy: write address = 17 and table = "holding", as registers '
+    "begin at 0 here; leave it if the device has such addresses",
 )
 DEVICE_ABSENT = Code(
     "B27",

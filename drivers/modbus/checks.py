@@ -216,11 +216,13 @@ def _check_counted_from_0(layout: ModbusLayout, path: KeyPath) -> Iterator[Findi
     for index, channel in enumerate(layout.channels):
         if first := manuals_first(channel.address):
             number = channel.address - first
+            table = "holding" if first > 40_000 else "input"
+            other = "" if layout.table == table else f' and table = "{table}"'
             yield Finding(
                 (*path, "channels", index, "address"),
                 f"looks like a number of the manual, where registers begin at {first}",
-                f"write address = {number}, as registers begin at 0 here; leave it if the device has such "
-                "addresses",
+                f"write address = {number}{other}, as registers begin at 0 here; leave it if the device has "
+                "such addresses",
                 fatal=False,
                 code=MANUALS_NUMBER,
             )

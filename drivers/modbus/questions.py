@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from drivers.modbus.sniff import RegisterRange
+
 REGISTERS = ("uint16", "int16", "uint32", "int32", "float32", "uint64", "int64", "float64")
 _OF_SAMPLES = REGISTERS[:5]
 _WAYS = {
@@ -159,9 +161,9 @@ class _ModbusQuestions(BusQuestions):
         """Which units are to be found; only an option is asked for them."""
         return self.ask("units", _units, _AUTO, quiet=True)
 
-    def _ask_registers(self) -> Question:
+    def _ask_registers(self, answers: Answers) -> Question:
         """Which registers are to be read; only who listens is asked for them."""
-        return self.ask("registers", _registers, _AUTO, doubt=_doubt_of_registers)
+        return self.ask("registers", _registers, _AUTO, doubt=partial(_doubt_of_registers, answers))
 
     def _sniffed_as(self, answers: Answers) -> Sequence[str]:
         """Arguments of the sniffer that say where the units are."""
@@ -172,6 +174,8 @@ class _ModbusQuestions(BusQuestions):
         from drivers.modbus.scan_report import NO_VALUE  # noqa: PLC0415 - brings the settings
 
         tables = [one for one in found["tables"] if one["registers"]]
+        meant = _meant(answers, "registers")
+        tables.sort(key=lambda one: _TABLES[one["function"]] != meant)  # stable: else as they were found
         proposed = {"unit": f"{tables[0]['unit']}"}
         tables = [one for one in tables if one["unit"] == answers.get("unit", tables[0]["unit"])]
         if tables:
@@ -227,7 +231,8 @@ class _ModbusQuestions(BusQuestions):
         yield self.choose("way", _WAYS, "values")
         way = answers["way"]
         if way != "fifo":
-            yield self.choose("table", dict.fromkeys(("holding", "input"), ""), "holding")
+            likely = _meant(answers, "registers") or "holding"
+            yield self.choose("table", dict.fromkeys(("holding", "input"), ""), likely)
         if way == "values":
             yield self.ask("max-count", q.whole, f"{_READ_REGISTERS}", quiet=True)
         yield self.ask("channels", q.names, "vibration, temperature" if way == "values" else "x")
@@ -238,17 +243,22 @@ class _ModbusQuestions(BusQuestions):
         ways = {"waveform": self._ask_waveform, "ring": self._ask_ring, "fifo": self._ask_fifo}
         yield from ways[way](answers)
 
+    def _ask_address(self, answers: Answers, key: str, default: str) -> Iterator[Question]:
+        """A register of the table that the stream reads; a number of the manual states which one that is."""
+        yield self.ask(key, q.whole, default, doubt=partial(_doubt_with_table, answers, key))
+        answers["table"] = _meant(answers, key) or answers["table"]
+
     def _ask_waveform(self, answers: Answers) -> Iterator[Question]:
-        yield self.ask("block-id", q.whole, "0", doubt=_doubt)
-        yield self.ask("block-address", q.whole, "100", doubt=_doubt)
+        yield from self._ask_address(answers, "block-id", "0")
+        yield from self._ask_address(answers, "block-address", "100")
         yield self.ask("samples", q.whole, f"{max(min(4096, 60_000 // _sample_registers(answers)), 1)}")
 
     def _ask_ring(self, answers: Answers) -> Iterator[Question]:
-        yield self.ask("count-address", q.whole, "0", doubt=_doubt)
+        yield from self._ask_address(answers, "count-address", "0")
         yield self.choose("count-bits", _COUNT_BITS, "32")
         count = answers["count-address"]
         behind = count + 2 if count < ADDRESSES // 2 else 0
-        yield self.ask("ring-address", q.whole, f"{16 if count + 2 <= 16 else behind}", doubt=_doubt)
+        yield from self._ask_address(answers, "ring-address", f"{16 if count + 2 <= 16 else behind}")
         begin = answers["ring-address"]
         room = (count if begin < count else ADDRESSES) - begin
         places = max(min(1024, room // _sample_registers(answers)), 2)
@@ -279,10 +289,19 @@ class _ModbusQuestions(BusQuestions):
 
         types, orders = dict.fromkeys(REGISTERS, ""), dict.fromkeys(("ABCD", "CDAB", "BADC", "DCBA"), "")
         following = f"{self._next_address(answers, channel)}"
+        key = sensor_key(channel, "address")
+        only = channel == answers["channels"][0]
+        doubted = partial(_doubt_with_table, answers, key, fixed=not only)
         doubt = partial(
-            _doubt_of_channel, self._taken(answers, channel), following, _to_read(answers["registers"])
+            _doubt_of_channel,
+            doubted,
+            self._taken(answers, channel),
+            following,
+            _to_read(answers["registers"]),
         )
         yield self.ask_of(channel, "address", q.whole, following, doubt=doubt)
+        if only:
+            answers["table"] = _meant(answers, key) or answers["table"]
         unit = _unit(channel)
         default = "int16" if unit == "degC" else "uint16"
         yield self.ask_of(channel, "register-type", q.one_of(types), default, choices=types)
@@ -431,7 +450,7 @@ class TcpQuestions(_ModbusQuestions):
         yield self._ask_timeout()
         yield self._ask_units()
         yield self.ask("tcp-port", q.whole, _host_and_port(answers["host"])[1], quiet=True)
-        yield self._ask_registers()
+        yield self._ask_registers(answers)
 
     def _sniffed_as(self, answers: Answers) -> Sequence[str]:
         host, _ = _host_and_port(answers["host"])
@@ -454,13 +473,12 @@ class RtuQuestions(_ModbusQuestions):
     }
 
     def _line(self, answers: Answers) -> Iterator[Question]:
-        del answers
         yield self.ask("port", q.line, only_port())
         yield self.ask("baud", q.bit_rate, "19200")
         yield self._ask_timeout()
         yield self._ask_units()
         yield self.choose("parity", dict.fromkeys(("none", "even", "odd"), ""), "even")
-        yield self._ask_registers()
+        yield self._ask_registers(answers)
 
     def _sniffed_as(self, answers: Answers) -> Sequence[str]:
         line = ["--baud", f"{answers['baud']}", "--parity", answers["parity"]]
@@ -542,7 +560,7 @@ def _registers(text: str) -> str:
     except SniffError as error:
         raise ValueError(f"{error}".partition(": ")[2]) from None
     if registers.end > LAST_REGISTER:
-        raise ValueError(f"{registers.reason}: write {registers.there}")
+        raise ValueError(f"{registers.reason}: write {registers.there}, and --table {registers.table}")
     return text
 
 
@@ -637,6 +655,13 @@ def _unheard(found: Mapping[str, Any], answers: Answers) -> str:
     return f"Unit {unit} {said}. Remedy: correct --unit; those that answer: {others}"
 
 
+def _note(registers: RegisterRange) -> str:
+    """That they are numbers of a manual, with the options that mean the same; empty if they are not."""
+    if not registers.reason:
+        return ""
+    return f"{registers.reason}. Remedy: write --registers {registers.there} --table {registers.table}"
+
+
 def _without_registers(found: Mapping[str, Any], registers: str) -> Heard:
     """Units that answer, although none of the registers that were asked for is there."""
     from drivers.modbus.scan import ILLEGAL_FUNCTION  # noqa: PLC0415 - only for who listens
@@ -653,7 +678,7 @@ def _without_registers(found: Mapping[str, Any], registers: str) -> Heard:
             tables.append(name)
             asked = " to ".join(map(str, table["asked"]))
             lines.append(f"unit {unit} answers for {name} registers, but has none of {asked}")
-    note = "" if registers == _AUTO else registers_of(registers).note("both")
+    note = "" if registers == _AUTO else _note(registers_of(registers))
     remedy = "Remedy: write the addresses of its manual, counted from 0, as --registers, e.g. 4000-4100"
     others = "; or name other units with --units" if found["units_alike"] or found["units_left_out"] else ""
     missed = note or f"No register that was asked for is there. {remedy}{others}"
@@ -682,24 +707,74 @@ def _doubt(address: int | None) -> tuple[str, str] | None:
     return reason, f"{meant}"
 
 
-def _doubt_of_registers(text: str) -> tuple[str, str] | None:
+_MEANT = "meant"
+"""Key, beside the answers, of the tables that numbers of a manual mean: by question, register and table."""
+
+
+def _mean(answers: Answers, key: str, there: Any, table: str) -> None:
+    """Keep which table a number of the manual means, for when what it is on the line is taken."""
+    answers[_MEANT] = {**answers.get(_MEANT, {}), key: (there, table)}
+
+
+def _meant(answers: Answers, key: str) -> str | None:
+    """The table that an answer means as it was typed, with the number of a manual; None if it was not."""
+    there, table = answers.get(_MEANT, {}).get(key, (None, None))
+    return table if key in answers and answers[key] == there else None
+
+
+def _doubt_with_table(
+    answers: Answers, key: str, address: int | None, *, fixed: bool = False
+) -> tuple[str, str] | None:
+    """See `_doubt`; the number also means holding or input registers, and the stream reads one of them.
+
+    Args:
+        answers: so far; what is meant is kept there.
+        key: of the question.
+        address: the answer.
+        fixed: whether registers before have the table already.
+    """
+    doubted = _doubt(address)
+    if doubted is None or address is None:
+        return doubted
+    reason, there = doubted
+    table = _table_of(address)
+    if table == answers["table"]:
+        return doubted
+    if fixed:
+        other = f"they are {table} registers, and the channels before {answers['table']} registers"
+        return f"{reason}. But {other}: a stream reads one table, make one for each", there
+    _mean(answers, key, int(there), table)
+    return f"{reason}. Enter also takes {table} registers for the table", there
+
+
+def _table_of(address: int) -> str:
+    """The table that a number of the manual is in."""
+    return "input" if address < 40_001 else "holding"
+
+
+def _doubt_of_registers(answers: Answers, text: str) -> tuple[str, str] | None:
     """The same of the registers that --listen is to read."""
     registers = _AUTO if text == _AUTO else registers_of(text)
     if isinstance(registers, str) or not registers.reason:
         return None
+    _mean(answers, "registers", registers.there, registers.table)
     again = f"Enter takes {registers.there}; type {text} again if the device has such addresses"
     return f"{registers.reason}. {again}", registers.there
 
 
 def _doubt_of_channel(
-    taken: Mapping[int, str], free: str, to_read: range, address: int
+    doubt: Callable[[int], tuple[str, str] | None],
+    taken: Mapping[int, str],
+    free: str,
+    to_read: range,
+    address: int,
 ) -> tuple[str, str] | None:
     """The same of a channel's register, which may be that of another channel, too.
 
     Whoever has such registers read, or has given another channel such an address, means them.
     """
     if address not in taken:
-        return None if address in to_read or any(map(_doubt, taken)) else _doubt(address)
+        return None if address in to_read or any(map(_doubt, taken)) else doubt(address)
     reason = (
         f'register {address} holds "{taken[address]}" already. Enter takes {free}; type {address} again '
         "if both are in it"

@@ -157,21 +157,27 @@ class RegisterRange(NamedTuple):
         return f"{self.begin - first}-{self.end - first}"
 
     @property
+    def table(self) -> str:
+        """Which registers they are, if they are numbers of a manual; else empty."""
+        if self.manuals_first is None:
+            return ""
+        return "input" if self.manuals_first in _INPUT else "holding"
+
+    @property
     def reason(self) -> str:
         """Why they are most likely numbers of a manual; empty if they are not."""
         if self.manuals_first is None:
             return ""
-        kind = "input" if self.manuals_first in _INPUT else "holding"
         return (
-            f"registers {self.begin} to {self.end} look like numbers of a manual, where {kind} registers "
-            f"begin at {self.manuals_first}; on the line they are {self.there}"
+            f"registers {self.begin} to {self.end} look like numbers of a manual, where {self.table} "
+            f"registers begin at {self.manuals_first}; on the line they are {self.there}"
         )
 
     def note(self, function: str) -> str:
         """The same with its remedy, where one of the functions, or all, are to be asked for."""
         if not self.reason:
             return ""
-        other = self.manuals_first in _INPUT and function != "both"
+        other = self.table == "input" and function != "both"
         return f"{self.reason}. Remedy: write --registers {self.there}{' --function 4' if other else ''}"
 
 

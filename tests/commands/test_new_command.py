@@ -422,7 +422,7 @@ def test_answers_of_a_file_are_those_of_the_options(tmp_path, capsys):
         ),
         (
             ["--yes", "--listen", "--bus=modbus-tcp", "--host=a", "--registers=400101-400110"],
-            "holding registers begin at 400001; on the line they are 100-109: write 100-109 [C22]",
+            "on the line they are 100-109: write 100-109, and --table holding [C22]",
         ),
         (
             ["--yes", "--bus=modbus-tcp", "--host=a", "--units=0-300"],
@@ -688,6 +688,54 @@ def test_a_number_of_the_manual_is_asked_again_with_the_address_that_it_means():
     assert answers["sensor.a.address"] == 30_001
     assert len(said) == 1
     assert asked(["30000"], "modbus-tcp")[1] == []
+
+
+def test_a_number_of_the_manual_states_the_table_too():
+    answers, said, _ = asked(["30017", ""], "modbus-tcp")
+    assert (answers["table"], answers["sensor.a.address"]) == ("input", 16)
+    assert "that is 16 here" in said[0]
+    assert "Enter also takes input registers for the table" in said[0]
+    answers, said, _ = asked(["40017", ""], "modbus-tcp", table="input")
+    assert (answers["table"], answers["sensor.a.address"]) == ("holding", 16)
+    # Whoever has such addresses means no other table.
+    assert asked(["30017", "30017"], "modbus-tcp")[0]["table"] == "holding"
+
+
+def test_check_names_the_table_of_such_a_number(tmp_path, capsys):
+    words = ["--yes", "--bus=modbus-tcp", "--host=::1", "--channels=a", "--sensor=a.address=30017"]
+    assert main(["new", f"{tmp_path / 'm.toml'}", *words]) == 0
+    assert (
+        'Remedy: write address = 16 and table = "input", as registers begin at 0' in capsys.readouterr().out
+    )
+
+
+def test_channels_of_two_tables_are_no_channels_of_one_stream():
+    texts, said = iter(["7", "30017", ""]), []
+
+    def ask(question: Question) -> str:
+        if question.key in {"sensor.a.address", "sensor.b.address"}:
+            return next(texts) or f"{question.default}"
+        assert question.default is not None, question.key
+        return question.default
+
+    beforehand = Given({"bus": "modbus-tcp", "host": "::1", "channels": "a, b"}, defaults=False)
+    answers = conduct(Path("m.toml"), beforehand, ask, said.append)
+    assert answers["table"] == "holding"
+    assert (
+        "they are input registers, and the channels before holding registers: a stream reads one" in said[0]
+    )
+
+
+def test_a_block_whose_registers_are_input_registers_of_the_manual_is_read_as_such():
+    texts = iter(["30001"])
+
+    def ask(question: Question) -> str:
+        assert question.default is not None, question.key
+        return next(texts, question.default) if question.key == "block-id" else question.default
+
+    beforehand = Given({"bus": "modbus-tcp", "host": "::1", "way": "waveform"}, defaults=False)
+    answers = conduct(Path("m.toml"), beforehand, ask, lambda _reason: None)
+    assert (answers["block-id"], answers["table"]) == (0, "input")
 
 
 def test_whoever_has_such_addresses_is_asked_once_only():

@@ -706,7 +706,7 @@ def test_new_looks_at_the_registers_that_it_is_told(
     ]
     shown = capsys.readouterr()
     assert "answers for holding registers, but has none of 40001 to 40004\n" in shown.out
-    assert "on the line they are 0-3. Remedy: write --registers 0-3 [C20]\n" in shown.err
+    assert "on the line they are 0-3. Remedy: write --registers 0-3 --table holding [C20]\n" in shown.err
 
 
 def test_at_a_terminal_it_asks_which_registers_and_going_back_asks_again(
@@ -740,6 +740,35 @@ def test_at_a_terminal_it_asks_which_registers_and_going_back_asks_again(
     assert "where input registers begin at 30001; on the line they are 0-3. Enter takes 0-3; type" in said[2]
     assert len(said) == 3
     assert [answers[f"sensor.{name}.address"] for name in answers["channels"]] == [30_001, 30_003]
+
+
+class Both(ModbusUnit):
+    """A unit with registers of both tables at the same addresses."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.put("holding", 0, struct.pack(">3H", 1, 2, 3))
+        self.put("input", 0, struct.pack(">3H", 231, 452, 1480))
+
+
+def test_numbers_of_a_manual_of_input_registers_are_read_as_input_registers(tmp_path: Path) -> None:
+    texts = ["30001-30003", ""]
+    tables: list[str | None] = []
+
+    def ask(question: Question) -> str:
+        if question.key == "table":
+            tables.append(question.default)
+        return (texts.pop(0) if question.key == "registers" else "") or f"{question.default}"
+
+    listen = functools.partial(_heard, tmp_path, person=True)
+    with tcp({3: Both()}) as target:
+        given = Given({"bus": "modbus-tcp", "host": target, "units": "3"}, defaults=False)
+        answers = conduct(tmp_path / "m.toml", given, ask, lambda _reason: None, listen)
+        option = new(tmp_path, target, "--units=3", "--registers=0-2", "--table=input")
+    assert tables == ["input"]
+    assert (answers["registers"], answers["table"]) == ("0-2", "input")
+    assert [answers[f"sensor.{name}.address"] for name in answers["channels"]] == [0, 1, 2]
+    assert option["streams"]["device"]["layout"]["table"] == "input"
 
 
 def test_without_listening_nobody_is_asked_for_registers_to_look_at(tmp_path: Path) -> None:
