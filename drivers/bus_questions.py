@@ -18,7 +18,7 @@ from drivers.toml_lines import entry
 
 if TYPE_CHECKING:
     import threading
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
 BUS, STREAM = "main", "device"
 """Names of the only bus and the only stream of the file."""
@@ -58,12 +58,15 @@ class Heard:
         missed: what is looked for and was not there, so that an answer before may have to be corrected, with
             its remedy; empty if all was there. Without a person, ``daqsvc new`` then writes nothing.
         unheard: the same of the answers so far: what they state and was not heard.
+        notes: sentences for the file, of all answers and of the keys of those that are nothing but a default:
+            what of them listening cannot show.
     """
 
     lines: Sequence[str]
     proposals: Callable[[Answers], Mapping[str, str]]
     missed: str = ""
     unheard: Callable[[Answers], str] = lambda _answers: ""
+    notes: Callable[[Answers, Collection[str]], Sequence[str]] = lambda _answers, _assumed: ()
 
 
 class BusQuestions(ABC):

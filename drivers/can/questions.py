@@ -20,7 +20,7 @@ from drivers.toml_lines import Hexadecimal, array, behind, entry, toml
 
 if TYPE_CHECKING:
     import threading
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
     from cantools.database.can import Message
 
@@ -97,6 +97,7 @@ class _CanQuestions(BusQuestions):
             lambda so_far: self._proposals(found, so_far),
             self.missed(found, answers),
             lambda so_far: self.unheard(found, so_far),
+            self.notes,
         )
 
     def _proposals(self, found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
@@ -117,6 +118,11 @@ class _CanQuestions(BusQuestions):
     def unheard(self, found: Mapping[str, Any], answers: Answers) -> str:
         """See `Heard.unheard`."""
         raise NotImplementedError
+
+    def notes(self, answers: Answers, assumed: Collection[str]) -> Sequence[str]:
+        """See `Heard.notes`."""
+        del answers, assumed
+        return ()
 
     def _interface(self) -> Iterator[Question]:
         yield self.ask("interface", _interface, _SOCKETCAN, quiet=True)
@@ -216,6 +222,12 @@ class PackedQuestions(_CanQuestions):
             return ""
         others = ", ".join(f"{one:#x}" for one in heard[:_SHOWN])
         return f"{answers['id']:#x} was not heard. Remedy: correct --id; those that come: {others}"
+
+    def notes(self, answers: Answers, assumed: Collection[str]) -> Sequence[str]:
+        """See `Heard.notes`: a frame shows its bytes, and not what they mean."""
+        if "channels" not in assumed and "raw-type" not in assumed:
+            return ()
+        return (f"The bytes of {answers['id']:#x} are not known: these channels are an example.",)
 
     def tables(self, answers: Answers) -> Iterator[str]:
         """See `BusQuestions.tables`."""

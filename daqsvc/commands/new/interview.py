@@ -101,18 +101,20 @@ class _Interview:
         """Keys of questions whose default was taken, and was not heard."""
         self._unheard = ""
 
-    def notes(self) -> list[str]:
+    def notes(self) -> Sequence[str]:
         """What in the file was neither answered nor heard, where it was listened for."""
-        example = any(key in _OF_CHANNELS or key.endswith(".address") for key in self._assumed)
+        counters = {"counter", "counter-byte"}
+        channels = self._assumed & (_OF_CHANNELS - counters)
+        example = bool(channels) or any(key.endswith(".address") for key in self._assumed)
         if not self._has_listened:
             return []
         if self._heard is None:
             return ["Nothing was heard on the bus; the channels are an example."] * example
         if not self._heard.missed:
-            return []
+            return [*self._heard.notes(self.answers, self._assumed)]
         if example:
             return ["None of these channels was heard on the bus; they are an example."]
-        counter = bool(self._assumed & {"counter", "counter-byte"})
+        counter = bool(self._assumed & counters)
         return ["Nothing was heard that counts or tells a time; the counter is an example."] * counter
 
     def is_over(self) -> bool:
@@ -154,7 +156,9 @@ class _Interview:
             _answer(question, self._ask, self._say, self.answers, self._file)
             self._typed.append(key)
         heard = self._heard is not None and question.default != plain.default
-        if key not in texts and not heard and self._is_default(question):
+        # Whoever takes a default most often knows it; what the channels are, nobody has by chance.
+        unasked = key not in self._typed or key in _OF_CHANNELS or key.endswith(".address")
+        if key not in texts and not heard and unasked and self._is_default(question):
             self._assumed.add(key)
         if self._answered is not None:
             self._answered(question, self.answers)
@@ -237,8 +241,8 @@ class _Interview:
             self._heard, self._has_listened = None, False
 
 
-_OF_CHANNELS = {"channels", "columns", "signals"}
-"""Questions that say what is measured."""
+_OF_CHANNELS = {"channels", "columns", "signals", "counter", "counter-byte"}
+"""Questions that say what is measured, and by what samples are counted."""
 
 
 def _answer(

@@ -507,6 +507,24 @@ def test_new_proposes_the_frames_that_it_hears(
 
 
 @pytest.mark.usefixtures("hub")
+def test_new_states_that_it_does_not_know_the_bytes_of_a_frame(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 0.5)
+    with talking(tmp_path / "bus", accelerations):
+        new(tmp_path, "--bus=can", "--id=0x201")
+        said = capsys.readouterr().out
+        text = (tmp_path / "new.toml").read_text("utf-8")
+        own = ["--channels=a, b", "--raw-type=int16", "--samples-per-frame=1", "--first-byte=1"]
+        new(tmp_path, "--bus=can", "--id=0x201", *own)
+    words = "The bytes of 0x201 are not known: these channels are an example.\n"
+    assert f"\n# {words}" in text
+    assert f"\n{words}" in said
+    assert "not known" not in capsys.readouterr().out  # whoever states the layout knows it
+    assert "not known" not in (tmp_path / "new.toml").read_text("utf-8")
+
+
+@pytest.mark.usefixtures("hub")
 def test_new_proposes_the_message_that_comes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
