@@ -402,6 +402,10 @@ def test_answers_of_a_file_are_those_of_the_options(tmp_path, capsys):
             "--home-assistant is not asked for with these answers; it needs --b",
         ),
         (["--yes", "--bus=can", "--limits=none", "--alert=2"], "it needs --limits own"),
+        (
+            ["--yes", "--limits=iso", "--class=2-rigid"],
+            "answers; probes on the shaft have no class: leave it out",
+        ),
         (["--yes", "--bus=serial", "--port=COM3"], "or /dev/ttyUSB0"),
         (
             ["--yes", "--bus=can", "--id=0x123456789"],

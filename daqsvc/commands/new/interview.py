@@ -408,7 +408,8 @@ def _why_not_asked(key: str, asked: Sequence[str], answers: Answers) -> str:
     if key.endswith(".bearing"):
         return why_no_bearing(answers)
     if key in _NEEDS:
-        return f"it needs {_NEEDS[key]}"
+        of_shaft = key == "class" and answers.get("limits") == "iso"
+        return "probes on the shaft have no class: leave it out" if of_shaft else f"it needs {_NEEDS[key]}"
     other = _INSTEAD.get(key, key)
     if other in asked:
         return f"write {option(other)} instead"
