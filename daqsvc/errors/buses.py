@@ -451,7 +451,8 @@ TIMES_SHARED = Code(
     "The unit of the device's time is longer than the time between two lines. If the device sends whole "
     "numbers, several lines have the same time. Each of them is a sample, in the order of arrival. But a "
     "single lost line is mostly not noticed, and of several lost in a row one may not be counted. Losses "
-    "that go on are counted from about 3 % of the lines on; up to 1.25 % look like a slow device.",
+    "that go on are counted from about 3 % of the lines on; up to 1.25 % look like a slow device. If the "
+    "unit is hardly shorter than the time between two lines, up to 2 % are taken for lost that are not.",
     "Have the device send a counter, or its time in a finer unit. Leave it if the device sends decimals that "
     "are finer than the time between lines.",
     "serial.md#lines-of-text",

@@ -44,6 +44,9 @@ _CHECKSUM_CHARACTERS = {"none": 0, "xor": 3, "crc16": 5}
 EXACT_STAMPS = 4.0
 """How many times finer than the time between lines stamps must be for every gap to be exact."""
 
+HARDLY_LONGER = 1.1
+"""Units of time from line to line below which one of two units cannot be told from a lost line."""
+
 _NUMBERED = re.compile(r"/dev/tty(USB|ACM)\d+")
 
 
@@ -224,13 +227,22 @@ def _check_time(layout: LineLayout, rate_hz: float, path: KeyPath) -> Iterator[F
         return
     unit = layout.time.unit
     period = UNITS_PER_S[unit] / rate_hz
-    if period >= 1.0:
+    if period < 1.0:
+        why = (
+            f"is longer than the {period:.4g} {unit} from line to line: if the device sends whole {unit}, "
+            "several lines have the same time. A single lost line is then mostly not noticed"
+        )
+    elif 1.0 < period < HARDLY_LONGER:
+        why = (
+            f"is hardly shorter than the {period:.4g} {unit} from line to line: if the device sends whole "
+            f"{unit}, some lines are taken for lost that are not"
+        )
+    else:
         return
     finer = next((one for one, per_s in UNITS_PER_S.items() if per_s >= EXACT_STAMPS * rate_hz), "us")
     yield Finding(
         path,
-        f"is longer than the {period:.4g} {unit} from line to line: if the device sends whole {unit}, "
-        "several lines have the same time. A single lost line is then mostly not noticed",
+        why,
         f'have the device send a counter, or {finer} with unit = "{finer}"; if it sends decimals, e.g. '
         f"12.345 {unit}, leave it",
         fatal=False,

@@ -442,6 +442,17 @@ def test_lines_that_are_late_at_times_are_no_lost_ones(rate_hz, grain_s):
     assert int(counts[-1]) + 1 - MANY <= 0.005 * MANY
 
 
+def test_lines_hardly_slower_than_their_stamps_are_taken_for_lost_at_times():
+    """The check of the machine file warns of it; below it, none are."""
+    counted = {
+        rate_hz: int(DeviceTime(rate_hz).count(np.floor(np.arange(MANY) / rate_hz * 1e3 + 1e-9) / 1e3)[-1])
+        + 1
+        for rate_hz in (900.0, 970.0, 1000.0)
+    }
+    assert counted[900.0] == counted[1000.0] == MANY
+    assert MANY < counted[970.0] < 1.02 * MANY
+
+
 def test_overtaken_lines_go_back_to_their_places():
     stamps = np.arange(100) * 0.01
     order = np.arange(100)

@@ -183,7 +183,15 @@ def test_a_time_that_several_lines_may_share_is_a_warning(unit, rate_hz, period,
     assert f'{finer} with unit = "{finer}"' in str(warning)
 
 
-@pytest.mark.parametrize(("unit", "rate_hz"), [("ms", 1000.0), ("us", 2000.0)])
+def test_a_time_that_is_hardly_finer_than_the_lines_is_a_warning():
+    line, time = TIMED
+    edits = ((LINE, line), (COUNTER, time.format("ms")), ("rate_hz = 200.0", "rate_hz = 970.0"))
+    (warning,) = parsed(SERIAL, *edits, ("baud = 115_200", "baud = 921_600")).warnings
+    assert "hardly shorter than the 1.031 ms from line to line" in str(warning)
+    assert 'us with unit = "us"' in str(warning)
+
+
+@pytest.mark.parametrize(("unit", "rate_hz"), [("ms", 1000.0), ("ms", 900.0), ("us", 2000.0)])
 def test_a_time_that_tells_each_line_from_the_next_is_no_warning(unit, rate_hz):
     line, time = TIMED
     edits = ((LINE, line), (COUNTER, time.format(unit)), ("rate_hz = 200.0", f"rate_hz = {rate_hz}"))
