@@ -224,6 +224,9 @@ def _opened(bus: CanBus, clock: Any) -> CanSource:
 
 
 def _why_not_open(error: OSError, channel: str) -> str:
+    if "/" in channel:
+        remedy = "for the path of a bus between programs write --interface unixbus"
+        return f"{channel} is no CAN interface of the kernel. Remedy: {remedy}"
     if error.errno == errno.ENODEV:
         there = can_interfaces()
         listed = (

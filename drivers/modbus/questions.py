@@ -449,7 +449,8 @@ class TcpQuestions(_ModbusQuestions):
         yield self.ask("host", q.line)
         yield self._ask_timeout()
         yield self._ask_units()
-        yield self.ask("tcp-port", q.whole, _host_and_port(answers["host"])[1], quiet=True)
+        read = partial(_tcp_port, answers["host"])
+        yield self.ask("tcp-port", read, _host_and_port(answers["host"])[1], quiet=True)
         yield self._ask_registers(answers)
 
     def _sniffed_as(self, answers: Answers) -> Sequence[str]:
@@ -506,6 +507,14 @@ def _host_and_port(text: str) -> tuple[str, str]:
     """The host and the port of an address, as the sniffer takes it too; 502 if there is no port."""
     both = _HOST_AND_PORT.fullmatch(text)
     return (text, "502") if both is None else (both[1].strip("[]"), both[2])
+
+
+def _tcp_port(host: str, text: str) -> int:
+    """The port; the same one if the address of the device has one already."""
+    port = q.whole(text)
+    if _HOST_AND_PORT.fullmatch(host) and port != int(_host_and_port(host)[1]):
+        raise ValueError(f"{host} names another port: leave one of the two out")
+    return port
 
 
 _WORD = re.compile("stat|alarm|fault|error|flag|trip|warn|word|bits", re.IGNORECASE)

@@ -406,6 +406,10 @@ def test_answers_of_a_file_are_those_of_the_options(tmp_path, capsys):
             ["--yes", "--limits=iso", "--class=2-rigid"],
             "answers; probes on the shaft have no class: leave it out",
         ),
+        (
+            ["--yes", "--bus=modbus-tcp", "--host=10.0.0.1:502", "--tcp-port=503"],
+            "--tcp-port 503: 10.0.0.1:502 names another port: leave one of the two out [C22]",
+        ),
         (["--yes", "--bus=serial", "--port=COM3"], "or /dev/ttyUSB0"),
         (
             ["--yes", "--bus=can", "--id=0x123456789"],

@@ -594,3 +594,8 @@ def test_new_says_what_to_do_when_no_frame_comes(
     said = capsys.readouterr().err
     assert said.startswith("daqsvc new: nothing was written: ")
     assert "Remedy: start the program that sends there" in said
+
+
+def test_the_path_of_a_bus_between_programs_is_known_as_one(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["sniff", "can", "/nowhere/bus"]) == 1
+    assert "for the path of a bus between programs write --interface unixbus" in capsys.readouterr().err
