@@ -12,6 +12,7 @@ import errno
 import logging
 import socket
 import termios
+from collections import deque
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -63,6 +64,9 @@ LEAST_CONNECT_S = 1.0
 MS_PER_S = 1000.0
 _BUFFER_BYTES = 4096
 _LAST_TRANSACTION = 0xFFFF
+_SAME_IDLE, _IDLE_SPREAD = 3, 0.2
+"""How often in a row a device closes the connection after about the same time until that is its limit, and
+how far apart the times may be, as part of the longest."""
 
 
 class ModbusRequest(NamedTuple):
@@ -347,6 +351,10 @@ class ModbusClient:
         self._clock = clock
         self._counters = counters
         self._wire = ModbusWire(bus, clock, counters)
+        self._idle_ns: deque[int] = deque(maxlen=_SAME_IDLE)
+        """How long nothing had been asked when the device closed the connection, the last times."""
+        self._told = False
+        """Whether it was stated that the device closes idle connections."""
 
     @property
     def last_byte_ns(self) -> int:
@@ -430,11 +438,28 @@ class ModbusClient:
             raise LineLostError(closed.why_lost) from error
         self._wire = wire
         self._counters.idle_closes += 1
+        self._idle_ns.append(closed.idle_ns)
         if self._counters.idle_closes == 1:
             notice(
                 logger,
-                "%s closes a connection over which nothing is asked (after %.3g s); it is opened again for "
-                "each request, and counted from now on. A rate_hz that asks more often keeps it open",
+                "%s closed the connection while nothing was asked (after %.3g s); it is opened again, and "
+                "counted from now on",
                 self._bus.where,
                 closed.idle_ns / NS_PER_S,
             )
+        # A device that restarts closes it, too, at any time: only about the same time again is a limit.
+        if not self._told and len(self._idle_ns) == _SAME_IDLE and _alike(self._idle_ns):
+            self._told = True
+            notice(
+                logger,
+                "%s closes a connection over which nothing is asked (%d times after about %.3g s); it is "
+                "opened again for each request. A rate_hz that asks more often keeps it open",
+                self._bus.where,
+                _SAME_IDLE,
+                closed.idle_ns / NS_PER_S,
+            )
+
+
+def _alike(idle_ns: Sequence[int]) -> bool:
+    """Whether some times may be one limit, at which a device looks now and then."""
+    return max(idle_ns) - min(idle_ns) <= _IDLE_SPREAD * max(idle_ns)

@@ -238,8 +238,36 @@ def test_a_device_that_closes_idle_connections_is_connected_for_each_request(cap
         simulate(main)
     assert rig.indices("s").tolist() == [0, 1, 2, 3, 4, 5]
     assert (rig.driver.link.losses, rig.driver.counters.idle_closes) == (0, 5)
-    (said,) = [one.getMessage() for one in caplog.records if "closes a connection" in one.getMessage()]
-    assert "over which nothing is asked (after 20 s); it is opened again for each request" in said
+    once, limit = [
+        one.getMessage()
+        for one in caplog.records
+        if "nothing is asked" in one.getMessage() or "nothing was asked" in one.getMessage()
+    ]
+    assert "closed the connection while nothing was asked (after 20 s); it is opened again" in once
+    assert "closes a connection over which nothing is asked (3 times after about 20 s); it is opened" in limit
+
+
+def test_a_device_that_restarts_now_and_then_is_not_said_to_close_idle_connections(caplog):
+    rig = Rig(options_of(serial=False), {"s": (SLOW, 0.04)}, clock=LoopClock())
+
+    async def main():
+        async with (
+            responding(marked_units([1]), lambda *_: PlannedReply(), serial=False) as units,
+            rig.running() as driver,
+        ):
+            for wait_s in (5, 40, 17, 33, 25):  # until then nothing was asked for 5, 20, 12, 20 and 20 s
+                await asyncio.sleep(wait_s)
+                for connection in list(units.active_connections.values()):
+                    connection.close()
+            await asyncio.sleep(4)
+            assert driver.link.state == "up"
+
+    with caplog.at_level(NOTICE):
+        simulate(main)
+    said = " ".join(one.getMessage() for one in caplog.records)
+    assert rig.driver.counters.idle_closes == 4
+    assert said.count("closed the connection while nothing was asked (after 5 s); it is opened again") == 1
+    assert "rate_hz" not in said
 
 
 def test_a_poll_that_was_due_when_the_line_was_lost_is_made_over_the_next_line():
