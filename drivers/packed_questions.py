@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from drivers import questions as q
-from drivers.bus_questions import BusQuestions, by_name
 from drivers.questions import NONE, Answers, Question, Topic
-from drivers.sniffing import WAVEFORM_HZ
+from drivers.sniffing import WAVEFORM_HZ, by_name
 from drivers.toml_lines import array, behind, entry, toml
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
+
+    from drivers.bus_questions import BusQuestions
 
 RAW_BYTES = {"int8": 1, "int16": 2, "int24": 3, "int32": 4, "uint8": 1, "uint16": 2, "uint24": 3, "uint32": 4}
 TOPICS = {

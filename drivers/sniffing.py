@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 LONGEST_UNIT = 16
 """Letters that the unit of a sensor may have."""
+_GUESS = "    # a guess by the rate, its unit too: see the device's manual"
 WAVEFORM_HZ = 100.0
 """Rate from which on samples are usually a waveform; below it, values that the device measures itself."""
 
@@ -112,6 +113,18 @@ class Sniffer(ABC):
         """
 
 
+def by_name(channel: str) -> str | None:
+    """The type of sensor that the name of a channel suggests; None if it suggests none."""
+    low = channel.lower()
+    if any(part in low for part in ("kph", "key", "phas", "tacho")):
+        return "keyphasor"
+    if low.startswith(("acc", "a_")) or low == "a":
+        return "accelerometer"
+    if any(part in low for part in ("temp", "press", "speed", "rpm", "rms")):
+        return "trend"
+    return None
+
+
 def quoted(text: str) -> str:
     """A text as TOML has it."""
     return json.dumps(text, ensure_ascii=False)
@@ -129,6 +142,7 @@ def sensor_lines(
     rate_hz: float = math.inf,
     *,
     by_stream: bool = False,
+    guess: bool = False,
 ) -> list[str]:
     """A table ``[[sensors]]`` for each channel of a stream, of the type that its unit is usual for.
 
@@ -138,12 +152,17 @@ def sensor_lines(
         taken: names of sensors that there are; the new ones are added.
         rate_hz: samples per second; of a velocity, below `WAVEFORM_HZ`, they are levels, no vibration.
         by_stream: whether a sensor is named after its stream, too, as others have channels of the same names.
+        guess: whether what has no unit and comes as often as a waveform is taken for an acceleration, as
+            ``daqsvc new`` takes it, unless its name suggests something else.
     """
     lines: list[str] = []
     before = f"{stream}-" if by_stream else ""
     for channel, text in channels.items():
-        known = unit_of(text)
-        unit = text.strip() if known is None else known.name
+        is_guess = guess and text == "1" and math.inf > rate_hz >= WAVEFORM_HZ
+        is_guess = is_guess and by_name(channel) in {None, "accelerometer"}
+        given = "g" if is_guess else text
+        known = unit_of(given)
+        unit = given.strip() if known is None else known.name
         kind = {"g": "accelerometer", "m/s2": "accelerometer", "mm/s": "velocity"}.get(unit, "trend")
         if kind == "velocity" and rate_hz < WAVEFORM_HZ:
             kind = "trend"
@@ -155,7 +174,7 @@ def sensor_lines(
             "",
             "[[sensors]]",
             f"name = {quoted(unused(table_name(f'{before}{channel.lower()}', 'sensor'), taken))}",
-            f"type = {quoted(kind)}",
+            f"type = {quoted(kind)}{_GUESS if is_guess else ''}",
             f"stream = {quoted(stream)}",
             f"channel = {quoted(channel)}",
             f"unit = {quoted(unit)}",

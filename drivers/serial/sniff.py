@@ -617,7 +617,7 @@ class _Report(NamedTuple):
         yield f"channels = [{', '.join(listed)}]{comment}"
         channels = {names[one]: unit_of_suffix(one.unit) for one in numbers}
         by_stream = bool(what.prefix) and stream != "lines"
-        yield from sensor_lines(stream, channels, sensors, rate_hz, by_stream=by_stream)
+        yield from sensor_lines(stream, channels, sensors, rate_hz, by_stream=by_stream, guess=True)
 
     def _frames_tables(self, what: BinaryFrames, bus: str) -> Iterator[str]:
         yield f"framing = {quoted(what.framing)}"
@@ -655,7 +655,7 @@ class _Report(NamedTuple):
         names = [f"c{k + 1}" for k in range(packed.channels)]
         listed = ", ".join(f'{{ name = "{one}", type = "int16", scale = 1.0 }}' for one in names)
         yield f"channels = [{listed}]"
-        yield from sensor_lines("frames", dict.fromkeys(names, "1"), set())
+        yield from sensor_lines("frames", dict.fromkeys(names, "1"), set(), rate_hz * samples, guess=True)
 
 
 class _Packed(NamedTuple):

@@ -9,6 +9,20 @@ import pytest
 from drivers.sniffing import WAVEFORM_HZ, sensor_lines
 
 
+def test_what_has_no_unit_is_taken_for_an_acceleration_where_it_comes_as_often_as_a_waveform() -> None:
+    def sensor(channel: str, rate_hz: float, *, guess: bool = True) -> tuple[dict[str, str], str]:
+        text = "\n".join(sensor_lines("device", {channel: "1"}, set(), rate_hz, guess=guess))
+        return tomllib.loads(text)["sensors"][0], text
+
+    fast, text = sensor("x", 2000.0)
+    assert (fast["type"], fast["unit"]) == ("accelerometer", "g")
+    assert 'type = "accelerometer"    # a guess by the rate, its unit too: see the device\'s manual' in text
+    for channel, rate_hz, guess in (("x", 10.0, True), ("temp", 2000.0, True), ("x", 2000.0, False)):
+        slow, text = sensor(channel, rate_hz, guess=guess)
+        assert (slow["type"], slow["unit"]) == ("trend", "1")
+        assert "a guess" not in text
+
+
 @pytest.mark.parametrize(
     ("unit", "rate_hz", "kind"),
     [
