@@ -7,6 +7,7 @@ the contents and is found by the search.
 from __future__ import annotations
 
 TITLES = {
+    "alarms": "Alarms",
     "fleet": "The archive of a fleet",
     "machine-file": "Machine file: what daqsvc check checks",
     "page": "The page",

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from drivers import questions as q
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
-from drivers.sniffing import WAVEFORM_HZ
+from drivers.sniffing import WAVEFORM_HZ, by_name
 from drivers.toml_lines import entry
 
 if TYPE_CHECKING:
@@ -60,6 +60,7 @@ class Heard:
         unheard: the same of the answers so far: what they state and was not heard.
         notes: sentences for the file, of all answers and of the keys of those that are nothing but a default:
             what of them listening cannot show.
+        not_read: what was heard and is not in the file by the answers, in a sentence; empty if all is.
     """
 
     lines: Sequence[str]
@@ -67,6 +68,7 @@ class Heard:
     missed: str = ""
     unheard: Callable[[Answers], str] = lambda _answers: ""
     notes: Callable[[Answers, Collection[str]], Sequence[str]] = lambda _answers, _assumed: ()
+    not_read: Callable[[Answers], str] = lambda _answers: ""
 
 
 class BusQuestions(ABC):
@@ -182,18 +184,6 @@ class BusQuestions(ABC):
 
     def _topic(self, key: str) -> Topic:
         return self.topics[key] if key in self.topics else SHARED[key]
-
-
-def by_name(channel: str) -> str | None:
-    """The type of sensor that the name of a channel suggests; None if it suggests none."""
-    low = channel.lower()
-    if any(part in low for part in ("kph", "key", "phas", "tacho")):
-        return "keyphasor"
-    if low.startswith(("acc", "a_")) or low == "a":
-        return "accelerometer"
-    if any(part in low for part in ("temp", "press", "speed", "rpm", "rms")):
-        return "trend"
-    return None
 
 
 _UNIT_OF = {

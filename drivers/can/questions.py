@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from daqsvc.rounding import counted
 from drivers import packed_questions as packed
 from drivers import questions as q
-from drivers.bus_questions import BUS, BusQuestions, Heard, by_name, is_count
+from drivers.bus_questions import BUS, BusQuestions, Heard, is_count
 from drivers.can.sniff import CanSniffer, number_of, numbered, of_one_channel
 from drivers.questions import NONE, Answers, Question, Topic
-from drivers.sniffing import WAVEFORM_HZ, NothingFoundError, SniffError, sniffed, usual_rate
+from drivers.sniffing import WAVEFORM_HZ, NothingFoundError, SniffError, by_name, sniffed, usual_rate
 from drivers.toml_lines import Hexadecimal, array, behind, entry, toml
 
 if TYPE_CHECKING:
@@ -98,6 +98,7 @@ class _CanQuestions(BusQuestions):
             self.missed(found, answers),
             lambda so_far: self.unheard(found, so_far),
             self.notes,
+            lambda so_far: self.not_read(found, so_far),
         )
 
     def _proposals(self, found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
@@ -123,6 +124,11 @@ class _CanQuestions(BusQuestions):
         """See `Heard.notes`."""
         del answers, assumed
         return ()
+
+    def not_read(self, found: Mapping[str, Any], answers: Answers) -> str:
+        """See `Heard.not_read`."""
+        del found, answers
+        return ""
 
     def _interface(self) -> Iterator[Question]:
         yield self.ask("interface", _interface, _SOCKETCAN, quiet=True)
@@ -393,6 +399,17 @@ class DbcQuestions(_CanQuestions):
             f"{answers['message']} was not heard. Remedy: correct --message; those that come: "
             f"{', '.join(heard)}"
         )
+
+    def not_read(self, found: Mapping[str, Any], answers: Answers) -> str:
+        """See `Heard.not_read`: the file reads one message."""
+        others = [
+            f"{one['message']} ({one['id']:#x})"
+            for one in found["ids"]
+            if one["message"] not in {None, answers["message"]}
+        ]
+        more = f" and {len(others) - _SHOWN} more" if len(others) > _SHOWN else ""
+        named = ", ".join(others[:_SHOWN])
+        return f"Not read: {named}{more}; daqsvc sniff can --dbc prints their tables." if others else ""
 
     def _messages(self, answers: Answers) -> dict[str, Message]:
         return _with_signals(answers["dbc-folder"] / answers["dbc"])

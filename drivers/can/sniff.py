@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from daqsvc.documentation import documented_in
 from daqsvc.rounding import counted
 from drivers.sniffing import (
     Sniffed,
@@ -580,9 +581,10 @@ class _Report(NamedTuple):
 
 
 def _why_left_out(signal: SignalTraffic) -> str:
-    return (
-        "its values have names, as states have" if signal.named else "it rises all the time, as a clock does"
-    )
+    if not signal.named:
+        return "it rises all the time, as a clock does"
+    section = f'"A state or an enum signal" of {documented_in("alarms")}'
+    return f"its values have names, as states have: see {section}"
 
 
 def of_one_channel(signals: Sequence[str]) -> Iterator[str]:

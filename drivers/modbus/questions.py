@@ -343,7 +343,9 @@ class _ModbusQuestions(BusQuestions):
         """See `BusQuestions.guess`."""
         if answers["way"] != "values":
             return ("accelerometer" if answers["rate"] >= WAVEFORM_HZ else "trend"), None
-        return "trend", _unit(channel)
+        unit, kind = _unit(channel), answers[sensor_key(channel, "register-type")]
+        # A float of a register whose meaning is not known is a quantity, and no count.
+        return "trend", None if unit == "count" and kind.startswith("float") else unit
 
     def tables(self, answers: Answers) -> Iterator[str]:
         """See `BusQuestions.tables`."""
@@ -601,9 +603,9 @@ def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
         if not table["registers"]:
             continue
         runs = ", ".join(f"{low}" if low == high else f"{low} to {high}" for low, high in table["runs"])
-        asked = " to ".join(map(str, table["asked"]))
         name = f"unit {table['unit']} has {_TABLES[table['function']]} registers {runs}"
-        yield f"{name} ({asked} were asked; --registers looks further):"
+        were = "was" if len(set(table["asked"])) == 1 else "were"
+        yield f"{name} ({_asked(table)} {were} asked; --registers looks further):"
         if table["max_count"] is not None:
             yield f"  registers in a request: {table['max_count']} at most"
         by_address = {one["address"]: one for one in table["registers"]}
@@ -631,6 +633,11 @@ def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
             yield f"  {address}: {value}{meant}{moves}{', no value?' if is_mark else ''}"
         if len(shown) > _SHOWN:
             yield f"  ... and {len(shown) - _SHOWN} more: daqsvc sniff modbus shows them"
+
+
+def _asked(table: Mapping[str, Any]) -> str:
+    """The first and the last register that was asked for, or the only one."""
+    return " to ".join(map(str, dict.fromkeys(table["asked"])))
 
 
 def _units_in_words(found: Mapping[str, Any]) -> Iterator[str]:
@@ -685,8 +692,8 @@ def _without_registers(found: Mapping[str, Any], registers: str) -> Heard:
             lines.append(f"unit {unit} has no {name} registers: it refuses function {table['function']}")
         elif table["asked"]:
             tables.append(name)
-            asked = " to ".join(map(str, table["asked"]))
-            lines.append(f"unit {unit} answers for {name} registers, but has none of {asked}")
+            none = "no" if len(set(table["asked"])) == 1 else "none of"
+            lines.append(f"unit {unit} answers for {name} registers, but has {none} {_asked(table)}")
     note = "" if registers == _AUTO else _note(registers_of(registers))
     remedy = "Remedy: write the addresses of its manual, counted from 0, as --registers, e.g. 4000-4100"
     others = "; or name other units with --units" if found["units_alike"] or found["units_left_out"] else ""

@@ -67,7 +67,8 @@ class ScanReport:
         if not any(table.first for table in scan.tables) and not scan.stop.is_set():
             functions = " and ".join(map(str, self._functions))
             last = max((table.last for table in scan.tables if table.last is not None), default=None)
-            asked = f"registers {scan.tables[0].begin} to {last}"
+            begin = scan.tables[0].begin
+            asked = f"register {begin}" if begin == last else f"registers {begin} to {last}"
             other = ", and for its tables (--function both)" if len(self._functions) == 1 else ""
             others = (
                 ", and for its unit address (--units N), as others may have some"
@@ -75,9 +76,10 @@ class ScanReport:
                 else ""
             )
             whose = f" of {units_in_words(scan.units)}" if others else ""
+            were = "was" if begin == last else "were"
             more = self._note or (
-                f"{asked}{whose} were asked. Remedy: see the device's manual for its addresses (--registers)"
-                f"{other}{others}"
+                f"{asked}{whose} {were} asked. Remedy: see the device's manual for its addresses "
+                f"(--registers){other}{others}"
             )
             return f"{where}: no register could be read by function {functions}; {more}"
         return ""
@@ -184,6 +186,8 @@ class ScanReport:
             return
         last = table.begin if table.last is None else table.last
         asked = f"Registers {table.begin} to {last} were asked"
+        if table.begin == last:
+            asked = f"Register {last} was asked"
         further = min(2 * last - table.begin if last > table.begin else last + 100, LAST_REGISTER)
         if not table.complete:
             why = "the line was lost" if self._scan.lost else "it was ended"

@@ -822,3 +822,54 @@ def test_a_can_bus_is_asked_for_its_bit_rate_as_it_is_said(tmp_path):
 def test_names_without_commas_are_told_of(capsys):
     assert main(["new", "--yes", "--bus=modbus-tcp", "--host=::1", "--channels=vibration temp"]) == 2
     assert '"vibration temp" has no commas: write vibration, temp' in capsys.readouterr().err
+
+
+def test_a_class_that_there_is_not_is_refused_with_those_that_there_are(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["new", f"{tmp_path / 'm.toml'}", "--bus=can", "--yes"]
+    assert main([*words, "--class=3-soft"]) == 2
+    assert '--class 3-soft: "3-soft" is not one of 2-rigid, 2-flexible, 1-rigid' in capsys.readouterr().err
+    assert main([*words, "--limits=none", "--class=1-rigid"]) == 2
+    assert "--class is not asked for with these answers; it needs --limits iso" in capsys.readouterr().err
+    assert main([*words, "--limits=iso", "--class=1-rigid"]) == 2  # of probes, which are the default
+    assert "probes on the shaft have no class: leave it out" in capsys.readouterr().err
+
+
+def test_an_empty_answer_is_shown_in_quotes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["new", f"{tmp_path / 'm.toml'}", "--bus=modbus-tcp", "--host=h", "--listen", "--yes"]
+    assert main([*words, "--registers", ""]) == 2
+    assert "--registers '': write FIRST-LAST from 0 to 65535" in capsys.readouterr().err
+
+
+def test_a_file_without_an_alarm_is_said_to_have_none(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "m.toml"
+    words = ["new", f"{file}", "--bus=modbus-tcp", "--host=h", "--yes", "--overwrite", "--channels=r40"]
+    floats = [*words, "--sensor=r40.register-type=float32"]
+    assert main(floats) == 0
+    assert (
+        "No alarm is in it yet: write a table [[alarms]] in place of its comment on alarms, see "
+        '"Alarms" in the documentation; or run daqsvc new again with --limits.' in capsys.readouterr().out
+    )
+    [sensor] = tomllib.loads(file.read_text("utf-8"))["sensors"]
+    assert sensor["unit"] == "1"  # a float is no count
+    assert main(words) == 0
+    [sensor] = tomllib.loads(file.read_text("utf-8"))["sensors"]
+    assert sensor["unit"] == "count"
+    capsys.readouterr()
+    assert main([*floats, "--limits=own", "--alert=3", "--danger=5"]) == 0
+    assert "No alarm" not in capsys.readouterr().out
+
+
+def test_the_help_on_a_channel_tells_its_types_apart() -> None:
+    answers: Answers = {"bus": "can"}
+    for question in questions(answers, Path()):
+        answers.setdefault(question.key, question.read(question.default or NEEDED.get(question.key, "x")))
+        if question.key.endswith(".type"):
+            for kind in question.choices or {}:
+                assert kind in question.topic.help or kind == "keyphasor"
+            break
+    else:
+        pytest.fail("no channel was asked for")

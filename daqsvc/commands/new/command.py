@@ -16,6 +16,7 @@ from daqsvc.commands.complaint import complain
 from daqsvc.commands.new.buses import bus_of
 from daqsvc.commands.new.topics import all_topics
 from daqsvc.commands.plugged import foreign_words
+from daqsvc.documentation import documented_in
 from daqsvc.errors.command_line import CANNOT_WRITE, INTERRUPTED
 from daqsvc.errors.machine_file import PLUGIN_FAILED
 from drivers.questions import SENSOR, short_name
@@ -321,6 +322,11 @@ def _report(file: Path, text: str, answers: Answers) -> int:
         _say(note)
     for warning in (*machine.warnings, *doubts_of_owner(Box.single(machine))):
         _say(f"{warning}")
+    if not machine.alarms:
+        _say(
+            "No alarm is in it yet: write a table [[alarms]] in place of its comment on alarms, see "
+            f"{documented_in('alarms')}; or run daqsvc new again with --limits."
+        )
     beside, about = bus_of(answers).beside(quoted)
     commands = {
         f"daqsvc check {quoted}": "what was understood",

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 
 from daqsvc.commands.new.buses import bus_of, buses
 from daqsvc.commands.new.machine_text import NOTES, machine_text, questions
-from daqsvc.commands.new.sensors import why_no_bearing
+from daqsvc.commands.new.sensors import CLASSES, why_no_bearing
 from daqsvc.commands.new.topics import TOPICS
 from daqsvc.errors.command_line import ANSWER
+from drivers import questions as q
 from drivers.bus_questions import SHARED
 from drivers.questions import SENSOR, Answers, Question
 from drivers.sniffing import NothingFoundError
@@ -101,7 +102,12 @@ class _Interview:
         """Keys of questions whose default was taken, and was not heard."""
         self._unheard = ""
 
-    def notes(self) -> Sequence[str]:
+    def notes(self) -> list[str]:
+        """What in the file was neither answered nor heard, and what was heard and is not in it."""
+        not_read = "" if self._heard is None else self._heard.not_read(self.answers)
+        return [*self._not_heard(), *([not_read] if not_read else [])]
+
+    def _not_heard(self) -> Sequence[str]:
         """What in the file was neither answered nor heard, where it was listened for."""
         counters = {"counter", "counter-byte"}
         channels = self._assumed & (_OF_CHANNELS - counters)
@@ -340,7 +346,8 @@ def option(key: str) -> str:
 
 def given_as(key: str, text: str) -> str:
     """An answer as it was given on the command line."""
-    return f"{option(key)}{'' if key.startswith(f'{SENSOR}.') else ' '}{text}"
+    shown = text if text.strip() else repr(text)
+    return f"{option(key)}{'' if key.startswith(f'{SENSOR}.') else ' '}{shown}"
 
 
 def _missing(question: Question) -> str:
@@ -380,8 +387,18 @@ def _refuse_others(given: Given, interview: _Interview) -> None:
     asked = interview.asked
     for key in given.texts:
         if key not in asked:
+            if key == "class":
+                _refuse_class(given.texts[key])
             hint = _why_not_asked(key, asked, interview.answers)
             raise AnswerError(f"{option(key)} is not asked for with these answers; {hint}")
+
+
+def _refuse_class(text: str) -> None:
+    """Whoever names a class that there is not corrects that first, whatever else is missing."""
+    try:
+        q.one_of(CLASSES)(text)
+    except ValueError as error:
+        raise AnswerError(f"{given_as('class', text)}: {error}") from None
 
 
 _NEEDS = {

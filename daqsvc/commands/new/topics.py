@@ -54,8 +54,13 @@ _TOPICS_BEHIND = {
 TOPICS = {**_TOPICS_BEFORE, **_TOPICS_BEHIND}
 """Whatever the bus is."""
 
+_TYPE_HELP = (
+    "Many samples a second: proximity (the shaft, in um or mil), accelerometer (the housing, in g or m/s2), "
+    "velocity (the housing, in mm/s). One value some times a second or less, which the device has computed, "
+    "such as a velocity RMS or a temperature: trend. none leaves the channel out."
+)
 SENSOR_TOPICS = {
-    "type": Topic("What is on channel {channel}?", "none leaves the channel out."),
+    "type": Topic("What is on channel {channel}?", _TYPE_HELP),
     "name": Topic("Name of that sensor", "Best its place, e.g. de-horizontal: drive end, horizontal."),
     "unit": Topic("Unit of {channel}", "The unit in which limits are given and values are shown."),
     "sensitivity": Topic(

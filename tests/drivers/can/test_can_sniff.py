@@ -164,7 +164,10 @@ def test_clocks_and_states_are_no_channels_and_samples_of_one_channel_are_pointe
     assert [channel["name"] for channel in stream["layout"]["channels"]] == ["VibDE_0", "VibDE_1"]
     assert stream["layout"]["counter"]["signal"] == "Count"
     assert "# TimeMs is left out: it rises all the time" in fragment
-    assert "# State is left out: its values have names" in fragment
+    assert (
+        '# State is left out: its values have names, as states have: see "A state or an enum signal" of '
+        '"Alarms" in the documentation' in fragment
+    )
     assert '{ name = "VibDE", signals = ["VibDE_0", "VibDE_1"] }, and 2 times the rate' in fragment
 
 
@@ -583,6 +586,26 @@ def test_new_writes_nothing_about_frames_that_it_did_not_hear(
     with talking(tmp_path / "bus", accelerations):
         assert not_written(tmp_path, *given) == 1
     assert words in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("hub")
+def test_new_names_the_messages_that_it_heard_and_does_not_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 0.5)
+    (tmp_path / "two.dbc").write_text(
+        DBC.read_text("utf-8") + '\nBO_ 801 Slow: 8 Vector__XXX\n SG_ T : 0|16@1+ (0.1,0) [0|0] "degC" A\n'
+    )
+
+    def both(bus: UnixBus, number: int) -> None:
+        accelerations(bus, number)
+        bus.send(can.Message(arbitration_id=801, is_extended_id=False, data=bytes(8)))
+
+    with talking(tmp_path / "bus", both):
+        new(tmp_path, "--bus=can-dbc", "--dbc=two.dbc", "--message=Acceleration")
+    note = "Not read: Slow (0x321); daqsvc sniff can --dbc prints their tables."
+    assert f"\n{note}\n" in capsys.readouterr().out
+    assert f"# {note}\n" in (tmp_path / "new.toml").read_text("utf-8")
 
 
 @pytest.mark.usefixtures("hub")

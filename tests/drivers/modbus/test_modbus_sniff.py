@@ -274,7 +274,7 @@ def test_what_was_not_read_is_not_called_absent(capsys: pytest.CaptureFixture[st
     assert "units that answer: 1, 2, 3" in shown
     assert "Unit 1, holding registers (function 3): 4 at 0-3" in shown
     assert "Unit 3, holding registers (function 3): not read: ended before" in shown
-    assert "Unit 2, holding registers (function 3): none so far\nRegisters 0 to " in shown
+    assert "Unit 2, holding registers (function 3): none so far\nRegister" in shown
     assert "Unit 3, holding registers (function 3): none" not in shown
 
 
@@ -782,6 +782,16 @@ def test_without_listening_nobody_is_asked_for_registers_to_look_at(tmp_path: Pa
     conduct(tmp_path / "m.toml", given, ask, asked.append)
     assert "parity" in asked
     assert "registers" not in asked
+
+
+def test_a_single_register_was_asked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with tcp({3: Elsewhere()}) as target:
+        new(tmp_path, target, "--units=3", "--registers=4000")
+        assert "unit 3 has holding registers 4000 (4000 was asked; " in capsys.readouterr().out
+        assert main(words(target, "--units", "3", "--registers", "4000")) == 0
+        assert "\nRegister 4000 was asked, and 4000 exists: " in capsys.readouterr().out
+        assert main(words(target, "--units", "3", "--registers", "9")) == 1
+        assert "; register 9 was asked. Remedy: " in capsys.readouterr().err
 
 
 def test_units_may_be_a_list(capsys: pytest.CaptureFixture[str]) -> None:
