@@ -23,7 +23,7 @@ from sphinx.search.en import SearchEnglish
 from sphinx.util import logging
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
     from sphinx.application import Sphinx
 
@@ -40,8 +40,20 @@ FAR_AWAY = {
     "daqsvc/alarms/setpoints.py": "A17",
     "daqsvc/dsp/quality/": "D21",
     "daqsvc/detectors/levels/trends.py": "D22",
+    "daqsvc/acquisition/counter_sense.py": "B38",
+    "daqsvc/acquisition/standing.py": "B38",
+    "daqsvc/cli.py": "C01",
+    "drivers/modbus/scan_report.py": "C20",
+    "drivers/questions.py": "C22",
+    "drivers/serial/binary.py": "B34",
+    "drivers/serial/lines.py": "B34",
+    "sim_hw/bus_socket.py": "B29",
 }
 """Where messages are put together that have their codes elsewhere, e.g. those of alarms."""
+RAISED = {"UnknownAlarmError": "C05"}
+"""Codes of exceptions whose messages get them where they are caught."""
+HAD = ROOT / "tests" / "errors" / "messages.txt"
+"""Messages that tests have had from the program, each behind its code."""
 ERRORS_PAGE = "reference/errors"
 
 
@@ -110,7 +122,31 @@ def messages() -> dict[str, set[str]]:
                 names = {part.id for part in ast.walk(node) if isinstance(part, ast.Name)}
                 if len(codes := {ids[name] for name in names & ids.keys()}) == 1:
                     found[codes.pop()].update(_texts(node))
+    for code, text in (*_raised_messages(trees.values()), *_had_messages()):
+        found[code].add(text)
     return found
+
+
+def _had_messages() -> Iterator[tuple[str, str]]:
+    """Messages of `HAD`, each behind its code."""
+    for line in HAD.read_text("utf-8").splitlines():
+        code, _, message = line.partition(" ")
+        # Of a mistake in a machine file the keys and values are those of one file.
+        if not re.match(r"[\w-]+\.toml\b", message):
+            yield code, message
+
+
+def _raised_messages(trees: Iterable[ast.AST]) -> Iterator[tuple[str, str]]:
+    """Texts of the exceptions of `RAISED`, each behind its code."""
+    for node in (node for tree in trees for node in ast.walk(tree)):
+        if isinstance(node, ast.Raise) and (code := RAISED.get(_raised(node))):
+            yield from ((code, text) for text in _texts(node))
+
+
+def _raised(node: ast.Raise) -> str:
+    """The name of the exception."""
+    made = node.exc.func if isinstance(node.exc, ast.Call) else node.exc
+    return made.id if isinstance(made, ast.Name) else ""
 
 
 def _last(call: ast.Call) -> ast.expr:

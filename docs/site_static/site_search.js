@@ -67,6 +67,15 @@ const stemsOf = (text) => {
   return new Set(wordsOf(text).map((word) => stemmer.stemWord(word)));
 };
 
+/* A counter is looked up by its own name, too: that of its group and of its stream or bus may be left out. */
+const COUNTERS = "reference/counters";
+const COUNTER_WEIGHT = 1.05;
+const lastOf = (title) => withoutNumbers(title).split(/[ =,]/)[0].split(".").pop().toLowerCase();
+const namesOfKeys = () => {
+  const { pages, entries } = SITE_INDEX;
+  return new Set(entries.filter(([page]) => /^reference\/keys/.test(pages[page])).map(([, , title]) => lastOf(title)));
+};
+
 /* How much a word tells: the fewer entries have it, the more. */
 const rarityOf = (word) => {
   const { entries, terms } = SITE_INDEX;
@@ -130,8 +139,8 @@ const rankByQuestions = (text, scores) => {
 
 /* A message that was copied has pairs of words that its text in the source has; names and figures are between them. */
 const LEAST_PAIRS = 3;
-/* A question is no message, though it has such pairs, too. */
-const QUESTION = /^\s*(how|what|where|why|when|which|who|can|does|do|is)\b|\?\s*$/i;
+/* A question is no message, though it has such pairs, too; the name of a CAN bus is no question. */
+const QUESTION = /^\s*(how|what|where|why|when|which|who|can(?! (bus|interface)\b)|does|do|is)\b|\?\s*$/i;
 
 const pairsOf = (text) => {
   const pairs = new Set();
@@ -142,20 +151,39 @@ const pairsOf = (text) => {
   return pairs;
 };
 
+/* Figures, quoted names and brackets of a message are those of one machine. */
+const OF_ONE_MACHINE = /'[^']*'|"[^"]*"|-?\d[\d.]*/g;
+
+/* Whether one text of the source has all pairs of the query: what is there word for word was copied. */
+const isCopied = (query) => {
+  const asked = [...pairsOf(query.replace(OF_ONE_MACHINE, "|"))];
+  return (
+    asked.length >= LEAST_PAIRS &&
+    SITE_INDEX.messages.some(([, texts]) =>
+      texts.some((text) => {
+        const pairs = pairsOf(text);
+        return asked.every((pair) => pairs.has(pair));
+      }),
+    )
+  );
+};
+
 /* Puts the errors first whose messages have most of the query, by the rarity of the pairs. */
 const rankByMessages = (query, scores) => {
   const asked = pairsOf(query);
   const had = SITE_INDEX.messages.map(([entry, texts]) => {
     const pairs = new Set(texts.flatMap((text) => [...pairsOf(text)]).filter((pair) => asked.has(pair)));
-    return [entry, pairs];
+    return [entry, pairs, texts];
   });
   const times = new Map();
   for (const [, pairs] of had) for (const pair of pairs) times.set(pair, (times.get(pair) || 0) + 1);
   const rarity = (pair) => Math.log(1 + had.length / times.get(pair));
-  for (const [entry, pairs] of had) {
+  const sumOf = (pairs) => [...pairs].reduce((sum, pair) => sum + rarity(pair), 0);
+  for (const [entry, pairs, texts] of had) {
     if (pairs.size < LEAST_PAIRS) continue;
-    const sum = [...pairs].reduce((sum, pair) => sum + rarity(pair), 0);
-    scores.set(entry, Math.max(scores.get(entry) || 0, 3 * NAMED + sum));
+    /* Pairs that are together in one text tell more than the same ones in several. */
+    const together = texts.map((text) => sumOf([...pairsOf(text)].filter((pair) => pairs.has(pair))));
+    scores.set(entry, Math.max(scores.get(entry) || 0, 3 * NAMED + sumOf(pairs) + Math.max(...together)));
   }
 };
 
@@ -165,12 +193,16 @@ const siteSearch = (typed) => {
   const scores = new Map();
   const names = possibleNames(query);
   let others = query;
+  const keys = namesOfKeys();
   entries.forEach(([page, , title], entry) => {
     const pattern = nameIn(title);
     for (const name of pattern ? names.filter((name) => pattern.test(name)) : []) {
       scores.set(entry, pages[page] === ERRORS ? 5 * NAMED : NAMED * pageWeight(pages[page]));
       others = others.replaceAll(name, " ");
     }
+    const counter = pages[page] === COUNTERS && lastOf(title);
+    if (counter && counter.includes("_") && !keys.has(counter) && query.trim().toLowerCase() === counter)
+      scores.set(entry, COUNTER_WEIGHT * NAMED);
   });
   /* In a message the words beside the name of a key are those that lead to its code. */
   const named = scores.size > 0;
@@ -184,7 +216,9 @@ const siteSearch = (typed) => {
     scores.set(entry, Math.max(score, NAMED / 2));
   }
   const isQuestion = rankByQuestions(others, scores) >= SAME_QUESTION || QUESTION.test(query);
-  if (splitQuery(query).length >= MESSAGE_WORDS && !isQuestion) rankByMessages(query, scores);
+  /* A topic or a path is one name, though it has many words. */
+  const isMessage = /\s/.test(query.trim()) && splitQuery(query).length >= MESSAGE_WORDS;
+  if (isMessage && (!isQuestion || (!QUESTION.test(query) && isCopied(query)))) rankByMessages(query, scores);
   const best = Math.max(0, ...scores.values());
   const enough = best > NAMED / 4 ? 0 : best * LEAST_SHARE;
   return [...scores]

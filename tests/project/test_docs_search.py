@@ -127,6 +127,18 @@ PLAIN = {
     "multiplexed CAN message": "can.html#the-frames",
     "multiplexed frame": "can.html#the-frames",
     "enum state alarm": "alarms.html#a-state-or-an-enum-signal",
+    "no register could be read by function 3 and 4; registers 44001 to 44009 were asked": (
+        "reference/errors.html#c20-"
+    ),
+    "counter c1 is 1.3, no whole number from 0 up": "reference/errors.html#b34-",
+    "CAN bus 'can0' is lost: unixbus /run/can0 is gone: its hub ended": "reference/errors.html#b29-",
+    "argument --store: not allowed with argument FILE": "reference/errors.html#c01-",
+    '"-4" is not a rate': "reference/errors.html#c22-",
+    "no alarm is named 'vibde'": "reference/errors.html#c05-",
+    "more than 4 times as many frames come as the file states": "reference/errors.html#b38-",
+    "rx_errors": "reference/counters.html#buses.NAME.rx_errors",
+    "frames_malformed": "reference/counters.html#buses.NAME.frames_malformed",
+    "samples_lost": "reference/counters.html#streams.NAME.samples_lost",
 }
 """What engineers ask in plain words, and how the addresses begin of which one must be among the first three.
 
@@ -174,6 +186,18 @@ async def test_a_question_in_plain_words_leads_to_its_page(site: Path) -> None:
 async def test_the_list_of_questions_is_not_all_that_is_asked_here() -> None:
     kept = {question for those in tomllib.loads(QUESTIONS.read_text("utf-8")).values() for question in those}
     assert len({*PLAIN} - kept) > len(PLAIN) / 2
+
+
+async def test_a_counter_and_a_topic_by_its_name_alone_come_first(site: Path) -> None:
+    first = {
+        "frames_unknown": "reference/counters.html#buses.NAME.frames_unknown",
+        "rx_errors": "reference/counters.html#buses.NAME.rx_errors",
+        "frames_malformed": "reference/counters.html#buses.NAME.frames_malformed",
+        "ROOT/SITE/BOX/MACHINE/summary": "reference/topics.html#summary",
+        "max_gap": "reference/keys-streams.html#streams-name-layout-max-gap",
+    }
+    found = await searched(site, [*first])
+    assert dict(zip(first, (those[0] for those in found), strict=True)) == first
 
 
 async def test_the_page_states_how_many_results_there_are(site: Path) -> None:
