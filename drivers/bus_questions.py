@@ -41,7 +41,8 @@ SHARED = {
     "baud": Topic("Baud rate, in bit/s", "As the device is set; its manual states it."),
     "counter": Topic(
         "Which signal or column counts the frames or lines, or tells the time?",
-        "By it lost samples are found. none if there is no such signal (CAN only).",
+        "By it lost samples are found. none if there is none: losses are then estimated from the times of "
+        "arrival. Binary frames of a serial port need one.",
     ),
 }
 """What is asked about buses of several kinds."""

@@ -48,12 +48,14 @@ LOSS_UNNOTICED = Code(
     "B05",
     "Lost samples would not be noticed",
     "A counter in each frame or line tells what was lost and when a sample was taken. A time in each line"
-    " does so less exactly.",
-    "State where the counter is. If the device sends none, write no_counter = true: loss is then estimated.",
+    " does so less exactly. Without both, loss is estimated from the times of arrival, and daqsvc check "
+    "warns of it where lines of text are read so.",
+    "State where the counter is. If the device sends none, write no_counter = true into the layout: loss is "
+    "then estimated. Binary frames of a serial port need a counter.",
     "driver-contract.md",
     example="machine.toml:54: streams.casing.layout: has neither counter nor time: lost lines would not be "
     'noticed. Remedy: add counter = { column = "seq" } or time = { column = "t", unit = "ms" }, '
-    "whichever it sends",
+    "whichever it sends; if it sends neither, no_counter = true",
 )
 UNFIT_COUNTER = Code(
     "B06",

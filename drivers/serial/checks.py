@@ -176,20 +176,7 @@ def _check_columns(layout: LineLayout, path: KeyPath) -> Iterator[Finding]:
                 code=NAMED_TWICE,
             )
         seen.add(name)
-    if layout.counter is None and layout.time is None:
-        yield Finding(
-            path,
-            "has neither counter nor time: lost lines would not be noticed",
-            'add counter = { column = "seq" } or time = { column = "t", unit = "ms" }, whichever it sends',
-            code=LOSS_UNNOTICED,
-        )
-    if layout.counter is not None and layout.time is not None:
-        yield Finding(
-            (*path, "time"),
-            "has no effect beside counter, which tells loss exactly",
-            "remove time; its column may stay in line",
-            code=NO_EFFECT,
-        )
+    yield from _check_place(layout, path)
     for key, part in (("counter", layout.counter), ("time", layout.time)):
         if part is not None and part.column not in layout.line:
             yield Finding(
@@ -206,6 +193,40 @@ def _check_columns(layout: LineLayout, path: KeyPath) -> Iterator[Finding]:
                 choice(channel.name, layout.line),
                 code=NO_SUCH_NAME,
             )
+
+
+def _check_place(layout: LineLayout, path: KeyPath) -> Iterator[Finding]:
+    """A line has a counter or the device's time, or the file states that it has neither."""
+    if layout.counter is None and layout.time is None and not layout.no_counter:
+        yield Finding(
+            path,
+            "has neither counter nor time: lost lines would not be noticed",
+            'add counter = { column = "seq" } or time = { column = "t", unit = "ms" }, whichever it sends; '
+            "if it sends neither, no_counter = true",
+            code=LOSS_UNNOTICED,
+        )
+    elif layout.no_counter and (layout.counter is not None or layout.time is not None):
+        yield Finding(
+            (*path, "no_counter"),
+            f"contradicts {'time' if layout.counter is None else 'counter'}",
+            "leave it out if the device counts its lines or sends its time, else remove that",
+            code=CONTRADICTION,
+        )
+    elif layout.no_counter:
+        yield Finding(
+            (*path, "no_counter"),
+            "lets lost lines be estimated from the times of arrival: few of them are mostly not noticed",
+            "have the device send a counter or its time; if it can send neither, leave it",
+            fatal=False,
+            code=LOSS_UNNOTICED,
+        )
+    if layout.counter is not None and layout.time is not None:
+        yield Finding(
+            (*path, "time"),
+            "has no effect beside counter, which tells loss exactly",
+            "remove time; its column may stay in line",
+            code=NO_EFFECT,
+        )
 
 
 def _check_suffixes(layout: LineLayout, delimiter: str, path: KeyPath) -> Iterator[Finding]:

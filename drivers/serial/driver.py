@@ -258,10 +258,11 @@ def _assembler(spec: StreamSpec[Any], port: BusPort) -> StreamAssembler:
     layout: FrameLayout | LineLayout = spec.layout
     if not isinstance(layout, LineLayout):
         return assembler_of(spec, port)
+    bits = None if layout.no_counter else TIME_COUNTER_BITS
     return StreamAssembler(
         spec.name,
         spec.rate_hz,
-        counter_bits=TIME_COUNTER_BITS if layout.counter is None else layout.counter.bits,
+        counter_bits=bits if layout.counter is None else layout.counter.bits,
         samples_per_frame=1,
         counts_per_frame=1,
         deliver=port.deliver,

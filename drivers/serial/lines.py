@@ -1,8 +1,8 @@
 """Samples as lines of text: ``seq,x,y,z`` with a counter, or a time stamp of the device's own clock.
 
 One line carries one sample of every channel. The loss of lines shows in the counter; a device that sends
-none may send the time at which it sampled instead. Two optional parts, as NMEA 0183 has them: a first
-field that names the stream, and a checksum behind a ``*``.
+none may send the time at which it sampled instead. Of one that sends neither, the times of arrival count.
+Two optional parts, as NMEA 0183 has them: a first field that names the stream, and a checksum behind a ``*``.
 """
 
 from __future__ import annotations
@@ -94,32 +94,35 @@ class LineCodec:
         layout: which column is what; its scale and offset lead to the physical units.
 
     Raises:
-        LayoutError: the line has no counter and no time, or both; or a named column is not there once.
+        LayoutError: the line has no counter and no time without stating so, or both; or a named column is not
+            there once.
     """
 
     def __init__(self, layout: LineLayout) -> None:
-        if (layout.counter is None) == (layout.time is None):
-            raise LayoutError(
-                "a line needs a counter or a time, and not both: without it lost lines cannot be found"
-            )
         place = layout.counter or layout.time
-        assert place is not None  # noqa: S101 - there is one, as above
-        for name in (place.column, *layout.channel_names):
+        if [layout.counter is None, layout.time is None, not layout.no_counter].count(False) != 1:
+            raise LayoutError(
+                "a line needs a counter or a time, and not both: without it lost lines cannot be found; "
+                "no_counter = true states that it has neither"
+            )
+        for name in (*([] if place is None else [place.column]), *layout.channel_names):
             if layout.line.count(name) != 1:
                 raise LayoutError(
                     f"column {name!r} is there {counted(layout.line.count(name), 'time')} among "
                     f"{', '.join(layout.line)}; name it once"
                 )
         self._layout = layout
-        self._place = place.column
+        self._place = None if place is None else place.column
         self._counts = 2.0 ** (TIME_COUNTER_BITS if layout.counter is None else layout.counter.bits)
         self._units_per_s = None if layout.time is None else UNITS_PER_S[layout.time.unit]
+        self._is_counted = layout.counter is not None
         self._scale = np.array([channel.scale for channel in layout.channels])
         self._offset = np.array([channel.offset for channel in layout.channels])
-        names = (self._place, *layout.channel_names)
-        self._picks = np.array([layout.line.index(name) for name in names], np.int64)
+        # No column is at -1: without a counter and a time, the place of every line reads 0.
+        place_at = -1 if place is None else layout.line.index(place.column)
+        self._picks = np.array([place_at, *map(layout.line.index, layout.channel_names)], np.int64)
         self._suffixes = {one.name: one.suffix or "" for one in layout.channels}
-        texts = [self._suffixes.get(name, "").encode("ascii") for name in names]
+        texts = [b"", *(text.encode("ascii") for text in self._suffixes.values())]
         padded = [text.ljust(max(1, *map(len, texts)), b"\0") for text in texts]
         self._texts = np.array([list(text) for text in padded], np.uint8)
         self._prefix = np.frombuffer((layout.prefix or "").encode("ascii"), np.uint8).copy()
@@ -138,13 +141,15 @@ class LineCodec:
             len(layout.line),
             self._picks,
             self._texts,
-            self._units_per_s is None,
+            self._is_counted,
         )
         for k in np.flatnonzero(states == HARD).tolist():
             text = buffer[starts[k] : stops[k]].tobytes().decode("ascii", "replace")
             fields = fields_of(text, layout.separator)[bool(layout.prefix) :]
             values[k] = [
                 _value((number_before(fields[pick], suffix) or "").replace(layout.decimal, "."))
+                if pick >= 0
+                else 0.0
                 for pick, suffix in zip(self._picks.tolist(), ("", *self._suffixes.values()), strict=True)
             ]
         places = values[:, 0]
@@ -165,10 +170,16 @@ class LineCodec:
             many = counted(len(fields), "column")
             why = f"{many}, the file lists {len(columns)} ({', '.join(columns)})"
             return NoFrame(why, self._other_columns(len(fields) - len(columns)))
-        for name in (self._place, *self._layout.channel_names):
+        for name in filter(None, (self._place, *self._layout.channel_names)):
             why_no_number = self._why_no_number(name, fields[columns.index(name)])
             if why_no_number is not None:
                 return why_no_number
+        return NoFrame("it cannot be read") if self._place is None else self._why_no_place(fields)
+
+    def _why_no_place(self, fields: Sequence[str]) -> NoFrame:
+        """Why a line whose columns are numbers has no place among the others."""
+        columns = self._layout.line
+        assert self._place is not None  # noqa: S101 - else it needs none
         place = fields[columns.index(self._place)].replace(self._layout.decimal, ".")
         if self._units_per_s is not None:
             return NoFrame(

@@ -152,10 +152,13 @@ class SerialQuestions(BusQuestions):
             marks = {".": "as in 0.25", ",": "as in 0,25"}
             yield self.choose("decimal", marks, ".", quiet=True)
         yield self.choose("checksum", dict.fromkeys(("none", "xor", "crc16"), ""), "none", quiet=True)
-        yield self.ask("columns", _columns, "t, x, y")
+        yield self.ask("columns", q.names, "t, x, y")
         columns = dict.fromkeys(answers["columns"], "")
-        first = answers["columns"][0]
+        first = answers["columns"][0] if len(columns) > 1 else NONE
+        columns[NONE] = "lines carry neither a count nor a time"
         yield self.ask("counter", q.exactly(columns), first, choices=columns)
+        if answers["counter"] is None:
+            return
         is_time = _is_time(answers["counter"])
         kinds = {"count": "it counts lines", "s": "time in s", "ms": "time in ms", "us": "time in us"}
         yield self.choose("counts", kinds, "ms" if is_time else "count")
@@ -236,7 +239,9 @@ class SerialQuestions(BusQuestions):
         yield entry("separator", answers["separator"])
         if answers.get("decimal") == ",":
             yield entry("decimal", ",", "numbers have a decimal comma")
-        if answers["counts"] == "count":
+        if answers["counter"] is None:
+            yield entry("no_counter", value=True, comment="losses are estimated from the times of arrival")
+        elif answers["counts"] == "count":
             yield f"# {MUST_TURN[0].upper()}{MUST_TURN[1:]}."
             yield entry("counter", {"column": answers["counter"]}, "losses are counted by it")
         else:
@@ -277,13 +282,6 @@ def _is_time(name: str) -> bool:
     """Whether the name of a column suggests a time."""
     words = ("time", "stamp", "milli", "micro", "clock")
     return name.lower() in {"t", "ts", "s", "ms", "us"} or any(word in name.lower() for word in words)
-
-
-def _columns(text: str) -> tuple[str, ...]:
-    columns = q.names(text)
-    if len(columns) < 2:
-        raise ValueError("a line needs a column that counts or tells the time, and one that is measured")
-    return columns
 
 
 def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
@@ -343,13 +341,13 @@ def _proposals(found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
     for name, one in zip(answers.get("columns", named), named.values(), strict=False):
         if one["counts"] or one["time_unit"]:
             proposed |= {"counter": name, "counts": one["time_unit"] or "count"}
-        elif one["turns_at"]:
-            # For want of another one; what was heard states what comes of it.
-            proposed = {"counter": name, "counts": "count"} | proposed
-        elif not one["numeric"]:
+        elif one["turns_at"] or not one["numeric"]:
+            # What begins again after 999 is no counter, and measures nothing: what was heard states it.
             proposed[sensor_key(name, "type")] = NONE
         elif one["unit"]:
             proposed[sensor_key(name, "suffix")] = one["unit"]
+    if not _missed(found):
+        proposed.setdefault("counter", NONE)
     return proposed
 
 
@@ -359,9 +357,8 @@ def _missed(found: Mapping[str, Any]) -> str:
         if found["counter"] is not None and found["counter_bits"] is not None:
             return ""
         return f"{frames_need(_payload_length(found))}. Remedy: see the manual of the device"
-    places = [one for one in found["columns"] if one["counts"] or one["time_unit"]]
     numbers = [one for one in found["columns"] if one["numeric"]]
-    if places and len(numbers) > 1:
+    if any(not (one["counts"] or one["time_unit"] or one["turns_at"]) for one in numbers):
         return ""
     begin = "" if numbers else f"{NO_NUMBERS} "
     return f"{begin}{LINES_NEED}. Remedy: have the device send them"

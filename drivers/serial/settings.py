@@ -298,7 +298,7 @@ class LineLayout(Layout):
         tuple[Name, ...],
         Field(
             strict=False,
-            min_length=2,
+            min_length=1,
             max_length=MOST_CHANNELS,
             description="names of the columns; those named nowhere else are left out",
             examples=['["seq", "x", "y"]'],
@@ -318,6 +318,10 @@ class LineLayout(Layout):
     time: LineTime | None = Field(
         default=None,
         description="the column with the device's time, of a device that does not count its lines",
+    )
+    no_counter: bool = Field(
+        default=False,
+        description="true if lines carry neither: losses are then estimated from the times of arrival",
     )
     channels: Annotated[
         tuple[LineChannel, ...],
@@ -344,7 +348,9 @@ class LineLayout(Layout):
     def summary(self) -> str:
         """What a person should know about it, in a few words."""
         named = "" if self.prefix is None else f"{self.prefix}, "
-        place = "device's time" if self.counter is None else f"{self.counter.bits} bit count"
+        place = "no count" if self.time is None else "device's time"
+        if self.counter is not None:
+            place = f"{self.counter.bits} bit count"
         return f"{named}{len(self.channels)} of {len(self.line)} columns, {place}"
 
 

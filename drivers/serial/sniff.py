@@ -575,9 +575,14 @@ class _Report(NamedTuple):
 
     def _stream(self, what: TextLines, bus: str, stream: str, sensors: set[str]) -> Iterator[str]:
         counter, time_column = _counter(what), self._time(what)
-        numbers = [one for one in what.columns if one.numeric and one not in {counter, time_column}]
+        # What begins again after 999 counts, and measures nothing.
+        numbers = [
+            one
+            for one in what.columns
+            if one.numeric and not one.turns_at and one not in {counter, time_column}
+        ]
         place, rate_hz = counter or time_column, self._sampling_hz(what)
-        if place is None or not numbers or rate_hz is None:
+        if not numbers or rate_hz is None:
             if what.prefix:
                 yield f"# Lines that begin with {what.prefix}:"
             if not any(one.numeric for one in what.columns):
@@ -603,6 +608,8 @@ class _Report(NamedTuple):
             bits = 8 if counter.most < 256 else 16 if counter.most < 65_536 else 32
             table = f"{{ column = {quoted(names[counter])}, bits = {bits} }}"
             yield f"counter = {table}    # as far as it was seen: {MUST_TURN}"
+        elif place is None:
+            yield "no_counter = true    # none was seen, and no time: losses are estimated from the arrivals"
         else:
             unit = self._time_unit(what, place)
             yield f'time = {{ column = {quoted(names[place])}, unit = "{unit}" }}'
@@ -693,10 +700,7 @@ def _tried_row(one: Tried) -> Sequence[str]:
 
 
 NO_NUMBERS = "No column is a number alone, such as 22.5: NAME=22.5, JSON and hex are not read."
-LINES_NEED = (
-    "A stream needs a column that counts lines, or one with the device's time, and a column of numbers "
-    "beside it"
-)
+LINES_NEED = "A stream needs a column of numbers, best beside one that counts lines or has the device's time"
 """Why nothing is proposed of lines."""
 
 

@@ -293,6 +293,24 @@ def test_overtaken_lines_and_numbers_beyond_all_bounds_cost_no_sample(tmp_path: 
     assert (counters.frames_reordered, counters.frames_rejected, time_base.restarts) == (1, 0, 0)
 
 
+def test_lines_with_neither_counter_nor_time_are_placed_and_counted_by_their_arrival(tmp_path: Path) -> None:
+    layout = line_layout(("x",), ("x",), no_counter=True)
+    specs = [StreamSpec("x", layout, 100.0)]
+    bus = serial_bus(port=str(tmp_path), framing="lines")
+    blocks: list[SampleBlock] = []
+    driver = SerialDriver(bus, BusPort("ser0", specs, DrivenClock(), blocks.append))
+    framing = framing_of(bus, specs)
+    # Forty lines do not come.
+    for k in [*range(300), *range(340, 800)]:
+        driver.accept(framing.cut(b"%d\n" % k, lambda ends, k=k: np.full(len(ends), 10_000_000 * k)))
+    driver._assemblers["x"].flush()
+    values = np.concatenate([block.samples[:, 0] for block in blocks])
+    np.testing.assert_array_equal(values, np.float32([*range(1, 300), *range(340, 800)]))
+    counters, _ = driver.streams["x"]
+    assert (counters.samples_received, counters.samples_lost, counters.gaps) == (759, 40, 1)
+    assert blocks[-1].first_index + len(blocks[-1].samples) == 799
+
+
 async def test_a_port_is_not_silent_while_its_kernels_are_compiled(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

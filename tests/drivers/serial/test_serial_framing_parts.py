@@ -162,6 +162,7 @@ def test_without_a_crc_a_sync_word_must_follow():
         (lambda: SyncFraming(BodyCodec({"a": layout()}), b""), "sync word is empty"),
         (lambda: LineCodec(line(counter=None)), "needs a counter or a time"),
         (lambda: LineCodec(line(time="x")), "not both"),
+        (lambda: LineCodec(line(no_counter=True)), "not both"),
         (lambda: LineCodec(line(columns=("seq", "y"))), "column 'x' is there 0 times"),
         (lambda: LineFraming({"a": line(), "b": line()}, {}), "cannot be told apart"),
         (
@@ -485,3 +486,16 @@ def test_nothing_is_logged_by_a_framing(caplog):
     with caplog.at_level(logging.DEBUG):
         LineFraming({"a": line()}, {"a": 1.0}).cut(b"garbage\n" * 10)
     assert not caplog.records
+
+
+def test_lines_with_neither_counter_nor_time_are_read_as_they_come():
+    framing = LineFraming(
+        {"a": line(columns=("x",), counter=None, no_counter=True, channels=({"name": "x", "suffix": "C"},))},
+        {"a": 10.0},
+    )
+    found = framing.cut(b"1.5C\n2.5C\n-C\n123456789012345678901234567890C\nhot\n3.5C\n").frames["a"]
+    assert found.counter.tolist() == [0] * 4
+    read = np.float32([2.5, np.nan, 123456789012345678901234567890, 3.5])
+    np.testing.assert_array_equal(found.samples[:, 0, 0], read)
+    written = framing.encode("a", np.arange(2), np.array([[[1.0]], [[2.0]]]))
+    assert written == [b"1.000000C\r\n", b"2.000000C\r\n"]

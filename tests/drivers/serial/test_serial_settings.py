@@ -105,6 +105,14 @@ def test_the_driver_is_found_by_its_name():
         ),
         ('bus = "probes"', 'bus = "casing"', "streams.shaft.layout", "carries lines", "line ="),
         (COUNTER, "", "streams.casing.layout", "has neither counter nor time", "counter = {"),
+        (COUNTER, "", "streams.casing.layout", "has neither counter nor time", "no_counter = true"),
+        (
+            COUNTER,
+            COUNTER + "no_counter = true\n",
+            "streams.casing.layout.no_counter",
+            "contradicts counter",
+            "leave it out",
+        ),
         ('column = "seq"', 'column = "sek"', "streams.casing.layout.counter.column", "no such column", "seq"),
         (
             LINE,
@@ -196,6 +204,14 @@ def test_a_time_that_tells_each_line_from_the_next_is_no_warning(unit, rate_hz):
     line, time = TIMED
     edits = ((LINE, line), (COUNTER, time.format(unit)), ("rate_hz = 200.0", f"rate_hz = {rate_hz}"))
     assert not parsed(SERIAL, *edits, ("baud = 115_200", "baud = 921_600")).warnings
+
+
+def test_lines_with_neither_counter_nor_time_are_a_warning():
+    machine = parsed(SERIAL, (COUNTER, "no_counter = true\n"))
+    (warning,) = machine.warnings
+    assert "streams.casing.layout.no_counter = true: lets lost lines be estimated" in str(warning)
+    assert "if it can send neither, leave it" in str(warning)
+    assert machine.streams["casing"].layout.summary == "$ACC, 2 of 3 columns, no count"
 
 
 def test_a_port_belongs_to_one_bus():

@@ -119,10 +119,22 @@ def test_a_counter_that_begins_again_after_999_is_not_proposed(
         (False, None),
         (False, None),
     ]
-    assert "counter =" not in found["machine_file"]
+    assert "\ncounter =" not in found["machine_file"]
+    assert 'channels = [{ name = "c2" }, { name = "c3" }]' in found["machine_file"]
     proposed = _proposals(found, {})
-    assert (proposed["counter"], proposed["counts"]) == ("c1", "count")
+    assert (proposed["counter"], proposed["sensor.c1.type"]) == ("none", "none")
     assert any("c1 begins again at 0 after 999" in line for line in _in_words(found))
+
+
+def test_lines_with_neither_counter_nor_time_are_proposed_as_such(
+    cable: PseudoTerminal, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with talking(cable, lambda number: b"%d.25\r\n" % (20 + number * 7 % 5)):
+        found = figures(cable, capsys)
+    read = tomllib.loads(BEGIN + found["machine_file"])["streams"]["lines"]["layout"]
+    assert (read["line"], read["no_counter"]) == (["c1"], True)
+    proposed = _proposals(found, {})
+    assert (proposed["columns"], proposed["counter"]) == ("c1", "none")
 
 
 def test_a_counter_whose_turn_was_not_seen_is_proposed_with_a_word(
@@ -586,13 +598,21 @@ def test_new_says_what_to_do_when_it_hears_nothing(
         assert not file.exists()
 
 
+def test_new_reads_lines_that_only_have_what_is_measured(
+    cable: PseudoTerminal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 0.6)
+    file = tmp_path / "no-counter.toml"
+    with talking(cable, lambda number: b"1.%d mm/s, 45.%d C\r\n" % (number * 7 % 10, number * 3 % 10)):
+        assert main(["new", f"{file}", "--yes", "--listen", "--bus=serial", f"--port={cable.path}"]) == 0
+    (stream,) = tomllib.loads(file.read_text("utf-8"))["streams"].values()
+    assert (stream["layout"]["line"], stream["layout"]["no_counter"]) == (["c1", "c2"], True)
+    assert main(["check", f"{file}"]) == 0
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (
-            b"1.%d mm/s, 45.%d C\r\n",
-            "A stream needs a column that counts lines, or one with the device's time",
-        ),
         (b"V=1.%d T=45.%d\r\n", "No column is a number alone, such as 22.5: NAME=22.5, JSON and hex are not"),
     ],
 )
