@@ -61,7 +61,8 @@ class Heard:
         unheard: the same of the answers so far: what they state and was not heard.
         notes: sentences for the file, of all answers and of the keys of those that are nothing but a default:
             what of them listening cannot show.
-        not_read: what was heard and is not in the file by the answers, in a sentence; empty if all is.
+        not_read: what was heard and is not in the file by the answers, a sentence in each line; empty if it
+            all is.
     """
 
     lines: Sequence[str]

@@ -20,9 +20,10 @@ from daqsvc.acquisition.counter_sense import CounterSense
 from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.acquisition.standing import QUIET_NS, StreamStanding, tell_nobody
 from daqsvc.acquisition.timebase import TimeBase, TimeBaseState, rate_in_words
-from daqsvc.dsp.quality.rate import ArrivalRate
+from daqsvc.dsp.quality.rate import FITS, ArrivalRate
 from daqsvc.errors.buses import NO_FRAME, NO_MEASUREMENT, SAMPLES_MISSING, TIME_UNSURE
 from daqsvc.errors.code import coded
+from daqsvc.rounding import readable
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -92,6 +93,7 @@ class StreamAssembler:
         stamped: whether the counter is made of the device's time stamps with the nominal rate, and so shows
             nothing of its rate.
         tell: called when it changes whether anything can be judged by the samples.
+        unread: how many frames have come that could not be read and may have been of the stream.
     """
 
     def __init__(
@@ -106,6 +108,7 @@ class StreamAssembler:
         reorder_window_ns: int = 10_000_000,
         stamped: bool = False,
         tell: Tell = tell_nobody,
+        unread: Callable[[], int] = lambda: 0,
     ) -> None:
         self.stream = stream
         self.counters = StreamCounters()
@@ -132,6 +135,7 @@ class StreamAssembler:
         self._sense = CounterSense(counter_bits, counts_per_frame, frame_rate_hz)
         self._arrivals = ArrivalRate(frame_rate_hz) if self._counts_arrivals or stamped else None
         self._rate_hz = rate_hz
+        self._unread = unread
         self._standing = StreamStanding(stream, tell)
         self._said: dict[str, int] = {}
 
@@ -147,7 +151,14 @@ class StreamAssembler:
             return self._sense.doubt or self._time.rate_doubt
         if self._arrivals.rate_hz is None or self._arrivals.fits:
             return ""
-        return rate_in_words(self._arrivals.rate_hz * self._per_frame, NS_PER_S / self._rate_hz)
+        rate_hz, unread = self._arrivals.rate_hz * self._per_frame, self._unread()
+        with_them_hz = rate_hz * (1.0 + unread / max(self.counters.frames_received, 1))
+        if unread and abs(with_them_hz / self._rate_hz - 1.0) <= FITS:
+            return (
+                f"only {readable(rate_hz)} of {readable(self._rate_hz)} Hz can be read; the rest is as the "
+                "layout does not state it (frames_malformed): correct the layout, or see the link"
+            )
+        return rate_in_words(rate_hz, NS_PER_S / self._rate_hz)
 
     @property
     def frames_lost(self) -> int:

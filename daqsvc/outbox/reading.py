@@ -147,7 +147,7 @@ def _read(path: Path, query: Callable[[sqlite3.Connection], _T]) -> _T:
     except FileNotFoundError:
         raise OutboxError(
             f"there is no journal {path}: the service has not run with this store yet, or keeps it "
-            f"elsewhere; see `directory` in [store] of its machine file"
+            f"elsewhere; see --store of its daqsvc run, or `directory` in [store] of its machine file"
         ) from None
     except PermissionError as error:
         raise OutboxError(

@@ -13,7 +13,7 @@ from daqsvc.rounding import counted
 from drivers import packed_questions as packed
 from drivers import questions as q
 from drivers.bus_questions import BUS, BusQuestions, Heard, is_count
-from drivers.can.sniff import CanSniffer, number_of, numbered, of_one_channel
+from drivers.can.sniff import STATE, CanSniffer, number_of, numbered, of_one_channel
 from drivers.questions import NONE, Answers, Question, Topic
 from drivers.sniffing import WAVEFORM_HZ, NothingFoundError, SniffError, by_name, sniffed, usual_rate
 from drivers.toml_lines import Hexadecimal, array, behind, entry, toml
@@ -401,7 +401,7 @@ class DbcQuestions(_CanQuestions):
         )
 
     def not_read(self, found: Mapping[str, Any], answers: Answers) -> str:
-        """See `Heard.not_read`: the file reads one message."""
+        """See `Heard.not_read`: the file reads one message, and of that no states if nobody names them."""
         others = [
             f"{one['message']} ({one['id']:#x})"
             for one in found["ids"]
@@ -409,7 +409,12 @@ class DbcQuestions(_CanQuestions):
         ]
         more = f" and {len(others) - _SHOWN} more" if len(others) > _SHOWN else ""
         named = ", ".join(others[:_SHOWN])
-        return f"Not read: {named}{more}; daqsvc sniff can --dbc prints their tables." if others else ""
+        said = [f"Not read: {named}{more}; daqsvc sniff can --dbc prints their tables."] if others else []
+        taken = {answers["counter"], *answers["signals"]}
+        signals = self._messages(answers)[answers["message"]].signals
+        states = [one.name for one in signals if one.choices and one.name not in taken]
+        said += [f"{name} is left out: {STATE}." for name in states[:_SHOWN]]
+        return "\n".join(said)
 
     def _messages(self, answers: Answers) -> dict[str, Message]:
         return _with_signals(answers["dbc-folder"] / answers["dbc"])

@@ -583,8 +583,11 @@ class _Report(NamedTuple):
 def _why_left_out(signal: SignalTraffic) -> str:
     if not signal.named:
         return "it rises all the time, as a clock does"
-    section = f'"A state or an enum signal" of {documented_in("alarms")}'
-    return f"its values have names, as states have: see {section}"
+    return STATE
+
+
+STATE = f'its values have names, as states have: see "A state or an enum signal" of {documented_in("alarms")}'
+"""Why a signal is no measured value, and where what to do with it is described."""
 
 
 def of_one_channel(signals: Sequence[str]) -> Iterator[str]:

@@ -18,6 +18,7 @@ import numpy as np
 import serial
 
 from daqsvc.acquisition.assembler import StreamAssembler
+from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.link import Link
 from daqsvc.errors.buses import NO_FRAME
 from daqsvc.errors.code import coded
@@ -33,7 +34,7 @@ from drivers.stream_driver import assembler_of
 from drivers.tty import Character, CharacterFormat, why_not_open
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from daqsvc.acquisition.assembler import StreamCounters
     from daqsvc.acquisition.timebase import TimeBaseState
@@ -46,6 +47,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 REMEMBERED_IDS = 64
+RECENT_NS = 10 * NS_PER_S
+"""Time for which bytes that were no frame count as coming."""
 
 _PARITY = {"none": serial.PARITY_NONE, "even": serial.PARITY_EVEN, "odd": serial.PARITY_ODD}
 
@@ -97,8 +100,12 @@ class SerialDriver:
         self._bus = bus
         self._port = port
         self._framing = framing_of(bus, port.streams)
-        self._assemblers = {s.name: _assembler(s, port) for s in port.streams}
+        self._assemblers = {s.name: _assembler(s, port, self._unread) for s in port.streams}
         self._said: set[str] = set()
+        self._faults: dict[str, str] = {}
+        self.link.faults = self._faults
+        self._no_frame = ""
+        self._no_frame_ns = 0
         self._characters = CharacterFormat(self.link.name, Character(bus.data_bits, bus.parity))
 
     @property
@@ -179,6 +186,7 @@ class SerialDriver:
                 f"; {batch.malformed}" if batch.malformed else "",
                 batch.remedy or COMPARE,
             )
+            self._come_in_place(batch)
         for name, count in batch.unknown.items():
             self._count_unknown(name, count)
         for stream, (count, length) in batch.wrong_length.items():
@@ -193,14 +201,30 @@ class SerialDriver:
                 length,
             )
         for stream, frames in batch.frames.items():
+            self._faults.pop(stream, None)
             with sparing_others(self.link, stream, self.counters):
                 self._assemblers[stream].accept(*frames)
 
     def tick(self, drained_ns: int) -> None:
         """Nothing more is under way that was sent before ``drained_ns``; runs on the event loop."""
+        if self._faults and self._port.clock.monotonic_ns() - self._no_frame_ns > RECENT_NS:
+            self._faults.clear()
         for name, assembler in self._assemblers.items():
             with sparing_others(self.link, name, self.counters):
                 assembler.tick(drained_ns)
+
+    def _come_in_place(self, batch: DecodedBatch) -> None:
+        """State what comes in place of the frames of streams, until these come."""
+        self._no_frame = batch.malformed or self._no_frame
+        self._no_frame_ns = self._port.clock.monotonic_ns()
+        frame = "line" if isinstance(self._bus, LinesBus) else "frame"
+        for stream in self._assemblers.keys() - batch.frames.keys():
+            why = f"bytes come on {self.name}, but no {frame} as its layout states"
+            self._faults[stream] = f"{why}; {self._no_frame}" if self._no_frame else why
+
+    def _unread(self) -> int:
+        """How many frames could not be read; 0 if there are several streams: they may be of any."""
+        return self.counters.frames_malformed if len(self._assemblers) == 1 else 0
 
     def note(self, counter: str, count: int = 1) -> None:
         """Add to one of the bus's counters; runs on the event loop."""
@@ -254,7 +278,7 @@ def _warm(bus: SerialBus, streams: Sequence[StreamSpec[Any]]) -> None:
         framing.cut(b"".join(frames))
 
 
-def _assembler(spec: StreamSpec[Any], port: BusPort) -> StreamAssembler:
+def _assembler(spec: StreamSpec[Any], port: BusPort, unread: Callable[[], int]) -> StreamAssembler:
     layout: FrameLayout | LineLayout = spec.layout
     if not isinstance(layout, LineLayout):
         return assembler_of(spec, port)
@@ -269,6 +293,7 @@ def _assembler(spec: StreamSpec[Any], port: BusPort) -> StreamAssembler:
         reorder_window_ns=spec.reorder_window_ns,
         stamped=layout.time is not None,
         tell=port.tell,
+        unread=unread,
     )
 
 

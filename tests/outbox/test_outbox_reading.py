@@ -159,7 +159,7 @@ async def test_a_store_that_may_only_be_read(outbox, tmp_path):
 
 
 def test_a_store_without_a_journal_says_where_to_look(tmp_path):
-    with pytest.raises(OutboxError, match=r"there is no journal .*see `directory` in \[store\]"):
+    with pytest.raises(OutboxError, match=r"there is no journal .*see --store .*`directory` in \[store\]"):
         read_journal(tmp_path)
     with pytest.raises(OutboxError, match="there is no journal"):
         read_journal(tmp_path / "nowhere")

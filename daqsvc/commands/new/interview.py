@@ -105,7 +105,7 @@ class _Interview:
     def notes(self) -> list[str]:
         """What in the file was neither answered nor heard, and what was heard and is not in it."""
         not_read = "" if self._heard is None else self._heard.not_read(self.answers)
-        return [*self._not_heard(), *([not_read] if not_read else [])]
+        return [*self._not_heard(), *not_read.splitlines()]
 
     def _not_heard(self) -> Sequence[str]:
         """What in the file was neither answered nor heard, where it was listened for."""

@@ -594,7 +594,9 @@ def test_new_names_the_messages_that_it_heard_and_does_not_read(
 ) -> None:
     monkeypatch.setattr(questions, "_LISTEN_S", 0.5)
     (tmp_path / "two.dbc").write_text(
-        DBC.read_text("utf-8") + '\nBO_ 801 Slow: 8 Vector__XXX\n SG_ T : 0|16@1+ (0.1,0) [0|0] "degC" A\n'
+        DBC.read_text("utf-8")
+        + '\nBO_ 801 Slow: 8 Vector__XXX\n SG_ T : 0|16@1+ (0.1,0) [0|0] "degC" A\n'
+        + '\nVAL_ 513 Status 0 "good" 1 "self-test failed" ;\n'
     )
 
     def both(bus: UnixBus, number: int) -> None:
@@ -604,8 +606,11 @@ def test_new_names_the_messages_that_it_heard_and_does_not_read(
     with talking(tmp_path / "bus", both):
         new(tmp_path, "--bus=can-dbc", "--dbc=two.dbc", "--message=Acceleration")
     note = "Not read: Slow (0x321); daqsvc sniff can --dbc prints their tables."
-    assert f"\n{note}\n" in capsys.readouterr().out
-    assert f"# {note}\n" in (tmp_path / "new.toml").read_text("utf-8")
+    state = "Status is left out: its values have names, as states have: see"
+    assert f"\n{note}\n{state}" in capsys.readouterr().out
+    written = (tmp_path / "new.toml").read_text("utf-8")
+    assert f"# {note}\n" in written
+    assert f"# {state}" in written
 
 
 @pytest.mark.usefixtures("hub")

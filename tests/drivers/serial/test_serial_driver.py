@@ -25,7 +25,7 @@ from drivers.base import BusPort, StreamSpec
 from drivers.make import bus_drivers, stream_layout
 from drivers.serial import driver as serial_driver
 from drivers.serial import reader as serial_reader
-from drivers.serial.driver import SerialDriver, framing_of
+from drivers.serial.driver import RECENT_NS, SerialDriver, framing_of
 from sim_hw.link_faults import LinkFaults
 from sim_hw.nodes.pacing import DrivenPacer
 from sim_hw.nodes.serial_node import PseudoTerminal, SerialNode
@@ -309,6 +309,45 @@ def test_lines_with_neither_counter_nor_time_are_placed_and_counted_by_their_arr
     counters, _ = driver.streams["x"]
     assert (counters.samples_received, counters.samples_lost, counters.gaps) == (759, 40, 1)
     assert blocks[-1].first_index + len(blocks[-1].samples) == 799
+
+
+@pytest.mark.parametrize(
+    ("bad", "words"), [(b"%d,9\n", "only 66.67 of 100 Hz can be read"), (b"", "sends 66.67 Hz")]
+)
+def test_lines_that_cannot_be_read_are_no_other_rate(tmp_path: Path, bad: bytes, words: str) -> None:
+    layout = line_layout(("x",), ("x",), no_counter=True)
+    specs = [StreamSpec("x", layout, 100.0)]
+    bus = serial_bus(port=str(tmp_path), framing="lines")
+    driver = SerialDriver(bus, BusPort("ser0", specs, DrivenClock(), lambda _: None))
+    framing = framing_of(bus, specs)
+    for k in range(2000):
+        line = bad % k if k % 3 == 1 and bad else b"" if k % 3 == 1 else b"%d\n" % k
+        driver.accept(framing.cut(line, lambda ends, k=k: np.full(len(ends), 10_000_000 * k)))
+    _, time_base = driver.streams["x"]
+    assert words in time_base.doubt
+
+
+def test_why_no_samples_come_is_stated_while_lines_come_that_are_none_of_the_layout(tmp_path: Path) -> None:
+    clock, specs = DrivenClock(), [StreamSpec("x", LINE, 100.0)]
+    bus = serial_bus(port=str(tmp_path), framing="lines")
+    driver = SerialDriver(bus, BusPort("ser0", specs, clock, lambda _: None))
+    driver.link.up()
+    framing = framing_of(bus, specs)
+    driver.accept(framing.cut(b"0\n1,2,3\n"))
+    why = 'bytes come on ser0, but no line as its layout states; the first line is "1,2,3": 3 columns'
+    assert driver.link.why_silent("x").startswith(why)
+    driver.accept(framing.cut(b"4,5,6\n"))
+    assert driver.link.why_silent("x").startswith(why)
+    driver.accept(framing.cut(b"7,8\n"))
+    assert driver.link.why_silent("x") == ""
+    driver.accept(framing.cut(b"9,8,7\n"))
+    clock.advance_to(clock.monotonic_ns() + RECENT_NS)
+    driver.tick(clock.monotonic_ns())
+    assert driver.link.why_silent("x").startswith(why)
+    # By now nothing comes at all.
+    clock.advance_to(clock.monotonic_ns() + 1)
+    driver.tick(clock.monotonic_ns())
+    assert driver.link.why_silent("x") == ""
 
 
 async def test_a_port_is_not_silent_while_its_kernels_are_compiled(
