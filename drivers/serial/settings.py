@@ -8,6 +8,7 @@ from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
 from daqsvc.errors.machine_file import BAD_TEXT
+from daqsvc.rounding import counted
 from daqsvc.settings.addresses import DevicePath, serial_port
 from daqsvc.settings.buses import Bus, Device, Layout, WireRange
 from daqsvc.settings.packing import (
@@ -351,7 +352,7 @@ class LineLayout(Layout):
         place = "no count" if self.time is None else "device's time"
         if self.counter is not None:
             place = f"{self.counter.bits} bit count"
-        return f"{named}{len(self.channels)} of {len(self.line)} columns, {place}"
+        return f"{named}{len(self.channels)} of {counted(len(self.line), 'column')}, {place}"
 
 
 FRAMINGS: dict[str, type[SerialBus]] = {"cobs": CobsBus, "sync": SyncBus, "lines": LinesBus}
