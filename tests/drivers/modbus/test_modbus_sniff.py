@@ -433,7 +433,9 @@ def test_units_that_answer_with_one_exception_only_share_a_line(capsys: pytest.C
 def test_units_on_a_serial_line_are_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     port = tmp_path / "ttyS0"
     with serving(lambda: ModbusRtuServer({2: pump()}, port)):
-        assert main(words(f"{port}", "--units", "1-3", "--registers", "0-50", "--json")) == 0
+        # Two units are silent, so it cannot be patient; a reply may take half a second on a busy computer.
+        asked = ("--units", "1-3", "--registers", "0-50", "--timeout-ms", "500")
+        assert main(words(f"{port}", *asked, "--json")) == 0
     found = figures(capsys)
     assert (found["units"], found["tables"][0]["runs"]) == ([2], [[0, 3], [40, 41]])
     [bus] = tomllib.loads(found["machine_file"])["buses"].values()
