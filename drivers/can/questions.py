@@ -393,11 +393,28 @@ class DbcQuestions(_CanQuestions):
     def unheard(self, found: Mapping[str, Any], answers: Answers) -> str:
         """See `Heard.unheard`."""
         heard = [one["message"] for one in _decoded(found)]
-        if not heard or answers.get("message", heard[0]) in heard:
+        chosen = answers.get("message", "")
+        if not heard or not chosen:
             return ""
+        if chosen in heard:
+            return self._other_length(found, answers)
         return (
             f"{answers['message']} was not heard. Remedy: correct --message; those that come: "
             f"{', '.join(heard)}"
+        )
+
+    def _other_length(self, found: Mapping[str, Any], answers: Answers) -> str:
+        """That the frames of the message have another length than the file states; empty if not."""
+        message = answers["message"]
+        length = self._messages(answers)[message].length
+        lengths = {many for one in found["ids"] if one["message"] == message for many in one["lengths"]}
+        # Longer frames are of CAN FD, which pads them.
+        if not lengths or length in lengths or max(length, *lengths) > 8:
+            return ""
+        come = " and ".join(f"{many}" for many in sorted(lengths))
+        return (
+            f"the frames of {message} have {come} bytes, the DBC file states {length}. Remedy: give the file "
+            "of the device that sends"
         )
 
     def not_read(self, found: Mapping[str, Any], answers: Answers) -> str:

@@ -145,6 +145,12 @@ class _ModbusQuestions(BusQuestions):
                 raise
         except SniffError as error:
             raise SniffError(f"{error}".replace("TARGET", "its address")) from error
+        if not any(one["registers"] for one in found["tables"]):
+            units = ", ".join(f"{unit}" for unit in found["units"])
+            raise NothingFoundError(
+                f"the registers of unit {units} were not read yet when it was ended. Remedy: let it go on, "
+                "or write --units N if the unit is known"
+            )
         lines = list(_in_words(found))
         if chosen == _AUTO and found["units_asked"][0] == int(_UNITS[0].partition("-")[0]):
             lines.append(f"units {_UNITS[1]} were not asked: daqsvc new --listen --units {_WHOLE} asks all")

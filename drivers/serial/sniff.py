@@ -600,7 +600,7 @@ class _Report(NamedTuple):
         if what.prefix:
             yield f"prefix = {quoted(what.prefix)}"
         yield f"line = [{', '.join(quoted(name) for name in names.values())}]"
-        if what.separator != ",":
+        if what.separator not in {",", ""}:  # of one column there is none
             yield f"separator = {quoted(what.separator)}"
         if what.decimal != ".":
             yield f"decimal = {quoted(what.decimal)}"

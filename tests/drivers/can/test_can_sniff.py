@@ -571,6 +571,10 @@ def test_new_says_that_the_dbc_file_is_of_another_device(
             ("--bus=can-dbc", "--dbc=two.dbc", "--message=Environment"),
             "Environment was not heard. Remedy: correct --message; those that come: Acceleration",
         ),
+        (
+            ("--bus=can-dbc", "--dbc=short.dbc"),
+            "the frames of Acceleration have 8 bytes, the DBC file states 6. Remedy: give",
+        ),
     ],
 )
 def test_new_writes_nothing_about_frames_that_it_did_not_hear(
@@ -583,6 +587,9 @@ def test_new_writes_nothing_about_frames_that_it_did_not_hear(
     monkeypatch.setattr(questions, "_LISTEN_S", 0.5)
     other = '\nBO_ 1000 Environment: 8 Vector__XXX\n SG_ Humidity : 0|16@1+ (0.1,0) [0|100] "%" Vector__XXX\n'
     (tmp_path / "two.dbc").write_text(DBC.read_text("utf-8") + other)
+    message = DBC.read_text("utf-8").replace("Acceleration: 8", "Acceleration: 6")
+    kept = [one for one in message.splitlines() if "AccelZ" not in one and "Status" not in one]
+    (tmp_path / "short.dbc").write_text("\n".join([*kept, ""]))
     with talking(tmp_path / "bus", accelerations):
         assert not_written(tmp_path, *given) == 1
     assert words in capsys.readouterr().err

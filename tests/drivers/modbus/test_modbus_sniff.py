@@ -597,6 +597,21 @@ def test_new_proposes_the_registers_that_it_finds(tmp_path: Path, capsys: pytest
     assert all(pdu[0] in {3, 4} for pdu in unit.asked)
 
 
+def test_new_says_what_it_had_not_read_when_it_was_ended(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = questions.sniffed
+
+    def ended(*arguments: Any) -> Any:
+        found = whole(*arguments)
+        return {**found, "tables": [{**one, "registers": []} for one in found["tables"]]}
+
+    monkeypatch.setattr(questions, "sniffed", ended)
+    with tcp({1: pump()}) as target:
+        assert not_written(tmp_path, target, "--units=1", "--registers=0-50") == 1
+    assert "the registers of unit 1 were not read yet when it was ended" in capsys.readouterr().err
+
+
 @pytest.mark.long
 @pytest.mark.usefixtures("_few_registers")
 def test_new_asks_the_other_units_where_none_of_the_first_answers(

@@ -127,11 +127,11 @@ def test_a_counter_that_begins_again_after_999_is_not_proposed(
 
 
 def test_lines_with_neither_counter_nor_time_are_proposed_as_such(
-    cable: PseudoTerminal, capsys: pytest.CaptureFixture[str]
+    cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with talking(cable, lambda number: b"%d.25\r\n" % (20 + number * 7 % 5)):
         found = figures(cable, capsys)
-    read = tomllib.loads(BEGIN + found["machine_file"])["streams"]["lines"]["layout"]
+    read = check(tmp_path, found["machine_file"], capsys)["streams"]["lines"]["layout"]
     assert (read["line"], read["no_counter"]) == (["c1"], True)
     proposed = _proposals(found, {})
     assert (proposed["columns"], proposed["counter"]) == ("c1", "none")
