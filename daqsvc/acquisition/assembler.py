@@ -155,8 +155,8 @@ class StreamAssembler:
         with_them_hz = rate_hz * (1.0 + unread / max(self.counters.frames_received, 1))
         if unread and abs(with_them_hz / self._rate_hz - 1.0) <= FITS:
             return (
-                f"only {readable(rate_hz)} of {readable(self._rate_hz)} Hz can be read; the rest is as the "
-                "layout does not state it (frames_malformed): correct the layout, or see the link"
+                f"only {readable(rate_hz)} of {readable(self._rate_hz)} Hz can be read; the rest does not "
+                "fit the layout (frames_malformed): correct the layout, or check the cable"
             )
         return rate_in_words(rate_hz, NS_PER_S / self._rate_hz)
 

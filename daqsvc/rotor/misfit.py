@@ -177,7 +177,7 @@ class SteadyChange:
     moved: Complexes
     samples: int
 
-    def is_certain(self, hunting: Complexes, noise: float) -> bool:
+    def is_certain(self, nearby: Complexes, noise: float) -> bool:
         """Whether no healthy machine moves so, though the observers may see it as well as the healthy one.
 
         An observer that may err by much follows an orbit that has grown by half, and its innovations hardly
@@ -185,11 +185,11 @@ class SteadyChange:
         moves along its own curve of 1X over speed, near a critical speed by as much as a fault does.
 
         Args:
-            hunting: complex128 ``[P, 3]``, of the healthy mode at the speeds about the present one.
+            nearby: complex128 ``[P, 3]``, where the healthy machine moves about this speed; see `hunting`.
             noise: standard deviation of the measured position, in clearances.
         """
-        healthy = hunting[len(_HUNTING) // 2]
-        along = [one[:2] for one in hunting - healthy]
+        healthy = nearby[len(_HUNTING) // 2]
+        along = [one[:2] for one in nearby - healthy]
         off = _distance(self.moved[:2], along, beyond=False)
         orbit = float(np.linalg.norm(healthy[:2]))
         return off > max(_LEAST_CHANGE * orbit, _CERTAIN * noise * math.sqrt(4.0 / self.samples))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import tempfile
+from abc import abstractmethod
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -107,18 +108,18 @@ class _CanQuestions(BusQuestions):
         rates = {"bitrate": found["bitrate"], "data-bitrate": found["data_bitrate"]}
         return proposed | {key: f"{rate}" for key, rate in rates.items() if rate is not None}
 
+    @abstractmethod
     def proposals(self, found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
         """Those that are about frames; see `Heard.proposals`."""
-        raise NotImplementedError
 
     def missed(self, found: Mapping[str, Any], answers: Answers) -> str:
         """See `Heard.missed`."""
         del found, answers
         return ""
 
+    @abstractmethod
     def unheard(self, found: Mapping[str, Any], answers: Answers) -> str:
         """See `Heard.unheard`."""
-        raise NotImplementedError
 
     def notes(self, answers: Answers, assumed: Collection[str]) -> Sequence[str]:
         """See `Heard.notes`."""

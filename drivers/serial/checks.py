@@ -215,7 +215,7 @@ def _check_place(layout: LineLayout, path: KeyPath) -> Iterator[Finding]:
     elif layout.no_counter:
         yield Finding(
             (*path, "no_counter"),
-            "lets lost lines be estimated from the times of arrival: few of them are mostly not noticed",
+            "lets lost lines be estimated from the times of arrival: a few lost ones are mostly not noticed",
             "have the device send a counter or its time; if it can send neither, leave it",
             fatal=False,
             code=LOSS_UNNOTICED,

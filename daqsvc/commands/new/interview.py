@@ -120,8 +120,9 @@ class _Interview:
             return [*self._heard.notes(self.answers, self._assumed)]
         if example:
             return ["None of these channels was heard on the bus; they are an example."]
-        counter = bool(self._assumed & counters)
-        return ["Nothing was heard that counts or tells a time; the counter is an example."] * counter
+        return [f"What was heard does not fit this file: {self._heard.missed}."] * bool(
+            self._assumed & counters
+        )
 
     def is_over(self) -> bool:
         """Ask what is not answered yet; False if a person goes back, and the rest must be asked again."""

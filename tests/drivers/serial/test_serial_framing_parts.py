@@ -438,9 +438,9 @@ def test_lines_that_are_late_at_times_are_no_lost_ones(rate_hz, grain_s):
     counts = DeviceTime(rate_hz).count(shared_stamps(rate_hz, grain_s, jitter=0.2))
     # A fifth of a period in the mean: few are late by more than a period, again and again none.
     assert int(counts[-1]) + 1 - MANY <= 1e-4 * MANY + grain_s * rate_hz
-    # Half a period in the mean, which some of them exceed by far: 0.5 % are taken for lost ones at most.
+    # Half a period in the mean, which some of them exceed by far: 0.4 % are taken for lost ones at most.
     counts = DeviceTime(rate_hz).count(shared_stamps(rate_hz, grain_s, jitter=0.5))
-    assert int(counts[-1]) + 1 - MANY <= 0.005 * MANY
+    assert int(counts[-1]) + 1 - MANY <= 0.004 * MANY
 
 
 def test_lines_hardly_slower_than_their_stamps_are_taken_for_lost_at_times():
