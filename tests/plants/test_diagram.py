@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING
 
 import pytest
 from plants.diagram import draw, interval
+from plants.table import BEGIN, END, PAGE
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -27,3 +29,22 @@ def test_the_same_names_make_the_same_picture(tmp_path: Path) -> None:
     assert "tuned half" in picture
     assert "probability of the first name" in picture
     assert ">10<" in picture, "names in a bin are counted"
+
+
+@pytest.mark.sources
+@pytest.mark.parametrize("half", ["tuned", "set aside"])
+def test_the_pictures_of_the_page_count_the_names_of_its_tables(half: str) -> None:
+    """If this fails, run: make bench-diagnosis."""
+    picture = PAGE.with_name(f"plants-{half.replace(' ', '-')}.svg").read_text("utf-8")
+    drawn = [int(count) for count in re.findall(r">(\d+)</text>", picture)]
+    page = PAGE.read_text("utf-8")
+    tabled = []
+    for place in (half, f"{half}, run-up"):
+        table = page.partition(BEGIN.format(place))[2].partition(END.format(place))[0]
+        tabled += [
+            int(count) for count in re.findall(r"^\| 0[.\d]* to [.\d]+ \| (\d+) \|", table, re.MULTILINE)
+        ]
+    # Both divide at 0.5, 0.7 and 0.9; between, the picture divides at 0.6, 0.8 and 0.95, the tables at 0.99.
+    assert [(a, b + c, d + e, f + g) for a, b, c, d, e, f, g in (drawn[:7], drawn[7:])] == [
+        (a, b, c, d + e) for a, b, c, d, e in (tabled[:5], tabled[5:])
+    ]

@@ -1,0 +1,56 @@
+"""The pictures of the page in the README show it as it is now: its words, and where things are."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import runpy
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from PIL import Image, ImageChops
+from support.browsers import chromium
+from support.paths import ROOT
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+pytestmark = [pytest.mark.integration, pytest.mark.long, pytest.mark.sources]
+DOCS = ROOT / "docs"
+SCRIPT = runpy.run_path(f"{DOCS / 'make_screenshots.py'}")
+BLOCK_PX = 20
+LEAST_STEP = 16
+"""Between the grey of two blocks that differ, of 255."""
+MOST_DIFFERENT = 0.08
+"""Share of the blocks. Orbits and times are others in each run (0.03); moved by half a line, it is 0.11."""
+MODE = re.compile(r"N|(?:[FLKDR][0-9]*)+|[AP]M")
+"""Modes of the bank, of which the second is by chance another one, and halves of the day."""
+
+
+def words(picture: Image.Image) -> set[str]:
+    found = re.findall(r"[A-Za-z][\w-]*", picture.text[SCRIPT["WORDS"]])  # type: ignore[attr-defined]
+    return {word for word in found if not MODE.fullmatch(word)}
+
+
+def different(one: Image.Image, other: Image.Image) -> float:
+    """Share of the blocks of two pictures that are lighter or darker in one of them."""
+    first, second = (np.asarray(image.convert("L").reduce(BLOCK_PX), int) for image in (one, other))
+    return float(np.mean(np.abs(first - second) > LEAST_STEP))
+
+
+async def test_the_pictures_are_of_the_page_as_it_is_now(tmp_path: Path) -> None:
+    chromium()
+    await asyncio.to_thread(SCRIPT["main"], tmp_path)
+    for name in SCRIPT["SHOTS"]:
+        with Image.open(DOCS / name) as shown, Image.open(tmp_path / name) as now:
+            assert words(shown) == words(now), "run: python docs/make_screenshots.py"
+            assert shown.size == now.size
+            assert different(shown, now) < MOST_DIFFERENT, "run: python docs/make_screenshots.py"
+
+
+@pytest.mark.parametrize("name", SCRIPT["SHOTS"])
+def test_a_page_on_which_something_moved_has_another_picture(name: str) -> None:
+    with Image.open(DOCS / name) as shown:
+        assert different(shown, ImageChops.offset(shown, 0, BLOCK_PX // 2)) > MOST_DIFFERENT
+        assert {"Orbit", "Machine", "danger"} <= words(shown)
