@@ -63,6 +63,9 @@ class Heard:
             what of them listening cannot show.
         not_read: what was heard and is not in the file by the answers, a sentence in each line; empty if it
             all is.
+        unknown: what must be answered because nothing that was heard shows it, with its remedy; empty if
+            all is known. It is made of the same as `notes`. Without a person, ``daqsvc new`` then writes
+            nothing.
     """
 
     lines: Sequence[str]
@@ -71,6 +74,7 @@ class Heard:
     unheard: Callable[[Answers], str] = lambda _answers: ""
     notes: Callable[[Answers, Collection[str]], Sequence[str]] = lambda _answers, _assumed: ()
     not_read: Callable[[Answers], str] = lambda _answers: ""
+    unknown: Callable[[Answers, Collection[str]], str] = lambda _answers, _assumed: ""
 
 
 class BusQuestions(ABC):
@@ -126,6 +130,16 @@ class BusQuestions(ABC):
             SniffError: nothing was found; states what to do.
         """
         raise NotImplementedError
+
+    def example(self, answers: Answers, assumed: Collection[str]) -> str:
+        """A sentence for the file on what is an example, where nobody has listened; empty if nothing is.
+
+        Args:
+            answers: all of them.
+            assumed: keys of those that are nothing but a default.
+        """
+        del answers, assumed
+        return ""
 
     def channels(self, answers: Answers) -> tuple[str, ...]:
         """Names of the channels."""

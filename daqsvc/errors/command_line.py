@@ -174,12 +174,14 @@ ACCOUNTS = Code(
 )
 NOTHING_ON_BUS = Code(
     "C20",
-    "Nothing was seen on the bus",
+    "Nothing of use was seen on the bus",
     "Nobody sends or answers. On a line, the bit rate or the parity is wrong, or the cable is not plugged "
     "in. On a network, the address, the port or the unit is wrong, or a firewall is between. Or a Modbus "
-    "device answers, but has none of the registers that were asked for.",
+    "device answers, but has none of the registers that were asked for. Or CAN frames come, and nothing "
+    "states what their bytes mean.",
     "Check power, cable and the settings that the message names, and look for longer. If the device answers, "
-    "see its manual for the registers that it has, and ask for these, or for another unit.",
+    "see its manual for the registers that it has, and ask for these, or for another unit. For CAN frames "
+    "give the DBC file of the device, or answer what its manual states of them.",
     "sniff.md",
     "daqsvc: CAN bus 'can0' (socketcan can0) has carried no frame, so there is no plant.blf; its state at"
     " the end: up",

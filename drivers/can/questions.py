@@ -98,8 +98,9 @@ class _CanQuestions(BusQuestions):
             lambda so_far: self._proposals(found, so_far),
             self.missed(found, answers),
             lambda so_far: self.unheard(found, so_far),
-            self.notes,
+            lambda so_far, assumed: self.notes(found, so_far, assumed),
             lambda so_far: self.not_read(found, so_far),
+            lambda so_far, assumed: self.unknown(found, so_far, assumed),
         )
 
     def _proposals(self, found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
@@ -121,10 +122,15 @@ class _CanQuestions(BusQuestions):
     def unheard(self, found: Mapping[str, Any], answers: Answers) -> str:
         """See `Heard.unheard`."""
 
-    def notes(self, answers: Answers, assumed: Collection[str]) -> Sequence[str]:
+    def notes(self, found: Mapping[str, Any], answers: Answers, assumed: Collection[str]) -> Sequence[str]:
         """See `Heard.notes`."""
-        del answers, assumed
+        del found, answers, assumed
         return ()
+
+    def unknown(self, found: Mapping[str, Any], answers: Answers, assumed: Collection[str]) -> str:
+        """See `Heard.unknown`."""
+        del found, answers, assumed
+        return ""
 
     def not_read(self, found: Mapping[str, Any], answers: Answers) -> str:
         """See `Heard.not_read`."""
@@ -230,11 +236,43 @@ class PackedQuestions(_CanQuestions):
         others = ", ".join(f"{one:#x}" for one in heard[:_SHOWN])
         return f"{answers['id']:#x} was not heard. Remedy: correct --id; those that come: {others}"
 
-    def notes(self, answers: Answers, assumed: Collection[str]) -> Sequence[str]:
+    def notes(self, found: Mapping[str, Any], answers: Answers, assumed: Collection[str]) -> Sequence[str]:
         """See `Heard.notes`: a frame shows its bytes, and not what they mean."""
-        if "channels" not in assumed and "raw-type" not in assumed:
-            return ()
-        return (f"The bytes of {answers['id']:#x} are not known: these channels are an example.",)
+        if _OF_BYTES.intersection(assumed):
+            return (f"The bytes of {answers['id']:#x} are not known: these channels are an example.",)
+        guessed = _PLACES.keys() & set(assumed) - self.proposals(found, answers).keys()
+        if packed.RAW_BYTES[answers["raw-type"]] == 1:
+            guessed -= {"byte-order"}
+        places = [_PLACES[key].format(answers[key]) for key in _PLACES if key in guessed]
+        if sensors := [one for one in self.channels(answers) if q.sensor_key(one, "type") in assumed]:
+            places.append(f"which sensors are on {', '.join(sensors[:_SHOWN])} (--sensor {sensors[0]}.type=)")
+        return (
+            (f"Neither heard nor answered: {'; '.join(places)}. See the device's manual.",) if places else ()
+        )
+
+    def unknown(self, found: Mapping[str, Any], answers: Answers, assumed: Collection[str]) -> str:
+        """See `Heard.unknown`."""
+        del answers
+        if not _OF_BYTES.intersection(assumed):
+            return ""
+        heard = [line.strip() for line in _of_ids(found)]
+        more = len(found["ids"]) - len(heard)
+        return (
+            f"no frame states which of its bytes are which value. Heard: {'; '.join(heard)}"
+            f"{f'; and {more} more' if more else ''}. Remedy: give the DBC file of the device, with --bus "
+            "can-dbc --dbc; or give --channels, --raw-type and --scale as its manual states them, or answer "
+            "the questions in a terminal, without --yes; daqsvc sniff can shows the frames"
+        )
+
+    def example(self, answers: Answers, assumed: Collection[str]) -> str:
+        """See `BusQuestions.example`."""
+        if not {"id", *_OF_BYTES}.intersection(assumed):
+            return ""
+        return (
+            f"The frames are an example: nothing was heard, and nobody has stated what the bytes of "
+            f"{answers['id']:#x} mean. Before the first run correct [streams.device.layout] by the device's "
+            "manual; if there is a DBC file of the device, use daqsvc new --bus can-dbc."
+        )
 
     def tables(self, answers: Answers) -> Iterator[str]:
         """See `BusQuestions.tables`."""
@@ -245,6 +283,16 @@ class PackedQuestions(_CanQuestions):
             yield entry("extended", value=True, comment="an id of 29 bits")
         yield entry("length", answers["length"], "bytes of a frame")
         yield from packed.layout_lines(answers)
+
+
+_OF_BYTES = frozenset({"channels", "raw-type", "scale"})
+"""Questions that say what the bytes of a frame mean, which no frame shows."""
+_PLACES = {
+    "first-byte": "the byte where samples begin, {} (--first-byte)",
+    "byte-order": "the byte order, {} (--byte-order)",
+    "samples-per-frame": "how many samples of a channel a frame has, {} (--samples-per-frame)",
+}
+"""Questions that say where samples lie; their defaults are the usual ones."""
 
 
 class VirtualQuestions(PackedQuestions):
@@ -269,6 +317,11 @@ class VirtualQuestions(PackedQuestions):
         """See `BusQuestions.rate_hz`: 64 samples a revolution."""
         per_second: float = 64.0 * abs(answers["speed"]) / 60.0
         return min(max(round(per_second), 640), 12_800)
+
+    def example(self, answers: Answers, assumed: Collection[str]) -> str:
+        """See `BusQuestions.example`: the simulated device sends what the file states."""
+        del answers, assumed
+        return ""
 
     def beside(self, file: str) -> tuple[str, str]:
         """See `BusQuestions.beside`."""
@@ -688,6 +741,14 @@ def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
     """What was heard, in a few lines: the ids that come most often."""
     ids = sorted(found["ids"], key=lambda one: -(one["rate_hz"] or 0.0))
     yield f"{counted(found['frames'], 'frame')} of {counted(len(ids), 'id')}:"
+    yield from _of_ids(found)
+    if len(ids) > _SHOWN:
+        yield f"  ... and {len(ids) - _SHOWN} more: daqsvc sniff can shows them"
+
+
+def _of_ids(found: Mapping[str, Any]) -> Iterator[str]:
+    """The ids that come most often: how long their frames are, and how often they come."""
+    ids = sorted(found["ids"], key=lambda one: -(one["rate_hz"] or 0.0))
     for one in ids[:_SHOWN]:
         lengths = ", ".join(map(str, one["lengths"]))
         rate = "once" if one["rate_hz"] is None else f"{one['rate_hz']:.4g} a second"
@@ -696,5 +757,3 @@ def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
         if message is None and "dbc" in found:
             message = "not in the DBC file"
         yield f"  {one['id']:#x}: {lengths} bytes, {rate}{counts}{f', {message}' if message else ''}"
-    if len(ids) > _SHOWN:
-        yield f"  ... and {len(ids) - _SHOWN} more: daqsvc sniff can shows them"

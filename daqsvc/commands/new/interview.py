@@ -113,7 +113,8 @@ class _Interview:
         channels = self._assumed & (_OF_CHANNELS - counters)
         example = bool(channels) or any(key.endswith(".address") for key in self._assumed)
         if not self._has_listened:
-            return []
+            example_only = bus_of(self.answers).example(self.answers, self._assumed)
+            return [example_only] if example_only else []
         if self._heard is None:
             return ["Nothing was heard on the bus; the channels are an example."] * example
         if not self._heard.missed:
@@ -170,6 +171,7 @@ class _Interview:
         if self._answered is not None:
             self._answered(question, self.answers)
         self._see_unheard()
+        self._see_unknown()
         self._behind(key)
 
     def _is_default(self, question: Question) -> bool:
@@ -205,6 +207,16 @@ class _Interview:
         if unheard and unheard != self._unheard:
             self._say(unheard)
         self._unheard = unheard
+
+    def _see_unknown(self) -> None:
+        """Write nothing of what was neither heard nor answered: a machine must not be watched by it.
+
+        Raises:
+            NothingFoundError: there is such a thing, and nobody can be asked.
+        """
+        unknown = "" if self._heard is None else self._heard.unknown(self.answers, self._assumed)
+        if unknown and self._ask is None:
+            raise NothingFoundError(unknown)
 
     def _is_quiet(self, question: Question) -> bool:
         """Whether the default is taken; of what is looked for, unless a person listens."""

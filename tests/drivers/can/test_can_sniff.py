@@ -493,9 +493,10 @@ def test_new_proposes_the_frames_that_it_hears(
 ) -> None:
     monkeypatch.setattr(questions, "_LISTEN_S", 3.0)
     with talking(tmp_path / "bus", packed):
-        tables = new(tmp_path, "--bus=can")
-        other = new(tmp_path, "--bus=can", "--id=0x80", "--channels=state", "--raw-type=uint8")
-    said = capsys.readouterr().out
+        tables = new(tmp_path, "--bus=can", "--channels=c1, c2", "--raw-type=int16", "--scale=0.1")
+        said = capsys.readouterr().out
+        one = ["--id=0x80", "--channels=state", "--raw-type=uint8", "--scale=1"]
+        other = new(tmp_path, "--bus=can", *one)
     assert "0x2a1: 12 bytes" in said
     assert tables["buses"]["main"]["fd"] is True
     layout = tables["streams"]["device"]["layout"]
@@ -510,21 +511,55 @@ def test_new_proposes_the_frames_that_it_hears(
 
 
 @pytest.mark.usefixtures("hub")
-def test_new_states_that_it_does_not_know_the_bytes_of_a_frame(
+def test_new_writes_nothing_where_nothing_states_what_the_bytes_of_a_frame_mean(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(questions, "_LISTEN_S", 0.5)
     with talking(tmp_path / "bus", accelerations):
-        new(tmp_path, "--bus=can", "--id=0x201")
+        assert not_written(tmp_path, "--bus=can") == 1
+        said = capsys.readouterr().err
+        assert not_written(tmp_path, "--bus=can", "--channels=a, b", "--raw-type=int16") == 1
+    assert "nothing was written: no frame states which of its bytes are which value. Heard: 0x" in said
+    assert "0x201: 8 bytes, 1" in said
+    assert "Remedy: give the DBC file of the device, with --bus can-dbc --dbc; or give --channels" in said
+    assert said.count("\n") == 1
+    assert "no frame states which of its bytes" in capsys.readouterr().err  # what a count is worth
+
+
+@pytest.mark.usefixtures("hub")
+def test_new_states_what_of_a_layout_was_neither_heard_nor_answered(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 0.5)
+    layout = ["--id=0x201", "--channels=a, b", "--raw-type=int16", "--scale=0.1"]
+    with talking(tmp_path / "bus", accelerations):
+        new(tmp_path, "--bus=can", *layout)
         said = capsys.readouterr().out
         text = (tmp_path / "new.toml").read_text("utf-8")
-        own = ["--channels=a, b", "--raw-type=int16", "--samples-per-frame=1", "--first-byte=1"]
-        new(tmp_path, "--bus=can", "--id=0x201", *own)
-    words = "The bytes of 0x201 are not known: these channels are an example.\n"
+        more = ["--byte-order=big", "--first-byte=1", "--sensor=a.type=trend", "--sensor=b.type=trend"]
+        new(tmp_path, "--bus=can", *layout, *more)
+    words = (
+        "Neither heard nor answered: the byte where samples begin, 1 (--first-byte); the byte order, little "
+        "(--byte-order); which sensors are on a, b (--sensor a.type=). See the device's manual.\n"
+    )
     assert f"\n# {words}" in text
     assert f"\n{words}" in said
-    assert "not known" not in capsys.readouterr().out  # whoever states the layout knows it
-    assert "not known" not in (tmp_path / "new.toml").read_text("utf-8")
+    assert "Neither heard" not in capsys.readouterr().out  # whoever states the layout knows it
+
+
+def test_new_that_does_not_listen_states_that_its_frames_are_an_example(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "new.toml"
+    assert main(["new", f"{file}", "--yes", "--bus=can"]) == 0
+    words = (
+        "The frames are an example: nothing was heard, and nobody has stated what the bytes of 0x101 mean."
+    )
+    assert f"\n{words}" in capsys.readouterr().out
+    assert f"\n# {words}" in file.read_text("utf-8")
+    known = ["--id=0x101", "--channels=a, b", "--raw-type=int16", "--scale=0.1", "--overwrite"]
+    assert main(["new", f"{file}", "--yes", "--bus=can", *known]) == 0
+    assert "an example" not in capsys.readouterr().out
 
 
 @pytest.mark.usefixtures("hub")
