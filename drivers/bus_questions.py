@@ -61,6 +61,8 @@ class Heard:
         unheard: the same of the answers so far: what they state and was not heard.
         notes: sentences for the file, of all answers and of the keys of those that are nothing but a default:
             what of them listening cannot show.
+        guesses: sentences for the file, of all answers and of the keys of those that are a proposal or a
+            default: what of them is a guess, although something was heard.
         not_read: what was heard and is not in the file by the answers, a sentence in each line; empty if it
             all is.
         unknown: what must be answered because nothing that was heard shows it, with its remedy; empty if
@@ -75,6 +77,7 @@ class Heard:
     notes: Callable[[Answers, Collection[str]], Sequence[str]] = lambda _answers, _assumed: ()
     not_read: Callable[[Answers], str] = lambda _answers: ""
     unknown: Callable[[Answers, Collection[str]], str] = lambda _answers, _assumed: ""
+    guesses: Callable[[Answers, Collection[str]], Sequence[str]] = lambda _answers, _taken: ()
 
 
 class BusQuestions(ABC):
@@ -88,6 +91,8 @@ class BusQuestions(ABC):
         listens_behind: key of the question behind which it is known where the device is, so that `listen` can
             look at it; empty if nothing can.
         for_listening: keys of questions that only `listen` uses; without it they are neither asked nor given.
+        narrowed_by: keys of questions that only `listen` uses, each with that of a later question: an answer
+            to it that was given beforehand is all that is looked for.
         simulated: whether ``daqsvc sim`` plays the device, so that most defaults need no question.
     """
 
@@ -96,6 +101,7 @@ class BusQuestions(ABC):
     channel_topics: ClassVar[Mapping[str, Topic]] = {}
     listens_behind: ClassVar[str] = ""
     for_listening: ClassVar[Sequence[str]] = ()
+    narrowed_by: ClassVar[Mapping[str, str]] = {}
     simulated: ClassVar[bool] = False
 
     @abstractmethod

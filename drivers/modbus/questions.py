@@ -17,7 +17,7 @@ from drivers.toml_lines import Hexadecimal, array, entry
 
 if TYPE_CHECKING:
     import threading
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from drivers.modbus.sniff import RegisterRange
@@ -36,6 +36,7 @@ _READ_REGISTERS, _FIFO_REGISTERS = 125, 31
 """Of one reply."""
 _UNITS, _WHOLE = ("1-10", "11-247"), "1-247"
 """Most devices have one of the first addresses; to ask for all takes two minutes."""
+_OTHERS = f"To see which other units answer, add --units {_WHOLE}"
 _AUTO = "auto"
 _TIMEOUT_MS = 500.0
 _TABLES = {3: "holding", 4: "input"}
@@ -47,6 +48,7 @@ class _ModbusQuestions(BusQuestions):
 
     listens_behind = "registers"
     for_listening = ("registers",)
+    narrowed_by: ClassVar[Mapping[str, str]] = {"units": "unit"}
     topics: ClassVar[Mapping[str, Topic]] = {
         "units": Topic(
             "Which units does --listen look for?",
@@ -134,6 +136,8 @@ class _ModbusQuestions(BusQuestions):
             if error.figures.get("units") and not (alike and further):
                 return _without_registers(error.figures, answers["registers"])
             if not further:
+                if not error.figures.get("units") and chosen.isdecimal():
+                    raise NothingFoundError(f"{error}. {_OTHERS}", error.figures) from error
                 raise
             why = "has such registers" if alike else "answers"
             tell(f"none of units {_UNITS[0]} {why}: {_UNITS[1]} are asked, too; Ctrl-C ends that")
@@ -157,7 +161,10 @@ class _ModbusQuestions(BusQuestions):
         return Heard(
             lines,
             lambda so_far: self._proposals(found, so_far),
+            _only_0(found, answers["registers"]),
             unheard=lambda so_far: _unheard(found, so_far),
+            guesses=lambda so_far, taken: _guesses(found, so_far, taken),
+            not_read=lambda so_far: _not_read(found, so_far),
         )
 
     def _ask_timeout(self) -> Question:
@@ -177,16 +184,10 @@ class _ModbusQuestions(BusQuestions):
 
     def _proposals(self, found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
         """See `Heard.proposals`."""
+        from drivers.modbus.readings import is_signed  # noqa: PLC0415 - only for who listens
         from drivers.modbus.scan_report import NO_VALUE  # noqa: PLC0415 - brings the settings
 
-        tables = [one for one in found["tables"] if one["registers"]]
-        meant = _meant(answers, "registers")
-        tables.sort(key=lambda one: _TABLES[one["function"]] != meant)  # stable: else as they were found
-        proposed = {"unit": f"{tables[0]['unit']}"}
-        tables = [one for one in tables if one["unit"] == answers.get("unit", tables[0]["unit"])]
-        if tables:
-            proposed["table"] = _TABLES[tables[0]["function"]]
-        tables = [one for one in tables if _TABLES[one["function"]] == answers.get("table")]
+        proposed, tables = _place(found, answers)
         if not tables or answers.get("way") != "values":
             return proposed
         if tables[0]["max_count"] is not None:
@@ -206,7 +207,7 @@ class _ModbusQuestions(BusQuestions):
                     address = self._heard_address(answers, channel, found_channels, values)
                     proposed[sensor_key(channel, "address")] = f"{address}"
                 kind = found_channels.get(address, {"type": "uint16", "order": "ABCD"})
-                negative = kind["type"] == "uint16" and values.get(address, 0) < 0
+                negative = address not in found_channels and is_signed([values.get(address, 0) & 0xFFFF])
                 if kind["type"] != "uint16" or negative:
                     proposed[sensor_key(channel, "register-type")] = "int16" if negative else kind["type"]
                 proposed[sensor_key(channel, "order")] = kind["order"]
@@ -611,14 +612,17 @@ def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
         runs = ", ".join(f"{low}" if low == high else f"{low} to {high}" for low, high in table["runs"])
         name = f"unit {table['unit']} has {_TABLES[table['function']]} registers {runs}"
         were = "was" if len(set(table["asked"])) == 1 else "were"
-        yield f"{name} ({_asked(table)} {were} asked; --registers looks further):"
+        only_0 = ": all of them read 0" if _is_0(table) else ":"
+        yield f"{name} ({_asked(table)} {were} asked; --registers looks further){only_0}"
         if table["max_count"] is not None:
             yield f"  registers in a request: {table['max_count']} at most"
         by_address = {one["address"]: one for one in table["registers"]}
         wide = {one["address"]: one for one in table["channels"] if not one["type"].endswith("int16")}
+        unsigned = {one["address"] for one in table["channels"] if one["type"] == "uint16"}
         behind = {
             address + number for address, one in wide.items() for number in range(1, _width(one["type"]))
         }
+        undecided = {one["address"]: one for one in table["undecided"]}
         shown = [address for address in by_address if address not in behind]
         if len(shown) > _SHOWN:
             shown = [address for address in shown if address in wide or address in table["moved"]]
@@ -626,7 +630,7 @@ def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
             width = _width(wide[address]["type"]) if address in wide else 1
             moved = any(address + number in table["moved"] for number in range(width))
             moves = ", moves" if moved else ""
-            value, meant = f"{by_address[address]['int16']}", ""
+            value, meant = f"{by_address[address]['uint16' if address in unsigned else 'int16']}", ""
             if address in wide:
                 one = wide[address]
                 same = [
@@ -635,10 +639,119 @@ def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
                     if (reading["type"], reading["order"]) == (one["type"], one["order"])
                 ]
                 value, meant = f"{same[0]['value']:.6g}", f" as {one['type']} {one['order']}"
+            if address in undecided:
+                one = undecided[address]
+                meant = f", or with {address + 1} {one['value']:.6g} as {one['type']} {one['order']}"
             is_mark = address not in wide and not moved and by_address[address]["uint16"] in NO_VALUE
             yield f"  {address}: {value}{meant}{moves}{', no value?' if is_mark else ''}"
         if len(shown) > _SHOWN:
             yield f"  ... and {len(shown) - _SHOWN} more: daqsvc sniff modbus shows them"
+
+
+def _place(found: Mapping[str, Any], answers: Answers) -> tuple[dict[str, str], list[Mapping[str, Any]]]:
+    """The unit and the table to propose, and what was found of those that are answered."""
+    tables = [one for one in found["tables"] if one["registers"]]
+    # Where all is 0, nothing shows that the values are there. Else units are as they were found.
+    proposed = {"unit": f"{min(tables, key=_is_0)['unit']}"}
+    tables = [one for one in tables if one["unit"] == answers.get("unit", int(proposed["unit"]))]
+    meant = _meant(answers, "registers")
+    tables.sort(key=lambda one: (_TABLES[one["function"]] != meant, _is_0(one), not one["moved"]))
+    if tables and not (len(tables) > 1 and all(map(_is_0, tables)) and meant is None):
+        proposed["table"] = _TABLES[tables[0]["function"]]
+    return proposed, [one for one in tables if _TABLES[one["function"]] == answers.get("table")]
+
+
+def _is_0(table: Mapping[str, Any]) -> bool:
+    """Whether all registers of a table read 0 all the time."""
+    return not table["moved"] and not any(one["uint16"] for one in table["registers"])
+
+
+def _is_only_0(found: Mapping[str, Any]) -> bool:
+    """Whether all registers that were read are 0."""
+    return all(map(_is_0, found["tables"]))
+
+
+def _only_0(found: Mapping[str, Any], registers: str) -> str:
+    """See `Heard.missed`: all registers are 0, and nobody has stated which of them are the values."""
+    if not _is_only_0(found) or (registers != _AUTO and not registers_of(registers).reason):
+        return ""
+    manual = "give --registers (and --table, holding or input) from its manual"
+    meant = "" if registers == _AUTO else _note(registers_of(registers)).replace("Remedy: write", "Write")
+    return (
+        "All registers that were read are 0, and nothing shows where the values are. Remedy: switch the "
+        f"machine and its sensors on, or {manual}{'. ' * bool(meant)}{meant[:1].upper()}{meant[1:]}"
+    )
+
+
+def _guesses(found: Mapping[str, Any], answers: Answers, taken: Collection[str]) -> Sequence[str]:
+    """See `Heard.guesses`: what the values of registers do not show."""
+    from drivers.modbus.scan_report import undecided_words  # noqa: PLC0415 - brings the settings
+
+    if answers["way"] != "values":
+        return ()
+    guessed = [name for name in answers["channels"] if sensor_key(name, "register-type") in taken]
+    notes = [_guessed_words(answers, guessed, taken)] * bool(guessed)
+    table = _table_read(found, answers)
+    if table is None:
+        return notes
+    single = {
+        answers[sensor_key(name, "address")]
+        for name in guessed
+        if _width(answers[sensor_key(name, "register-type")]) == 1
+    }
+    halves = [one for one in table["undecided"] if single & {one["address"], one["address"] + 1}]
+    if halves:
+        one = halves[0]
+        keys = f'address = {one["address"]}, type = "{one["type"]}", order = "{one["order"]}"'
+        notes.append(
+            f"{undecided_words(each['address'] for each in halves)}. If so, write one channel in place of "
+            f"two{', e.g.' if len(halves) > 1 else ':'} {keys}."
+        )
+    if _is_0(table):
+        notes.append("All registers that were read are 0: nothing shows that the values are there.")
+    return notes
+
+
+def _guessed_words(answers: Answers, guessed: Sequence[str], taken: Collection[str]) -> str:
+    """What of some channels nobody has stated."""
+    about = ["type"]
+    if any(_width(answers[sensor_key(name, "register-type")]) > 1 for name in guessed):
+        about.append("byte order")
+    if any(sensor_key(name, "scale") in taken for name in guessed):
+        about.append("scale")
+    what = " and ".join([", ".join(about[:-1]), about[-1]] if len(about) > 1 else about)
+    whose = ", ".join(guessed) if len(guessed) < len(answers["channels"]) else "the registers"
+    are = "are" if len(about) > 1 else "is"
+    return (
+        f"{what[0].upper()}{what[1:]} of {whose} {are} a guess by the values that were read: compare with "
+        "the device's register map."
+    )
+
+
+def _not_read(found: Mapping[str, Any], answers: Answers) -> str:
+    """See `Heard.not_read`: the other table of the unit, if it has values."""
+    others = [
+        _TABLES[one["function"]]
+        for one in found["tables"]
+        if one["unit"] == answers["unit"] and one["registers"] and not _is_0(one)
+    ]
+    return "\n".join(
+        f"Unit {answers['unit']} has {other} registers, too; this file reads {answers['table']} registers."
+        for other in others
+        if answers["way"] == "values" and other != answers["table"]
+    )
+
+
+def _table_read(found: Mapping[str, Any], answers: Answers) -> Mapping[str, Any] | None:
+    """The table that the file reads, as it was found; None if it was not."""
+    return next(
+        (
+            one
+            for one in found["tables"]
+            if one["unit"] == answers["unit"] and _TABLES[one["function"]] == answers["table"]
+        ),
+        None,
+    )
 
 
 def _asked(table: Mapping[str, Any]) -> str:

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     """Values by address, 0 to 65535."""
 
 ORDERS: Sequence[Order] = ("ABCD", "CDAB", "BADC", "DCBA")
+USUAL_ORDERS: Sequence[Order] = ("ABCD", "CDAB")
+"""Small integers look like floats in the others."""
 _WIDE: Sequence[tuple[RegisterType, str, int]] = (
     ("float32", ">f", 2),
     ("int32", ">i", 2),
@@ -35,8 +37,12 @@ NONE, BESIDE_OTHERS, ALONE, SURE = 0, 1, 2, 3
 """Evidence: only if others of the unit have the same order, enough by itself, and beyond doubt."""
 _USUAL = (1e-3, 1e6)
 """Values of which a float is likely, although only its lower register moves."""
-_SHORT, _ROUND = 5, 3
-"""Digits of a number that a person has set; of a round one."""
+_SHORT, _SHORTER, _ROUND = 5, 4, 3
+"""Digits of a number that a person has set; of one that is hardly chance; of a round one."""
+_MOST_ZEROS = 12
+"""Registers in a row that read 0 and may still be numbers, rather than unused."""
+_AGREE = 2
+"""Numbers that stand still and have few digits, from which on their order is taken for that of the unit."""
 _LEAST_COUNT = 65_536
 _WILD = 1024
 """A register that moves by so much, either way round, is rather the lower part of a number."""
@@ -179,6 +185,8 @@ class _Numbers(NamedTuple):
         digits = self._digits(self.values[0])
         is_round = digits <= _ROUND or (digits <= _SHORT and self._is_zero(len(self.raw[0]) // 2 - 1))
         if self._is_usual_order:
+            # Of the 65536 lower halves a dozen make a float32 of four digits.
+            is_round = is_round or (digits <= _SHORTER and self.kind == "float32" and self._is_usual)
             return ALONE if is_round else BESIDE_OTHERS if digits <= _SHORT else NONE
         return BESIDE_OTHERS if is_round else NONE
 
@@ -204,8 +212,11 @@ class _Numbers(NamedTuple):
     def _lower_is_natural(self) -> bool:
         """Whether the value is usual, and bytes that are not in the usual order show it."""
         here, there = self._movement(1)
-        usual = all(_USUAL[0] <= abs(value) <= _USUAL[1] for value in self.values)
-        return usual and (self._is_usual_order or _CLEARLY * here <= there)
+        return self._is_usual and (self._is_usual_order or _CLEARLY * here <= there)
+
+    @property
+    def _is_usual(self) -> bool:
+        return all(_USUAL[0] <= abs(value) <= _USUAL[1] for value in self.values)
 
     @property
     def _is_exchanged(self) -> bool:
@@ -241,8 +252,7 @@ class _Numbers(NamedTuple):
 
     @property
     def _is_usual_order(self) -> bool:
-        """Small integers look like floats whose bytes are exchanged."""
-        return self.order in {"ABCD", "CDAB"}
+        return self.order in USUAL_ORDERS
 
 
 def _in_range(values: Sequence[float]) -> bool:
@@ -279,10 +289,85 @@ def chosen(rounds: Sequence[Registers]) -> list[Reading]:
     if not rounds:
         return []
     found = [one for address in sorted(rounds[0]) for one in readings(rounds, address) if one.evidence]
-    sure = {one.order for one in found if one.evidence == SURE}
+    sure = {one.order for one in found if one.evidence == SURE} | _agreed(found)
     likely = [one for one in found if one.plausible or one.order in sure]
     doubles = _apart([one for one in likely if one.type == "float64" and one.evidence == SURE], [])
     return sorted(doubles + _apart(likely, doubles), key=lambda one: one.address)
+
+
+def _agreed(found: Sequence[Reading]) -> set[Order]:
+    """The order in which several float32 that stand still have few digits: chance makes hardly one so."""
+    apart = _apart([one for one in found if _stands_still(one)], [])
+    agreeing = Counter(one.order for one in apart)
+    return {order for order, count in agreeing.items() if count >= _AGREE}
+
+
+def _stands_still(one: Reading) -> bool:
+    usual = _USUAL[0] <= abs(one.value) <= _USUAL[1]
+    return one.type == "float32" and one.order in USUAL_ORDERS and one.change == 0 and usual
+
+
+def undecided(rounds: Sequence[Registers], numbers: Sequence[Reading]) -> list[Reading]:
+    """Two registers each that may be one float32, which too little shows, mostly as they stand still.
+
+    Of readings that overlap, those of the order that fits most often.
+
+    Args:
+        rounds: see `readings`.
+        numbers: what is chosen of them.
+    """
+    taken = {place for one in numbers for place in one.places}
+    found = [one for address in sorted(rounds[0] if rounds else ()) for one in readings(rounds, address)]
+    moved = {place for these in rounds for place in these if these[place] != rounds[0].get(place)}
+    possible = [
+        one
+        for one in found
+        if one.type == "float32"
+        and one.order in USUAL_ORDERS
+        and not taken & set(one.places)
+        and (one.evidence or (_USUAL[0] <= abs(one.value) <= _USUAL[1] and not moved & set(one.places)))
+    ]
+    by_order = {
+        order: _side_by_side([one for one in possible if one.order == order]) for order in USUAL_ORDERS
+    }
+    best = max(USUAL_ORDERS, key=lambda order: len(by_order[order]))
+    kept = list(by_order[best])
+    places = {place for one in kept for place in one.places}
+    for order in USUAL_ORDERS:
+        kept += [one for one in by_order[order] if order != best and not places & set(one.places)]
+    zeros = [one for one in found if one.address in _zeros_beside(rounds, numbers) and one.order == "ABCD"]
+    kept += [one._replace(order=numbers[0].order) for one in zeros if one.type == "float32"]
+    return sorted(kept, key=lambda one: one.address)
+
+
+def _zeros_beside(rounds: Sequence[Registers], numbers: Sequence[Reading]) -> set[int]:
+    """First registers of pairs that read 0 beside float32: a machine at rest has many such values."""
+    taken = {place for one in numbers if one.type == "float32" for place in one.places}
+    zeros = {
+        address
+        for address in (rounds[0] if rounds else ())
+        if not any(these.get(address) for these in rounds) and address not in taken
+    }
+    found: set[int] = set()
+    for first in sorted(zeros):
+        if first - 1 in zeros:
+            continue
+        end = first
+        while end in zeros:
+            end += 1
+        beside = first - 1 in taken or end in taken
+        if beside and (end - first) % 2 == 0 and end - first <= _MOST_ZEROS:
+            found |= set(range(first, end, 2))
+    return found
+
+
+def _side_by_side(possible: Sequence[Reading]) -> list[Reading]:
+    """Those that do not overlap, from the first register on."""
+    kept: list[Reading] = []
+    for one in possible:
+        if not kept or one.address > kept[-1].places[-1]:
+            kept.append(one)
+    return kept
 
 
 def _apart(likely: Sequence[Reading], taken: Sequence[Reading]) -> list[Reading]:

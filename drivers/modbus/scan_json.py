@@ -55,6 +55,22 @@ class ProposedChannel(TypedDict):
     order: str
 
 
+class UndecidedPair(TypedDict):
+    """Two registers that are proposed as two numbers, and may be one of 32 bits.
+
+    Attributes:
+        address: the first of them.
+        type: type of the number that they may be.
+        order: its order of bytes and words.
+        value: the number.
+    """
+
+    address: int
+    type: str
+    order: str
+    value: float
+
+
 class TableFigures(TypedDict):
     """What one function reads of a unit.
 
@@ -69,6 +85,7 @@ class TableFigures(TypedDict):
         max_count: registers that the unit answers at once; null if it has refused no request for its length.
         moved: registers whose values changed.
         channels: what is proposed for the machine file.
+        undecided: two registers each of these that may be one number.
         registers: each register with its value.
     """
 
@@ -82,6 +99,7 @@ class TableFigures(TypedDict):
     max_count: int | None
     moved: list[int]
     channels: list[ProposedChannel]
+    undecided: list[UndecidedPair]
     registers: list[RegisterFigures]
 
 

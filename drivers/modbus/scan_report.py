@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from typing import TYPE_CHECKING, NamedTuple
 
-from drivers.modbus.readings import chosen, is_signed, readings
+from drivers.modbus.readings import chosen, is_signed, readings, undecided
 from drivers.modbus.replies import EXCEPTIONS
 from drivers.modbus.scan import ILLEGAL_FUNCTION, LAST_REGISTER, TABLES, units_in_words
 from drivers.modbus.settings import ModbusTcpBus
@@ -46,6 +47,7 @@ class ScanReport:
         self._all_orders = all_orders
         self._note = note
         self._tables = [(table, chosen(table.rounds)) for table in scan.tables]
+        self._undecided = [undecided(table.rounds, numbers) for table, numbers in self._tables]
 
     def sniffed(self) -> Sniffed:
         """All of it."""
@@ -141,11 +143,11 @@ class ScanReport:
         if self._all_orders:
             yield "* marks the readings that look like quantities; without --all-orders only these are shown."
         refusing = self._refusing()
-        for table, numbers in self._tables:
+        for (table, numbers), doubted in zip(self._tables, self._undecided, strict=True):
             code = _only_refusal(table)
             units = [] if code is None else refusing[table.function, code]
             if code is None or len(units) == 1:
-                yield from self._table(table, numbers)
+                yield from self._table(table, numbers, doubted)
             elif units[0] == table.unit:
                 whose = units_in_words(units)
                 name = f"{whose[0].upper()}{whose[1:]}, {TABLES[table.function]} registers"
@@ -159,7 +161,9 @@ class ScanReport:
                 units.setdefault((table.function, code), []).append(table.unit)
         return units
 
-    def _table(self, table: FoundTable, numbers: Sequence[Reading]) -> Iterator[str | SniffTable]:
+    def _table(
+        self, table: FoundTable, numbers: Sequence[Reading], doubted: Sequence[Reading]
+    ) -> Iterator[str | SniffTable]:
         name = f"{table.name[0].upper()}{table.name[1:]}"
         if table.last is None:
             yield f"{name}: not read: {'the line was lost' if self._scan.lost else 'ended'} before"
@@ -177,8 +181,10 @@ class ScanReport:
         if table.first:
             yield SniffTable(
                 ("address", "hex", "uint16", "int16", "moves", "may be"),
-                [self._row(table, numbers, address) for address in sorted(table.first)],
+                [self._row(table, numbers, doubted, address) for address in sorted(table.first)],
             )
+        if halves := _halves(table, numbers, doubted):
+            yield textwrap.fill(f"{undecided_words(halves)}.", 100)
 
     def _range(self, table: FoundTable) -> Iterator[str]:
         """Which registers were asked for, and how to look further."""
@@ -199,18 +205,22 @@ class ScanReport:
         else:
             yield f"{asked}; --registers {table.begin}-{further} looks further."
 
-    def _row(self, table: FoundTable, numbers: Sequence[Reading], address: int) -> Sequence[str]:
+    def _row(
+        self, table: FoundTable, numbers: Sequence[Reading], doubted: Sequence[Reading], address: int
+    ) -> Sequence[str]:
         raw = table.first[address]
         shown = [one for one in numbers if one.address == address]
         if self._all_orders:
             shown = readings(table.rounds, address)
+        else:
+            shown += [one for one in doubted if one.address == address]
         return (
             f"{address}",
             f"{raw:04x}",
             f"{raw}",
             f"{_signed(raw)}",
             "yes" if address in table.moved else "",
-            "; ".join(_words(one, mark=self._all_orders) for one in shown)
+            "; ".join(f"{_words(one, mark=self._all_orders)}{'?' * (one in doubted)}" for one in shown)
             or self._no_value(table, numbers, address),
         )
 
@@ -230,11 +240,18 @@ class ScanReport:
             "units_gateway": scan.gateway,
             "units_alike": scan.alike,
             "units_left_out": scan.left_out,
-            "tables": [_table_figures(table, numbers) for table, numbers in self._tables],
+            "tables": [
+                _table_figures(table, numbers, doubted)
+                for (table, numbers), doubted in zip(self._tables, self._undecided, strict=True)
+            ],
         }
 
     def _fragment(self) -> str:
-        tables = [(table, numbers) for table, numbers in self._tables if table.first]
+        tables = [
+            (table, numbers, doubted)
+            for (table, numbers), doubted in zip(self._tables, self._undecided, strict=True)
+            if table.first
+        ]
         if not tables:
             return ""
         bus = self._bus
@@ -246,8 +263,8 @@ class ScanReport:
             lines.append(f"parity = {quoted(bus.parity)}")
         lines.append(f"timeout_ms = {bus.timeout_ms}")
         sensors: set[str] = set()
-        for table, numbers in tables:
-            lines += ["", *_stream(table, numbers, sensors)]
+        for table, numbers, doubted in tables:
+            lines += ["", *_stream(table, numbers, doubted, sensors)]
         return "\n".join(lines)
 
 
@@ -262,7 +279,24 @@ def _only_refusal(table: FoundTable) -> int | None:
     return codes.pop() if is_all and len(codes) == 1 else None
 
 
-def _table_figures(table: FoundTable, numbers: Sequence[Reading]) -> TableFigures:
+def undecided_words(addresses: Iterable[int]) -> str:
+    """That two registers each may be one number, and how to find out."""
+    pairs = [f"{address} and {address + 1}" for address in addresses]
+    each = ": each pair" if len(pairs) > 1 else ""
+    return (
+        f"Registers {', '.join(pairs)}{each} may be one 32-bit number, e.g. a float32, and not two of 16 "
+        "bits; values that stand still do not show it. See the device's register map, or listen again while "
+        "the values change"
+    )
+
+
+def _halves(table: FoundTable, numbers: Sequence[Reading], doubted: Sequence[Reading]) -> list[int]:
+    """First registers of those that may be one number and are proposed as two."""
+    proposed = {one.address for one in _channels(table, numbers)}
+    return [one.address for one in doubted if proposed & set(one.places)]
+
+
+def _table_figures(table: FoundTable, numbers: Sequence[Reading], doubted: Sequence[Reading]) -> TableFigures:
     last = table.again[-1] if table.again else {}
     return {
         "unit": table.unit,
@@ -277,6 +311,10 @@ def _table_figures(table: FoundTable, numbers: Sequence[Reading]) -> TableFigure
         "channels": [
             {"name": one.name, "address": one.address, "type": one.type, "order": one.order}
             for one in _channels(table, numbers)
+        ],
+        "undecided": [
+            {"address": one.address, "type": one.type, "order": one.order, "value": one.value}
+            for one in doubted
         ],
         "registers": [
             {
@@ -299,7 +337,9 @@ def _table_figures(table: FoundTable, numbers: Sequence[Reading]) -> TableFigure
     }
 
 
-def _stream(table: FoundTable, numbers: Sequence[Reading], sensors: set[str]) -> Iterator[str]:
+def _stream(
+    table: FoundTable, numbers: Sequence[Reading], doubted: Sequence[Reading], sensors: set[str]
+) -> Iterator[str]:
     channels = list(_channels(table, numbers))
     name = f"unit-{table.unit}" + ("" if table.function == 3 else "-input")
     yield f"[streams.{name}]"
@@ -314,6 +354,9 @@ def _stream(table: FoundTable, numbers: Sequence[Reading], sensors: set[str]) ->
     yield "max_gap = 0    # registers between them may not be there"
     if table.max_count is not None:
         yield f"max_count = {table.max_count}    # it refuses requests of more registers"
+    if halves := _halves(table, numbers, doubted):
+        words = textwrap.wrap(f"{undecided_words(halves)}.", 90)
+        yield from (f"# {line}" for line in words)
     yield "channels = ["
     yield from (f"  {{ {one.keys} }}," for one in channels)
     yield "]"

@@ -100,12 +100,14 @@ class _Interview:
         self._has_listened = False
         self._assumed: set[str] = set()
         """Keys of questions whose default was taken, and was not heard."""
+        self._taken: set[str] = set()
+        """Keys of questions whose default was taken, whether it was heard or not."""
         self._unheard = ""
 
     def notes(self) -> list[str]:
         """What in the file was neither answered nor heard, and what was heard and is not in it."""
         not_read = "" if self._heard is None else self._heard.not_read(self.answers)
-        return [*self._not_heard(), *not_read.splitlines()]
+        return [*self._not_heard(), *self._guesses(), *not_read.splitlines()]
 
     def _not_heard(self) -> Sequence[str]:
         """What in the file was neither answered nor heard, where it was listened for."""
@@ -124,6 +126,12 @@ class _Interview:
         return [f"What was heard does not fit this file: {self._heard.missed}."] * bool(
             self._assumed & counters
         )
+
+    def _guesses(self) -> Sequence[str]:
+        """What in the file was heard and is a guess all the same."""
+        if self._heard is None or self._heard.missed:
+            return []
+        return self._heard.guesses(self.answers, self._taken)
 
     def is_over(self) -> bool:
         """Ask what is not answered yet; False if a person goes back, and the rest must be asked again."""
@@ -144,10 +152,11 @@ class _Interview:
             question = _offered(plain, self._heard, self.answers, self._file)
             self._see_rate(question, self._heard)
         key, texts = question.key, self._given.texts
-        if key in texts:
-            reason = take(question, texts[key], self.answers, self._file)
+        given = self._given_key(key)
+        if given in texts:
+            reason = take(question, texts[given], self.answers, self._file)
             if reason is not None:
-                refused = f"{given_as(key, texts[key])}: {reason}"
+                refused = f"{given_as(given, texts[given])}: {reason}"
                 if self._ask is None:
                     raise AnswerError(refused)
                 # What a person has typed by now is not lost for that.
@@ -163,16 +172,28 @@ class _Interview:
         else:
             _answer(question, self._ask, self._say, self.answers, self._file)
             self._typed.append(key)
-        heard = self._heard is not None and question.default != plain.default
-        # Whoever takes a default most often knows it; what the channels are, nobody has by chance.
-        unasked = key not in self._typed or key in _OF_CHANNELS or key.endswith(".address")
-        if key not in texts and not heard and unasked and self._is_default(question):
-            self._assumed.add(key)
+        if given not in texts and self._is_default(question):
+            heard = self._heard is not None and question.default != plain.default
+            self._note_default(key, heard=heard)
         if self._answered is not None:
             self._answered(question, self.answers)
         self._see_unheard()
         self._see_unknown()
         self._behind(key)
+
+    def _note_default(self, key: str, *, heard: bool) -> None:
+        """Keep that an answer is nothing but a default, or what was heard."""
+        self._taken.add(key)
+        # Whoever takes a default most often knows it; what the channels are, nobody has by chance.
+        unasked = key not in self._typed or key in _OF_CHANNELS or key.endswith(".address")
+        if not heard and unasked:
+            self._assumed.add(key)
+
+    def _given_key(self, key: str) -> str:
+        """The key itself, or that of an answer given beforehand to which listening is narrowed."""
+        if key == "bus" or key in self._given.texts or self._listen is None or "bus" not in self.answers:
+            return key
+        return bus_of(self.answers).narrowed_by.get(key, key)
 
     def _is_default(self, question: Question) -> bool:
         default = question.default
@@ -256,6 +277,7 @@ class _Interview:
         for key in keys[keys.index(self._typed.pop()) :]:
             del self.answers[key]
             self._assumed.discard(key)
+            self._taken.discard(key)
         if listens_behind not in self.answers:
             self._heard, self._has_listened = None, False
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from typing import TYPE_CHECKING
 
 from daqsvc.commands.new.buses import bus_of, buses
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+_WIDTH = 100
 NOTES = "notes"
 """Key, beside the answers, of sentences on what in the file was neither answered nor heard."""
 SCHEMA_FILE = "machine.schema.json"
@@ -89,7 +91,7 @@ def _head(answers: Answers, file: str) -> Iterator[str]:
     yield "# Units are part of every name. Relative paths start at the folder of this file."
     if notes := answers.get(NOTES):
         yield "#"
-        yield from (f"# {note}" for note in notes)
+        yield from (f"# {line}" for note in notes for line in textwrap.wrap(note, _WIDTH))
     yield ""
 
 

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.examples import examples
 
-from drivers.modbus.readings import ORDERS, arranged, chosen, is_signed, readings
+from drivers.modbus.readings import ORDERS, arranged, chosen, is_signed, readings, undecided
 from drivers.modbus.registers import byte_places
 from drivers.modbus.settings import RegisterChannel
 
@@ -226,3 +226,35 @@ def test_a_register_that_is_near_below_0_is_signed() -> None:
     assert is_signed([65_276])
     assert not is_signed([543, 541])
     assert not is_signed([40_000, 65_000])
+
+
+@pytest.mark.parametrize("order", ["ABCD", "CDAB"])
+def test_a_float_of_four_digits_that_does_not_move_is_found(order: str) -> None:
+    (found,) = chosen(numbers(itertools.repeat([23.45]), ">f", order))
+    assert (found.type, found.order) == ("float32", order)
+
+
+@pytest.mark.parametrize("order", ["ABCD", "CDAB"])
+def test_two_floats_of_five_digits_that_do_not_move_show_their_order(order: str) -> None:
+    found = chosen(numbers(itertools.repeat([1013.2, 23.456]), ">f", order))
+    assert [(one.type, one.order) for one in found] == [("float32", order)] * 2
+
+
+@pytest.mark.parametrize("order", ["ABCD", "CDAB"])
+def test_two_registers_that_stand_still_may_be_one_float(order: str) -> None:
+    rounds = numbers(itertools.repeat([23.4517, 1480.172]), ">f", order)
+    assert chosen(rounds) == []
+    found = undecided(rounds, [])
+    assert [(one.type, one.order) for one in found] == [("float32", order)] * 2
+
+
+def test_registers_that_are_no_float_are_not_doubted() -> None:
+    small = {0: 235, 1: 451, 2: 700, 3: 0, 4: 0, 5: 12_000}
+    assert undecided([small, small], chosen([small, small])) == []
+    assert undecided([], []) == []
+    # The lower one moves as a number of 16 bits beside a still one, however large that is.
+    first, second = {0: 16_827, 1: 478}, {0: 16_800, 1: 478}
+    assert undecided([first, second], chosen([first, second])) == []
+    # Zeros that touch no float are nothing.
+    zeros = dict.fromkeys(range(4), 0)
+    assert undecided([zeros, zeros], []) == []

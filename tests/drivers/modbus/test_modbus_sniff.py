@@ -679,11 +679,153 @@ def test_new_writes_nothing_about_a_unit_that_did_not_answer(
 ) -> None:
     monkeypatch.setattr(questions, "_UNITS", ("1-2", "3-4"))
     with tcp({2: pump()}) as target:
-        assert not_written(tmp_path, target, "--unit=1") == 1
-        assert not_written(tmp_path, target, "--unit=9") == 1
+        assert not_written(tmp_path, target, "--unit=1", "--units=1-2") == 1
+        assert not_written(tmp_path, target, "--unit=9", "--units=1-2") == 1
     said = capsys.readouterr().err
     assert "Unit 1 has not answered. Remedy: correct --unit; those that answer: 2 [C20]" in said
     assert "Unit 9 was not asked. Remedy: write --units 9, too; those that answer: 2 [C20]" in said
+
+
+def test_new_looks_only_for_the_unit_that_is_given(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other, meant = pump(), pump()
+    with tcp({2: other, 15: meant}) as target:
+        tables = new(tmp_path, target, "--unit=15", "--registers=0-45")
+        told = capsys.readouterr().out
+        assert not_written(tmp_path, target, "--unit=9", "--registers=0-45") == 1
+        refused = capsys.readouterr().err
+        assert not_written(tmp_path, target, "--unit=x") == 2
+    assert tables["streams"]["device"]["layout"]["unit"] == 15
+    assert "for unit 15, at most" in told
+    assert "units that answer: 15 (unit 15 was asked)" in told
+    assert "not asked" not in told
+    assert other.asked == []
+    assert "no unit answers (unit 9 was asked)" in refused
+    assert "To see which other units answer, add --units 1-247 [C20]" in refused
+    assert "daqsvc new: --unit x: " in capsys.readouterr().err
+
+
+class Still(ModbusUnit):
+    """A unit whose registers all stand still, from an address on."""
+
+    def __init__(self, address: int, raw: bytes, *tables: str) -> None:
+        super().__init__()
+        for table in tables or ("holding",):
+            self.put(table, address, raw)
+
+
+def swapped(*values: float) -> bytes:
+    """Numbers in the order CDAB."""
+    raw = struct.pack(f">{len(values)}f", *values)
+    return b"".join(raw[k + 2 : k + 4] + raw[k : k + 2] for k in range(0, len(raw), 4))
+
+
+def test_floats_that_stand_still_are_proposed_as_such_and_called_a_guess(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with tcp({1: Still(20, swapped(23.45, 1.913, 48.21))}) as target:
+        tables = new(tmp_path, target, "--unit=1", "--registers=20-30")
+        told = capsys.readouterr().out
+        new(
+            tmp_path,
+            target,
+            "--unit=1",
+            "--registers=20-30",
+            "--channels=a",
+            "--sensor=a.register-type=float32",
+        )
+    channels = tables["streams"]["device"]["layout"]["channels"]
+    assert [(one["address"], one["type"], one["order"]) for one in channels] == [
+        (address, "float32", "CDAB") for address in (20, 22, 24)
+    ]
+    note = (
+        "Type, byte order and scale of the registers are a guess by the values that were read: compare with"
+    )
+    assert f"\n{note} the device's register map.\n" in told
+    assert "a guess" not in capsys.readouterr().out  # the type was given
+
+
+def test_two_registers_that_may_be_one_float_are_not_halves_without_a_word(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    note = "Registers 20 and 21 may be one 32-bit number, e.g. a float32, and not two of 16 bits;"
+    with tcp({1: Still(20, swapped(23.4517))}) as target:
+        tables = new(tmp_path, target, "--unit=1", "--registers=20-30")
+        told = capsys.readouterr().out
+        assert main(words(target, "--units", "1", "--registers", "20-30", *PATIENT)) == 0
+        shown = capsys.readouterr().out
+        assert main(words(target, "--units", "1", "--registers", "20-30", "--json", *PATIENT)) == 0
+    assert [one["type"] for one in tables["streams"]["device"]["layout"]["channels"]] == ["uint16", "uint16"]
+    assert "  20: 40213, or with 21 23.4517 as float32 CDAB" in told
+    assert f"\n{note} values that stand still do not show it. See the device's" in told
+    assert 'place of two: address = 20, type = "float32", order = "CDAB".' in told
+    assert "# Registers 20 and 21 may be one 32-bit number" in (tmp_path / "new.toml").read_text("utf-8")
+    assert "float32 CDAB 23.4517?" in shown
+    assert shown.count("Registers 20 and 21 may be one 32-bit number") == 2  # and in the proposal
+    [table] = figures(capsys)["tables"]
+    assert [(one["address"], one["order"]) for one in table["undecided"]] == [(20, "CDAB")]
+
+
+def test_zeros_beside_floats_may_be_floats_of_a_machine_at_rest(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with tcp({1: Still(20, swapped(0.0, 0.0, 21.5))}) as target:
+        new(tmp_path, target, "--unit=1", "--registers=20-30")
+    told = capsys.readouterr().out
+    assert "Registers 20 and 21, 22 and 23: each pair may be one 32-bit number" in told
+    assert 'e.g. address = 20, type = "float32", order = "CDAB".' in told
+
+
+def test_new_writes_nothing_of_a_device_whose_registers_are_all_0(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # One that answers 0 at any address has 30001, too, where a manual means input register 0.
+    zeros = Still(0, bytes(2 * 8), "holding", "input")
+    zeros.put("holding", 30_001, bytes(8))
+    with tcp({1: zeros}) as target:
+        assert not_written(tmp_path, target, "--unit=1") == 1
+        refused = capsys.readouterr().err
+        assert not_written(tmp_path, target, "--unit=1", "--registers=30001-30004") == 1
+        manual = capsys.readouterr().err
+        answers, told, shown = as_asked(
+            tmp_path, target, unit="1", registers="0-3", table="input", limits="none"
+        )
+        new(tmp_path, target, "--unit=1", "--registers=0-3", "--table=input", "--channels=flow")
+    assert (
+        "All registers that were read are 0, and nothing shows where the values are. Remedy: switch"
+        in refused
+    )
+    assert "or give --registers (and --table, holding or input) from its manual [C20]" in refused
+    assert (
+        "where input registers begin at 30001; on the line they are 0-3. Write --registers 0-3 --table"
+        in manual
+    )
+    # Where the manual states the registers, it is right that they read 0 while the machine stands.
+    assert (answers["table"], told) == ("input", [])
+    note = "All registers that were read are 0: nothing shows that the values are there."
+    assert note in answers["notes"]
+    assert note in capsys.readouterr().out
+    assert shown["channels"] == "r0, r1, r2, r3"
+
+
+def test_the_table_whose_values_move_is_proposed_and_the_other_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Both(Still):
+        def answer(self, pdu: bytes) -> bytes:
+            self.count += 1
+            self.put("input", 0, struct.pack(">2H", 230 + self.count % 7, 700))
+            return super().answer(pdu)
+
+        count = 0
+
+    with tcp({1: Both(0, struct.pack(">3H", 1, 19_200, 2))}) as target:
+        layout = new(tmp_path, target, "--unit=1", "--registers=0-9")["streams"]["device"]["layout"]
+    assert layout["table"] == "input"
+    assert (
+        "\nUnit 1 has holding registers, too; this file reads input registers.\n" in capsys.readouterr().out
+    )
 
 
 class Elsewhere(ModbusUnit):
