@@ -82,6 +82,8 @@ _BY_SPELLING = {
     for quantity, name, factor, spellings in _UNITS
     for spelling in spellings.split()
 }
+# Units that are not converted, and that in lower case are others: a torque, a millipascal, a gallon.
+_OTHERS = frozenset(("Nm", "NM", "mPa", "gal"))
 # How a level was made shows nothing of its unit: "mm/s RMS", "um p-p".
 _QUALIFIER = re.compile(r"[_ ]*\(?(?:rms|pk-?pk|p-?p|pp|0-?p|0-?pk|peak|pk)\)?$", re.IGNORECASE)
 _DROPPED = re.compile(r"[\s^*()\[\]{}·⋅]+")
@@ -138,6 +140,8 @@ def unit_of(text: str) -> Unit | None:
     Args:
         text: as somebody has written it, e.g. ``m/s²``, ``°C``, ``mm/s RMS``.
     """
+    if _DROPPED.sub("", text) in _OTHERS:
+        return None
     plain = _DROPPED.sub("", _plain(text))
     plain = _SECONDS.sub("s", _PER.sub("/", plain)).replace("squared", "2")
     return _BY_SPELLING.get(plain)

@@ -49,6 +49,12 @@ def test_what_one_unit_is_of_another(one, other, factor):
     assert factor_between(one, other) == (None if factor is None else pytest.approx(factor))
 
 
+@pytest.mark.parametrize("unit", ["Nm", "N·m", "N m", "NM", "mPa", "gal"])
+def test_what_only_its_case_tells_from_another_unit_is_none_of_the_known(unit):
+    assert unit_of(unit) is None
+    assert {unit_of(known).name for known in ("nm", "MPa", "Gal")} == {"nm", "MPa", "Gal"}
+
+
 def test_units_that_are_not_known_are_the_same_only_as_texts():
     assert unit_of("furlong") is None
     assert unit_of("") is None
