@@ -65,6 +65,8 @@ class Heard:
             default: what of them is a guess, although something was heard.
         not_read: what was heard and is not in the file by the answers, a sentence in each line; empty if it
             all is.
+        not_offered: choices by the key of their question that a person is not shown, as what was heard shows
+            that they are wrong.
         unknown: what must be answered because nothing that was heard shows it, with its remedy; empty if
             all is known. It is made of the same as `notes`. Without a person, ``daqsvc new`` then writes
             nothing.
@@ -76,6 +78,7 @@ class Heard:
     unheard: Callable[[Answers], str] = lambda _answers: ""
     notes: Callable[[Answers, Collection[str]], Sequence[str]] = lambda _answers, _assumed: ()
     not_read: Callable[[Answers], str] = lambda _answers: ""
+    not_offered: Callable[[Answers], Mapping[str, Collection[str]]] = lambda _answers: {}
     unknown: Callable[[Answers, Collection[str]], str] = lambda _answers, _assumed: ""
     guesses: Callable[[Answers, Collection[str]], Sequence[str]] = lambda _answers, _taken: ()
 

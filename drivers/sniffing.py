@@ -125,6 +125,12 @@ def by_name(channel: str) -> str | None:
     return None
 
 
+def span(least: float, most: float) -> str:
+    """The values between two, in words; one where they are the same."""
+    ends = f"{least:.6g}", f"{most:.6g}"
+    return ends[0] if ends[0] == ends[1] else " to ".join(ends)
+
+
 def quoted(text: str) -> str:
     """A text as TOML has it."""
     return json.dumps(text, ensure_ascii=False)

@@ -12,6 +12,7 @@ from drivers.can.checks import LEAST_COUNTER_BITS
 from drivers.can.dbc import selecting_values, signal_field
 from drivers.counter_search import LEAST_COUNTS
 from drivers.fields import FieldGroup, LayoutError, j1939_valid_raw
+from drivers.sniffing import span
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -25,6 +26,10 @@ if TYPE_CHECKING:
 
 
 _LEAST_CLOCK_BITS = 12
+_LEAST_JUMP_BITS = 8
+_LEAST_STEPS = 20
+_MANY_JUMPS = 0.05
+"""Of the steps from value to value: a noisy signal hardly ever crosses half of its range in one of them."""
 
 
 class SignalTraffic:
@@ -42,6 +47,8 @@ class SignalTraffic:
         last: the last value in its unit; NaN if none came.
         least: the least one.
         most: the largest one.
+        stated: least and largest value by the DBC file; None where it states none.
+        outside: how many frames had a value beyond these that has no name.
 
     Raises:
         LayoutError: no number can lie where the DBC file puts it.
@@ -65,9 +72,13 @@ class SignalTraffic:
         ]
         self._choices = {int(value): f"{text}" for value, text in (signal.choices or {}).items()}
         self._last_raw: int | None = None
+        self.stated = tuple(None if end is None else float(end) for end in (signal.minimum, signal.maximum))
+        self.outside = 0
+        self._bits = cell.bits
+        self._may_jump = cell.kind != "float" and cell.bits >= _LEAST_JUMP_BITS and not self._choices
+        self._jumps = self._steps = 0
         self.multiplexed = bool(self._selectors)
         self._may_count = cell.kind == "unsigned" and self._scale == 1 and cell.bits >= LEAST_COUNTER_BITS
-        self._may_count &= not self.multiplexed
         self._may_rise = cell.kind == "unsigned" and cell.bits >= _LEAST_CLOCK_BITS and not self.multiplexed
         self._mask = np.uint64(2**cell.bits - 1)
         self._before = np.empty(0, np.uint64)
@@ -92,6 +103,32 @@ class SignalTraffic:
         """What the DBC file calls the last value; empty if it does not name it."""
         return "" if self._last_raw is None else self._choices.get(self._last_raw, "")
 
+    @property
+    def doubt(self) -> str:
+        """What is strange about its values if the DBC file is that of the device; empty if nothing is."""
+        unit = f" {self.unit}" if self.unit else ""
+        if self.outside:
+            least, most = self.stated
+            ends = (
+                f"at least {least:g}"
+                if most is None
+                else f"at most {most:g}"
+                if least is None
+                else f"{least:g} to {most:g}"
+            )
+            return (
+                f"{self.name} reads {span(self.least, self.most)}{unit}, in {self.outside:,} of "
+                f"{self.frames:,} frames beyond what the DBC file states ({ends}): is it the file of this "
+                "device?"
+            )
+        may_jump = self._may_jump and not self.counts and not self.rises
+        if may_jump and self._steps >= _LEAST_STEPS and self._jumps > _MANY_JUMPS * self._steps:
+            return (
+                f"{self.name} jumps by more than half of what its {self._bits} bits can carry, in "
+                f"{self._jumps:,} of {self.frames:,} frames: is the DBC file that of this device?"
+            )
+        return ""
+
     def take(self, payloads: Payloads) -> None:
         """The next frames of the message ``[n, length]``."""
         for group, values in self._selectors:
@@ -111,9 +148,19 @@ class SignalTraffic:
     def _note(self, raw: NDArray[np.float64]) -> None:
         if self._valid is not None:
             raw = raw[(raw >= self._valid[0]) & (raw <= self._valid[1])]
-        values = raw[np.isfinite(raw)] * self._scale + self._offset
+        raw = raw[np.isfinite(raw)]
+        values = raw * self._scale + self._offset
         if not len(values):
             return
+        before = values[:1] if math.isnan(self.last) else [self.last]
+        self._steps += len(values) - math.isnan(self.last)
+        half = 2.0 ** (self._bits - 1) * abs(self._scale)
+        self._jumps += int((np.abs(np.diff(values, prepend=before)) > half).sum())
+        least, most = self.stated
+        unnamed = values[~np.isin(raw, list(self._choices))]
+        rounding = 0.5 * abs(self._scale)
+        self.outside += int((unnamed < least - rounding).sum()) if least is not None else 0
+        self.outside += int((unnamed > most + rounding).sum()) if most is not None else 0
         self.frames += len(values)
         self.last = float(values[-1])
         self.least = float(np.fmin(self.least, values.min()))
@@ -156,8 +203,8 @@ class MessageTraffic:
 
     @property
     def counter(self) -> SignalTraffic | None:
-        """The first signal that counts frames."""
-        return next((signal for signal in self.signals if signal.counts), None)
+        """The first signal that counts all frames."""
+        return next((one for one in self.signals if one.counts and not one.multiplexed), None)
 
     def has(self, frame_id: int) -> bool:
         """Whether an id, with its flags, is the message's."""

@@ -16,7 +16,16 @@ from drivers import questions as q
 from drivers.bus_questions import BUS, BusQuestions, Heard, is_count
 from drivers.can.sniff import STATE, CanSniffer, number_of, numbered, of_one_channel
 from drivers.questions import NONE, Answers, Question, Topic
-from drivers.sniffing import WAVEFORM_HZ, NothingFoundError, SniffError, by_name, sniffed, usual_rate
+from drivers.sniffing import (
+    LONGEST_UNIT,
+    WAVEFORM_HZ,
+    NothingFoundError,
+    SniffError,
+    by_name,
+    sniffed,
+    span,
+    usual_rate,
+)
 from drivers.toml_lines import Hexadecimal, array, behind, entry, toml
 
 if TYPE_CHECKING:
@@ -33,8 +42,6 @@ _LAST_SHORT_ID = 0x7FF
 """Of 11 bits; a higher id has 29."""
 _LISTEN_S = 5.0
 _SHOWN = 8
-_SURE_FRAMES = 20
-"""Frames of a message without a signal that counts, after which it is taken to have none."""
 
 
 def _interface(text: str) -> str:
@@ -100,6 +107,7 @@ class _CanQuestions(BusQuestions):
             lambda so_far: self.unheard(found, so_far),
             lambda so_far, assumed: self.notes(found, so_far, assumed),
             lambda so_far: self.not_read(found, so_far),
+            lambda so_far: self.not_offered(found, so_far),
             lambda so_far, assumed: self.unknown(found, so_far, assumed),
         )
 
@@ -126,6 +134,11 @@ class _CanQuestions(BusQuestions):
         """See `Heard.notes`."""
         del found, answers, assumed
         return ()
+
+    def not_offered(self, found: Mapping[str, Any], answers: Answers) -> Mapping[str, Collection[str]]:
+        """See `Heard.not_offered`."""
+        del found, answers
+        return {}
 
     def unknown(self, found: Mapping[str, Any], answers: Answers, assumed: Collection[str]) -> str:
         """See `Heard.unknown`."""
@@ -376,15 +389,11 @@ class DbcQuestions(_CanQuestions):
         signals = {one.name: one for one in message.signals}
         by_page = _by_page(message)
         counters = {
-            name: f"{one.length} bits{_of_all_pages(one) if by_page else ''}"
-            for name, one in signals.items()
-            if _may_count(one, len(signals))
+            one.name: f"{one.length} bits{_of_all_pages(one) if by_page else ''}"
+            for one in _may_be_counters(message)
         }
-        likely = next((name for name in counters if is_count(name)), NONE)
-        if _of_pages(signals[name] for name in _likely_measured(message.signals)):
-            likely = next((name for name in counters if is_count(name) and _of_pages([signals[name]])), NONE)
         choices = {**counters, NONE: "losses are then estimated from the times of arrival"}
-        yield self.ask("counter", q.exactly(choices), likely, choices=choices)
+        yield self.ask("counter", q.exactly(choices), _likely_counter(message) or NONE, choices=choices)
         rest = [name for name in signals if name != answers["counter"]]
         measured = _likely_measured([signals[name] for name in rest])
         yield self.ask(
@@ -420,11 +429,12 @@ class DbcQuestions(_CanQuestions):
         chosen = next((m for m in heard if m["message"] == answers.get("message", best["message"])), None)
         if chosen is None:
             return proposed
-        counter = next((one["signal"] for one in chosen["signals"] if one["counts_frames"]), None)
-        # Of a multiplexed message it counts the frames of all pages, and a stream reads those of one.
-        paged = any(one["multiplexed"] for one in chosen["signals"])
-        if not paged and (counter is not None or chosen["frames"] >= _SURE_FRAMES):
-            proposed["counter"] = counter or NONE
+        counters = [one["signal"] for one in chosen["signals"] if one["counts_frames"]]
+        if any(one["multiplexed"] for one in chosen["signals"]):
+            # Most signals that count do so on all pages, and a stream reads the frames of one.
+            likely = _likely_counter(self._messages(answers)[chosen["message"]])
+            counters = [one for one in counters if one == likely]
+        proposed["counter"] = next(iter(counters), NONE)
         rates = [one["rate_hz"] for one in found["ids"] if one["message"] == chosen["message"]]
         if len(rates) == 1 and rates[0]:
             measured = [one for one in chosen["signals"] if one["signal"] in answers.get("signals", ())]
@@ -451,7 +461,7 @@ class DbcQuestions(_CanQuestions):
         if not heard or not chosen:
             return ""
         if chosen in heard:
-            return self._other_length(found, answers)
+            return self._other_length(found, answers) or self._other_counter(found, answers)
         return (
             f"{answers['message']} was not heard. Remedy: correct --message; those that come: "
             f"{', '.join(heard)}"
@@ -471,6 +481,58 @@ class DbcQuestions(_CanQuestions):
             "of the device that sends"
         )
 
+    def _other_counter(self, found: Mapping[str, Any], answers: Answers) -> str:
+        """That the signal which is to count the frames was heard and does not; empty if it may."""
+        if answers.get("counter") not in self._not_counting(found, answers):
+            return ""
+        counters = [one for one in self._signals(found, answers) if one["counts_frames"]]
+        instead = ", ".join([*(one["signal"] for one in counters), NONE])
+        return (
+            f"{answers['counter']} does not grow by 1 from frame to frame. Remedy: correct --counter; it may "
+            f"be {instead}"
+        )
+
+    def _signals(self, found: Mapping[str, Any], answers: Answers) -> list[Mapping[str, Any]]:
+        """The signals of the message as they were heard."""
+        chosen = (one["signals"] for one in _decoded(found) if one["message"] == answers.get("message"))
+        return list(next(chosen, []))
+
+    def _not_counting(self, found: Mapping[str, Any], answers: Answers) -> set[str]:
+        """Signals of the message that do not grow by 1 from frame to frame of those that a stream reads."""
+        from drivers.counter_search import LEAST_COUNTS  # noqa: PLC0415 - brings numpy
+
+        signals = self._signals(found, answers)
+        paged = any(one["multiplexed"] for one in signals)
+        # A counter of each page by itself has the same value in several frames in a row.
+        return {
+            one["signal"]
+            for one in signals
+            if not one["counts_frames"] and one["frames"] > LEAST_COUNTS and (one["multiplexed"] or not paged)
+        }
+
+    def not_offered(self, found: Mapping[str, Any], answers: Answers) -> Mapping[str, Collection[str]]:
+        """See `Heard.not_offered`."""
+        return {"counter": self._not_counting(found, answers)}
+
+    def notes(self, found: Mapping[str, Any], answers: Answers, assumed: Collection[str]) -> Sequence[str]:
+        """See `Heard.notes`: what was heard of the channels, so that a person can judge it."""
+        del assumed
+        heard = {one["signal"]: one for one in self._signals(found, answers)}
+        read = [heard[name] for name in answers["signals"] if name in heard]
+        notes = [f"Heard: {_values(read)}."] if read else []
+        if silent := [name for name in answers["signals"] if name not in heard]:
+            notes.append(f"No value was heard of {', '.join(silent[:_SHOWN])}.")
+        notes += [one["doubt"] for one in read if one["doubt"]][:_SHOWN]
+        if answers["counter"] is None and not any(one["counts_frames"] for one in heard.values()):
+            notes.append(
+                f"No signal is known to count the frames of {answers['message']}: lost ones are found by the "
+                "times of arrival only."
+            )
+        counter = heard.get(answers["counter"])
+        if counter is not None and not counter["counts_frames"]:
+            notes.append(f"It was not heard whether {counter['signal']} counts the frames that are read.")
+        return notes
+
     def not_read(self, found: Mapping[str, Any], answers: Answers) -> str:
         """See `Heard.not_read`: the file reads one message, and of that no states if nobody names them."""
         others = [
@@ -485,6 +547,13 @@ class DbcQuestions(_CanQuestions):
         signals = self._messages(answers)[answers["message"]].signals
         states = [one.name for one in signals if one.choices and one.name not in taken]
         said += [f"{name} is left out: {STATE}." for name in states[:_SHOWN]]
+        heard = [one["signal"] for one in self._signals(found, answers)]
+        if rest := [name for name in heard if name not in {*taken, *states}]:
+            more = f" and {len(rest) - _SHOWN} more" if len(rest) > _SHOWN else ""
+            said.append(
+                f"Not read of {answers['message']}: {', '.join(rest[:_SHOWN])}{more}. Name with --signals "
+                "what of them is measured."
+            )
         return "\n".join(said)
 
     def _messages(self, answers: Answers) -> dict[str, Message]:
@@ -533,7 +602,12 @@ class DbcQuestions(_CanQuestions):
             yield from (f"#   {page} {names}".rstrip() for page, names in _shown(others, ":").items())
 
     def _units(self, answers: Answers) -> dict[str, str]:
-        units = _unit_names(self._messages(answers)[answers["message"]].signals, answers["signals"])
+        """Units of the channels: as machine files write them, or as the DBC file does where none is known."""
+        signals = self._messages(answers)[answers["message"]].signals
+        stated = {one.name: (one.unit or "").strip() for one in signals}
+        fitting = {name: unit for name, unit in stated.items() if 0 < len(unit) <= LONGEST_UNIT}
+        units = {name: unit for name, unit in fitting.items() if unit.isprintable()}
+        units |= _unit_names(signals, answers["signals"])
         return {
             name: units[first] for name, (first, *_) in self._by_channel(answers).items() if first in units
         }
@@ -699,6 +773,20 @@ def _likely(messages: Mapping[str, Message]) -> str:
     return max(messages, key=lambda name: score(messages[name]))
 
 
+def _may_be_counters(message: Message) -> list[Any]:
+    """Signals of a message that may count its frames by how they are made."""
+    return [one for one in message.signals if _may_count(one, len(message.signals))]
+
+
+def _likely_counter(message: Message) -> str | None:
+    """The signal that counts the frames of a stream by its name; None if there is none."""
+    named = [one for one in _may_be_counters(message) if is_count(one.name)]
+    signals = {one.name: one for one in message.signals}
+    if _of_pages(signals[name] for name in _likely_measured(message.signals)):
+        named = [one for one in named if _of_pages([one])]
+    return next((str(one.name) for one in named), None)
+
+
 def _may_count(signal: Any, signals: int) -> bool:
     plain = not signal.is_signed and not signal.is_float and signal.scale == 1 and signal.length >= 4
     return bool(plain) and signals > 1 and not signal.is_multiplexer
@@ -737,17 +825,29 @@ def _decoded(found: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     return [one for one in found["dbc"]["messages"] if one["signals"]]
 
 
+def _values(signals: Sequence[Mapping[str, Any]]) -> str:
+    """The values of some signals as they were heard."""
+    shown = [
+        f"{one['signal']} {span(one['min'], one['max'])}{f' {unit}' if (unit := one['unit']) else ''}"
+        for one in signals[:_SHOWN]
+    ]
+    return "; ".join(shown) + (f"; and {len(signals) - _SHOWN} more" if len(signals) > _SHOWN else "")
+
+
 def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
     """What was heard, in a few lines: the ids that come most often."""
     ids = sorted(found["ids"], key=lambda one: -(one["rate_hz"] or 0.0))
     yield f"{counted(found['frames'], 'frame')} of {counted(len(ids), 'id')}:"
-    yield from _of_ids(found)
+    yield from _of_ids(found, values=True)
     if len(ids) > _SHOWN:
         yield f"  ... and {len(ids) - _SHOWN} more: daqsvc sniff can shows them"
 
 
-def _of_ids(found: Mapping[str, Any]) -> Iterator[str]:
-    """The ids that come most often: how long their frames are, and how often they come."""
+def _of_ids(found: Mapping[str, Any], *, values: bool = False) -> Iterator[str]:
+    """The ids that come most often: how long their frames are, how often they come, with which values."""
+    by_message = (
+        {one["message"]: one["signals"] for one in _decoded(found)} if values and "dbc" in found else {}
+    )
     ids = sorted(found["ids"], key=lambda one: -(one["rate_hz"] or 0.0))
     for one in ids[:_SHOWN]:
         lengths = ", ".join(map(str, one["lengths"]))
@@ -757,3 +857,7 @@ def _of_ids(found: Mapping[str, Any]) -> Iterator[str]:
         if message is None and "dbc" in found:
             message = "not in the DBC file"
         yield f"  {one['id']:#x}: {lengths} bytes, {rate}{counts}{f', {message}' if message else ''}"
+        signals = by_message.pop(message, [])
+        if signals:
+            yield f"    {_values(signals)}"
+        yield from (f"    {signal['doubt']}" for signal in signals if signal["doubt"])

@@ -425,6 +425,7 @@ class _Report(NamedTuple):
         if rows:
             yield SniffTable(("message", "signal", "last", "min", "max", "unit", ""), rows)
         for message in dbc.heard:
+            yield from (f"{message.name}: {signal.doubt}" for signal in message.signals if signal.doubt)
             if message.short:
                 yield (
                     f"{message.name}: {message.short} of {message.frames} frames have fewer than the "
@@ -497,6 +498,9 @@ class _Report(NamedTuple):
                             "last": signal.last,
                             "min": signal.least,
                             "max": signal.most,
+                            "dbc_min": signal.stated[0],
+                            "dbc_max": signal.stated[1],
+                            "doubt": signal.doubt,
                             "counts_frames": signal.counts,
                             "multiplexed": signal.multiplexed,
                         }
@@ -569,6 +573,7 @@ class _Report(NamedTuple):
             *(f"  {{ name = {quoted(s.name)}, signals = [{quoted(s.name)}] }}," for s in channels),
             "]",
             *(f"# {s.name} is left out: {_why_left_out(s)}" for s in measured if s not in channels),
+            *(f"# {s.doubt}" for s in channels if s.doubt),
             *of_one_channel([signal.name for signal in channels]),
             *sensor_lines(
                 name,

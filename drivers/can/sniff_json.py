@@ -69,6 +69,9 @@ class DbcSignalFigures(TypedDict):
         last: the last value.
         min: the least value.
         max: the greatest value.
+        dbc_min: the least value by the DBC file; null if it states none.
+        dbc_max: the greatest value by the DBC file; null if it states none.
+        doubt: what is strange about its values if the file is that of the device; empty if nothing is.
         counts_frames: whether it grew by 1 from frame to frame.
         multiplexed: whether only some frames of the message have it.
     """
@@ -79,6 +82,9 @@ class DbcSignalFigures(TypedDict):
     last: float
     min: float
     max: float
+    dbc_min: float | None
+    dbc_max: float | None
+    doubt: str
     counts_frames: bool
     multiplexed: bool
 

@@ -312,6 +312,9 @@ def _answer(
 
 def _offered(question: Question, heard: Heard, answers: Answers, file: Path) -> Question:
     """The question with what was heard as its default, where that can be used; then it is never quiet."""
+    if question.choices and (wrong := heard.not_offered(answers).get(question.key)):
+        shown = {choice: about for choice, about in question.choices.items() if choice not in wrong}
+        question = replace(question, choices=shown)
     text = heard.proposals(answers).get(question.key)
     if text is None or text == question.default or take(question, text, dict(answers), file) is not None:
         return question

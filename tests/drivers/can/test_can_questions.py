@@ -103,6 +103,24 @@ def test_whether_samples_are_of_one_channel_is_asked(tmp_path: Path, dbc: str, l
     assert len([key for key in answers if key.endswith(".type")]) == (2 if likely == "yes" else 4)
 
 
+@pytest.mark.parametrize(
+    ("stated", "unit"),
+    [
+        *((one, one) for one in ("l/min", "m3/h", "kW", "Hz", "Nm", "m³/h", "kWh", "1/h")),
+        ("°C", "degC"),
+        ("1/min", "rpm"),
+        ("µm", "um"),
+        ("litres per minute!", "1"),  # no unit of a machine file is as long
+    ],
+)
+def test_the_unit_of_the_dbc_file_is_taken_over(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], stated: str, unit: str
+) -> None:
+    tables = new(tmp_path, GEARBOX.replace('"degC"', f'"{stated}"'), "--message=Slow", "--rate=10")
+    assert {one["channel"]: one["unit"] for one in tables["sensors"]}["OilTemp"] == unit
+    assert ("[F40]" in capsys.readouterr().out) == (unit == "1")
+
+
 def test_it_is_not_asked_where_one_stream_could_not_read_them_so(tmp_path: Path) -> None:
     layout = layout_of(new(tmp_path, GEARBOX, "--signals=AX_0, AX_1, Supply"))
     assert [one["name"] for one in layout["channels"]] == ["AX_0", "AX_1", "Supply"]

@@ -20,6 +20,7 @@ from support.paths import ROOT
 from support.waiting import PATIENCE_S
 
 from daqsvc.cli import main
+from daqsvc.commands.new.interview import Given, conduct
 from drivers.can import questions, sniff, socketcan
 from sim_hw.bus_socket import UnixBus
 from sim_hw.bus_socket_hub import Hub
@@ -27,6 +28,9 @@ from sim_hw.bus_socket_hub import Hub
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
+
+    from drivers.bus_questions import BusQuestions, Heard
+    from drivers.questions import Answers, Question
 
 pytestmark = pytest.mark.integration
 DBC = ROOT / "config" / "devices" / "triaxial-accelerometer.dbc"
@@ -219,7 +223,8 @@ def test_new_reads_one_page_without_the_counter_of_all_and_names_the_other(tmp_p
 @pytest.mark.parametrize(
     ("signals", "rate"), [(("Temperature",), "10"), (("Count",), "20"), (("Supply",), "6.66667")]
 )
-def test_a_page_is_proposed_at_its_own_rate(signals: tuple[str, ...], rate: str) -> None:
+def test_a_page_is_proposed_at_its_own_rate(tmp_path: Path, signals: tuple[str, ...], rate: str) -> None:
+    (tmp_path / "slow.dbc").write_text(COUNTED)
     heard = [("Page", 100, False), ("Count", 100, False), ("Temperature", 50, True), ("Supply", 34, True)]
     found = {
         "ids": [{"message": "Slow", "rate_hz": 20.0}],
@@ -242,9 +247,10 @@ def test_a_page_is_proposed_at_its_own_rate(signals: tuple[str, ...], rate: str)
             ]
         },
     }
-    proposed = questions.DbcQuestions().proposals(found, {"message": "Slow", "signals": signals})
+    answers = {"dbc-folder": tmp_path, "dbc": "slow.dbc", "message": "Slow", "signals": signals}
+    proposed = questions.DbcQuestions().proposals(found, answers)
     assert proposed["rate"] == rate
-    assert "counter" not in proposed
+    assert proposed["counter"] == "none"  # what counts the frames of all pages is no counter of one
 
 
 def test_signals_of_two_pages_are_not_taken_for_one_stream(
@@ -653,6 +659,105 @@ def test_new_names_the_messages_that_it_heard_and_does_not_read(
     written = (tmp_path / "new.toml").read_text("utf-8")
     assert f"# {note}\n" in written
     assert f"# {state}" in written
+
+
+STATUS = """VERSION ""
+BU_: A
+BO_ 802 Temps: 6 A
+ SG_ OilTemp : 0|16@1- (0.1,0) [-40|200] "degC" A
+ SG_ Flow : 16|16@1+ (0.1,0) [0|0] "l/min" A
+ SG_ StatusCount : 32|16@1+ (1,0) [0|0] "" A
+"""
+"""With a status word that is named as a counter, and no counter."""
+
+
+def temperatures(bus: UnixBus, number: int) -> None:
+    status = 0x8004 if number % 40 > 30 else 4
+    payload = b"".join(v.to_bytes(2, "little") for v in (610 + number % 20, 450, status))
+    bus.send(can.Message(arbitration_id=802, is_extended_id=False, data=payload))
+
+
+@pytest.mark.usefixtures("hub")
+def test_new_takes_no_signal_for_the_counter_that_was_not_heard_to_count(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 0.5)
+    (tmp_path / "temps.dbc").write_text(STATUS)
+    given = ["--bus=can-dbc", "--dbc=temps.dbc"]
+    with talking(tmp_path / "bus", temperatures):
+        tables = new(tmp_path, *given, "--rate=200")
+        said = capsys.readouterr().out
+        (tmp_path / "new.toml").unlink()
+        assert not_written(tmp_path, *given, "--counter=StatusCount") == 1
+    assert tables["streams"]["device"]["layout"]["no_counter"] is True
+    assert [one["unit"] for one in tables["sensors"]] == ["degC", "l/min"]
+    text = (
+        "Heard: OilTemp 61 to 62.9 degC; Flow 45 l/min.\n"
+        "No signal is known to count the frames of Temps: lost ones are found by the times of arrival only.\n"
+        "Not read of Temps: StatusCount. Name with --signals what of them is measured.\n"
+    )
+    assert f"\n{text}" in said
+    assert "StatusCount does not grow by 1 from frame to frame. Remedy: correct" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("hub")
+def test_a_signal_that_does_not_count_is_not_offered_to_a_person_as_the_counter(tmp_path: Path) -> None:
+    (tmp_path / "temps.dbc").write_text(STATUS.replace("StatusCount", "StatusWord"))
+    shown: dict[str, Question] = {}
+
+    def ask(question: Question) -> str:
+        shown[question.key] = question
+        return question.default or ""
+
+    given = {
+        "bus": "can-dbc",
+        "interface": "unixbus",
+        "channel": f"{tmp_path / 'bus'}",
+        "dbc": "temps.dbc",
+        "rate": "200",
+    }
+
+    def listen(bus: BusQuestions, answers: Answers) -> Heard:
+        return bus.listen(answers, tmp_path, threading.Event(), print)
+
+    with pytest.MonkeyPatch.context() as patch, talking(tmp_path / "bus", temperatures):
+        patch.setattr(questions, "_LISTEN_S", 0.5)
+        conduct(tmp_path / "new.toml", Given(given, defaults=False), ask, print, listen)
+    assert shown["counter"].default == "none"
+    assert list(shown["counter"].choices or {}) == ["none"]
+
+
+@pytest.mark.usefixtures("hub")
+def test_values_that_the_dbc_file_excludes_are_stated_as_a_doubt_about_the_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file of another device whose frames have the same id and length; nothing is certain here."""
+    monkeypatch.setattr(questions, "_LISTEN_S", 0.5)
+    (tmp_path / "other.dbc").write_text(
+        'VERSION ""\nBU_: A\nBO_ 513 Pump: 8 A\n SG_ Cnt : 0|8@1+ (1,0) [0|255] "" A\n'
+        ' SG_ Pressure : 8|16@1+ (0.01,0) [0|100] "bar" A\n SG_ Flow : 24|16@1+ (0.1,0) [0|0] "l/min" A\n'
+    )
+
+    def vibration(bus: UnixBus, number: int) -> None:
+        x, y = (-20 if number % 2 else 20), (-1 if number % 3 else 1)
+        payload = bytes([number % 256]) + x.to_bytes(2, "little", signed=True)
+        payload += y.to_bytes(2, "little", signed=True) + bytes(3)
+        bus.send(can.Message(arbitration_id=513, is_extended_id=False, data=payload))
+
+    with talking(tmp_path / "bus", vibration):
+        new(tmp_path, "--bus=can-dbc", "--dbc=other.dbc")
+        listened = capsys.readouterr().out
+        assert main(words(tmp_path, "--seconds", "0.5", "--dbc", f"{tmp_path / 'other.dbc'}")) == 0
+        shown = capsys.readouterr().out
+        assert main(words(tmp_path, "--seconds", "0.5", "--json", "--dbc", f"{tmp_path / 'other.dbc'}")) == 0
+    [message] = figures(capsys.readouterr().out)["dbc"]["messages"]
+    range_of = {one["signal"]: (one["dbc_min"], one["dbc_max"]) for one in message["signals"]}
+    assert range_of == {"Cnt": (0, 255), "Pressure": (0, 100), "Flow": (None, None)}
+    for text in (listened, (tmp_path / "new.toml").read_text("utf-8"), shown):
+        assert "Pressure reads 0.2 to 655.16 bar, in " in text
+        assert "beyond what the DBC file states (0 to 100): is it the file of this device?" in text
+        assert "Flow jumps by more than half of what its 16 bits can carry, in " in text
+    assert "# Pressure reads 0.2 to 655.16 bar, in " in shown  # the tables to begin a machine file with
 
 
 @pytest.mark.usefixtures("hub")
