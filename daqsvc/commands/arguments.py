@@ -39,6 +39,11 @@ EXIT_STUCK = 5
 """Of `run`: the event loop was blocked."""
 
 
+_FILE_AND_STORE = (
+    {"argument --store:", "argument FILE"},
+    {"argument FILE:", "argument --store"},
+)
+"""Parts of the message of argparse that both name a store, in either order."""
 _ALIKE = 0.7
 """How alike a word and a choice are that may be meant, as `difflib` counts it."""
 
@@ -66,6 +71,8 @@ class ArgumentParser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Say what is wrong and where help is, and exit with 2."""
         is_value = message.startswith("argument ") and "not allowed with argument" not in message
+        if set(message.split(" not allowed with ")) in _FILE_AND_STORE:
+            message += "; the machine file names the store already: leave out FILE or --store"
         code = WRONG_VALUE if is_value else ARGUMENTS
         self.exit(EXIT_USAGE, with_code(f"{self.prog}: {message}; see {self.prog} --help", code) + "\n")
 

@@ -238,6 +238,19 @@ def _taken(arguments: argparse.Namespace) -> tuple[str, Code] | None:
     return problem
 
 
+def _no_history(store: Path, *, by_file: bool) -> str:
+    """That a store has no history, and what to do; the store may also not be that of the service."""
+    other = (
+        "if the service was started with --store, give the same --store in place of FILE"
+        if by_file
+        else "give the machine file in place of --store, as it names the store"
+    )
+    return (
+        f"there is no history in {store}; write [history] into the machine file, and start the service with "
+        f"it; or {other}"
+    )
+
+
 def _tell(
     store: Path, machine: str | None, arguments: argparse.Namespace, since_s: float, until_s: float
 ) -> None:
@@ -254,10 +267,7 @@ def _tell(
 
     path = store / NAME
     if not path.is_file():
-        raise NoTrendError(
-            f"there is no history in {store}; write [history] into the machine file, and start the service "
-            "with it, or name its store with --store in place of FILE"
-        )
+        raise NoTrendError(_no_history(store, by_file=arguments.store is None))
     reader = HistoryReader(path)
     try:
         if arguments.events:

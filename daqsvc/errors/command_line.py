@@ -119,7 +119,8 @@ NOTHING_RECORDED = Code(
     "Ask for another time or figure. A service writes a history if its machine file has [history].",
     "history.md",
     "daqsvc trend: there is no history in /var/lib/daqsvc/lab; write [history] into the machine file, and "
-    "start the service with it, or name its store with --store in place of FILE",
+    "start the service with it; or if the service was started with --store, give the same --store in place "
+    "of FILE",
 )
 NOT_KNOWN = Code(
     "C14",

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 LAST_ALARMS = 8
 BAR = 28
 PER_SECOND = 8
+_MUCH_SLOWER = 1.2
 COLUMNS = (
     ("rms", "RMS", None),
     ("peak", "peak", None),
@@ -254,10 +255,17 @@ class View:
         console.print(
             f"event loop lag: p50 {lag['p50']:.2f} ms, p99 {lag['p99']:.2f} ms, max {lag['max']:.2f} ms"
         )
+        played_s, took_s = summary["simulated_s"], summary["real_s"]
         console.print(
             f"{summary['alarm_events']} alarm events among {summary['messages']} messages "
-            f"through the broker; {summary['simulated_s']:.1f} s played in {summary['real_s']:.1f} s"
+            f"through the broker; {played_s:.1f} s played in {took_s:.1f} s, without the start"
         )
+        wanted_s = played_s / self._speed if self._speed else 0.0
+        if summary["complete"] and took_s > _MUCH_SLOWER * wanted_s > 0.0:
+            console.print(
+                f"That is {played_s / took_s:.2g} times the speed of the machine, and not {self._speed:g} "
+                "times: this computer is too slow for more, or too busy."
+            )
 
     def show_snapshots(self, summary: DemoSummary) -> None:
         """Print where the snapshots of alarms are, and what they are good for."""

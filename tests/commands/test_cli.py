@@ -216,7 +216,13 @@ def test_of_a_verb_or_choice_that_is_misspelt_the_one_that_is_meant_is_named(arg
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["ack", "foo", "pump.toml", "--store", "."], "argument FILE: not allowed with argument --store"),
+        (
+            ["ack", "foo", "pump.toml", "--store", "."],
+            (
+                "argument FILE: not allowed with argument --store; the machine file names the store already: "
+                "leave out FILE or --store"
+            ),
+        ),
         (["trend", "--nope"], "unrecognized arguments: --nope"),
         (["check", "pump.toml", "--nope"], "unrecognized arguments: --nope"),
     ],

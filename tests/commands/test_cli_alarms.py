@@ -329,7 +329,14 @@ async def test_the_store_is_found_as_run_finds_it(tmp_path: Path) -> None:
         (["shelve", "shaking"], "--for"),
         (["ack", "shaking", "--for", "30m"], "--for"),
         (["ack", "shaking", "--by", "ann\x1b[2J"], "is not printable"),
-        (["ack", "shaking", "motor.toml", "--store", "here"], "not allowed with argument"),
+        (
+            ["ack", "shaking", "motor.toml", "--store", "here"],
+            "not allowed with argument --store; the machine file names the store already: leave out FILE or",
+        ),
+        (
+            ["alarms", "motor.toml", "--store", "here"],
+            "not allowed with argument FILE; the machine file names the store already: leave out FILE or",
+        ),
         (["alarms", "--history", "0"], "'0' is not a whole number from 1 on"),
         (["ack"], "ID"),
     ],

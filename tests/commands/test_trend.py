@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from support.machine_files import MACHINES
 
 from daqsvc.cli import main
 from daqsvc.history.file import NAME, Event, HistoryFile, Series
@@ -177,11 +178,15 @@ def test_what_cannot_be_shown_is_said(store, capsys, arguments, code, words) -> 
     assert said.err.count("\n") == 1
 
 
-def test_without_a_history_the_remedy_is_said(tmp_path, capsys) -> None:
+def test_without_a_history_the_remedy_is_said(tmp_path, capsys, monkeypatch) -> None:
     assert main(["trend", "--store", str(tmp_path)]) == 1
     said = capsys.readouterr().err
     assert "write [history] into the machine file" in said
-    assert "or name its store with --store in place of FILE" in said
+    assert "; or give the machine file in place of --store, as it names the store [C13]" in said
+    monkeypatch.setenv("STATE_DIRECTORY", f"{tmp_path}")
+    assert main(["trend", f"{MACHINES / 'laval-rig.toml'}"]) == 1
+    words = "; or if the service was started with --store, give the same --store in place of FILE [C13]"
+    assert words in capsys.readouterr().err
     (tmp_path / NAME).touch()
     assert main(["trend", "--store", str(tmp_path)]) == 1
     said = capsys.readouterr().err

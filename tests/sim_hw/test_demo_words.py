@@ -20,10 +20,10 @@ def script(**more):
     return Script("a rig", lambda _: None, "shaft", np.zeros((19_200, 3)), 640.0, **more)
 
 
-def shown(act):
+def shown(act, speed=1.0):
     """What a view without a terminal prints."""
     console = Console(file=io.StringIO(), width=200, force_terminal=False)
-    act(View(script(), 1.0, console))
+    act(View(script(), speed, console))
     return console.file.getvalue()
 
 
@@ -66,12 +66,17 @@ def test_frames_that_were_never_sent_are_told_from_those_that_the_link_lost():
         "messages": 0,
         "simulated_s": 1.0,
         "real_s": 1.0,
+        "complete": True,
     }
     text = shown(lambda view: view.show_summary(summary))
     assert (
         "856 of the frames counted as dropped were never on the bus: the scenario has 2 s of silence and"
         in text
     )
+    assert "through the broker; 1.0 s played in 1.0 s, without the start\n" in text
+    assert "this computer is too slow" not in text
+    slow = shown(lambda view: view.show_summary(summary), speed=20.0)
+    assert "That is 1 times the speed of the machine, and not 20 times: this computer is too slow" in slow
     summary["frames"]["not_sent"], summary["samples"]["left_over"] = [], 1
     assert "1 sample was not sent: it fills no frame\n" in shown(lambda view: view.show_summary(summary))
     assert "never on the bus" not in shown(lambda view: view.show_summary(summary))
