@@ -13,8 +13,10 @@ NUMBER: Mapping[str, re.Pattern[str]] = {
     for mark in (".", ",")
 }
 """A number, by decimal mark."""
-ABSENT = re.compile(r" *(-*|nan) *", re.IGNORECASE)
-"""What devices write where they have no value: nothing, dashes, or ``nan``."""
+ABSENT_WORDS = ("nan", "na", "n/a", "null", "none", "ol", "ovl", "inf", "+inf", "-inf")
+"""Words for no value, or for one beyond what the device can measure. ``err`` is none: a code may follow."""
+ABSENT = re.compile(rf" *(-*|{'|'.join(map(re.escape, ABSENT_WORDS))}) *", re.IGNORECASE)
+"""What devices write where they have no value: nothing, dashes, or a word."""
 _UNIT = r"[A-Za-z%]+[23]?(?:/[A-Za-z]+[23]?)?|[A-Za-z]+\^[23]|[A-Za-z]+/[A-Za-z]+\^[23]|1/[A-Za-z]+"
 _WITH_UNIT: Mapping[str, re.Pattern[str]] = {
     mark: re.compile(rf"({number.pattern})({_UNIT}) *") for mark, number in NUMBER.items()

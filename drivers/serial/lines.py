@@ -255,7 +255,7 @@ def _other_unit(text: str) -> str:
 
 def _value(field: str) -> float:
     """The number of a field that the kernels have found to be one, or absent."""
-    return math.nan if not field.strip(" -") else float(field)
+    return math.nan if ABSENT.fullmatch(field) else float(field)
 
 
 class DeviceTime:

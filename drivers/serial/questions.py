@@ -11,16 +11,20 @@ from drivers import questions as q
 from drivers.bus_questions import BUS, BusQuestions, Heard, only_port
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
 from drivers.serial.sniff import (
+    ANY_BAUD,
     LINES_NEED,
     MUST_TURN,
     NO_NUMBERS,
     SerialSniffer,
+    absent_words,
     frames_need,
+    no_number_words,
+    other_lines_words,
     overrun_words,
     turn_words,
     unit_of_suffix,
 )
-from drivers.sniffing import WAVEFORM_HZ, sniffed, table_name, unused, usual_rate
+from drivers.sniffing import WAVEFORM_HZ, quoted, sniffed, table_name, unused, usual_rate
 from drivers.toml_lines import array, entry
 
 if TYPE_CHECKING:
@@ -124,7 +128,13 @@ class SerialQuestions(BusQuestions):
         """See `BusQuestions.listen`."""
         del folder
         found = sniffed(SerialSniffer(), ["--seconds", f"{_LISTEN_S:g}", "--", answers["port"]], stop, tell)
-        return Heard(list(_in_words(found)), lambda so_far: _proposals(found, so_far), _missed(found))
+        return Heard(
+            list(_in_words(found)),
+            lambda so_far: _proposals(found, so_far),
+            _missed(found),
+            notes=lambda so_far, _: [f"baud = {so_far['baud']} is {ANY_BAUD}."] * found["any_baud"],
+            not_read=lambda so_far: "\n".join(_not_read(found, so_far)),
+        )
 
     def questions(self, answers: Answers, folder: Path) -> Iterator[Question]:
         """See `BusQuestions.questions`."""
@@ -304,7 +314,7 @@ def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
     comma = ", numbers with a decimal comma" if found["decimal"] == "," else ""
     yield f"{line}: lines of text{rate}, {counted(len(found['columns']), 'column')}{prefix}{comma}"
     if found["lines_damaged"]:
-        yield f"  {found['lines_damaged']} of {found['lines_heard']} lines are damaged"
+        yield f"  {other_lines_words(found['lines_damaged'], found['lines_heard'], found['damaged_line'])}"
     yield from (f"  {one}" for one in found["lines"][:_SHOWN_LINES])
     for one in found["columns"]:
         if one["turns_at"]:
@@ -346,9 +356,37 @@ def _proposals(found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
             proposed[sensor_key(name, "type")] = NONE
         elif one["unit"]:
             proposed[sensor_key(name, "suffix")] = one["unit"]
-    if not _missed(found):
-        proposed.setdefault("counter", NONE)
+    # Else a person who takes all defaults would have lines counted by what counts nothing.
+    proposed.setdefault("counter", NONE)
     return proposed
+
+
+def _not_read(found: Mapping[str, Any], answers: Answers) -> Iterator[str]:
+    """See `Heard.not_read`."""
+    if found["framing"] != "lines" or answers["framing"] != "lines":
+        return
+    if missed := _missed(found):
+        yield f"What was heard does not fit this file: {missed}."
+        return
+    if found["lines_damaged"]:
+        words = other_lines_words(found["lines_damaged"], found["lines_heard"], found["damaged_line"])
+        yield f"{words}."
+    if len(answers["columns"]) != len(found["columns"]):
+        return
+    heard, texts = found["lines_heard"] - found["lines_damaged"], {}
+    for name, one in zip(answers["columns"], found["columns"], strict=True):
+        measured = answers.get(sensor_key(name, "type")) not in {None, NONE}
+        if not one["numeric"] and (measured or name == answers["counter"]):
+            yield (
+                f"No number was heard in column {name}, but e.g. {quoted(one['last'])}: a line without a "
+                "number there is not read."
+            )
+        elif not one["numeric"]:
+            texts[name] = one["last"]
+        elif measured and one["absent"]:
+            yield absent_words(name, one["absent"], heard, one["absent_text"])
+    if texts:
+        yield no_number_words(texts)
 
 
 def _missed(found: Mapping[str, Any]) -> str:

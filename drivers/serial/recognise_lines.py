@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drivers.serial.line_numbers import ABSENT, NUMBER, fields_of, number_before, unit_behind
+from drivers.serial.line_numbers import ABSENT, BLANK, NUMBER, fields_of, number_before, unit_behind
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -40,8 +40,13 @@ _ENDS = 5
 """Lines at each end by which the growth of a column is judged."""
 _CHECKSUM = re.compile(r"\*([0-9A-Fa-f]{4}|[0-9A-Fa-f]{2})$")
 _PREFIX = re.compile(r"[!$]?[A-Za-z_-][A-Za-z0-9_-]{0,14}")
-_NO_NUMBER = frozenset({"inf", "-inf", "null", "none", "err", "error", "na", "n-a", "ovl", "ol"})
-"""Words in place of a number, beside those that are `ABSENT` for the driver, too."""
+_MESSAGES = frozenset(
+    {"err", "error", "fail", "failed", "fault", "warn", "warning", "info", "debug", "timeout"}
+)
+"""Words that messages of a device begin with, which are neither names of columns nor kinds of lines."""
+_WORD = re.compile(r"\W*([A-Za-z]+)(?![\w,;|\t])")
+_CODED = re.compile(r".*[ :]\d+ *")
+_DIGITS = re.compile(r"\d+")
 _PRINTABLE = re.compile(r"[\t -~]*")
 _SUMS: Mapping[int, tuple[str, Callable[[bytes], int]]] = {
     2: ("xor", lambda text: reduce(xor, text, 0)),
@@ -65,6 +70,8 @@ class Column:
         grows: whether it never falls, and grows at all.
         per_line: by how much it grows from line to line, on average.
         last: its last text.
+        absent: in how many lines there is no value.
+        absent_text: its text in the last one of these.
     """
 
     name: str
@@ -77,6 +84,8 @@ class Column:
     per_line: float = 0.0
     last: str = ""
     unit: str = ""
+    absent: int = 0
+    absent_text: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +130,7 @@ def text_lines(data: bytes) -> TextLines | None:
         first, *pieces = data.split(delimiter)
         lines = [line for piece in pieces[:-1] if (line := _text(piece))]
         if len(lines) >= _LEAST_LINES:
-            if first.startswith(b"#") or _is_header(_text(first), lines[0]):
+            if first.startswith(b"#") or _is_header(_text(first), lines):
                 lines = [_text(first), *lines]
             return _kinds_of(lines, delimiter.decode())
     return None
@@ -157,7 +166,7 @@ def _kinds_of(lines: Sequence[str], delimiter: str) -> TextLines:
 
 def _is_word(field: str) -> bool:
     """Whether a first column can name a kind of line: a word, and not what devices write for no number."""
-    no_number = ABSENT.fullmatch(field) is not None or field.lower() in _NO_NUMBER
+    no_number = ABSENT.fullmatch(field) is not None or field.lstrip("$!").lower() in _MESSAGES
     return _PREFIX.fullmatch(field) is not None and not no_number
 
 
@@ -165,8 +174,9 @@ def _text(piece: bytes) -> str:
     return piece.decode("ascii", "replace").strip("\r\n")
 
 
-def _is_header(first: str, second: str) -> bool:
+def _is_header(first: str, lines: Sequence[str]) -> bool:
     """Whether a line is a header: words, where the next one has numbers."""
+    second = lines[0]
     separator, decimal = _marks_of([second])
     fields = fields_of(first, separator) if separator else [first]
     others = fields_of(second, separator) if separator else [second]
@@ -174,7 +184,22 @@ def _is_header(first: str, second: str) -> bool:
         len(fields) == len(others)
         and _only_words(fields, others, decimal)
         and not second.strip().startswith(fields[0].strip())
+        and not _is_message(first, lines, separator)
     )
+
+
+def _is_message(first: str, others: Sequence[str], separator: str) -> bool:
+    """Whether a line of words is a message of the device, and no header: messages come again, with codes.
+
+    Some devices repeat their header, too: then it is the same words each time, and several of them.
+    """
+    word = _WORD.match(first)
+    if word is not None and word[1].lower() in _MESSAGES:
+        return True
+    if separator in {"", BLANK}:
+        form = _DIGITS.sub("0", first)
+        return _CODED.fullmatch(first) is not None or any(_DIGITS.sub("0", one) == form for one in others)
+    return False
 
 
 def _only_words(fields: Sequence[str], others: Sequence[str], decimal: str) -> bool:
@@ -230,6 +255,7 @@ def _columns_of(lines: Sequence[str], delimiter: str) -> TextLines:
         and _only_words(rows[0], rows[1], decimal)
         and any(number.fullmatch(one) or unit_behind(one, decimal) for one in rows[1])
         and rows[0][0] != rows[1][0]
+        and not _is_message(plain[0], plain[1:], separator)
     )
     names = [name.lstrip("#").strip() for name in rows[0]] if header else []
     sound = [
@@ -272,11 +298,15 @@ def _unit_of(texts: Sequence[str], decimal: str) -> str | None:
     """The unit behind the number of a column; empty if it is the number alone, None if it is no number.
 
     A word that is always the same, such as 0A, is none: the numbers before a unit change, have decimals, or a
-    blank behind them.
+    blank behind them. Lines without a value are left out of it, also where most have none.
     """
     units = ["" if NUMBER[decimal].fullmatch(text) else unit_behind(text, decimal) or None for text in texts]
-    unit, times = Counter(units).most_common(1)[0] if units else (None, 0)
-    if unit is None or times < MAJORITY * len(units):
+    known = Counter(unit for unit in units if unit is not None)
+    unit = max(known, key=lambda one: known[one], default=None)
+    if unit is None:
+        return None
+    fitting = sum(_is_number(text, unit, NUMBER[decimal]) for text in texts)
+    if fitting < MAJORITY * len(texts):
         return None
     numbers = {text.removesuffix(unit) for text, one in zip(texts, units, strict=True) if one == unit}
     if unit and len(numbers) == 1 and not any(mark in one for one in numbers for mark in (decimal, " ")):
@@ -309,10 +339,12 @@ def _column(texts: Sequence[str], places: NDArray[np.int64], name: str, decimal:
         unit: behind the numbers.
     """
     last = texts[-1] if texts else ""
+    written = texts
     texts = [(number_before(text, unit) or "").strip() for text in texts] if decimal else texts
     if not decimal or all(map(ABSENT.fullmatch, texts)):
         return Column(name, numeric=False, last=last)
     there = [k for k, text in enumerate(texts) if not ABSENT.fullmatch(text)]
+    absent = [text for k, text in enumerate(written) if ABSENT.fullmatch(texts[k])]
     texts, places = [texts[k] for k in there], places[there]
     values = np.array([float(text.replace(decimal, ".")) for text in texts])
     # The driver reads neither a counter nor a time with a text behind it.
@@ -328,7 +360,20 @@ def _column(texts: Sequence[str], places: NDArray[np.int64], name: str, decimal:
     step = _step_of(values, places) if whole else 0.0
     turns_at = _turn_of(values, step)
     least, most = float(values.min()), float(values.max())
-    return Column(name, True, least, most, step, turns_at, grows, per_line, last if unit else texts[-1], unit)
+    return Column(
+        name,
+        True,
+        least,
+        most,
+        step,
+        turns_at,
+        grows,
+        per_line,
+        last if unit else texts[-1],
+        unit,
+        len(absent),
+        absent[-1] if absent else "",
+    )
 
 
 def _step_of(values: NDArray[np.float64], places: NDArray[np.int64]) -> float:

@@ -28,7 +28,7 @@ from drivers.sniffing import (
 if TYPE_CHECKING:
     import argparse
     import threading
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from drivers.serial.recognise import Recognised
     from drivers.serial.recognise_frames import BinaryFrames
@@ -53,8 +53,8 @@ _WIDEST = 100
 _PER_S = {"s": 1.0, "ms": 1e3, "us": 1e6}
 _FAST = (9600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_800, 921_600, 2_000_000, 4_000_000, 12_000_000)
 """Baud rates to propose where the port has none."""
-_WAITING = 4096
-"""Bytes that Linux keeps of a port until they are read."""
+_WAITING_S = 0.05
+"""Within this time from the first byte on, those come that had been waiting in the port."""
 _SURELY = 1.05
 _WHOLE = 0.995
 """Share of the bytes in frames from which on the rest is not worth a word."""
@@ -71,6 +71,7 @@ class Heard(NamedTuple):
         last_s: when the last did.
         errors: characters that the UART found without a stop bit; 0 where it does not count.
         lost: why the port was lost; empty if it was not.
+        waiting: how many of the bytes came within `_WAITING_S`: most of them had been waiting in the port.
     """
 
     data: bytes
@@ -79,6 +80,7 @@ class Heard(NamedTuple):
     last_s: float
     errors: int
     lost: str = ""
+    waiting: int = 0
 
 
 class Tried(NamedTuple):
@@ -218,7 +220,7 @@ def _listen(descriptor: int, seconds: float, enough: int, stop: threading.Event)
     poll.register(descriptor, select.POLLIN)
     data = bytearray()
     before = line_errors(descriptor)
-    count, lost = 0, ""
+    count, waiting, lost = 0, 0, ""
     first_s = last_s = begin_s = time.monotonic()
     whole = enough >= MOST_KEPT
     while not stop.is_set() and time.monotonic() < begin_s + seconds and (whole or count < enough):
@@ -237,11 +239,12 @@ def _listen(descriptor: int, seconds: float, enough: int, stop: threading.Event)
         last_s = time.monotonic()
         first_s = first_s if count else last_s
         count += len(chunk)
+        waiting = count if last_s <= first_s + _WAITING_S else waiting
         data += chunk
         del data[:-MOST_KEPT]
     after = None if lost else line_errors(descriptor)
     errors = 0 if before is None or after is None else (after.framing_errors - before.framing_errors) % 2**32
-    return Heard(bytes(data), count, first_s, last_s, errors, lost)
+    return Heard(bytes(data), count, first_s, last_s, errors, lost, waiting)
 
 
 def dump(data: bytes) -> str:
@@ -281,7 +284,8 @@ class _Report(NamedTuple):
         """What comes; what had been waiting in the port is left out."""
         heard = self.best.heard
         bits = 2 + (7 if self.best.found.parity else 8) + (self._parity != "none")
-        return bits * max(heard.received - _WAITING, 0) / max(heard.last_s - heard.first_s, 1e-3)
+        seconds = heard.last_s - heard.first_s - _WAITING_S
+        return bits * (heard.received - heard.waiting) / seconds if seconds > 0 else 0.0
 
     @property
     def _is_overrun(self) -> bool:
@@ -420,8 +424,7 @@ class _Report(NamedTuple):
         words += ["the first line names them"] * what.header
         words += [f"checksum {what.checksum}"] * (what.checksum != "none")
         if what.damaged:
-            example = quoted(_printable(what.damaged[0][:_WIDEST]))
-            words.append(f"{len(what.damaged)} of {len(what.lines)} lines are damaged, e.g. {example}")
+            words.append(_other_lines(what))
         rate_hz = self._rate_hz(what)
         rate = "" if rate_hz is None else f", {rate_hz:.4g} lines/s"
         yield f"Lines of text{rate}: {'; '.join(words)}"
@@ -438,6 +441,17 @@ class _Report(NamedTuple):
             rows.append((one.name, "number" if one.numeric else "text", *limits, one.last[:24], use))
         yield SniffTable(("column", "kind", "min", "max", "last", ""), rows)
         yield from (turn_words(one.name, one.turns_at) for one in what.columns if one.turns_at)
+        yield from self._not_read(what, {one: one.name for one in what.columns})
+
+    def _not_read(self, what: TextLines, names: Mapping[Column, str]) -> Iterator[str]:
+        """What of the lines does not become samples, beside those of another layout; names by column."""
+        heard = len(what.lines) - len(what.damaged)
+        yield from (
+            absent_words(names[one], one.absent, heard, one.absent_text) for one in what.columns if one.absent
+        )
+        texts = {names[one]: one.last for one in what.columns if not one.numeric}
+        if texts and len(texts) < len(what.columns):
+            yield no_number_words(texts)
 
     def _time(self, what: TextLines) -> Column | None:
         """The column that has the device's time, if none counts."""
@@ -518,6 +532,9 @@ class _Report(NamedTuple):
                         "counts": one is counter,
                         "turns_at": one.turns_at or None,
                         "time_unit": self._time_unit(what, one) if one is time_column else None,
+                        "last": one.last,
+                        "absent": one.absent,
+                        "absent_text": one.absent_text if one.absent else None,
                     }
                     for one in what.columns
                 ],
@@ -525,6 +542,7 @@ class _Report(NamedTuple):
                 "other_prefixes": [one.prefix for one in what.others],
                 "lines_heard": len(what.lines),
                 "lines_damaged": len(what.damaged),
+                "damaged_line": what.damaged[0] if what.damaged else None,
             }
         elif what is not None:
             figures |= {
@@ -553,7 +571,7 @@ class _Report(NamedTuple):
             f"[buses.{name}]",
             'driver = "serial"',
             f"port = {quoted(lasting_name(self.port))}",
-            f"baud = {self._baud:_}{'    # any: the port does not use it' if self._any_baud else ''}",
+            f"baud = {self._baud:_}{f'    # {ANY_BAUD}' if self._any_baud else ''}",
         ]
         head += ["data_bits = 7"] * (self.best.found.parity is not None)
         head += [f"parity = {quoted(self._parity)}"] * (self._parity != "none")
@@ -592,6 +610,9 @@ class _Report(NamedTuple):
             )
             return
         names = _names(what.columns)
+        remarks = [f"{_other_lines(what)}."] if what.damaged else []
+        for remark in (*remarks, *self._not_read(what, names)):
+            yield from (f"# {line}" for line in textwrap.wrap(remark, 98))
         yield f"[streams.{stream}]"
         yield f"bus = {quoted(bus)}"
         yield f"rate_hz = {rounded_rate(rate_hz)}    # as measured; see the device's manual"
@@ -717,6 +738,8 @@ def overrun_words(baud: int, proposed: int) -> str:
     )
 
 
+ANY_BAUD = "any: the port does not use it"
+"""What the baud rate of a port is that brings the same at all of them."""
 MUST_TURN = "one that begins again at 0 after 999, 9999 or the like is no counter for daqsvc"
 """What a few seconds of a counter do not show."""
 
@@ -728,6 +751,41 @@ def turn_words(name: str, turns_at: int) -> str:
         "each turn as a restarted counter [B37], and samples as lost that are not. Use a column with the "
         f"device's time, if there is one. See {documented_in('serial')}."
     )
+
+
+def other_lines_words(count: int, heard: int, example: str) -> str:
+    """What it means that some lines are not like the others."""
+    are = "is" if count == 1 else "are"
+    return (
+        f"{count} of {heard} lines {are} not of this layout, e.g. {quoted(_printable(example[:_WIDEST]))}: "
+        "daqsvc counts such lines, and does not read them"
+    )
+
+
+def _other_lines(what: TextLines) -> str:
+    return other_lines_words(len(what.damaged), len(what.lines), what.damaged[0])
+
+
+def absent_words(name: str, absent: int, heard: int, text: str) -> str:
+    """What it means that a column has no value in some lines."""
+    shown = quoted(_printable(text)) if text else "nothing"
+    return (
+        f"{name} has no value in {absent} of {heard} lines: {shown} is there. Only these samples of it are "
+        f"missing. See {documented_in('serial')}."
+    )
+
+
+def no_number_words(texts: Mapping[str, str]) -> str:
+    """What it means that columns, by name, are no numbers."""
+    name, text = next(iter(texts.items()))
+    example = quoted(_printable(text[:_WIDEST]))
+    if len(texts) == 1:
+        begin = f"Column {name} is left out, as no number is there, but e.g. {example}. If it is"
+    else:
+        begin = (
+            f"Columns {', '.join(texts)} are left out: no numbers are there, but e.g. {example}. If they are"
+        )
+    return f"{begin} to be watched, have the device send numbers."
 
 
 def _counter(what: TextLines) -> Column | None:

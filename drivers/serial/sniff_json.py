@@ -31,6 +31,9 @@ class ColumnFigures(TypedDict):
         counts: whether it counts the lines.
         turns_at: the power of ten at which it begins again at 0; null if it does not.
         time_unit: unit of the time in it; null if it is no time.
+        last: what was in it last.
+        absent: in how many lines it has no value, such as `---`.
+        absent_text: its text in the last one of these; null if there are none.
     """
 
     name: str
@@ -41,6 +44,9 @@ class ColumnFigures(TypedDict):
     counts: bool
     turns_at: int | None
     time_unit: str | None
+    last: str
+    absent: int
+    absent_text: str | None
 
 
 class SerialFigures(TypedDict):
@@ -71,6 +77,7 @@ class SerialFigures(TypedDict):
         other_prefixes: of lines: first fields of lines of other kinds.
         lines_heard: of lines: how many whole ones there were.
         lines_damaged: of lines: how many of them are not like most.
+        damaged_line: of lines: one that is not; null if there are none.
         sync_word: of frames: the bytes that each begins with, in hexadecimal digits; empty with COBS.
         frame_length: of frames: bytes of one.
         payload_length: of frames: bytes between sync word and CRC.
@@ -107,6 +114,7 @@ class SerialFigures(TypedDict):
     other_prefixes: NotRequired[list[str]]
     lines_heard: NotRequired[int]
     lines_damaged: NotRequired[int]
+    damaged_line: NotRequired[str | None]
     sync_word: NotRequired[str]
     frame_length: NotRequired[int]
     payload_length: NotRequired[int]

@@ -322,7 +322,7 @@ def test_records_with_another_delimiter_are_lines_too():
 @pytest.mark.parametrize(
     "bad",
     [
-        b"5,inf",
+        b"5,err",
         b"5,1_0",
         b"5",
         b"5,1,2",

@@ -52,17 +52,18 @@ def number(text: str, kind: type) -> float | None:
 
 def value(text: str) -> float | None:
     """The same, but NaN of what states that there is no value."""
-    return np.nan if re.fullmatch(" *(-*|[nN][aA][nN]) *", text) else number(text, float)
+    return np.nan if re.fullmatch(f" *(-*|{WORDS}) *", text, re.IGNORECASE) else number(text, float)
 
 
-ABSENT = st.sampled_from(["", " ", "-", "----", " -- ", "nan", "NaN"])
+WORDS = r"nan|na|n/a|null|none|ol|ovl|[+-]?inf"
+ABSENT = st.sampled_from(["", " ", "-", "----", " -- ", "nan", "NaN", "OL", "n/a", "-inf"])
 
 
 @given(
     st.lists(st.tuples(NUMBERS, st.sampled_from(["", "?", "1.5"]), NUMBERS | ABSENT), min_size=1, max_size=8)
 )
 @example([("1", "", " 1. "), ("1", "", ".5e+01"), ("1", "", "."), ("1", "", "1e"), ("1", "", "1 2")])
-@example([("1", "", text) for text in ("", "----", "nan", "na", "- -", "nann", "x")])
+@example([("1", "", text) for text in ("", "----", "nan", "na", "- -", "nann", "x", "OL ", "N/A", "n\x0fa")])
 @example([("1", "", "9007199254740993"), ("1", "", "1e23"), ("1", "", "1e999"), ("1", "", "-0")])
 @example([(counter, "", "1") for counter in (" 7 ", "+7", "-0", "7.", "7e0", "", "9" * 30)])
 def test_numbers_are_those_of_python_to_the_last_bit(rows: list[tuple[str, str, str]]) -> None:

@@ -453,3 +453,52 @@ def test_what_grows_with_a_unit_behind_it_is_no_counter_and_no_time() -> None:
     what = text_lines("".join(f"{10 * k} ms,{k % 7}.5\n" for k in range(60)).encode())
     assert what is not None
     assert (what.columns[0].unit, what.columns[0].step, what.columns[0].grows) == ("ms", 0.0, False)
+
+
+MESSAGES = {
+    "values alone, a message first": (["ERR 12"], "{v:.1f}", 1),
+    "a message of two words first": (["E 7"], "{k} {v:.1f}", 2),
+    "messages of words": (["sensor lost", "x"], "{k} {v:.1f}", 2),
+    "words behind the prefix": (["$ERR,12,3"], "$ACC,{k},{v:.1f}", 2),
+    "messages with the separator": (["ERR,12"], "{k},{v:.1f}", 2),
+    "units": (["ERR 12", "WARN 3.5 C"], "{v:.1f} C", 2),
+}
+
+
+@pytest.mark.parametrize("first", [0, 7])
+@pytest.mark.parametrize(("messages", "form", "columns"), MESSAGES.values(), ids=MESSAGES)
+def test_messages_between_lines_name_no_column_and_are_no_columns(
+    messages: list[str], form: str, columns: int, first: int
+) -> None:
+    rows = [
+        messages[k % len(messages)] if k % 15 == first else form.format(k=k, v=12 + k % 7 / 10)
+        for k in range(60)
+    ]
+    what = text_lines("".join(f"{row}\r\n" for row in ["", *rows]).encode())
+    assert what is not None
+    assert (what.header, list(what.others), len(what.columns)) == (False, [], columns)
+    assert list(what.damaged) == rows[first::15]
+    assert [column.name for column in what.columns] == [f"c{k + 1}" for k in range(columns)]
+
+
+def test_a_header_that_comes_again_and_one_that_begins_like_a_message_are_headers() -> None:
+    rows = [f"{k},{k % 7}.5" for k in range(40)]
+    for header in ("fault,x", "t,x"):
+        what = text_lines("\n".join([header, *rows[:20], header, *rows[20:], ""]).encode())
+        assert what is not None
+        assert (what.header, list(what.damaged)) == (True, [header])
+
+
+@pytest.mark.parametrize("text", ["---", "NaN", "OL", "", "n/a", "-inf"])
+@pytest.mark.parametrize("unit", ["", " mm/s"])
+@pytest.mark.parametrize("each", [4, 2])
+def test_a_column_without_a_value_in_some_lines_is_a_column_of_numbers(
+    text: str, unit: str, each: int
+) -> None:
+    rows = [f"{k},{text}" if k % each else f"{k},{k % 7}.5{unit}" for k in range(40)]
+    what = text_lines("".join(f"{row}\n" for row in rows).encode())
+    assert what is not None
+    column = what.columns[1]
+    assert (column.numeric, column.unit, column.absent_text) == (True, unit.strip(), text)
+    assert column.absent == sum(k % each > 0 for k in range(1, 40))
+    assert not what.damaged

@@ -263,6 +263,43 @@ def test_words_for_no_number_are_no_kinds_of_lines() -> None:
     assert not what.others
 
 
+def test_what_of_the_lines_is_no_sample_is_stated_on_the_terminal_and_in_both_files(
+    cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 0.8)
+
+    def sends(number: int) -> bytes:
+        if number % 20 == 13:
+            return b"ERR 12\r\n"
+        return b"%d,%s,ok\r\n" % (number, b"---" if number % 4 == 3 else b"%d.5" % (number % 7))
+
+    with talking(cable, sends):
+        assert main(["sniff", "serial", f"{cable.path}", "--seconds", "0.8"]) == 0
+        shown = capsys.readouterr().out
+        file = new(cable, tmp_path / "new.toml")
+        said = capsys.readouterr().out
+    assert file["streams"]["device"]["layout"]["channels"] == [{"name": "c2"}]
+    table, fragment = " ".join(shown.split()).split("To begin a machine file")
+    text = " ".join((tmp_path / "new.toml").read_text("utf-8").replace("\n# ", " ").split())
+    for words in (
+        'lines are not of this layout, e.g. "ERR 12": daqsvc counts such lines, and does not read them',
+        'lines: "---" is there. Only these samples of it are missing.',
+        'Column c3 is left out, as no number is there, but e.g. "ok".',
+    ):
+        for place in (table, fragment.replace("# ", ""), said, text):
+            assert words in place
+
+
+@pytest.mark.parametrize("seconds", [1.0, 3.0, 5.0])
+def test_the_baud_rate_for_a_port_without_one_is_the_same_however_long_it_listens(seconds: float) -> None:
+    """`new` listens for a shorter time than `sniff`; what had been waiting in the port is not counted."""
+    data = b"".join(b"%d.25\r\n" % (k % 7) for k in range(600))
+    received, waiting = round(0.995 * 36_864 * seconds) + 40_000, 40_000
+    heard = sniff.Heard(data, received, 0.0, seconds + sniff._WAITING_S, 0, waiting=waiting)
+    report = sniff._Report("ttyACM0", [], sniff.Tried(9600, "none", heard, recognised(data)), False)
+    assert report.sniffed().figures["baud"] == 460_800
+
+
 def test_what_ends_a_line_is_in_the_file_of_new(
     cable: PseudoTerminal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -292,7 +329,7 @@ def test_damaged_lines_are_counted_and_a_stream_is_proposed(
         assert main(["sniff", "serial", f"{cable.path}", "--seconds", "0.8"]) == 0
         said = capsys.readouterr().out
         found = figures(cable, capsys)
-    assert ' lines are damaged, e.g. "ERR sensor timeout"' in said
+    assert ' lines are not of this layout, e.g. "ERR sensor timeout": daqsvc counts such lines' in said
     assert 0 < found["lines_damaged"] < 0.1 * found["lines_heard"]
     [stream] = check(tmp_path, found["machine_file"], capsys)["streams"].values()
     assert stream["layout"]["counter"]["column"] == "c1"
@@ -515,6 +552,9 @@ def test_a_port_that_brings_more_than_its_baud_rate_is_proposed_with_one_that_ca
         assert main([*slow, f"--port={cable.path}"]) == 2
     refused = capsys.readouterr().err
     assert words in said
+    any_baud = f"baud = {file['buses']['main']['baud']} is any: the port does not use it."
+    assert any_baud in said
+    assert f"# {any_baud}\n" in (tmp_path / "fast.toml").read_text("utf-8")
     assert file["buses"]["main"]["baud"] in {460_800, 921_600}
     assert 800 < file["streams"]["device"]["rate_hz"] < 2100
     assert (found["any_baud"], found["overrun_baud"]) == (True, 115_200)
