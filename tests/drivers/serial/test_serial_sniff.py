@@ -394,7 +394,7 @@ def test_a_column_of_time_and_a_header_are_used(
         return head + b"%d;%d.5;20.5\n" % (1000 * (time.monotonic() - begin_s), number % 5)
 
     with talking(cable, say):
-        found = figures(cable, capsys, "--baud", "57600")
+        found = figures(cable, capsys, "--baud", "57600", "--seconds", "2")
     assert found["header"] is True
     tables = check(tmp_path, found["machine_file"], capsys)
     [bus], [stream] = tables["buses"].values(), tables["streams"].values()
