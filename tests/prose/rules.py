@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-from prose.texts import texts_of
+from prose.texts import items_of, texts_of
 from support.paths import ROOT
 
 if TYPE_CHECKING:
@@ -61,6 +61,7 @@ class Rules:
 
     longest: dict[str, int]
     phrases: tuple[Phrase, ...]
+    longest_item: int
 
     def findings(self, texts: Iterable[Text]) -> Iterator[Finding]:
         """All that is to be mended, in the order of the texts."""
@@ -78,6 +79,16 @@ class Rules:
                     yield Finding(
                         text, f'"{match[0]}" is {phrase.why}: write {phrase.write} in "... {around} ..."'
                     )
+
+    def long_items(self, items: Iterable[Text]) -> Iterator[Finding]:
+        """List items with too many sentences: nobody finds a fact in there."""
+        for item in items:
+            if (words := length(item.words)) > self.longest_item:
+                beginning = " ".join(item.words.split()[:8])
+                yield Finding(
+                    item,
+                    f'{words} words in a list item, at most {self.longest_item}: divide "{beginning} ..."',
+                )
 
 
 def sentences(words: str, kind: str = "page") -> list[str]:
@@ -101,7 +112,7 @@ def rules(file: Path = VOCABULARY) -> Rules:
         Phrase(entry["avoid"], entry["write"], entry["why"], tuple(entry.get("in", KINDS)))
         for entry in data["phrase"]
     )
-    return Rules(data["longest_sentence"], tuple(phrases))
+    return Rules(data["longest_sentence"], tuple(phrases), data["longest_item"])
 
 
 def prose_files(root: Path = ROOT) -> list[Path]:
@@ -135,4 +146,9 @@ def prose_files(root: Path = ROOT) -> list[Path]:
 def findings(files: Iterable[Path]) -> list[Finding]:
     """What is to be mended in the files."""
     every = rules()
-    return [finding for file in files for finding in every.findings(texts_of(file))]
+    found: list[Finding] = []
+    for file in files:
+        found += every.findings(texts_of(file))
+        if file.suffix == ".md" and file.name != "CHANGELOG.md":
+            found += every.long_items(items_of(file))
+    return found

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from prose.rules import KINDS, VOCABULARY, length, prose_files, rules, sentences
-from prose.texts import texts_of
+from prose.texts import items_of, texts_of
 from support.paths import ROOT
 
 if TYPE_CHECKING:
@@ -124,6 +124,14 @@ def test_words_that_readers_stumbled_over_are_found(kind: str, bad: str, good: s
     assert found(file)
     file.write_text(form[kind].format(good), "utf-8")
     assert found(file) == []
+
+
+def test_a_list_item_of_many_short_sentences_is_found(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    many = "It is short. " * 34
+    page.write_text(f"# Title\n\n{many}\n\n- An item.\n- {many}\n- {'It is short. ' * 33}\n", "utf-8")
+    [finding] = rules().long_items(items_of(page))
+    assert (finding.text.line, finding.message.split(":")[0]) == (6, "102 words in a list item, at most 100")
 
 
 def test_a_limit_is_there_for_each_kind_of_text_but_cells() -> None:

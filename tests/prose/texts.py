@@ -80,6 +80,17 @@ def _of_page(text: str) -> Iterator[tuple[int, str, str]]:
             yield line, kind, "".join(_visible(token.children or []))
 
 
+def items_of(page: Path) -> Iterator[Text]:
+    """The paragraphs of the list items of a page, which is in Markdown."""
+    depth, line = 0, 1
+    for token in MarkdownIt("commonmark").enable("table").parse(page.read_text("utf-8")):
+        if token.map:
+            line = token.map[0] + 1
+        depth += {"list_item_open": 1, "list_item_close": -1}.get(token.type, 0)
+        if depth and token.type == "inline":
+            yield Text(page, line, "page", " ".join("".join(_visible(token.children or [])).split()))
+
+
 def _visible(tokens: list[Token]) -> Iterator[str]:
     for token in tokens:
         if token.type in {"softbreak", "hardbreak"}:
