@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 
 _LEAST_CLOCK_BITS = 12
+_FEW = 0.01
 _LEAST_JUMP_BITS = 8
 _LEAST_STEPS = 20
 _MANY_JUMPS = 0.05
@@ -81,12 +82,13 @@ class SignalTraffic:
         self._may_count = cell.kind == "unsigned" and self._scale == 1 and cell.bits >= LEAST_COUNTER_BITS
         self._may_rise = cell.kind == "unsigned" and cell.bits >= _LEAST_CLOCK_BITS and not self.multiplexed
         self._mask = np.uint64(2**cell.bits - 1)
+        self._odd = 0
         self._before = np.empty(0, np.uint64)
 
     @property
     def counts(self) -> bool:
-        """Whether it grew by 1 from frame to frame."""
-        return self._may_count and self.frames > LEAST_COUNTS
+        """Whether it grew by 1 from frame to frame, but for a few frames that were lost."""
+        return self._may_count and self.frames > LEAST_COUNTS and self._odd <= _FEW * self.frames
 
     @property
     def rises(self) -> bool:
@@ -139,7 +141,10 @@ class SignalTraffic:
         if self._may_count or self._may_rise:
             counts = np.concatenate((self._before, raw.astype(np.uint64)))
             steps = np.diff(counts) & self._mask
-            self._may_count = self._may_count and bool((steps == 1).all())
+            odd = steps != 1
+            # Frames may be lost while it is listened; what begins again too early counts no frames.
+            self._may_count = self._may_count and not bool((counts[1:][odd] <= 1).any())
+            self._odd += int(odd.sum())
             self._may_rise = self._may_rise and bool(((steps > 0) & (steps < self._mask // 2)).all())
             self._before = counts[-1:]
         self._note(raw.astype(np.float64))

@@ -524,9 +524,18 @@ class DbcQuestions(_CanQuestions):
             notes.append(f"No value was heard of {', '.join(silent[:_SHOWN])}.")
         notes += [one["doubt"] for one in read if one["doubt"]][:_SHOWN]
         if answers["counter"] is None and not any(one["counts_frames"] for one in heard.values()):
+            offered = _likely_counter(self._messages(answers)[answers["message"]])
+            few = offered is not None and offered not in self._not_counting(found, answers)
             notes.append(
-                f"No signal is known to count the frames of {answers['message']}: lost ones are found by the "
-                "times of arrival only."
+                (
+                    f"Too few frames of {answers['message']} came to see whether {offered} counts them: "
+                    f"without --counter {offered} lost ones are found by the times of arrival only."
+                )
+                if few
+                else (
+                    f"No signal is known to count the frames of {answers['message']}: lost ones are found by "
+                    "the times of arrival only."
+                )
             )
         counter = heard.get(answers["counter"])
         if counter is not None and not counter["counts_frames"]:

@@ -14,6 +14,7 @@ import tomllib
 from typing import TYPE_CHECKING, Any
 
 import can
+import numpy as np
 import pytest
 from support.formats import fits
 from support.paths import ROOT
@@ -22,11 +23,13 @@ from support.waiting import PATIENCE_S
 from daqsvc.cli import main
 from daqsvc.commands.new.interview import Given, conduct
 from drivers.can import questions, sniff, socketcan
+from drivers.can.dbc import messages_of
+from drivers.can.dbc_traffic import SignalTraffic
 from sim_hw.bus_socket import UnixBus
 from sim_hw.bus_socket_hub import Hub
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
     from pathlib import Path
 
     from drivers.bus_questions import BusQuestions, Heard
@@ -483,6 +486,12 @@ def new(tmp_path: Path, *more: str) -> dict[str, Any]:
     return tomllib.loads(file.read_text("utf-8"))
 
 
+def comments(file: Path) -> str:
+    """The comments in front of all tables, as one line: long sentences are in several."""
+    head = file.read_text("utf-8").partition("\nschema_version")[0]
+    return " ".join(" ".join(line.removeprefix("#") for line in head.splitlines()).split())
+
+
 def not_written(tmp_path: Path, *more: str) -> int:
     """The exit code of the same where it writes no file."""
     file = tmp_path / "new.toml"
@@ -541,15 +550,15 @@ def test_new_states_what_of_a_layout_was_neither_heard_nor_answered(
     with talking(tmp_path / "bus", accelerations):
         new(tmp_path, "--bus=can", *layout)
         said = capsys.readouterr().out
-        text = (tmp_path / "new.toml").read_text("utf-8")
+        text = comments(tmp_path / "new.toml")
         more = ["--byte-order=big", "--first-byte=1", "--sensor=a.type=trend", "--sensor=b.type=trend"]
         new(tmp_path, "--bus=can", *layout, *more)
     words = (
         "Neither heard nor answered: the byte where samples begin, 1 (--first-byte); the byte order, little "
-        "(--byte-order); which sensors are on a, b (--sensor a.type=). See the device's manual.\n"
+        "(--byte-order); which sensors are on a, b (--sensor a.type=). See the device's manual."
     )
-    assert f"\n# {words}" in text
-    assert f"\n{words}" in said
+    assert words in text
+    assert f"\n{words}\n" in said
     assert "Neither heard" not in capsys.readouterr().out  # whoever states the layout knows it
 
 
@@ -562,7 +571,7 @@ def test_new_that_does_not_listen_states_that_its_frames_are_an_example(
         "The frames are an example: nothing was heard, and nobody has stated what the bytes of 0x101 mean."
     )
     assert f"\n{words}" in capsys.readouterr().out
-    assert f"\n# {words}" in file.read_text("utf-8")
+    assert words in comments(file)
     known = ["--id=0x101", "--channels=a, b", "--raw-type=int16", "--scale=0.1", "--overwrite"]
     assert main(["new", f"{file}", "--yes", "--bus=can", *known]) == 0
     assert "an example" not in capsys.readouterr().out
@@ -700,6 +709,48 @@ def test_new_takes_no_signal_for_the_counter_that_was_not_heard_to_count(
     assert "StatusCount does not grow by 1 from frame to frame. Remedy: correct" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("counts", "is_counter"),
+    [
+        (range(600), True),
+        ([n for n in range(600) if n not in {77, 300, 301}], True),  # frames that were lost meanwhile
+        ([n for n in range(600) if n % 9], False),
+        ([n % 100 for n in range(600)], False),  # each turn would count as a loss
+        ([n % 255 + 1 for n in range(600)], False),
+        (range(8), False),
+    ],
+)
+def test_a_counter_of_a_dbc_file_may_miss_a_few_frames_and_no_value(
+    tmp_path: Path, counts: Iterable[int], *, is_counter: bool
+) -> None:
+    (tmp_path / "x.dbc").write_text('VERSION ""\nBU_: A\nBO_ 1 M: 1 A\n SG_ C : 0|8@1+ (1,0) [0|0] "" A\n')
+    [message] = messages_of(tmp_path / "x.dbc")
+    signal = SignalTraffic(message, message.signals[0])
+    payloads = (np.array(list(counts)) % 256).astype(np.uint8)[:, None]
+    for piece in np.array_split(payloads, max(len(payloads) // 50, 1)):
+        signal.take(piece)
+    assert signal.counts == is_counter
+
+
+@pytest.mark.usefixtures("hub")
+def test_new_states_that_too_few_frames_came_to_see_a_counter(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 1.0)
+    (tmp_path / "temps.dbc").write_text(STATUS)
+
+    def seldom(bus: UnixBus, number: int) -> None:
+        if number % 40 == 0:
+            temperatures(bus, number)
+
+    with talking(tmp_path / "bus", seldom):
+        new(tmp_path, "--bus=can-dbc", "--dbc=temps.dbc", "--rate=5")
+    words = (
+        "Too few frames of Temps came to see whether StatusCount counts them: without --counter StatusCount"
+    )
+    assert words in capsys.readouterr().out
+
+
 @pytest.mark.usefixtures("hub")
 def test_a_signal_that_does_not_count_is_not_offered_to_a_person_as_the_counter(tmp_path: Path) -> None:
     (tmp_path / "temps.dbc").write_text(STATUS.replace("StatusCount", "StatusWord"))
@@ -753,7 +804,7 @@ def test_values_that_the_dbc_file_excludes_are_stated_as_a_doubt_about_the_file(
     [message] = figures(capsys.readouterr().out)["dbc"]["messages"]
     range_of = {one["signal"]: (one["dbc_min"], one["dbc_max"]) for one in message["signals"]}
     assert range_of == {"Cnt": (0, 255), "Pressure": (0, 100), "Flow": (None, None)}
-    for text in (listened, (tmp_path / "new.toml").read_text("utf-8"), shown):
+    for text in (listened, comments(tmp_path / "new.toml"), shown):
         assert "Pressure reads 0.2 to 655.16 bar, in " in text
         assert "beyond what the DBC file states (0 to 100): is it the file of this device?" in text
         assert "Flow jumps by more than half of what its 16 bits can carry, in " in text
