@@ -109,6 +109,7 @@ class _CanQuestions(BusQuestions):
             lambda so_far: self.not_read(found, so_far),
             lambda so_far: self.not_offered(found, so_far),
             lambda so_far, assumed: self.unknown(found, so_far, assumed),
+            self.guesses,
         )
 
     def _proposals(self, found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
@@ -144,6 +145,11 @@ class _CanQuestions(BusQuestions):
         """See `Heard.unknown`."""
         del found, answers, assumed
         return ""
+
+    def guesses(self, answers: Answers, taken: Collection[str]) -> Sequence[str]:
+        """See `Heard.guesses`."""
+        del answers, taken
+        return ()
 
     def not_read(self, found: Mapping[str, Any], answers: Answers) -> str:
         """See `Heard.not_read`."""
@@ -250,9 +256,9 @@ class PackedQuestions(_CanQuestions):
         return f"{answers['id']:#x} was not heard. Remedy: correct --id; those that come: {others}"
 
     def notes(self, found: Mapping[str, Any], answers: Answers, assumed: Collection[str]) -> Sequence[str]:
-        """See `Heard.notes`: a frame shows its bytes, and not what they mean."""
+        """See `Heard.notes`: of the layout, what is neither heard nor answered."""
         if _OF_BYTES.intersection(assumed):
-            return (f"The bytes of {answers['id']:#x} are not known: these channels are an example.",)
+            return ()  # all of it is an example then
         guessed = _PLACES.keys() & set(assumed) - self.proposals(found, answers).keys()
         if packed.RAW_BYTES[answers["raw-type"]] == 1:
             guessed -= {"byte-order"}
@@ -262,6 +268,12 @@ class PackedQuestions(_CanQuestions):
         return (
             (f"Neither heard nor answered: {'; '.join(places)}. See the device's manual.",) if places else ()
         )
+
+    def guesses(self, answers: Answers, taken: Collection[str]) -> Sequence[str]:
+        """See `Heard.guesses`: a frame shows its bytes, and not what they mean."""
+        if "channels" not in taken:
+            return ()
+        return (f"The bytes of {answers['id']:#x} are not known: these channels are an example.",)
 
     def unknown(self, found: Mapping[str, Any], answers: Answers, assumed: Collection[str]) -> str:
         """See `Heard.unknown`."""

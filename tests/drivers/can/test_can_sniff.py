@@ -562,6 +562,26 @@ def test_new_states_what_of_a_layout_was_neither_heard_nor_answered(
     assert "Neither heard" not in capsys.readouterr().out  # whoever states the layout knows it
 
 
+@pytest.mark.usefixtures("hub")
+def test_a_person_who_takes_all_defaults_is_told_that_the_channels_are_an_example(tmp_path: Path) -> None:
+    given = {"bus": "can", "interface": "unixbus", "channel": f"{tmp_path / 'bus'}", "id": "0x201"}
+
+    def listen(bus: BusQuestions, answers: Answers) -> Heard:
+        return bus.listen(answers, tmp_path, threading.Event(), print)
+
+    def notes(**more: str) -> list[str]:
+        texts = Given(given | more, defaults=False)
+        file = tmp_path / "new.toml"
+        answers = conduct(file, texts, lambda question: question.default or "", print, listen)
+        return list(answers["notes"])
+
+    with pytest.MonkeyPatch.context() as patch, talking(tmp_path / "bus", accelerations):
+        patch.setattr(questions, "_LISTEN_S", 0.5)
+        example = "The bytes of 0x201 are not known: these channels are an example."
+        assert example in notes()
+        assert example not in notes(channels="a, b")
+
+
 def test_new_that_does_not_listen_states_that_its_frames_are_an_example(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
