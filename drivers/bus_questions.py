@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 BUS, STREAM = "main", "device"
 """Names of the only bus and the only stream of the file."""
+BEFOREHAND = "beforehand"
+"""Key, beside the answers that `BusQuestions.listen` gets, of those that were given beforehand."""
 _BY_ID = Path("/dev/serial/by-id")
 
 SHARED = {
@@ -130,7 +132,9 @@ class BusQuestions(ABC):
         """Look at the bus, for ``daqsvc new --listen``. Nothing is changed there.
 
         Args:
-            answers: as far as `listens_behind`.
+            answers: as far as `listens_behind`; ``seconds`` is the time to listen, and None or not there if
+                that is up to the driver. `BEFOREHAND` has the texts of all answers that were given
+                beforehand, also of later questions.
             folder: of the machine file, where relative paths start.
             stop: set when the person has waited enough; look at it every 0.2 s or so.
             tell: states one line while it goes on.
@@ -227,6 +231,36 @@ _UNIT_OF = {
 def unit_by_name(channel: str) -> str | None:
     """The unit that the name of a channel suggests; None if it suggests none."""
     return next((unit for word, unit in _UNIT_OF.items() if word in channel.lower()), None)
+
+
+def guessed_sensors(answers: Answers, channels: Sequence[str], taken: Collection[str]) -> list[str]:
+    """Sentences on types and units of sensors that are a guess, by the rate or by the name of a channel.
+
+    Args:
+        answers: all of them.
+        channels: those whose unit neither the device nor a file states.
+        taken: see `Heard.guesses`.
+    """
+    by_rate, named = [], []
+    for channel in channels:
+        kind = answers.get(sensor_key(channel, "type"))
+        unit = answers.get(sensor_key(channel, "unit"))
+        if kind in {"accelerometer", "velocity"} and by_name(channel) is None:
+            if sensor_key(channel, "type") in taken:
+                by_rate.append(channel)
+        elif unit and unit == unit_by_name(channel) and sensor_key(channel, "unit") in taken:
+            named.append(f"{channel} ({unit})")
+    rate = (
+        f"{', '.join(by_rate)}: type and unit of the sensor are a guess by the rate; see the device's manual."
+    )
+    name = f"Units that are a guess by the names of channels: {', '.join(named)}. See the device's manual."
+    return [rate] * bool(by_rate) + [name] * bool(named)
+
+
+def seconds_of(answers: Answers) -> list[str]:
+    """Arguments of a sniffer that state how long it listens, where that was answered."""
+    seconds = answers.get("seconds")
+    return [] if seconds is None else ["--seconds", f"{seconds:g}"]
 
 
 def is_count(name: str) -> bool:

@@ -158,6 +158,21 @@ def number(text: str) -> float:
     return value
 
 
+AUTO = "auto"
+"""Answer that leaves a question to the program."""
+_LONGEST_S = 3600.0
+
+
+def seconds_or_auto(text: str) -> float | None:
+    """A time to listen; None for ``auto``."""
+    if text.lower() == AUTO:
+        return None
+    value = number(text)
+    if not 0 < value <= _LONGEST_S:
+        raise ValueError(f'"{text}": give a time above 0, up to {_LONGEST_S:g} s, or {AUTO}')
+    return value
+
+
 def rate_hz(text: str) -> float:
     """A sampling rate."""
     value = number(text)

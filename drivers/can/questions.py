@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from daqsvc.rounding import counted
 from drivers import packed_questions as packed
 from drivers import questions as q
-from drivers.bus_questions import BUS, BusQuestions, Heard, is_count
+from drivers.bus_questions import BUS, BusQuestions, Heard, is_count, seconds_of
 from drivers.can.sniff import STATE, CanSniffer, number_of, numbered, of_one_channel
 from drivers.questions import NONE, Answers, Question, Topic
 from drivers.sniffing import (
@@ -86,20 +86,20 @@ class _CanQuestions(BusQuestions):
         self, answers: Answers, folder: Path, stop: threading.Event, tell: Callable[[str], None]
     ) -> Heard:
         """See `BusQuestions.listen`."""
-        words = ["--interface", answers["interface"], "--seconds", f"{_LISTEN_S:g}"]
+        words = ["--interface", answers["interface"], *seconds_of(answers)]
         if "dbc" in answers:
             words += ["--dbc", f"{folder / answers['dbc']}"]
         line = ["--", answers["channel"]]
         try:
             # An interface of the kernel takes CAN FD frames anyway.
             fd = ["--fd"] if answers["interface"] != "socketcan" else []
-            found = sniffed(CanSniffer(), [*words, *fd, *line], stop, tell)
+            found = sniffed(CanSniffer(_LISTEN_S), [*words, *fd, *line], stop, tell)
         except NothingFoundError:
             raise
         except SniffError:
             if answers["interface"] == "socketcan":
                 raise
-            found = sniffed(CanSniffer(), [*words, *line], stop, tell)
+            found = sniffed(CanSniffer(_LISTEN_S), [*words, *line], stop, tell)
         return Heard(
             list(_in_words(found)),
             lambda so_far: self._proposals(found, so_far),

@@ -38,6 +38,9 @@ if TYPE_CHECKING:
 
 SECONDS = 5.0
 LONGEST_SECONDS = 3600.0
+LONGER_S = 20.0
+"""For which it goes on by itself where frames come, and too few to judge their rates."""
+_FEW = 3
 TYPICAL_BITRATE = 500_000
 _POLL_S = 0.1
 _SHOWN_BYTES = 16
@@ -48,7 +51,11 @@ _IP_S = 2.0
 
 
 class CanSniffer(Sniffer):
-    """See `drivers.sniffing.Sniffer`."""
+    """See `drivers.sniffing.Sniffer`.
+
+    Args:
+        seconds: time to listen, unless it is stated by ``--seconds``.
+    """
 
     help = "listen to a CAN bus: ids, rates, bytes that change, values with a DBC file"
     description = (
@@ -57,6 +64,9 @@ class CanSniffer(Sniffer):
         "Nothing is sent."
     )
 
+    def __init__(self, seconds: float = SECONDS) -> None:
+        self._seconds = seconds
+
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `drivers.sniffing.Sniffer.add_arguments`."""
         parser.add_argument("channel", metavar="INTERFACE", help="CAN interface, e.g. can0")
@@ -64,9 +74,9 @@ class CanSniffer(Sniffer):
         parser.add_argument(
             "--seconds",
             type=float,
-            default=SECONDS,
             metavar="S",
-            help=f"time to listen, in s (default: {SECONDS:g})",
+            help=f"time to listen, in s (default: {SECONDS:g}, and up to {LONGER_S:g} more if few frames "
+            "come)",
         )
         parser.add_argument(
             "--fd",
@@ -101,18 +111,26 @@ class CanSniffer(Sniffer):
 
         facts = _kernel_facts(arguments.channel) if arguments.interface == "socketcan" else _NO_FACTS
         bus = _bus(arguments, facts)
-        if not 0 < arguments.seconds <= LONGEST_SECONDS:
+        seconds = self._seconds if arguments.seconds is None else arguments.seconds
+        if not 0 < seconds <= LONGEST_SECONDS:
             raise SniffError(
-                f"--seconds {arguments.seconds:g}: give a time above 0, up to {LONGEST_SECONDS:g} s",
+                f"--seconds {seconds:g}: give a time above 0, up to {LONGEST_SECONDS:g} s",
                 usage=True,
             )
         dbc = None if arguments.dbc is None else _dbc(arguments.dbc)
         source = _opened(bus, SystemClock())
         traffic = Traffic()
-        tell(f"listening to {bus.channel} for {arguments.seconds:g} s; Ctrl-C ends it early")
+        tell(f"listening to {bus.channel} for {seconds:g} s; Ctrl-C ends it early")
         begin_s = time.monotonic()
         try:
-            lost = _listen(source, traffic, dbc, stop, begin_s + arguments.seconds)
+            lost = _listen(source, traffic, dbc, stop, begin_s + seconds)
+            if arguments.seconds is None and not lost and not stop.is_set() and _are_few(traffic):
+                tell(
+                    f"too few frames came in {seconds:g} s to judge their rates: listening for up to "
+                    f"{LONGER_S:g} s more; --seconds sets the time"
+                )
+                until_s = time.monotonic() + LONGER_S
+                lost = _listen(source, traffic, dbc, stop, until_s, until=lambda: not _are_few(traffic))
         finally:
             source.close()
         return _Report(bus, traffic, dbc, arguments.dbc, time.monotonic() - begin_s, lost).sniffed()
@@ -265,14 +283,19 @@ def _set_up(channel: str, bitrate: int | None = None) -> str:
 
 
 def _listen(
-    source: CanSource, traffic: Traffic, dbc: DbcTraffic | None, stop: threading.Event, until_s: float
+    source: CanSource,
+    traffic: Traffic,
+    dbc: DbcTraffic | None,
+    stop: threading.Event,
+    until_s: float,
+    until: Callable[[], bool] = lambda: False,
 ) -> str:
     """Take in frames until it is time, or the bus is lost; returns why it was lost, else nothing."""
     from drivers.can.batches import BusOffError  # noqa: PLC0415 - only for who listens
     from drivers.can.errors import BUS_OFF_REASON  # noqa: PLC0415
     from drivers.reconnect import words  # noqa: PLC0415
 
-    while not stop.is_set() and (left_s := until_s - time.monotonic()) > 0:
+    while not stop.is_set() and not until() and (left_s := until_s - time.monotonic()) > 0:
         try:
             batch = source.read(min(left_s, _POLL_S))
         except BusOffError:
@@ -285,6 +308,11 @@ def _listen(
         if len(batch.ids):
             source.gather(stop)
     return ""
+
+
+def _are_few(traffic: Traffic) -> bool:
+    """Whether frames came, and none often enough to tell its rate."""
+    return bool(traffic.ids) and all(one.frames < _FEW for one in traffic.ids.values())
 
 
 class _Report(NamedTuple):

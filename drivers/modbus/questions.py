@@ -9,7 +9,15 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from drivers import questions as q
-from drivers.bus_questions import BUS, BusQuestions, Heard, only_port, unit_by_name
+from drivers.bus_questions import (
+    BUS,
+    BusQuestions,
+    Heard,
+    guessed_sensors,
+    only_port,
+    seconds_of,
+    unit_by_name,
+)
 from drivers.modbus.sniff import LAST_REGISTER, ModbusSniffer, registers_of, units_of
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
 from drivers.sniffing import WAVEFORM_HZ, NothingFoundError, SniffError, sniffed
@@ -125,7 +133,8 @@ class _ModbusQuestions(BusQuestions):
         del folder
         chosen: str = answers["units"]
         registers = [] if answers["registers"] == _AUTO else ["--registers", answers["registers"]]
-        words = ["--timeout-ms", f"{answers['timeout-ms']:g}", *registers, *self._sniffed_as(answers)]
+        timeout = ["--timeout-ms", f"{answers['timeout-ms']:g}"]
+        words = [*timeout, *seconds_of(answers), *registers, *self._sniffed_as(answers)]
         try:
             first = _UNITS[0] if chosen == _AUTO else chosen
             found = sniffed(ModbusSniffer(), ["--units", first, *words], stop, tell)
@@ -691,6 +700,7 @@ def _guesses(found: Mapping[str, Any], answers: Answers, taken: Collection[str])
         return ()
     guessed = [name for name in answers["channels"] if sensor_key(name, "register-type") in taken]
     notes = [_guessed_words(answers, guessed, taken)] * bool(guessed)
+    notes += guessed_sensors(answers, answers["channels"], taken)
     table = _table_read(found, answers)
     if table is None:
         return notes

@@ -35,6 +35,8 @@ QUIET_S = 0.1
 """Silence on a serial line after a request without reply, which may still come."""
 ROUNDS, ROUND_S = 5, 0.3
 """Readings of the registers that are there, and the pause before each further one."""
+MOST_ROUNDS, STOP_S = 60, 0.2
+"""The same where a time is given, and how often it is seen to whether the person has enough."""
 READ_ON = 800
 """Registers that are read beyond those asked for, as long as there are any."""
 TELL_S = 5.0
@@ -202,6 +204,7 @@ class Scan:
         *,
         until_found: bool = False,
         read_on: bool = False,
+        seconds: float | None = None,
     ) -> None:
         """Find units, read their registers, and read those that are there again and again.
 
@@ -212,6 +215,7 @@ class Scan:
             end: last one.
             until_found: whether no further function is tried on a unit that has registers.
             read_on: whether registers behind the last one are read, too, if that one is there.
+            seconds: for which they are read again and again; None for a few times.
 
         Raises:
             LineLostError: the line cannot be opened.
@@ -229,7 +233,7 @@ class Scan:
                     if until_found and (table.first or self.stop.is_set()):
                         break
             if any(table.first for table in self.tables):
-                await self._read_again()
+                await self._read_again(seconds)
         except LineLostError as error:
             self.lost = f"{error}"
         finally:
@@ -392,15 +396,36 @@ class Scan:
             except NoReplyError:
                 return
 
-    async def _read_again(self) -> None:
+    async def _read_again(self, seconds: float | None) -> None:
         """What is there, so often that what moves is seen to, also if the device measures once a second."""
-        for _ in range(ROUNDS - 1):
+        rounds, pause_s = ROUNDS - 1, ROUND_S
+        if seconds is not None:
+            rounds = max(1, min(MOST_ROUNDS, math.ceil(seconds / ROUND_S) if ROUND_S else MOST_ROUNDS))
+            pause_s = seconds / rounds
+            self.tell(f"reading what is there again and again for {seconds:g} s; Ctrl-C ends it early")
+        begin_s = self.clock.monotonic_ns() / NS_PER_S
+        for number in range(1, rounds + 1):
+            await self._pause(begin_s + number * pause_s if seconds else None)
             if self.stop.is_set():
                 return
-            await asyncio.sleep(ROUND_S)
             for table in self.tables:
                 table.again.append({})
                 await self._read_round(table, table.again[-1])
+            if seconds and self.clock.monotonic_ns() / NS_PER_S >= begin_s + seconds:
+                return
+
+    async def _pause(self, until_s: float | None) -> None:
+        """Before a round: as always, or until a time."""
+        if until_s is None:
+            if not self.stop.is_set():
+                await asyncio.sleep(ROUND_S)
+            return
+        left_s = max(0.0, until_s - self.clock.monotonic_ns() / NS_PER_S)
+        parts = max(1, math.ceil(left_s / STOP_S))
+        for _ in range(parts):
+            if self.stop.is_set():
+                return
+            await asyncio.sleep(left_s / parts)
 
     async def _read_round(self, table: FoundTable, again: dict[int, int]) -> None:
         most = table.max_count or BLOCK

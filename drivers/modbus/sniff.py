@@ -22,6 +22,7 @@ REGISTERS = "0-200"
 _AUTO = "auto"
 _FUNCTIONS = {_AUTO: (3, 4), "3": (3,), "4": (4,), "both": (3, 4)}
 LAST_REGISTER = 65_535
+LONGEST_SECONDS = 3600.0
 _LONG_MANUALS_FIRST = (300_001, 400_001)
 """What manuals with six digits call the first input register and the first holding register."""
 _INPUT = (30_001, 300_001)
@@ -76,6 +77,12 @@ class ModbusSniffer(Sniffer):
             help="pause before each request, in ms (default: 20)",
         )
         parser.add_argument(
+            "--seconds",
+            type=float,
+            metavar="S",
+            help="time for which the registers are read again and again, in s (default: five times in all)",
+        )
+        parser.add_argument(
             "--baud",
             type=int,
             default=19_200,
@@ -109,6 +116,9 @@ class ModbusSniffer(Sniffer):
             raise SniffError(note, usage=True)
         if not 0 <= arguments.pause_ms <= 10_000:
             raise SniffError(f"--pause-ms {arguments.pause_ms:g}: give 0 to 10000 ms", usage=True)
+        if arguments.seconds is not None and not 0 < arguments.seconds <= LONGEST_SECONDS:
+            wrong = f"--seconds {arguments.seconds:g}: give a time above 0, up to {LONGEST_SECONDS:g} s"
+            raise SniffError(wrong, usage=True)
         bus = _bus(arguments)
         functions = _FUNCTIONS[arguments.function]
         scan = Scan(bus, SystemClock(), stop, arguments.pause_ms / 1000, tell)
@@ -125,6 +135,7 @@ class ModbusSniffer(Sniffer):
                 end,
                 until_found=arguments.function == _AUTO,
                 read_on=arguments.registers is None,
+                seconds=arguments.seconds,
             )
             asyncio.run(scanning)
         except LineLostError as error:

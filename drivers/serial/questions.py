@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from daqsvc.rounding import counted
 from drivers import packed_questions as packed
 from drivers import questions as q
-from drivers.bus_questions import BUS, BusQuestions, Heard, only_port
+from drivers.bus_questions import BEFOREHAND, BUS, BusQuestions, Heard, guessed_sensors, only_port, seconds_of
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
 from drivers.serial.sniff import (
     ANY_BAUD,
@@ -29,7 +29,7 @@ from drivers.toml_lines import array, entry
 
 if TYPE_CHECKING:
     import threading
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
     from pathlib import Path
 
 _CHARACTERS = {
@@ -127,13 +127,16 @@ class SerialQuestions(BusQuestions):
     ) -> Heard:
         """See `BusQuestions.listen`."""
         del folder
-        found = sniffed(SerialSniffer(), ["--seconds", f"{_LISTEN_S:g}", "--", answers["port"]], stop, tell)
+        baud = answers.get(BEFOREHAND, {}).get("baud", "")
+        words = [*(["--baud", baud] if baud.isdecimal() else []), *seconds_of(answers)]
+        found = sniffed(SerialSniffer(_LISTEN_S), [*words, "--", answers["port"]], stop, tell)
         return Heard(
             list(_in_words(found)),
             lambda so_far: _proposals(found, so_far),
             _missed(found),
             notes=lambda so_far, _: [f"baud = {so_far['baud']} is {ANY_BAUD}."] * found["any_baud"],
             not_read=lambda so_far: "\n".join(_not_read(found, so_far)),
+            guesses=lambda so_far, taken: _guesses(so_far, self.channels(so_far), taken),
         )
 
     def questions(self, answers: Answers, folder: Path) -> Iterator[Question]:
@@ -387,6 +390,26 @@ def _not_read(found: Mapping[str, Any], answers: Answers) -> Iterator[str]:
             yield absent_words(name, one["absent"], heard, one["absent_text"])
     if texts:
         yield no_number_words(texts)
+
+
+def _guesses(answers: Answers, channels: Sequence[str], taken: Collection[str]) -> list[str]:
+    """See `Heard.guesses`."""
+    notes = []
+    if answers["framing"] != "lines":
+        if {"channels", "raw-type", "byte-order", "scale"} & set(taken):
+            notes.append(
+                "What is behind the counter of a frame is a guess: channels, type, byte order and scale. "
+                "See the device's manual."
+            )
+        return [*notes, *guessed_sensors(answers, channels, taken)]
+    counter = answers["counter"]
+    if counter is not None and "counter" in taken:
+        what = (
+            "counts lines" if answers["counts"] == "count" else f"is the device's time in {answers['counts']}"
+        )
+        notes.append(f"That {counter} {what} is a guess by the lines that came: see the device's manual.")
+    unstated = [name for name in channels if answers.get(sensor_key(name, "suffix")) is None]
+    return [*notes, *guessed_sensors(answers, unstated, taken)]
 
 
 def _missed(found: Mapping[str, Any]) -> str:

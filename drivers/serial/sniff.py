@@ -7,6 +7,7 @@ import os
 import select
 import textwrap
 import time
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -42,6 +43,10 @@ TRY_BYTES = 512
 """Bytes that are enough to judge a rate."""
 SECONDS = 5.0
 LONGEST_SECONDS = 3600.0
+LONGER_S = 20.0
+"""For which it goes on by itself where something comes, and too little to judge."""
+LITTLE_BYTES, _LITTLE_LINES = 256, 10
+"""Bytes and lines from which on it is enough."""
 MOST_KEPT = 1 << 20
 """Bytes that are kept of what comes."""
 _POLL_MS = 100
@@ -93,7 +98,11 @@ class Tried(NamedTuple):
 
 
 class SerialSniffer(Sniffer):
-    """See `drivers.sniffing.Sniffer`."""
+    """See `drivers.sniffing.Sniffer`.
+
+    Args:
+        seconds: time to listen, unless it is stated by ``--seconds``.
+    """
 
     help = "listen to a serial port: baud rate, first bytes, columns of lines or frames"
     description = (
@@ -101,6 +110,9 @@ class SerialSniffer(Sniffer):
         "they are lines of text or binary frames. Also print columns, sync word, length, CRC and "
         "counter. Nothing is sent."
     )
+
+    def __init__(self, seconds: float = SECONDS) -> None:
+        self._seconds = seconds
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `drivers.sniffing.Sniffer.add_arguments`."""
@@ -111,17 +123,18 @@ class SerialSniffer(Sniffer):
         parser.add_argument(
             "--seconds",
             type=float,
-            default=SECONDS,
             metavar="S",
-            help=f"time to listen, in s, after the baud rate is found (default: {SECONDS:g})",
+            help=f"time to listen, in s, after the baud rate is found (default: {SECONDS:g}, and up to "
+            f"{LONGER_S:g} more if little comes)",
         )
 
     def sniff(
         self, arguments: argparse.Namespace, stop: threading.Event, tell: Callable[[str], None]
     ) -> Sniffed:
         """See `drivers.sniffing.Sniffer.sniff`."""
-        if not 0 < arguments.seconds <= LONGEST_SECONDS:
-            wrong = f"--seconds {arguments.seconds:g}: give a time above 0, up to {LONGEST_SECONDS:g} s"
+        seconds = self._seconds if arguments.seconds is None else arguments.seconds
+        if not 0 < seconds <= LONGEST_SECONDS:
+            wrong = f"--seconds {seconds:g}: give a time above 0, up to {LONGEST_SECONDS:g} s"
             raise SniffError(wrong, usage=True)
         if arguments.baud is not None and not 50 <= arguments.baud <= 12_000_000:
             wrong = f"--baud {arguments.baud}: give a rate from 50 to 12000000 bit/s"
@@ -132,8 +145,12 @@ class SerialSniffer(Sniffer):
         silent = best is not None and not any(one.heard.received for one in tried)
         if (best is None or not (silent or best.heard.lost)) and not stop.is_set():
             baud, parity = (bauds[0], "none") if best is None else (best.baud, best.parity)
-            tell(f"listening to {arguments.port} at {baud} bit/s for {arguments.seconds:g} s; Ctrl-C ends it")
-            best = _try(arguments.port, baud, parity, arguments.seconds, MOST_KEPT, stop)
+            tell(f"listening to {arguments.port} at {baud} bit/s for {seconds:g} s; Ctrl-C ends it")
+            longer = None
+            if arguments.seconds is None:
+                came = any(one.heard.received for one in tried)
+                longer = partial(_go_on, arguments.port, seconds, tell, came=came)
+            best = _try(arguments.port, baud, parity, seconds, MOST_KEPT, stop, longer)
         if best is None:
             raise SniffError(f"{arguments.port}: it was ended before a byte came")
         return _Report(arguments.port, tried, best, arguments.baud is not None).sniffed()
@@ -167,7 +184,32 @@ def _alike(tried: Sequence[Tried]) -> bool:
     return len(tried) > 1 and all(one.found.sure for one in tried)
 
 
-def _try(port: str, baud: int, parity: str, seconds: float, enough: int, stop: threading.Event) -> Tried:
+def _go_on(port: str, seconds: float, tell: Callable[[str], None], data: bytes, *, came: bool) -> bool:
+    """Whether to listen longer, as something comes and it is too little to judge; it then states that."""
+    if not (data or came) or not _is_little(data):
+        return False
+    tell(
+        f"{counted(len(data), 'byte')} came from {port} in {seconds:g} s, which is little to judge by: "
+        f"listening for up to {LONGER_S:g} s more; --seconds sets the time"
+    )
+    return True
+
+
+def _is_little(data: bytes) -> bool:
+    """Whether it is less than some lines or frames."""
+    ends = max(data.count(b"\n"), data.count(b"\r"))
+    return len(data) < LITTLE_BYTES and ends < _LITTLE_LINES
+
+
+def _try(
+    port: str,
+    baud: int,
+    parity: str,
+    seconds: float,
+    enough: int,
+    stop: threading.Event,
+    longer: Callable[[bytes], bool] | None = None,
+) -> Tried:
     """Listen at one rate.
 
     Raises:
@@ -176,7 +218,7 @@ def _try(port: str, baud: int, parity: str, seconds: float, enough: int, stop: t
     from drivers.serial.recognise import recognised  # noqa: PLC0415 - only for who listens
 
     with _opened(port, baud, parity) as device:
-        heard = _listen(device.fileno(), seconds, enough, stop)
+        heard = _listen(device.fileno(), seconds, enough, stop, longer)
     return Tried(baud, parity, heard, recognised(heard.data, heard.errors))
 
 
@@ -212,8 +254,17 @@ def serial_ports() -> list[str]:
         return []
 
 
-def _listen(descriptor: int, seconds: float, enough: int, stop: threading.Event) -> Heard:
-    """Take what comes, until it is time, there is enough, or the port is lost."""
+def _listen(
+    descriptor: int,
+    seconds: float,
+    enough: int,
+    stop: threading.Event,
+    longer: Callable[[bytes], bool] | None = None,
+) -> Heard:
+    """Take what comes, until it is time, there is enough, or the port is lost.
+
+    Where too little came by then, ``longer`` states whether to go on for a while.
+    """
     from drivers.serial.reader import line_errors  # noqa: PLC0415 - only for who listens
 
     poll = select.poll()
@@ -223,7 +274,14 @@ def _listen(descriptor: int, seconds: float, enough: int, stop: threading.Event)
     count, waiting, lost = 0, 0, ""
     first_s = last_s = begin_s = time.monotonic()
     whole = enough >= MOST_KEPT
-    while not stop.is_set() and time.monotonic() < begin_s + seconds and (whole or count < enough):
+    until_s, is_longer = begin_s + seconds, False
+    while not stop.is_set() and (whole or count < enough):
+        if is_longer and not _is_little(bytes(data)):
+            break
+        if time.monotonic() >= until_s:
+            if is_longer or longer is None or not longer(bytes(data)):
+                break
+            until_s, is_longer = until_s + LONGER_S, True
         if not poll.poll(_POLL_MS):
             continue
         try:

@@ -421,6 +421,14 @@ def test_answers_of_a_file_are_those_of_the_options(tmp_path, capsys):
             "--registers 4000-4100 is for --listen only; add --listen, or leave it out [C22]",
         ),
         (
+            ["--yes", "--bus=serial", "--port=/dev/ttyS0", "--seconds=10"],
+            "--seconds 10 is for --listen only; add --listen, or leave it out [C22]",
+        ),
+        (
+            ["--yes", "--listen", "--bus=serial", "--port=/dev/ttyS0", "--seconds=0"],
+            '--seconds 0: "0": give a time above 0, up to 3600 s, or auto [C22]',
+        ),
+        (
             ["--yes", "--listen", "--bus=serial", "--registers=4000-4100"],
             "--registers is not asked for with these answers; it needs --bus modbus-tcp or modbus-rtu [C22]",
         ),

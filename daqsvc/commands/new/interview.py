@@ -12,7 +12,7 @@ from daqsvc.commands.new.sensors import CLASSES, why_no_bearing
 from daqsvc.commands.new.topics import TOPICS
 from daqsvc.errors.command_line import ANSWER
 from drivers import questions as q
-from drivers.bus_questions import SHARED
+from drivers.bus_questions import BEFOREHAND, SHARED
 from drivers.questions import SENSOR, Answers, Question
 from drivers.sniffing import NothingFoundError
 
@@ -258,7 +258,7 @@ class _Interview:
         if key == "bus" and not bus.listens_behind:
             self._say("--listen is left out: on a bus of this kind there is nothing to listen to")
         if key == bus.listens_behind:
-            self._heard = listen(bus, self.answers)
+            self._heard = listen(bus, self.answers | {BEFOREHAND: self._given.texts})
             self._has_listened = True
             if self._heard is not None and self._heard.missed:
                 if self._ask is None:
@@ -397,7 +397,7 @@ def _missing(question: Question) -> str:
 
 def _refuse_for_listening(given: Given) -> None:
     """What tells where to look is of no use to who does not look."""
-    for key in {key for bus in buses().values() for key in bus.for_listening}:
+    for key in {"seconds", *(key for bus in buses().values() for key in bus.for_listening)}:
         if key in given.texts:
             raise AnswerError(
                 f"{given_as(key, given.texts[key])} is for --listen only; add --listen, or leave it out"

@@ -44,6 +44,7 @@ def questions(answers: Answers, folder: Path) -> Iterator[Question]:
     yield Question("name", TOPICS["name"], q.title, "rig" if virtual else "machine")
     yield Question("site", TOPICS["site"], q.name, "plant", quiet=True)
     yield Question("box", TOPICS["box"], q.name, "edge-1", quiet=True)
+    yield Question("seconds", TOPICS["seconds"], q.seconds_or_auto, q.AUTO, quiet=True)
     yield from bus.questions(answers, folder)
     yield Question("speed", TOPICS["speed"], q.speed_rpm, "600" if virtual else "1480", quiet=virtual)
     yield Question("rate", TOPICS["rate"], q.rate_hz, f"{bus.rate_hz(answers):g}", quiet=virtual)

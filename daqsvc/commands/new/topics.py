@@ -17,6 +17,11 @@ _TOPICS_BEFORE = {
     ),
     "site": Topic("Name of the site", "It is part of every topic and message."),
     "box": Topic("Name of this computer in topics", "It is part of every topic and message."),
+    "seconds": Topic(
+        "How long does --listen listen, in s?",
+        "auto: some seconds, and longer if too little comes to judge. A device that sends once a second or "
+        "less needs e.g. 20. Of Modbus registers: how long they are read again and again.",
+    ),
 }
 """Before what is asked about the bus."""
 

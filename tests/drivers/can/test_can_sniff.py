@@ -25,6 +25,7 @@ from daqsvc.commands.new.interview import Given, conduct
 from drivers.can import questions, sniff, socketcan
 from drivers.can.dbc import messages_of
 from drivers.can.dbc_traffic import SignalTraffic
+from drivers.sniffing import sniffed
 from sim_hw.bus_socket import UnixBus
 from sim_hw.bus_socket_hub import Hub
 
@@ -499,6 +500,25 @@ def not_written(tmp_path: Path, *more: str) -> int:
     code = main(["new", f"{file}", "--yes", *words])
     assert not file.exists()
     return code
+
+
+@pytest.mark.usefixtures("hub")
+def test_a_bus_with_few_frames_is_listened_to_longer(tmp_path: Path) -> None:
+    def rare(bus: UnixBus, number: int) -> None:
+        if number % 60 == 0:
+            accelerations(bus, number)
+
+    told: list[str] = []
+    where = ["--interface", "unixbus", "--fd", f"{tmp_path / 'bus'}"]
+    with talking(tmp_path / "bus", rare):
+        longer = sniffed(sniff.CanSniffer(0.5), where, threading.Event(), told.append)
+        sniffed(sniff.CanSniffer(0.5), [*where, "--seconds", "0.5"], threading.Event(), told.append)
+    assert min(one["frames"] for one in longer["ids"]) >= 2
+    assert [line.partition(" for up to")[0] for line in told] == [
+        f"listening to {tmp_path / 'bus'} for 0.5 s; Ctrl-C ends it early",
+        "too few frames came in 0.5 s to judge their rates: listening",
+        f"listening to {tmp_path / 'bus'} for 0.5 s; Ctrl-C ends it early",
+    ]
 
 
 @pytest.mark.long

@@ -11,6 +11,7 @@ import struct
 import subprocess
 import sys
 import threading
+import time
 import tomllib
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -765,6 +766,22 @@ def test_two_registers_that_may_be_one_float_are_not_halves_without_a_word(
     assert shown.count("Registers 20 and 21 may be one 32-bit number") == 2  # and in the proposal
     [table] = figures(capsys)["tables"]
     assert [(one["address"], one["order"]) for one in table["undecided"]] == [(20, "CDAB")]
+
+
+def test_registers_are_read_again_for_as_long_as_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scan, "ROUND_S", 0.1)
+    unit = pump()
+    with tcp({1: unit}) as target:
+        begin_s = time.monotonic()
+        new(tmp_path, target, "--unit=1", "--registers=40-41", "--seconds=1")
+        took_s = time.monotonic() - begin_s
+        rounds = sum(struct.unpack(">H", pdu[3:5]) == (2,) for pdu in unit.asked)
+        assert main(words(target, "--seconds", "-1")) == 2
+    assert "reading what is there again and again for 1 s; Ctrl-C ends it early" in capsys.readouterr().out
+    assert took_s >= 1.0
+    assert rounds > scan.ROUNDS
 
 
 def test_zeros_beside_floats_may_be_floats_of_a_machine_at_rest(

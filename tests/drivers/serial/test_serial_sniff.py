@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 import tomllib
 from typing import TYPE_CHECKING, Any
 
@@ -376,10 +377,60 @@ def test_too_few_bytes_are_no_verdict(cable: PseudoTerminal, capsys: pytest.Capt
     )
 
 
+def slow(number: int) -> bytes:
+    """A few lines a second."""
+    time.sleep(0.15)
+    return b"%d.25\r\n" % (20 + number % 7)
+
+
+def test_a_device_that_sends_little_is_listened_to_longer(
+    cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 0.4)
+    with talking(cable, slow):
+        layout = new(cable, tmp_path / "new.toml", "--baud=9600")["streams"]["device"]["layout"]
+        told = capsys.readouterr().out
+        assert main(["sniff", "serial", f"{cable.path}", "--seconds", "0.4", "--baud", "9600"]) == 1
+        short = capsys.readouterr().err
+    assert layout["no_counter"] is True
+    assert "trying" not in told  # the rate was given
+    assert "in 0.4 s, which is little to judge by: listening for up to 20 s more; --seconds sets" in told
+    assert "more; --seconds" not in short
+
+
+def test_new_listens_as_long_as_it_is_told(
+    cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 60.0)
+    with talking(cable, line):
+        new(cable, tmp_path / "new.toml", "--baud=115200", "--seconds=0.5")
+    told = capsys.readouterr().out
+    assert f"listening to {cable.path} at 115200 bit/s for 0.5 s" in told
+    note = "That c1 counts lines is a guess by the lines that came: see the device's manual."
+    assert f"\n{note}\n" in told
+    assert f"# {note}\n" in (tmp_path / "new.toml").read_text("utf-8")
+
+
+def test_what_new_takes_by_rate_or_name_is_called_a_guess(
+    cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 0.5)
+    names = ["--baud=115200", "--columns=n, x, temp, z", "--rate=200"]
+    with talking(cable, line):
+        new(cable, tmp_path / "new.toml", *names)
+        told = capsys.readouterr().out
+        names += ["--sensor=x.type=trend", "--sensor=z.type=none", "--counter=n"]
+        new(cable, tmp_path / "given.toml", *names)
+    given = capsys.readouterr().out
+    assert "x, z: type and unit of the sensor are a guess by the rate; see the device's manual." in told
+    assert "Units that are a guess by the names of channels: temp (degC). See the device's" in told
+    assert "guess by the rate" not in given
+    assert "counts lines is a guess" not in given
+
+
 def test_a_column_of_time_and_a_header_are_used(
     cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    import time
 
     begin_s = time.monotonic()
     opened_s: list[float] = []
