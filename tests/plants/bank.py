@@ -69,6 +69,7 @@ class BankSaid:
         delay: revolutions from the change to the departure; None if there was none.
         told_delay: the same of a test that is told when the change comes.
         onset_error: revolutions that the stated onset is late.
+        predicted: whether the bank predicts that it names every level of the fault alone.
     """
 
     case: str
@@ -81,6 +82,7 @@ class BankSaid:
     delay: float | None
     told_delay: float | None
     onset_error: float | None
+    predicted: bool
 
     @property
     def right(self) -> bool:
@@ -158,6 +160,7 @@ def judge_bank(folder: Path, seed: int, job: tuple[Case, int]) -> BankSaid:
         calibrate_revolutions=40,
         rules=_RULES,
     )
+    predicted = detector.predicted_groups()
     alarms, delay, onset, before, end = 0, None, None, "", None
     for begin in range(0, len(samples), detector.block):
         for said in detector.process(window_of(samples[begin : begin + detector.block], begin, rate_hz)):
@@ -183,6 +186,9 @@ def judge_bank(folder: Path, seed: int, job: tuple[Case, int]) -> BankSaid:
         delay=delay,
         told_delay=_told_delay(detector, z, angle, fault),
         onset_error=onset,
+        predicted=all(
+            stated == (fault,) for mode, stated in predicted.items() if mode.rsplit(" ", 1)[0] == fault
+        ),
     )
 
 
@@ -214,13 +220,21 @@ def _told_delay(
 
 def bank_summary(said: Sequence[BankSaid]) -> list[str]:
     """One row for every ratio."""
-    lines = [
-        "| SNR | right | told | wrong | not seen | healthy right | false alarms | onset off | delay ratio |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
+    columns = (
+        "SNR",
+        "right",
+        "right of predicted",
+        "told",
+        "wrong",
+        "not seen",
+        "healthy right",
+        "false alarms",
+    )
+    lines = [f"| {' | '.join(columns)} | onset off | delay ratio |", "|---" * (len(columns) + 2) + "|"]
     for snr in SNR_DB:
         at = [one for one in said if one.snr_db == snr]
         faults = [one for one in at if one.fault != "healthy"]
+        predicted = [one for one in faults if one.predicted]
         healthy = [one for one in at if one.fault == "healthy"]
         both = [one.delay / one.told_delay for one in faults if one.delay and one.told_delay]
         off = [abs(one.onset_error) for one in faults if one.onset_error is not None]
@@ -229,7 +243,9 @@ def bank_summary(said: Sequence[BankSaid]) -> list[str]:
             return f"{100.0 * sum(map(of, runs)) / len(runs):.1f} %"
 
         lines.append(
-            f"| {snr} dB | {share(lambda one: one.right, faults)} | {share(lambda one: one.told, faults)} | "
+            f"| {snr} dB | {share(lambda one: one.right, faults)} | "
+            f"{share(lambda one: one.right, predicted)} of {len(predicted)} | "
+            f"{share(lambda one: one.told, faults)} | "
             f"{share(lambda one: one.wrong, faults)} of {len(faults)} | "
             f"{share(lambda one: one.delay is None, faults)} | {share(lambda one: one.right, healthy)} | "
             f"{sum(one.false_alarms for one in at)} in {ONSET_REV * len(at)} revolutions | "

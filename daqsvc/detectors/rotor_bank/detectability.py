@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, TypedDict
 from daqsvc.rotor.detectability.prediction import detectability
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping, Sequence
 
     from daqsvc.detectors.rotor_bank.detector import RotorBankDetector
     from daqsvc.detectors.rotor_bank.settings import RotorBank
@@ -112,6 +112,18 @@ class SmallestChangeJson(TypedDict):
     by_vector: float | None
 
 
+class GroupJson(TypedDict):
+    """What the bank would state of a mode that it cannot name alone.
+
+    Attributes:
+        mode: name of the mode.
+        faults: its fault, and those that the bank would not tell from it.
+    """
+
+    mode: str
+    faults: list[str]
+
+
 class BankDetectabilityJson(TypedDict):
     """What the bank can tell apart.
 
@@ -125,6 +137,8 @@ class BankDetectabilityJson(TypedDict):
         modes: names of the modes, the healthiest first.
         pairs: every ordered pair of modes.
         ambiguous: modes that look the same at this speed.
+        groups: modes of a bank from a run-up that are stated together with other faults, although their
+            observers differ: a model that is nearly right moves as these do.
         smallest_change: the smallest visible change of each kind.
         within_rev: revolutions that `by_bank` is for.
         calibration_rev: revolutions that the baseline of the synchronous vector is taken from.
@@ -140,22 +154,26 @@ class BankDetectabilityJson(TypedDict):
     modes: list[str]
     pairs: list[PairJson]
     ambiguous: list[AmbiguityJson]
+    groups: list[GroupJson]
     smallest_change: list[SmallestChangeJson]
     within_rev: float
     calibration_rev: float
     touching: list[str]
 
 
-def as_json(prediction: BankDetectability, machine: MachineFile) -> BankDetectabilityJson:
+def as_json(
+    prediction: BankDetectability, machine: str, detector: RotorBankDetector
+) -> BankDetectabilityJson:
     """The figures in the units of the machine file; what is never reached is null.
 
     Args:
         prediction: the figures.
-        machine: the machine file that they are for.
+        machine: name of the machine that they are for.
+        detector: its bank.
     """
-    units = _Units(machine)
+    units = _Units(detector)
     return {
-        "machine": machine.machine.name,
+        "machine": machine,
         "speed_rpm": units.rpm(prediction.w),
         "samples_per_rev": prediction.samples_per_rev,
         "noise_um": units.um(prediction.noise),
@@ -183,6 +201,11 @@ def as_json(prediction: BankDetectability, machine: MachineFile) -> BankDetectab
             }
             for ambiguity in prediction.ambiguities
         ],
+        "groups": [
+            {"mode": mode, "faults": list(faults)}
+            for mode, faults in detector.predicted_groups().items()
+            if len(faults) > 1
+        ],
         "smallest_change": [
             {
                 "fault": change.fault,
@@ -200,17 +223,18 @@ def as_json(prediction: BankDetectability, machine: MachineFile) -> BankDetectab
     }
 
 
-def as_text(prediction: BankDetectability, machine: MachineFile) -> str:
+def as_text(prediction: BankDetectability, machine: str, detector: RotorBankDetector) -> str:
     """Tables and sentences for a person.
 
     Args:
         prediction: the figures.
-        machine: the machine file that they are for.
+        machine: name of the machine that they are for.
+        detector: its bank.
     """
-    units = _Units(machine)
+    units = _Units(detector)
     thresholds = sorted({pair.threshold_nats for pair in prediction.pairs})
     head = (
-        f"{machine.machine.name} at {units.rpm(prediction.w):.6g} rpm: {len(prediction.modes)} modes, "
+        f"{machine} at {units.rpm(prediction.w):.6g} rpm: {len(prediction.modes)} modes, "
         f"{prediction.samples_per_rev:.4g} samples a revolution,\n"
         f"noise {units.um(prediction.noise):.3g} um, "
         f"the machine's own process noise {prediction.process_noise:.3g}; "
@@ -225,18 +249,16 @@ def as_text(prediction: BankDetectability, machine: MachineFile) -> str:
     ]
     if any(pair.simulated for pair in prediction.pairs):
         paragraphs[-1] += "\n* from simulated runs of the rub; everything else is computed"
-    paragraphs += [_smallest(prediction, units), "\n".join(_sentences(prediction, units))]
+    paragraphs += [_smallest(prediction, units), "\n".join(_sentences(prediction, units, detector))]
     return "\n\n".join(paragraphs)
 
 
 class _Units:
     """From normalised quantities back to those of a machine file."""
 
-    def __init__(self, machine: MachineFile) -> None:
-        rotor = machine.machine.rotor
-        assert rotor is not None  # noqa: S101 - settings/checks.py: a rotor bank needs [machine.rotor]
-        self._natural_frequency_hz = rotor.natural_frequency_hz
-        self._clearance_um = rotor.clearance_um
+    def __init__(self, detector: RotorBankDetector) -> None:
+        self._natural_frequency_hz = detector.natural_frequency_hz
+        self._clearance_um = detector.clearance_um
 
     def rpm(self, w: float) -> float:
         return 60.0 * w * self._natural_frequency_hz
@@ -286,7 +308,7 @@ def _smallest(prediction: BankDetectability, units: _Units) -> str:
     return "\n".join(rows)
 
 
-def _sentences(prediction: BankDetectability, units: _Units) -> list[str]:
+def _sentences(prediction: BankDetectability, units: _Units, detector: RotorBankDetector) -> list[str]:
     rpm = f"{units.rpm(prediction.w):.6g} rpm"
     sentences = [_ambiguity(prediction, ambiguity, rpm, units) for ambiguity in prediction.ambiguities]
     if not sentences:
@@ -295,6 +317,7 @@ def _sentences(prediction: BankDetectability, units: _Units) -> list[str]:
             f"All modes can be told apart at {rpm}; {closest.truth} and {closest.rival} are the closest, "
             f"{_figure(closest.nats_per_rev)} nats a revolution."
         )
+    sentences += _groups(detector.predicted_groups(), rpm)
     sentences += [
         f"The orbit of {name} reaches the housing, but its model has no contact: "
         "give the mode rub = true, or these figures do not hold for it."
@@ -322,6 +345,20 @@ def _ambiguity(prediction: BankDetectability, ambiguity: Ambiguity, rpm: str, un
         f"{sentence}; at {units.rpm(ambiguity.opens_at_w):.6g} rpm they differ by "
         f"{_figure(ambiguity.open_nats_per_rev)} nats a revolution."
     )
+
+
+def _groups(groups: Mapping[str, Sequence[str]], rpm: str) -> list[str]:
+    """Faults that stay together, and all modes of which they do; healthy has sentences of its own."""
+    together: dict[tuple[str, ...], list[str]] = {}
+    for mode, stated in groups.items():
+        faults = tuple(sorted({*stated} - {"normal"}))
+        if len(faults) > 1:
+            together.setdefault(faults, []).append(mode)
+    return [
+        f"{', '.join(modes)} would be called {' or '.join(faults)} at {rpm}: "
+        "these faults move a rotor of two modes in nearly the same way."
+        for faults, modes in together.items()
+    ]
 
 
 def _figure(value: float) -> str:

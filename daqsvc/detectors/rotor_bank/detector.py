@@ -25,7 +25,7 @@ from daqsvc.dsp.speed.keyphasor import KeyphasorProbe, KeyphasorTracker
 from daqsvc.rotor.adaptation import MODEL_ERROR, VARIANCE_FACTOR, SteadyFit, adapted
 from daqsvc.rotor.bank import UNDETERMINED, BankReport, ModelBank
 from daqsvc.rotor.decision import DecisionRules
-from daqsvc.rotor.misfit import SteadyMotions, hunting, misfit, steady_change
+from daqsvc.rotor.misfit import SteadyChange, SteadyMotions, hunting, misfit, steady_change
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -47,6 +47,8 @@ _RETUNE = 0.003
 """Relative change of speed that the reference orbits follow; smaller ones are jitter of the edges."""
 _SAME_SPEED = 0.02
 """Relative difference from the speed of the calibration up to which its motion is the healthy one."""
+_PREDICTED_REVOLUTIONS = 100.0
+"""Over which a steady motion is predicted: a change is there for as long, or longer."""
 _BLIND_REVOLUTIONS = 3.0
 """Time for which the angle is trusted without an edge."""
 
@@ -216,6 +218,11 @@ class RotorBankDetector:
     def duration(self) -> float:
         """Normalised time between samples."""
         return self._duration
+
+    @property
+    def natural_frequency_hz(self) -> float:
+        """Of the healthy rotor, the unit of speeds: that of the run-up where there is one."""
+        return self._duration * self._rate_hz / math.tau
 
     @property
     def rules(self) -> DecisionRules:
@@ -403,6 +410,40 @@ class RotorBankDetector:
         off.excluded[0] |= certain
         bank.exclude(off.excluded, off.pairs)
         self._misfit = float(off.part[bank.decision])
+
+    def predicted_groups(self) -> dict[str, tuple[str, ...]]:
+        """What would be stated of a machine that did exactly what a mode does, by the name of the mode.
+
+        Returns:
+            Of each faulty mode its fault, with all that would not be told from it; ``"normal"`` is among
+            them if the change would not be seen. Empty for a rotor with one mode, which leaves the decision
+            to the evidence of its observers. A rub is left out that is not steady, or does not touch.
+        """
+        bank = self._bank
+        if not len(bank.couplings) or self._rules.rule != "cusum":
+            return {}
+        motions = self._steady_motions.of(bank.observers, bank.couplings)
+        nearby = hunting(self._bank_modes[0].rotor, bank.speed)
+        faults = np.array(list(self._faults.values()))
+        samples = round(_PREDICTED_REVOLUTIONS * self._nominal_period)
+        predicted = {}
+        for k in range(1, len(faults)):
+            change = SteadyChange(motions[k] - motions[0], samples)
+            if not np.isfinite(change.moved).all():
+                continue
+            off = misfit(
+                change,
+                motions,
+                list(faults),
+                noise=self._noise,
+                nats=self._rules.group_nats,
+                exact=self._exact,
+            )
+            # No steady motion is compared of a machine that all observers take for the healthy one.
+            off.excluded[0] = change.is_certain(nearby, self._noise)
+            together = off.pairs[k] | (bank.look_alike(k) & ~off.excluded)
+            predicted[self._modes[k].name] = tuple(dict.fromkeys(map(str, [faults[k], *faults[together]])))
+        return predicted
 
     @property
     def _at_calibrated_speed(self) -> bool:

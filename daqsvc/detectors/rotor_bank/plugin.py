@@ -120,7 +120,10 @@ class RotorBankPlugin(DetectorPlugin[RotorBank]):
             # Who asks names the file.
             raise ValueError(str(error).removeprefix(f"{machine.path}: ")) from error
         prediction = bank.bank_detectability(machine, settings, detector, options.process_noise)
-        return Detectability({**bank.as_json(prediction, machine)}, bank.as_text(prediction, machine))
+        name = machine.machine.name
+        return Detectability(
+            {**bank.as_json(prediction, name, detector)}, bank.as_text(prediction, name, detector)
+        )
 
     def readings(self, machine: MachineFile, settings: RotorBank) -> Iterator[Reading]:
         """See `DetectorPlugin.readings`."""

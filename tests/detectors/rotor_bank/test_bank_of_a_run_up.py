@@ -201,7 +201,36 @@ def test_what_only_the_steady_motion_shows_is_predicted(calibrated, capsys):
     assert not any(shown for (first, _), shown in seen.items() if first != "N")
     assert main(arguments) == 0
     printed = capsys.readouterr().out
-    assert "The observers take U1 for N at 1680.97 rpm, but it is seen in the steady 1X" in printed
+    assert "The observers take U1 for N at 1680 rpm, but it is seen in the steady 1X" in printed
+
+
+def test_faults_that_are_stated_together_are_predicted(calibrated):
+    detector, said = said_of(machine_of(calibrated, FOLLOWING), [MACHINE, MACHINE.damped(0.5)])
+    stated = {detector.faults[name] for name in said[-1].group}
+    assert stated == {"damping_loss", "rub"} == {*detector.predicted_groups()[said[-1].decision]}
+
+
+def test_a_change_that_no_observer_sees_is_predicted_as_healthy(calibrated):
+    move = positions_of(MACHINE)
+    detector, said = said_of(machine_of(calibrated, FOLLOWING), [move, lambda angle: move(angle) - 10j])
+    assert said[-1].decision == "N"
+    assert "normal" in detector.predicted_groups()["L2"]
+
+
+def test_a_load_on_oil_films_is_predicted_to_look_like_a_softer_support(calibrated, capsys):
+    # Far below the critical speed both move the mean position, and 1X hardly.
+    on_films = ("clearance_um = 250.0", "clearance_um = 250.0\nplain_bearings = true")
+    machine_of(calibrated, on_films)
+    arguments = ["detectability", str(calibrated / "machine.toml"), "--speed-rpm", "720"]
+    assert main([*arguments, "--json"]) == 0
+    groups = {one["mode"]: set(one["faults"]) for one in json.loads(capsys.readouterr().out)["groups"]}
+    assert all(groups[mode] == {"static_load", "stiffness_loss"} for mode in ("L1", "L3", "K1", "K2"))
+    assert "U1" not in groups
+    assert main(arguments) == 0
+    assert (
+        "L1, L2, L3, K1, K2 would be called static_load or stiffness_loss at 720 rpm"
+        in capsys.readouterr().out
+    )
 
 
 @pytest.mark.parametrize("part", [1.0, 1.05])
