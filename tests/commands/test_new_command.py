@@ -538,7 +538,7 @@ class Terminal:
         while self.process.poll() is None:
             self.process.send_signal(signal.SIGINT)
             with contextlib.suppress(subprocess.TimeoutExpired):
-                self.process.wait(timeout=1)
+                self.process.wait(timeout=10)  # a second one while it ends would end it by the signal
 
     def rest(self) -> str:
         seen = ""
