@@ -71,7 +71,7 @@ def check_serial(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[Fi
                 "correct one of them, as the device sends it",
                 code=CONTRADICTION,
             )
-        yield from _check_suffixes(layout, bus.delimiter, path)
+        yield from _check_texts(layout, bus.delimiter, path)
     elif isinstance(bus, CobsBus | SyncBus):
         if not isinstance(layout, SerialLayout):
             yield Finding(
@@ -229,13 +229,21 @@ def _check_place(layout: LineLayout, path: KeyPath) -> Iterator[Finding]:
         )
 
 
-def _check_suffixes(layout: LineLayout, delimiter: str, path: KeyPath) -> Iterator[Finding]:
-    """A text behind numbers has neither a separator nor the end of the line in it."""
-    for index, channel in enumerate(layout.channels):
+def _check_texts(layout: LineLayout, delimiter: str, path: KeyPath) -> Iterator[Finding]:
+    """A text beside numbers has neither a separator nor the end of the line in it."""
+    tables = [(("channels", index), channel) for index, channel in enumerate(layout.channels)]
+    places = [((name,), getattr(layout, name)) for name in ("counter", "time")]
+    texts = [
+        ((*path, *where, key), getattr(table, key) or "")
+        for where, table in (*places, *tables)
+        if table is not None
+        for key in ("prefix", "suffix")
+    ]
+    for where, text in texts:
         for what, mark in (("separator", layout.separator), ("delimiter", delimiter)):
-            if channel.suffix is not None and mark in channel.suffix:
+            if mark in text:
                 yield Finding(
-                    (*path, "channels", index, "suffix"),
+                    where,
                     f"has the {what} {json.dumps(mark)} in it",
                     "correct one of them; what comes behind a separator is a separate column in line",
                     code=CONTRADICTION,
@@ -318,8 +326,8 @@ def _least_characters(bus: SerialBus, layout: LineLayout | SerialLayout) -> int:
         # A digit in each column, separators between them, and an end.
         prefix = 0 if layout.prefix is None else len(layout.prefix) + 1
         checksum = _CHECKSUM_CHARACTERS[bus.checksum] if isinstance(bus, LinesBus) else 0
-        suffixes = sum(len(channel.suffix or "") for channel in layout.channels)
-        return prefix + 2 * len(layout.line) + suffixes + checksum
+        texts = sum(len(front) + len(behind) for front, behind in layout.beside.values())
+        return prefix + 2 * len(layout.line) + texts + checksum
     if not isinstance(bus, CobsBus | SyncBus):
         return layout.payload_length
     length = layout.payload_length + bus.crc_bytes + bus.stream_ids

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Bytes = NDArray[np.uint8]
+    Texts = NDArray[np.uint8]
     Places = NDArray[np.int64]
     Values = NDArray[np.float64]
     Far = tuple[int, bool, int, int, int, bool]
@@ -174,21 +175,45 @@ def _next(byte: int, kind: int, far: Far) -> Far:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _suffixed(buffer: Bytes, start: int, stop: int, suffix: Bytes, classes: Bytes) -> tuple[Far, int]:
-    """A number with a text behind it: how far it has been read, and where it ends; -1 without that text."""
-    far = (START, False, 0, 0, 0, False)
-    while start < stop and buffer[stop - 1] == SPACE:
-        stop -= 1
+def _length_there(buffer: Bytes, start: int, stop: int, text: Bytes, at_end: bool) -> int:  # noqa: FBT001 - numba
+    """The length of a text if a field begins with it, or ends; -1 if it does not."""
     length = 0
-    while length < len(suffix) and suffix[length]:
+    while length < len(text) and text[length]:
         length += 1
-    end = stop - length
+    if length > stop - start:
+        return -1
+    begin = stop - length if at_end else start
     for k in range(length):
-        if end < start or buffer[end + k] != suffix[k]:
-            return far, -1
-    for at in range(start, end):
+        if buffer[begin + k] != text[k]:
+            return -1
+    return length
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _within(buffer: Bytes, start: int, stop: int, texts: Texts, classes: Bytes) -> tuple[Far, int, int]:
+    """A number with texts around it: how far it has been read, not at all without them; where it is."""
+    far = (START, False, 0, 0, 0, False)
+    if texts[0, 0]:
+        while start < stop and buffer[start] == SPACE:
+            start += 1
+        length = _length_there(buffer, start, stop, texts[0], False)
+        if length < 0:
+            length = _length_there(buffer, start, stop, texts[1], False)
+        if length < 0:
+            return far, start, stop
+        start += length
+    if texts[2, 0]:
+        while start < stop and buffer[stop - 1] == SPACE:
+            stop -= 1
+        length = _length_there(buffer, start, stop, texts[2], True)
+        if length < 0:
+            length = _length_there(buffer, start, stop, texts[3], True)
+        if length < 0:
+            return far, start, stop
+        stop -= length
+    for at in range(start, stop):
         far = _next(buffer[at], classes[buffer[at]], far)
-    return far, end
+    return far, start, stop
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -241,7 +266,7 @@ def _line(
     classes: Bytes,
     columns: int,
     picks: Places,
-    suffixes: Bytes,
+    texts: Texts,
     values: Values,
 ) -> tuple[int, bool]:
     """Read the picked fields of one line.
@@ -261,13 +286,13 @@ def _line(
         padding = separator == SPACE and begin == at
         for k in range(len(picks)):
             if picks[k] == column and not padding:
-                end = at
-                if suffixes[k, 0]:
-                    # Without the text it is another unit: then it must not be read.
-                    far, end = _suffixed(buffer, begin, at, suffixes[k], classes)
+                first, end = begin, at
+                if texts[k, 0, 0] or texts[k, 2, 0]:
+                    # Without the texts it is another unit, or quantity: then it must not be read.
+                    far, first, end = _within(buffer, begin, at, texts[k], classes)
                 value, outcome = _number(far)
                 if outcome == BAD:
-                    if k == 0 or not _is_absent(buffer, begin, at if end < 0 else end):
+                    if k == 0 or not _is_absent(buffer, first, end):
                         return BAD, False
                     value, outcome = np.nan, READ
                 values[k] = value
@@ -288,7 +313,7 @@ def read_lines(
     classes: Bytes,
     columns: int,
     picks: Places,
-    suffixes: Bytes,
+    texts: Texts,
     counted: bool,  # noqa: FBT001 - numba
 ) -> tuple[NDArray[np.int8], NDArray[np.float64]]:
     """Read the numbers of the lines of one stream.
@@ -302,8 +327,8 @@ def read_lines(
         classes: one of `CLASSES`, by the decimal mark of the stream.
         columns: how many fields there are, without the prefix.
         picks: int64 ``[p]``, which of them are read.
-        suffixes: uint8 ``[p, m]``, the text behind the number of each, such as its unit, and zeros; zeros
-            only where a field is the number alone.
+        texts: uint8 ``[p, 4, m]``, the texts around the number of each, with zeros behind them. The first
+            two are those in front, of which either may be there, in two encodings. The others are behind it.
         counted: whether the first of those must be an integer.
 
     Returns:
@@ -317,9 +342,7 @@ def read_lines(
         if start < 0:
             states[k] = OTHER
             continue
-        state, integer = _line(
-            buffer, start, stops[k], separator, classes, columns, picks, suffixes, values[k]
-        )
+        state, integer = _line(buffer, start, stops[k], separator, classes, columns, picks, texts, values[k])
         states[k] = BAD if counted and not integer else state
     return states, values
 

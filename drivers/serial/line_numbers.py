@@ -17,10 +17,17 @@ ABSENT_WORDS = ("nan", "na", "n/a", "null", "none", "ol", "ovl", "inf", "+inf", 
 """Words for no value, or for one beyond what the device can measure. ``err`` is none: a code may follow."""
 ABSENT = re.compile(rf" *(-*|{'|'.join(map(re.escape, ABSENT_WORDS))}) *", re.IGNORECASE)
 """What devices write where they have no value: nothing, dashes, or a word."""
-_UNIT = r"[A-Za-z%]+[23]?(?:/[A-Za-z]+[23]?)?|[A-Za-z]+\^[23]|[A-Za-z]+/[A-Za-z]+\^[23]|1/[A-Za-z]+"
+BEYOND_ASCII = "°µμ²³"
+"""Letters of units that have no code in ASCII; two of them are a mu."""
+_POWER = r"(?:\^?[23]|[²³])"
+_NAME = rf"[A-Za-z%µμ]+{_POWER}?"
+_UNIT = rf"°|°?{_NAME}(?:/{_NAME})?|1/[A-Za-z]+"
 _WITH_UNIT: Mapping[str, re.Pattern[str]] = {
     mark: re.compile(rf"({number.pattern})({_UNIT}) *") for mark, number in NUMBER.items()
 }
+_NAMED = re.compile(
+    r" *([A-Za-z_][\w.-]{0,13}[=:])(?=[ +.,\d-]|$|nan|inf|ol|n/?a|none|null)", re.ASCII | re.IGNORECASE
+)
 BLANK = " "
 RUN_OF_BLANKS = re.compile(" +")
 
@@ -36,14 +43,42 @@ def fields_of(text: str, separator: str) -> list[str]:
     return text.split(separator)
 
 
-def number_before(text: str, suffix: str) -> str | None:
-    """The text of a number in a field that has another text behind it, such as its unit.
+def text_of(data: bytes) -> str:
+    """The text of bytes, of which units may be in UTF-8 or in Latin-1, as the device has it."""
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
 
-    A field that states that there is no value may lack that text. None if any other one does not end with it.
+
+def number_within(text: str, prefix: str, suffix: str) -> str | None:
+    """The text of a number in a field that has other texts around it, such as its name and its unit.
+
+    A field that states that there is no value may lack these. None if any other one does not have them.
     """
-    if suffix and not text.rstrip(BLANK).endswith(suffix):
+    if prefix and text.lstrip(BLANK).startswith(prefix):
+        text = text.lstrip(BLANK).removeprefix(prefix)
+    elif prefix:
         return text if ABSENT.fullmatch(text) else None
-    return text.rstrip(BLANK).removesuffix(suffix) if suffix else text
+    if suffix and text.rstrip(BLANK).endswith(suffix):
+        text = text.rstrip(BLANK).removesuffix(suffix)
+    elif suffix:
+        return text if ABSENT.fullmatch(text) else None
+    return text
+
+
+def parts_of(text: str, decimal: str) -> tuple[str, str] | None:
+    """The name in front of the number of a field, and the unit behind it; None if there is no number."""
+    name = name_before(text)
+    bare = text.lstrip(BLANK)[len(name) :]
+    unit = "" if NUMBER[decimal].fullmatch(bare) else unit_behind(bare, decimal) or None
+    return None if unit is None else (name, unit)
+
+
+def name_before(text: str) -> str:
+    """What looks like a name in front of the number of a field, with its sign; empty if nothing does."""
+    found = _NAMED.match(text)
+    return "" if found is None else found[1]
 
 
 def unit_behind(text: str, decimal: str) -> str:

@@ -30,7 +30,15 @@ from drivers.serial.line_kernels import (
     count_stamps,
     read_lines,
 )
-from drivers.serial.line_numbers import ABSENT, NUMBER, fields_of, number_before, unit_behind
+from drivers.serial.line_numbers import (
+    ABSENT,
+    BEYOND_ASCII,
+    NUMBER,
+    fields_of,
+    number_within,
+    parts_of,
+    text_of,
+)
 from drivers.serial.settings import UNITS_PER_S
 
 if TYPE_CHECKING:
@@ -57,7 +65,6 @@ _NAMES_OF_ENDS = {NEWLINE: "line feed", RETURN: "carriage return"}
 
 SHOWN_CHARACTERS = 80
 """Characters that are shown of what is no line."""
-_PRINTABLE = frozenset(range(0x20, 0x7F)) | {0x09}
 
 DIGITS: Mapping[Checksum, int] = {"xor": 2, "crc16": 4}
 _SUMS: Mapping[Checksum, Callable[[bytes], int]] = {
@@ -121,10 +128,13 @@ class LineCodec:
         # No column is at -1: without a counter and a time, the place of every line reads 0.
         place_at = -1 if place is None else layout.line.index(place.column)
         self._picks = np.array([place_at, *map(layout.line.index, layout.channel_names)], np.int64)
-        self._suffixes = {one.name: one.suffix or "" for one in layout.channels}
-        texts = [b"", *(text.encode("ascii") for text in self._suffixes.values())]
+        self._beside = layout.beside
+        read = [*([] if place is None else [place.column]), *layout.channel_names]
+        around = [("", "")] * (place is None) + [self._beside[name] for name in read]
+        texts = [encoded for pair in around for text in pair for encoded in _encoded(text)]
         padded = [text.ljust(max(1, *map(len, texts)), b"\0") for text in texts]
-        self._texts = np.array([list(text) for text in padded], np.uint8)
+        self._texts = np.array([list(text) for text in padded], np.uint8).reshape(len(around), 4, -1)
+        self._around = around
         self._prefix = np.frombuffer((layout.prefix or "").encode("ascii"), np.uint8).copy()
 
     def read(self, lines: Pieces) -> Lines:
@@ -144,13 +154,13 @@ class LineCodec:
             self._is_counted,
         )
         for k in np.flatnonzero(states == HARD).tolist():
-            text = buffer[starts[k] : stops[k]].tobytes().decode("ascii", "replace")
+            text = text_of(buffer[starts[k] : stops[k]].tobytes())
             fields = fields_of(text, layout.separator)[bool(layout.prefix) :]
             values[k] = [
-                _value((number_before(fields[pick], suffix) or "").replace(layout.decimal, "."))
+                _value((number_within(fields[pick], *beside) or "").replace(layout.decimal, "."))
                 if pick >= 0
                 else 0.0
-                for pick, suffix in zip(self._picks.tolist(), ("", *self._suffixes.values()), strict=True)
+                for pick, beside in zip(self._picks.tolist(), self._around, strict=True)
             ]
         places = values[:, 0]
         if self._units_per_s is None:
@@ -180,7 +190,8 @@ class LineCodec:
         """Why a line whose columns are numbers has no place among the others."""
         columns = self._layout.line
         assert self._place is not None  # noqa: S101 - else it needs none
-        place = fields[columns.index(self._place)].replace(self._layout.decimal, ".")
+        text = number_within(fields[columns.index(self._place)], *self._beside[self._place]) or ""
+        place = text.replace(self._layout.decimal, ".")
         if self._units_per_s is not None:
             return NoFrame(
                 f"time {self._place} is {place}, later than any", "correct column and unit of time"
@@ -195,8 +206,11 @@ class LineCodec:
 
     def _why_no_number(self, name: str, text: str) -> NoFrame | None:
         """Why a column has no number; None if it has one, or none need be there."""
-        suffix = self._suffixes.get(name, "")
-        number = number_before(text, suffix)
+        prefix, suffix = self._beside[name]
+        number = number_within(text, prefix, suffix)
+        if number is None and number_within(text, prefix, "") is None:
+            why = f"column {name} is {text!r}, without {prefix!r} in front of the number"
+            return NoFrame(why, f"correct prefix of {self._table(name)}")
         if number is None:
             return NoFrame(f"column {name} is {text!r}, without {suffix!r} at its end", _other_unit(text))
         if name != self._place and ABSENT.fullmatch(number):
@@ -207,13 +221,21 @@ class LineCodec:
 
     def _other_number(self, name: str, text: str) -> str:
         """What to do if all lines have such a text where a number should be."""
-        unit = unit_behind(text, self._layout.decimal)
-        if unit and name in self._suffixes:
-            return f"write suffix = {json.dumps(unit)} in the channel {name} of the layout"
+        named, unit = parts_of(text, self._layout.decimal) or ("", "")
+        texts = {"prefix": named, "suffix": unit}
+        keys = [f"{key} = {json.dumps(one, ensure_ascii=False)}" for key, one in texts.items() if one]
+        if keys:
+            return f"write {' and '.join(keys)} in {self._table(name)} of the layout"
         other = "." if self._layout.decimal == "," else ","
         if other != self._layout.separator and NUMBER[other].fullmatch(text):
             return f"write decimal = {json.dumps(other)} in the layout"
         return "put the names in line in the order in which the device sends its columns"
+
+    def _table(self, name: str) -> str:
+        """The table of the layout that a column has."""
+        if name != self._place:
+            return f"the channel {name}"
+        return "counter" if self._units_per_s is None else "time"
 
     def _other_columns(self, more: int) -> str:
         """What to do if lines have so many columns more than the file lists; fewer if it is negative."""
@@ -237,13 +259,29 @@ class LineCodec:
         fields = [] if layout.prefix is None else [layout.prefix]
         for name in layout.line:
             if name != self._place:
-                number = f"{values.get(name, 0.0):.6f}".replace(".", layout.decimal)
-                fields.append(f"{number}{self._suffixes.get(name, '')}")
+                number = f"{values.get(name, 0.0):.6f}"
             elif self._units_per_s is None:
-                fields.append(str(int(place) % int(self._counts)))
+                number = str(int(place) % int(self._counts))
             else:
-                fields.append(f"{place * self._units_per_s:.4f}".replace(".", layout.decimal))
-        return layout.separator.join(fields).encode("ascii")
+                number = f"{place * self._units_per_s:.4f}"
+            prefix, suffix = self._beside.get(name, ("", ""))
+            fields.append(f"{prefix}{number.replace('.', layout.decimal)}{suffix}")
+        return layout.separator.join(fields).encode()
+
+
+def _encoded(text: str) -> tuple[bytes, bytes]:
+    """A text as devices may write it: in UTF-8, and in Latin-1 where that has its letters."""
+    try:
+        return text.encode(), text.encode("latin-1")
+    except UnicodeEncodeError:
+        return text.encode(), text.encode()
+
+
+def _is_text(text: str) -> bool:
+    """Whether all of it is what lines of a device are made of."""
+    return all(letter.isascii() or letter in BEYOND_ASCII for letter in text) and all(
+        letter.isprintable() or letter == "\t" for letter in text
+    )
 
 
 def _other_unit(text: str) -> str:
@@ -359,9 +397,11 @@ class LineFraming(DelimitedFraming):
         return [line + end for line, end in zip(lines, ends, strict=True)]
 
     def _why_no_frame(self, piece: bytes) -> NoFrame:
+        line = text_of(piece)
         shown = piece[:SHOWN_CHARACTERS].decode("ascii", "backslashreplace")
+        shown = line[:SHOWN_CHARACTERS] if _is_text(line) else shown
         said = f'the first line is "{shown}{"..." if len(piece) > SHOWN_CHARACTERS else ""}"'
-        if not all(byte in _PRINTABLE for byte in piece):
+        if not _is_text(line):
             why = "no text, as at another baud rate or parity, or of a device that sends no lines"
             return NoFrame(f"{said}: {why}")
         if self._checksum != "none":
@@ -374,11 +414,11 @@ class LineFraming(DelimitedFraming):
                 why = f"checksum {sent.decode()}, its text makes {made.decode()}"
                 return NoFrame(f"{said}: {why}", "compare checksum with the device's")
             piece = text
-        fields = fields_of(piece.decode("ascii"), self._separator)
+        fields = fields_of(text_of(piece), self._separator)
         if None in self._by_prefix:
             why, remedy = self._codecs[self._by_prefix[None]].why_not(fields)
             return NoFrame(f"{said}: {why}", remedy)
-        name = self._by_prefix.get(fields[0].encode("ascii"))
+        name = self._by_prefix.get(fields[0].encode())
         if name is None:
             return NoFrame(f"{said}: of no stream", "correct prefix and separator of the layout")
         why, remedy = self._codecs[name].why_not(fields[1:])

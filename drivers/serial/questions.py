@@ -114,6 +114,11 @@ class SerialQuestions(BusQuestions):
     }
 
     channel_topics: ClassVar[Mapping[str, Topic]] = {
+        "prefix": Topic(
+            "What is in front of the number of {channel}?",
+            "A name that the device writes there, e.g. V= in V=12.3; none if the number is alone. A line "
+            "with another text there is not read.",
+        ),
         "suffix": Topic(
             "What is behind the number of {channel}?",
             "A unit that the device writes there, e.g. mm/s in 12.3 mm/s; none if the number is alone. "
@@ -175,6 +180,11 @@ class SerialQuestions(BusQuestions):
         is_time = _is_time(answers["counter"])
         kinds = {"count": "it counts lines", "s": "time in s", "ms": "time in ms", "us": "time in us"}
         yield self.choose("counts", kinds, "ms" if is_time else "count")
+        yield from self._ask_around(answers["counter"])
+
+    def _ask_around(self, column: str) -> Iterator[Question]:
+        yield self.ask_of(column, "prefix", q.text_or_none, NONE, quiet=True)
+        yield self.ask_of(column, "suffix", q.text_or_none, NONE, quiet=True)
 
     def channels(self, answers: Answers) -> tuple[str, ...]:
         """See `BusQuestions.channels`."""
@@ -193,12 +203,13 @@ class SerialQuestions(BusQuestions):
             usual = _TYPE_OF if answers["rate"] >= WAVEFORM_HZ else {}
             return kind if kind == "keyphasor" else usual.get(unit, "trend"), unit
         # A column without a name may be anything: limits of vibration are not for it.
-        return kind, "1" if unit is None and _UNNAMED.fullmatch(channel) else unit
+        anything = _UNNAMED.fullmatch(channel) or answers.get(sensor_key(channel, "prefix")) is not None
+        return kind, "1" if unit is None and anything else unit
 
     def of_channel(self, answers: Answers, channel: str) -> Iterator[Question]:
         """See `BusQuestions.of_channel`."""
         if answers["framing"] == "lines":
-            yield self.ask_of(channel, "suffix", q.text_or_none, NONE, quiet=True)
+            yield from self._ask_around(channel)
 
     def in_volts(self, answers: Answers, channel: str) -> bool:
         """See `BusQuestions.in_volts`."""
@@ -256,15 +267,16 @@ class SerialQuestions(BusQuestions):
             yield entry("no_counter", value=True, comment="losses are estimated from the times of arrival")
         elif answers["counts"] == "count":
             yield f"# {MUST_TURN[0].upper()}{MUST_TURN[1:]}."
-            yield entry("counter", {"column": answers["counter"]}, "losses are counted by it")
+            counter = {"column": answers["counter"], **_around(answers, answers["counter"])}
+            yield entry("counter", counter, "losses are counted by it")
         else:
             time = {"column": answers["counter"], "unit": answers["counts"]}
+            time |= _around(answers, answers["counter"])
             yield entry("time", time, "the device's own clock: it places the lines in time")
         yield "# scale = 0.01 behind a name if the device sends hundredths"
-        channels = []
-        for name in self._measured(answers):
-            suffix = answers.get(sensor_key(name, "suffix"))
-            channels.append({"name": name} if suffix is None else {"name": name, "suffix": suffix})
+        channels = [{"name": name, **_around(answers, name)} for name in self._measured(answers)]
+        if any("prefix" in one for one in channels):
+            yield "# prefix: what the device writes in front of the number; a line without it is not read"
         if any("suffix" in one for one in channels):
             yield "# suffix: what the device writes behind the number; a line in another unit is not read"
         yield from array("channels", channels)
@@ -274,6 +286,12 @@ class SerialQuestions(BusQuestions):
         named = self.channels(answers)
         kept = tuple(name for name in named if answers.get(sensor_key(name, "type")) != NONE)
         return kept or named
+
+
+def _around(answers: Answers, column: str) -> dict[str, str]:
+    """The keys for the texts around the number of a column."""
+    texts = {key: answers.get(sensor_key(column, key)) for key in ("prefix", "suffix")}
+    return {key: text for key, text in texts.items() if text is not None}
 
 
 def _sync_word(text: str) -> str:
@@ -319,17 +337,23 @@ def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
     if found["lines_damaged"]:
         yield f"  {other_lines_words(found['lines_damaged'], found['lines_heard'], found['damaged_line'])}"
     yield from (f"  {one}" for one in found["lines"][:_SHOWN_LINES])
-    for one in found["columns"]:
-        if one["turns_at"]:
-            yield f"  {turn_words(one['name'], one['turns_at'])}"
-        elif one["counts"]:
-            yield f"  {one['name']} counts lines; {MUST_TURN}"
-        elif one["unit"]:
-            yield f"  {one['name']} is in {one['unit']}, as the device writes it behind the number"
+    yield from (f"  {words}" for one in found["columns"] for words in _column_words(one))
     if found["other_prefixes"]:
         others = ", ".join(found["other_prefixes"])
         yield f"  Lines that begin with {others} come, too. The file reads one kind of line; add a stream for"
         yield "  each other one, as daqsvc sniff serial writes it."
+
+
+def _column_words(one: Mapping[str, Any]) -> Iterator[str]:
+    """What is known of a column, in a few lines."""
+    if one["turns_at"]:
+        yield turn_words(one["name"], one["turns_at"])
+    elif one["counts"]:
+        yield f"{one['name']} counts lines; {MUST_TURN}"
+    elif one["unit"]:
+        yield f"{one['name']} is in {one['unit']}, as the device writes it behind the number"
+    if one["prefix"]:
+        yield f"{one['name']} is the number behind {one['prefix']}"
 
 
 def _proposals(found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
@@ -352,13 +376,15 @@ def _proposals(found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
         proposed["rate"] = f"{usual_rate(found['rate_hz']):g}"
     # Most engineers name the columns themselves: what is known of each is known by its place.
     for name, one in zip(answers.get("columns", named), named.values(), strict=False):
+        if one["numeric"] and one["prefix"]:
+            proposed[sensor_key(name, "prefix")] = one["prefix"]
+        if one["numeric"] and one["unit"]:
+            proposed[sensor_key(name, "suffix")] = one["unit"]
         if one["counts"] or one["time_unit"]:
             proposed |= {"counter": name, "counts": one["time_unit"] or "count"}
         elif one["turns_at"] or not one["numeric"]:
             # What begins again after 999 is no counter, and measures nothing: what was heard states it.
             proposed[sensor_key(name, "type")] = NONE
-        elif one["unit"]:
-            proposed[sensor_key(name, "suffix")] = one["unit"]
     # Else a person who takes all defaults would have lines counted by what counts nothing.
     proposed.setdefault("counter", NONE)
     return proposed

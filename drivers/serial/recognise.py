@@ -27,6 +27,10 @@ MOST_BYTES = 65_536
 _TEXT = frozenset(range(0x20, 0x7F)) | {0x09, 0x0A, 0x0D}
 _LEAST_PRINTABLE = 0.95
 _SAME_PARITY = 0.98
+_OF_UNITS = re.compile(
+    rb"(?<=[ -~])(?:\xc2[\xb0\xb2\xb3\xb5]|\xce\xbc|[\xb0\xb2\xb3\xb5])(?=[A-Za-z/,;|*\t\r\n ]|$)"
+)
+"""Letters of units such as a degree or a mu, in UTF-8 or Latin-1, between others of a text."""
 _ENCLOSED = re.compile(rb"\x02[\t\x20-\x7e]{3,}\x03")
 _LEAST_ENCLOSED = 3
 _MOSTLY = 0.75
@@ -70,7 +74,8 @@ def recognised(data: bytes, line_errors: int = 0) -> Recognised:
         return Recognised(0.0)
     parity = seven_bits(data)
     text = bytes(byte & 0x7F for byte in data) if parity else data
-    printable = sum(byte in _TEXT for byte in text) / len(text)
+    strange = sum(byte not in _TEXT for byte in _OF_UNITS.sub(b"", text))
+    printable = 1 - strange / len(text)
     if _is_enclosed(text):
         # Of one length, such text looks like frames whose sync word is part of it.
         return Recognised(CONCLUSIVE, None, parity, printable, is_enclosed=True)

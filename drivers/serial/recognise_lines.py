@@ -16,7 +16,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drivers.serial.line_numbers import ABSENT, BLANK, NUMBER, fields_of, number_before, unit_behind
+from drivers.serial.line_numbers import (
+    ABSENT,
+    BEYOND_ASCII,
+    BLANK,
+    NUMBER,
+    fields_of,
+    number_within,
+    parts_of,
+    text_of,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -47,7 +56,9 @@ _MESSAGES = frozenset(
 _WORD = re.compile(r"\W*([A-Za-z]+)(?![\w,;|\t])")
 _CODED = re.compile(r".*[ :]\d+ *")
 _DIGITS = re.compile(r"\d+")
-_PRINTABLE = re.compile(r"[\t -~]*")
+_PRINTABLE = re.compile(rf"[\t -~{BEYOND_ASCII}]*")
+TIME_UNITS: Mapping[str, str] = {"s": "s", "sec": "s", "ms": "ms", "us": "us", "µs": "us", "μs": "us"}
+"""Units of a time as devices write them, and as the driver names them."""
 _SUMS: Mapping[int, tuple[str, Callable[[bytes], int]]] = {
     2: ("xor", lambda text: reduce(xor, text, 0)),
     4: ("crc16", lambda text: binascii.crc_hqx(text, 0xFFFF)),
@@ -69,6 +80,7 @@ class Column:
         turns_at: the power of ten at which it was seen to begin again at 0; else 0. No counter of bits does.
         grows: whether it never falls, and grows at all.
         per_line: by how much it grows from line to line, on average.
+        prefix: the text in front of the number that is the same in all of them, such as a name; else empty.
         last: its last text.
         absent: in how many lines there is no value.
         absent_text: its text in the last one of these.
@@ -84,6 +96,7 @@ class Column:
     per_line: float = 0.0
     last: str = ""
     unit: str = ""
+    prefix: str = ""
     absent: int = 0
     absent_text: str = ""
 
@@ -171,7 +184,7 @@ def _is_word(field: str) -> bool:
 
 
 def _text(piece: bytes) -> str:
-    return piece.decode("ascii", "replace").strip("\r\n")
+    return text_of(piece).strip("\r\n")
 
 
 def _is_header(first: str, lines: Sequence[str]) -> bool:
@@ -203,10 +216,10 @@ def _is_message(first: str, others: Sequence[str], separator: str) -> bool:
 
 
 def _only_words(fields: Sequence[str], others: Sequence[str], decimal: str) -> bool:
-    """Whether the fields of a line are words, as in a header: no numbers, with or without a unit."""
+    """Whether the fields of a line are words, as in a header: no numbers, with or without name and unit."""
     return not any(
         NUMBER[decimal].fullmatch(one)
-        or ((unit := unit_behind(one, decimal)) and unit == unit_behind(other, decimal))
+        or ((parts := parts_of(one, decimal)) is not None and parts == parts_of(other, decimal))
         for one, other in zip(fields, others, strict=True)
     )
 
@@ -225,17 +238,12 @@ def _marks_of(lines: Sequence[str]) -> tuple[str, str]:
             continue
         fields = [field for row in rows if len(row) == width for field in row]
         for decimal in (mark for mark in (".", ",") if mark != separator):
-            numbers = sum(
-                NUMBER[decimal].fullmatch(field) is not None or bool(unit_behind(field, decimal))
-                for field in fields
-            )
+            numbers = sum(parts_of(field, decimal) is not None for field in fields)
             score = agreeing / len(lines) * (1 + numbers / len(fields))
             if score > most + 0.02:
                 best, most = (separator, decimal), score
     if not best[0]:
-        alone = {
-            mark: sum(number.fullmatch(line) is not None for line in lines) for mark, number in NUMBER.items()
-        }
+        alone = {mark: sum(parts_of(line, mark) is not None for line in lines) for mark in NUMBER}
         return "", max(alone, key=lambda mark: alone[mark])
     return best
 
@@ -253,7 +261,7 @@ def _columns_of(lines: Sequence[str], delimiter: str) -> TextLines:
     header = (
         len(rows[0]) == len(rows[1]) == width
         and _only_words(rows[0], rows[1], decimal)
-        and any(number.fullmatch(one) or unit_behind(one, decimal) for one in rows[1])
+        and any(parts_of(one, decimal) is not None for one in rows[1])
         and rows[0][0] != rows[1][0]
         and not _is_message(plain[0], plain[1:], separator)
     )
@@ -265,8 +273,8 @@ def _columns_of(lines: Sequence[str], delimiter: str) -> TextLines:
     sound[0] &= not header
     prefix = _prefix_of([row for row, good in zip(rows, sound, strict=True) if good], width)
     first = 1 if prefix else 0
-    units = [
-        _unit_of([row[k] for row, good in zip(rows, sound, strict=True) if good], decimal)
+    around = [
+        _texts_of([row[k] for row, good in zip(rows, sound, strict=True) if good], decimal)
         for k in range(first, width)
     ]
     for at, row in enumerate(rows):
@@ -274,9 +282,9 @@ def _columns_of(lines: Sequence[str], delimiter: str) -> TextLines:
             sound[at]
             and (not prefix or row[0] == prefix)
             and all(
-                _is_number(text, unit, number)
-                for text, unit in zip(row[first:], units, strict=True)
-                if unit is not None
+                _is_number(text, texts, number)
+                for text, texts in zip(row[first:], around, strict=True)
+                if texts is not None
             )
         )
     places = np.flatnonzero(sound)
@@ -284,39 +292,45 @@ def _columns_of(lines: Sequence[str], delimiter: str) -> TextLines:
         _column(
             [rows[at][first + k] for at in places.tolist()],
             places,
-            names[first + k] if names else f"c{k + 1}",
-            decimal if unit is not None else "",
-            unit or "",
+            names[first + k] if names else texts[0].strip("=:") if texts and texts[0] else f"c{k + 1}",
+            decimal if texts is not None else "",
+            texts or ("", ""),
         )
-        for k, unit in enumerate(units)
+        for k, texts in enumerate(around)
     ]
     damaged = [line for line, good in zip(lines[header:], sound[header:], strict=True) if not good]
     return TextLines(lines, delimiter, separator, decimal, prefix, checksum, columns, header, damaged)
 
 
-def _unit_of(texts: Sequence[str], decimal: str) -> str | None:
-    """The unit behind the number of a column; empty if it is the number alone, None if it is no number.
+def _texts_of(texts: Sequence[str], decimal: str) -> tuple[str, str] | None:
+    """The name in front of the number of a column, and the unit behind it; None if it is no number.
+
+    Either is empty where there is none.
 
     A word that is always the same, such as 0A, is none: the numbers before a unit change, have decimals, or a
     blank behind them. Lines without a value are left out of it, also where most have none.
     """
-    units = ["" if NUMBER[decimal].fullmatch(text) else unit_behind(text, decimal) or None for text in texts]
-    known = Counter(unit for unit in units if unit is not None)
-    unit = max(known, key=lambda one: known[one], default=None)
-    if unit is None:
+    found = [parts_of(text, decimal) for text in texts]
+    known = Counter(one for one in found if one is not None)
+    around = max(known, key=lambda one: known[one], default=None)
+    if around is None:
         return None
-    fitting = sum(_is_number(text, unit, NUMBER[decimal]) for text in texts)
+    fitting = sum(_is_number(text, around, NUMBER[decimal]) for text in texts)
     if fitting < MAJORITY * len(texts):
         return None
-    numbers = {text.removesuffix(unit) for text, one in zip(texts, units, strict=True) if one == unit}
-    if unit and len(numbers) == 1 and not any(mark in one for one in numbers for mark in (decimal, " ")):
-        return None
-    return unit
+    name, unit = around
+    numbers = {
+        text.removeprefix(name).removesuffix(unit)
+        for text, one in zip(texts, found, strict=True)
+        if one == around
+    }
+    alone = unit and not name and len(numbers) == 1
+    return None if alone and not any(mark in one for one in numbers for mark in (decimal, " ")) else around
 
 
-def _is_number(text: str, unit: str, number: re.Pattern[str]) -> bool:
-    """Whether a field has a number, with that unit behind it if it is not empty; it may be absent."""
-    bare = number_before(text, unit)
+def _is_number(text: str, around: tuple[str, str], number: re.Pattern[str]) -> bool:
+    """Whether a field has a number, with those texts around it where they are not empty; it may be absent."""
+    bare = number_within(text, *around)
     return bare is not None and bool(number.fullmatch(bare) or ABSENT.fullmatch(bare))
 
 
@@ -328,7 +342,9 @@ def _prefix_of(rows: Sequence[Sequence[str]], width: int) -> str:
     return word if times >= MAJORITY * len(rows) and _PREFIX.fullmatch(word) else ""
 
 
-def _column(texts: Sequence[str], places: NDArray[np.int64], name: str, decimal: str, unit: str) -> Column:
+def _column(
+    texts: Sequence[str], places: NDArray[np.int64], name: str, decimal: str, around: tuple[str, str]
+) -> Column:
     """One column.
 
     Args:
@@ -336,21 +352,24 @@ def _column(texts: Sequence[str], places: NDArray[np.int64], name: str, decimal:
         places: int64 ``[n]``, which lines those are.
         name: of the column.
         decimal: decimal mark of the numbers; empty if it is text.
-        unit: behind the numbers.
+        around: the texts in front of and behind the numbers.
     """
+    prefix, unit = around
     last = texts[-1] if texts else ""
     written = texts
-    texts = [(number_before(text, unit) or "").strip() for text in texts] if decimal else texts
+    texts = [(number_within(text, *around) or "").strip() for text in texts] if decimal else texts
     if not decimal or all(map(ABSENT.fullmatch, texts)):
         return Column(name, numeric=False, last=last)
     there = [k for k, text in enumerate(texts) if not ABSENT.fullmatch(text)]
     absent = [text for k, text in enumerate(written) if ABSENT.fullmatch(texts[k])]
     texts, places = [texts[k] for k in there], places[there]
     values = np.array([float(text.replace(decimal, ".")) for text in texts])
-    # The driver reads neither a counter nor a time with a text behind it.
+    # What has a unit counts no lines; but it may be a time.
     whole = not unit and all(text.isdigit() for text in texts)
     rises = np.diff(values) >= 0
-    grows = bool(not unit and len(rises) and rises.mean() >= 0.98 and values[-1] > values[0])
+    grows = bool(
+        (not unit or unit in TIME_UNITS) and len(rises) and rises.mean() >= 0.98 and values[-1] > values[0]
+    )
     ends = min(_ENDS, len(values) // 2)
     per_line = 0.0
     if ends:
@@ -369,8 +388,9 @@ def _column(texts: Sequence[str], places: NDArray[np.int64], name: str, decimal:
         turns_at,
         grows,
         per_line,
-        last if unit else texts[-1],
+        last if any(around) else texts[-1],
         unit,
+        prefix,
         len(absent),
         absent[-1] if absent else "",
     )
@@ -413,7 +433,7 @@ def _sum_fits(line: str, checksum: str) -> bool:
     match = _CHECKSUM.search(line)
     if match is None:
         return False
-    text = line[: match.start()].encode("ascii", "replace").lstrip(b"$!")
+    text = line[: match.start()].encode().lstrip(b"$!")
     name, made = _SUMS[len(match[1])]
     return name == checksum and made(text) == int(match[1], 16)
 

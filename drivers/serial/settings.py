@@ -243,6 +243,34 @@ class SerialLayout(Layout):
         return packed_range(self.channels, channel)
 
 
+def _beside(text: str, where: str, example: str) -> str:
+    if not text.isprintable() or text != text.strip() or not set(text) - _OF_NUMBERS:
+        raise PydanticCustomError(
+            "beside_number",
+            f"cannot be the text {where} a number",
+            {
+                "remedy": f'write what the device puts there, without blanks around it, e.g. "{example}"',
+                "code": BAD_TEXT,
+            },
+        )
+    return text
+
+
+def _in_front(text: str) -> str:
+    return _beside(text, "in front of", "V=")
+
+
+def _behind(text: str) -> str:
+    return _beside(text, "behind", "mm/s")
+
+
+_LONGEST_BESIDE = 16
+_InFront = Annotated[str, AfterValidator(_in_front), Field(min_length=1, max_length=_LONGEST_BESIDE)]
+_Behind = Annotated[str, AfterValidator(_behind), Field(min_length=1, max_length=_LONGEST_BESIDE)]
+_IN_FRONT = "text in front of the number, such as its name; a line with another text there is not read"
+_BEHIND = "text behind the number, such as its unit; a line with another text there is not read"
+
+
 class LineCounter(Section):
     """The column that counts lines, and so samples."""
 
@@ -250,6 +278,8 @@ class LineCounter(Section):
     bits: Literal[8, 16, 32] = Field(
         default=32, description="width of the counter: it begins again at 0 after 2**bits"
     )
+    prefix: _InFront | None = Field(default=None, description=_IN_FRONT, examples=["n="])
+    suffix: _Behind | None = Field(default=None, description=_BEHIND, examples=["#"])
 
 
 class LineTime(Section):
@@ -257,19 +287,8 @@ class LineTime(Section):
 
     column: Annotated[Name, Field(description="name of the column with the time", examples=["t"])]
     unit: Annotated[Literal["s", "ms", "us"], Field(description="unit of that time", examples=["ms"])]
-
-
-def _suffix(text: str) -> str:
-    if not text.isascii() or not text.isprintable() or text != text.strip() or not set(text) - _OF_NUMBERS:
-        raise PydanticCustomError(
-            "suffix",
-            "cannot be the text behind a number",
-            {
-                "remedy": 'write what the device puts there, without blanks around it, e.g. "mm/s"',
-                "code": BAD_TEXT,
-            },
-        )
-    return text
+    prefix: _InFront | None = Field(default=None, description=_IN_FRONT, examples=["t="])
+    suffix: _Behind | None = Field(default=None, description=_BEHIND, examples=["ms"])
 
 
 class LineChannel(Section):
@@ -282,11 +301,8 @@ class LineChannel(Section):
     offset: Quantity = Field(
         default=0.0, description="what a 0 in the line is worth, in V or the unit of the sensor"
     )
-    suffix: Annotated[str, AfterValidator(_suffix), Field(min_length=1, max_length=16)] | None = Field(
-        default=None,
-        description="text behind the number, such as its unit; a line with another text there is not read",
-        examples=["mm/s"],
-    )
+    prefix: _InFront | None = Field(default=None, description=_IN_FRONT, examples=["V="])
+    suffix: _Behind | None = Field(default=None, description=_BEHIND, examples=["mm/s"])
 
 
 class LineLayout(Layout):
@@ -334,6 +350,14 @@ class LineLayout(Layout):
             examples=['[{ name = "x" }]'],
         ),
     ]
+
+    @property
+    def beside(self) -> dict[str, tuple[str, str]]:
+        """The texts in front of and behind the number of each column that is read; empty where none is."""
+        read = {one.name: one for one in self.channels}
+        texts = {name: (one.prefix or "", one.suffix or "") for name, one in read.items()}
+        place = self.counter or self.time
+        return texts if place is None else {place.column: (place.prefix or "", place.suffix or ""), **texts}
 
     @property
     def samples_per_frame(self) -> int:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from daqsvc.documentation import documented_in
 from daqsvc.rounding import counted
 from daqsvc.settings.units import may_be_unit, unit_of
+from drivers.serial.line_numbers import BEYOND_ASCII
 from drivers.sniffing import (
     Sniffed,
     Sniffer,
@@ -495,7 +496,7 @@ class _Report(NamedTuple):
             ]
             use = "counts" if one is counter else "time" if one is time_column else ""
             use = f"counts to {one.turns_at - 1}" if one.turns_at else use
-            use = f"in {one.unit}" if one.unit else use
+            use = ", ".join(filter(None, (use, f"in {one.unit}" if one.unit else "")))
             rows.append((one.name, "number" if one.numeric else "text", *limits, one.last[:24], use))
         yield SniffTable(("column", "kind", "min", "max", "last", ""), rows)
         yield from (turn_words(one.name, one.turns_at) for one in what.columns if one.turns_at)
@@ -520,10 +521,14 @@ class _Report(NamedTuple):
 
     def _time_unit(self, what: TextLines, column: Column) -> str | None:
         """The unit in which a column grows by as much as lines take; None if there is none."""
+        from drivers.serial.recognise_lines import TIME_UNITS  # noqa: PLC0415 - only for who listens
+
         rate_hz = self._rate_hz(what)
         if rate_hz is None:
             return None
         for unit, per_s in _PER_S.items():
+            if column.unit and TIME_UNITS[column.unit] != unit:
+                continue
             if 0.8 < column.per_line * rate_hz / per_s < 1.25:
                 return unit
         return None
@@ -584,6 +589,7 @@ class _Report(NamedTuple):
                     {
                         "name": one.name,
                         "numeric": one.numeric,
+                        "prefix": one.prefix or None,
                         "unit": one.unit or None,
                         "min": one.least,
                         "max": one.most,
@@ -668,9 +674,7 @@ class _Report(NamedTuple):
             )
             return
         names = _names(what.columns)
-        remarks = [f"{_other_lines(what)}."] if what.damaged else []
-        for remark in (*remarks, *self._not_read(what, names)):
-            yield from (f"# {line}" for line in textwrap.wrap(remark, 98))
+        yield from self._remarks(what, names)
         yield f"[streams.{stream}]"
         yield f"bus = {quoted(bus)}"
         yield f"rate_hz = {rounded_rate(rate_hz)}    # as measured; see the device's manual"
@@ -685,25 +689,27 @@ class _Report(NamedTuple):
             yield f"decimal = {quoted(what.decimal)}"
         if counter is not None:
             bits = 8 if counter.most < 256 else 16 if counter.most < 65_536 else 32
-            table = f"{{ column = {quoted(names[counter])}, bits = {bits} }}"
+            table = f"{{ column = {quoted(names[counter])}, bits = {bits}{_texts(counter)} }}"
             yield f"counter = {table}    # as far as it was seen: {MUST_TURN}"
         elif place is None:
             yield "no_counter = true    # none was seen, and no time: losses are estimated from the arrivals"
         else:
             unit = self._time_unit(what, place)
-            yield f'time = {{ column = {quoted(names[place])}, unit = "{unit}" }}'
-        suffixes = [f", suffix = {quoted(one.unit)}" if one.unit else "" for one in numbers]
-        listed = [
-            f"{{ name = {quoted(names[one])}{suffix} }}"
-            for one, suffix in zip(numbers, suffixes, strict=True)
-        ]
-        comment = (
-            "    # a line in another unit is not read: it is counted as damaged" if any(suffixes) else ""
-        )
+            yield f'time = {{ column = {quoted(names[place])}, unit = "{unit}"{_texts(place)} }}'
+        listed = [f"{{ name = {quoted(names[one])}{_texts(one)} }}" for one in numbers]
+        comment = ""
+        if any(map(_texts, numbers)):
+            comment = "    # a line with other texts there is not read: it is counted as damaged"
         yield f"channels = [{', '.join(listed)}]{comment}"
         channels = {names[one]: unit_of_suffix(one.unit) for one in numbers}
         by_stream = bool(what.prefix) and stream != "lines"
         yield from sensor_lines(stream, channels, sensors, rate_hz, by_stream=by_stream, guess=True)
+
+    def _remarks(self, what: TextLines, names: Mapping[Column, str]) -> Iterator[str]:
+        """What of the lines the file does not read, as comments."""
+        others = [f"{_other_lines(what)}."] if what.damaged else []
+        for remark in (*others, *self._not_read(what, names)):
+            yield from (f"# {line}" for line in textwrap.wrap(remark, 98))
 
     def _frames_tables(self, what: BinaryFrames, bus: str) -> Iterator[str]:
         yield f"framing = {quoted(what.framing)}"
@@ -778,7 +784,7 @@ def _tried_row(one: Tried) -> Sequence[str]:
     )
 
 
-NO_NUMBERS = "No column is a number alone, such as 22.5: NAME=22.5, JSON and hex are not read."
+NO_NUMBERS = "No column is a number, such as 22.5 or NAME=22.5: JSON and hex are not read."
 LINES_NEED = "A stream needs a column of numbers, best beside one that counts lines or has the device's time"
 """Why nothing is proposed of lines."""
 
@@ -865,6 +871,12 @@ def _prefixes(what: TextLines) -> str:
     return ", ".join(kind.prefix for kind in what.kinds)
 
 
+def _texts(column: Column) -> str:
+    """The keys for the texts around the number of a column; empty without any."""
+    texts = {"prefix": column.prefix, "suffix": column.unit}
+    return "".join(f", {key} = {quoted(text)}" for key, text in texts.items() if text)
+
+
 def _names(columns: Sequence[Column]) -> dict[Column, str]:
     """Names of columns that a machine file can have, each once."""
     taken: set[str] = set()
@@ -881,6 +893,9 @@ def lasting_name(port: str) -> str:
 
 def _printable(text: str) -> str:
     shown = (
-        letter if letter.isascii() and (letter.isprintable() or letter in "\n\t") else "?" for letter in text
+        letter
+        if (letter.isascii() and (letter.isprintable() or letter in "\n\t")) or letter in BEYOND_ASCII
+        else "?"
+        for letter in text
     )
     return "".join(shown)

@@ -25,6 +25,7 @@ class ColumnFigures(TypedDict):
     Attributes:
         name: as the header has it, else `c1`, `c2`, ...
         numeric: whether it is a number in all lines that are not damaged.
+        prefix: text in front of the number that is the same in all of them, such as a name; null without one.
         unit: text behind the number that is the same in all of them, such as a unit; null without one.
         min: the least value.
         max: the greatest value.
@@ -38,6 +39,7 @@ class ColumnFigures(TypedDict):
 
     name: str
     numeric: bool
+    prefix: str | None
     unit: str | None
     min: float
     max: float

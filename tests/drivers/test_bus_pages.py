@@ -59,7 +59,7 @@ def test_the_keys_of_a_serial_port_are_all_shown_with_their_defaults():
     assert shown == least
 
 
-@pytest.mark.parametrize(("place", "stream", "channel"), [(1, "casing", "h"), (4, "shaft", "kph")])
+@pytest.mark.parametrize(("place", "stream", "channel"), [(1, "casing", "h"), (5, "shaft", "kph")])
 def test_a_serial_port_of_the_page_has_a_stream(place, stream, channel):
     assert machine(blocks("serial.md")[place], stream, channel).streams[stream].rate_hz > 100
 
@@ -71,8 +71,15 @@ def test_the_channels_with_a_unit_behind_the_number_fit_a_line():
     assert [channel.suffix for channel in layout.channels] == ["mm/s", "mm/s"]
 
 
+def test_the_channels_with_a_name_in_front_of_the_number_fit_a_line():
+    _, lines, _, changed, *_ = blocks("serial.md")
+    text = lines[: lines.index("[streams.casing.layout]")] + changed
+    layout = machine(text, "casing", "V").streams["casing"].layout
+    assert layout.beside == {"t": ("t=", "ms"), "V": ("V=", ""), "T": ("T=", "C")}
+
+
 def test_lines_without_a_counter_fit_a_port():
-    made = machine(blocks("serial.md")[3], "oil", "oil")
+    made = machine(blocks("serial.md")[4], "oil", "oil")
     assert made.streams["oil"].layout.no_counter
 
 

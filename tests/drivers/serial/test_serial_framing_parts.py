@@ -246,13 +246,33 @@ def test_a_value_in_another_unit_is_no_sample_and_is_told(text, said, remedy):
     assert remedy in found.remedy
 
 
-def test_the_key_is_named_for_a_number_with_a_unit():
+@pytest.mark.parametrize(
+    ("text", "shown", "keys"),
+    [
+        (b"1,45.1 degC", "column x is '45.1 degC'", 'suffix = "degC" in the channel x'),
+        (b"1,45.1 \xb0C", "column x is '45.1 °C'", 'suffix = "°C" in the channel x'),
+        ("1,T=45.1°C".encode(), "column x is 'T=45.1°C'", 'prefix = "T=" and suffix = "°C" in the channel x'),
+        (b"n=1,45.1", "column seq is 'n=1'", 'prefix = "n=" in counter'),
+    ],
+)
+def test_the_keys_are_named_for_a_number_with_a_name_or_a_unit(text, shown, keys):
     columns = line_layout(("seq", "x"), ["x"], counter="seq")
     framing = LineFraming({"a": columns}, {"a": 100.0})
     framing.cut(b"half a line\n")
-    found = framing.cut(b"1,45.1 degC\n")
-    assert "column x is '45.1 degC', no number" in found.malformed
-    assert found.remedy == 'write suffix = "degC" in the channel x of the layout'
+    found = framing.cut(text + b"\n")
+    assert f"{shown}, no number" in found.malformed
+    assert found.remedy == f"write {keys} of the layout"
+
+
+def test_a_number_without_the_text_in_front_of_it_is_no_sample_and_is_told():
+    columns = line_layout(("seq", "x"), [{"name": "x", "prefix": "V="}], counter="seq")
+    framing = LineFraming({"a": columns}, {"a": 100.0})
+    framing.cut(b"half a line\n")
+    found = framing.cut(b"0,V=1.5\n1,U=2.5\n2, V= 3.5\n3,V=---\n4,\n")
+    assert found.frames["a"].counter.tolist() == [0, 2, 3, 4]
+    np.testing.assert_array_equal(found.frames["a"].samples[:, 0, 0], np.float32([1.5, 3.5, np.nan, np.nan]))
+    assert "column x is 'U=2.5', without 'V=' in front of the number" in found.malformed
+    assert found.remedy == "correct prefix of the channel x"
 
 
 def test_lines_of_padded_columns_are_read_and_others_described():

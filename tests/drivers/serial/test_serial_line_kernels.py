@@ -16,6 +16,7 @@ from support.bus_tables import line_layout
 from drivers.serial.framing import Pieces
 from drivers.serial.line_kernels import check_lines
 from drivers.serial.lines import DeviceTime, LineCodec
+from drivers.serial.settings import LineLayout
 
 pytestmark = pytest.mark.property
 NUMBERS = st.one_of(
@@ -165,6 +166,59 @@ def test_a_number_is_read_with_the_text_behind_it_and_with_no_other(
     with np.errstate(over="ignore"):
         want = np.array([one for one in values if one is not None], float).astype(np.float32)
     np.testing.assert_array_equal(lines.samples[:, 0, 0], want)
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(["", " "]),
+            st.sampled_from(["V=", "E", "W=", "", "µ:"]),
+            NUMBERS | ABSENT,
+            st.sampled_from(["", " "]),
+            st.sampled_from(["°C", "C", "E", ""]),
+        ),
+        min_size=1,
+        max_size=8,
+    ),
+    st.sampled_from(["V=", "E", "µ:"]),
+    st.sampled_from([None, "°C", "E"]),
+    st.sampled_from(["utf-8", "latin-1"]),
+)
+@example([("", "V=", "", "", ""), ("", "", "--", "", ""), ("", "V=", "--", "", "°C")], "V=", "°C", "utf-8")
+@example([("", "V=", "9007199254740993", " ", "°C"), (" ", "V=", "1e5", "", "")], "V=", "°C", "latin-1")
+def test_a_number_is_read_between_two_texts_and_not_without_them(
+    rows: list[tuple[str, ...]], prefix: str, suffix: str | None, encoding: str
+) -> None:
+    channel = {"name": "x", "prefix": prefix} | ({} if suffix is None else {"suffix": suffix})
+    fields = ["".join(row) for row in rows]
+    lines = codec(channels=[channel]).read(pieces([f"1,,{field}".encode(encoding) for field in fields]))
+    values: list[float | None] = []
+    for field in fields:
+        bare = field.lstrip(" ")
+        is_whole = bare.startswith(prefix)
+        bare = bare.removeprefix(prefix) if is_whole else field
+        if is_whole and suffix is not None:
+            is_whole = bare.rstrip(" ").endswith(suffix)
+            bare = bare.rstrip(" ").removesuffix(suffix)
+        one = value(bare)
+        values.append(one if is_whole or (one is not None and np.isnan(one)) else None)
+    assert lines.good.tolist() == [one is not None for one in values]
+    with np.errstate(over="ignore"):
+        want = np.array([one for one in values if one is not None], float).astype(np.float32)
+    np.testing.assert_array_equal(lines.samples[:, 0, 0], want)
+
+
+def test_counter_and_time_have_texts_around_them_too() -> None:
+    layout = {"line": ("n", "x"), "channels": [{"name": "x", "prefix": "x:"}]}
+    for place, text, good in (
+        ({"counter": {"column": "n", "prefix": "n=", "suffix": "#"}}, b"n=17#", b"17"),
+        ({"time": {"column": "n", "unit": "ms", "prefix": "t=", "suffix": "ms"}}, b"t=17000ms", b"t=17000s"),
+    ):
+        stream = LineCodec(LineLayout.model_validate({**layout, **place}))
+        lines = stream.read(pieces([text + b",x:1.5", good + b",x:1.5", b"--,x:1.5"]))
+        assert (lines.good.tolist(), lines.places.tolist()) == ([True, False, False], [17.0])
+        written = stream.write(17, np.array([-0.5]))
+        assert stream.read(pieces([written])).samples.ravel().tolist() == [-0.5]
 
 
 def test_what_is_written_with_a_text_behind_it_is_read_again() -> None:

@@ -449,10 +449,46 @@ def test_lines_in_another_unit_are_damaged() -> None:
     assert list(what.damaged) == rows[56:]
 
 
-def test_what_grows_with_a_unit_behind_it_is_no_counter_and_no_time() -> None:
-    what = text_lines("".join(f"{10 * k} ms,{k % 7}.5\n" for k in range(60)).encode())
+@pytest.mark.parametrize(("unit", "grows"), [("ms", True), ("mm/s", False)])
+def test_what_grows_with_a_unit_behind_it_is_no_counter_and_a_time_if_the_unit_is_of_one(
+    unit: str, *, grows: bool
+) -> None:
+    what = text_lines("".join(f"{10 * k} {unit},{k % 7}.5\n" for k in range(60)).encode())
     assert what is not None
-    assert (what.columns[0].unit, what.columns[0].step, what.columns[0].grows) == ("ms", 0.0, False)
+    assert (what.columns[0].unit, what.columns[0].step, what.columns[0].grows) == (unit, 0.0, grows)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+def test_lines_with_letters_of_units_beyond_ascii_are_text(encoding: str) -> None:
+    rows = [f"{20 + k % 7 / 10:.1f}°C,{k % 5}.25 µm,{k % 3}.5 m/s²" for k in range(60)]
+    found = recognised("".join(f"{row}\r\n" for row in rows).encode(encoding))
+    assert isinstance(found.what, TextLines)
+    assert found.score >= CONCLUSIVE
+    assert [column.unit for column in found.what.columns] == ["°C", "µm", "m/s²"]
+    assert not found.what.damaged
+
+
+@pytest.mark.parametrize("separator", [" ", ",", ", ", ";"])
+@pytest.mark.parametrize("sign", ["=", ":"])
+def test_names_in_front_of_numbers_are_those_of_the_columns(separator: str, sign: str) -> None:
+    rows = [
+        separator.join(
+            (
+                f"n{sign}{k}",
+                f"Temp{sign}{20 + k % 7 / 10:.1f}C",
+                f"V_1{sign}{'---' if k % 4 else k % 3}",
+                "ok",
+            )
+        )
+        for k in range(40)
+    ]
+    what = text_lines("".join(f"{row}\n" for row in rows).encode())
+    assert what is not None
+    assert (what.separator, what.header, list(what.damaged)) == (separator[0], False, [])
+    assert [column.name for column in what.columns] == ["n", "Temp", "V_1", "c4"]
+    assert [column.prefix for column in what.columns] == [f"n{sign}", f"Temp{sign}", f"V_1{sign}", ""]
+    assert [column.unit for column in what.columns] == ["", "C", "", ""]
+    assert what.columns[0].step == 1
 
 
 MESSAGES = {

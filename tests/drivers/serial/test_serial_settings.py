@@ -141,8 +141,22 @@ def test_the_driver_is_found_by_its_name():
                 ("mm,s", 'has the separator "," in it', "a separate column in line"),
                 (" mm/s", "cannot be the text behind a number", 'e.g. "mm/s"'),
                 ("12", "cannot be the text behind a number", 'e.g. "mm/s"'),
-                ("°C", "cannot be the text behind a number", 'e.g. "mm/s"'),
+                ("m\\u0007", "cannot be the text behind a number", 'e.g. "mm/s"'),
             )
+        ),
+        (
+            '{ name = "v" }',
+            '{ name = "v", prefix = "12" }',
+            "streams.casing.layout.channels[0].prefix",
+            "cannot be the text in front of a number",
+            'e.g. "V="',
+        ),
+        (
+            'column = "seq", bits = 16 }',
+            'column = "seq", bits = 16, prefix = "n," }',
+            "streams.casing.layout.counter.prefix",
+            'has the separator "," in it',
+            "a separate column in line",
         ),
         (LINE, LINE + 'separator = "."\n', "streams.casing.layout.separator", "cannot stand between", '";"'),
         (

@@ -17,6 +17,7 @@ import time
 import tomllib
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
 import serial
 from support.formats import fits
@@ -24,10 +25,14 @@ from support.waiting import PATIENCE_S
 
 from daqsvc.cli import main
 from daqsvc.commands.new.interview import Given, conduct
+from daqsvc.commands.new.machine_text import machine_text
 from drivers.serial import questions, sniff
+from drivers.serial.framing import Pieces
+from drivers.serial.lines import LineCodec
 from drivers.serial.questions import SerialQuestions, _in_words, _proposals
 from drivers.serial.recognise import recognised
 from drivers.serial.recognise_lines import TextLines
+from drivers.serial.settings import LineLayout
 from drivers.serial.sniff import MUST_TURN
 from sim_hw.nodes.serial_node import PseudoTerminal
 
@@ -704,10 +709,10 @@ def test_new_reads_lines_that_only_have_what_is_measured(
 def test_new_makes_no_counter_of_a_measured_column(
     cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = "No column is a number alone, such as 22.5: NAME=22.5, JSON and hex are not"
+    words = "No column is a number, such as 22.5 or NAME=22.5: JSON and hex are not read."
     monkeypatch.setattr(questions, "_LISTEN_S", 0.6)
     file = tmp_path / "no-counter.toml"
-    with talking(cable, lambda number: b"V=1.%d T=45.%d\r\n" % (number * 7 % 10, number * 3 % 10)):
+    with talking(cable, lambda number: b'{"v":1.%d} 0x%02X\r\n' % (number * 7 % 10, number * 3 % 10 + 160)):
         assert main(["new", f"{file}", "--yes", "--listen", "--bus=serial", f"--port={cable.path}"]) == 1
         said = capsys.readouterr()
         heard = SerialQuestions().listen(
@@ -723,6 +728,72 @@ def test_new_makes_no_counter_of_a_measured_column(
     answers = conduct(file, given, lambda question: f"{question.default}", told.append, lambda *_: heard)
     assert words in told[0]
     assert answers["notes"] == [f"What was heard does not fit this file: {told[0]}."]
+
+
+NAMED = {
+    "neither counter nor time": (
+        lambda n: b"V=1.%d T=%d\r\n" % (n * 7 % 10, 3 + n * 3 % 4),
+        {"line": ["V", "T"], "no_counter": True},
+        [{"name": "V", "prefix": "V="}, {"name": "T", "prefix": "T="}],
+    ),
+    "a counter": (
+        lambda n: b"n=%d,x:1.%d\r\n" % (n, n * 7 % 10),
+        {"line": ["n", "x"], "counter": {"column": "n", "prefix": "n="}},
+        [{"name": "x", "prefix": "x:"}],
+    ),
+    "letters beyond ASCII": (
+        lambda n: f"{n},4{n * 7 % 10}.5°C\r\n".encode("latin-1"),
+        {"line": ["c1", "c2"], "counter": {"column": "c1"}},
+        [{"name": "c2", "suffix": "°C"}],
+    ),
+}
+
+
+@pytest.mark.parametrize(("sends", "layout", "channels"), NAMED.values(), ids=NAMED)
+def test_whoever_takes_all_defaults_gets_the_file_of_yes_and_it_reads_the_lines(
+    cable: PseudoTerminal,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    sends: Callable[[int], bytes],
+    layout: dict[str, Any],
+    channels: list[dict[str, str]],
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 0.8)
+    with talking(cable, sends):
+        file = new(cable, tmp_path / "new.toml", "--name=fan", "--rate=200")
+        heard = SerialQuestions().listen(
+            {"port": f"{cable.path}"}, tmp_path, threading.Event(), lambda _line: None
+        )
+    given = Given({"bus": "serial", "port": f"{cable.path}", "name": "fan", "rate": "200"}, defaults=False)
+    named = tmp_path / "new.toml"
+    answers = conduct(named, given, lambda one: f"{one.default}", lambda _: None, lambda *_: heard)
+    assert tomllib.loads(machine_text(answers, named.name)) == file
+    written = file["streams"]["device"]["layout"]
+    assert {key: written[key] for key in layout} == layout
+    assert written["channels"] == channels
+    codec = LineCodec(LineLayout.model_validate({**written, "line": tuple(written["line"])}))
+    sent = [sends(number).rstrip(b"\r\n") for number in range(20)]
+    stops = np.cumsum([len(one) for one in sent])
+    pieces = Pieces(np.frombuffer(b"".join(sent), np.uint8), np.append(0, stops[:-1]), stops, stops)
+    assert codec.read(pieces).good.all()
+
+
+def test_a_time_with_a_unit_behind_it_is_proposed_as_it_is(
+    cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 0.8)
+    begin_s = time.monotonic()
+
+    def sends(number: int) -> bytes:
+        return b"t=%.2fms,%d.5 mm/s\r\n" % (1e3 * (time.monotonic() - begin_s), number * 7 % 9)
+
+    with talking(cable, sends):
+        found = figures(cable, capsys)
+        file = new(cable, tmp_path / "new.toml")
+    time_keys = {"column": "t", "unit": "ms", "prefix": "t=", "suffix": "ms"}
+    proposed = check(tmp_path, found["machine_file"], capsys)
+    assert proposed["streams"]["lines"]["layout"]["time"] == time_keys
+    assert file["streams"]["device"]["layout"]["time"] == time_keys
 
 
 def test_new_proposes_no_counter_for_frames_without_one(
@@ -764,13 +835,13 @@ def test_new_proposes_the_frames_that_it_hears(
     assert 50 < stream["rate_hz"] < 400
 
 
-@pytest.mark.parametrize("text", ["T=%.2f P=6.967 S=OK\n", '{"x":%.3f,"y":-0.352}\n'])
+@pytest.mark.parametrize("text", ["T=0x%.0fF S=OK\n", '{"x":%.3f,"y":-0.352}\n'])
 def test_why_text_without_numbers_gives_no_stream_is_stated(
     cable: PseudoTerminal, capsys: pytest.CaptureFixture[str], text: str
 ) -> None:
     with talking(cable, lambda number: (text % (number % 7 + 0.25)).encode()):
         assert main(["sniff", "serial", f"{cable.path}", "--seconds", "0.6"]) == 0
-    assert "# No column is a number alone, such as 22.5: NAME=22.5, JSON" in capsys.readouterr().out
+    assert "# No column is a number, such as 22.5 or NAME=22.5: JSON and hex" in capsys.readouterr().out
 
 
 def test_the_file_states_that_the_driver_does_not_check_a_sum(
