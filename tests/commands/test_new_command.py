@@ -47,6 +47,8 @@ WORDS = st.text(st.one_of(PLAIN, st.sampled_from(" \"'\\#[]=,{}")), max_size=40)
 NAMES = st.from_regex(r"[A-Za-z][A-Za-z0-9_-]{0,20}", fullmatch=True)
 NUMBERS = st.floats(-1e6, 1e6).map(repr)
 FREE = {
+    "seconds": st.sampled_from(["auto", "0.5", "20"]),
+    "suffix": st.sampled_from(["none", "mm/s", "C"]),
     "name": st.builds("{}a{}".format, WORDS, WORDS),
     "site": NAMES,
     "box": NAMES,
