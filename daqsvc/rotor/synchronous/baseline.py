@@ -366,10 +366,11 @@ def _refuse_unsteady(
                 f"{speed_rpm:.1f} rpm ({100.0 * (orbit_rpm / speed_rpm - 1.0):+.2f} %); correct the speed, "
                 "or use a keyphasor"
             )
+    by_chance = odd.by * math.sqrt(VECTOR_NATS / odd.nats)
     raise NotCalibratableError(
         f"not steady: {odd.what} moves by {odd.by:.3g} um in revolutions {odd.begin + 1} to {odd.end} of "
-        f"{len(moved)} ({odd.nats:.0f} nats, at most {VECTOR_NATS:.0f} are chance); calibrate where the "
-        "machine runs steadily and is healthy"
+        f"{len(moved)} (by chance it moves by {by_chance:.3g} um at most); calibrate where the machine runs "
+        "steadily and is healthy"
     )
 
 
