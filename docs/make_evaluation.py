@@ -185,6 +185,7 @@ def rotors(docs: Path) -> Iterator[Row]:
             "rotor bank from a run-up",
             {
                 "right": "named right",
+                "right of predicted": "named right, of those that are predicted to be named alone",
                 "told": "truth in the group",
                 "wrong": "wrong",
                 "not seen": "not seen",
