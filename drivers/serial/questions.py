@@ -10,12 +10,12 @@ from drivers import packed_questions as packed
 from drivers import questions as q
 from drivers.bus_questions import BEFOREHAND, BUS, BusQuestions, Heard, guessed_sensors, only_port, seconds_of
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
-from drivers.serial.sniff import (
+from drivers.serial.sniff import SerialSniffer
+from drivers.serial.sniff_report import (
     ANY_BAUD,
     LINES_NEED,
     MUST_TURN,
     NO_NUMBERS,
-    SerialSniffer,
     absent_words,
     frames_need,
     no_number_words,

@@ -26,14 +26,14 @@ from support.waiting import PATIENCE_S
 from daqsvc.cli import main
 from daqsvc.commands.new.interview import Given, conduct
 from daqsvc.commands.new.machine_text import machine_text
-from drivers.serial import questions, sniff
+from drivers.serial import ports, questions, sniff
 from drivers.serial.framing import Pieces
 from drivers.serial.lines import LineCodec
 from drivers.serial.questions import SerialQuestions, _in_words, _proposals
 from drivers.serial.recognise import recognised
 from drivers.serial.recognise_lines import TextLines
 from drivers.serial.settings import LineLayout
-from drivers.serial.sniff import MUST_TURN
+from drivers.serial.sniff_report import MUST_TURN, WAITING_S, Heard, Report, Tried
 from sim_hw.nodes.serial_node import PseudoTerminal
 
 if TYPE_CHECKING:
@@ -257,8 +257,8 @@ def test_two_machines_on_one_port_are_two_kinds_of_lines(
 def test_the_rate_is_that_of_the_clock_of_the_device_where_it_sends_one() -> None:
     data = b"".join(b"%d;1.5\n" % (251 * number) for number in range(40))
     # Few lines in little time: by their arrival the rate is 4 % off.
-    heard = sniff.Heard(data, len(data), 0.0, 10.2, 0)
-    found = sniff._Report("ttyUSB0", [], sniff.Tried(9600, "none", heard, recognised(data)), True).sniffed()
+    heard = Heard(data, len(data), 0.0, 10.2, 0)
+    found = Report("ttyUSB0", [], Tried(9600, "none", heard, recognised(data)), True).sniffed()
     assert found.figures["rate_hz"] == pytest.approx(1000 / 251, rel=1e-6)
     assert tomllib.loads(found.fragment)["streams"]["lines"]["rate_hz"] == pytest.approx(3.98)
 
@@ -301,8 +301,8 @@ def test_the_baud_rate_for_a_port_without_one_is_the_same_however_long_it_listen
     """`new` listens for a shorter time than `sniff`; what had been waiting in the port is not counted."""
     data = b"".join(b"%d.25\r\n" % (k % 7) for k in range(600))
     received, waiting = round(0.995 * 36_864 * seconds) + 40_000, 40_000
-    heard = sniff.Heard(data, received, 0.0, seconds + sniff._WAITING_S, 0, waiting=waiting)
-    report = sniff._Report("ttyACM0", [], sniff.Tried(9600, "none", heard, recognised(data)), False)
+    heard = Heard(data, received, 0.0, seconds + WAITING_S, 0, waiting=waiting)
+    report = Report("ttyACM0", [], Tried(9600, "none", heard, recognised(data)), False)
     assert report.sniffed().figures["baud"] == 460_800
 
 
@@ -521,8 +521,8 @@ def test_a_port_that_is_busy_absent_or_not_ours_is_one_line(
     by_id = tmp_path / "by-id"
     by_id.mkdir()
     (by_id / "usb-Pico-if00").symlink_to(cable.path)
-    monkeypatch.setattr(sniff, "BY_ID", by_id)
-    assert sniff.lasting_name(f"{cable.path}") == f"{by_id}/usb-Pico-if00"
+    monkeypatch.setattr(ports, "BY_ID", by_id)
+    assert ports.lasting_name(f"{cable.path}") == f"{by_id}/usb-Pico-if00"
     words = said(tmp_path / "absent")
     assert "plug the device in, or correct the name" in words
     assert f"ports of this computer: {by_id}/usb-Pico-if00" in words

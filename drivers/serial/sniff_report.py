@@ -1,0 +1,673 @@
+"""What ``daqsvc sniff serial`` found on a port: in words, in figures, and as a machine file."""
+
+from __future__ import annotations
+
+import textwrap
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from daqsvc.documentation import documented_in
+from daqsvc.rounding import counted
+from daqsvc.settings.units import may_be_unit, unit_of
+from drivers.serial.line_numbers import BEYOND_ASCII
+from drivers.serial.ports import lasting_name
+from drivers.sniffing import (
+    Sniffed,
+    SniffTable,
+    quoted,
+    rounded_rate,
+    sensor_lines,
+    table_name,
+    unused,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from drivers.serial.recognise import Recognised
+    from drivers.serial.recognise_frames import BinaryFrames
+    from drivers.serial.recognise_lines import Column, TextLines
+    from drivers.serial.sniff_json import SerialFigures
+
+_SHOWN_LINES = 8
+_SHOWN_ROWS = 8
+_ROW = 16
+_WIDEST = 100
+_PER_S = {"s": 1.0, "ms": 1e3, "us": 1e6}
+_FAST = (9600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_800, 921_600, 2_000_000, 4_000_000, 12_000_000)
+"""Baud rates to propose where the port has none."""
+WAITING_S = 0.05
+"""Within this time from the first byte on, those come that had been waiting in the port."""
+_SURELY = 1.05
+_WHOLE = 0.995
+"""Share of the bytes in frames from which on the rest is not worth a word."""
+
+
+class Heard(NamedTuple):
+    """What came over an open port.
+
+    Attributes:
+        data: the bytes, the last `MOST_KEPT` of them.
+        received: how many came.
+        first_s: when the first came, host monotonic.
+        last_s: when the last did.
+        errors: characters that the UART found without a stop bit; 0 where it does not count.
+        lost: why the port was lost; empty if it was not.
+        waiting: how many of the bytes came within `WAITING_S`: most of them had been waiting in the port.
+    """
+
+    data: bytes
+    received: int
+    first_s: float
+    last_s: float
+    errors: int
+    lost: str = ""
+    waiting: int = 0
+
+
+class Tried(NamedTuple):
+    """One baud rate: how it was opened, what came, and what that is."""
+
+    baud: int
+    parity: str
+    heard: Heard
+    found: Recognised
+
+
+def all_alike(tried: Sequence[Tried]) -> bool:
+    """Whether the bytes have a meaning at all baud rates: the port does not use them.
+
+    A pseudo-terminal does not, nor do many devices that are the USB port themselves.
+    """
+    return len(tried) > 1 and all(one.found.sure for one in tried)
+
+
+def dump(data: bytes) -> str:
+    """Bytes in hexadecimal beside what they are as text, 16 on a line."""
+    rows = []
+    for at in range(0, len(data), _ROW):
+        row = data[at : at + _ROW]
+        text = "".join(chr(byte) if 0x20 <= byte < 0x7F else "." for byte in row)
+        rows.append(f"{at:06x}  {row.hex(' '):<{3 * _ROW - 1}}  {text}")
+    return "\n".join(rows)
+
+
+class Report(NamedTuple):
+    """What was heard, in words, in figures and as a machine file."""
+
+    port: str
+    tried: Sequence[Tried]
+    best: Tried
+    asked: bool
+
+    def sniffed(self) -> Sniffed:
+        """All of it."""
+        return Sniffed(list(self._parts()), self._figures(), self._fragment(), self._problem())
+
+    @property
+    def _what(self) -> TextLines | BinaryFrames | None:
+        """What was found; a guess is none of it."""
+        return self.best.found.what if self.best.found.sure else None
+
+    @property
+    def _any_baud(self) -> bool:
+        """Whether all rates came out alike, or one brings more than it can carry."""
+        return all_alike(self.tried) or self._is_overrun
+
+    @property
+    def _bits_per_s(self) -> float:
+        """What comes; what had been waiting in the port is left out."""
+        heard = self.best.heard
+        bits = 2 + (7 if self.best.found.parity else 8) + (self._parity != "none")
+        seconds = heard.last_s - heard.first_s - WAITING_S
+        return bits * (heard.received - heard.waiting) / seconds if seconds > 0 else 0.0
+
+    @property
+    def _is_overrun(self) -> bool:
+        """Whether more bytes come than the baud rate carries: a port that is USB itself has none."""
+        return self._bits_per_s > _SURELY * self.best.baud
+
+    @property
+    def _baud(self) -> int:
+        """The baud rate for the machine file: the least usual one that carries what comes."""
+        from daqsvc.settings.buses import BUSY  # noqa: PLC0415 - brings the settings
+
+        if not self._is_overrun:
+            return self.best.baud
+        return next((baud for baud in _FAST if BUSY * baud >= self._bits_per_s), _FAST[-1])
+
+    @property
+    def _parity(self) -> str:
+        return self.best.found.parity or self.best.parity
+
+    @property
+    def _character(self) -> str:
+        bits = 7 if self.best.found.parity else 8
+        return f"{bits}{self._parity[0].upper()}1"
+
+    def _rate_hz(self, what: TextLines | BinaryFrames | None) -> float | None:
+        """Lines of one kind, or frames, a second; None where it cannot be known."""
+        from drivers.serial.recognise_lines import TextLines  # noqa: PLC0415 - only for who listens
+
+        heard = self.best.heard
+        seconds = heard.last_s - heard.first_s
+        if seconds <= 0 or what is None:
+            return None
+        if isinstance(what, TextLines):
+            count = heard.data.count(what.delimiter.encode()) * self._share(what)
+            per_frame = len(heard.data) / max(1, count)
+        else:
+            per_frame = what.bytes_per_frame
+        return max(heard.received - per_frame, 0) / per_frame / seconds or None
+
+    def _sampling_hz(self, what: TextLines) -> float | None:
+        """Lines of one kind a second by the device's own clock, where it sends one, else as they came."""
+        column = self._time(what)
+        unit = None if column is None else self._time_unit(what, column)
+        if column is None or unit is None:
+            return self._rate_hz(what)
+        return _PER_S[unit] / column.per_line
+
+    def _share(self, what: TextLines) -> float:
+        """How many of the lines are of one kind."""
+        from drivers.serial.recognise_lines import TextLines  # noqa: PLC0415 - only for who listens
+
+        of_all = self._what.kinds if isinstance(self._what, TextLines) else [what]
+        return len(what.lines) / sum(len(kind.lines) for kind in of_all)
+
+    def _problem(self) -> str:
+        from drivers.serial.recognise import LEAST_BYTES  # noqa: PLC0415 - only for who listens
+
+        heard = self.best.heard
+        if heard.lost:
+            return f"{self.port} was lost: {heard.lost}. Remedy: plug it in again and see `dmesg`"
+        if not heard.received and not any(one.heard.received for one in self.tried):
+            return (
+                f"{self.port}: no byte came. Remedy: check that the device is powered and sends without "
+                "being asked. Its TX must lead to RX of this port (for RS-485: A to A, B to B), and "
+                "ground must be connected. A Modbus device must be asked: daqsvc sniff modbus"
+            )
+        if self._what is None and heard.received < LEAST_BYTES:
+            return (
+                f"{self.port}: only {heard.received} bytes came, which are too few to tell what they are. "
+                "Remedy: listen longer by --seconds, with --baud if the device's rate is known"
+            )
+        if self.best.found.is_enclosed:
+            return (
+                f"{self.port}: text comes between the bytes 02 (STX) and 03 (ETX), which daqsvc does not "
+                "read. Remedy: set the device to lines that end with a line feed or a carriage return; else "
+                "write a driver"
+            )
+        if self._what is None:
+            tried = f"--baud {self.best.baud}" if self.asked else "each of the usual baud rates"
+            return (
+                f"{self.port}: bytes come, but by {tried} they are neither lines of text nor frames of one "
+                f"length{self._guess()}. Remedy: state the device's rate by --baud; check that no other "
+                "device drives the line"
+            )
+        return ""
+
+    def _guess(self) -> str:
+        """What the bytes are most likely, in words; empty if they are like nothing."""
+        from drivers.serial.recognise_lines import TextLines  # noqa: PLC0415 - only for who listens
+
+        what, score = self.best.found.what, self.best.found.score
+        if what is None:
+            return ""
+        if isinstance(what, TextLines):
+            likely = "lines of text"
+        elif what.framing == "cobs":
+            likely = f"COBS frames of {what.length} bytes"
+        else:
+            likely = f"frames of {what.length} bytes behind {what.sync.hex(' ')}"
+        return f"; most likely they are {likely}, but a score of {score:.2f} may be chance"
+
+    def _parts(self) -> Iterator[str | SniffTable]:
+        from drivers.serial.recognise_lines import TextLines  # noqa: PLC0415 - only for who listens
+
+        heard = self.best.heard
+        if len(self.tried) > 1:
+            rows = [_tried_row(one) for one in self.tried]
+            yield SniffTable(("bit/s", "bytes", "framing errors", "text", "score"), rows)
+        if not heard.received:
+            yield f"{self.port}: no byte came"
+            return
+        per_s = heard.received / max(heard.last_s - heard.first_s, 1e-3)
+        line = f"{'any baud rate' if self._any_baud else f'{self.best.baud} bit/s'}, {self._character}"
+        yield f"{self.port} at {line}: {heard.received} bytes, {per_s:.0f}/s"
+        if self._is_overrun:
+            yield overrun_words(self.best.baud, self._baud)
+        begin = heard.data[: _ROW * _SHOWN_ROWS]
+        yield f"The first bytes:\n{dump(begin)}"
+        what = self._what
+        if isinstance(what, TextLines):
+            if what.others:
+                yield f"{len(what.kinds)} kinds of lines, by their first column: {_prefixes(what)}"
+            for kind in what.kinds:
+                yield from self._lines(kind)
+        elif what is not None:
+            yield self._frames(what)
+
+    def _lines(self, what: TextLines) -> Iterator[str | SniffTable]:
+        shown = "\n".join(line[:_WIDEST] for line in what.lines[:_SHOWN_LINES])
+        yield f"The first lines:\n{_printable(shown)}"
+        words = [counted(len(what.columns), "column")]
+        between = "blanks" if what.separator == " " else quoted(what.separator)
+        words += [f"separated by {between}"] * bool(what.separator)
+        words += ["numbers have a decimal comma"] * (what.decimal == ",")
+        words += [f"each line begins with {what.prefix}"] * bool(what.prefix)
+        words += ["the first line names them"] * what.header
+        words += [f"checksum {what.checksum}"] * (what.checksum != "none")
+        if what.damaged:
+            words.append(_other_lines(what))
+        rate_hz = self._rate_hz(what)
+        rate = "" if rate_hz is None else f", {rate_hz:.4g} lines/s"
+        yield f"Lines of text{rate}: {'; '.join(words)}"
+        counter, time_column = _counter(what), self._time(what)
+        rows = []
+        for one in what.columns:
+            # As the device writes them, and as the last one is shown.
+            limits = [
+                f"{end:g}".replace(".", what.decimal) if one.numeric else "" for end in (one.least, one.most)
+            ]
+            use = "counts" if one is counter else "time" if one is time_column else ""
+            use = f"counts to {one.turns_at - 1}" if one.turns_at else use
+            use = ", ".join(filter(None, (use, f"in {one.unit}" if one.unit else "")))
+            rows.append((one.name, "number" if one.numeric else "text", *limits, one.last[:24], use))
+        yield SniffTable(("column", "kind", "min", "max", "last", ""), rows)
+        yield from (turn_words(one.name, one.turns_at) for one in what.columns if one.turns_at)
+        yield from self._not_read(what, {one: one.name for one in what.columns})
+
+    def _not_read(self, what: TextLines, names: Mapping[Column, str]) -> Iterator[str]:
+        """What of the lines does not become samples, beside those of another layout; names by column."""
+        heard = len(what.lines) - len(what.damaged)
+        yield from (
+            absent_words(names[one], one.absent, heard, one.absent_text) for one in what.columns if one.absent
+        )
+        texts = {names[one]: one.last for one in what.columns if not one.numeric}
+        if texts and len(texts) < len(what.columns):
+            yield no_number_words(texts)
+
+    def _time(self, what: TextLines) -> Column | None:
+        """The column that has the device's time, if none counts."""
+        if _counter(what) is not None:
+            return None
+        growing = [one for one in what.columns if one.grows and self._time_unit(what, one) is not None]
+        return growing[0] if growing else None
+
+    def _time_unit(self, what: TextLines, column: Column) -> str | None:
+        """The unit in which a column grows by as much as lines take; None if there is none."""
+        from drivers.serial.recognise_lines import TIME_UNITS  # noqa: PLC0415 - only for who listens
+
+        rate_hz = self._rate_hz(what)
+        if rate_hz is None:
+            return None
+        for unit, per_s in _PER_S.items():
+            if column.unit and TIME_UNITS[column.unit] != unit:
+                continue
+            if 0.8 < column.per_line * rate_hz / per_s < 1.25:
+                return unit
+        return None
+
+    def _frames(self, what: BinaryFrames) -> str:
+        name = "COBS frames"
+        if what.framing == "sync":
+            name = f"Frames behind the sync word {what.sync.hex(' ')}"
+        rate_hz = self._rate_hz(what)
+        rate = "" if rate_hz is None else f", {rate_hz:.4g} frames/s"
+        check = "no check that is known"
+        if what.crc:
+            order = f", {what.crc_order} endian" if what.crc_bytes > 1 else ""
+            begin = "" if what.crc_from or not what.sync else ", sync word included"
+            check = f"check {what.crc}{order}{begin}"
+            count = len(what.frames) + what.damaged
+            share = f"{100 * what.passing:.0f} %" if what.damaged else "all"
+            check += f", passes in {share} of {count} frames"
+        counter = f"counter at {what.counter}" if what.counter else "no counter"
+        stray = ""
+        if what.coverage < _WHOLE:
+            stray = f"; {100 * (1 - what.coverage):.0f} % of the bytes are in no frame"
+        return (
+            f"{name}{rate}: {what.length} bytes, of them {what.payload_length} of payload; {check}; "
+            f"{counter} (bytes of the payload count from 0){stray}"
+        )
+
+    def _figures(self) -> SerialFigures:
+        from drivers.serial.recognise_lines import TextLines  # noqa: PLC0415 - only for who listens
+
+        heard, what = self.best.heard, self._what
+        figures: SerialFigures = {
+            "bus": "serial",
+            "port": self.port,
+            "baud": self._baud,
+            "overrun_baud": self.best.baud if self._is_overrun else None,
+            "any_baud": self._any_baud,
+            "character": self._character,
+            "bytes": heard.received,
+            "framing_errors": heard.errors,
+            "score": round(self.best.found.score, 3),
+            "tried": [{"baud": one.baud, "score": round(one.found.score, 3)} for one in self.tried],
+            "first_bytes": heard.data[: _ROW * _SHOWN_ROWS].hex(),
+            "rate_hz": self._sampling_hz(what) if isinstance(what, TextLines) else self._rate_hz(what),
+            "framing": None,
+        }
+        if isinstance(what, TextLines):
+            counter, time_column = _counter(what), self._time(what)
+            figures |= {
+                "framing": "lines",
+                "delimiter": what.delimiter,
+                "separator": what.separator,
+                "decimal": what.decimal,
+                "prefix": what.prefix,
+                "checksum": what.checksum,
+                "header": what.header,
+                "columns": [
+                    {
+                        "name": one.name,
+                        "numeric": one.numeric,
+                        "prefix": one.prefix or None,
+                        "unit": one.unit or None,
+                        "min": one.least,
+                        "max": one.most,
+                        "counts": one is counter,
+                        "turns_at": one.turns_at or None,
+                        "time_unit": self._time_unit(what, one) if one is time_column else None,
+                        "last": one.last,
+                        "absent": one.absent,
+                        "absent_text": one.absent_text if one.absent else None,
+                    }
+                    for one in what.columns
+                ],
+                "lines": list(what.lines[:_SHOWN_LINES]),
+                "other_prefixes": [one.prefix for one in what.others],
+                "lines_heard": len(what.lines),
+                "lines_damaged": len(what.damaged),
+                "damaged_line": what.damaged[0] if what.damaged else None,
+            }
+        elif what is not None:
+            figures |= {
+                "framing": what.framing,
+                "sync_word": what.sync.hex(),
+                "frame_length": what.length,
+                "payload_length": what.payload_length,
+                "crc": what.crc,
+                "crc_order": what.crc_order,
+                "crc_bytes": what.crc_bytes,
+                "crc_from": what.crc_from,
+                "frames_passing": round(what.passing, 4),
+                "counter": None if what.counter is None else what.counter._asdict(),
+                "counter_bits": None if (packed := _packed(what)) is None else packed.counter_bits,
+            }
+        return figures
+
+    def _fragment(self) -> str:
+        from drivers.serial.recognise_lines import TextLines  # noqa: PLC0415 - only for who listens
+
+        what = self._what
+        if what is None:
+            return ""
+        name = table_name(Path(self.port).name.lower(), "serial0")
+        head = [
+            f"[buses.{name}]",
+            'driver = "serial"',
+            f"port = {quoted(lasting_name(self.port))}",
+            f"baud = {self._baud:_}{f'    # {ANY_BAUD}' if self._any_baud else ''}",
+        ]
+        head += ["data_bits = 7"] * (self.best.found.parity is not None)
+        head += [f"parity = {quoted(self._parity)}"] * (self._parity != "none")
+        if isinstance(what, TextLines):
+            return "\n".join([*head, *self._lines_tables(what, name)])
+        return "\n".join([*head, *self._frames_tables(what, name)])
+
+    def _lines_tables(self, what: TextLines, bus: str) -> Iterator[str]:
+        yield 'framing = "lines"'
+        if what.checksum in {"xor", "crc16"}:
+            yield f"checksum = {quoted(what.checksum)}"
+        if what.delimiter != "\n":
+            yield f"delimiter = {quoted(what.delimiter)}"
+        sensors: set[str] = set()
+        for kind in what.kinds:
+            yield ""
+            stream = table_name(kind.prefix.lower(), "lines") if what.others else "lines"
+            yield from self._stream(kind, bus, stream, sensors)
+
+    def _stream(self, what: TextLines, bus: str, stream: str, sensors: set[str]) -> Iterator[str]:
+        counter, time_column = _counter(what), self._time(what)
+        # What begins again after 999 counts, and measures nothing.
+        numbers = [
+            one
+            for one in what.columns
+            if one.numeric and not one.turns_at and one not in {counter, time_column}
+        ]
+        place, rate_hz = counter or time_column, self._sampling_hz(what)
+        if not numbers or rate_hz is None:
+            if what.prefix:
+                yield f"# Lines that begin with {what.prefix}:"
+            if not any(one.numeric for one in what.columns):
+                yield f"# {NO_NUMBERS}"
+            yield from (
+                f"# {line}" for line in textwrap.wrap(f"{LINES_NEED}; have the device send them.", 90)
+            )
+            return
+        names = _names(what.columns)
+        yield from self._remarks(what, names)
+        yield f"[streams.{stream}]"
+        yield f"bus = {quoted(bus)}"
+        yield f"rate_hz = {rounded_rate(rate_hz)}    # as measured; see the device's manual"
+        yield ""
+        yield f"[streams.{stream}.layout]"
+        if what.prefix:
+            yield f"prefix = {quoted(what.prefix)}"
+        yield f"line = [{', '.join(quoted(name) for name in names.values())}]"
+        if what.separator not in {",", ""}:  # of one column there is none
+            yield f"separator = {quoted(what.separator)}"
+        if what.decimal != ".":
+            yield f"decimal = {quoted(what.decimal)}"
+        if counter is not None:
+            bits = 8 if counter.most < 256 else 16 if counter.most < 65_536 else 32
+            table = f"{{ column = {quoted(names[counter])}, bits = {bits}{_texts(counter)} }}"
+            yield f"counter = {table}    # as far as it was seen: {MUST_TURN}"
+        elif place is None:
+            yield "no_counter = true    # none was seen, and no time: losses are estimated from the arrivals"
+        else:
+            unit = self._time_unit(what, place)
+            yield f'time = {{ column = {quoted(names[place])}, unit = "{unit}"{_texts(place)} }}'
+        listed = [f"{{ name = {quoted(names[one])}{_texts(one)} }}" for one in numbers]
+        comment = ""
+        if any(map(_texts, numbers)):
+            comment = "    # a line with other texts there is not read: it is counted as damaged"
+        yield f"channels = [{', '.join(listed)}]{comment}"
+        channels = {names[one]: unit_of_suffix(one.unit) for one in numbers}
+        by_stream = bool(what.prefix) and stream != "lines"
+        yield from sensor_lines(stream, channels, sensors, rate_hz, by_stream=by_stream, guess=True)
+
+    def _remarks(self, what: TextLines, names: Mapping[Column, str]) -> Iterator[str]:
+        """What of the lines the file does not read, as comments."""
+        others = [f"{_other_lines(what)}."] if what.damaged else []
+        for remark in (*others, *self._not_read(what, names)):
+            yield from (f"# {line}" for line in textwrap.wrap(remark, 98))
+
+    def _frames_tables(self, what: BinaryFrames, bus: str) -> Iterator[str]:
+        yield f"framing = {quoted(what.framing)}"
+        if what.sync:
+            yield f"sync_word = {quoted(what.sync.hex())}"
+        driver_checks = what.crc in {"ibm-3740", "xmodem"} and what.crc_from == len(what.sync)
+        if what.crc and not driver_checks:
+            yield f"# The driver does not check {what.crc}: a damaged frame is taken for a good one."
+        yield f"crc = {quoted(what.crc if driver_checks else 'none')}"
+        if driver_checks and what.crc_order == "little":
+            yield 'crc_order = "little"'
+        payload = what.payload_length + (0 if driver_checks else what.crc_bytes)
+        yield ""
+        counter, packed = what.counter, _packed(what)
+        rate_hz = self._rate_hz(what)
+        if counter is None or packed is None or rate_hz is None:
+            needed = f"{frames_need(payload)}. See the manual of the device."
+            yield from (f"# {line}" for line in textwrap.wrap(needed, 90))
+            return
+        samples = packed.samples_per_frame
+        yield "[streams.frames]"
+        yield f"bus = {quoted(bus)}"
+        yield f"rate_hz = {rounded_rate(rate_hz * samples)}    # as measured; see the device's manual"
+        yield ""
+        yield "[streams.frames.layout]    # what is behind the counter is a guess: see the device's manual"
+        yield f"payload_length = {payload}"
+        known = f"as the counter has; {'little' if counter.order == 'big' else 'big'} if the values jump"
+        if counter.bits == 8:
+            known = "a guess; big if the values jump"
+        yield f'byte_order = "{counter.order}"    # {known}'
+        counts = "frames" if counter.step == 1 else "samples"
+        yield f'counter = {{ byte = {counter.byte}, bits = {packed.counter_bits}, counts = "{counts}" }}'
+        yield f"first_byte = {counter.byte + packed.counter_bits // 8}"
+        yield f"samples_per_frame = {samples}"
+        names = [f"c{k + 1}" for k in range(packed.channels)]
+        listed = ", ".join(f'{{ name = "{one}", type = "int16", scale = 1.0 }}' for one in names)
+        yield f"channels = [{listed}]"
+        yield from sensor_lines("frames", dict.fromkeys(names, "1"), set(), rate_hz * samples, guess=True)
+
+
+class _Packed(NamedTuple):
+    """How samples of two bytes may lie behind the counter of a frame."""
+
+    counter_bits: int
+    samples_per_frame: int
+    channels: int
+
+
+def _packed(what: BinaryFrames) -> _Packed | None:
+    """What fits; None if nothing does."""
+    counter = what.counter
+    if counter is None:
+        return None
+    bits, end = counter.bits, len(what.sync) + counter.byte + counter.bits // 8
+    if bits == 16 and counter.order == "little" and what.payload_length - counter.byte >= 6:
+        # The upper half of 32 bits, which has not carried yet.
+        upper = what.frames[:, end : end + 2]
+        bits = 16 if upper.any() else 32
+    room = what.payload_length - counter.byte - bits // 8
+    channels = room // (2 * counter.step)
+    return None if channels < 1 else _Packed(bits, counter.step, channels)
+
+
+def _tried_row(one: Tried) -> Sequence[str]:
+    heard, found = one.heard, one.found
+    return (
+        f"{one.baud}{'' if one.parity == 'none' else f', {one.parity} parity'}",
+        f"{heard.received}",
+        f"{heard.errors}",
+        f"{100 * found.printable:.0f} %",
+        f"{found.score:.2f}",
+    )
+
+
+NO_NUMBERS = "No column is a number, such as 22.5 or NAME=22.5: JSON and hex are not read."
+
+
+LINES_NEED = "A stream needs a column of numbers, best beside one that counts lines or has the device's time"
+"""Why nothing is proposed of lines."""
+
+
+def frames_need(payload: int) -> str:
+    """The same of binary frames with so many bytes between sync word and CRC."""
+    return f"A stream needs a counter: none was found in the {payload} bytes of payload, or nothing behind it"
+
+
+def overrun_words(baud: int, proposed: int) -> str:
+    """What it means that more bytes come than a baud rate carries."""
+    return (
+        f"More bytes come than {baud} bit/s carry: the port does not use its baud rate, as USB devices often "
+        f"do not. {proposed} bit/s, which carry them, are proposed."
+    )
+
+
+ANY_BAUD = "any: the port does not use it"
+"""What the baud rate of a port is that brings the same at all of them."""
+
+
+MUST_TURN = "one that begins again at 0 after 999, 9999 or the like is no counter for daqsvc"
+"""What a few seconds of a counter do not show."""
+
+
+def turn_words(name: str, turns_at: int) -> str:
+    """What a column means for daqsvc that begins again at 0 after 99, 999, ..."""
+    return (
+        f"{name} begins again at 0 after {turns_at - 1}: daqsvc cannot count lines by it. It would report "
+        "each turn as a restarted counter [B37], and samples as lost that are not. Use a column with the "
+        f"device's time, if there is one. See {documented_in('serial')}."
+    )
+
+
+def other_lines_words(count: int, heard: int, example: str) -> str:
+    """What it means that some lines are not like the others."""
+    are = "is" if count == 1 else "are"
+    return (
+        f"{count} of {heard} lines {are} not of this layout, e.g. {quoted(_printable(example[:_WIDEST]))}: "
+        "daqsvc counts such lines, and does not read them"
+    )
+
+
+def _other_lines(what: TextLines) -> str:
+    return other_lines_words(len(what.damaged), len(what.lines), what.damaged[0])
+
+
+def absent_words(name: str, absent: int, heard: int, text: str) -> str:
+    """What it means that a column has no value in some lines."""
+    shown = quoted(_printable(text)) if text else "nothing"
+    return (
+        f"{name} has no value in {absent} of {heard} lines: {shown} is there. Only these samples of it are "
+        f"missing. See {documented_in('serial')}."
+    )
+
+
+def no_number_words(texts: Mapping[str, str]) -> str:
+    """What it means that columns, by name, are no numbers."""
+    name, text = next(iter(texts.items()))
+    example = quoted(_printable(text[:_WIDEST]))
+    if len(texts) == 1:
+        begin = f"Column {name} is left out, as no number is there, but e.g. {example}. If it is"
+    else:
+        begin = (
+            f"Columns {', '.join(texts)} are left out: no numbers are there, but e.g. {example}. If they are"
+        )
+    return f"{begin} to be watched, have the device send numbers."
+
+
+def _counter(what: TextLines) -> Column | None:
+    """The column that counts lines: whole numbers, always by 1, to a power of two."""
+    counts = (one for one in what.columns if one.numeric and one.step == 1 and one.least >= 0)
+    return next((one for one in counts if not one.turns_at), None)
+
+
+def unit_of_suffix(suffix: str) -> str:
+    """The unit that a text behind numbers means, as a machine file spells it; ``1`` if it is none."""
+    known = unit_of(suffix)
+    if known is not None:
+        return known.name
+    return suffix if suffix and may_be_unit(suffix) else "1"
+
+
+def _prefixes(what: TextLines) -> str:
+    """The words by which kinds of lines are told apart."""
+    return ", ".join(kind.prefix for kind in what.kinds)
+
+
+def _texts(column: Column) -> str:
+    """The keys for the texts around the number of a column; empty without any."""
+    texts = {"prefix": column.prefix, "suffix": column.unit}
+    return "".join(f", {key} = {quoted(text)}" for key, text in texts.items() if text)
+
+
+def _names(columns: Sequence[Column]) -> dict[Column, str]:
+    """Names of columns that a machine file can have, each once."""
+    taken: set[str] = set()
+    return {one: unused(table_name(one.name, "column"), taken) for one in columns}
+
+
+def _printable(text: str) -> str:
+    shown = (
+        letter
+        if (letter.isascii() and (letter.isprintable() or letter in "\n\t")) or letter in BEYOND_ASCII
+        else "?"
+        for letter in text
+    )
+    return "".join(shown)
