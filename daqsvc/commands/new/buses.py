@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 from daqsvc.commands.plugged import plugged
 from drivers.bus_questions import BusQuestions
-from drivers.can.questions import DbcQuestions, PackedQuestions, VirtualQuestions
+from drivers.can.dbc_questions import DbcQuestions
+from drivers.can.questions import PackedQuestions, VirtualQuestions
 from drivers.modbus.questions import RtuQuestions, TcpQuestions
 from drivers.serial.questions import SerialQuestions
 

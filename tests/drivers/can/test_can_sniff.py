@@ -24,6 +24,7 @@ from daqsvc.cli import main
 from daqsvc.commands.new.interview import Given, conduct
 from drivers.can import questions, sniff, socketcan
 from drivers.can.dbc import messages_of
+from drivers.can.dbc_questions import DbcQuestions
 from drivers.can.dbc_traffic import SignalTraffic
 from drivers.sniffing import sniffed
 from sim_hw.bus_socket import UnixBus
@@ -252,7 +253,7 @@ def test_a_page_is_proposed_at_its_own_rate(tmp_path: Path, signals: tuple[str, 
         },
     }
     answers = {"dbc-folder": tmp_path, "dbc": "slow.dbc", "message": "Slow", "signals": signals}
-    proposed = questions.DbcQuestions().proposals(found, answers)
+    proposed = DbcQuestions().proposals(found, answers)
     assert proposed["rate"] == rate
     assert proposed["counter"] == "none"  # what counts the frames of all pages is no counter of one
 
