@@ -13,22 +13,29 @@ from drivers.bus_questions import (
     BUS,
     BusQuestions,
     Heard,
-    guessed_sensors,
     only_port,
     seconds_of,
     unit_by_name,
 )
-from drivers.modbus.sniff import LAST_REGISTER, ModbusSniffer, registers_of, units_of
+from drivers.modbus import heard
+from drivers.modbus.heard import register_count
+from drivers.modbus.manual_addresses import (
+    doubt_of,
+    doubt_of_channel,
+    doubt_of_registers,
+    doubt_with_table,
+    table_meant,
+)
+from drivers.modbus.sniff import AUTO, LAST_REGISTER, ModbusSniffer, registers_of, units_of
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
 from drivers.sniffing import WAVEFORM_HZ, NothingFoundError, SniffError, sniffed
 from drivers.toml_lines import Hexadecimal, array, entry
 
 if TYPE_CHECKING:
     import threading
-    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from drivers.modbus.sniff import RegisterRange
 
 REGISTERS = ("uint16", "int16", "uint32", "int32", "float32", "uint64", "int64", "float64")
 _OF_SAMPLES = REGISTERS[:5]
@@ -45,10 +52,7 @@ _READ_REGISTERS, _FIFO_REGISTERS = 125, 31
 _UNITS, _WHOLE = ("1-10", "11-247"), "1-247"
 """Most devices have one of the first addresses; to ask for all takes two minutes."""
 _OTHERS = f"To see which other units answer, add --units {_WHOLE}"
-_AUTO = "auto"
 _TIMEOUT_MS = 500.0
-_TABLES = {3: "holding", 4: "input"}
-_SHOWN = 12
 
 
 class _ModbusQuestions(BusQuestions):
@@ -132,18 +136,18 @@ class _ModbusQuestions(BusQuestions):
         """See `BusQuestions.listen`: units are asked for their registers, and nothing is written."""
         del folder
         chosen: str = answers["units"]
-        registers = [] if answers["registers"] == _AUTO else ["--registers", answers["registers"]]
+        registers = [] if answers["registers"] == AUTO else ["--registers", answers["registers"]]
         timeout = ["--timeout-ms", f"{answers['timeout-ms']:g}"]
         words = [*timeout, *seconds_of(answers), *registers, *self._sniffed_as(answers)]
         try:
-            first = _UNITS[0] if chosen == _AUTO else chosen
+            first = _UNITS[0] if chosen == AUTO else chosen
             found = sniffed(ModbusSniffer(), ["--units", first, *words], stop, tell)
         except NothingFoundError as error:
             # A server that answers for units that it does not have answers alike for all of these.
             alike = error.figures.get("units_alike", False) and error.figures["units_asked"] == _first_units()
-            further = chosen == _AUTO and not stop.is_set()
+            further = chosen == AUTO and not stop.is_set()
             if error.figures.get("units") and not (alike and further):
-                return _without_registers(error.figures, answers["registers"])
+                return heard.without_registers(error.figures, answers["registers"])
             if not further:
                 if not error.figures.get("units") and chosen.isdecimal():
                     raise NothingFoundError(f"{error}. {_OTHERS}", error.figures) from error
@@ -154,7 +158,7 @@ class _ModbusQuestions(BusQuestions):
                 found = sniffed(ModbusSniffer(), ["--units", _UNITS[1], *words], stop, tell)
             except NothingFoundError as other:
                 if other.figures.get("units"):
-                    return _without_registers(other.figures, answers["registers"])
+                    return heard.without_registers(other.figures, answers["registers"])
                 raise
         except SniffError as error:
             raise SniffError(f"{error}".replace("TARGET", "its address")) from error
@@ -164,16 +168,16 @@ class _ModbusQuestions(BusQuestions):
                 f"the registers of unit {units} were not read yet when it was ended. Remedy: let it go on, "
                 "or write --units N if the unit is known"
             )
-        lines = list(_in_words(found))
-        if chosen == _AUTO and found["units_asked"][0] == int(_UNITS[0].partition("-")[0]):
+        lines = list(heard.in_words(found))
+        if chosen == AUTO and found["units_asked"][0] == int(_UNITS[0].partition("-")[0]):
             lines.append(f"units {_UNITS[1]} were not asked: daqsvc new --listen --units {_WHOLE} asks all")
         return Heard(
             lines,
             lambda so_far: self._proposals(found, so_far),
-            _only_0(found, answers["registers"]),
-            unheard=lambda so_far: _unheard(found, so_far),
-            guesses=lambda so_far, taken: _guesses(found, so_far, taken),
-            not_read=lambda so_far: _not_read(found, so_far),
+            heard.only_0(found, answers["registers"]),
+            unheard=lambda so_far: heard.unheard(found, so_far),
+            guesses=lambda so_far, taken: heard.guesses(found, so_far, taken),
+            not_read=lambda so_far: heard.not_read(found, so_far),
         )
 
     def _ask_timeout(self) -> Question:
@@ -181,11 +185,11 @@ class _ModbusQuestions(BusQuestions):
 
     def _ask_units(self) -> Question:
         """Which units are to be found; only an option is asked for them."""
-        return self.ask("units", _units, _AUTO, quiet=True)
+        return self.ask("units", _units, AUTO, quiet=True)
 
     def _ask_registers(self, answers: Answers) -> Question:
         """Which registers are to be read; only who listens is asked for them."""
-        return self.ask("registers", _registers, _AUTO, doubt=partial(_doubt_of_registers, answers))
+        return self.ask("registers", _registers, AUTO, doubt=partial(doubt_of_registers, answers))
 
     def _sniffed_as(self, answers: Answers) -> Sequence[str]:
         """Arguments of the sniffer that say where the units are."""
@@ -196,7 +200,7 @@ class _ModbusQuestions(BusQuestions):
         from drivers.modbus.readings import is_signed  # noqa: PLC0415 - only for who listens
         from drivers.modbus.scan_report import NO_VALUE  # noqa: PLC0415 - brings the settings
 
-        proposed, tables = _place(found, answers)
+        proposed, tables = heard.place(found, answers)
         if not tables or answers.get("way") != "values":
             return proposed
         if tables[0]["max_count"] is not None:
@@ -224,7 +228,7 @@ class _ModbusQuestions(BusQuestions):
             address = answers[sensor_key(channel, "address")]
             if address in found_channels:
                 proposed[sensor_key(channel, "order")] = found_channels[address]["order"]
-            if address in marks and _width(answers[sensor_key(channel, "register-type")]) == 1:
+            if address in marks and register_count(answers[sensor_key(channel, "register-type")]) == 1:
                 proposed[sensor_key(channel, "no-value")] = f"0x{marks[address]:04X}"
         return proposed
 
@@ -243,11 +247,11 @@ class _ModbusQuestions(BusQuestions):
         del folder
         yield from self._line(answers)
         chosen: str = answers["units"]
-        yield self.ask("unit", q.whole, "1" if chosen == _AUTO else f"{units_of(chosen)[0]}")
+        yield self.ask("unit", q.whole, "1" if chosen == AUTO else f"{units_of(chosen)[0]}")
         yield self.choose("way", _WAYS, "values")
         way = answers["way"]
         if way != "fifo":
-            likely = _meant(answers, "registers") or "holding"
+            likely = table_meant(answers, "registers") or "holding"
             yield self.choose("table", dict.fromkeys(("holding", "input"), ""), likely)
         if way == "values":
             yield self.ask("max-count", q.whole, f"{_READ_REGISTERS}", quiet=True)
@@ -261,8 +265,8 @@ class _ModbusQuestions(BusQuestions):
 
     def _ask_address(self, answers: Answers, key: str, default: str) -> Iterator[Question]:
         """A register of the table that the stream reads; a number of the manual states which one that is."""
-        yield self.ask(key, q.whole, default, doubt=partial(_doubt_with_table, answers, key))
-        answers["table"] = _meant(answers, key) or answers["table"]
+        yield self.ask(key, q.whole, default, doubt=partial(doubt_with_table, answers, key))
+        answers["table"] = table_meant(answers, key) or answers["table"]
 
     def _ask_waveform(self, answers: Answers) -> Iterator[Question]:
         yield from self._ask_address(answers, "block-id", "0")
@@ -282,9 +286,9 @@ class _ModbusQuestions(BusQuestions):
 
     def _ask_fifo(self, answers: Answers) -> Iterator[Question]:
         del answers
-        yield self.ask("fifo-address", q.whole, "0", doubt=_doubt)
+        yield self.ask("fifo-address", q.whole, "0", doubt=doubt_of)
         yield self.choose("count-bits", _COUNT_BITS, "16")
-        yield self.ask("acknowledge", q.whole_or_none, NONE, doubt=_doubt)
+        yield self.ask("acknowledge", q.whole_or_none, NONE, doubt=doubt_of)
 
     def rate_hz(self, answers: Answers) -> float:
         """See `BusQuestions.rate_hz`."""
@@ -307,9 +311,9 @@ class _ModbusQuestions(BusQuestions):
         following = f"{self._next_address(answers, channel)}"
         key = sensor_key(channel, "address")
         only = channel == answers["channels"][0]
-        doubted = partial(_doubt_with_table, answers, key, fixed=not only)
+        doubted = partial(doubt_with_table, answers, key, fixed=not only)
         doubt = partial(
-            _doubt_of_channel,
+            doubt_of_channel,
             doubted,
             self._taken(answers, channel),
             following,
@@ -317,11 +321,11 @@ class _ModbusQuestions(BusQuestions):
         )
         yield self.ask_of(channel, "address", q.whole, following, doubt=doubt)
         if only:
-            answers["table"] = _meant(answers, key) or answers["table"]
+            answers["table"] = table_meant(answers, key) or answers["table"]
         unit = _unit(channel)
         default = "int16" if unit == "degC" else "uint16"
         yield self.ask_of(channel, "register-type", q.one_of(types), default, choices=types)
-        wide = _width(answers[sensor_key(channel, "register-type")]) > 1
+        wide = register_count(answers[sensor_key(channel, "register-type")]) > 1
         is_word = _WORD.search(channel) is not None and _is_unsigned(answers, channel)
         yield self.ask_of(channel, "bits", _bits, NONE, quiet=not is_word)
         yield self.ask_of(channel, "order", q.exactly(orders), "ABCD", choices=orders, quiet=not wide)
@@ -335,7 +339,7 @@ class _ModbusQuestions(BusQuestions):
         taken: dict[int, str] = {}
         for before in answers["channels"][: answers["channels"].index(channel)]:
             first = answers[sensor_key(before, "address")]
-            width = _width(answers[sensor_key(before, "register-type")])
+            width = register_count(answers[sensor_key(before, "register-type")])
             taken.update(dict.fromkeys(range(first, first + width), before))
         return taken
 
@@ -345,7 +349,7 @@ class _ModbusQuestions(BusQuestions):
         for before in answers["channels"]:
             if before == channel:
                 break
-            width = _width(answers[sensor_key(before, "register-type")])
+            width = register_count(answers[sensor_key(before, "register-type")])
             end = max(end, answers[sensor_key(before, "address")] + width)
         return end if end < 65_535 else 0
 
@@ -389,7 +393,7 @@ class _ModbusQuestions(BusQuestions):
         ways = {"waveform": self._waveform, "ring": self._ring, "fifo": self._fifo}
         yield from ways[way](answers)
         yield "# place is the first register of a channel within a sample; value = raw * scale"
-        kind, scale, width = answers["raw-type"], answers["scale"], _width(answers["raw-type"])
+        kind, scale, width = answers["raw-type"], answers["scale"], register_count(answers["raw-type"])
         channels = enumerate(answers["channels"])
         yield from array(
             "channels",
@@ -420,7 +424,7 @@ class _ModbusQuestions(BusQuestions):
 
     def _registers(self, answers: Answers) -> Iterator[str]:
         runs = sorted(
-            (answers[sensor_key(name, "address")], _width(answers[sensor_key(name, "register-type")]))
+            (answers[sensor_key(name, "address")], register_count(answers[sensor_key(name, "register-type")]))
             for name in answers["channels"]
         )
         if any(before + width < after for (before, width), (after, _) in pairwise(runs)):
@@ -568,10 +572,15 @@ def _unit(channel: str) -> str | None:
     return unit_by_name(channel) or ("count" if _NAMED_BY_ADDRESS.fullmatch(channel) else None)
 
 
+def _first_units() -> list[int]:
+    """The first and the last of the units that are asked at first."""
+    return [int(one) for one in _UNITS[0].split("-")]
+
+
 def _units(text: str) -> str:
-    """Addresses of units as the sniffer takes them, or `_AUTO`."""
+    """Addresses of units as the sniffer takes them, or `AUTO`."""
     try:
-        if text != _AUTO:
+        if text != AUTO:
             units_of(text)
     except SniffError as error:
         raise ValueError(f"{error}".partition(": ")[2]) from None
@@ -579,8 +588,8 @@ def _units(text: str) -> str:
 
 
 def _registers(text: str) -> str:
-    """Registers as the sniffer takes them, or `_AUTO`."""
-    if text == _AUTO:
+    """Registers as the sniffer takes them, or `AUTO`."""
+    if text == AUTO:
         return text
     try:
         registers = registers_of(text)
@@ -593,335 +602,13 @@ def _registers(text: str) -> str:
 
 def _to_read(registers: str) -> range:
     """The registers that --listen was to read; none if it was to choose them."""
-    if registers == _AUTO:
+    if registers == AUTO:
         return range(0)
     asked = registers_of(registers)
     return range(asked.begin, asked.end + 1)
 
 
-def _width(raw_type: str) -> int:
-    """Registers of a number."""
-    return int(raw_type[-2:]) // 16
-
-
 def _sample_registers(answers: Answers) -> int:
     """Registers of one sample of every channel."""
     channels: int = len(answers["channels"])
-    return channels * _width(answers["raw-type"])
-
-
-def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
-    """What was found, in a few lines: which units answer, and the registers that are worth reading."""
-    from drivers.modbus.scan_report import NO_VALUE  # noqa: PLC0415 - brings the settings
-
-    yield from _units_in_words(found)
-    for table in found["tables"]:
-        if not table["registers"]:
-            continue
-        runs = ", ".join(f"{low}" if low == high else f"{low} to {high}" for low, high in table["runs"])
-        name = f"unit {table['unit']} has {_TABLES[table['function']]} registers {runs}"
-        were = "was" if len(set(table["asked"])) == 1 else "were"
-        only_0 = ": all of them read 0" if _is_0(table) else ":"
-        yield f"{name} ({_asked(table)} {were} asked; --registers looks further){only_0}"
-        if table["max_count"] is not None:
-            yield f"  registers in a request: {table['max_count']} at most"
-        by_address = {one["address"]: one for one in table["registers"]}
-        wide = {one["address"]: one for one in table["channels"] if not one["type"].endswith("int16")}
-        unsigned = {one["address"] for one in table["channels"] if one["type"] == "uint16"}
-        behind = {
-            address + number for address, one in wide.items() for number in range(1, _width(one["type"]))
-        }
-        undecided = {one["address"]: one for one in table["undecided"]}
-        shown = [address for address in by_address if address not in behind]
-        if len(shown) > _SHOWN:
-            shown = [address for address in shown if address in wide or address in table["moved"]]
-        for address in shown[:_SHOWN]:
-            width = _width(wide[address]["type"]) if address in wide else 1
-            moved = any(address + number in table["moved"] for number in range(width))
-            moves = ", moves" if moved else ""
-            value, meant = f"{by_address[address]['uint16' if address in unsigned else 'int16']}", ""
-            if address in wide:
-                one = wide[address]
-                same = [
-                    reading
-                    for reading in by_address[address]["readings"]
-                    if (reading["type"], reading["order"]) == (one["type"], one["order"])
-                ]
-                value, meant = f"{same[0]['value']:.6g}", f" as {one['type']} {one['order']}"
-            if address in undecided:
-                one = undecided[address]
-                meant = f", or with {address + 1} {one['value']:.6g} as {one['type']} {one['order']}"
-            is_mark = address not in wide and not moved and by_address[address]["uint16"] in NO_VALUE
-            yield f"  {address}: {value}{meant}{moves}{', no value?' if is_mark else ''}"
-        if len(shown) > _SHOWN:
-            yield f"  ... and {len(shown) - _SHOWN} more: daqsvc sniff modbus shows them"
-
-
-def _place(found: Mapping[str, Any], answers: Answers) -> tuple[dict[str, str], list[Mapping[str, Any]]]:
-    """The unit and the table to propose, and what was found of those that are answered."""
-    tables = [one for one in found["tables"] if one["registers"]]
-    # Where all is 0, nothing shows that the values are there. Else units are as they were found.
-    proposed = {"unit": f"{min(tables, key=_is_0)['unit']}"}
-    tables = [one for one in tables if one["unit"] == answers.get("unit", int(proposed["unit"]))]
-    meant = _meant(answers, "registers")
-    tables.sort(key=lambda one: (_TABLES[one["function"]] != meant, _is_0(one), not one["moved"]))
-    if tables and not (len(tables) > 1 and all(map(_is_0, tables)) and meant is None):
-        proposed["table"] = _TABLES[tables[0]["function"]]
-    return proposed, [one for one in tables if _TABLES[one["function"]] == answers.get("table")]
-
-
-def _is_0(table: Mapping[str, Any]) -> bool:
-    """Whether all registers of a table read 0 all the time."""
-    return not table["moved"] and not any(one["uint16"] for one in table["registers"])
-
-
-def _is_only_0(found: Mapping[str, Any]) -> bool:
-    """Whether all registers that were read are 0."""
-    return all(map(_is_0, found["tables"]))
-
-
-def _only_0(found: Mapping[str, Any], registers: str) -> str:
-    """See `Heard.missed`: all registers are 0, and nobody has stated which of them are the values."""
-    if not _is_only_0(found) or (registers != _AUTO and not registers_of(registers).reason):
-        return ""
-    manual = "give --registers (and --table, holding or input) from its manual"
-    meant = "" if registers == _AUTO else _note(registers_of(registers)).replace("Remedy: write", "Write")
-    return (
-        "All registers that were read are 0, and nothing shows where the values are. Remedy: switch the "
-        f"machine and its sensors on, or {manual}{'. ' * bool(meant)}{meant[:1].upper()}{meant[1:]}"
-    )
-
-
-def _guesses(found: Mapping[str, Any], answers: Answers, taken: Collection[str]) -> Sequence[str]:
-    """See `Heard.guesses`: what the values of registers do not show."""
-    from drivers.modbus.scan_report import undecided_words  # noqa: PLC0415 - brings the settings
-
-    if answers["way"] != "values":
-        return ()
-    guessed = [name for name in answers["channels"] if sensor_key(name, "register-type") in taken]
-    notes = [_guessed_words(answers, guessed, taken)] * bool(guessed)
-    notes += guessed_sensors(answers, answers["channels"], taken)
-    table = _table_read(found, answers)
-    if table is None:
-        return notes
-    single = {
-        answers[sensor_key(name, "address")]
-        for name in guessed
-        if _width(answers[sensor_key(name, "register-type")]) == 1
-    }
-    halves = [one for one in table["undecided"] if single & {one["address"], one["address"] + 1}]
-    if halves:
-        one = halves[0]
-        keys = f'address = {one["address"]}, type = "{one["type"]}", order = "{one["order"]}"'
-        notes.append(
-            f"{undecided_words(each['address'] for each in halves)}. If so, write one channel in place of "
-            f"two{', e.g.' if len(halves) > 1 else ':'} {keys}."
-        )
-    if _is_0(table):
-        notes.append("All registers that were read are 0: nothing shows that the values are there.")
-    return notes
-
-
-def _guessed_words(answers: Answers, guessed: Sequence[str], taken: Collection[str]) -> str:
-    """What of some channels nobody has stated."""
-    about = ["type"]
-    if any(_width(answers[sensor_key(name, "register-type")]) > 1 for name in guessed):
-        about.append("byte order")
-    if any(sensor_key(name, "scale") in taken for name in guessed):
-        about.append("scale")
-    what = " and ".join([", ".join(about[:-1]), about[-1]] if len(about) > 1 else about)
-    whose = ", ".join(guessed) if len(guessed) < len(answers["channels"]) else "the registers"
-    are = "are" if len(about) > 1 else "is"
-    return (
-        f"{what[0].upper()}{what[1:]} of {whose} {are} a guess by the values that were read: compare with "
-        "the device's register map."
-    )
-
-
-def _not_read(found: Mapping[str, Any], answers: Answers) -> str:
-    """See `Heard.not_read`: the other table of the unit, if it has values."""
-    others = [
-        _TABLES[one["function"]]
-        for one in found["tables"]
-        if one["unit"] == answers["unit"] and one["registers"] and not _is_0(one)
-    ]
-    return "\n".join(
-        f"Unit {answers['unit']} has {other} registers, too; this file reads {answers['table']} registers."
-        for other in others
-        if answers["way"] == "values" and other != answers["table"]
-    )
-
-
-def _table_read(found: Mapping[str, Any], answers: Answers) -> Mapping[str, Any] | None:
-    """The table that the file reads, as it was found; None if it was not."""
-    return next(
-        (
-            one
-            for one in found["tables"]
-            if one["unit"] == answers["unit"] and _TABLES[one["function"]] == answers["table"]
-        ),
-        None,
-    )
-
-
-def _asked(table: Mapping[str, Any]) -> str:
-    """The first and the last register that was asked for, or the only one."""
-    return " to ".join(map(str, dict.fromkeys(table["asked"])))
-
-
-def _units_in_words(found: Mapping[str, Any]) -> Iterator[str]:
-    """Which units answer, of those that were asked, and which of these were not read."""
-    first, last = found["units_asked"]
-    asked = f"unit {first} was" if first == last else f"units {first} to {last} were"
-    yield f"units that answer: {', '.join(map(str, found['units']))} ({asked} asked)"
-    if found["units_alike"]:
-        yield f"all answer alike, so only unit {found['units'][0]} was read: --units N reads unit N"
-    elif left_out := found["units_left_out"]:
-        yield (
-            f"the others from {left_out[0]} to {left_out[-1]} all refuse with one exception, as if they were "
-            "not there: --units N reads unit N"
-        )
-
-
-def _first_units() -> list[int]:
-    """The first and the last of the units that are asked at first."""
-    return [int(one) for one in _UNITS[0].split("-")]
-
-
-def _unheard(found: Mapping[str, Any], answers: Answers) -> str:
-    """See `Heard.unheard`: the unit that was answered has sent nothing."""
-    if found["units_alike"] or answers.get("unit", found["units"][0]) in found["units"]:
-        return ""
-    unit, others = answers["unit"], ", ".join(map(str, found["units"]))
-    first, last = found["units_asked"]
-    if not first <= unit <= last:
-        return f"Unit {unit} was not asked. Remedy: write --units {unit}, too; those that answer: {others}"
-    said = "has refused, like most units" if unit in found["units_left_out"] else "has not answered"
-    return f"Unit {unit} {said}. Remedy: correct --unit; those that answer: {others}"
-
-
-def _note(registers: RegisterRange) -> str:
-    """That they are numbers of a manual, with the options that mean the same; empty if they are not."""
-    if not registers.reason:
-        return ""
-    return f"{registers.reason}. Remedy: write --registers {registers.there} --table {registers.table}"
-
-
-def _without_registers(found: Mapping[str, Any], registers: str) -> Heard:
-    """Units that answer, although none of the registers that were asked for is there."""
-    from drivers.modbus.scan import ILLEGAL_FUNCTION  # noqa: PLC0415 - only for who listens
-
-    lines = list(_units_in_words(found))
-    proposed = {"unit": f"{found['units'][0]}"}
-    by_unit: dict[int, list[str]] = {}
-    for table in found["tables"]:
-        name, unit = _TABLES[table["function"]], table["unit"]
-        tables = by_unit.setdefault(unit, [])
-        if any(code == ILLEGAL_FUNCTION for _, code in table["refused"]):
-            lines.append(f"unit {unit} has no {name} registers: it refuses function {table['function']}")
-        elif table["asked"]:
-            tables.append(name)
-            none = "no" if len(set(table["asked"])) == 1 else "none of"
-            lines.append(f"unit {unit} answers for {name} registers, but has {none} {_asked(table)}")
-    note = "" if registers == _AUTO else _note(registers_of(registers))
-    remedy = "Remedy: write the addresses of its manual, counted from 0, as --registers, e.g. 4000-4100"
-    others = "; or name other units with --units" if found["units_alike"] or found["units_left_out"] else ""
-    missed = note or f"No register that was asked for is there. {remedy}{others}"
-
-    def proposals(so_far: Answers) -> dict[str, str]:
-        tables = by_unit.get(so_far.get("unit", found["units"][0]), [])
-        return proposed | ({"table": tables[0]} if tables else {})
-
-    return Heard(lines, proposals, missed)
-
-
-def _doubt(address: int | None) -> tuple[str, str] | None:
-    """See `Question.doubt`: it is counted as in manuals, from 30001 or 40001."""
-    if address is None:
-        return None
-    from drivers.modbus.checks import manuals_first  # noqa: PLC0415 - brings the settings
-
-    first = manuals_first(address)
-    if first is None:
-        return None
-    meant = address - first
-    reason = (
-        f"{address} looks like a number of the manual, where registers begin at {first}: that is {meant} "
-        f"here. Enter takes it; type {address} again if the device has such addresses"
-    )
-    return reason, f"{meant}"
-
-
-_MEANT = "meant"
-"""Key, beside the answers, of the tables that numbers of a manual mean: by question, register and table."""
-
-
-def _mean(answers: Answers, key: str, there: Any, table: str) -> None:
-    """Keep which table a number of the manual means, for when what it is on the line is taken."""
-    answers[_MEANT] = {**answers.get(_MEANT, {}), key: (there, table)}
-
-
-def _meant(answers: Answers, key: str) -> str | None:
-    """The table that an answer means as it was typed, with the number of a manual; None if it was not."""
-    there, table = answers.get(_MEANT, {}).get(key, (None, None))
-    return table if key in answers and answers[key] == there else None
-
-
-def _doubt_with_table(
-    answers: Answers, key: str, address: int | None, *, fixed: bool = False
-) -> tuple[str, str] | None:
-    """See `_doubt`; the number also means holding or input registers, and the stream reads one of them.
-
-    Args:
-        answers: so far; what is meant is kept there.
-        key: of the question.
-        address: the answer.
-        fixed: whether registers before have the table already.
-    """
-    doubted = _doubt(address)
-    if doubted is None or address is None:
-        return doubted
-    reason, there = doubted
-    table = _table_of(address)
-    if table == answers["table"]:
-        return doubted
-    if fixed:
-        other = f"they are {table} registers, and the channels before {answers['table']} registers"
-        return f"{reason}. But {other}: a stream reads one table, make one for each", there
-    _mean(answers, key, int(there), table)
-    return f"{reason}. Enter also takes {table} registers for the table", there
-
-
-def _table_of(address: int) -> str:
-    """The table that a number of the manual is in."""
-    return "input" if address < 40_001 else "holding"
-
-
-def _doubt_of_registers(answers: Answers, text: str) -> tuple[str, str] | None:
-    """The same of the registers that --listen is to read."""
-    registers = _AUTO if text == _AUTO else registers_of(text)
-    if isinstance(registers, str) or not registers.reason:
-        return None
-    _mean(answers, "registers", registers.there, registers.table)
-    again = f"Enter takes {registers.there}; type {text} again if the device has such addresses"
-    return f"{registers.reason}. {again}", registers.there
-
-
-def _doubt_of_channel(
-    doubt: Callable[[int], tuple[str, str] | None],
-    taken: Mapping[int, str],
-    free: str,
-    to_read: range,
-    address: int,
-) -> tuple[str, str] | None:
-    """The same of a channel's register, which may be that of another channel, too.
-
-    Whoever has such registers read, or has given another channel such an address, means them.
-    """
-    if address not in taken:
-        return None if address in to_read or any(map(_doubt, taken)) else doubt(address)
-    reason = (
-        f'register {address} holds "{taken[address]}" already. Enter takes {free}; type {address} again '
-        "if both are in it"
-    )
-    return reason, free
+    return channels * register_count(answers["raw-type"])

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 TCP_PORT = 502
 UNITS = "1-247"
 REGISTERS = "0-200"
-_AUTO = "auto"
-_FUNCTIONS = {_AUTO: (3, 4), "3": (3,), "4": (4,), "both": (3, 4)}
+AUTO = "auto"
+_FUNCTIONS = {AUTO: (3, 4), "3": (3,), "4": (4,), "both": (3, 4)}
 LAST_REGISTER = 65_535
 LONGEST_SECONDS = 3600.0
 _LONG_MANUALS_FIRST = (300_001, 400_001)
@@ -58,7 +58,7 @@ class ModbusSniffer(Sniffer):
         parser.add_argument(
             "--function",
             choices=tuple(_FUNCTIONS),
-            default=_AUTO,
+            default=AUTO,
             help="function code: 3 reads holding registers, 4 input registers (default: auto: 3, and 4 for "
             "a unit without holding registers)",
         )
@@ -133,7 +133,7 @@ class ModbusSniffer(Sniffer):
                 functions,
                 begin,
                 end,
-                until_found=arguments.function == _AUTO,
+                until_found=arguments.function == AUTO,
                 read_on=arguments.registers is None,
                 seconds=arguments.seconds,
             )

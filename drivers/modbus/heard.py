@@ -1,0 +1,243 @@
+"""What ``daqsvc new --listen`` found of the units of a Modbus line, for the questions and for the file."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from drivers.bus_questions import (
+    Heard,
+    guessed_sensors,
+)
+from drivers.modbus.manual_addresses import manual_note, table_meant
+from drivers.modbus.sniff import AUTO, registers_of
+from drivers.questions import Answers, sensor_key
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator, Mapping, Sequence
+
+
+TABLES = {3: "holding", 4: "input"}
+"""By function code."""
+_SHOWN = 12
+
+
+def register_count(raw_type: str) -> int:
+    """Registers of a number."""
+    return int(raw_type[-2:]) // 16
+
+
+def in_words(found: Mapping[str, Any]) -> Iterator[str]:
+    """What was found, in a few lines: which units answer, and the registers that are worth reading."""
+    from drivers.modbus.scan_report import NO_VALUE  # noqa: PLC0415 - brings the settings
+
+    yield from _units_in_words(found)
+    for table in found["tables"]:
+        if not table["registers"]:
+            continue
+        runs = ", ".join(f"{low}" if low == high else f"{low} to {high}" for low, high in table["runs"])
+        name = f"unit {table['unit']} has {TABLES[table['function']]} registers {runs}"
+        were = "was" if len(set(table["asked"])) == 1 else "were"
+        only_0 = ": all of them read 0" if _is_0(table) else ":"
+        yield f"{name} ({_asked(table)} {were} asked; --registers looks further){only_0}"
+        if table["max_count"] is not None:
+            yield f"  registers in a request: {table['max_count']} at most"
+        by_address = {one["address"]: one for one in table["registers"]}
+        wide = {one["address"]: one for one in table["channels"] if not one["type"].endswith("int16")}
+        unsigned = {one["address"] for one in table["channels"] if one["type"] == "uint16"}
+        behind = {
+            address + number
+            for address, one in wide.items()
+            for number in range(1, register_count(one["type"]))
+        }
+        undecided = {one["address"]: one for one in table["undecided"]}
+        shown = [address for address in by_address if address not in behind]
+        if len(shown) > _SHOWN:
+            shown = [address for address in shown if address in wide or address in table["moved"]]
+        for address in shown[:_SHOWN]:
+            width = register_count(wide[address]["type"]) if address in wide else 1
+            moved = any(address + number in table["moved"] for number in range(width))
+            moves = ", moves" if moved else ""
+            value, meant = f"{by_address[address]['uint16' if address in unsigned else 'int16']}", ""
+            if address in wide:
+                one = wide[address]
+                same = [
+                    reading
+                    for reading in by_address[address]["readings"]
+                    if (reading["type"], reading["order"]) == (one["type"], one["order"])
+                ]
+                value, meant = f"{same[0]['value']:.6g}", f" as {one['type']} {one['order']}"
+            if address in undecided:
+                one = undecided[address]
+                meant = f", or with {address + 1} {one['value']:.6g} as {one['type']} {one['order']}"
+            is_mark = address not in wide and not moved and by_address[address]["uint16"] in NO_VALUE
+            yield f"  {address}: {value}{meant}{moves}{', no value?' if is_mark else ''}"
+        if len(shown) > _SHOWN:
+            yield f"  ... and {len(shown) - _SHOWN} more: daqsvc sniff modbus shows them"
+
+
+def place(found: Mapping[str, Any], answers: Answers) -> tuple[dict[str, str], list[Mapping[str, Any]]]:
+    """The unit and the table to propose, and what was found of those that are answered."""
+    tables = [one for one in found["tables"] if one["registers"]]
+    # Where all is 0, nothing shows that the values are there. Else units are as they were found.
+    proposed = {"unit": f"{min(tables, key=_is_0)['unit']}"}
+    tables = [one for one in tables if one["unit"] == answers.get("unit", int(proposed["unit"]))]
+    meant = table_meant(answers, "registers")
+    tables.sort(key=lambda one: (TABLES[one["function"]] != meant, _is_0(one), not one["moved"]))
+    if tables and not (len(tables) > 1 and all(map(_is_0, tables)) and meant is None):
+        proposed["table"] = TABLES[tables[0]["function"]]
+    return proposed, [one for one in tables if TABLES[one["function"]] == answers.get("table")]
+
+
+def _is_0(table: Mapping[str, Any]) -> bool:
+    """Whether all registers of a table read 0 all the time."""
+    return not table["moved"] and not any(one["uint16"] for one in table["registers"])
+
+
+def _is_only_0(found: Mapping[str, Any]) -> bool:
+    """Whether all registers that were read are 0."""
+    return all(map(_is_0, found["tables"]))
+
+
+def only_0(found: Mapping[str, Any], registers: str) -> str:
+    """See `Heard.missed`: all registers are 0, and nobody has stated which of them are the values."""
+    if not _is_only_0(found) or (registers != AUTO and not registers_of(registers).reason):
+        return ""
+    manual = "give --registers (and --table, holding or input) from its manual"
+    meant = (
+        "" if registers == AUTO else manual_note(registers_of(registers)).replace("Remedy: write", "Write")
+    )
+    return (
+        "All registers that were read are 0, and nothing shows where the values are. Remedy: switch the "
+        f"machine and its sensors on, or {manual}{'. ' * bool(meant)}{meant[:1].upper()}{meant[1:]}"
+    )
+
+
+def guesses(found: Mapping[str, Any], answers: Answers, taken: Collection[str]) -> Sequence[str]:
+    """See `Heard.guesses`: what the values of registers do not show."""
+    from drivers.modbus.scan_report import undecided_words  # noqa: PLC0415 - brings the settings
+
+    if answers["way"] != "values":
+        return ()
+    guessed = [name for name in answers["channels"] if sensor_key(name, "register-type") in taken]
+    notes = [_guessed_words(answers, guessed, taken)] * bool(guessed)
+    notes += guessed_sensors(answers, answers["channels"], taken)
+    table = _table_read(found, answers)
+    if table is None:
+        return notes
+    single = {
+        answers[sensor_key(name, "address")]
+        for name in guessed
+        if register_count(answers[sensor_key(name, "register-type")]) == 1
+    }
+    halves = [one for one in table["undecided"] if single & {one["address"], one["address"] + 1}]
+    if halves:
+        one = halves[0]
+        keys = f'address = {one["address"]}, type = "{one["type"]}", order = "{one["order"]}"'
+        notes.append(
+            f"{undecided_words(each['address'] for each in halves)}. If so, write one channel in place of "
+            f"two{', e.g.' if len(halves) > 1 else ':'} {keys}."
+        )
+    if _is_0(table):
+        notes.append("All registers that were read are 0: nothing shows that the values are there.")
+    return notes
+
+
+def _guessed_words(answers: Answers, guessed: Sequence[str], taken: Collection[str]) -> str:
+    """What of some channels nobody has stated."""
+    about = ["type"]
+    if any(register_count(answers[sensor_key(name, "register-type")]) > 1 for name in guessed):
+        about.append("byte order")
+    if any(sensor_key(name, "scale") in taken for name in guessed):
+        about.append("scale")
+    what = " and ".join([", ".join(about[:-1]), about[-1]] if len(about) > 1 else about)
+    whose = ", ".join(guessed) if len(guessed) < len(answers["channels"]) else "the registers"
+    are = "are" if len(about) > 1 else "is"
+    return (
+        f"{what[0].upper()}{what[1:]} of {whose} {are} a guess by the values that were read: compare with "
+        "the device's register map."
+    )
+
+
+def not_read(found: Mapping[str, Any], answers: Answers) -> str:
+    """See `Heard.not_read`: the other table of the unit, if it has values."""
+    others = [
+        TABLES[one["function"]]
+        for one in found["tables"]
+        if one["unit"] == answers["unit"] and one["registers"] and not _is_0(one)
+    ]
+    return "\n".join(
+        f"Unit {answers['unit']} has {other} registers, too; this file reads {answers['table']} registers."
+        for other in others
+        if answers["way"] == "values" and other != answers["table"]
+    )
+
+
+def _table_read(found: Mapping[str, Any], answers: Answers) -> Mapping[str, Any] | None:
+    """The table that the file reads, as it was found; None if it was not."""
+    return next(
+        (
+            one
+            for one in found["tables"]
+            if one["unit"] == answers["unit"] and TABLES[one["function"]] == answers["table"]
+        ),
+        None,
+    )
+
+
+def _asked(table: Mapping[str, Any]) -> str:
+    """The first and the last register that was asked for, or the only one."""
+    return " to ".join(map(str, dict.fromkeys(table["asked"])))
+
+
+def _units_in_words(found: Mapping[str, Any]) -> Iterator[str]:
+    """Which units answer, of those that were asked, and which of these were not read."""
+    first, last = found["units_asked"]
+    asked = f"unit {first} was" if first == last else f"units {first} to {last} were"
+    yield f"units that answer: {', '.join(map(str, found['units']))} ({asked} asked)"
+    if found["units_alike"]:
+        yield f"all answer alike, so only unit {found['units'][0]} was read: --units N reads unit N"
+    elif left_out := found["units_left_out"]:
+        yield (
+            f"the others from {left_out[0]} to {left_out[-1]} all refuse with one exception, as if they were "
+            "not there: --units N reads unit N"
+        )
+
+
+def unheard(found: Mapping[str, Any], answers: Answers) -> str:
+    """See `Heard.unheard`: the unit that was answered has sent nothing."""
+    if found["units_alike"] or answers.get("unit", found["units"][0]) in found["units"]:
+        return ""
+    unit, others = answers["unit"], ", ".join(map(str, found["units"]))
+    first, last = found["units_asked"]
+    if not first <= unit <= last:
+        return f"Unit {unit} was not asked. Remedy: write --units {unit}, too; those that answer: {others}"
+    said = "has refused, like most units" if unit in found["units_left_out"] else "has not answered"
+    return f"Unit {unit} {said}. Remedy: correct --unit; those that answer: {others}"
+
+
+def without_registers(found: Mapping[str, Any], registers: str) -> Heard:
+    """Units that answer, although none of the registers that were asked for is there."""
+    from drivers.modbus.scan import ILLEGAL_FUNCTION  # noqa: PLC0415 - only for who listens
+
+    lines = list(_units_in_words(found))
+    proposed = {"unit": f"{found['units'][0]}"}
+    by_unit: dict[int, list[str]] = {}
+    for table in found["tables"]:
+        name, unit = TABLES[table["function"]], table["unit"]
+        tables = by_unit.setdefault(unit, [])
+        if any(code == ILLEGAL_FUNCTION for _, code in table["refused"]):
+            lines.append(f"unit {unit} has no {name} registers: it refuses function {table['function']}")
+        elif table["asked"]:
+            tables.append(name)
+            none = "no" if len(set(table["asked"])) == 1 else "none of"
+            lines.append(f"unit {unit} answers for {name} registers, but has {none} {_asked(table)}")
+    note = "" if registers == AUTO else manual_note(registers_of(registers))
+    remedy = "Remedy: write the addresses of its manual, counted from 0, as --registers, e.g. 4000-4100"
+    others = "; or name other units with --units" if found["units_alike"] or found["units_left_out"] else ""
+    missed = note or f"No register that was asked for is there. {remedy}{others}"
+
+    def proposals(so_far: Answers) -> dict[str, str]:
+        tables = by_unit.get(so_far.get("unit", found["units"][0]), [])
+        return proposed | ({"table": tables[0]} if tables else {})
+
+    return Heard(lines, proposals, missed)
