@@ -74,8 +74,8 @@ def test_the_channels_with_a_unit_behind_the_number_fit_a_line():
 def test_the_channels_with_a_name_in_front_of_the_number_fit_a_line():
     _, lines, _, changed, *_ = blocks("serial.md")
     text = lines[: lines.index("[streams.casing.layout]")] + changed
-    layout = machine(text, "casing", "V").streams["casing"].layout
-    assert layout.beside == {"t": ("t=", "ms"), "V": ("V=", ""), "T": ("T=", "C")}
+    layout = machine(text, "casing", "v").streams["casing"].layout
+    assert layout.beside == {"t": ("t=", "ms"), "v": ("v=", "mm/s"), "h": ("h=", "")}
 
 
 def test_lines_without_a_counter_fit_a_port():
