@@ -11,10 +11,12 @@ from __future__ import annotations
 
 import functools
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.paths import ROOT
 
 from daqsvc.rotor import kernels
 from daqsvc.rotor.detectability.prediction import detectability
@@ -24,6 +26,9 @@ from sim_hw.plants import rotor as plant
 
 pytestmark = pytest.mark.statistical
 
+PAGE = ROOT / "docs" / "detectability.md"
+CALLED = {"U1": "unbalance x1.3", "L1": "static load 0.05 c", "K1": "stiffness 0.95", "R": "rub"}
+"""How the page calls modes."""
 PER_REV = 64
 DURATION = 2.0 * math.pi / PER_REV
 THRESHOLD = 16.0
@@ -126,6 +131,17 @@ def foreseen(before, after, noise, **options):
     return back.nats_per_rev, forward.nats_per_rev, forward.delay_rev
 
 
+def assert_on_the_page(before, after, snr_db, predicted, seen):
+    """Print a row of the table of docs/detectability.md, and hold that of the page against it."""
+    change = f"| {before} to {CALLED.get(after, after)} | {snr_db} dB |"
+    figures = [*zip(predicted[1:], seen[1:], strict=True)]
+    print(change, " | ".join(f"{a:.3g} / {b:.3g}" for a, b in figures), "|")
+    for line in PAGE.read_text("utf-8").splitlines():
+        if line.startswith(change):
+            stated = [float(figure) for figure in re.findall(r"[\d.]+", line.removeprefix(change))]
+            assert stated == pytest.approx([one for both in figures for one in both], rel=0.02)
+
+
 @pytest.mark.parametrize(
     ("snr_db", "before", "after", "settled_rev"),
     [
@@ -145,8 +161,8 @@ def test_evidence_and_delay_come_true(snr_db, before, after, settled_rev):
     noise = noise_at(snr_db)
     predicted = foreseen(before, after, noise, process_noise=CALM)
     seen = observed(before, after, noise, settled_rev=settled_rev, seeds=50)
-    print(f"{before} to {after}, {snr_db} dB: delay {predicted[2]:.1f} / {seen[2]:.1f} revolutions")
     assert predicted == pytest.approx(seen, rel=0.15)
+    assert_on_the_page(before, after, snr_db, predicted, seen)
 
 
 @pytest.mark.parametrize("other", ["N", "F1L2"])
@@ -154,8 +170,8 @@ def test_evidence_and_delay_of_a_rub_come_true(other):
     noise = noise_at(0)
     predicted = foreseen(other, "R", noise, process_noise=CALM)
     seen = observed(other, "R", noise, settled_rev=30, seeds=20)
-    print(f"{other} to R, 0 dB: delay {predicted[2]:.1f} / {seen[2]:.1f} revolutions")
     assert predicted == pytest.approx(seen, rel=0.15)
+    assert_on_the_page(other, "R", 0, predicted, seen)
 
 
 @pytest.mark.parametrize("process_noise", [1e-4, 1e-6])
