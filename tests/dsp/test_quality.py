@@ -151,6 +151,28 @@ def test_a_wrong_rate_is_seen_by_stamps_and_by_arrivals() -> None:
     assert not arrivals.fits
 
 
+@pytest.mark.parametrize("stall_s", [0.0, 4.0])
+@pytest.mark.parametrize("wakes_s", [1e-4, 0.004, 0.02, 0.1])
+@pytest.mark.parametrize(("sent_hz", "stated_hz"), [(800.0, 800.0), (800.0, 1000.0), (50.0, 50.0)])
+def test_frames_that_come_in_bursts_are_of_no_fast_device(sent_hz, stated_hz, wakes_s, stall_s):
+    # What sends them wakes up at times, once after a stall, and sends all that are due, 5 us apart.
+    sent_s = np.arange(round(30.0 * sent_hz)) / sent_hz
+    woken_s = np.ceil(sent_s / wakes_s) * wakes_s
+    woken_s[(woken_s > 10.0) & (woken_s < 10.0 + stall_s)] = 10.0 + stall_s
+    apart_s = 5e-6 * np.arange(len(sent_s))
+    arrival_ns = np.rint(1e9 * (np.maximum.accumulate(woken_s - apart_s) + apart_s)).astype(np.int64)
+    arrivals, measured = ArrivalRate(stated_hz), set()
+    for block in np.split(
+        arrival_ns, np.searchsorted(arrival_ns, np.arange(7_000_000, arrival_ns[-1], 7_000_000))
+    ):
+        if len(block):
+            arrivals.add(block)
+            measured.add(arrivals.rate_hz)
+    known = measured - {None}
+    assert known
+    assert max(known) < 1.1 * max(sent_hz, stated_hz)
+
+
 def test_lengths():
     assert LENGTH_UNITS == ("m", "mm", "um", "mil")
     lengths = np.array([[1.0, np.nan], [-2.0, 0.0]])

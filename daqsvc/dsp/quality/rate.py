@@ -62,6 +62,8 @@ RUNS = 32
 REMEMBERED = RUNS + RUN
 WIDEST = 0.5
 """How far apart such times may be, in nominal times between frames: frames that are lost make it 1."""
+MOST_RATIO = 2.0
+"""Between the rate of single frames and that of all in `LEAST_NS`: what was held up comes in a burst."""
 LEAST_SPREAD = 6.0
 """Frames by which numbers in equal times must differ if they are lost at random, for that to show."""
 AS_BEFORE = 0.1
@@ -291,4 +293,7 @@ class ArrivalRate:
         shortest_ns, usual_ns, longest_ns = np.percentile(runs_ns, [5, 50, 95])
         if usual_ns <= 0 or (longest_ns - shortest_ns) * self._nominal_hz / _NS_PER_S > WIDEST:
             return None
-        return RUN * _NS_PER_S / float(usual_ns)
+        rate_hz = RUN * _NS_PER_S / float(usual_ns)
+        recent = list(self._bins)[-math.ceil(LEAST_NS / self._bin_ns) :]
+        come_hz = sum(recent) * _NS_PER_S / (len(recent) * self._bin_ns)
+        return rate_hz if rate_hz <= MOST_RATIO * come_hz else None
