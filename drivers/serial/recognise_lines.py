@@ -56,6 +56,7 @@ _MESSAGES = frozenset(
 _WORD = re.compile(r"\W*([A-Za-z]+)(?![\w,;|\t])")
 _CODED = re.compile(r".*[ :]\d+ *")
 _DIGITS = re.compile(r"\d+")
+_LETTERS = re.compile(r"[A-Za-z]{3,}")
 _PRINTABLE = re.compile(rf"[\t -~{BEYOND_ASCII}]*")
 TIME_UNITS: Mapping[str, str] = {"s": "s", "sec": "s", "ms": "ms", "us": "us", "µs": "us", "μs": "us"}
 """Units of a time as devices write them, and as the driver names them."""
@@ -79,7 +80,7 @@ class Column:
         step: by how much it counts, if it is whole numbers that do; else 0.
         turns_at: the power of ten at which it was seen to begin again at 0; else 0. No counter of bits does.
         grows: whether it never falls, and grows at all.
-        per_line: by how much it grows from line to line, on average.
+        per_line: by how much it grows from line to line, on average; of a counter, without its turns.
         prefix: the text in front of the number that is the same in all of them, such as a name; else empty.
         last: its last text.
         absent: in how many lines there is no value.
@@ -117,6 +118,7 @@ class TextLines:
         damaged: lines that are not like most: other columns, no number where most have one, bytes that are
             no text, or a wrong checksum.
         others: lines of other kinds on the same port, each with another prefix, the most frequent first.
+        behind: how many bytes came behind each line of the layout, a damaged one too, oldest first.
     """
 
     lines: Sequence[str]
@@ -129,6 +131,7 @@ class TextLines:
     header: bool
     damaged: Sequence[str]
     others: Sequence[TextLines] = ()
+    behind: Sequence[int] = ()
 
     @property
     def kinds(self) -> Sequence[TextLines]:
@@ -141,15 +144,21 @@ def text_lines(data: bytes) -> TextLines | None:
     for delimiter in (b"\n", b"\r", b";"):
         # The first piece may lack its beginning, the last its end.
         first, *pieces = data.split(delimiter)
-        lines = [line for piece in pieces[:-1] if (line := _text(piece))]
+        lines, behind, left = [], [], len(data) - len(first)
+        for piece in pieces[:-1]:
+            left -= len(delimiter) + len(piece)
+            if line := _text(piece):
+                lines.append(line)
+                behind.append(left)
         if len(lines) >= _LEAST_LINES:
             if first.startswith(b"#") or _is_header(_text(first), lines):
                 lines = [_text(first), *lines]
-            return _kinds_of(lines, delimiter.decode())
+                behind = [len(data) - len(first), *behind]
+            return _kinds_of(lines, behind, delimiter.decode())
     return None
 
 
-def _kinds_of(lines: Sequence[str], delimiter: str) -> TextLines:
+def _kinds_of(lines: Sequence[str], behind: Sequence[int], delimiter: str) -> TextLines:
     """Lines by the word that they begin with, where there are several of them."""
     separator, _ = _marks_of(lines[1:] or lines)
     words = (
@@ -162,9 +171,13 @@ def _kinds_of(lines: Sequence[str], delimiter: str) -> TextLines:
         word for word, times in Counter(words).most_common(_MOST_KINDS) if times >= least and _is_word(word)
     ]
     if len(frequent) < 2 or sum(word in frequent for word in words) < MAJORITY * len(lines):
-        return _columns_of(lines, delimiter)
+        return _columns_of(lines, behind, delimiter)
     kinds = [
-        _columns_of([line for line, word in zip(lines, words, strict=True) if word == one], delimiter)
+        _columns_of(
+            [line for line, word in zip(lines, words, strict=True) if word == one],
+            [left for left, word in zip(behind, words, strict=True) if word == one],
+            delimiter,
+        )
         for one in frequent
     ]
     strange = [line for line, word in zip(lines, words, strict=True) if word not in frequent]
@@ -248,7 +261,7 @@ def _marks_of(lines: Sequence[str]) -> tuple[str, str]:
     return best
 
 
-def _columns_of(lines: Sequence[str], delimiter: str) -> TextLines:
+def _columns_of(lines: Sequence[str], behind: Sequence[int], delimiter: str) -> TextLines:
     checksum = _checksum_of(lines)
     plain = [_CHECKSUM.sub("", line) if checksum != "none" else line for line in lines]
     separator, decimal = _marks_of(plain[1:] or plain)
@@ -287,10 +300,17 @@ def _columns_of(lines: Sequence[str], delimiter: str) -> TextLines:
                 if texts is not None
             )
         )
-    places = np.flatnonzero(sound)
+    # Messages of the device between the lines take no turn of the layout; a damaged line of it does.
+    turns = np.array(sound)
+    words = {word for line, good in zip(lines, sound, strict=True) if good for word in _LETTERS.findall(line)}
+    for at, row in enumerate(rows):
+        if not sound[at] and not (header and at == 0):
+            turns[at] = not _is_other(plain[at], row, around, words, decimal)
+    found = np.flatnonzero(sound)
+    places = (np.cumsum(turns) - 1)[found]
     columns = [
         _column(
-            [rows[at][first + k] for at in places.tolist()],
+            [rows[at][first + k] for at in found.tolist()],
             places,
             names[first + k] if names else texts[0].strip("=:") if texts and texts[0] else f"c{k + 1}",
             decimal if texts is not None else "",
@@ -299,7 +319,23 @@ def _columns_of(lines: Sequence[str], delimiter: str) -> TextLines:
         for k, texts in enumerate(around)
     ]
     damaged = [line for line, good in zip(lines[header:], sound[header:], strict=True) if not good]
-    return TextLines(lines, delimiter, separator, decimal, prefix, checksum, columns, header, damaged)
+    ends = [behind[at] for at in np.flatnonzero(turns).tolist()]
+    return TextLines(
+        lines, delimiter, separator, decimal, prefix, checksum, columns, header, damaged, behind=ends
+    )
+
+
+def _is_other(
+    line: str, row: Sequence[str], around: Sequence[tuple[str, str] | None], words: set[str], decimal: str
+) -> bool:
+    """Whether a line that is not sound is none of the layout: a message of the device, and no damaged line.
+
+    It has words that no sound line has, or fewer than half of the numbers.
+    """
+    if len(row) != len(around) and any(word not in words for word in _LETTERS.findall(line)):
+        return True
+    numbers = sum(parts_of(field, decimal) is not None for field in row)
+    return 2 * numbers < sum(texts is not None for texts in around)
 
 
 def _texts_of(texts: Sequence[str], decimal: str) -> tuple[str, str] | None:
@@ -349,7 +385,7 @@ def _column(
 
     Args:
         texts: its fields, of the lines that are not damaged; a number may be absent in some.
-        places: int64 ``[n]``, which lines those are.
+        places: int64 ``[n]``, which lines of the layout those are.
         name: of the column.
         decimal: decimal mark of the numbers; empty if it is text.
         around: the texts in front of and behind the numbers.
@@ -378,6 +414,7 @@ def _column(
         per_line = float((np.median(values[-ends:]) - np.median(values[:ends])) / lines)
     step = _step_of(values, places) if whole else 0.0
     turns_at = _turn_of(values, step)
+    per_line = _counted_per_line(values, places) if step == 1 else per_line
     least, most = float(values.min()), float(values.max())
     return Column(
         name,
@@ -413,6 +450,16 @@ def _step_of(values: NDArray[np.float64], places: NDArray[np.int64]) -> float:
     resets = (steps[1:-1] < 0) & same[:-2] & same[2:]
     beyond = (steps[1:-1] - step * lines[1:-1]) % _WRAP != 0
     return float(step) if (resets & beyond).sum() <= _MOST_RESETS else 0.0
+
+
+def _counted_per_line(values: NDArray[np.float64], places: NDArray[np.int64]) -> float:
+    """By how much a column counts from line to line: more than 1 where lines are missing."""
+    lines, steps = np.diff(places), np.diff(values)
+    missing = np.maximum(steps - lines, 0.0)
+    # Around a damaged digit, or where the count begins again, it falls.
+    falls = np.concatenate([[False], steps <= 0, [False]])
+    missing[falls[:-2] | falls[1:-1] | falls[2:]] = 0.0
+    return float(1 + missing.sum() / lines.sum())
 
 
 def _turn_of(values: NDArray[np.float64], step: float) -> int:

@@ -6,6 +6,7 @@ import errno
 import os
 import select
 import time
+from collections import deque
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -198,6 +199,7 @@ def _listen(
     poll = select.poll()
     poll.register(descriptor, select.POLLIN)
     data = bytearray()
+    marks: deque[tuple[int, float]] = deque()
     before = line_errors(descriptor)
     count, waiting, lost = 0, 0, ""
     first_s = last_s = begin_s = time.monotonic()
@@ -225,9 +227,12 @@ def _listen(
         last_s = time.monotonic()
         first_s = first_s if count else last_s
         count += len(chunk)
+        marks.append((count, last_s))
+        while marks[0][0] < count - MOST_KEPT:
+            marks.popleft()
         waiting = count if last_s <= first_s + WAITING_S else waiting
         data += chunk
         del data[:-MOST_KEPT]
     after = None if lost else line_errors(descriptor)
     errors = 0 if before is None or after is None else (after.framing_errors - before.framing_errors) % 2**32
-    return Heard(bytes(data), count, first_s, last_s, errors, lost, waiting)
+    return Heard(bytes(data), count, first_s, last_s, errors, lost, waiting, tuple(marks))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import textwrap
+from bisect import bisect_left, bisect_right
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -39,6 +41,8 @@ _FAST = (9600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_800, 921_600, 2_000
 WAITING_S = 0.05
 """Within this time from the first byte on, those come that had been waiting in the port."""
 _SURELY = 1.05
+_MOST_MISSING = 1.5
+"""Steps of a counter per line, with lines missing; what seems more is a counter that began again."""
 _WHOLE = 0.995
 """Share of the bytes in frames from which on the rest is not worth a word."""
 
@@ -54,6 +58,7 @@ class Heard(NamedTuple):
         errors: characters that the UART found without a stop bit; 0 where it does not count.
         lost: why the port was lost; empty if it was not.
         waiting: how many of the bytes came within `WAITING_S`: most of them had been waiting in the port.
+        marks: when the bytes came: how many had come by then, and the time, host monotonic, oldest first.
     """
 
     data: bytes
@@ -63,6 +68,14 @@ class Heard(NamedTuple):
     errors: int
     lost: str = ""
     waiting: int = 0
+    marks: Sequence[tuple[int, float]] = ()
+
+    def came_s(self, behind: int) -> float:
+        """When that byte came behind which so many others came."""
+        if not self.marks:
+            return self.last_s - (self.last_s - self.first_s) * behind / max(self.received, 1)
+        at = bisect_left(self.marks, self.received - behind, key=itemgetter(0))
+        return self.marks[min(at, len(self.marks) - 1)][1]
 
 
 class Tried(NamedTuple):
@@ -154,10 +167,8 @@ class Report(NamedTuple):
         if seconds <= 0 or what is None:
             return None
         if isinstance(what, TextLines):
-            count = heard.data.count(what.delimiter.encode()) * self._share(what)
-            per_frame = len(heard.data) / max(1, count)
-        else:
-            per_frame = what.bytes_per_frame
+            return _lines_hz(heard, what)
+        per_frame = what.bytes_per_frame
         return max(heard.received - per_frame, 0) / per_frame / seconds or None
 
     def _sampling_hz(self, what: TextLines) -> float | None:
@@ -167,13 +178,6 @@ class Report(NamedTuple):
         if column is None or unit is None:
             return self._rate_hz(what)
         return _PER_S[unit] / column.per_line
-
-    def _share(self, what: TextLines) -> float:
-        """How many of the lines are of one kind."""
-        from drivers.serial.recognise_lines import TextLines  # noqa: PLC0415 - only for who listens
-
-        of_all = self._what.kinds if isinstance(self._what, TextLines) else [what]
-        return len(what.lines) / sum(len(kind.lines) for kind in of_all)
 
     def _problem(self) -> str:
         from drivers.serial.recognise import LEAST_BYTES  # noqa: PLC0415 - only for who listens
@@ -547,6 +551,21 @@ def _packed(what: BinaryFrames) -> _Packed | None:
     room = what.payload_length - counter.byte - bits // 8
     channels = room // (2 * counter.step)
     return None if channels < 1 else _Packed(bits, counter.step, channels)
+
+
+def _lines_hz(heard: Heard, what: TextLines) -> float | None:
+    """Lines of the layout a second, from the first to the last; None where it cannot be known.
+
+    Those that had been waiting in the port came at once: the last of them is the first that counts. Where a
+    column counts lines, those that are missing count, too.
+    """
+    times = [heard.came_s(behind) for behind in what.behind]
+    first = max(bisect_right(times, heard.first_s + WAITING_S) - 1, 0)
+    if len(times) - first < 2 or times[-1] <= times[first]:
+        return None
+    counter = _counter(what)
+    per_line = 1.0 if counter is None or not 1 <= counter.per_line < _MOST_MISSING else counter.per_line
+    return (len(times) - 1 - first) * per_line / (times[-1] - times[first])
 
 
 def _tried_row(one: Tried) -> Sequence[str]:

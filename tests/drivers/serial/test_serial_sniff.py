@@ -263,6 +263,39 @@ def test_the_rate_is_that_of_the_clock_of_the_device_where_it_sends_one() -> Non
     assert tomllib.loads(found.fragment)["streams"]["lines"]["rate_hz"] == pytest.approx(3.98)
 
 
+def heard_at(lines: list[tuple[float, bytes]], waiting: bytes = b"") -> Heard:
+    """What a port brings when each of the lines comes at its time, behind what had been waiting in it."""
+    data, marks = bytearray(waiting), [(len(waiting), 0.0)] if waiting else []
+    for at_s, line in lines:
+        data += line
+        marks.append((len(data), at_s))
+    return Heard(bytes(data), len(data), marks[0][1], marks[-1][1], 0, "", len(waiting), tuple(marks))
+
+
+MESSAGE = b"WARN at 2145 code 8998\r\n"
+
+
+@pytest.mark.parametrize("seconds", [3.0, 5.0])
+@pytest.mark.parametrize(
+    ("say", "waiting"),
+    [
+        (lambda n: b"P1 %d 1.%d\r\n" % (n, n % 7) + MESSAGE * (n % 7 == 3), b""),
+        (lambda n: b"P1 1.%d\r\n" % (n % 7) + MESSAGE * (n % 7 == 3), b""),
+        (lambda n: b"%d;1.%d\r\n" % (n * 101, n % 7) + MESSAGE * (n % 7 == 3), b""),
+        (lambda n: b"1.%d;2.5\r\n" % (n % 7), b"1.5;2.5\r\n" * 9),
+        (lambda n: b"1.%d;2.5\r\n" % (n % 7) if n % 9 else b"1.%d;2?5\r\n" % (n % 7), b""),
+        (lambda n: b"%d;2.5\r\n" % n if n % 10 else b"", b""),
+    ],
+    ids=["counter", "neither", "time", "waiting", "damaged", "missing"],
+)
+def test_the_rate_is_that_of_the_lines_of_the_layout(
+    say: Callable[[int], bytes], waiting: bytes, seconds: float
+) -> None:
+    heard = heard_at([(n * 0.101, say(n)) for n in range(1, int(seconds / 0.101))], waiting)
+    found = Report("ttyUSB0", [], Tried(9600, "none", heard, recognised(heard.data)), True).sniffed()
+    assert found.figures["rate_hz"] == pytest.approx(1 / 0.101, rel=0.005)
+
+
 def test_words_for_no_number_are_no_kinds_of_lines() -> None:
     what = recognised(b"".join(b"%s,%d,2\n" % ((b"nan", b"---")[k % 2], k) for k in range(40))).what
     assert isinstance(what, TextLines)
