@@ -52,7 +52,7 @@ def summary(said: Sequence[Said]) -> list[str]:
             f"| {snr} dB | {share(modelled, lambda s: s.right)} % | {share(modelled, lambda s: s.told)} % | "
             f"{share(modelled, lambda s: s.wrong)} % of {len(modelled)} | "
             f"{share(others, lambda s: s.misnamed)} % of {len(others)} | "
-            f"{1000.0 * alarms / max(healthy, 1.0):.2f}, in {healthy:.0f} rev | "
+            f"{1000.0 * alarms / max(healthy, 1.0):.2f} ({healthy:.0f} rev) | "
             f"{sum(bool(s.refused) for s in at)} of {len(at)} |"
         )
     return lines
