@@ -72,6 +72,7 @@ class Heard:
         unknown: what must be answered because nothing that was heard shows it, with its remedy; empty if
             all is known. It is made of the same as `notes`. Without a person, ``daqsvc new`` then writes
             nothing.
+        beside: by the key of a question, what was heard of its proposal, for a person to judge it.
     """
 
     lines: Sequence[str]
@@ -83,6 +84,7 @@ class Heard:
     not_offered: Callable[[Answers], Mapping[str, Collection[str]]] = lambda _answers: {}
     unknown: Callable[[Answers, Collection[str]], str] = lambda _answers, _assumed: ""
     guesses: Callable[[Answers, Collection[str]], Sequence[str]] = lambda _answers, _taken: ()
+    beside: Callable[[Answers], Mapping[str, str]] = lambda _answers: {}
 
 
 class BusQuestions(ABC):

@@ -52,6 +52,7 @@ class Question:
         doubt: why a value is most likely a mistake, and what to offer instead; None if it is none. Whoever
             types it again means it.
         quiet: whether the default is taken without asking, unless an option states something else.
+        beside: what was heard of the default, shown behind it; may be empty.
     """
 
     key: str
@@ -61,6 +62,7 @@ class Question:
     choices: Mapping[str, str] | None = None
     quiet: bool = False
     doubt: Callable[[Any], tuple[str, str] | None] | None = None
+    beside: str = ""
 
 
 def sensor_key(channel: str, topic: str) -> str:

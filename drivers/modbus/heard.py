@@ -10,6 +10,7 @@ from drivers.bus_questions import (
 )
 from drivers.modbus.manual_addresses import manual_note, table_meant
 from drivers.modbus.sniff import AUTO, registers_of
+from drivers.modbus.values_heard import SHOWN, values_heard
 from drivers.questions import Answers, sensor_key
 
 if TYPE_CHECKING:
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 
 TABLES = {3: "holding", 4: "input"}
 """By function code."""
-_SHOWN = 12
 
 
 def register_count(raw_type: str) -> int:
@@ -34,8 +34,7 @@ def in_words(found: Mapping[str, Any]) -> Iterator[str]:
     for table in found["tables"]:
         if not table["registers"]:
             continue
-        runs = ", ".join(f"{low}" if low == high else f"{low} to {high}" for low, high in table["runs"])
-        name = f"unit {table['unit']} has {TABLES[table['function']]} registers {runs}"
+        name = f"unit {table['unit']} has {TABLES[table['function']]} registers {_runs_in_words(table)}"
         were = "was" if len(set(table["asked"])) == 1 else "were"
         only_0 = ": all of them read 0" if _is_0(table) else ":"
         yield f"{name} ({_asked(table)} {were} asked; --registers looks further){only_0}"
@@ -51,9 +50,9 @@ def in_words(found: Mapping[str, Any]) -> Iterator[str]:
         }
         undecided = {one["address"]: one for one in table["undecided"]}
         shown = [address for address in by_address if address not in behind]
-        if len(shown) > _SHOWN:
+        if len(shown) > SHOWN:
             shown = [address for address in shown if address in wide or address in table["moved"]]
-        for address in shown[:_SHOWN]:
+        for address in shown[:SHOWN]:
             width = register_count(wide[address]["type"]) if address in wide else 1
             moved = any(address + number in table["moved"] for number in range(width))
             moves = ", moves" if moved else ""
@@ -71,8 +70,8 @@ def in_words(found: Mapping[str, Any]) -> Iterator[str]:
                 meant = f", or with {address + 1} {one['value']:.6g} as {one['type']} {one['order']}"
             is_mark = address not in wide and not moved and by_address[address]["uint16"] in NO_VALUE
             yield f"  {address}: {value}{meant}{moves}{', no value?' if is_mark else ''}"
-        if len(shown) > _SHOWN:
-            yield f"  ... and {len(shown) - _SHOWN} more: daqsvc sniff modbus shows them"
+        if len(shown) > SHOWN:
+            yield f"  ... and {len(shown) - SHOWN} more: daqsvc sniff modbus shows them"
 
 
 def place(found: Mapping[str, Any], answers: Answers) -> tuple[dict[str, str], list[Mapping[str, Any]]]:
@@ -112,6 +111,12 @@ def only_0(found: Mapping[str, Any], registers: str) -> str:
     )
 
 
+def notes(found: Mapping[str, Any], answers: Answers) -> Sequence[str]:
+    """See `Heard.notes`: what was read of the channels."""
+    table = _table_read(found, answers)
+    return values_heard(table, answers) if answers["way"] == "values" and table is not None else []
+
+
 def guesses(found: Mapping[str, Any], answers: Answers, taken: Collection[str]) -> Sequence[str]:
     """See `Heard.guesses`: what the values of registers do not show."""
     from drivers.modbus.scan_report import undecided_words  # noqa: PLC0415 - brings the settings
@@ -119,7 +124,8 @@ def guesses(found: Mapping[str, Any], answers: Answers, taken: Collection[str]) 
     if answers["way"] != "values":
         return ()
     guessed = [name for name in answers["channels"] if sensor_key(name, "register-type") in taken]
-    notes = [_guessed_words(answers, guessed, taken)] * bool(guessed)
+    notes = _guessed_addresses(answers, taken)
+    notes += [_guessed_words(answers, guessed, taken)] * bool(guessed)
     notes += guessed_sensors(answers, answers["channels"], taken)
     table = _table_read(found, answers)
     if table is None:
@@ -142,6 +148,23 @@ def guesses(found: Mapping[str, Any], answers: Answers, taken: Collection[str]) 
     return notes
 
 
+def _guessed_addresses(answers: Answers, taken: Collection[str]) -> list[str]:
+    """That channels which are not named after their registers have them by the order of their names."""
+    addresses = {name: answers[sensor_key(name, "address")] for name in answers["channels"]}
+    named = [
+        f"{name} ({address})"
+        for name, address in addresses.items()
+        if sensor_key(name, "address") in taken and name != f"r{address}"
+    ]
+    if not named:
+        return []
+    more = [f"and {len(named) - SHOWN} more"] if len(named) > SHOWN else []
+    which = ", ".join([*named[:SHOWN], *more])
+    return [
+        f"Addresses that are a guess by the order of names: {which}. Compare with the device's register map."
+    ]
+
+
 def _guessed_words(answers: Answers, guessed: Sequence[str], taken: Collection[str]) -> str:
     """What of some channels nobody has stated."""
     about = ["type"]
@@ -159,17 +182,41 @@ def _guessed_words(answers: Answers, guessed: Sequence[str], taken: Collection[s
 
 
 def not_read(found: Mapping[str, Any], answers: Answers) -> str:
-    """See `Heard.not_read`: the other table of the unit, if it has values."""
+    """See `Heard.not_read`: the other table of the unit, if it has values, and the other units."""
     others = [
         TABLES[one["function"]]
         for one in found["tables"]
         if one["unit"] == answers["unit"] and one["registers"] and not _is_0(one)
     ]
-    return "\n".join(
+    said = [
         f"Unit {answers['unit']} has {other} registers, too; this file reads {answers['table']} registers."
         for other in others
         if answers["way"] == "values" and other != answers["table"]
+    ]
+    units = [unit for unit in found["units"] if unit != answers["unit"]]
+    named = "; ".join(f"unit {unit} ({_has(found, unit)})" for unit in units[:SHOWN])
+    more = f"; and {len(units) - SHOWN} more" if len(units) > SHOWN else ""
+    if units and not found["units_alike"]:
+        said.append(f"Not read: {named}{more}. daqsvc sniff modbus proposes a stream for each.")
+    return "\n".join(said)
+
+
+def _has(found: Mapping[str, Any], unit: int) -> str:
+    """Which registers were found of a unit."""
+    tables = [one for one in found["tables"] if one["unit"] == unit and one["registers"]]
+    return (
+        ", ".join(
+            f"{TABLES[one['function']]} registers {_runs_in_words(one)}{', all 0' if _is_0(one) else ''}"
+            for one in tables
+        )
+        or "no registers were found"
     )
+
+
+def _runs_in_words(table: Mapping[str, Any]) -> str:
+    """The registers that a table has."""
+    runs = [f"{low}" if low == high else f"{low} to {high}" for low, high in table["runs"]]
+    return ", ".join([*runs[:SHOWN], *([f"and {len(runs) - SHOWN} more"] if len(runs) > SHOWN else [])])
 
 
 def _table_read(found: Mapping[str, Any], answers: Answers) -> Mapping[str, Any] | None:

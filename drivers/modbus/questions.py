@@ -27,6 +27,7 @@ from drivers.modbus.manual_addresses import (
     table_meant,
 )
 from drivers.modbus.sniff import AUTO, LAST_REGISTER, ModbusSniffer, registers_of, units_of
+from drivers.modbus.values_heard import in_register
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
 from drivers.sniffing import WAVEFORM_HZ, NothingFoundError, SniffError, sniffed
 from drivers.toml_lines import Hexadecimal, array, entry
@@ -176,8 +177,10 @@ class _ModbusQuestions(BusQuestions):
             lambda so_far: self._proposals(found, so_far),
             heard.only_0(found, answers["registers"]),
             unheard=lambda so_far: heard.unheard(found, so_far),
+            notes=lambda so_far, _: heard.notes(found, so_far),
             guesses=lambda so_far, taken: heard.guesses(found, so_far, taken),
             not_read=lambda so_far: heard.not_read(found, so_far),
+            beside=lambda so_far: self._beside(found, so_far),
         )
 
     def _ask_timeout(self) -> Question:
@@ -231,6 +234,19 @@ class _ModbusQuestions(BusQuestions):
             if address in marks and register_count(answers[sensor_key(channel, "register-type")]) == 1:
                 proposed[sensor_key(channel, "no-value")] = f"0x{marks[address]:04X}"
         return proposed
+
+    def _beside(self, found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
+        """See `Heard.beside`: what the register reads that a channel gets, whatever its name suggests."""
+        proposed, tables = self._proposals(found, answers), heard.place(found, answers)[1]
+        channel = next(
+            (one for one in answers.get("channels", ()) if sensor_key(one, "address") in proposed), ""
+        )
+        if not channel or not tables:
+            return {}
+        address = int(proposed[sensor_key(channel, "address")])
+        kind = proposed.get(sensor_key(channel, "register-type"), "uint16")
+        order = proposed[sensor_key(channel, "order")]
+        return {sensor_key(channel, "address"): in_register(tables[0], address, kind, order)}
 
     def _heard_address(
         self, answers: Answers, channel: str, channels: Mapping[int, Any], values: Mapping[int, int]

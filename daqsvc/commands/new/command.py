@@ -241,7 +241,8 @@ def _ask(question: Question) -> str:
     """
     from daqsvc.commands.new.interview import BackError  # noqa: PLC0415 - slow to import
 
-    bracket = "" if question.default is None else f" [{question.default}]"
+    beside = f", {question.beside}" if question.beside else ""
+    bracket = "" if question.default is None else f" [{question.default}{beside}]"
     _say(question.topic.text)
     width = max(map(len, question.choices or [""]))
     for choice, about in (question.choices or {}).items():

@@ -303,7 +303,7 @@ def _answer(
             if doubt is not None:
                 reason, instead = doubt
                 del answers[question.key]
-                question = replace(question, default=instead)
+                question = replace(question, default=instead, beside="")
         if reason is None:
             return
         say(reason)
@@ -315,10 +315,12 @@ def _offered(question: Question, heard: Heard, answers: Answers, file: Path) -> 
     if question.choices and (wrong := heard.not_offered(answers).get(question.key)):
         shown = {choice: about for choice, about in question.choices.items() if choice not in wrong}
         question = replace(question, choices=shown)
-    text = heard.proposals(answers).get(question.key)
-    if text is None or text == question.default or take(question, text, dict(answers), file) is not None:
+    text, beside = heard.proposals(answers).get(question.key), heard.beside(answers).get(question.key, "")
+    if text is not None and text == question.default:
+        return replace(question, beside=beside)
+    if text is None or take(question, text, dict(answers), file) is not None:
         return question
-    return replace(question, default=text, quiet=False)
+    return replace(question, default=text, quiet=False, beside=beside)
 
 
 def take(question: Question, text: str, answers: Answers, file: Path) -> str | None:

@@ -734,6 +734,7 @@ def test_floats_that_stand_still_are_proposed_as_such_and_called_a_guess(
             "--unit=1",
             "--registers=20-30",
             "--channels=a",
+            "--sensor=a.address=20",
             "--sensor=a.register-type=float32",
         )
     channels = tables["streams"]["device"]["layout"]["channels"]
@@ -744,7 +745,60 @@ def test_floats_that_stand_still_are_proposed_as_such_and_called_a_guess(
         "Type, byte order and scale of the registers are a guess by the values that were read: compare with"
     )
     assert f"\n{note} the device's register map.\n" in told
-    assert "a guess" not in capsys.readouterr().out  # the type was given
+    assert "a guess" not in capsys.readouterr().out  # address and type were given
+
+
+def test_what_was_read_of_a_channel_is_shown_with_its_register_and_is_in_the_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Names of one's own are given registers in a row, whatever the names suggest."""
+    beside: dict[str, str] = {}
+    typed = {"channels": "vib, temp, speed"}
+
+    def ask(question: Question) -> str:
+        beside[question.key] = question.beside
+        return typed.get(question.key) or f"{question.default}"
+
+    unit = Still(20, swapped(1.83, 2.19) + struct.pack(">2H", 2970, 0x8000))
+    listen = functools.partial(_heard, tmp_path, person=True)
+    with tcp({3: unit}) as target:
+        given = Given(
+            {"bus": "modbus-tcp", "host": target, "units": "3", "registers": "20-30"}, defaults=False
+        )
+        conduct(tmp_path / "m.toml", given, ask, lambda _reason: None, listen)
+        capsys.readouterr()
+        new(tmp_path, target, "--units=3", "--registers=20-30", "--channels=vib, temp, speed")
+        told = capsys.readouterr().out
+        own = "--sensor=off.no-value=0x8000"
+        new(tmp_path, target, "--units=3", "--registers=25-30", "--channels=off, r26", own)
+        absent = capsys.readouterr().out
+        new(tmp_path, target, "--units=3", "--registers=20-30")
+    assert beside["sensor.temp.address"] == "reads 2.19 as float32 CDAB"
+    assert beside["sensor.speed.address"] == "reads 2970 as uint16"
+    assert not beside["sensor.temp.register-type"]
+    heard = "Heard: vib 1.83 mm/s (register 20); temp 2.19 degC (register 22); speed 2970 rpm (register 24)."
+    guess = "Addresses that are a guess by the order of names: vib (20), temp (22), speed (24). Compare with"
+    assert f"\n{heard}\n{guess} the device's register map.\n" in told
+    assert "Heard: off no value (register 25).\nNo value was read of r26.\n" in absent
+    # Names of registers say which ones they are.
+    assert "order of names" not in capsys.readouterr().out
+    assert "# Heard: r20 1.83 (register 20); r22 2.19" in (tmp_path / "new.toml").read_text("utf-8")
+
+
+def test_units_that_the_file_does_not_read_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    units = {3: Still(20, struct.pack(">2H", 5, 9)), 4: Still(20, struct.pack(">H", 7)), 5: ModbusUnit()}
+    units[6] = Still(20, bytes(4))
+    with tcp(units) as target:
+        new(tmp_path, target, "--registers=20-30", "--units=1-8")
+        several = capsys.readouterr().out
+        new(tmp_path, target, "--registers=20-30", "--units=3")
+    others = (
+        "unit 4 (holding registers 20); unit 5 (no registers were found); unit 6 (holding registers 20 to "
+    )
+    assert f"\nNot read: {others}21, all 0). daqsvc sniff modbus proposes a stream for each.\n" in several
+    assert "Not read" not in capsys.readouterr().out
 
 
 def test_two_registers_that_may_be_one_float_are_not_halves_without_a_word(
