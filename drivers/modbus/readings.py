@@ -13,7 +13,8 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Set as AbstractSet
 
     from drivers.modbus.settings import Order, RegisterType
 
@@ -323,21 +324,46 @@ def undecided(rounds: Sequence[Registers], numbers: Sequence[Reading]) -> list[R
         one
         for one in found
         if one.type == "float32"
-        and one.order in USUAL_ORDERS
         and not taken & set(one.places)
         and (one.evidence or (_USUAL[0] <= abs(one.value) <= _USUAL[1] and not moved & set(one.places)))
     ]
+    of_others = {one.order for one in numbers if one.type == "float32"}
     by_order = {
-        order: _side_by_side([one for one in possible if one.order == order]) for order in USUAL_ORDERS
+        order: _side_by_side(
+            these if order in USUAL_ORDERS or order in of_others else _beside_large(rounds[0], these)
+        )
+        for order in ORDERS
+        if (these := [one for one in possible if one.order == order]) or order == ORDERS[0]
     }
-    best = max(USUAL_ORDERS, key=lambda order: len(by_order[order]))
+    best = max(by_order, key=lambda order: (order in of_others, len(by_order[order])))
     kept = list(by_order[best])
     places = {place for one in kept for place in one.places}
-    for order in USUAL_ORDERS:
-        kept += [one for one in by_order[order] if order != best and not places & set(one.places)]
+    for order, these in by_order.items():
+        kept += [one for one in these if order != best and not places & set(one.places)]
+        places |= {place for one in kept for place in one.places}
     zeros = [one for one in found if one.address in _zeros_beside(rounds, numbers) and one.order == "ABCD"]
     kept += [one._replace(order=numbers[0].order) for one in zeros if one.type == "float32"]
     return sorted(kept, key=lambda one: one.address)
+
+
+def _beside_large(registers: Registers, possible: Sequence[Reading]) -> list[Reading]:
+    """Those whose registers are both far from 0, as of most floats, and others of 16 bits seldom are.
+
+    Those side by side with one of these may be floats, too.
+    """
+    large = {one.address for one in possible if all(_around(registers[p]) >= _WILD for p in one.places)}
+    for these in (possible, reversed(possible)):
+        large |= _chained(these, large)
+    return [one for one in possible if one.address in large]
+
+
+def _chained(possible: Iterable[Reading], begun: AbstractSet[int]) -> set[int]:
+    """First registers of pairs side by side with one before, in the order in which they are given."""
+    found = set(begun)
+    for one in possible:
+        if {one.address - 2, one.address + 2} & found:
+            found.add(one.address)
+    return found
 
 
 def _zeros_beside(rounds: Sequence[Registers], numbers: Sequence[Reading]) -> set[int]:

@@ -47,12 +47,14 @@ class ProposedChannel(TypedDict):
         address: its first register.
         type: type of the number.
         order: order of bytes and words.
+        no_value: raw value by which the device most likely states that it has none; null without one.
     """
 
     name: str
     address: int
     type: str
     order: str
+    no_value: int | None
 
 
 class UndecidedPair(TypedDict):

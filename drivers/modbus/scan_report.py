@@ -226,8 +226,8 @@ class ScanReport:
 
     def _no_value(self, table: FoundTable, numbers: Sequence[Reading], address: int) -> str:
         """A hint where a register shows nothing but what devices write when they have no value."""
-        seen = {these[address] for these in table.rounds if address in these}
-        return "no value?" if len(seen) == 1 and seen <= NO_VALUE and address not in _covered(numbers) else ""
+        is_mark = address not in _covered(numbers) and _mark(table, address) is not None
+        return "no value?" if is_mark else ""
 
     def _figures(self) -> ModbusFigures:
         scan = self._scan
@@ -309,7 +309,13 @@ def _table_figures(table: FoundTable, numbers: Sequence[Reading], doubted: Seque
         "max_count": table.max_count,
         "moved": sorted(table.moved),
         "channels": [
-            {"name": one.name, "address": one.address, "type": one.type, "order": one.order}
+            {
+                "name": one.name,
+                "address": one.address,
+                "type": one.type,
+                "order": one.order,
+                "no_value": one.no_value,
+            }
             for one in _channels(table, numbers)
         ],
         "undecided": [
@@ -346,7 +352,8 @@ def _stream(
     yield 'bus = "modbus"'
     yield "rate_hz = 1.0"
     yield ""
-    yield f"[streams.{name}.layout]    # types are a guess: see the device's register map"
+    guessed = "types and no_value" if any(one.no_value is not None for one in channels) else "types"
+    yield f"[streams.{name}.layout]    # {guessed} are a guess: see the device's register map"
     yield 'way = "registers"'
     yield f"unit = {table.unit}"
     if table.function == 4:
@@ -380,12 +387,16 @@ class _Channel(NamedTuple):
     address: int
     type: str
     order: str
+    no_value: int | None = None
 
     @property
     def keys(self) -> str:
         """As in a machine file."""
         order = "" if self.order == "ABCD" else f", order = {quoted(self.order)}"
-        return f"name = {quoted(self.name)}, address = {self.address}, type = {quoted(self.type)}{order}"
+        mark = "" if self.no_value is None else f", no_value = 0x{self.no_value:04X}"
+        return (
+            f"name = {quoted(self.name)}, address = {self.address}, type = {quoted(self.type)}{order}{mark}"
+        )
 
 
 def _channels(table: FoundTable, numbers: Sequence[Reading]) -> Iterator[_Channel]:
@@ -403,7 +414,14 @@ def _channels(table: FoundTable, numbers: Sequence[Reading]) -> Iterator[_Channe
             yield _Channel(f"r{address}", address, wide[address].type, wide[address].order)
         else:
             signed = is_signed([these[address] for these in table.rounds if address in these])
-            yield _Channel(f"r{address}", address, "int16" if signed else "uint16", "ABCD")
+            kind = "int16" if signed else "uint16"
+            yield _Channel(f"r{address}", address, kind, "ABCD", _mark(table, address))
+
+
+def _mark(table: FoundTable, address: int) -> int | None:
+    """The raw value by which a register most likely states that it has none; None if it does not."""
+    seen = {these[address] for these in table.rounds if address in these}
+    return seen.pop() if len(seen) == 1 and seen <= NO_VALUE else None
 
 
 def _covered(numbers: Iterable[Reading]) -> set[int]:

@@ -248,7 +248,28 @@ def test_two_registers_that_stand_still_may_be_one_float(order: str) -> None:
     assert [(one.type, one.order) for one in found] == [("float32", order)] * 2
 
 
+@pytest.mark.parametrize("order", ["BADC", "DCBA"])
+def test_floats_with_exchanged_bytes_that_stand_still_may_be_floats(order: str) -> None:
+    rounds = numbers(itertools.repeat([1.8374, 2.2159, 23.5, 63.2]), ">f", order)
+    assert chosen(rounds) == []
+    found = undecided(rounds, [])
+    assert [(one.address % 2, one.order) for one in found] == [(found[0].address % 2, order)] * 4
+
+
+@pytest.mark.parametrize("order", ["BADC", "DCBA"])
+def test_floats_that_stand_still_beside_one_that_moves_may_be_floats(order: str) -> None:
+    moving = [[1.83 + 0.00137 * n * n, 2.2159, 8.0] for n in range(5)]
+    rounds = numbers(iter(moving), ">f", order)
+    found = [*chosen(rounds), *undecided(rounds, chosen(rounds))]
+    assert sorted((one.address, one.type, one.order) for one in found) == [
+        (address, "float32", order) for address in (0, 2, 4)
+    ]
+
+
 def test_registers_that_are_no_float_are_not_doubted() -> None:
+    # With their bytes exchanged, these would be 8 and 0.53.
+    exchanged = {0: 65, 1: 0, 2: 2970, 3: 4, 4: 63, 5: 1031}
+    assert undecided([exchanged, exchanged], chosen([exchanged, exchanged])) == []
     small = {0: 235, 1: 451, 2: 700, 3: 0, 4: 0, 5: 12_000}
     assert undecided([small, small], chosen([small, small])) == []
     assert undecided([], []) == []

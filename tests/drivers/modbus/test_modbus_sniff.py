@@ -822,6 +822,29 @@ def test_two_registers_that_may_be_one_float_are_not_halves_without_a_word(
     assert [(one["address"], one["order"]) for one in table["undecided"]] == [(20, "CDAB")]
 
 
+def test_floats_with_exchanged_bytes_that_stand_still_are_not_halves_without_a_word(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    raw = struct.pack(">3f", 1.8374, 2.2159, 63.2)
+    badc = b"".join(raw[k : k + 2][::-1] for k in range(0, len(raw), 2))
+    with tcp({1: Still(20, badc + struct.pack(">H", 0x8000))}) as target:
+        tables = new(tmp_path, target, "--unit=1", "--registers=20-30")
+        told = capsys.readouterr().out
+        assert main(words(target, "--units", "1", "--registers", "20-30", *PATIENT)) == 0
+        shown = capsys.readouterr().out
+        assert main(words(target, "--units", "1", "--registers", "20-30", "--json", *PATIENT)) == 0
+    assert "20: -5313, or with 21 1.8374 as float32 BADC" in told
+    assert "Registers 20 and 21, 22 and 23, 24 and 25: each pair may be one 32-bit number" in told
+    assert 'e.g. address = 20, type = "float32", order = "BADC".' in told
+    assert "float32 BADC 2.2159?" in shown
+    # Both propose the mark by which a register has no value.
+    assert tables["streams"]["device"]["layout"]["channels"][-1]["no_value"] == 0x8000
+    assert 'name = "r26", address = 26, type = "uint16", no_value = 0x8000 },' in shown
+    assert "[streams.unit-1.layout]    # types and no_value are a guess: see" in shown
+    [table] = figures(capsys)["tables"]
+    assert [one["no_value"] for one in table["channels"]] == [None] * 6 + [0x8000]
+
+
 def test_registers_are_read_again_for_as_long_as_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
