@@ -43,13 +43,10 @@ FAR_AWAY = {
     "daqsvc/acquisition/counter_sense.py": "B38",
     "daqsvc/acquisition/standing.py": "B38",
     "daqsvc/cli.py": "C01",
-    "drivers/modbus/heard.py": "C20",
     "drivers/modbus/scan_report.py": "C20",
     "drivers/questions.py": "C22",
     "drivers/serial/binary.py": "B34",
     "drivers/serial/lines.py": "B34",
-    "drivers/serial/reader.py": "B29",
-    "drivers/serial/sniff_report.py": "C20",
     "sim_hw/bus_socket.py": "B29",
 }
 """Where messages are put together that have their codes elsewhere, e.g. those of alarms."""

@@ -176,6 +176,11 @@ class BusQuestions(ABC):
         waveform = answers["rate"] >= WAVEFORM_HZ
         return by_name(channel) or ("accelerometer" if waveform else "trend"), unit_by_name(channel)
 
+    def measuring_range(self, answers: Answers, channel: str) -> tuple[float, float] | None:
+        """Least and greatest value that a file of the device states for a channel; None if none does."""
+        del answers, channel
+        return None
+
     def in_volts(self, answers: Answers, channel: str) -> bool:
         """Whether the samples of the sensor on a channel are volts, as a rule."""
         del answers, channel

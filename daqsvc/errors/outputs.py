@@ -122,10 +122,12 @@ CLIENT_ID_TAKEN = Code(
     "O13",
     "Another client has the same client id",
     "A broker ends a connection when another client comes with the same id. Both end each other in turn.",
-    "Give each box its own box name, or mqtt.client_id.",
-    "mqtt.md",
+    "Give each box its own box name, or mqtt.client_id. Watch several machines of one box with one service: "
+    "daqsvc run a.toml b.toml.",
+    "several-machines.md",
     "MQTT broker 10.0.0.1:8883: this connection was ended by another client with client_id "
-    "'daqsvc-lab:edge-1'; give each box its own box name or mqtt.client_id",
+    "'daqsvc-lab:edge-1'; give each box its own box name or mqtt.client_id, and watch several machines of "
+    "one box with one service: daqsvc run a.toml b.toml",
 )
 CERTIFICATE_UNKNOWN = Code(
     "O14",

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import functools
 import math
+import shlex
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from daqsvc.rounding import counted
 from drivers import questions as q
-from drivers.bus_questions import is_count
+from drivers.bus_questions import BUS, is_count
 from drivers.can.questions import SHOWN, CanQuestions, decoded_signals, values_heard
 from drivers.can.sniff import STATE, number_of, numbered, of_one_channel
-from drivers.questions import NONE, Answers, Question, Topic
+from drivers.questions import NONE, Answers, Question, Topic, sensor_key
 from drivers.sniffing import (
     LONGEST_UNIT,
     WAVEFORM_HZ,
@@ -202,7 +203,7 @@ class DbcQuestions(CanQuestions):
         notes = [f"Heard: {values_heard(read)}."] if read else []
         if silent := [name for name in answers["signals"] if name not in heard]:
             notes.append(f"No value was heard of {', '.join(silent[:SHOWN])}.")
-        notes += [one["doubt"] for one in read if one["doubt"]][:SHOWN]
+        notes += _doubts(one for message in decoded_signals(found) for one in message["signals"])
         if answers["counter"] is None and not any(one["counts_frames"] for one in heard.values()):
             offered = _likely_counter(self._messages(answers)[answers["message"]])
             few = offered is not None and offered not in self._not_counting(found, answers)
@@ -222,6 +223,19 @@ class DbcQuestions(CanQuestions):
             notes.append(f"It was not heard whether {counter['signal']} counts the frames that are read.")
         return notes
 
+    def unknown(self, found: Mapping[str, Any], answers: Answers, assumed: Collection[str]) -> str:
+        """See `Heard.unknown`: values that contradict the file make it most likely that of another device."""
+        if "signals" not in answers:
+            return ""
+        named = None if "signals" in assumed else answers["signals"]
+        read = [one for one in self._signals(found, answers) if named is None or one["signal"] in named]
+        if not (doubts := _doubts(read)):
+            return ""
+        return (
+            f"{' '.join(doubts)} Remedy: give the file of the device that sends. If it is that one, name "
+            "with --signals those that are right, or answer the questions in a terminal, without --yes"
+        )
+
     def not_read(self, found: Mapping[str, Any], answers: Answers) -> str:
         """See `Heard.not_read`: the file reads one message, and of that no states if nobody names them."""
         others = [
@@ -231,7 +245,12 @@ class DbcQuestions(CanQuestions):
         ]
         more = f" and {len(others) - SHOWN} more" if len(others) > SHOWN else ""
         named = ", ".join(others[:SHOWN])
-        said = [f"Not read: {named}{more}; daqsvc sniff can --dbc prints their tables."] if others else []
+        said = []
+        if others:
+            said.append(
+                f"Not read: {named}{more}; {_sniffed_by(answers)} prints their tables. Of these take the "
+                f'streams and sensors, and write bus = "{BUS}", as this file calls it.'
+            )
         taken = {answers["counter"], *answers["signals"]}
         signals = self._messages(answers)[answers["message"]].signals
         states = [one.name for one in signals if one.choices and one.name not in taken]
@@ -276,6 +295,15 @@ class DbcQuestions(CanQuestions):
         if answers["rate"] < WAVEFORM_HZ:
             kind = "trend"
         return kind or by_name(channel) or "trend", unit
+
+    def measuring_range(self, answers: Answers, channel: str) -> tuple[float, float] | None:
+        """See `BusQuestions.measuring_range`: what the file states, unless it is what the bits can carry."""
+        if answers.get(sensor_key(channel, "unit")) != self._units(answers).get(channel):
+            return None
+        names = self._by_channel(answers)[channel]
+        signals = self._messages(answers)[answers["message"]].signals
+        ranges = {_stated_range(one) for one in signals if one.name in names}
+        return ranges.pop() if len(ranges) == 1 else None
 
     def in_volts(self, answers: Answers, channel: str) -> bool:
         """See `BusQuestions.in_volts`."""
@@ -355,6 +383,18 @@ def _read_once(file: Path, changed_ns: int) -> dict[str, Message]:
     return {message.name: message for message in messages_of(file) if message.signals}
 
 
+def _sniffed_by(answers: Answers) -> str:
+    """The command that looks at the same bus with the same DBC file."""
+    adapter = [] if answers["interface"] == "socketcan" else ["--interface", answers["interface"]]
+    adapter += ["--fd"] if adapter and answers["fd"] else []
+    return shlex.join(["daqsvc", "sniff", "can", answers["channel"], *adapter, "--dbc", answers["dbc"]])
+
+
+def _doubts(signals: Iterable[Mapping[str, Any]]) -> list[str]:
+    """What of the values that were heard contradicts the DBC file."""
+    return [one["doubt"] for one in signals if one["doubt"]][:SHOWN]
+
+
 def _about(message: Message) -> str:
     shown = [one.name for one in message.signals[:SHOWN]]
     more = len(message.signals) - len(shown)
@@ -423,6 +463,19 @@ _KINDS = {
     **dict.fromkeys(("um", "mm", "mil"), "proximity"),
 }
 """Sensors by the unit of their samples."""
+
+
+_MOST_OF_BITS = 0.9
+"""A range up to this part of what the bits can carry is one of the sensor; SAE J1939 uses 98 % of them."""
+
+
+def _stated_range(signal: Any) -> tuple[float, float] | None:
+    """The range that a DBC file states for a signal; None where that is what the bits can carry."""
+    if signal.minimum is None or signal.maximum is None or signal.choices:
+        return None
+    least, most = float(signal.minimum), float(signal.maximum)
+    carried = math.inf if signal.is_float else (2.0**signal.length - 1.0) * abs(signal.scale)
+    return (least, most) if 0.0 < most - least <= _MOST_OF_BITS * carried else None
 
 
 def _most_likely_samples(signals: Iterable[Any], names: Sequence[str]) -> list[str]:

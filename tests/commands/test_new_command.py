@@ -205,7 +205,7 @@ NEEDED_OF = {
 
 @pytest.mark.long
 @pytest.mark.parametrize("case", grid(), ids=lambda case: " ".join(case.values()))
-def test_without_a_terminal_options_and_defaults_make_a_file_without_warnings(tmp_path, capsys, case):
+def test_without_a_terminal_options_and_defaults_make_a_file_without_other_warnings(tmp_path, capsys, case):
     file = tmp_path / "m.toml"
     texts = {key: value for key, value in case.items() if not key.startswith("sensor.")}
     options = [f"--{key}={value}" for key, value in texts.items()]
@@ -214,7 +214,9 @@ def test_without_a_terminal_options_and_defaults_make_a_file_without_warnings(tm
     said = capsys.readouterr().out
     assert f"{file} is written; daqsvc check finds no error in it." in said
     machine = load_machine_file(file)
-    assert machine.warnings == ()
+    # Which value of a register means that there is none, only its manual states.
+    modbus_values = case["bus"].startswith("modbus") and "way" not in case and "channels" not in case
+    assert {f"{one.code}" for one in machine.warnings} == ({"B45"} if modbus_values else set())
     assert bool(machine.alarms) == (case.get("limits") != "none")
     # What it says to type next is what there is to type.
     verbs = [line.split()[1] for line in said.partition("Next:")[2].splitlines() if line.strip()]
@@ -340,11 +342,17 @@ def test_an_interface_that_python_can_does_not_know_is_refused_at_once(tmp_path,
     assert '"unixbus"?' in said
 
 
-def test_the_proposed_range_of_a_speed_holds_the_speed(tmp_path):
+@pytest.mark.parametrize("channels", ["rpm", "vibration, temperature"])
+def test_what_a_sensor_can_measure_is_not_invented(tmp_path, channels):
+    """Beyond that range no alarm acts: a danger alarm of a hot bearing would be suppressed."""
     file = tmp_path / "m.toml"
-    words = ["--bus=modbus-tcp", "--host=192.0.2.10", "--channels=rpm", "--speed=-1473", "--limits=none"]
+    words = ["--bus=modbus-tcp", "--host=192.0.2.10", f"--channels={channels}", "--limits=none"]
     assert main(["new", f"{file}", "--yes", *words]) == 0
-    assert "# ok_between = [0.0, 4410.0]" in file.read_text()
+    text = file.read_text()
+    assert text.count(
+        "# ok_between = [LEAST, GREATEST]    # from the sensor's data sheet: beyond, its"
+    ) == len(channels.split(","))
+    assert [sensor.ok_between for sensor in load_machine_file(file).sensors] == [None] * text.count("[[sens")
 
 
 def test_answers_of_a_file_are_those_of_the_options(tmp_path, capsys):
@@ -366,8 +374,7 @@ def test_answers_of_a_file_are_those_of_the_options(tmp_path, capsys):
     assert layout["unit"] == 4
     assert [(one["address"], one["scale"]) for one in layout["channels"]] == [(17, 1.0), (32, 0.001)]
     assert [alarm.alert for alarm in machine.alarms] == [7.1, 7.1]
-    # A velocity that no machine has is not believed.
-    assert [sensor.ok_between for sensor in machine.sensors] == [(-1.0, 100.0)] * 2
+    assert [sensor.ok_between for sensor in machine.sensors] == [None] * 2  # nobody has stated it
     assert main(["check", f"{file}"]) == 0
 
 

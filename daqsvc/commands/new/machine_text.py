@@ -92,8 +92,13 @@ def _head(answers: Answers, file: str) -> Iterator[str]:
     yield "# Units are part of every name. Relative paths start at the folder of this file."
     if notes := answers.get(NOTES):
         yield "#"
-        yield from (f"# {line}" for note in notes for line in textwrap.wrap(note, _WIDTH))
+        yield from (f"# {line}" for note in notes for line in _wrapped(note))
     yield ""
+
+
+def _wrapped(note: str) -> list[str]:
+    """Its lines; a path or option that is broken at a hyphen could not be found or copied."""
+    return textwrap.wrap(note, _WIDTH, break_on_hyphens=False, break_long_words=False)
 
 
 def _machine(answers: Answers) -> Iterator[str]:

@@ -256,15 +256,14 @@ def sensor_tables(answers: Answers) -> Iterator[str]:
 
 def _ok_between(sensor: Sensor, answers: Answers) -> Iterator[str]:
     """What the sensor can measure: by it a wrong type, order or scale is found, and a broken sensor."""
-    about = "beyond, it counts as broken; see its manual"
-    usual = {"mm/s": (-1.0, 100.0), "degC": (-40.0, 150.0)}.get(sensor.unit)
+    # Only what somebody has stated: beyond it the alarms are suppressed, also those of a hot machine.
+    stated = bus_of(answers).measuring_range(answers, sensor.channel)
     own = [answers[key] for key in ("alert", "danger") if key in answers]
-    if usual is None or any(not usual[0] < limit < usual[1] for limit in own):
-        fastest = 3.0 * round(abs(answers["speed"]), -1)
-        ends = f"0.0, {fastest:.1f}" if sensor.unit == "rpm" else "LEAST, GREATEST"
-        yield f"# ok_between = [{ends}]    # what it can measure; {about}"
+    if stated is None or any(not stated[0] < limit < stated[1] for limit in own):
+        about = "from the sensor's data sheet: beyond, its alarms are suppressed"
+        yield f"# ok_between = [LEAST, GREATEST]    # {about}"
     else:
-        yield entry("ok_between", list(usual), f"what it can measure; {about}")
+        yield entry("ok_between", list(stated), "by the DBC file; beyond, its alarms are suppressed")
 
 
 def pipeline_tables(answers: Answers) -> Iterator[str]:

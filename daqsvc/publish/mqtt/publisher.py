@@ -534,7 +534,8 @@ class MqttPublisher(Output):
     def _report_rival(self, how: str, error: Exception) -> None:
         self._outage.note(f"MQTT broker {self._name}", in_words(error))
         log.error(
-            "MQTT broker %s: %s with client_id %r; give each box its own box name or mqtt.client_id",
+            "MQTT broker %s: %s with client_id %r; give each box its own box name or mqtt.client_id, and "
+            "watch several machines of one box with one service: daqsvc run a.toml b.toml",
             self._name,
             how,
             self._settings.client_id,

@@ -121,6 +121,26 @@ def test_the_unit_of_the_dbc_file_is_taken_over(
     assert ("[F40]" in capsys.readouterr().out) == (unit == "1")
 
 
+@pytest.mark.parametrize(
+    ("stated", "written"),
+    [
+        ("[-40|215]", [-40.0, 215.0]),
+        ("[0|0]", None),
+        ("[-3276.8|3276.7]", None),  # what 16 bits can carry
+        ("[-3200|3200]", None),  # most of it, as SAE J1939 has it
+    ],
+)
+def test_what_a_sensor_can_measure_is_as_the_dbc_file_states(
+    tmp_path: Path, stated: str, written: list[float] | None
+) -> None:
+    dbc = GEARBOX.replace('(0.1,0) [0|0] "degC"', f'(0.1,0) {stated} "degC"')
+    more = ["--message=Slow", "--signals=OilTemp", "--rate=10", "--limits=own", "--alert=110"]
+    [sensor] = new(tmp_path, dbc, *more, "--danger=130")["sensors"]
+    assert sensor.get("ok_between") == written
+    if stated == "[-40|215]":  # an alarm that lies beyond would never come
+        assert "ok_between" not in new(tmp_path, dbc, *more, "--danger=230")["sensors"][0]
+
+
 def test_it_is_not_asked_where_one_stream_could_not_read_them_so(tmp_path: Path) -> None:
     layout = layout_of(new(tmp_path, GEARBOX, "--signals=AX_0, AX_1, Supply"))
     assert [one["name"] for one in layout["channels"]] == ["AX_0", "AX_1", "Supply"]

@@ -703,12 +703,14 @@ def test_new_names_the_messages_that_it_heard_and_does_not_read(
 
     with talking(tmp_path / "bus", both):
         new(tmp_path, "--bus=can-dbc", "--dbc=two.dbc", "--message=Acceleration")
-    note = "Not read: Slow (0x321); daqsvc sniff can --dbc prints their tables."
+    command = f"daqsvc sniff can {tmp_path / 'bus'} --interface unixbus --dbc two.dbc"
+    note = (
+        f"Not read: Slow (0x321); {command} prints their tables. Of these take the streams and sensors, and "
+        'write bus = "main", as this file calls it.'
+    )
     state = "Status is left out: its values have names, as states have: see"
     assert f"\n{note}\n{state}" in capsys.readouterr().out
-    written = (tmp_path / "new.toml").read_text("utf-8")
-    assert f"# {note}\n" in written
-    assert f"# {state}" in written
+    assert f"{note} {state}" in comments(tmp_path / "new.toml")
 
 
 STATUS = """VERSION ""
@@ -828,6 +830,7 @@ def test_values_that_the_dbc_file_excludes_are_stated_as_a_doubt_about_the_file(
     (tmp_path / "other.dbc").write_text(
         'VERSION ""\nBU_: A\nBO_ 513 Pump: 8 A\n SG_ Cnt : 0|8@1+ (1,0) [0|255] "" A\n'
         ' SG_ Pressure : 8|16@1+ (0.01,0) [0|100] "bar" A\n SG_ Flow : 24|16@1+ (0.1,0) [0|0] "l/min" A\n'
+        ' SG_ Level : 40|8@1+ (1,0) [0|0] "%" A\n'
     )
 
     def vibration(bus: UnixBus, number: int) -> None:
@@ -837,15 +840,24 @@ def test_values_that_the_dbc_file_excludes_are_stated_as_a_doubt_about_the_file(
         bus.send(can.Message(arbitration_id=513, is_extended_id=False, data=payload))
 
     with talking(tmp_path / "bus", vibration):
-        new(tmp_path, "--bus=can-dbc", "--dbc=other.dbc")
-        listened = capsys.readouterr().out
+        assert not_written(tmp_path, "--bus=can-dbc", "--dbc=other.dbc") == 1
+        listened = capsys.readouterr()
+        new(tmp_path, "--bus=can-dbc", "--dbc=other.dbc", "--signals=Level")
+        in_terminal = capsys.readouterr().out
         assert main(words(tmp_path, "--seconds", "0.5", "--dbc", f"{tmp_path / 'other.dbc'}")) == 0
         shown = capsys.readouterr().out
         assert main(words(tmp_path, "--seconds", "0.5", "--json", "--dbc", f"{tmp_path / 'other.dbc'}")) == 0
     [message] = figures(capsys.readouterr().out)["dbc"]["messages"]
     range_of = {one["signal"]: (one["dbc_min"], one["dbc_max"]) for one in message["signals"]}
-    assert range_of == {"Cnt": (0, 255), "Pressure": (0, 100), "Flow": (None, None)}
-    for text in (listened, comments(tmp_path / "new.toml"), shown):
+    assert range_of == {"Cnt": (0, 255), "Pressure": (0, 100), "Flow": (None, None), "Level": (None, None)}
+    assert "nothing was written: Pressure reads 0.2 to 655.16 bar, in " in listened.err
+    assert (
+        "Remedy: give the file of the device that sends. If it is that one, name with --signals"
+        in listened.err
+    )
+    # Who names other signals has the doubt in the file and behind all, too: it is about the file.
+    assert "Pressure reads" in in_terminal.partition("is written;")[2]
+    for text in (listened.out, comments(tmp_path / "new.toml"), shown):
         assert "Pressure reads 0.2 to 655.16 bar, in " in text
         assert "beyond what the DBC file states (0 to 100): is it the file of this device?" in text
         assert "Flow jumps by more than half of what its 16 bits can carry, in " in text
