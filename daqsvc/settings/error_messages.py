@@ -39,7 +39,7 @@ from daqsvc.settings.schema import (
     words_of,
 )
 from daqsvc.settings.section import NamesDetector
-from daqsvc.settings.written_numbers import as_toml, number_meant
+from daqsvc.settings.written_numbers import as_toml, number_meant, with_digits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -381,6 +381,9 @@ class ErrorFormatter:
     def _write_meant(self, path: KeyPath, value: object, *, whole: bool) -> str:
         """The number that a text begins with, if it is a valid one; else an example."""
         meant = number_meant(value, str(path[-1])) if isinstance(value, str) else None
+        supposed = ""
+        if isinstance(value, str) and (alike := with_digits(value)) is not None:
+            meant, supposed = float(alike[0]), f", {alike[1]}"
         if meant is None or isinstance(path[-1], int) or (whole and not meant.is_integer()):
             return self._write_example(path)
         try:
@@ -389,7 +392,7 @@ class ErrorFormatter:
             )
         except ValidationError:
             return self._write_example(path)
-        return f"write {self._key(path)} = {as_toml(meant, whole=whole)}, a number alone"
+        return f"write {self._key(path)} = {as_toml(meant, whole=whole)}{supposed or ', a number alone'}"
 
     def _add(self, path: KeyPath) -> str:
         """How to add what is missing at ``path``, or to make a table of it."""

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from daqsvc.errors.machine_file import NOT_TOML, NOT_UTF8, TOO_LARGE
 from daqsvc.settings.error_messages import dotted
 from daqsvc.settings.locate import Spot, TooMuchError, locate
-from daqsvc.settings.written_numbers import number_meant
+from daqsvc.settings.written_numbers import number_meant, with_digits
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -290,6 +290,8 @@ _EITHER_COMMA = re.compile(
     r"(?P<key>[\w.-]+)\s*=\s*(?P<whole>[+-]?[1-9]\d{0,2}),(?P<part>\d{3})(?=\s*(?:[,}\]]|$))"
 )
 """A comma between thousands, or a decimal comma: only who wrote it knows."""
+_VALUE = re.compile(r"\s*(?P<key>[\w.-]+)\s*=\s*(?P<text>[\w.+-]+)\s*(?:#|$)")
+"""A value without quotes."""
 _UNIT = re.compile(
     r"^\s*(?P<key>[\w.-]+)\s*=\s*(?P<text>(?P<number>[+-]?\d[\d_]*(?:\.\d+)?)\s*(?:[^\W\d][^\s#]*|\d[NEO]\d))\s*$"
 )
@@ -312,6 +314,10 @@ def _number_in(line: str) -> str | None:
         return (
             f"write {found_comma['key']} = {found_comma['whole']}.{found_comma['part']}, with a decimal point"
         )
+    if (bare_value := _VALUE.match(bare)) is not None:
+        alike = with_digits(bare_value["text"])
+        if alike is not None:
+            return f"write {bare_value['key']} = {alike[0]}, {alike[1]}"
     if (united := _UNIT.match(bare)) is not None:
         key = united["key"].rpartition(".")[2]
         meant, written = number_meant(united["text"], key), float(united["number"].replace("_", ""))

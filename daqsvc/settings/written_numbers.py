@@ -1,4 +1,4 @@
-"""The number that somebody meant who wrote a unit behind it, or ``k`` for a thousand."""
+"""The number that somebody meant who wrote a unit behind it, ``k`` for a thousand, or O for a zero."""
 
 from __future__ import annotations
 
@@ -19,6 +19,29 @@ _OTHER_UNITS = {
 """What a number is multiplied by where the key ends with one unit, and another one is written."""
 
 
+_ALIKE = re.compile(r"[+-]?(?=[._OolI]*\d)[\dOolI][\d_OolI]*(?:\.[\dOolI]+)?")
+_DIGITS = {"O": "0", "o": "0", "l": "1", "I": "1"}
+_NAMES = {"0": "zero", "1": "one"}
+
+
+def with_digits(text: str) -> tuple[str, str] | None:
+    """A number that has letters for digits, with these digits, and what that takes for granted.
+
+    Args:
+        text: e.g. ``5O`` or ``l0.5``.
+
+    Returns:
+        e.g. ``50`` and ``if the letter O is a zero``; None if it is something else.
+    """
+    found = _ALIKE.fullmatch(text.strip())
+    letters = [] if found is None else [one for one in dict.fromkeys(found[0]) if one in _DIGITS]
+    if found is None or not letters:
+        return None
+    number = "".join(_DIGITS.get(one, one) for one in found[0])
+    number = re.sub(r"^([+-]?)0+(?=\d)", r"\1", number)
+    return number, "if " + " and ".join(f"the letter {one} is a {_NAMES[_DIGITS[one]]}" for one in letters)
+
+
 def number_meant(text: str, key: str) -> float | None:
     """The number that begins a text, in the unit of its key.
 
@@ -29,6 +52,8 @@ def number_meant(text: str, key: str) -> float | None:
     Returns:
         None if the text does not begin with a number, or it is not clear which one is meant.
     """
+    if with_digits(text) is not None:
+        return None  # the number that it begins with has lost a digit
     found = _NUMBER.match(text.strip())
     if found is None or text.strip()[found.end("number") :][:1] in {".", ",", ":", "-"}:
         return None
