@@ -15,7 +15,13 @@ from typing import TYPE_CHECKING, Any, TypedDict
 
 from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, alarm_id, count, duration, one_line
 from daqsvc.commands.complaint import complain
-from daqsvc.commands.store_argument import BadFileError, StoreNotFoundError, add_store, chosen_store
+from daqsvc.commands.store_argument import (
+    BadFileError,
+    OtherFileError,
+    StoreNotFoundError,
+    add_store,
+    chosen_store,
+)
 from daqsvc.errors.code import with_code
 from daqsvc.errors.command_line import COMMAND_REFUSED, NO_SUCH_MACHINE
 from daqsvc.errors.service import JOURNAL_BEHIND
@@ -90,6 +96,7 @@ class AlarmsCommand:
                         events = [event for event in events if event["machine"] == chosen.machine]
                     if not arguments.all:
                         events = [event for event in events if event["state"] != "normal"]
+                chosen.tell_other("daqsvc alarms")
                 _show(store, events, arguments)
             finally:
                 if doubt:
@@ -267,11 +274,13 @@ class AlarmVerb:
 
         name = arguments.verb
         try:
-            store, asked, _ = chosen_store(arguments, self._load)
-            targets = meant(store, arguments.alarms, Verb(self._verb), asked)
+            chosen = chosen_store(arguments, self._load)
+            chosen.refuse_other()
+            store = chosen.directory
+            targets = meant(store, arguments.alarms, Verb(self._verb), chosen.machine)
         except BadFileError:
             return EXIT_USAGE
-        except (StoreNotFoundError, NoSuchAlarmError, OutboxError) as error:
+        except (OtherFileError, StoreNotFoundError, NoSuchAlarmError, OutboxError) as error:
             return _complain(name, error, error.code)
         several = len({one.machine for one in targets if one.machine}) > 1
         code = EXIT_OK

@@ -134,7 +134,9 @@ class PageCommand:
             BadFileError: the machine file has errors, which were printed.
             StoreNotFoundError: there is none.
         """
-        store = chosen_store(arguments, self._load).directory
+        chosen = chosen_store(arguments, self._load)
+        chosen.tell_other("daqsvc page")
+        store = chosen.directory
         if not store.is_dir():
             raise StoreNotFoundError(
                 f"the store {store} does not exist: name that of a service by --store, or start "

@@ -7,7 +7,13 @@ from typing import TYPE_CHECKING, TypedDict
 
 from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE
 from daqsvc.commands.complaint import complain
-from daqsvc.commands.store_argument import BadFileError, StoreNotFoundError, add_store, chosen_store
+from daqsvc.commands.store_argument import (
+    BadFileError,
+    OtherFileError,
+    StoreNotFoundError,
+    add_store,
+    chosen_store,
+)
 from daqsvc.errors.command_line import COMMAND_REFUSED
 
 if TYPE_CHECKING:
@@ -61,10 +67,11 @@ class SnapshotCommand:
 
         try:
             store = chosen_store(arguments, self._load)
+            store.refuse_other()
             answer = ask_snapshot(store.directory, store.machine)
         except BadFileError:
             return EXIT_USAGE
-        except (StoreNotFoundError, ControlError) as error:
+        except (OtherFileError, StoreNotFoundError, ControlError) as error:
             return complain("daqsvc snapshot", error, error.code)
         if arguments.json:
             told: SnapshotTaken = {

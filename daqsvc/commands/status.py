@@ -8,19 +8,22 @@ import shutil
 import signal
 import sys
 import time
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.commands.arguments import EXIT_OK, EXIT_USAGE, signals_to_end
 from daqsvc.commands.complaint import complain
 from daqsvc.commands.store_argument import BadFileError, StoreNotFoundError, add_store, chosen_store
+from daqsvc.errors.code import with_code
 from daqsvc.errors.command_line import NO_SERVICE
+from daqsvc.errors.service import UNUSABLE_STORE
 from daqsvc.rounding import counted
 
 if TYPE_CHECKING:
     import argparse
-    from pathlib import Path
 
     from daqsvc.commands.machine_files import Load
+    from daqsvc.commands.store_argument import ChosenStore
 
 EVERY_S = 1.0
 ENTER, LEAVE = "\x1b[?1049h\x1b[?25l", "\x1b[?25h\x1b[?1049l"
@@ -62,11 +65,13 @@ class StatusCommand:
         from daqsvc.control import ControlError, ask_status  # noqa: PLC0415 - only what a verb needs
 
         try:
-            store, machine, _ = chosen_store(arguments, self._load)
+            chosen = chosen_store(arguments, self._load)
             if arguments.watch:
-                _watch(store, machine, as_json=arguments.json)
+                _watch(chosen, as_json=arguments.json)
             else:
-                print(_shown(ask_status(store, machine), as_json=arguments.json))  # noqa: T201 - what the verb is for
+                status = ask_status(chosen.directory, chosen.machine)
+                chosen.tell_other("daqsvc status")
+                print(_shown(status, as_json=arguments.json))  # noqa: T201 - what the verb is for
         except BadFileError:
             return EXIT_USAGE
         except (StoreNotFoundError, ControlError) as error:
@@ -74,16 +79,18 @@ class StatusCommand:
         return EXIT_OK
 
 
-def _shown(machines: list[dict[str, Any]], *, as_json: bool, is_live: bool = False) -> str:
+def _shown(machines: list[dict[str, Any]], *, as_json: bool, is_live: bool = False, warning: str = "") -> str:
     from daqsvc.commands.status_text import status_text  # noqa: PLC0415 - as above
+    from daqsvc.commands.tables import wrapped  # noqa: PLC0415
 
     if as_json:
         return "\n".join(json.dumps(status) for status in machines)
     width = shutil.get_terminal_size().columns
-    return "\n\n".join(status_text(status, width, alarms_first=is_live) for status in machines)
+    above = ["\n".join(wrapped(warning, width))] * bool(warning)
+    return "\n\n".join([*above, *(status_text(one, width, alarms_first=is_live) for one in machines)])
 
 
-def _watch(store: Path, machine: str | None, *, as_json: bool) -> None:
+def _watch(chosen: ChosenStore, *, as_json: bool) -> None:
     """Show the status again and again, until Ctrl-C.
 
     Raises:
@@ -94,14 +101,21 @@ def _watch(store: Path, machine: str | None, *, as_json: bool) -> None:
     is_live = not as_json and sys.stdout.isatty() and os.environ.get("TERM") != "dumb"
     picture = _Picture(is_live=is_live)
     before = {number: signal.signal(number, signal.default_int_handler) for number in signals_to_end()}
+    # The picture covers what was printed before it.
+    warning = with_code(f"{chosen.other}. Remedy: {chosen.instead}", UNUSABLE_STORE)
+    shown_now = partial(
+        _shown, as_json=as_json, is_live=is_live, warning=warning if chosen.other and is_live else ""
+    )
     try:
-        shown = _shown(ask_status(store, machine), as_json=as_json, is_live=is_live)
+        shown = shown_now(ask_status(chosen.directory, chosen.machine))
+        if not is_live:
+            chosen.tell_other("daqsvc status")
         with picture:
             picture.show(shown)
             while True:
                 time.sleep(EVERY_S)
                 try:
-                    shown = _shown(ask_status(store, machine), as_json=as_json, is_live=is_live)
+                    shown = shown_now(ask_status(chosen.directory, chosen.machine))
                 except AbsentError as error:
                     picture.wait(f"{error}; it is asked again every second", shown)
                 else:

@@ -37,6 +37,12 @@ class BadFileError(Exception):
     """The machine file has errors, which have been printed."""
 
 
+class OtherFileError(Exception):
+    """The store is that of another machine file than the one that was named; states which, and the remedy."""
+
+    code = UNUSABLE_STORE
+
+
 class ChosenStore(NamedTuple):
     """What the arguments of a verb mean.
 
@@ -44,11 +50,29 @@ class ChosenStore(NamedTuple):
         directory: of the store.
         machine: the machine that is meant; None for all.
         machines: those of the machine files that were named, where the store is theirs for certain.
+        other: a sentence if the store is that of another machine file than the one named; else empty.
+        instead: what to do about that.
     """
 
     directory: Path
     machine: str | None
     machines: tuple[str, ...] = ()
+    other: str = ""
+    instead: str = ""
+
+    def tell_other(self, verb: str) -> None:
+        """Say on stderr that what is shown is of another machine file, if so."""
+        if self.other:
+            complain(verb, f"{self.other}. Remedy: {self.instead}", UNUSABLE_STORE)
+
+    def refuse_other(self) -> None:
+        """Do nothing to the alarms of another machine file.
+
+        Raises:
+            OtherFileError: the store is that of another one.
+        """
+        if self.other:
+            raise OtherFileError(f"nothing was done: {self.other}. Remedy: {self.instead}")
 
 
 def store_directory(box: Box) -> Path:
@@ -192,20 +216,54 @@ def chosen_store(arguments: argparse.Namespace, load: Load, *, all_sound: bool =
         BadFileError: the machine file cannot be read.
         StoreNotFoundError: nothing was named, and there is not exactly one store; or it is no directory.
     """
-    chosen = _chosen(arguments, load, all_sound=all_sound)
+    chosen, box = _chosen(arguments, load, all_sound=all_sound)
     _refuse_file(chosen.directory)
+    return chosen if box is None else _compared(chosen, box)
+
+
+def _compared(chosen: ChosenStore, box: Box) -> ChosenStore:
+    """With what to know where the store is that of another file, as ``daqsvc run`` would refuse it.
+
+    A copy with the same text is no other machine: people keep one beside the file that the service runs.
+    """
+    from daqsvc.commands.tables import harmless  # noqa: PLC0415 - only what a verb needs
+    from daqsvc.outbox.machine_files import other_file  # noqa: PLC0415 - as above
+
+    for identity, file in files_by_identity(box).items():
+        if chosen.machine not in {None, identity.machine}:
+            continue
+        other = other_file(chosen.directory, identity, file)
+        if other is None or _have_one_text(file, other):
+            continue
+        words = (
+            f"{file} has the same site {identity.site!r}, box {identity.box!r} and machine "
+            f"{identity.machine!r} as {other}, with which the service was started: values and alarms are "
+            f"those of {other}"
+        )
+        instead = (
+            f"name {other} if you mean them; if {file} is another machine, write another name = ... in "
+            f"[machine] of it; if it takes the place of {other}, run the service with it"
+        )
+        return chosen._replace(other=harmless(words), instead=harmless(instead))
     return chosen
 
 
-def _chosen(arguments: argparse.Namespace, load: Load, *, all_sound: bool) -> ChosenStore:
+def _have_one_text(file: Path, other: Path) -> bool:
+    with contextlib.suppress(OSError):
+        return file.read_bytes() == other.read_bytes()
+    return False
+
+
+def _chosen(arguments: argparse.Namespace, load: Load, *, all_sound: bool) -> tuple[ChosenStore, Box | None]:
+    """The store, and the box of the machine files if they were named and are sound."""
     machine: str | None = getattr(arguments, "machine", None)
     if arguments.store is not None:
-        return ChosenStore(arguments.store, machine)
+        return ChosenStore(arguments.store, machine), None
     if arguments.file is not None:
         return _of_file(arguments.file, load, machine, all_sound=all_sound)
     if directory := os.environ.get("STATE_DIRECTORY"):
-        return ChosenStore(Path(directory.split(":")[0]), machine)
-    return ChosenStore(_only_store(_state_directory()), machine)
+        return ChosenStore(Path(directory.split(":")[0]), machine), None
+    return ChosenStore(_only_store(_state_directory()), machine), None
 
 
 def _refuse_file(store: Path) -> None:
@@ -220,7 +278,9 @@ def _refuse_file(store: Path) -> None:
         return  # the reader of the journal reports what this account may not do
 
 
-def _of_file(path: Path, load: Load, machine: str | None, *, all_sound: bool) -> ChosenStore:
+def _of_file(
+    path: Path, load: Load, machine: str | None, *, all_sound: bool
+) -> tuple[ChosenStore, Box | None]:
     from daqsvc.box import BOX  # noqa: PLC0415 - each verb imports only what it needs
 
     box, sound = load_machines([path], load)
@@ -233,17 +293,17 @@ def _of_file(path: Path, load: Load, machine: str | None, *, all_sound: bool) ->
             # The service may run well by what the file was before.
             print("or name the store with --store DIR", file=sys.stderr)  # noqa: T201 - after the errors
             raise
-        return ChosenStore(store, machine, (*(one.machine.name for one in sound), BOX))
+        return ChosenStore(store, machine, (*(one.machine.name for one in sound), BOX)), None
     store = store_directory(box)
     if not box.is_single:
-        return ChosenStore(store, machine, (*box.machines, BOX))
+        return ChosenStore(store, machine, (*box.machines, BOX)), box
     # Also where the file names the store: other files may name the same one.
     machine = machine or box.own.machine.name
     if box.own.store is None and not _is_used(store):
         for other in _of_its_box(path, box.own):
             if _is_used(other):
-                return ChosenStore(other, machine)
-    return ChosenStore(store, machine, tuple(box.machines))
+                return ChosenStore(other, machine), box
+    return ChosenStore(store, machine, tuple(box.machines)), box
 
 
 def _of_sound(path: Path, sound: Sequence[MachineFile]) -> Path:

@@ -167,8 +167,10 @@ class TrendCommand:
             what, code = problem
             return complain("daqsvc trend", what, code, EXIT_USAGE)
         try:
-            store, machine, _ = chosen_store(arguments, self._load)
-            _tell(store, machine, arguments, since_s, until_s)
+            chosen = chosen_store(arguments, self._load)
+            store = chosen.directory
+            chosen.tell_other("daqsvc trend")
+            _tell(store, chosen.machine, arguments, since_s, until_s)
         except BadFileError:
             return EXIT_USAGE
         except (StoreNotFoundError, NoTrendError, NewerHistoryError, EmptyHistoryError) as error:

@@ -16,7 +16,8 @@ UNUSABLE_STORE = Code(
     "S02",
     "The store cannot be used",
     "Its path is no directory, this user may not write there, or a newer version of daqsvc has written it. "
-    "Or it is that of another machine file with the same site, box and machine name.",
+    "Or it is that of another machine file with the same site, box and machine name: then status and alarms "
+    "show that one, and nothing is done to its alarms.",
     "Correct store.directory, give the user of the service the right to write there, install the newer"
     " version, or give the machine another name.",
     "outbox.md",

@@ -13,7 +13,9 @@ from support.written_journals import write_journal
 
 from daqsvc.alarms.commands import AlarmCommand, CommandOutcome
 from daqsvc.cli import main
+from daqsvc.commands.status import _shown
 from daqsvc.control import ControlServer
+from daqsvc.outbox.machine_files import note_files
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -249,3 +251,74 @@ def test_one_file_of_a_service_is_enough(capsys: Captured) -> None:
         assert ended.value.code == 2
         said = "unrecognized arguments: b.toml: one file of the service is enough, or the directory of them"
         assert said in capsys.readouterr().err
+
+
+def two_files(tmp_path: Path) -> tuple[Path, Path, Path]:
+    """Two files of the same machine's name, and the store that the service of the first one has."""
+    first, second, store = tmp_path / "first.toml", tmp_path / "second.toml", tmp_path / "store"
+    first.write_text(RIG + STORE)
+    second.write_text(RIG.replace("0x101", "0x201") + STORE)
+    store.mkdir(mode=0o700)
+    note_files(store, {"laval-rig": first})
+    return first, second, store
+
+
+def test_the_picture_of_a_terminal_begins_with_the_warning_as_it_covers_what_was_printed() -> None:
+    assert _shown([], as_json=False, is_live=True, warning="second.toml has ... [S02]") == (
+        "second.toml has ... [S02]"
+    )
+
+
+@pytest.mark.parametrize("words", [("status", "--json"), ("alarms",), ("alarms", "--json")], ids=" ".join)
+async def test_what_is_of_another_file_with_the_same_name_is_shown_with_a_warning(
+    words: tuple[str, ...], tmp_path: Path, capsys: Captured
+) -> None:
+    first, second, store = two_files(tmp_path)
+    await write_journal(store, {"machine": "laval-rig"})
+    service = Service(store, "laval-rig")
+    code, _, err = await service.asked(capsys, *words, second)
+    assert code == 0
+    assert err.startswith(f"daqsvc {words[0]}: {second} has the same site")
+    assert f"as {first}, with which the service was started: values and alarms are those of {first}" in err
+    had("S02", err.partition(": ")[2])
+    assert (await service.asked(capsys, *words, first))[2] == ""
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("ack", "probe-x"),
+        ("reset", "probe-x"),
+        ("shelve", "probe-x", "--for", "1h"),
+        ("bypass", "probe-x"),
+        ("snapshot",),
+    ],
+    ids=lambda words: words[0],
+)
+async def test_nothing_is_done_to_the_alarms_of_another_file_with_the_same_name(
+    words: tuple[str, ...], tmp_path: Path, capsys: Captured
+) -> None:
+    first, second, store = two_files(tmp_path)
+    await write_journal(store, {"machine": "laval-rig", "alarm": "probe-x"})
+    service = Service(store, "laval-rig")
+    code, _, err = await service.asked(capsys, *words, second)
+    assert code == 1
+    assert err.startswith(f"daqsvc {words[0]}: nothing was done: {second} has the same site")
+    assert f"Remedy: name {first} if you mean them" in err
+    had("S02", err.partition(": ")[2])
+    assert service.told == []
+
+
+async def test_a_copy_with_the_same_text_or_a_moved_file_is_the_same_machine(
+    tmp_path: Path, capsys: Captured
+) -> None:
+    first, second, store = two_files(tmp_path)
+    await write_journal(store, {"machine": "laval-rig", "alarm": "probe-x"})
+    service = Service(store, "laval-rig")
+    text = second.read_text()
+    second.write_text(first.read_text())
+    assert await service.asked(capsys, "ack", "probe-x", second) == (0, "probe-x: acknowledged\n", "")
+    second.write_text(text)
+    first.unlink()
+    assert (await service.asked(capsys, "ack", "probe-x", second))[0] == 0
+    assert service.told == [("laval-rig", "probe-x")] * 2
