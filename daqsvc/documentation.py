@@ -12,6 +12,7 @@ TITLES = {
     "machine-file": "Machine file: what daqsvc check checks",
     "page": "The page",
     "reference/counters": "Counters and figures of the status",
+    "reference/keys": "Keys of the machine file",
     "serial": "Serial ports",
 }
 """Titles of the pages that texts name, by the path below ``docs/``."""

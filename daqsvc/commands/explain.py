@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,12 +10,13 @@ from typing import TYPE_CHECKING
 from daqsvc.commands.arguments import EXIT_OK, EXIT_USAGE
 from daqsvc.commands.complaint import complain
 from daqsvc.commands.plugged import plugged_codes
+from daqsvc.documentation import documented_in
 from daqsvc.errors.code import PluginCode
 from daqsvc.errors.command_line import NOT_KNOWN
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from daqsvc.errors.code import Code
 
@@ -33,23 +35,46 @@ class ExplainCommand:
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `daqsvc.cli.Command.add_arguments`."""
         parser.add_argument(
-            "codes", nargs="*", metavar="CODE", help="code of a message, e.g. F01 (default: list all)"
+            "codes",
+            nargs="*",
+            metavar="CODE",
+            help="code of a message, e.g. F01, or the message with its code (default: list all)",
         )
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `daqsvc.cli.Command.run`."""
         from daqsvc.errors.table import CODES  # noqa: PLC0415 - texts that no other verb needs
 
+        # Of a message that was pasted, the code at its end is meant.
+        pasted = _PASTED.findall(" ".join(arguments.codes))
         wanted = [text.strip("[]").upper() for text in arguments.codes]
+        if pasted and not all(map(_CODE.fullmatch, wanted)):
+            wanted = pasted
         known = dict(CODES)
         if not known.keys() >= {*wanted} or not wanted:
             known |= plugged_codes()
         unknown = [text for text in wanted if text not in known]
         if unknown:
-            words = f"there is no code {unknown[0]!r}; daqsvc explain lists them"
-            return complain("daqsvc explain", words, NOT_KNOWN, EXIT_USAGE)
+            return complain("daqsvc explain", _unknown(unknown[0], arguments.codes), NOT_KNOWN, EXIT_USAGE)
         print("\n\n".join(_told(known[text]) for text in wanted) or _listed(known.values()))  # noqa: T201 - what the verb is for
         return EXIT_OK
+
+
+_CODE = re.compile(r"[A-Z]+[0-9]{2}")
+_PASTED = re.compile(rf"\[({_CODE.pattern})\]")
+"""As it is at the end of a message."""
+
+
+def _unknown(text: str, words: Sequence[str]) -> str:
+    """That there is no such code, and where what is none is explained."""
+    if _CODE.fullmatch(text):
+        return f"there is no code {text!r}; daqsvc explain lists them"
+    typed = next(word for word in words if word.strip("[]").upper() == text)
+    return (
+        f"{typed!r} is no code; it takes the code at the end of a message, e.g. B05, and daqsvc explain "
+        f"lists them. For a key of the machine file see {documented_in('reference/keys')}, for a counter "
+        f"{documented_in('reference/counters')}; for all else use the search of the documentation"
+    )
 
 
 _SOURCES = Path(__file__).parents[2] / "docs"

@@ -6,6 +6,7 @@ import re
 from typing import TYPE_CHECKING
 
 import pytest
+from support.given_codes import had
 from support.paths import ROOT
 
 from daqsvc.cli import main
@@ -90,3 +91,27 @@ def test_explain_of_a_code_that_there_is_not(capsys: pytest.CaptureFixture[str])
     out, err = capsys.readouterr()
     assert not out
     assert err == "daqsvc explain: there is no code 'Z99'; daqsvc explain lists them [C14]\n"
+
+
+@pytest.mark.parametrize("key", ["on_delay_s", "alarms.on_delay_s", "frames_lost", "no samples"])
+def test_explain_of_what_is_no_code_names_where_that_is_explained(
+    key: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["explain", key]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(
+        f"daqsvc explain: '{key}' is no code; it takes the code at the end of a message, e.g. B05"
+    )
+    assert 'a key of the machine file see "Keys of the machine file" in the documentation' in said
+    had("C14", said)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["m.toml:24: speed_rpm = 1: must be more. Remedy: write 600 [F05]"], ["must", "be", "more", "[F05]"]],
+)
+def test_explain_takes_a_message_that_was_pasted(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["explain", *words]) == 0
+    assert capsys.readouterr().out.startswith("F05  ")
