@@ -229,7 +229,11 @@ class LineCodec:
         other = "." if self._layout.decimal == "," else ","
         if other != self._layout.separator and NUMBER[other].fullmatch(text):
             return f"write decimal = {json.dumps(other)} in the layout"
-        return "put the names in line in the order in which the device sends its columns"
+        order = "put the names in line in the order in which the device sends its columns"
+        if name == self._place or any(map(str.isdigit, text)):
+            return order
+        change = f"leave {name} out of channels of the layout, and its sensor out of the file"
+        return f"{change}, if the device sends words there; else {order}"
 
     def _table(self, name: str) -> str:
         """The table of the layout that a column has."""

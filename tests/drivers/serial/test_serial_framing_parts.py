@@ -199,7 +199,7 @@ def test_a_sentence_of_a_gps_receiver_is_a_line():
         ),
         (b"1,2", '"1,2": 2 columns, the file lists 3 (seq, x, y)', "remove the 1 column that the device"),
         (b"1;2;3", '"1;2;3": 1 column, the file lists 3', 'or correct separator = ","'),
-        (b"1,abc,2", "column x is 'abc', no number", "names in line in the order"),
+        (b"1,abc,2", "column x is 'abc', no number", "leave x out of channels of the layout"),
         (b",1,2", "column seq is '', no number", "names in line in the order"),
         (b"1.5,1,2", "counter seq is 1.5, no whole number from 0 up", "write time in place of counter"),
         (b"-3,1,2", "counter seq is -3, no whole number from 0 up", "write time in place of counter"),
@@ -229,7 +229,7 @@ def test_a_line_that_is_none_is_quoted_with_what_is_wrong(spoilt, said, remedy):
     [
         (b"0.48 in/s", "column x is '0.48 in/s', without 'mm/s' at its end", "unit of its sensor"),
         (b"12.3", "column x is '12.3', without 'mm/s' at its end", "remove suffix of the channel"),
-        (b"what mm/s", "column x is 'what mm/s', no number", "names in line in the order"),
+        (b"what mm/s", "column x is 'what mm/s', no number", "leave x out of channels of the layout"),
     ],
 )
 def test_a_value_in_another_unit_is_no_sample_and_is_told(text, said, remedy):
