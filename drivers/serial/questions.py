@@ -19,6 +19,7 @@ from drivers.serial.sniff_report import (
     absent_words,
     frames_need,
     no_number_words,
+    other_kinds_words,
     other_lines_words,
     overrun_words,
     turn_words,
@@ -339,9 +340,7 @@ def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
     yield from (f"  {one}" for one in found["lines"][:_SHOWN_LINES])
     yield from (f"  {words}" for one in found["columns"] for words in _column_words(one))
     if found["other_prefixes"]:
-        others = ", ".join(found["other_prefixes"])
-        yield f"  Lines that begin with {others} come, too. The file reads one kind of line; add a stream for"
-        yield "  each other one, as daqsvc sniff serial writes it."
+        yield f"  {other_kinds_words(found['other_prefixes'])}"
 
 
 def _column_words(one: Mapping[str, Any]) -> Iterator[str]:
@@ -400,6 +399,9 @@ def _not_read(found: Mapping[str, Any], answers: Answers) -> Iterator[str]:
     if found["lines_damaged"]:
         words = other_lines_words(found["lines_damaged"], found["lines_heard"], found["damaged_line"])
         yield f"{words}."
+    kinds = [found["prefix"], *found["other_prefixes"]]
+    if found["other_prefixes"] and answers["prefix"] in kinds:
+        yield other_kinds_words([one for one in kinds if one != answers["prefix"]])
     if len(answers["columns"]) != len(found["columns"]):
         return
     heard, texts = found["lines_heard"] - found["lines_damaged"], {}

@@ -117,7 +117,8 @@ class TextLines:
         header: whether the first line names the columns.
         damaged: lines that are not like most: other columns, no number where most have one, bytes that are
             no text, or a wrong checksum.
-        others: lines of other kinds on the same port, each with another prefix, the most frequent first.
+        others: lines of other kinds on the same port, each with another prefix, those with the most columns of numbers
+            first, and of these the most frequent.
         behind: how many bytes came behind each line of the layout, a damaged one too, oldest first.
     """
 
@@ -181,6 +182,7 @@ def _kinds_of(lines: Sequence[str], behind: Sequence[int], delimiter: str) -> Te
         for one in frequent
     ]
     strange = [line for line, word in zip(lines, words, strict=True) if word not in frequent]
+    kinds.sort(key=lambda kind: -sum(one.numeric for one in kind.columns))
     first = kinds[0]
     return replace(
         first,

@@ -625,6 +625,14 @@ def other_lines_words(count: int, heard: int, example: str) -> str:
     )
 
 
+def other_kinds_words(prefixes: Sequence[str]) -> str:
+    """What it means for a file with one stream that lines of other kinds come, too."""
+    return (
+        f"Lines that begin with {', '.join(prefixes)} come, too. This file reads one kind of line: add a stream "
+        "for each other one, as daqsvc sniff serial writes it."
+    )
+
+
 def _other_lines(what: TextLines) -> str:
     return other_lines_words(len(what.damaged), len(what.lines), what.damaged[0])
 

@@ -233,25 +233,27 @@ def test_two_machines_on_one_port_are_two_kinds_of_lines(
 
     def both(number: int) -> bytes:
         turn = number // 2
-        return b"K2;%d;7.9\n" % turn if number % 2 else b"K1;%d;3.5;41.0\n" % turn
+        return b"K1;%d;7.9\n" % turn if number % 2 else b"K2;%d;3.5;41.0\n" % turn
 
     with talking(cable, both):
         assert main(["sniff", "serial", f"{cable.path}", "--seconds", "0.6"]) == 0
         said = capsys.readouterr().out
         found = figures(cable, capsys)
         new_layout = new(cable, tmp_path / "new.toml")["streams"]["device"]["layout"]
-    heard = capsys.readouterr().out
+    heard, written = capsys.readouterr().out, (tmp_path / "new.toml").read_text("utf-8")
     assert "2 kinds of lines, by their first column: K" in said
     assert "are damaged" not in said
     streams = check(tmp_path, found["machine_file"], capsys)["streams"]
     assert {name: one["layout"]["prefix"] for name, one in streams.items()} == {"k1": "K1", "k2": "K2"}
-    assert [len(streams[name]["layout"]["channels"]) for name in ("k1", "k2")] == [2, 1]
+    assert [len(streams[name]["layout"]["channels"]) for name in ("k1", "k2")] == [1, 2]
     sensors = tomllib.loads(found["machine_file"])["sensors"]
-    assert {one["name"] for one in sensors} == {"k1-c2", "k1-c3", "k2-c2"}
+    assert {one["name"] for one in sensors} == {"k1-c2", "k2-c2", "k2-c3"}
     rates = [one["rate_hz"] for one in streams.values()]
     assert max(rates) < 1.1 * min(rates)
-    assert new_layout["prefix"] in {"K1", "K2"}
-    assert "come, too. The file reads one kind of line" in heard
+    assert new_layout["prefix"] == "K2", "the one with the most numbers"
+    stated = "Lines that begin with K1 come, too. This file reads one kind of line"
+    assert stated in heard
+    assert stated in " ".join(line.removeprefix("# ") for line in written.splitlines())
 
 
 def test_the_rate_is_that_of_the_clock_of_the_device_where_it_sends_one() -> None:
