@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from drivers import questions as q
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
-from drivers.sniffing import WAVEFORM_HZ, by_name
+from drivers.sniffing import by_name, is_waveform_rate
 from drivers.toml_lines import entry
 
 if TYPE_CHECKING:
@@ -173,7 +173,7 @@ class BusQuestions(ABC):
 
     def guess(self, answers: Answers, channel: str) -> tuple[str, str | None]:
         """Type and, where it is known, unit of the sensor on a channel."""
-        waveform = answers["rate"] >= WAVEFORM_HZ
+        waveform = is_waveform_rate(answers["rate"])
         return by_name(channel) or ("accelerometer" if waveform else "trend"), unit_by_name(channel)
 
     def measuring_range(self, answers: Answers, channel: str) -> tuple[float, float] | None:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from drivers import questions as q
 from drivers.questions import NONE, Answers, Question, Topic
-from drivers.sniffing import WAVEFORM_HZ, by_name
+from drivers.sniffing import by_name, is_waveform_rate
 from drivers.toml_lines import array, behind, entry, toml
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ def guess(answers: Answers, channel: str) -> tuple[str, str | None]:
     probe = signed and carried_v > _PROBE_V and in_volts(answers)
     if named == "keyphasor" and not probe:
         named = None
-    slow = answers["rate"] < WAVEFORM_HZ
+    slow = not is_waveform_rate(answers["rate"])
     return named or ("proximity" if probe and not slow else "trend" if slow else "accelerometer"), None
 
 

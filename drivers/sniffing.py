@@ -20,15 +20,20 @@ from daqsvc.settings.units import unit_of
 
 if TYPE_CHECKING:
     import threading
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Collection, Mapping, Sequence
     from typing import NoReturn
 
 
 LONGEST_UNIT = 16
 """Letters that the unit of a sensor may have."""
-_GUESS = "    # a guess by the rate, its unit too: see the device's manual"
+_GUESS = "    # a guess by {}, its unit too: see the device's manual"
+_ABOUT_0 = "the values, which swing about 0"
 WAVEFORM_HZ = 100.0
 """Rate from which on samples are usually a waveform; below it, values that the device measures itself."""
+_NEAR_WAVEFORM = 0.95
+"""The clock of a device, and what was measured in a few seconds, are not exact."""
+LEAST_SWINGING_HZ = 30.0
+"""Rate from which on a vibration can be measured, where the values swing about 0."""
 
 
 class SniffError(Exception):
@@ -113,6 +118,11 @@ class Sniffer(ABC):
         """
 
 
+def is_waveform_rate(rate_hz: float) -> bool:
+    """Whether samples that come so often are usually a waveform."""
+    return rate_hz >= _NEAR_WAVEFORM * WAVEFORM_HZ
+
+
 def by_name(channel: str) -> str | None:
     """The type of sensor that the name of a channel suggests; None if it suggests none."""
     low = channel.lower()
@@ -149,6 +159,7 @@ def sensor_lines(
     *,
     by_stream: bool = False,
     guess: bool = False,
+    swinging: Collection[str] = (),
 ) -> list[str]:
     """A table ``[[sensors]]`` for each channel of a stream, of the type that its unit is usual for.
 
@@ -160,17 +171,21 @@ def sensor_lines(
         by_stream: whether a sensor is named after its stream, too, as others have channels of the same names.
         guess: whether what has no unit and comes as often as a waveform is taken for an acceleration, as
             ``daqsvc new`` takes it, unless its name suggests something else.
+        swinging: channels whose values were seen to swing about 0, as those of a vibration do.
     """
     lines: list[str] = []
     before = f"{stream}-" if by_stream else ""
     for channel, text in channels.items():
-        is_guess = guess and text == "1" and math.inf > rate_hz >= WAVEFORM_HZ
+        swings = channel in swinging and rate_hz >= LEAST_SWINGING_HZ
+        waveform = is_waveform_rate(rate_hz) or swings
+        is_guess = guess and text == "1" and rate_hz < math.inf and waveform
         is_guess = is_guess and by_name(channel) in {None, "accelerometer"}
+        by = _GUESS.format(_ABOUT_0 if swings else "the rate")
         given = "g" if is_guess else text
         known = unit_of(given)
         unit = given.strip() if known is None else known.name
         kind = {"g": "accelerometer", "m/s2": "accelerometer", "mm/s": "velocity"}.get(unit, "trend")
-        if kind == "velocity" and rate_hz < WAVEFORM_HZ:
+        if kind == "velocity" and not waveform:
             kind = "trend"
         if kind == "trend":
             unit = text.strip()
@@ -180,7 +195,7 @@ def sensor_lines(
             "",
             "[[sensors]]",
             f"name = {quoted(unused(table_name(f'{before}{channel.lower()}', 'sensor'), taken))}",
-            f"type = {quoted(kind)}{_GUESS if is_guess else ''}",
+            f"type = {quoted(kind)}{by if is_guess else ''}",
             f"stream = {quoted(stream)}",
             f"channel = {quoted(channel)}",
             f"unit = {quoted(unit)}",

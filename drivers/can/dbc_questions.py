@@ -17,8 +17,8 @@ from drivers.can.sniff import STATE, number_of, numbered, of_one_channel
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
 from drivers.sniffing import (
     LONGEST_UNIT,
-    WAVEFORM_HZ,
     by_name,
+    is_waveform_rate,
     usual_rate,
 )
 from drivers.toml_lines import array, behind, entry, toml
@@ -292,7 +292,7 @@ class DbcQuestions(CanQuestions):
         """See `BusQuestions.guess`."""
         unit = self._units(answers).get(channel)
         kind = _KINDS.get(unit or "")
-        if answers["rate"] < WAVEFORM_HZ:
+        if not is_waveform_rate(answers["rate"]):
             kind = "trend"
         return kind or by_name(channel) or "trend", unit
 

@@ -29,7 +29,7 @@ from drivers.modbus.manual_addresses import (
 from drivers.modbus.sniff import AUTO, LAST_REGISTER, ModbusSniffer, registers_of, units_of
 from drivers.modbus.values_heard import in_register
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
-from drivers.sniffing import WAVEFORM_HZ, NothingFoundError, SniffError, sniffed
+from drivers.sniffing import NothingFoundError, SniffError, is_waveform_rate, sniffed
 from drivers.toml_lines import Hexadecimal, array, entry
 
 if TYPE_CHECKING:
@@ -378,7 +378,7 @@ class _ModbusQuestions(BusQuestions):
     def guess(self, answers: Answers, channel: str) -> tuple[str, str | None]:
         """See `BusQuestions.guess`."""
         if answers["way"] != "values":
-            return ("accelerometer" if answers["rate"] >= WAVEFORM_HZ else "trend"), None
+            return ("accelerometer" if is_waveform_rate(answers["rate"]) else "trend"), None
         unit, kind = _unit(channel), answers[sensor_key(channel, "register-type")]
         # A float of a register whose meaning is not known is a quantity, and no count.
         return "trend", None if unit == "count" and kind.startswith("float") else unit

@@ -25,7 +25,16 @@ from drivers.serial.sniff_report import (
     turn_words,
     unit_of_suffix,
 )
-from drivers.sniffing import WAVEFORM_HZ, quoted, sniffed, table_name, unused, usual_rate
+from drivers.sniffing import (
+    LEAST_SWINGING_HZ,
+    by_name,
+    is_waveform_rate,
+    quoted,
+    sniffed,
+    table_name,
+    unused,
+    usual_rate,
+)
 from drivers.toml_lines import array, entry
 
 if TYPE_CHECKING:
@@ -142,7 +151,7 @@ class SerialQuestions(BusQuestions):
             _missed(found),
             notes=lambda so_far, _: [f"baud = {so_far['baud']} is {ANY_BAUD}."] * found["any_baud"],
             not_read=lambda so_far: "\n".join(_not_read(found, so_far)),
-            guesses=lambda so_far, taken: _guesses(so_far, self.channels(so_far), taken),
+            guesses=lambda so_far, taken: _guesses(found, so_far, self.channels(so_far), taken),
         )
 
     def questions(self, answers: Answers, folder: Path) -> Iterator[Question]:
@@ -201,7 +210,7 @@ class SerialQuestions(BusQuestions):
         suffix = answers.get(sensor_key(channel, "suffix"))
         if suffix is not None:
             unit = unit_of_suffix(suffix)
-            usual = _TYPE_OF if answers["rate"] >= WAVEFORM_HZ else {}
+            usual = _TYPE_OF if is_waveform_rate(answers["rate"]) else {}
             return kind if kind == "keyphasor" else usual.get(unit, "trend"), unit
         # A column without a name may be anything: limits of vibration are not for it.
         anything = _UNNAMED.fullmatch(channel) or answers.get(sensor_key(channel, "prefix")) is not None
@@ -379,6 +388,8 @@ def _proposals(found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
             proposed[sensor_key(name, "prefix")] = one["prefix"]
         if one["numeric"] and one["unit"]:
             proposed[sensor_key(name, "suffix")] = one["unit"]
+        if kind := _swinging_type(one, name, answers.get("rate", found["rate_hz"])):
+            proposed[sensor_key(name, "type")] = kind
         if one["counts"] or one["time_unit"]:
             proposed |= {"counter": name, "counts": one["time_unit"] or "count"}
         elif one["turns_at"] or not one["numeric"]:
@@ -387,6 +398,15 @@ def _proposals(found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
     # Else a person who takes all defaults would have lines counted by what counts nothing.
     proposed.setdefault("counter", NONE)
     return proposed
+
+
+def _swinging_type(one: Mapping[str, Any], name: str, rate_hz: float | None) -> str | None:
+    """The type of the sensor of a column whose values swing about 0; None if nothing is known."""
+    if not one["swings"] or rate_hz is None or rate_hz < LEAST_SWINGING_HZ:
+        return None
+    if by_name(name) not in {None, "accelerometer"}:
+        return None
+    return _TYPE_OF.get(unit_of_suffix(one["unit"])) if one["unit"] else "accelerometer"
 
 
 def _not_read(found: Mapping[str, Any], answers: Answers) -> Iterator[str]:
@@ -402,8 +422,12 @@ def _not_read(found: Mapping[str, Any], answers: Answers) -> Iterator[str]:
     kinds = [found["prefix"], *found["other_prefixes"]]
     if found["other_prefixes"] and answers["prefix"] in kinds:
         yield other_kinds_words([one for one in kinds if one != answers["prefix"]])
-    if len(answers["columns"]) != len(found["columns"]):
-        return
+    if len(answers["columns"]) == len(found["columns"]):
+        yield from _columns_not_read(found, answers)
+
+
+def _columns_not_read(found: Mapping[str, Any], answers: Answers) -> Iterator[str]:
+    """What of the columns is not in the file, or not always."""
     heard, texts = found["lines_heard"] - found["lines_damaged"], {}
     for name, one in zip(answers["columns"], found["columns"], strict=True):
         measured = answers.get(sensor_key(name, "type")) not in {None, NONE}
@@ -420,7 +444,9 @@ def _not_read(found: Mapping[str, Any], answers: Answers) -> Iterator[str]:
         yield no_number_words(texts)
 
 
-def _guesses(answers: Answers, channels: Sequence[str], taken: Collection[str]) -> list[str]:
+def _guesses(
+    found: Mapping[str, Any], answers: Answers, channels: Sequence[str], taken: Collection[str]
+) -> list[str]:
     """See `Heard.guesses`."""
     notes = []
     if answers["framing"] != "lines":
@@ -436,8 +462,33 @@ def _guesses(answers: Answers, channels: Sequence[str], taken: Collection[str]) 
             "counts lines" if answers["counts"] == "count" else f"is the device's time in {answers['counts']}"
         )
         notes.append(f"That {counter} {what} is a guess by the lines that came: see the device's manual.")
+    swinging = _swinging(found, answers)
+    by_values = [
+        name for name in swinging if answers[sensor_key(name, "type")] in {"accelerometer", "velocity"}
+    ]
+    by_values = [name for name in by_values if sensor_key(name, "type") in taken]
+    if by_values:
+        notes.append(
+            f"{', '.join(by_values)}: type and unit of the sensor are a guess by the values, which swing "
+            "about 0; see the device's manual."
+        )
+    averaged = [name for name in swinging if answers[sensor_key(name, "type")] == "trend"]
+    if averaged:
+        notes.append(
+            f"{', '.join(averaged)}: the values swing about 0. A trend value is averaged over "
+            "window_s, so that an alarm on it may never come: if it is a vibration, have the device send its "
+            "RMS."
+        )
     unstated = [name for name in channels if answers.get(sensor_key(name, "suffix")) is None]
-    return [*notes, *guessed_sensors(answers, unstated, taken)]
+    return [*notes, *guessed_sensors(answers, [one for one in unstated if one not in by_values], taken)]
+
+
+def _swinging(found: Mapping[str, Any], answers: Answers) -> list[str]:
+    """The columns that swing about 0 and have a sensor, by the names that were answered."""
+    if found["framing"] != "lines" or len(answers["columns"]) != len(found["columns"]):
+        return []
+    pairs = zip(answers["columns"], found["columns"], strict=True)
+    return [name for name, one in pairs if one["swings"] and sensor_key(name, "type") in answers]
 
 
 def _missed(found: Mapping[str, Any]) -> str:

@@ -47,6 +47,9 @@ _LEAST_SHARE = 0.02
 """Of the lines begin with a word that is no accident."""
 _ENDS = 5
 """Lines at each end by which the growth of a column is judged."""
+_LEAST_SWINGING, _LEAST_DIFFERENT, _SWINGING = 16, 4, 0.1
+"""A column may be a vibration from so many values on, different ones among them, and share of steps over
+the mean."""
 _CHECKSUM = re.compile(r"\*([0-9A-Fa-f]{4}|[0-9A-Fa-f]{2})$")
 _PREFIX = re.compile(r"[!$]?[A-Za-z_-][A-Za-z0-9_-]{0,14}")
 _MESSAGES = frozenset(
@@ -85,6 +88,7 @@ class Column:
         last: its last text.
         absent: in how many lines there is no value.
         absent_text: its text in the last one of these.
+        swings: whether it swings about 0, as a vibration does, much faster than it drifts.
     """
 
     name: str
@@ -100,6 +104,7 @@ class Column:
     prefix: str = ""
     absent: int = 0
     absent_text: str = ""
+    swings: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,8 +122,8 @@ class TextLines:
         header: whether the first line names the columns.
         damaged: lines that are not like most: other columns, no number where most have one, bytes that are
             no text, or a wrong checksum.
-        others: lines of other kinds on the same port, each with another prefix, those with the most columns of numbers
-            first, and of these the most frequent.
+        others: lines of other kinds on the same port, each with another prefix, those with the most columns
+            of numbers first, and of these the most frequent.
         behind: how many bytes came behind each line of the layout, a damaged one too, oldest first.
     """
 
@@ -432,7 +437,20 @@ def _column(
         prefix,
         len(absent),
         absent[-1] if absent else "",
+        _swings(values),
     )
+
+
+def _swings(values: NDArray[np.float64]) -> bool:
+    """Whether values swing about 0: they pass their mean in a good part of the steps.
+
+    The noise of a level does so, too, but not about 0.
+    """
+    mean = values.mean()
+    if len(values) < _LEAST_SWINGING or len(set(values.tolist())) < _LEAST_DIFFERENT:
+        return False
+    passes = np.diff(values > mean).mean() >= _SWINGING
+    return bool(passes and abs(mean) <= values.std() and values.min() < 0 < values.max())
 
 
 def _step_of(values: NDArray[np.float64], places: NDArray[np.int64]) -> float:

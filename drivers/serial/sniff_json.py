@@ -33,6 +33,7 @@ class ColumnFigures(TypedDict):
         turns_at: the power of ten at which it begins again at 0; null if it does not.
         time_unit: unit of the time in it; null if it is no time.
         last: what was in it last.
+        swings: whether it swings about 0, as a vibration does.
         absent: in how many lines it has no value, such as `---`.
         absent_text: its text in the last one of these; null if there are none.
     """
@@ -47,6 +48,7 @@ class ColumnFigures(TypedDict):
     turns_at: int | None
     time_unit: str | None
     last: str
+    swings: bool
     absent: int
     absent_text: str | None
 

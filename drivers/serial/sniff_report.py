@@ -377,6 +377,7 @@ class Report(NamedTuple):
                         "turns_at": one.turns_at or None,
                         "time_unit": self._time_unit(what, one) if one is time_column else None,
                         "last": one.last,
+                        "swings": one.swings,
                         "absent": one.absent,
                         "absent_text": one.absent_text if one.absent else None,
                     }
@@ -483,7 +484,10 @@ class Report(NamedTuple):
         yield f"channels = [{', '.join(listed)}]{comment}"
         channels = {names[one]: unit_of_suffix(one.unit) for one in numbers}
         by_stream = bool(what.prefix) and stream != "lines"
-        yield from sensor_lines(stream, channels, sensors, rate_hz, by_stream=by_stream, guess=True)
+        swinging = {names[one] for one in numbers if one.swings}
+        yield from sensor_lines(
+            stream, channels, sensors, rate_hz, by_stream=by_stream, guess=True, swinging=swinging
+        )
 
     def _remarks(self, what: TextLines, names: Mapping[Column, str]) -> Iterator[str]:
         """What of the lines the file does not read, as comments."""
@@ -628,8 +632,8 @@ def other_lines_words(count: int, heard: int, example: str) -> str:
 def other_kinds_words(prefixes: Sequence[str]) -> str:
     """What it means for a file with one stream that lines of other kinds come, too."""
     return (
-        f"Lines that begin with {', '.join(prefixes)} come, too. This file reads one kind of line: add a stream "
-        "for each other one, as daqsvc sniff serial writes it."
+        f"Lines that begin with {', '.join(prefixes)} come, too. This file reads one kind of line: add a "
+        "stream for each other one, as daqsvc sniff serial writes it."
     )
 
 

@@ -285,6 +285,8 @@ def pipeline_tables(answers: Answers) -> Iterator[str]:
     yield entry("ring_s", max(30.0, 4.0 * window_s), "how much of the past stays in memory")
     yield ""
     yield "[pipeline.levels]"
+    if any(one.type == "trend" for one in there):
+        yield "# A trend value is averaged over window_s: 0.5 s, if it is not stated here."
     if waveforms:
         yield entry("window_s", window_s, "time over which RMS, peak and so on are measured")
     if housing:

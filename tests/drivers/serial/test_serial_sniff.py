@@ -298,6 +298,36 @@ def test_the_rate_is_that_of_the_lines_of_the_layout(
     assert found.figures["rate_hz"] == pytest.approx(1 / 0.101, rel=0.005)
 
 
+def swinging(number: int) -> bytes:
+    """An acceleration and a temperature."""
+    return b"%.3f;%.1f\r\n" % (0.5 * np.sin(1.7 * number), 38 + 0.3 * np.sin(9.1 * number))
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "kind"), [(50.0, "accelerometer"), (99.97, "accelerometer"), (10.0, "trend")]
+)
+def test_values_that_swing_about_0_are_taken_for_a_waveform(rate_hz: float, kind: str) -> None:
+    heard = heard_at([(number / rate_hz, swinging(number)) for number in range(int(3 * rate_hz))])
+    found = Report("ttyUSB0", [], Tried(9600, "none", heard, recognised(heard.data)), True).sniffed()
+    types = [one["type"] for one in tomllib.loads(found.fragment)["sensors"]]
+    assert types[0] == kind
+    assert ("a guess by the values, which swing about 0" in found.fragment) == (rate_hz >= 30)
+    assert [one["swings"] for one in found.figures["columns"]] == [True, False]
+    proposed = _proposals(found.figures, {})
+    assert proposed.get("sensor.c1.type", "trend") == kind
+    assert "sensor.c2.type" not in proposed
+    taken = {"sensor.c1.type": kind, "sensor.c2.type": "trend", "columns": ("c1", "c2"), "counter": None}
+    notes = " ".join(questions._guesses(found.figures, {"framing": "lines", **taken}, ("c1", "c2"), taken))
+    assert ("c1: type and unit of the sensor are a guess by the values" in notes) == (kind != "trend")
+    assert ("c1: the values swing about 0. A trend value is averaged" in notes) == (kind == "trend")
+
+
+def test_the_rate_at_which_samples_are_a_waveform_does_not_turn_on_a_clock() -> None:
+    heard = heard_at([(number / 99.97, b"1.%d\r\n" % (number % 7)) for number in range(300)])
+    found = Report("ttyUSB0", [], Tried(9600, "none", heard, recognised(heard.data)), True).sniffed()
+    assert [one["type"] for one in tomllib.loads(found.fragment)["sensors"]] == ["accelerometer"]
+
+
 def test_words_for_no_number_are_no_kinds_of_lines() -> None:
     what = recognised(b"".join(b"%s,%d,2\n" % ((b"nan", b"---")[k % 2], k) for k in range(40))).what
     assert isinstance(what, TextLines)
