@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import textwrap
 from functools import partial
+from itertools import zip_longest
 from typing import TYPE_CHECKING
 
 from daqsvc.rounding import unit_behind
@@ -49,6 +50,7 @@ def describe(
         _facts(_identity(machine)),
         ["Buses", *_table([], [(name, _bus(machine, name)) for name in machine.buses])],
         ["Streams", *_streams(machine)],
+        *_channels(machine),
         ["Sensors", *_table(_SENSOR_HEADER, [_sensor(sensor) for sensor in machine.sensors])],
         ["Detectors", *_table([], list(_detectors(machine)))],
         ["Alarms", *_table(_ALARM_HEADER, list(_alarms(machine)))],
@@ -118,13 +120,33 @@ def _streams(machine: MachineFile) -> list[str]:
 
 
 def _stream(machine: MachineFile, name: str, stream: Stream) -> Sequence[str]:
-    plugin = driver_of_layout(stream.layout)
-    try:
-        words = StreamWords() if plugin is None else plugin.describe_stream(machine, name)
-    except PluginFailedError as failed:
-        words = StreamWords(frame=failed.failure.said)
-    frame_id, frames, frame, counter, share = map(one_line, words)
+    frame_id, frames, frame, counter, share = map(one_line, _stream_words(machine, name)[:5])
     return name, stream.bus, frame_id, f"{stream.rate_hz:g} Hz", frames, frame, counter, share
+
+
+def _stream_words(machine: MachineFile, name: str) -> StreamWords:
+    plugin = driver_of_layout(machine.streams[name].layout)
+    try:
+        return StreamWords() if plugin is None else plugin.describe_stream(machine, name)
+    except PluginFailedError as failed:
+        return StreamWords(frame=failed.failure.said)
+
+
+_MOST_CHANNELS = 64
+"""Lines on the channels of one stream."""
+
+
+def _channels(machine: MachineFile) -> Iterator[list[str]]:
+    """A table of the channels of each stream whose driver has one, without the columns that are empty."""
+    for name in machine.streams:
+        rows = [[one_line(str(cell)) for cell in row] for row in _stream_words(machine, name).channels]
+        columns = [column for column in zip_longest(*rows, fillvalue="") if any(column[1:])]
+        if not columns:
+            continue
+        header, *shown = zip(*columns, strict=True)
+        more = len(shown) - _MOST_CHANNELS
+        last = [f"{_INDENT}... and {more} more"] if more > 0 else []
+        yield [f"Channels of {name}", *_table(header, shown[:_MOST_CHANNELS]), *last]
 
 
 _SENSOR_HEADER = ("name", "type", "channel", "unit", "sensitivity", "details")

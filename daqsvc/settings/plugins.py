@@ -101,6 +101,7 @@ class StreamWords(NamedTuple):
         frame: what is in one.
         counter: how loss is counted.
         share: of the bus's time that it takes.
+        channels: rows of a table of its channels, the first of which names the columns.
     """
 
     frame_id: str = ""
@@ -108,6 +109,7 @@ class StreamWords(NamedTuple):
     frame: str = ""
     counter: str = ""
     share: str = ""
+    channels: tuple[tuple[str, ...], ...] = ()
 
 
 @contract

@@ -5,9 +5,18 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from daqsvc.settings.buses import percent
+from daqsvc.settings.plugins import StreamWords
 from drivers.modbus.checks import check_line_load, check_modbus, check_no_value, check_writes_and_samples
 from drivers.modbus.load import line_load
-from drivers.modbus.settings import WAYS, ModbusRtuBus, ModbusTcpBus, RegistersLayout
+from drivers.modbus.settings import (
+    WAYS,
+    FifoLayout,
+    ModbusRtuBus,
+    ModbusTcpBus,
+    RegistersLayout,
+    RingLayout,
+    WaveformLayout,
+)
 from drivers.plugin import DriverPlugin, in_units
 
 if TYPE_CHECKING:
@@ -59,6 +68,14 @@ class ModbusPlugin(DriverPlugin["ModbusBus"]):
             return bus.summary
         load = line_load(machine, name, bus)
         return f"{bus.summary}, load about {percent(load.least, load.usual)} of the line"
+
+    def describe_stream(self, machine: MachineFile, name: str) -> StreamWords:
+        """See `BusTable.describe_stream`."""
+        from drivers.modbus.channel_table import channel_table  # noqa: PLC0415 - only for who checks
+
+        layout = machine.streams[name].layout
+        assert isinstance(layout, RegistersLayout | FifoLayout | RingLayout | WaveformLayout)  # noqa: S101 - for the type checker
+        return StreamWords(frame=layout.summary, channels=channel_table(layout))
 
     def stream_layout(self, machine: MachineFile, stream: str) -> Layout:
         """See `DriverPlugin.stream_layout`."""

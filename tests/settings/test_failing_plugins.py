@@ -422,6 +422,7 @@ STEERING = "beats\n\x1b[2J\x1b]0;title\x07\tfast\udc00"
         ("tcp_frames.LoggerBus", "summary", STEERING),
         ("daqsvc.settings.packing.PackedLayout", "summary", STEERING),
         ("tcp_frames.LoggerPlugin", "describe_stream", StreamWords(*[STEERING] * 5)),
+        ("tcp_frames.LoggerPlugin", "describe_stream", StreamWords(channels=((STEERING,), (STEERING, "")))),
         ("crest.CrestPlugin", "describe", STEERING),
         ("event_file.EventFilePlugin", "describe", STEERING),
         ("crest.CrestPlugin", "checks", [iter([Finding((), STEERING, STEERING, fatal=False)])]),

@@ -17,10 +17,11 @@ from daqsvc.commands.status_text import status_text
 from daqsvc.control import ask_status
 from daqsvc.settings import describe, load_machine_file, parse_machine_file
 from drivers.make import bus_drivers, stream_layout
+from drivers.modbus.channel_table import channel_table, manual_number
 from drivers.modbus.driver import ModbusDriver
 from drivers.modbus.line import WriteRefusedError
 from drivers.modbus.registers import RegisterRecord
-from drivers.modbus.settings import FifoLayout
+from drivers.modbus.settings import FifoLayout, RegistersLayout
 from sim_hw.nodes.modbus_node import ModbusNode, ModbusRtuServer, ModbusTcpServer
 from sim_hw.nodes.modbus_unit import ModbusUnit
 from sim_hw.nodes.pacing import RealTimePacer
@@ -198,6 +199,55 @@ def test_the_examples_say_what_line_they_are_on(path):
     machine = load_machine_file(path)
     assert "Modbus" in describe(machine)
     assert "values polled in holding registers" in describe(machine)
+
+
+CHANNELS = """[
+  { name = "velocity", address = 16, type = "float32", order = "CDAB" },
+  { name = "level", address = 9999, type = "int16", scale = 0.1, offset = -40, no_value = [0x7FFF, -32768] },
+  { name = "trip", address = 3, type = "uint16", order = "BADC", bits = [3, 1] },
+]"""
+
+
+def test_check_shows_each_channel_as_a_manual_has_it():
+    layout = tomllib.loads(f'way = "registers"\nunit = 7\nchannels = {CHANNELS}')
+    head, *rows = channel_table(RegistersLayout.model_validate(layout))
+    velocity, level, trip = ({key: cell for key, cell in zip(head, row, strict=True) if cell} for row in rows)
+    assert list(velocity.values()) == ["velocity", "7", "holding", "16", "40017", "float32", "CDAB", "1"]
+    assert (level["manual"], level["scale"], level["offset"]) == ("410000", "0.1", "-40")
+    assert level["no_value"] == "0x7FFF, 0x8000"
+    assert (trip["order"], trip["bits"]) == ("BADC", "3")
+    assert [manual_number("input", one) for one in (0, 9998, 65_535)] == ["30001", "39999", "365536"]
+    shown = describe(load_machine_file(PUMP))
+    assert "\nChannels of drive-end\n  name         unit  table    address  manual  type    scale\n" in shown
+    assert "\n  temperature  1     holding  19       40020   int16   0.05\n" in shown
+
+
+def test_check_shows_no_more_channels_than_a_person_reads():
+    many = ", ".join(f'{{ name = "c{k}", address = {k}, type = "int16" }}' for k in range(70))
+    text = f"""
+schema_version = 1
+site = "lab"
+box = "edge-1"
+machine = {{ name = "fan", speed_rpm = 1480.0 }}
+buses.a = {{ driver = "modbus", transport = "tcp", host = "127.0.0.1" }}
+
+[streams.b]
+bus = "a"
+rate_hz = 1.0
+layout = {{ way = "registers", unit = 1, channels = [{many}] }}
+
+[[sensors]]
+name = "s"
+type = "trend"
+stream = "b"
+channel = "c0"
+unit = "mm/s"
+
+[pipeline]
+ring_s = 600.0
+"""
+    shown = describe(parse_machine_file(text, GAPS))
+    assert "\n  c63   1     holding  63       40064   int16  1\n  ... and 6 more\n" in shown
 
 
 def test_one_channel_is_no_channels():
