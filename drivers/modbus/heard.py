@@ -26,11 +26,13 @@ def register_count(raw_type: str) -> int:
     return int(raw_type[-2:]) // 16
 
 
-def in_words(found: Mapping[str, Any]) -> Iterator[str]:
+def in_words(found: Mapping[str, Any], timeout_ms: float) -> Iterator[str]:
     """What was found, in a few lines: which units answer, and the registers that are worth reading."""
-    from drivers.modbus.scan_report import NO_VALUE  # noqa: PLC0415 - brings the settings
+    from drivers.modbus.scan_report import NO_VALUE, late_words  # noqa: PLC0415 - brings the settings
 
     yield from _units_in_words(found)
+    if found["replies_late"]:
+        yield f"{late_words(found['replies_late'], timeout_ms)} to find what is missing"
     for table in found["tables"]:
         if not table["registers"]:
             continue

@@ -149,7 +149,8 @@ class _ModbusQuestions(BusQuestions):
             further = chosen == AUTO and not stop.is_set()
             if error.figures.get("units") and not (alike and further):
                 return heard.without_registers(error.figures, answers["registers"])
-            if not further:
+            # Some unit answers, and too late: no other one is to be taken for it.
+            if not further or error.figures.get("replies_late"):
                 if not error.figures.get("units") and chosen.isdecimal():
                     raise NothingFoundError(f"{error}. {_OTHERS}", error.figures) from error
                 raise
@@ -169,7 +170,7 @@ class _ModbusQuestions(BusQuestions):
                 f"the registers of unit {units} were not read yet when it was ended. Remedy: let it go on, "
                 "or write --units N if the unit is known"
             )
-        lines = list(heard.in_words(found))
+        lines = list(heard.in_words(found, answers["timeout-ms"]))
         if chosen == AUTO and found["units_asked"][0] == int(_UNITS[0].partition("-")[0]):
             lines.append(f"units {_UNITS[1]} were not asked: daqsvc new --listen --units {_WHOLE} asks all")
         return Heard(

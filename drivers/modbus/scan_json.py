@@ -117,6 +117,7 @@ class ModbusFigures(TypedDict):
         units_gateway: units of which a gateway reported that there is none.
         units_alike: whether every address answered alike, so that only the first is taken for a unit.
         units_left_out: addresses that were not read, as they gave the exception that most addresses gave.
+        replies_late: how many replies came after the time-out; 0 on a serial line, where none shows it.
         tables: what was read.
     """
 
@@ -128,4 +129,5 @@ class ModbusFigures(TypedDict):
     units_gateway: list[int]
     units_alike: bool
     units_left_out: list[int]
+    replies_late: int
     tables: list[TableFigures]

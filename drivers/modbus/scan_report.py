@@ -95,15 +95,17 @@ class ScanReport:
         units = [unit for unit in self._scan.to_ask if first <= unit <= last]
         return f"{units_in_words(units)} {'was' if first == last else 'were'} asked"
 
+    @property
+    def _late(self) -> int:
+        """How many replies came after the time-out, which only TCP shows."""
+        return self._scan.counters.replies_wrong_transaction
+
     def _to_check(self) -> str:
         """What there is to see to if nobody answers."""
         bus = self._bus
-        late = self._scan.counters.replies_wrong_transaction
         slow = f"a slow one needs a longer --timeout-ms than {bus.timeout_ms:g}"
-        if late:
-            longer = max(1000, round(3 * bus.timeout_ms))
-            came = f"{late} repl{'y' if late == 1 else 'ies'} came"
-            return f"{came} later than --timeout-ms {bus.timeout_ms:g}: write --timeout-ms {longer}"
+        if self._late:
+            return late_words(self._late, bus.timeout_ms)
         if not isinstance(bus, ModbusTcpBus):
             return (
                 "check that the device is powered, that baud rate and parity are its own, that A and B are "
@@ -135,6 +137,8 @@ class ScanReport:
                 f"Units {_runs(scan.left_out)} all answer with {_exception(scan.exception)}, as for units "
                 "that are not there: they were not read; --units N reads unit N."
             )
+        if scan.units and self._late:
+            yield f"{late_words(self._late, self._bus.timeout_ms)} to find what is missing."
         if scan.gateway:
             many = f"{len(scan.gateway)} address{'es' * (len(scan.gateway) != 1)}"
             yield f"A gateway reports that no unit answers behind it at {many}."
@@ -240,6 +244,7 @@ class ScanReport:
             "units_gateway": scan.gateway,
             "units_alike": scan.alike,
             "units_left_out": scan.left_out,
+            "replies_late": self._late,
             "tables": [
                 _table_figures(table, numbers, doubted)
                 for (table, numbers), doubted in zip(self._tables, self._undecided, strict=True)
@@ -277,6 +282,12 @@ def _only_refusal(table: FoundTable) -> int | None:
     codes = set(table.refused.values())
     is_all = table.complete and not table.first and not table.silent
     return codes.pop() if is_all and len(codes) == 1 else None
+
+
+def late_words(replies: int, timeout_ms: float) -> str:
+    """That so many replies came after the time-out, and which one to give."""
+    came = f"{replies} repl{'y' if replies == 1 else 'ies'} came later than --timeout-ms {timeout_ms:g}"
+    return f"{came}: write --timeout-ms {max(1000, round(3 * timeout_ms))}"
 
 
 def undecided_words(addresses: Iterable[int]) -> str:

@@ -6,6 +6,7 @@ import asyncio
 import functools
 import json
 import os
+import re
 import signal
 import struct
 import subprocess
@@ -1087,6 +1088,33 @@ def test_new_waits_for_replies_as_long_as_was_answered(
     with serving(lambda: ModbusTcpServer({5: InputOnly()}, plan=late)) as server:
         assert not_written(tmp_path, f"127.0.0.1:{server.port}", "--units=5") == 1
     assert "units that answer: 5" in capsys.readouterr().out
+
+
+def test_late_replies_of_the_first_search_are_stated_and_no_other_unit_is_looked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    late = lambda *_: PlannedReply(delay_ns=150_000_000)  # noqa: E731
+    with serving(lambda: ModbusTcpServer({3: pump()}, plan=late)) as server:
+        assert not_written(tmp_path, f"127.0.0.1:{server.port}", "--timeout-ms=60") == 1
+    shown = capsys.readouterr()
+    assert "11-247 are asked" not in shown.out
+    assert re.search(
+        r"Remedy: \d repl(y|ies) came later than --timeout-ms 60: write --timeout-ms 1000", shown.err
+    )
+
+
+def test_replies_that_come_too_late_are_stated_beside_units_that_are_found(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    slow_unit = lambda unit, _pdu: PlannedReply(delay_ns=400_000_000 * (unit == 3))  # noqa: E731
+    with serving(lambda: ModbusTcpServer({3: pump(), 8: pump()}, plan=slow_unit)) as server:
+        target = f"127.0.0.1:{server.port}"
+        new(tmp_path, target, "--timeout-ms=200", "--registers=0-3")
+        told = capsys.readouterr().out
+        assert main(words(target, "--units", "1-10", "--registers", "0-3", "--timeout-ms", "200")) == 0
+    note = r"\d repl(y|ies) came later than --timeout-ms 200: write --timeout-ms 1000 to find what is missing"
+    assert re.search(note, told)
+    assert re.search(note, capsys.readouterr().out)
 
 
 def test_new_proposes_a_unit_that_was_to_be_asked_although_it_does_not_answer(tmp_path: Path) -> None:
