@@ -156,6 +156,16 @@ class BusQuestions(ABC):
         del answers, assumed
         return ""
 
+    def origin(self, answers: Answers) -> str:
+        """Where the channels come from if none of them was heard."""
+        del answers
+        return "an example"
+
+    def stated(self, answers: Answers) -> Collection[str]:
+        """Keys of questions whose defaults a file of the device states."""
+        del answers
+        return ()
+
     def channels(self, answers: Answers) -> tuple[str, ...]:
         """Names of the channels."""
         named: tuple[str, ...] = answers["channels"]
@@ -272,7 +282,7 @@ def seconds_of(answers: Answers) -> list[str]:
 
 def is_count(name: str) -> bool:
     """Whether the name of a signal or column suggests a counter."""
-    return any(part in name.lower() for part in ("seq", "count", "cnt", "index"))
+    return any(part in name.lower() for part in ("seq", "count", "cnt", "ctr", "zaehl", "alive", "index"))
 
 
 def only_port() -> str | None:

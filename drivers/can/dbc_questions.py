@@ -264,6 +264,20 @@ class DbcQuestions(CanQuestions):
             )
         return "\n".join(said)
 
+    def origin(self, answers: Answers) -> str:
+        """See `BusQuestions.origin`."""
+        return f"as {answers['dbc']} describes them"
+
+    def stated(self, answers: Answers) -> Collection[str]:
+        """See `BusQuestions.stated`."""
+        known = {"message", "signals", "consecutive"}
+        if self._messages(answers)[answers["message"]].cycle_time:
+            known.add("rate")
+        units = self._units(answers)
+        return known | {
+            sensor_key(name, topic) for name in units for topic in ("type", "unit", "sensitivity")
+        }
+
     def _messages(self, answers: Answers) -> dict[str, Message]:
         return _with_signals(answers["dbc-folder"] / answers["dbc"])
 

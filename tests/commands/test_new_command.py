@@ -268,6 +268,89 @@ def test_a_value_whose_name_tells_no_vibration_gets_no_limits_of_one(tmp_path):
     assert [one["sensor"] for one in alarms] == ["vibration"]
 
 
+def assumed_keys(text: str) -> set[str]:
+    """Keys of the lines that are marked; of a channel, ``channels``."""
+    marked = [line.strip() for line in text.splitlines() if "  # assumed" in line]
+    return {"channels" if line.startswith("{") else line.partition(" = ")[0] for line in marked}
+
+
+@pytest.mark.parametrize(
+    ("options", "assumed"),
+    [
+        (
+            ["--bus=modbus-tcp", "--host=h"],
+            {"speed_rpm", "rate_hz", "way", "unit", "table", "channels", "zones"},
+        ),
+        (
+            ["--bus=modbus-tcp", "--host=h", "--speed=2960", "--class=1-rigid", "--unit=3", "--table=input"],
+            {"rate_hz", "way", "unit", "channels"},  # units of sensors, by the names of example channels
+        ),
+        (
+            ["--bus=serial", "--port=/dev/ttyS0"],
+            {"speed_rpm", "rate_hz", "baud", "framing", "line", "time", "type", "unit", "zones"},
+        ),
+        (
+            ["--bus=can-dbc", f"--dbc={DBC}"],
+            {"speed_rpm", "rate_hz", "bitrate", "channel", "counter", "zones"},
+        ),
+        ([], set()),  # simulated
+    ],
+)
+def test_what_nobody_has_stated_is_named_and_marked_in_the_file(tmp_path, capsys, options, assumed):
+    file = tmp_path / "m.toml"
+    assert main(["new", f"{file}", "--yes", *options]) == 0
+    text, said = file.read_text(), capsys.readouterr().out
+    found = assumed_keys(text)
+    assert assumed <= found
+    assert not found & {"speed_rpm", "zones", "table", "baud"} - assumed
+    if not assumed:
+        assert "ssumed" not in said + text
+        return
+    [words] = [line for line in said.splitlines() if line.startswith("Assumed, as nobody has stated it: ")]
+    assert set(words.partition(": ")[2].partition(". ")[0].split(", ")) == found
+    assert "# Assumed, as nobody has stated it: " in text
+    load_machine_file(file)
+
+
+def test_what_enter_took_of_the_machine_is_marked_and_what_was_typed_is_not(tmp_path):
+    given = {"bus": "modbus-tcp", "host": "h", "channels": "vibration", "table": "holding"}
+
+    def marked(**typed: str) -> set[str]:
+        answers = conduct(
+            tmp_path / "m.toml", Given(given, defaults=False), lambda asked: typed.get(asked.key, ""), print
+        )
+        return assumed_keys(machine_text(answers, "m.toml"))
+
+    assert marked() == {"speed_rpm", "rate_hz", "channels", "zones"}  # the register, too
+    typed = {"speed": "1480", "class": "2-rigid", "rate": "1", "sensor.vibration.address": "0"}
+    assert marked(**typed) == set()
+
+
+def test_what_was_heard_is_not_assumed_though_it_is_the_usual_value(tmp_path):
+    given = {"bus": "serial", "port": "/dev/ttyS0"}
+    heard = Heard([], lambda _answers: {"baud": "115200", "columns": "t, x", "rate": "100"})
+    answers = conduct(tmp_path / "m.toml", Given(given, defaults=True), None, print, lambda *_: heard)
+    assert assumed_keys(machine_text(answers, "m.toml")) == {"speed_rpm", "zones"}
+
+
+def test_two_figures_are_limits_of_one_quantity_only(tmp_path, capsys):
+    """Values without a unit are anything: one of them may be a temperature."""
+    file = tmp_path / "m.toml"
+    words = ["--yes", "--bus=modbus-tcp", "--host=h", "--limits=own"]
+    plain = [*words, "--channels=flow, level"]
+    assert main(["new", f"{file}", *plain]) == 2
+    assert "Alert limit (value of flow in 1): give --alert" in capsys.readouterr().err
+    assert main(["new", f"{file}", *plain, "--alert=5", "--danger=8"]) == 0
+    note = "Alert and danger are for flow. No alarm watches level yet: write one for each."
+    assert note in capsys.readouterr().out
+    assert f"# {note}" in file.read_text()
+    assert [one.sensor for one in load_machine_file(file).alarms] == ["flow"]
+    same = ["--overwrite", "--channels=temp1, temp2", "--alert=80", "--danger=95"]
+    assert main(["new", f"{file}", *words, *same]) == 0
+    assert [one.sensor for one in load_machine_file(file).alarms] == ["temp1", "temp2"]
+    assert "No alarm watches" not in capsys.readouterr().out
+
+
 def test_the_unit_that_a_name_suggests_is_the_same_on_every_bus(tmp_path):
     for bus, words in (
         ("modbus-tcp", {"host": "h"}),
@@ -576,7 +659,7 @@ def test_at_a_terminal_it_explains_asks_again_and_takes_defaults(tmp_path):
     terminal.type("pump.toml")
     assert "zones of ISO 20816-3" in terminal.until("[own]: ")
     terminal.type("")
-    assert "Alert limit (rms in um)" in terminal.until("[35]: ")
+    assert "Alert limit (rms of probe-x, probe-y in um)" in terminal.until("[35]: ")
     terminal.type("-5")
     assert "must be greater than 0" in terminal.until("[35]: ")
     terminal.type("50")

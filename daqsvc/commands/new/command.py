@@ -234,7 +234,7 @@ def _typed(value: Any) -> str:
 
 
 def _ask(question: Question) -> str:
-    """What a person types; ``?`` is answered with help.
+    """What a person types, and nothing for the default; ``?`` is answered with help.
 
     Raises:
         BackError: ``<`` was typed.
@@ -256,10 +256,8 @@ def _ask(question: Question) -> str:
             _say(f"  {question.topic.help}")
         elif text == "<":
             raise BackError
-        elif text:
+        elif text or question.default is not None:
             return text
-        elif question.default is not None:
-            return question.default
         else:
             _say("  there is no default: type an answer, or ? for help")
 

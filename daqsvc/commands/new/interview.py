@@ -6,9 +6,10 @@ import difflib
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from daqsvc.commands.new.assumed import ASSUMED
 from daqsvc.commands.new.buses import bus_of, buses
-from daqsvc.commands.new.machine_text import NOTES, machine_text, questions
-from daqsvc.commands.new.sensors import CLASSES, why_no_bearing
+from daqsvc.commands.new.machine_text import NOTES, assumed_words, machine_text, questions
+from daqsvc.commands.new.sensors import CLASSES, limits_words, why_no_bearing
 from daqsvc.commands.new.topics import TOPICS
 from daqsvc.errors.command_line import ANSWER
 from drivers import questions as q
@@ -71,7 +72,9 @@ def conduct(
     while not interview.is_over():
         pass
     _refuse_others(given, interview)
-    return interview.answers | {NOTES: interview.notes()}
+    answers = interview.answers | {ASSUMED: interview.assumed()}
+    # What is assumed comes last: it lists keys, and the sentences before it are about what was heard.
+    return answers | {NOTES: [*interview.notes(), *limits_words(answers), *assumed_words(answers)]}
 
 
 class BackError(Exception):
@@ -102,7 +105,14 @@ class _Interview:
         """Keys of questions whose default was taken, and was not heard."""
         self._taken: set[str] = set()
         """Keys of questions whose default was taken, whether it was heard or not."""
+        self._unstated: set[str] = set()
+        """Keys of what nobody has stated and nothing has shown, for the comments behind their lines."""
         self._unheard = ""
+
+    def assumed(self) -> frozenset[str]:
+        """Keys of answers that nobody has given and nothing has shown; none of a simulated machine."""
+        bus = bus_of(self.answers)
+        return frozenset() if bus.simulated else frozenset(self._unstated - set(bus.stated(self.answers)))
 
     def notes(self) -> list[str]:
         """What in the file was neither answered nor heard, and what was heard and is not in it."""
@@ -117,12 +127,14 @@ class _Interview:
         if not self._has_listened:
             example_only = bus_of(self.answers).example(self.answers, self._assumed)
             return [example_only] if example_only else []
+        origin = bus_of(self.answers).origin(self.answers)
         if self._heard is None:
-            return ["Nothing was heard on the bus; the channels are an example."] * example
+            return [f"Nothing was heard on the bus; the channels are {origin}."] * example
         if not self._heard.missed:
             return [*self._heard.notes(self.answers, self._assumed)]
         if example:
-            return ["None of these channels was heard on the bus; they are an example."]
+            unheard = f"None of these channels was heard on the bus; they are {origin}."
+            return [unheard, f"{self._heard.missed}."]
         return [f"What was heard does not fit this file: {self._heard.missed}."] * bool(
             self._assumed & counters
         )
@@ -147,10 +159,8 @@ class _Interview:
         return True
 
     def _take(self, plain: Question) -> None:
-        question = plain
-        if self._heard is not None:
-            question = _offered(plain, self._heard, self.answers, self._file)
-            self._see_rate(question, self._heard)
+        question, entered = self._as_heard(plain), False
+        shown = self._is_shown(question)
         key, texts = question.key, self._given.texts
         given = self._given_key(key)
         if given in texts:
@@ -161,7 +171,7 @@ class _Interview:
                     raise AnswerError(refused)
                 # What a person has typed by now is not lost for that.
                 self._say(refused)
-                _answer(question, self._ask, self._say, self.answers, self._file)
+                entered = _answer(question, self._ask, self._say, self.answers, self._file)
                 self._typed.append(key)
         elif question.default is not None and (self._given.defaults or self._is_quiet(question)):
             reason = take(question, question.default, self.answers, self._file)
@@ -170,11 +180,13 @@ class _Interview:
         elif self._ask is None:
             raise AnswerError(_missing(question))
         else:
-            _answer(question, self._ask, self._say, self.answers, self._file)
+            entered = _answer(question, self._ask, self._say, self.answers, self._file)
             self._typed.append(key)
         if given not in texts and self._is_default(question):
             heard = self._heard is not None and question.default != plain.default
             self._note_default(key, heard=heard)
+            if not shown and not (question.quiet and key.startswith(f"{SENSOR}.")):
+                self._note_unstated(key, entered=entered)
         if self._answered is not None:
             self._answered(question, self.answers)
         self._see_unheard()
@@ -188,6 +200,33 @@ class _Interview:
         unasked = key not in self._typed or key in _OF_CHANNELS or key.endswith(".address")
         if not heard and unasked:
             self._assumed.add(key)
+
+    def _as_heard(self, plain: Question) -> Question:
+        """The question with what was heard as its default."""
+        if self._heard is None:
+            return plain
+        question = _offered(plain, self._heard, self.answers, self._file)
+        self._see_rate(question, self._heard)
+        return question
+
+    def _is_shown(self, question: Question) -> bool:
+        """Whether its default was heard, also where it is the usual one."""
+        proposed = None if self._heard is None else self._heard.proposals(self.answers).get(question.key)
+        return proposed is not None and proposed == question.default
+
+    def _note_unstated(self, key: str, *, entered: bool) -> None:
+        """Keep that an answer is a default that nobody has stated and nothing has shown."""
+        if self._heard is not None and not self._heard.missed:
+            # What else was taken from there is in its notes and guesses.
+            matters = key in _OF_MACHINE or key in _BIT_RATES
+        elif key in self._typed:
+            # Of the rest, whoever takes a default most often knows it.
+            silent = self._has_listened and key in _BIT_RATES
+            matters = silent or key in _OF_MACHINE or key in _OF_CHANNELS or key.endswith(".address")
+        else:
+            matters = True
+        if matters and (entered or key not in self._typed):
+            self._unstated.add(key)
 
     def _given_key(self, key: str) -> str:
         """The key itself, or that of an answer given beforehand to which listening is narrowed."""
@@ -278,12 +317,16 @@ class _Interview:
             del self.answers[key]
             self._assumed.discard(key)
             self._taken.discard(key)
+            self._unstated.discard(key)
         if listens_behind not in self.answers:
             self._heard, self._has_listened = None, False
 
 
 _OF_CHANNELS = {"channels", "columns", "signals", "counter", "counter-byte"}
 """Questions that say what is measured, and by what samples are counted."""
+_OF_MACHINE = {"speed", "rate", "class", "alert", "danger"}
+"""Questions whose defaults are of no machine: nobody can mean them by chance."""
+_BIT_RATES = {"bitrate", "data-bitrate"}
 
 
 def _answer(
@@ -292,11 +335,16 @@ def _answer(
     say: Callable[[str], None],
     answers: Answers,
     file: Path,
-) -> None:
-    """Ask a person until there is an answer that can be used, and that is not most likely a mistake."""
+) -> bool:
+    """Ask a person until there is an answer that can be used, and that is not most likely a mistake.
+
+    Returns:
+        Whether Enter took the default.
+    """
     before = None
     while True:
-        text = ask(question)
+        typed = ask(question)
+        text = typed or question.default or ""
         reason = take(question, text, answers, file)
         if reason is None and question.doubt is not None and text != before:
             doubt = question.doubt(answers[question.key])
@@ -305,7 +353,7 @@ def _answer(
                 del answers[question.key]
                 question = replace(question, default=instead, beside="")
         if reason is None:
-            return
+            return not typed
         say(reason)
         before = text
 

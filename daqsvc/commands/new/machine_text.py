@@ -5,6 +5,7 @@ from __future__ import annotations
 import textwrap
 from typing import TYPE_CHECKING
 
+from daqsvc.commands.new.assumed import marked
 from daqsvc.commands.new.buses import bus_of, buses
 from daqsvc.commands.new.sensors import (
     alarm_tables,
@@ -71,9 +72,28 @@ def machine_text(answers: Answers, file: str) -> str:
         answers: to all `questions`.
         file: its name, for the commands that its first comment shows.
     """
-    lines = [*_head(answers, file), *_machine(answers), *bus_of(answers).tables(answers), ""]
-    lines += [*sensor_tables(answers), *pipeline_tables(answers), *alarm_tables(answers), *_broker(answers)]
+    lines = [*_head(answers, file), *marked(_tables(answers), answers)[0]]
     return "\n".join(line.rstrip() for line in lines).rstrip() + "\n"
+
+
+def assumed_words(answers: Answers) -> list[str]:
+    """A sentence on the keys of the file that nobody has stated; none if there are none."""
+    keys = marked(_tables(answers), answers)[1]
+    if not keys:
+        return []
+    return [f'Assumed, as nobody has stated it: {", ".join(keys)}. Correct the lines marked "assumed".']
+
+
+def _tables(answers: Answers) -> list[str]:
+    """Lines of all tables."""
+    lines = [*_machine(answers), *bus_of(answers).tables(answers), ""]
+    return [
+        *lines,
+        *sensor_tables(answers),
+        *pipeline_tables(answers),
+        *alarm_tables(answers),
+        *_broker(answers),
+    ]
 
 
 def _head(answers: Answers, file: str) -> Iterator[str]:

@@ -14,7 +14,7 @@ from drivers.questions import NONE, Answers, Question, sensor_key
 from drivers.toml_lines import array, behind, entry, toml
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from daqsvc.settings.zones import Boundaries
 
@@ -208,6 +208,7 @@ def limit_questions(answers: Answers) -> Iterator[Question]:
         yield Question("class", TOPICS["class"], q.one_of(CLASSES), "2-rigid", CLASSES)
     if answers["limits"] == "own":
         unit = limited[0].measure[1] if limited[0].measure else ""
+        names = ", ".join(one.name for one in _with_own_limits(limited))
         alert = (
             {"um": "35", "mm": "0.035", "mil": "1.4"}.get(unit)
             if probes
@@ -215,10 +216,29 @@ def limit_questions(answers: Answers) -> Iterator[Question]:
             if unit == "mm/s"
             else None
         )
-        what = f"{limited[0].measure[0]} in {unit}" if limited[0].measure else ""
+        what = f"{limited[0].measure[0].replace('_', ' ')} of {names} in {unit}" if limited[0].measure else ""
         for key, factor in (("alert", 1.0), ("danger", 1.5)):
-            words = q.Topic(f"{TOPICS[key].text} ({what.replace('_', ' ')})", TOPICS[key].help)
+            words = q.Topic(f"{TOPICS[key].text} ({what})", TOPICS[key].help)
             yield Question(key, words, q.number, alert if factor == 1.0 else _higher(answers["alert"]))
+
+
+def _with_own_limits(there: Sequence[Sensor]) -> list[Sensor]:
+    """The sensors that two figures can be for: of one quantity, and of a unit that states none the first."""
+    limited = [one for one in there if one.measure is not None]
+    if limited and limited[0].unit in {_NO_UNIT, "count"}:
+        return limited[:1]
+    return [one for one in limited if one.measure == limited[0].measure]
+
+
+def limits_words(answers: Answers) -> list[str]:
+    """Which sensors two figures are for, and which have no alarm by them; nothing if they are for all."""
+    there = [one for one in sensors(answers) if one.measure is not None]
+    with_limits = _with_own_limits(there)
+    others = ", ".join(one.name for one in there if one not in with_limits)
+    if answers.get("limits") != "own" or not others:
+        return []
+    names = ", ".join(one.name for one in with_limits)
+    return [f"Alert and danger are for {names}. No alarm watches {others} yet: write one for each."]
 
 
 def _higher(alert: float) -> str:
@@ -328,13 +348,13 @@ def alarm_tables(answers: Answers) -> Iterator[str]:
     """Lines of ``[[alarms]]``; what has no limits yet has them in a comment."""
     there = sensors(answers)
     limits = answers.get("limits", NONE)
-    first = next((one.measure for one in there if one.measure is not None), None)
+    own = _with_own_limits(there)
     for sensor in there:
         if sensor.measure is None:
             continue
         if limits == "iso" and sensor.iso is not None:
             yield from _iso_alarm(answers, sensor)
-        elif limits == "own" and sensor.measure == first:
+        elif limits == "own" and sensor in own:
             yield from _own_alarm(answers, sensor)
         else:
             yield from _later(sensor)

@@ -22,6 +22,7 @@ from support.waiting import PATIENCE_S
 
 from daqsvc.cli import main
 from daqsvc.commands.new.interview import Given, conduct
+from daqsvc.commands.new.machine_text import machine_text
 from drivers.can import questions, sniff, socketcan
 from drivers.can.dbc import messages_of
 from drivers.can.dbc_questions import DbcQuestions
@@ -651,6 +652,37 @@ def test_new_says_that_the_dbc_file_is_of_another_device(
     assert "Remedy: give the file of the device that sends [C20]" in said.err
     assert "\n  Found:\n" in said.out
     assert "Found, and proposed" not in said.out
+
+
+@pytest.mark.usefixtures("hub")
+@pytest.mark.parametrize("silent", [True, False])
+def test_who_goes_on_with_a_dbc_file_that_was_not_heard_is_told_what_is_assumed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, silent: bool
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 0.3)
+    (tmp_path / "other.dbc").write_text(
+        'VERSION ""\nBU_: A\nBO_ 900 Motor: 8 A\n SG_ Zaehler : 0|8@1+ (1,0) [0|255] "" A\n'
+        ' SG_ Lager : 8|16@1+ (0.1,-40) [-40|215] "degC" A\n'
+    )
+    given = {"bus": "can-dbc", "interface": "unixbus", "channel": f"{tmp_path / 'bus'}", "dbc": "other.dbc"}
+
+    def listen(bus: BusQuestions, answers: Answers) -> Heard | None:
+        return None if silent else bus.listen(answers, tmp_path, threading.Event(), print)
+
+    with talking(tmp_path / "bus", accelerations):
+        file = tmp_path / "new.toml"
+        answers = conduct(file, Given(given, defaults=False), lambda _question: "", print, listen)
+    file.write_text(machine_text(answers, file.name))
+    begin = (
+        "Nothing was heard on the bus; the" if silent else "None of these channels was heard on the bus; they"
+    )
+    text = comments(file)
+    assert f"{begin} {'channels ' * silent}are as other.dbc describes them." in text
+    assert ("it is most likely the file of another device." in text) == (not silent)
+    assert "Assumed, as nobody has stated it: speed_rpm, bitrate, rate_hz, counter" in text
+    lines = file.read_text("utf-8").splitlines()
+    for key in ("rate_hz", "counter", "bitrate", "speed_rpm"):
+        assert any(line.startswith(f"{key} = ") and "# assumed" in line for line in lines), key
 
 
 @pytest.mark.usefixtures("hub")

@@ -664,7 +664,9 @@ def test_new_proposes_the_unit_and_the_table_of_a_device_whose_registers_are_els
         with tcp({5: InputOnly()}) as target:
             answers, told, _ = as_asked(tmp_path, target)
             assert (answers["unit"], answers["table"]) == (5, "input")
-            assert answers["notes"] == ["None of these channels was heard on the bus; they are an example."]
+            channels, reason, *_ = answers["notes"]
+            assert channels == "None of these channels was heard on the bus; they are an example."
+            assert reason.startswith("No register that was asked for is there. Remedy: ")
             said = capsys.readouterr().out
             assert "Nothing was found" not in said
             assert "unit 5 has no holding registers: it refuses function 3" in said
