@@ -25,7 +25,8 @@ MOST_BYTES = 65_536
 """Of a longer stream the end is examined."""
 
 _TEXT = frozenset(range(0x20, 0x7F)) | {0x09, 0x0A, 0x0D}
-_LEAST_PRINTABLE = 0.95
+LEAST_PRINTABLE = 0.95
+"""Share of printable bytes from which on they may be text."""
 _SAME_PARITY = 0.98
 _OF_UNITS = re.compile(
     rb"(?<=[ -~])(?:\xc2[\xb0\xb2\xb3\xb5]|\xce\xbc|[\xb0\xb2\xb3\xb5])(?=[A-Za-z/,;|*\t\r\n ]|$)"
@@ -71,16 +72,15 @@ def recognised(data: bytes, line_errors: int = 0) -> Recognised:
     """
     data = data[-MOST_BYTES:]
     if len(data) < LEAST_BYTES:
-        return Recognised(0.0)
+        return Recognised(0.0, printable=_printable(data))
     parity = seven_bits(data)
     text = bytes(byte & 0x7F for byte in data) if parity else data
-    strange = sum(byte not in _TEXT for byte in _OF_UNITS.sub(b"", text))
-    printable = 1 - strange / len(text)
+    printable = _printable(text)
     if _is_enclosed(text):
         # Of one length, such text looks like frames whose sync word is part of it.
         return Recognised(CONCLUSIVE, None, parity, printable, is_enclosed=True)
     candidates = [Recognised(0.3 * printable**2, None, None, printable)]
-    if printable >= _LEAST_PRINTABLE and (lines := text_lines(text)) is not None:
+    if printable >= LEAST_PRINTABLE and (lines := text_lines(text)) is not None:
         damaged = sum(len(kind.damaged) for kind in lines.kinds)
         regular = 1 - damaged / sum(len(kind.lines) for kind in lines.kinds)
         score = (0.6 + 0.35 * regular) * printable + 0.05 * (lines.checksum in {"xor", "crc16"})
@@ -97,6 +97,12 @@ def recognised(data: bytes, line_errors: int = 0) -> Recognised:
     )
 
 
+def _printable(data: bytes) -> float:
+    """Share of bytes that are text; 0 of none."""
+    strange = sum(byte not in _TEXT for byte in _OF_UNITS.sub(b"", data))
+    return 1 - strange / len(data) if data else 0.0
+
+
 def _is_enclosed(data: bytes) -> bool:
     """Whether nearly all bytes are text between STX and ETX; check bytes may follow each."""
     found = _ENCLOSED.findall(data)
@@ -111,7 +117,7 @@ def seven_bits(data: bytes) -> Parity | None:
     ones = np.unpackbits(np.frombuffer(data, np.uint8)[:, None], axis=1).sum(axis=1) % 2
     high = np.frombuffer(data, np.uint8) >= 0x80
     low_text = sum(byte & 0x7F in _TEXT for byte in data) / len(data)
-    if not high.any() or high.all() or low_text < _LEAST_PRINTABLE:
+    if not high.any() or high.all() or low_text < LEAST_PRINTABLE:
         return None
     if (ones == 0).mean() >= _SAME_PARITY:
         return "even"

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from daqsvc.rounding import counted
 from drivers.serial.ports import serial_ports
-from drivers.serial.sniff_report import WAITING_S, Heard, Report, Tried, all_alike
+from drivers.serial.sniff_report import LEAST_TEXT, WAITING_S, Heard, Report, Tried, all_alike, too_few
 from drivers.sniffing import (
     Sniffed,
     Sniffer,
@@ -30,6 +30,8 @@ BAUDS = (115_200, 9600, 19_200, 57_600, 38_400, 230_400, 460_800, 921_600, 4800,
 TRY_S = 1.0
 TRY_BYTES = 512
 """Bytes that are enough to judge a rate."""
+AGAIN_S = 3.0
+"""For which a rate is tried again where too little came to judge it."""
 SECONDS = 5.0
 LONGEST_SECONDS = 3600.0
 LONGER_S = 20.0
@@ -86,9 +88,12 @@ class SerialSniffer(Sniffer):
             raise SniffError(wrong, usage=True)
         bauds = BAUDS if arguments.baud is None else (arguments.baud,)
         tried = _try_all(arguments.port, bauds, stop, tell) if arguments.baud is None else []
-        best = tried[0] if all_alike(tried) else max(tried, key=lambda one: one.found.score, default=None)
-        silent = best is not None and not any(one.heard.received for one in tried)
-        if (best is None or not (silent or best.heard.lost)) and not stop.is_set():
+        if _is_unclear(tried):
+            tried = _try_again(arguments.port, tried, arguments.seconds, stop, tell)
+        best = _likeliest(tried)
+        # By bytes that are none of the device's, nothing can be known, however many they are.
+        in_vain = best is not None and (_is_unclear(tried) or not any(one.heard.received for one in tried))
+        if (best is None or not (in_vain or best.heard.lost)) and not stop.is_set():
             baud, parity = (bauds[0], "none") if best is None else (best.baud, best.parity)
             tell(f"listening to {arguments.port} at {baud} bit/s for {seconds:g} s; Ctrl-C ends it")
             longer = None
@@ -119,6 +124,48 @@ def _try_all(
         if not any(one.heard.errors for one in tried):
             break  # parity that is not expected shows as missing stop bits
     return tried
+
+
+def _is_unclear(tried: Sequence[Tried]) -> bool:
+    """Whether little came at all rates, and at none of them what may be text."""
+    came = any(one.heard.received for one in tried)
+    lost = any(one.heard.lost for one in tried)
+    return came and not lost and too_few(tried) and not any(one.may_be_text for one in tried)
+
+
+def _likeliest(tried: Sequence[Tried]) -> Tried | None:
+    """The rate to listen at; None if none was tried."""
+    if all_alike(tried):
+        return tried[0]
+    texts = [one for one in tried if one.may_be_text] if too_few(tried) else []
+    return max(texts or tried, key=lambda one: (one.found.score, one.heard.received), default=None)
+
+
+def _try_again(
+    port: str,
+    tried: Sequence[Tried],
+    seconds: float | None,
+    stop: threading.Event,
+    tell: Callable[[str], None],
+) -> list[Tried]:
+    """The rates at which too little came, each for longer, until what comes may be text."""
+    each_s = AGAIN_S if seconds is None else max(seconds, TRY_S)
+    # What came at the others is no text, whatever follows; but frames need more bytes.
+    again = [at for at, one in enumerate(tried) if seconds is not None or one.heard.received < LEAST_TEXT]
+    if again:
+        tell(
+            f"too few bytes came from {port} to judge the baud rate: trying {counted(len(again), 'rate')} "
+            f"again, for {each_s:g} s each; --seconds sets the time, --baud the rate"
+        )
+    result = list(tried)
+    for at in again:
+        if stop.is_set():
+            break
+        one = tried[at]
+        result[at] = new = _try(port, one.baud, one.parity, each_s, TRY_BYTES, stop)
+        if new.may_be_text or new.found.sure or new.heard.lost:
+            break
+    return result
 
 
 def _go_on(port: str, seconds: float, tell: Callable[[str], None], data: bytes, *, came: bool) -> bool:

@@ -40,6 +40,10 @@ _FAST = (9600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_800, 921_600, 2_000
 """Baud rates to propose where the port has none."""
 WAITING_S = 0.05
 """Within this time from the first byte on, those come that had been waiting in the port."""
+LEAST_TEXT = 8
+"""Bytes that are text by chance at a wrong baud rate once in 2000 times."""
+_LEAST_ALIKE = 3
+_FEW = 64
 _SURELY = 1.05
 _MOST_MISSING = 1.5
 """Steps of a counter per line, with lines missing; what seems more is a counter that began again."""
@@ -86,13 +90,29 @@ class Tried(NamedTuple):
     heard: Heard
     found: Recognised
 
+    @property
+    def may_be_text(self) -> bool:
+        """Whether the bytes may be text, although they may be too few to judge."""
+        from drivers.serial.recognise import LEAST_PRINTABLE  # noqa: PLC0415 - only for who listens
+
+        return self.heard.received >= LEAST_TEXT and self.found.printable >= LEAST_PRINTABLE
+
+
+def too_few(tried: Sequence[Tried]) -> bool:
+    """Whether so few bytes came at each of the baud rates that they cannot be judged."""
+    return all(one.heard.received < _FEW and not one.found.sure for one in tried)
+
 
 def all_alike(tried: Sequence[Tried]) -> bool:
     """Whether the bytes have a meaning at all baud rates: the port does not use them.
 
-    A pseudo-terminal does not, nor do many devices that are the USB port themselves.
+    A pseudo-terminal does not, nor do many devices that are the USB port themselves. Where a device sends
+    little, the bytes are text at all of them.
     """
-    return len(tried) > 1 and all(one.found.sure for one in tried)
+    if len(tried) > 1 and all(one.found.sure for one in tried):
+        return True
+    came = [one for one in tried if one.heard.received]
+    return len(came) >= _LEAST_ALIKE and all(one.may_be_text for one in came)
 
 
 def dump(data: bytes) -> str:
@@ -180,8 +200,6 @@ class Report(NamedTuple):
         return _PER_S[unit] / column.per_line
 
     def _problem(self) -> str:
-        from drivers.serial.recognise import LEAST_BYTES  # noqa: PLC0415 - only for who listens
-
         heard = self.best.heard
         if heard.lost:
             return f"{self.port} was lost: {heard.lost}. Remedy: plug it in again and see `dmesg`"
@@ -191,11 +209,8 @@ class Report(NamedTuple):
                 "being asked. Its TX must lead to RX of this port (for RS-485: A to A, B to B), and "
                 "ground must be connected. A Modbus device must be asked: daqsvc sniff modbus"
             )
-        if self._what is None and heard.received < LEAST_BYTES:
-            return (
-                f"{self.port}: only {heard.received} bytes came, which are too few to tell what they are. "
-                "Remedy: listen longer by --seconds, with --baud if the device's rate is known"
-            )
+        if self._what is None and (few := self._too_few()):
+            return few
         if self.best.found.is_enclosed:
             return (
                 f"{self.port}: text comes between the bytes 02 (STX) and 03 (ETX), which daqsvc does not "
@@ -208,6 +223,24 @@ class Report(NamedTuple):
                 f"{self.port}: bytes come, but by {tried} they are neither lines of text nor frames of one "
                 f"length{self._guess()}. Remedy: state the device's rate by --baud; check that no other "
                 "device drives the line"
+            )
+        return ""
+
+    def _too_few(self) -> str:
+        """What to do where too few bytes came to judge them; empty if there were more."""
+        from drivers.serial.recognise import LEAST_BYTES  # noqa: PLC0415 - only for who listens
+
+        if self.tried and too_few(self.tried):
+            most = max(one.heard.received for one in self.tried)
+            return (
+                f"{self.port}: bytes come, but too few to judge the baud rate by: {most} at most at each of "
+                "the usual ones. Remedy: have each tried for longer by --seconds, e.g. --seconds 20; or "
+                "state the device's rate by --baud"
+            )
+        if self.best.heard.received < LEAST_BYTES:
+            return (
+                f"{self.port}: only {self.best.heard.received} bytes came, which are too few to tell what "
+                "they are. Remedy: listen longer by --seconds, with --baud if the device's rate is known"
             )
         return ""
 

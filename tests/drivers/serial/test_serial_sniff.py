@@ -328,6 +328,76 @@ def test_the_rate_at_which_samples_are_a_waveform_does_not_turn_on_a_clock() -> 
     assert [one["type"] for one in tomllib.loads(found.fragment)["sensors"]] == ["accelerometer"]
 
 
+def slow_line(number: int) -> bytes:
+    """As a device with a line a second sends it."""
+    return b"%d.25 degC;2.%d mm/s\r\n" % (38 + number % 2, number % 7)
+
+
+@pytest.fixture
+def tries(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[tuple[int, float]]]:
+    """Have a port with a device of a line a second, at one of the baud rates or at any."""
+
+    def at(its_baud: int | None, say: Callable[[int], bytes] = slow_line) -> list[tuple[int, float]]:
+        noise, done = np.random.default_rng(3), []
+
+        def listened(_port, baud, parity, seconds, _enough, _stop, longer=None) -> Tried:
+            done.append((baud, seconds))
+            seconds += 10.0 if longer is not None and longer(b"x" * 22) else 0.0
+            lines = [(float(number), say(number)) for number in range(max(1, int(seconds)))]
+            if its_baud not in {baud, None}:
+                lines = [
+                    (at_s, noise.integers(256, size=len(line), dtype=np.uint8).tobytes())
+                    for at_s, line in lines
+                ]
+            heard = heard_at(lines)
+            return Tried(baud, parity, heard, recognised(heard.data))
+
+        monkeypatch.setattr(sniff, "_try", listened)
+        return done
+
+    return at
+
+
+def test_a_slow_device_is_found_at_the_rate_whose_bytes_are_text(
+    tries, capsys: pytest.CaptureFixture[str]
+) -> None:
+    done = tries(9600)
+    assert main(["sniff", "serial", "ttyUSB0"]) == 0
+    said = capsys.readouterr()
+    assert done[-1] == (9600, sniff.SECONDS)
+    assert "baud = 9_600\n" in said.out
+    assert "9600    21     0               100 %  0.00" in said.out
+
+
+@pytest.mark.parametrize("seconds", [(), ("--seconds", "10")])
+def test_a_slow_device_on_a_port_without_a_rate_gets_no_rate(
+    seconds: tuple[str, ...], tries, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tries(None)
+    assert main(["sniff", "serial", "ttyUSB0", *seconds]) == 0
+    said = capsys.readouterr().out
+    assert "ttyUSB0 at any baud rate, 8N1" in said
+    assert "baud = 115_200    # any: the port does not use it" in said
+
+
+def test_too_few_bytes_at_all_rates_are_called_so_and_seconds_makes_the_tries_longer(
+    tries, capsys: pytest.CaptureFixture[str]
+) -> None:
+    noise = np.random.default_rng(5)
+    done = tries(None, lambda _: noise.integers(128, 256, size=12, dtype=np.uint8).tobytes())
+    assert main(["sniff", "serial", "ttyUSB0"]) == 1
+    error = capsys.readouterr().err
+    assert "bytes come, but too few to judge the baud rate by: 12 at most at each" in error
+    assert "neither lines" not in error
+    assert len(done) == len(sniff.BAUDS)
+    done.clear()
+    assert main(["sniff", "serial", "ttyUSB0", "--seconds", "20"]) == 1
+    said = capsys.readouterr().err
+    assert "trying 11 rates again, for 20 s each; --seconds sets the time" in said
+    assert done[11:] == [(baud, 20.0) for baud in sniff.BAUDS] + [(done[-1][0], 20.0)]
+    assert "neither lines of text nor frames" in said
+
+
 def test_words_for_no_number_are_no_kinds_of_lines() -> None:
     what = recognised(b"".join(b"%s,%d,2\n" % ((b"nan", b"---")[k % 2], k) for k in range(40))).what
     assert isinstance(what, TextLines)
