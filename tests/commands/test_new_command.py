@@ -260,6 +260,14 @@ def test_the_worth_of_a_count_is_guessed_only_where_the_name_tells_it(channel, s
     assert (answers[f"sensor.{channel}.scale"], answers[f"sensor.{channel}.unit"]) == (scale, unit)
 
 
+@pytest.mark.parametrize(("rate", "limits"), [("50", "none"), ("100", "iso")])
+def test_samples_that_are_too_slow_for_1x_get_no_zones_of_vibration(rate, limits):
+    given = {"bus": "serial", "port": "/dev/ttyS0", "columns": "n, x", "rate": rate, "speed": "1480"}
+    given["sensor.x.type"] = "accelerometer"
+    answers = conduct(Path("m.toml"), Given(given, defaults=True), None, print)
+    assert answers["limits"] == limits
+
+
 def test_a_value_whose_name_tells_no_vibration_gets_no_limits_of_one(tmp_path):
     given = {"host": "h", "bus": "modbus-tcp", "channels": "vibration, power, status, flow"}
     answers = conduct(tmp_path / "m.toml", Given(given, defaults=True), None, print)

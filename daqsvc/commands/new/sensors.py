@@ -44,6 +44,8 @@ _BEARING_RATE_HZ, _BEARING_RPM, _BEARING_BLOCK_S = 2500.0, 600.0, 1.25
 """What the bearings' detector needs."""
 _PULSE_SAMPLES, _HARMONIC_SAMPLES = 4.0, 12.0
 """Samples a revolution that a keyphasor's pulses, and 1X by them, need."""
+_HIGHEST_SHARE = 0.4
+"""Of the sampling rate, the highest frequency of the velocity RMS."""
 _LONGEST_WINDOW_S = 10.0
 _SLOW_RPM, _SLOW_HZ, _BAND_HZ = 600.0, 2.0, (10.0, 1000.0)
 """The velocity of machines up to this speed counts from a lower frequency on (ISO 20816-3)."""
@@ -199,7 +201,9 @@ def limit_questions(answers: Answers) -> Iterator[Question]:
     quiet = bus_of(answers).simulated
     in_range = _ISO_RPM[0] <= abs(answers["speed"]) <= _ISO_RPM[1]
     choices = {"iso": "zones of ISO 20816-3", "own": "two figures of yours", NONE: "write them later"}
-    if not in_range or not any(one.iso for one in limited):
+    # Zones are for the velocity up to 1000 Hz: of samples too slow for 1X they would miss nearly all of it.
+    sees_1x = _HIGHEST_SHARE * answers["rate"] >= abs(answers["speed"]) / 60.0
+    if not in_range or not any(one.iso and (sees_1x or not one.housing) for one in limited):
         del choices["iso"]
     probes = limited[0].type == "proximity"
     default = "own" if quiet and probes else "iso" if "iso" in choices else NONE
@@ -310,7 +314,7 @@ def pipeline_tables(answers: Answers) -> Iterator[str]:
     if waveforms:
         yield entry("window_s", window_s, "time over which RMS, peak and so on are measured")
     if housing:
-        high_hz = min(_BAND_HZ[1], float(f"{0.4 * rate_hz:.3g}"))
+        high_hz = min(_BAND_HZ[1], float(f"{_HIGHEST_SHARE * rate_hz:.3g}"))
         band = [low_hz, high_hz]
         early = f"; the standard goes to {_BAND_HZ[1]:g} Hz, half the sampling rate does not"
         about = "of the velocity RMS" + (early if high_hz < _BAND_HZ[1] else "")
