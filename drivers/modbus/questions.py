@@ -150,7 +150,8 @@ class _ModbusQuestions(BusQuestions):
             if error.figures.get("units") and not (alike and further):
                 return heard.without_registers(error.figures, answers["registers"])
             # Some unit answers, and too late: no other one is to be taken for it.
-            if not further or error.figures.get("replies_late"):
+            late = error.figures.get("replies_late") and not error.figures.get("units")
+            if not further or late:
                 if not error.figures.get("units") and chosen.isdecimal():
                     raise NothingFoundError(f"{error}. {_OTHERS}", error.figures) from error
                 raise

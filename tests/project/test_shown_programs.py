@@ -106,7 +106,7 @@ TERMINAL = {
 OUTPUT = {
     ("README.md", "run.npz: "), ("README.md", "105.mat: "), ("README.md", "run-up.npz: "),
     ("docs/analyze.md", "105.mat: "), ("docs/commands.md", "LEVEL "),
-    ("docs/status.md", "virtual-rig "),
+    ("docs/status.md", "virtual-rig "), ("docs/modbus.md", "Channels of transmitter"),
 }  # fmt: skip
 """Output of the line above it."""
 SECTION = re.compile(r"^(?:scrape_configs|rule_files):", re.MULTILINE)

@@ -11,7 +11,7 @@ import pytest
 from support.machine_files import MACHINES
 from support.paths import ROOT
 
-from daqsvc.settings import parse_machine_file
+from daqsvc.settings import describe, parse_machine_file
 from drivers.base import BusCounters
 from drivers.make import stream_layout
 from drivers.modbus.registers import RegisterRecord
@@ -28,6 +28,8 @@ LINE = next(part for part in PARTS if "writes" in part and "rtu" in part)
 def test_the_machine_with_trend_values_is_whole():
     machine = parse_machine_file(TREND, EXAMPLE)
     assert stream_layout(machine, "transmitter").unit == 1
+    [shown] = re.findall(r"```\n(Channels of .*?)```", TEXT, re.DOTALL)
+    assert f"\n{shown}\n" in describe(machine)
 
 
 def test_the_bus_over_tcp_takes_the_place_of_the_serial_line():
