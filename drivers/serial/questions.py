@@ -23,6 +23,7 @@ from drivers.serial.sniff_report import (
     other_lines_words,
     overrun_words,
     turn_words,
+    unchecked_words,
     unit_of_suffix,
 )
 from drivers.sniffing import (
@@ -147,12 +148,27 @@ class SerialQuestions(BusQuestions):
         found = sniffed(SerialSniffer(_LISTEN_S), [*words, "--", answers["port"]], stop, tell)
         return Heard(
             list(_in_words(found)),
-            lambda so_far: _proposals(found, so_far),
+            lambda so_far: _proposals(found, so_far) | self._no_limits(so_far),
             _missed(found),
             notes=lambda so_far, _: [f"baud = {so_far['baud']} is {ANY_BAUD}."] * found["any_baud"],
             not_read=lambda so_far: "\n".join(_not_read(found, so_far)),
             guesses=lambda so_far, taken: _guesses(found, so_far, self.channels(so_far), taken),
         )
+
+    def _no_limits(self, answers: Answers) -> dict[str, str]:
+        """No limits are proposed where type and unit of every sensor are a guess."""
+        if "rate" not in answers or "limits" in answers:
+            return {}
+        kinds = {one: answers.get(sensor_key(one, "type")) for one in self.channels(answers)}
+        vibrations = {one: kind for one, kind in kinds.items() if kind in _TYPE_OF.values()}
+        is_guess = [
+            kind in {self.guess(answers, one)[0], "accelerometer"}
+            and by_name(one) is None
+            and answers.get(sensor_key(one, "suffix")) is None
+            for one, kind in vibrations.items()
+        ]
+        levels = [one for one in kinds if answers.get(sensor_key(one, "unit")) == "mm/s"]
+        return {"limits": NONE} if is_guess and all(is_guess) and not levels else {}
 
     def questions(self, answers: Answers, folder: Path) -> Iterator[Question]:
         """See `BusQuestions.questions`."""
@@ -411,8 +427,15 @@ def _swinging_type(one: Mapping[str, Any], name: str, rate_hz: float | None) -> 
 
 def _not_read(found: Mapping[str, Any], answers: Answers) -> Iterator[str]:
     """See `Heard.not_read`."""
-    if found["framing"] != "lines" or answers["framing"] != "lines":
+    if found["framing"] != answers["framing"]:
         return
+    if found["framing"] == "lines":
+        yield from _not_read_of_lines(found, answers)
+    elif found["crc"] and not _is_known_crc(found):
+        yield unchecked_words(found["crc"])
+
+
+def _not_read_of_lines(found: Mapping[str, Any], answers: Answers) -> Iterator[str]:
     if missed := _missed(found):
         yield f"What was heard does not fit this file: {missed}."
         return
@@ -523,6 +546,8 @@ def _frame_proposals(found: Mapping[str, Any], answers: Answers) -> dict[str, st
         proposed["sync-word"] = found["sync_word"]
     if known:
         proposed["crc-order"] = found["crc_order"]
+    # As the sniffer proposes it: what a count is worth is not known, and volts of a probe are not heard.
+    proposed["scale"] = "1"
     if found["counter"] is not None:
         counter = {**found["counter"], "bits": found["counter_bits"] or found["counter"]["bits"]}
         proposed |= packed.frame_proposals(found["payload_length"], counter, answers)

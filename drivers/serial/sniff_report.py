@@ -534,7 +534,7 @@ class Report(NamedTuple):
             yield f"sync_word = {quoted(what.sync.hex())}"
         driver_checks = what.crc in {"ibm-3740", "xmodem"} and what.crc_from == len(what.sync)
         if what.crc and not driver_checks:
-            yield f"# The driver does not check {what.crc}: a damaged frame is taken for a good one."
+            yield f"# {unchecked_words(what.crc)}"
         yield f"crc = {quoted(what.crc if driver_checks else 'none')}"
         if driver_checks and what.crc_order == "little":
             yield 'crc_order = "little"'
@@ -626,6 +626,11 @@ LINES_NEED = "A stream needs a column of numbers, best beside one that counts li
 def frames_need(payload: int) -> str:
     """The same of binary frames with so many bytes between sync word and CRC."""
     return f"A stream needs a counter: none was found in the {payload} bytes of payload, or nothing behind it"
+
+
+def unchecked_words(crc: str) -> str:
+    """What it means that frames have a CRC that the driver does not know."""
+    return f"The driver does not check {crc}: a damaged frame is taken for a good one."
 
 
 def overrun_words(baud: int, proposed: int) -> str:

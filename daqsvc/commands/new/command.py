@@ -20,7 +20,7 @@ from daqsvc.documentation import documented_in
 from daqsvc.errors.command_line import CANNOT_WRITE, INTERRUPTED
 from daqsvc.errors.machine_file import PLUGIN_FAILED
 from drivers.questions import SENSOR, short_name
-from drivers.sniffing import SniffError
+from drivers.sniffing import NothingFoundError, SniffError
 
 if TYPE_CHECKING:
     import argparse
@@ -262,8 +262,8 @@ def _ask(question: Question) -> str:
             _say("  there is no default: type an answer, or ? for help")
 
 
-def _heard(folder: Path, bus: BusQuestions, answers: Answers, *, person: bool) -> Heard | None:
-    """What is on the bus, which is shown to the person, too; None if nothing was found.
+def _heard(folder: Path, bus: BusQuestions, answers: Answers, *, person: bool) -> Heard | SniffError:
+    """What is on the bus, which is shown to the person, too; or why nothing was found.
 
     Raises:
         SniffError: nothing was found, and nobody is there who could correct an answer.
@@ -276,8 +276,9 @@ def _heard(folder: Path, bus: BusQuestions, answers: Answers, *, person: bool) -
     except SniffError as error:
         if not person:
             raise
-        _say(f"  Nothing was found: {error}")
-        return None
+        is_deaf = not isinstance(error, NothingFoundError)
+        _say(f"  {'The bus could not be listened to' if is_deaf else 'Nothing was found'}: {error}")
+        return error
     _say("  Found:" if heard.missed else "  Found, and proposed below:")
     for line in heard.lines:
         _say(f"    {line}")

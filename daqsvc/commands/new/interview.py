@@ -15,7 +15,7 @@ from daqsvc.errors.command_line import ANSWER
 from drivers import questions as q
 from drivers.bus_questions import BEFOREHAND, SHARED
 from drivers.questions import SENSOR, Answers, Question
-from drivers.sniffing import NothingFoundError
+from drivers.sniffing import NothingFoundError, SniffError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -49,7 +49,7 @@ def conduct(
     given: Given,
     ask: Callable[[Question], str] | None,
     say: Callable[[str], None],
-    listen: Callable[[BusQuestions, Answers], Heard | None] | None = None,
+    listen: Callable[[BusQuestions, Answers], Heard | SniffError | None] | None = None,
     answered: Callable[[Question, Answers], None] | None = None,
 ) -> Answers:
     """All answers.
@@ -59,7 +59,8 @@ def conduct(
         given: what was answered beforehand.
         ask: asks a person; None where there is none.
         say: tells that person why an answer is asked for again.
-        listen: reads the bus as soon as it is known where it is; None if that is not wanted.
+        listen: reads the bus as soon as it is known where it is, and returns what was heard, or why nothing
+            was; None if that is not wanted.
         answered: called with each question after its answer; may raise `AnswerError`.
 
     Raises:
@@ -90,7 +91,7 @@ class _Interview:
         given: Given,
         ask: Callable[[Question], str] | None,
         say: Callable[[str], None],
-        listen: Callable[[BusQuestions, Answers], Heard | None] | None,
+        listen: Callable[[BusQuestions, Answers], Heard | SniffError | None] | None,
         answered: Callable[[Question, Answers], None] | None,
     ) -> None:
         self.answers: Answers = {}
@@ -101,6 +102,8 @@ class _Interview:
         """Keys of what a person has answered, the last one last."""
         self._heard: Heard | None = None
         self._has_listened = False
+        self._deaf: SniffError | None = None
+        """Why nothing was heard."""
         self._assumed: set[str] = set()
         """Keys of questions whose default was taken, and was not heard."""
         self._taken: set[str] = set()
@@ -129,6 +132,10 @@ class _Interview:
             return [example_only] if example_only else []
         origin = bus_of(self.answers).origin(self.answers)
         if self._heard is None:
+            if self._deaf is not None and not isinstance(self._deaf, NothingFoundError):
+                # Whoever reads that nothing was heard looks for the fault at the device.
+                so = f"; the channels are {origin}" * example
+                return [f"The bus could not be listened to{so}: {self._deaf}"]
             return [f"Nothing was heard on the bus; the channels are {origin}."] * example
         if not self._heard.missed:
             return [*self._heard.notes(self.answers, self._assumed)]
@@ -291,13 +298,17 @@ class _Interview:
         if self._listen is not None:
             self._listen_behind(key, self._listen)
 
-    def _listen_behind(self, key: str, listen: Callable[[BusQuestions, Answers], Heard | None]) -> None:
+    def _listen_behind(
+        self, key: str, listen: Callable[[BusQuestions, Answers], Heard | SniffError | None]
+    ) -> None:
         """Listen if the bus can be found by the answers up to this one."""
         bus = bus_of(self.answers)
         if key == "bus" and not bus.listens_behind:
             self._say("--listen is left out: on a bus of this kind there is nothing to listen to")
         if key == bus.listens_behind:
-            self._heard = listen(bus, self.answers | {BEFOREHAND: self._given.texts})
+            heard = listen(bus, self.answers | {BEFOREHAND: self._given.texts})
+            self._deaf = heard if isinstance(heard, SniffError) else None
+            self._heard = None if isinstance(heard, SniffError) else heard
             self._has_listened = True
             if self._heard is not None and self._heard.missed:
                 if self._ask is None:
@@ -319,7 +330,7 @@ class _Interview:
             self._taken.discard(key)
             self._unstated.discard(key)
         if listens_behind not in self.answers:
-            self._heard, self._has_listened = None, False
+            self._heard, self._has_listened, self._deaf = None, False, None
 
 
 _OF_CHANNELS = {"channels", "columns", "signals", "counter", "counter-byte"}

@@ -1072,10 +1072,12 @@ def test_new_says_what_to_do_when_nobody_answers(
         assert not_written(tmp_path, target) == 1
     assert "no unit answers (unit 2 was asked). Remedy: check that 127.0.0.1 is" in capsys.readouterr().err
     answers, _, _ = as_asked(tmp_path, nobody)
-    assert "Nothing was found: " in capsys.readouterr().out
+    assert "  The bus could not be listened to: " in capsys.readouterr().out
     assert answers["channels"] == ("vibration", "temperature")
     text = machine_text(answers, "m.toml")
-    assert "\n# Nothing was heard on the bus; the channels are an example.\n" in text
+    begin = f"# The bus could not be listened to; the channels are an example: {nobody}: "
+    assert begin in text
+    assert "nobody listens there; start the server" in text.replace("\n# ", " ")
     # Whoever names the channels and their registers needs no such comment.
     own = {"channels": "a", "sensor.a.address": "7"}
     assert "example" not in machine_text(as_asked(tmp_path, nobody, **own)[0], "m.toml").partition("[")[0]

@@ -10,6 +10,7 @@ import json
 import operator
 import os
 import signal
+import struct
 import subprocess
 import sys
 import threading
@@ -24,6 +25,7 @@ from support.formats import fits
 from support.waiting import PATIENCE_S
 
 from daqsvc.cli import main
+from daqsvc.commands.new.command import _heard
 from daqsvc.commands.new.interview import Given, conduct
 from daqsvc.commands.new.machine_text import machine_text
 from drivers.serial import ports, questions, sniff
@@ -1006,3 +1008,77 @@ def test_text_between_stx_and_etx_is_named_and_nothing_is_proposed(
     out, err = capsys.readouterr()
     assert "text comes between the bytes 02 (STX) and 03 (ETX), which daqsvc does not read" in err
     assert "[buses." not in out
+
+
+def modbus_frame(number: int) -> bytes:
+    """A counter, two values, and the CRC of Modbus, which the driver does not know."""
+    payload = struct.pack(
+        "<Hhh", number % 65_536, number * 7919 % 3001 - 1500, number * 104_729 % 4001 - 2000
+    )
+    crc = 0xFFFF
+    for byte in payload:
+        crc ^= byte
+        for _ in range(8):
+            crc = crc >> 1 ^ (0xA001 if crc & 1 else 0)
+    return b"\xaa\x55" + payload + crc.to_bytes(2, "little")
+
+
+def test_of_frames_new_proposes_the_sensors_of_sniff(
+    cable: PseudoTerminal,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 1.0)
+
+    def slowly(number: int) -> bytes:
+        time.sleep(0.02)
+        return modbus_frame(number)
+
+    with talking(cable, slowly):
+        sniffed = tomllib.loads(figures(cable, capsys)["machine_file"])
+        file = new(cable, tmp_path / "frames.toml")
+    kinds = [(one["channel"], one["type"], one["unit"]) for one in file["sensors"]]
+    assert kinds == [(one["channel"], one["type"], one["unit"]) for one in sniffed["sensors"]]
+    [heard] = sniffed["streams"].values()
+    assert file["streams"]["device"]["layout"]["channels"] == heard["layout"]["channels"]
+
+
+def test_of_frames_new_writes_no_limits_that_nobody_stated_and_names_the_guesses(
+    cable: PseudoTerminal,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 1.0)
+    with talking(cable, modbus_frame):
+        file = new(cable, tmp_path / "frames.toml", "--rate=200")
+        said = capsys.readouterr().out
+        stated = new(cable, tmp_path / "stated.toml", "--rate=200", "--limits=iso")
+    assert [(one["type"], one["unit"]) for one in file["sensors"]] == [("accelerometer", "g")] * 2
+    assert "alarms" not in file
+    assert len(stated["alarms"]) == 2
+    text = (tmp_path / "frames.toml").read_text().replace("\n# ", " ")
+    for words in (
+        "c1, c2: type and unit of the sensor are a guess by the rate; see the device's manual.",
+        "The driver does not check modbus: a damaged frame is taken for a good one.",
+    ):
+        assert words in said
+        assert words in text
+
+
+def test_a_port_that_was_not_opened_is_stated_at_the_end_and_in_the_file(
+    cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = Given({"bus": "serial", "port": f"{cable.path}"}, defaults=False)
+    listen = functools.partial(_heard, tmp_path, person=True)
+    with serial.Serial(f"{cable.path}", exclusive=True):
+        answers = conduct(
+            tmp_path / "m.toml", given, lambda one: f"{one.default}", lambda _reason: None, listen
+        )
+    why = f"{cable.path} cannot be opened: another program has it open; stop that program"
+    assert f"  The bus could not be listened to: {why}" in capsys.readouterr().out
+    assert f"The bus could not be listened to; the channels are an example: {why}" in answers["notes"]
+    text = machine_text(answers, "m.toml").replace("\n# ", " ")
+    assert why in text
+    assert "Nothing was heard" not in text
