@@ -170,3 +170,17 @@ ALARM_STANDS = Code(
     "commands.md",
     "alarm probe-x raised: probe-x alert: rms of probe-x is 36.2 um, alert limit 35 um",
 )
+BAND_WITHOUT_1X = Code(
+    "A18",
+    "The alarm does not see 1X of the machine",
+    "The band of the velocity does not hold the speed of the machine (speed_rpm / 60). An unbalance, which "
+    "shows once a revolution, is not in the value. Mostly the device sends too slowly for a wider band.",
+    "Have the device send faster: at least 2.56 times the highest frequency that counts. Or widen "
+    "velocity_band_hz where the rate allows it, or write another measure.",
+    _PAGE,
+    example='machine.toml:57: alarms[0].measure = "velocity_rms": does not see 1X: "drive-end-rms" watches '
+    "10 Hz to 24 Hz, and the machine turns at 29.93 Hz (1796 rpm). An unbalance does not show. Stream "
+    '"drive-end" has rate_hz = 60. Remedy: have the device send 76.7 samples a second or more, and end the '
+    "band at 0.4 times the rate. Best are 2560, 2.56 times the 1000 Hz of ISO 20816-3. Or write another "
+    'measure, e.g. measure = "rms" with limits of your own in g',
+)

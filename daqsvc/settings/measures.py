@@ -41,6 +41,10 @@ SLOW_BAND_HZ = (2.0, 1000.0)
 """Of machines that turn at `SLOW_RPM` or less (ISO 20816-3)."""
 SLOW_RPM = 600.0
 VELOCITIES = (VELOCITY, SLOW_VELOCITY)
+ISO_BAND_HZ = (10.0, 1000.0)
+"""Of the velocity whose zones ISO 20816-3 has, above `SLOW_RPM`."""
+SAMPLES_PER_PERIOD = 2.56
+"""How fast a device must sample, beside the highest frequency that counts: the usual figure of analysers."""
 
 AMPLITUDES = ("1x_amplitude", "2x_amplitude")
 PHASES = ("1x_phase_lag", "2x_phase_lag")
@@ -50,6 +54,23 @@ OF_THE_SHAFT = (*AMPLITUDES, *PHASES, *NOT_1X)
 """Measures that need the angle of the shaft, or its speed."""
 
 ON_REQUEST = (KURTOSIS, SLOW_VELOCITY, *OF_THE_SHAFT)
+
+
+def highest_hz(rate_hz: float) -> float:
+    """Up to where samples show a vibration for certain, in Hz: filters end before half the rate does."""
+    return float(f"{0.4 * rate_hz:.3g}")
+
+
+def shows_1x(rate_hz: float, speed_rpm: float, low_hz: float) -> bool:
+    """Whether a velocity RMS from ``low_hz`` on, of samples at this rate, can hold 1X of the machine.
+
+    Args:
+        rate_hz: sampling rate.
+        speed_rpm: of the machine; its sign does not matter.
+        low_hz: where the band of the velocity begins.
+    """
+    return highest_hz(rate_hz) > low_hz and highest_hz(rate_hz) >= abs(speed_rpm) / 60.0
+
 
 UNITS = {
     VELOCITY: "mm/s",

@@ -66,6 +66,15 @@ GIVEN: list[tuple[str, Path, list[tuple[str, str]]]] = [
     ("A10", MEASURES, [('measure = "velocity_rms_2_1000"', 'measure = "1x_phase_lag"')]),
     ("A12", LAVAL, [("[alarm_handling]", START_UP)]),
     ("A14", MEASURES, [("shaft = true", 'group = 1, support = "rigid"')]),
+    (
+        "A18",
+        MACHINES / "motor-accelerometer.toml",
+        [
+            ("rate_hz = 12_000.0", "rate_hz = 60.0"),
+            ("[10.0, 1000.0]", "[10.0, 24.0]"),
+            ('measure = "rms"', 'measure = "velocity_rms"'),
+        ],
+    ),
     ("O04", LAVAL, [("[store]", PAGE.format("192.0.2.1:8420"))]),
     ("O05", LAVAL, [("[store]", PAGE.format("0.0.0.0:8420"))]),
     ("O07", LAVAL, [(TOPICS, f'{TOPICS}\n[mqtt.sparkplug]\nclient_id = "daqsvc-lab:edge-1"')]),

@@ -384,3 +384,62 @@ def test_a_measure_without_brackets_is_refused_with_how_to_write_it():
     problem, _ = only_problem(SPECIMEN, (listed, 'measures = "kurtosis"'))
     assert problem.message == "must be an array in brackets"
     assert problem.remedy.startswith('write measures = ["kurtosis"] (')
+
+
+MOTOR = MACHINES / "motor-accelerometer.toml"
+BAND = "velocity_band_hz = [10.0, 1000.0]"
+ON_VELOCITY = ('measure = "rms"', 'measure = "velocity_rms"')
+IN_ZONES = ('measure = "rms"\nalert = 0.11\ndanger = 0.30', f'measure = "velocity_rms"\n{ZONES}')
+
+
+@pytest.mark.parametrize("watching", [ON_VELOCITY, IN_ZONES], ids=["own limits", "zones"])
+@pytest.mark.parametrize(
+    ("rate_hz", "rpm", "band", "remedy"),
+    [
+        (100, 2820, "10.0, 40.0", "have the device send 121 samples a second or more, and end"),
+        (50, 1480, "10.0, 20.0", "have the device send 63.2 samples a second or more, and end"),
+        (12_000, 1480, "10.0, 20.0", "write velocity_band_hz = [10.0, 1000.0] in [pipeline.levels]"),
+        (100, 2820, "10.0, 47.0", None),
+        (120, 2820, "10.0, 48.0", None),
+        (12_000, 2820, "10.0, 1000.0", None),
+    ],
+)
+def test_an_alarm_on_a_velocity_without_1x_is_warned_of(watching, rate_hz, rpm, band, remedy):
+    changes = [("12_000.0", f"{rate_hz:.1f}"), ("1796.0", f"{rpm:.1f}"), ("[10.0, 1000.0]", f"[{band}]")]
+    warnings = [one for one in parsed(MOTOR, *changes, watching).warnings if f"{one.code}" == "A18"]
+    assert len(warnings) == (remedy is not None)
+    for one in warnings:
+        assert one.key == "alarms[0].measure"
+        assert f"turns at {rpm / 60:.4g} Hz" in one.message
+        assert f'"drive-end-rms" watches {band.replace(", ", " Hz to ").replace(".0", "")} Hz' in one.message
+        assert f"rate_hz = {rate_hz}" in one.message
+        assert remedy in one.remedy
+
+
+def test_a_velocity_that_begins_above_a_slow_machine_is_warned_of():
+    (warning,) = parsed(MOTOR, ("1796.0", "300.0"), ON_VELOCITY).warnings
+    assert (f"{warning.code}", warning.key) == ("A18", "alarms[0].measure")
+    assert "write velocity_band_hz = [2.0, 1000.0]" in warning.remedy
+    (zones,) = parsed(MOTOR, ("1796.0", "300.0"), IN_ZONES).warnings
+    assert f"{zones.code}" == "A14"  # once
+
+
+def test_a_stream_too_slow_for_1x_has_no_velocity_unless_a_band_is_stated():
+    slow = [("12_000.0", "50.0"), (BAND, "")]
+    machine = parsed(MOTOR, *slow)
+    assert machine.warnings == ()
+    assert "no velocity RMS of accel-de: sampled too slowly" in " ".join(describe(machine).split())
+    assert "velocity_rms" not in [one.key for one in watched(machine).readings]
+    (levels,) = detectors(machine)
+    samples = np.random.default_rng(1).normal(size=(100, 1)).astype(np.float32)
+    first, *_ = levels.process(Window(0, samples, 2_000_000_000, 2e7))
+    assert "rms" in first.statistics
+    assert "velocity_rms" not in first.statistics
+    lost, *_ = levels.process(Window(200, samples, 6_000_000_000, 2e7, skipped=100))
+    assert "velocity_rms" not in lost.bounds
+    # What an alarm watches is needed.
+    problem, _ = only_problem(MOTOR, *slow, ON_VELOCITY)
+    assert problem.key == "pipeline.levels.velocity_band_hz"
+    # A band could be stated: 1X is 29.93 Hz, and 640 samples a second show 256 Hz.
+    problem, _ = only_problem(MOTOR, ("12_000.0", "640.0"), (BAND, ""))
+    assert "write velocity_band_hz = [10.0, 256.0]" in problem.remedy

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from daqsvc.commands.new.assumed import ASSUMED
 from daqsvc.commands.new.buses import bus_of, buses
 from daqsvc.commands.new.machine_text import NOTES, assumed_words, machine_text, questions
-from daqsvc.commands.new.sensors import CLASSES, limits_words, why_no_bearing
+from daqsvc.commands.new.sensors import CLASSES, limits_words, notes_on_velocity, why_no_bearing
 from daqsvc.commands.new.topics import TOPICS
 from daqsvc.errors.command_line import ANSWER
 from drivers import questions as q
@@ -120,7 +120,12 @@ class _Interview:
     def notes(self) -> list[str]:
         """What in the file was neither answered nor heard, and what was heard and is not in it."""
         not_read = "" if self._heard is None else self._heard.not_read(self.answers)
-        return [*self._not_heard(), *self._guesses(), *not_read.splitlines()]
+        return [
+            *self._not_heard(),
+            *self._guesses(),
+            *not_read.splitlines(),
+            *notes_on_velocity(self.answers),
+        ]
 
     def _not_heard(self) -> Sequence[str]:
         """What in the file was neither answered nor heard, where it was listened for."""

@@ -8,13 +8,22 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from daqsvc.commands.new.buses import bus_of
 from daqsvc.commands.new.topics import SENSOR_TOPICS, TOPICS
+from daqsvc.rounding import rounded_up
+from daqsvc.settings.measures import (
+    ISO_BAND_HZ,
+    SAMPLES_PER_PERIOD,
+    SLOW_BAND_HZ,
+    SLOW_RPM,
+    highest_hz,
+    shows_1x,
+)
 from drivers import questions as q
 from drivers.bus_questions import STREAM
 from drivers.questions import NONE, Answers, Question, sensor_key
 from drivers.toml_lines import array, behind, entry, toml
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from daqsvc.settings.zones import Boundaries
 
@@ -44,11 +53,7 @@ _BEARING_RATE_HZ, _BEARING_RPM, _BEARING_BLOCK_S = 2500.0, 600.0, 1.25
 """What the bearings' detector needs."""
 _PULSE_SAMPLES, _HARMONIC_SAMPLES = 4.0, 12.0
 """Samples a revolution that a keyphasor's pulses, and 1X by them, need."""
-_HIGHEST_SHARE = 0.4
-"""Of the sampling rate, the highest frequency of the velocity RMS."""
 _LONGEST_WINDOW_S = 10.0
-_SLOW_RPM, _SLOW_HZ, _BAND_HZ = 600.0, 2.0, (10.0, 1000.0)
-"""The velocity of machines up to this speed counts from a lower frequency on (ISO 20816-3)."""
 
 
 class Sensor(NamedTuple):
@@ -59,17 +64,19 @@ class Sensor(NamedTuple):
     type: str
     unit: str
     bearing: Any
+    shows_speed: bool
+    """Whether a velocity RMS of it has 1X of the machine in its band."""
 
     @property
     def housing(self) -> bool:
-        """Whether its velocity RMS is measured here."""
+        """Whether it sends the vibration of the housing."""
         return self.type in {"accelerometer", "velocity"}
 
     @property
     def measure(self) -> tuple[str, str] | None:
         """The measure that its limits are for, and the unit of that."""
         if self.housing:
-            return "velocity_rms", "mm/s"
+            return ("velocity_rms", "mm/s") if self.shows_speed else ("rms", self.unit)
         return {"proximity": ("rms", self.unit), "trend": ("value", self.unit)}.get(self.type)
 
     @property
@@ -77,19 +84,69 @@ class Sensor(NamedTuple):
         """Which zones of ISO 20816-3 are there for it: ``housing`` or ``shaft``."""
         if self.type == "proximity":
             return "shaft"
-        return "housing" if self.housing or (self.type == "trend" and self.unit == "mm/s") else None
+        measured_there = self.type == "trend" and self.unit == "mm/s"
+        return "housing" if measured_there or (self.housing and self.shows_speed) else None
 
 
 def sensors(answers: Answers) -> list[Sensor]:
     """The sensors as far as they have been answered."""
     found = []
+    band_hz = _band_hz(answers)
+    shows_speed = band_hz is not None and band_hz[0] <= abs(answers.get("speed", math.inf)) / 60.0
     for channel in bus_of(answers).channels(answers):
         kind = answers.get(sensor_key(channel, "type"), NONE)
         if kind != NONE and sensor_key(channel, "name") in answers:
             unit = _FIXED_UNITS.get(kind) or answers.get(sensor_key(channel, "unit"), "")
             bearing = answers.get(sensor_key(channel, "bearing"))
-            found.append(Sensor(channel, answers[sensor_key(channel, "name")], kind, unit, bearing))
+            found.append(
+                Sensor(channel, answers[sensor_key(channel, "name")], kind, unit, bearing, shows_speed)
+            )
     return found
+
+
+def _lowest_hz(answers: Answers) -> float:
+    """Where the velocity of ISO 20816-3 begins."""
+    return (SLOW_BAND_HZ if abs(answers["speed"]) <= SLOW_RPM else ISO_BAND_HZ)[0]
+
+
+def _band_hz(answers: Answers) -> tuple[float, float] | None:
+    """The band of the velocity RMS; None where the samples are too slow for one with 1X in it."""
+    if "rate" not in answers or "speed" not in answers:
+        return ISO_BAND_HZ
+    low_hz = _lowest_hz(answers)
+    if not shows_1x(answers["rate"], answers["speed"], low_hz):
+        return None
+    return low_hz, min(ISO_BAND_HZ[1], highest_hz(answers["rate"]))
+
+
+def notes_on_velocity(answers: Answers) -> list[str]:
+    """What the velocity RMS does not hold at this rate, if anything watches or would watch it."""
+    housing = [one for one in sensors(answers) if one.housing]
+    if not housing:
+        return []
+    band_hz = _band_hz(answers)
+    if band_hz is None:
+        return [f"There is no velocity RMS of {', '.join(one.name for one in housing)}. {_too_slow(answers)}"]
+    if answers.get("limits") == "iso" and band_hz[1] < ISO_BAND_HZ[1]:
+        narrow = (
+            f"The velocity RMS is of {band_hz[0]:g} Hz to {band_hz[1]:g} Hz, as samples come at "
+            f"{answers['rate']:g} Hz. That is less than the {band_hz[0]:g} Hz to {ISO_BAND_HZ[1]:g} Hz of "
+            "ISO 20816-3: what vibrates faster is not in it."
+        )
+        return [narrow]
+    return []
+
+
+def _too_slow(answers: Answers) -> str:
+    """Why there is no velocity RMS, and so no zones, and what to do."""
+    rate_hz, once_hz = answers["rate"], abs(answers["speed"]) / 60.0
+    least_hz = SAMPLES_PER_PERIOD * max(once_hz, _lowest_hz(answers))
+    return (
+        f"{rate_hz:g} samples a second show frequencies up to {highest_hz(rate_hz):g} Hz; the shaft turns at "
+        f"{once_hz:.3g} Hz, and the zones of ISO 20816-3 are of {_lowest_hz(answers):g} Hz to "
+        f"{ISO_BAND_HZ[1]:g} Hz. Have the device send {rounded_up(least_hz)} samples a second or more, best "
+        f"{SAMPLES_PER_PERIOD * ISO_BAND_HZ[1]:g}, or the velocity RMS that it measures itself (type trend)."
+    )
 
 
 def sensor_questions(answers: Answers) -> Iterator[Question]:
@@ -201,13 +258,16 @@ def limit_questions(answers: Answers) -> Iterator[Question]:
     quiet = bus_of(answers).simulated
     in_range = _ISO_RPM[0] <= abs(answers["speed"]) <= _ISO_RPM[1]
     choices = {"iso": "zones of ISO 20816-3", "own": "two figures of yours", NONE: "write them later"}
-    # Zones are for the velocity up to 1000 Hz: of samples too slow for 1X they would miss nearly all of it.
-    sees_1x = _HIGHEST_SHARE * answers["rate"] >= abs(answers["speed"]) / 60.0
-    if not in_range or not any(one.iso and (sees_1x or not one.housing) for one in limited):
+    topic, read = TOPICS["limits"], q.one_of(choices)
+    if not in_range or not any(one.iso for one in limited):
         del choices["iso"]
+        read = q.one_of(choices)
+        if in_range and any(one.housing for one in limited):
+            why = f"No zones of ISO 20816-3: {_too_slow(answers)}"
+            topic, read = q.Topic(f"{why}\n{topic.text}", f"{why} {topic.help}"), _without_zones(read, why)
     probes = limited[0].type == "proximity"
     default = "own" if quiet and probes else "iso" if "iso" in choices else NONE
-    yield Question("limits", TOPICS["limits"], q.one_of(choices), default, choices)
+    yield Question("limits", topic, read, default, choices)
     if answers["limits"] == "iso" and any(one.iso == "housing" for one in limited):
         yield Question("class", TOPICS["class"], q.one_of(CLASSES), "2-rigid", CLASSES)
     if answers["limits"] == "own":
@@ -217,7 +277,7 @@ def limit_questions(answers: Answers) -> Iterator[Question]:
             {"um": "35", "mm": "0.035", "mil": "1.4"}.get(unit)
             if probes
             else "2.8"
-            if unit == "mm/s"
+            if unit == "mm/s" and limited[0].iso
             else None
         )
         what = f"{limited[0].measure[0].replace('_', ' ')} of {names} in {unit}" if limited[0].measure else ""
@@ -243,6 +303,17 @@ def limits_words(answers: Answers) -> list[str]:
         return []
     names = ", ".join(one.name for one in with_limits)
     return [f"Alert and danger are for {names}. No alarm watches {others} yet: write one for each."]
+
+
+def _without_zones(read: Callable[[str], Any], why: str) -> Callable[[str], Any]:
+    """As ``read``, but whoever wants the zones hears why there are none."""
+
+    def other(text: str) -> Any:
+        if text.lower() == "iso":
+            raise ValueError(why)
+        return read(text)
+
+    return other
 
 
 def _higher(alert: float) -> str:
@@ -298,8 +369,8 @@ def pipeline_tables(answers: Answers) -> Iterator[str]:
     keyphasor = next((one.name for one in there if one.type == "keyphasor"), None)
     per_revolution = 60.0 * rate_hz / speed_rpm
     housing = any(one.housing for one in there)
-    low_hz = _SLOW_HZ if speed_rpm <= _SLOW_RPM else _BAND_HZ[0]
-    window_s = max(0.5, 16.0 / rate_hz, 2.0 / low_hz if housing else 0.0)
+    band_hz = _band_hz(answers)
+    window_s = max(0.5, 16.0 / rate_hz, 2.0 / band_hz[0] if housing and band_hz else 0.0)
     by_mark = keyphasor is not None and per_revolution >= _HARMONIC_SAMPLES and bool(waveforms)
     if by_mark and 120.0 / speed_rpm > window_s:
         by_mark = 120.0 / speed_rpm <= _LONGEST_WINDOW_S
@@ -313,12 +384,12 @@ def pipeline_tables(answers: Answers) -> Iterator[str]:
         yield "# A trend value is averaged over window_s: 0.5 s, if it is not stated here."
     if waveforms:
         yield entry("window_s", window_s, "time over which RMS, peak and so on are measured")
-    if housing:
-        high_hz = min(_BAND_HZ[1], float(f"{_HIGHEST_SHARE * rate_hz:.3g}"))
-        band = [low_hz, high_hz]
-        early = f"; the standard goes to {_BAND_HZ[1]:g} Hz, half the sampling rate does not"
-        about = "of the velocity RMS" + (early if high_hz < _BAND_HZ[1] else "")
-        yield entry("velocity_band_hz", band, about)
+    if housing and band_hz:
+        early = f"; the standard goes to {ISO_BAND_HZ[1]:g} Hz, half the sampling rate does not"
+        about = "of the velocity RMS" + (early if band_hz[1] < ISO_BAND_HZ[1] else "")
+        yield entry("velocity_band_hz", list(band_hz), about)
+    elif housing:
+        yield "# no velocity_band_hz: samples are too slow for a velocity RMS with 1X of the shaft in it"
     if by_mark:
         yield entry("keyphasor", keyphasor, "the mark from which phases count")
         yield entry("measures", ["1x_amplitude", "1x_phase_lag"], "measured for trends, without an alarm")

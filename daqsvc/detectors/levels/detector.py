@@ -27,6 +27,7 @@ from daqsvc.dsp.window_orders import phase_lag_deg, steady_angle, window_orders
 from daqsvc.rounding import unit_behind
 from daqsvc.settings.measures import (
     AMPLITUDES,
+    ISO_BAND_HZ,
     KURTOSIS,
     NOT_1X,
     OF_THE_SHAFT,
@@ -147,7 +148,7 @@ class LevelDetector:
         rate_hz: its sampling rate.
         channels: the sensors.
         window_s: length of a window.
-        velocity_band_hz: band of the velocity, in Hz.
+        velocity_band_hz: band of the velocity, in Hz; None: its RMS is not measured.
         speed_rpm: stated speed of the shaft, for 1X and 2X; its sign does not matter.
         shaft: the keyphasor of the stream; None: 1X is looked for near the stated speed, and has no phase.
     """
@@ -160,7 +161,7 @@ class LevelDetector:
         channels: Sequence[LevelChannel],
         *,
         window_s: float = 0.5,
-        velocity_band_hz: tuple[float, float] = (10.0, 1000.0),
+        velocity_band_hz: tuple[float, float] | None = ISO_BAND_HZ,
         speed_rpm: float | None = None,
         shaft: ShaftAngle | None = None,
     ) -> None:
@@ -170,7 +171,9 @@ class LevelDetector:
         self._statements = LevelStatements(machine, stream, "levels/1")
         self._rate_hz = rate_hz
         self._channels = tuple(channels)
-        self._bands_hz = {VELOCITY: velocity_band_hz, SLOW_VELOCITY: SLOW_BAND_HZ}
+        self._bands_hz = {SLOW_VELOCITY: SLOW_BAND_HZ}
+        if velocity_band_hz is not None:
+            self._bands_hz[VELOCITY] = velocity_band_hz
         known = speed_rpm is not None and math.isfinite(speed_rpm)
         self._turns_per_sample = abs(speed_rpm) / 60.0 / rate_hz if known and speed_rpm else None
         self._shaft = shaft
@@ -220,9 +223,8 @@ class LevelDetector:
         t_ns = window.t_end_ns - round(len(window.samples) * window.period_ns)
         unseen = Evidence(first, window.first_index, t_ns)
         measures = ["mean", "rms", "peak", "peak_to_peak", "crest_factor"]
-        measures += ["gap_voltage"] * (channel.gap is not None) + ["velocity_rms"] * (
-            channel.unit in _TO_VELOCITY
-        )
+        measures += ["gap_voltage"] * (channel.gap is not None)
+        measures += [VELOCITY] * (channel.unit in _TO_VELOCITY and VELOCITY in self._bands_hz)
         measures += channel.on_request
         reason = not_judged(channel.sensor, window.skipped)
         return self._state(channel, unseen, {}, "missing", reason, 1.0, nothing_known(measures))
@@ -308,7 +310,8 @@ class LevelDetector:
                 bounds["gap_voltage"] = (volts[0], volts[1])
         asked = channel.on_request
         if channel.unit in _TO_VELOCITY:
-            self._add_velocity(channel, VELOCITY, samples, share, statistics, bounds)
+            if VELOCITY in self._bands_hz:
+                self._add_velocity(channel, VELOCITY, samples, share, statistics, bounds)
             if SLOW_VELOCITY in asked:
                 self._add_velocity(channel, SLOW_VELOCITY, samples, share, statistics, bounds)
         if KURTOSIS in asked:

@@ -6,7 +6,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, NamedTuple
 
 from daqsvc.dsp.window_orders import LEAST_SAMPLES_PER_REVOLUTION
-from daqsvc.errors.alarms import UNFIT_ZONES
+from daqsvc.errors.alarms import BAND_WITHOUT_1X, UNFIT_ZONES
 from daqsvc.errors.detectors import BAND_TOO_HIGH, NEEDS_KEYPHASOR, WINDOW_TOO_SHORT
 from daqsvc.errors.machine_file import (
     NAMED_TWICE,
@@ -18,14 +18,17 @@ from daqsvc.errors.machine_file import (
 )
 from daqsvc.rounding import rounded_up
 from daqsvc.settings.measures import (
+    ISO_BAND_HZ,
     OF_THE_SHAFT,
     PHASE_OF,
     PHASES,
+    SAMPLES_PER_PERIOD,
     SLOW_BAND_HZ,
     SLOW_RPM,
     SLOW_VELOCITY,
     VELOCITIES,
     VELOCITY,
+    highest_hz,
 )
 from daqsvc.settings.models import LevelAlarm, SetpointAlarm
 from daqsvc.settings.problems import Finding, choice
@@ -44,7 +47,6 @@ _LEAST_REVOLUTIONS = 2.0
 _LEAST_PERIODS = 2.0
 _SAMPLED = ("proximity", "accelerometer", "velocity")
 _CASING = ("accelerometer", "velocity")
-_ISO_LOW_HZ = 10.0
 
 
 class _Asked(NamedTuple):
@@ -80,6 +82,7 @@ def measure_checks(draft: MachineFile, levels: Levels) -> Iterator[Iterator[Find
                 yield _slow_velocity(draft, levels, asked)
     yield _listed(draft, levels)
     yield _zones(draft, levels)
+    yield _speed_in_band(draft, levels)
 
 
 def _all_asked(draft: MachineFile, levels: Levels) -> Iterator[_Asked]:
@@ -236,7 +239,7 @@ def _zones(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
     """Zones hold for the band of the standard, which depends on the speed."""
     speed_rpm = abs(draft.machine.speed_rpm)
     slow = speed_rpm <= SLOW_RPM
-    wanted_hz = SLOW_BAND_HZ[0] if slow else _ISO_LOW_HZ
+    wanted_hz = SLOW_BAND_HZ[0] if slow else ISO_BAND_HZ[0]
     begins_hz = {VELOCITY: levels.velocity_band_hz[0], SLOW_VELOCITY: SLOW_BAND_HZ[0]}
     band = f"velocity_band_hz = [{wanted_hz:.1f}, {levels.velocity_band_hz[1]:.1f}] in [pipeline.levels]"
     remedy = {
@@ -257,3 +260,57 @@ def _zones(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
                     fatal=False,
                     code=UNFIT_ZONES,
                 )
+
+
+def _speed_in_band(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
+    """An alarm on a velocity sees what happens once a revolution, as an unbalance does."""
+    bands_hz = {VELOCITY: levels.velocity_band_hz, SLOW_VELOCITY: SLOW_BAND_HZ}
+    speed_rpm = abs(draft.machine.speed_rpm)
+    once_hz = speed_rpm / 60.0
+    wanted_hz = (SLOW_BAND_HZ if speed_rpm <= SLOW_RPM else ISO_BAND_HZ)[0]
+    for index, alarm in enumerate(draft.alarms):
+        with suppress(UnusableValueError):
+            if not isinstance(alarm, SetpointAlarm) or alarm.measure not in VELOCITIES:
+                continue
+            low_hz, high_hz = bands_hz[alarm.measure]
+            if low_hz <= once_hz <= high_hz or (alarm.zones is not None and low_hz > wanted_hz):
+                continue  # of such zones `_zones` warns
+            for sensor in draft.sensors:
+                if sensor.name not in alarm.watched or sensor.type not in _CASING:
+                    continue
+                rate_hz = draft.streams[sensor.stream].rate_hz if sensor.stream in draft.streams else 0.0
+                if high_hz >= rate_hz / 2:
+                    continue  # an error already
+                yield Finding(
+                    ("alarms", index, "measure"),
+                    f'does not see 1X: "{alarm.name}" watches {low_hz:g} Hz to {high_hz:g} Hz, and the '
+                    f"machine turns at {once_hz:.4g} Hz ({speed_rpm:g} rpm). An unbalance does not show. "
+                    f'Stream "{sensor.stream}" has rate_hz = {rate_hz:g}',
+                    _remedy_for_1x(alarm.measure, once_hz, bands_hz[alarm.measure], rate_hz, sensor.unit),
+                    fatal=False,
+                    code=BAND_WITHOUT_1X,
+                )
+                break
+
+
+def _remedy_for_1x(
+    measure: str, once_hz: float, band_hz: tuple[float, float], rate_hz: float, unit: str
+) -> str:
+    low_hz, high_hz = band_hz
+    other = f'write another measure, e.g. measure = "rms" with limits of your own in {unit}'
+    if measure == SLOW_VELOCITY or once_hz < SLOW_BAND_HZ[0]:
+        return other
+    if once_hz > highest_hz(rate_hz):
+        least, best = (
+            rounded_up(SAMPLES_PER_PERIOD * one_hz, 3) for one_hz in (max(once_hz, low_hz), ISO_BAND_HZ[1])
+        )
+        return (
+            f"have the device send {least} samples a second or more, and end the band at 0.4 times the rate. "
+            f"Best are {best}, {SAMPLES_PER_PERIOD:g} times the {ISO_BAND_HZ[1]:g} Hz of ISO 20816-3. "
+            f"Or {other}"
+        )
+    begin_hz = (
+        low_hz if low_hz <= once_hz else SLOW_BAND_HZ[0] if once_hz < ISO_BAND_HZ[0] else ISO_BAND_HZ[0]
+    )
+    end_hz = high_hz if once_hz <= high_hz else min(ISO_BAND_HZ[1], highest_hz(rate_hz))
+    return f"write velocity_band_hz = [{begin_hz:.1f}, {end_hz:.1f}] in [pipeline.levels]; or {other}"

@@ -17,7 +17,7 @@ from daqsvc.diagnosis.snapshots import at_once, patience
 from daqsvc.errors.detectors import BAND_TOO_HIGH, WINDOW_TOO_SHORT
 from daqsvc.errors.machine_file import NO_EFFECT, RING_TOO_SHORT
 from daqsvc.rounding import rounded_up
-from daqsvc.settings.measures import PHASE_OF, PHASES, UNITS, VELOCITIES
+from daqsvc.settings.measures import PHASE_OF, PHASES, UNITS, VELOCITIES, VELOCITY
 from daqsvc.settings.models import (
     Accelerometer,
     Keyphasor,
@@ -28,6 +28,7 @@ from daqsvc.settings.models import (
     VelocitySensor,
 )
 from daqsvc.settings.problems import Finding
+from daqsvc.settings.section import UnusableValueError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -92,7 +93,7 @@ class LevelsPlugin(DetectorPlugin[Levels]):
             rate_hz = machine.streams[sensor.stream].rate_hz
             silent_s = patience(machine, sensor.stream, rate_hz).ns / NS_PER_S
             stale_s = max(STALE_S, math.ceil(silent_s))
-            yield from _readings(sensor, stale_s)
+            yield from _readings(sensor, stale_s, velocity=_band_hz(machine, settings, sensor) is not None)
             if isinstance(sensor, TrendValue):
                 continue
             has_phase = _keyphasor_beside(machine, settings, sensor)
@@ -137,7 +138,7 @@ def _of_stream(machine: MachineFile, settings: Levels, stream: str) -> Iterator[
             rate_hz,
             channels,
             window_s=settings.window_s,
-            velocity_band_hz=settings.velocity_band_hz,
+            velocity_band_hz=settings.band_hz(rate_hz, machine.machine.speed_rpm),
             speed_rpm=machine.machine.speed_rpm,
             shaft=shaft,
         )
@@ -225,7 +226,11 @@ def _measured(machine: MachineFile) -> Iterator[Sensor]:
     return (sensor for sensor in machine.sensors if not isinstance(sensor, Keyphasor))
 
 
-def _readings(sensor: Sensor, stale_s: int) -> Iterator[Reading]:
+def _band_hz(machine: MachineFile, settings: Levels, sensor: Sensor) -> tuple[float, float] | None:
+    return settings.band_hz(machine.streams[sensor.stream].rate_hz, machine.machine.speed_rpm)
+
+
+def _readings(sensor: Sensor, stale_s: int, *, velocity: bool) -> Iterator[Reading]:
     detector = f"levels/{sensor.name}"
     if isinstance(sensor, TrendValue):
         yield Reading(detector, "statistics", "value", sensor.unit, stale_s)
@@ -235,12 +240,12 @@ def _readings(sensor: Sensor, stale_s: int) -> Iterator[Reading]:
     if isinstance(sensor, ProximityProbe):
         if sensor.sensitivity_mv_per_unit is not None:
             yield Reading(detector, "statistics", "gap_voltage", "V", stale_s)
-    else:
+    elif velocity:
         yield Reading(detector, "statistics", "velocity_rms", "mm/s", stale_s)
 
 
 def _described(machine: MachineFile, settings: Levels) -> str:
-    casing = [s.name for s in machine.sensors if isinstance(s, Accelerometer | VelocitySensor)]
+    casing = [s for s in machine.sensors if isinstance(s, Accelerometer | VelocitySensor)]
     waveforms = [s for s in machine.sensors if not isinstance(s, Keyphasor | TrendValue)]
     steady = [s.name for s in waveforms if not at_once(machine, s.stream)]
     of_blocks = [s.name for s in waveforms if at_once(machine, s.stream)]
@@ -250,9 +255,11 @@ def _described(machine: MachineFile, settings: Levels) -> str:
         parts.append(f"RMS, peak and crest factor over {settings.window_s:g} s of {', '.join(steady)}")
     if of_blocks:
         parts.append(f"RMS, peak and crest factor over each block of {', '.join(of_blocks)}")
-    if casing:
+    if with_velocity := [s.name for s in casing if _band_hz(machine, settings, s) is not None]:
         low_hz, high_hz = settings.velocity_band_hz
-        parts.append(f"velocity RMS {low_hz:g} to {high_hz:g} Hz of {', '.join(casing)}")
+        parts.append(f"velocity RMS {low_hz:g} to {high_hz:g} Hz of {', '.join(with_velocity)}")
+    if without := [s.name for s in casing if s.name not in with_velocity]:
+        parts.append(f"no velocity RMS of {', '.join(without)}: sampled too slowly for 1X of the machine")
     if settings.measures:
         parts.append(f"{', '.join(settings.measures)} besides")
     if settings.keyphasor is not None:
@@ -329,6 +336,8 @@ def _velocity_band(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
     for sensor in casing:
         rate_hz = _rate_hz(draft, sensor)
         if rate_hz is not None and high_hz >= rate_hz / 2:
+            if _has_no_velocity(draft, levels, sensor):
+                continue
             usable_hz = 0.4 * rate_hz
             remedy = (
                 f"write velocity_band_hz = [{low_hz:.1f}, {usable_hz:.1f}]"
@@ -345,11 +354,30 @@ def _velocity_band(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
             return
 
 
+def _has_no_velocity(draft: MachineFile, levels: Levels, sensor: Sensor) -> bool:
+    """Whether a sensor has no velocity RMS, and needs none; values that are polled are no waveform at all."""
+    stream = draft.streams[sensor.stream]
+    try:
+        watched = any(
+            isinstance(alarm, SetpointAlarm) and alarm.measure == VELOCITY and sensor.name in alarm.watched
+            for alarm in draft.alarms
+        )
+        none = levels.band_hz(stream.rate_hz, draft.machine.speed_rpm) is None
+    except UnusableValueError:
+        return False
+    return none and not watched and not stream.layout.polled
+
+
 def _lowest_frequency(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
     """A window holds the lowest frequency of the velocity band: below, the mean value leaks into it."""
     streams = dict.fromkeys(one.stream for one in draft.sensors if one.type in {"accelerometer", "velocity"})
     low_hz, window_s = levels.velocity_band_hz[0], levels.window_s
-    blocks = {name: draft.streams[name].layout.block for name in streams if name in draft.streams}
+    blocks = {
+        name: draft.streams[name].layout.block
+        for name in streams
+        if name in draft.streams
+        and levels.band_hz(draft.streams[name].rate_hz, draft.machine.speed_rpm) is not None
+    }
     for name, block in blocks.items():
         if block is None:
             continue

@@ -8,7 +8,7 @@ from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
 from daqsvc.errors.machine_file import WRONG_ORDER
-from daqsvc.settings.measures import ListedMeasure  # noqa: TC001 - pydantic reads the annotations
+from daqsvc.settings.measures import ISO_BAND_HZ, ListedMeasure, shows_1x
 from daqsvc.settings.section import Name, Section
 
 
@@ -33,7 +33,11 @@ class Levels(Section):
         default=0.5, description="length of the windows that levels are measured over"
     )
     velocity_band_hz: Annotated[tuple[BandHz, BandHz], AfterValidator(_ordered_band), Field(strict=False)] = (
-        Field(default=(10.0, 1000.0), description="band of the velocity RMS (ISO 20816-3: 10 Hz to 1000 Hz)")
+        Field(
+            default=ISO_BAND_HZ,
+            description="band of the velocity RMS (ISO 20816-3: 10 Hz to 1000 Hz); "
+            "without it, a stream too slow for 1X has none",
+        )
     )
     measures: Annotated[tuple[ListedMeasure, ...], Field(strict=False, max_length=100)] = Field(
         default=(),
@@ -45,3 +49,16 @@ class Levels(Section):
         description="the keyphasor of 1X and 2X; without one they are looked for near machine.speed_rpm",
         examples=["keyphasor"],
     )
+
+    def band_hz(self, rate_hz: float, speed_rpm: float) -> tuple[float, float] | None:
+        """The band of the velocity RMS of a stream; None: it has none, as no band would show the machine.
+
+        Args:
+            rate_hz: sampling rate of the stream.
+            speed_rpm: of the machine.
+        """
+        low_hz, high_hz = self.velocity_band_hz
+        stated = "velocity_band_hz" in self.model_fields_set
+        if stated or high_hz < rate_hz / 2 or shows_1x(rate_hz, speed_rpm, low_hz):
+            return self.velocity_band_hz
+        return None

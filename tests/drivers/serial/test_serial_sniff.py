@@ -864,7 +864,7 @@ def test_new_makes_no_counter_of_a_measured_column(
     given = Given({"bus": "serial", "port": f"{cable.path}"}, defaults=False)
     answers = conduct(file, given, lambda question: f"{question.default}", told.append, lambda *_: heard)
     assert words in told[0]
-    assert answers["notes"] == [f"What was heard does not fit this file: {told[0]}."]
+    assert answers["notes"][0] == f"What was heard does not fit this file: {told[0]}."
 
 
 NAMED = {
