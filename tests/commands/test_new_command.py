@@ -39,7 +39,7 @@ NEEDED = {
     "dbc": f"{DBC}",
     "host": "192.0.2.10",
     "port": "/dev/serial/by-id/usb-logger",
-    "alert": "2.5",
+    "alert": "0.1",
 }
 """Answers to what has no default."""
 PLAIN = st.characters(codec="utf-8", exclude_categories=["C", "Z"])
