@@ -170,7 +170,7 @@ $(PLANTS_VENV)/.ready: requirements-plants.lock
 	@$(PLANTS_VENV)/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes --no-deps -r requirements-plants.lock
 	@touch $@
 
-$(PLANTS)/cases.json: $(PLANTS_VENV)/.ready tests/plants/machines.py tests/plants/simulate.py tests/plants/records.py
+$(PLANTS)/cases.json: $(PLANTS_VENV)/.ready $(addprefix tests/plants/,machines.py bench.py drawn.py simulate.py records.py)
 	@PYTHONPATH=tests $(PLANTS_VENV)/bin/python -m plants.records $(PLANTS)
 
 $(PLANTS)/bank.json: $(PLANTS)/cases.json tests/plants/bank_records.py

@@ -269,11 +269,9 @@ def bank_answers(said: Sequence[BankSaid], snr_db: int) -> list[str]:
     return lines
 
 
-def bank_scored(
-    folder: Path, *, aside: bool, seed: int = 0, snr_db: Sequence[int] = SNR_DB
-) -> list[BankSaid]:
-    """Judge all records of one half."""
+def bank_scored(folder: Path, *, part: str, seed: int = 0, snr_db: Sequence[int] = SNR_DB) -> list[BankSaid]:
+    """Judge all records of one part."""
     cases = json.loads((folder / "bank.json").read_text())
-    jobs = [(case, snr) for case in cases if case["aside"] == aside for snr in snr_db]
+    jobs = [(case, snr) for case in cases if case["part"] == part for snr in snr_db]
     with ProcessPoolExecutor(2) as pool:
         return list(pool.map(partial(judge_bank, folder, seed), jobs, chunksize=11))

@@ -20,8 +20,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from plants.bench import ONSET_REV, Bench
+from plants.drawn import drawn
 from plants.machines import GEOMETRIES, Condition, Geometry, Model, unbalance_force
-from plants.records import ONSET_REV, RUNOUT, Bench
+from plants.records import RUNOUT
 from plants.simulate import Contact, Stage, move, run_through
 
 if TYPE_CHECKING:
@@ -45,7 +47,7 @@ class BankCase:
     Attributes:
         name: of the file.
         geometry: of the machine.
-        aside: whether it belongs to the half that is looked at once.
+        part: of the bench that it belongs to.
         speed_rpm: shaft speed.
         of_critical: the same in parts of the first critical speed.
         fault: what happens: ``healthy``, or a fault of the bank.
@@ -58,7 +60,7 @@ class BankCase:
 
     name: str
     geometry: str
-    aside: bool
+    part: str
     speed_rpm: float
     of_critical: float
     fault: str
@@ -130,7 +132,7 @@ def _kept(folder: Path, b: Bench, fault: str, size: float, stages: list[Stage]) 
         rate_hz=motion.rate_hz,
     )
     return BankCase(
-        name, b.geometry.name, b.geometry.aside, b.speed_rad_s * 30.0 / math.pi, b.of_critical, fault, size,
+        name, b.geometry.name, b.geometry.part, b.speed_rad_s * 30.0 / math.pi, b.of_critical, fault, size,
         1e6 * b.whirl_m, 1e6 * (abs(b.rest_probe) + CLEARANCE * b.whirl_m), b.critical[0] / (2.0 * math.pi),
         b.critical[1],
     )  # fmt: skip
@@ -181,8 +183,9 @@ def main(arguments: list[str]) -> int:
     """Write all records."""
     folder = Path(arguments[0])
     folder.mkdir(parents=True, exist_ok=True)
+    geometries = (*GEOMETRIES, *drawn())
     with ProcessPoolExecutor(2) as pool:
-        made = pool.map(_of_geometry, [folder] * len(GEOMETRIES), GEOMETRIES)
+        made = pool.map(_of_geometry, [folder] * len(geometries), geometries)
         cases = [case for of_one in made for case in of_one]
     (folder / "bank.json").write_text(json.dumps([asdict(case) for case in cases], indent=1) + "\n")
     print(f"{len(cases)} records for the bank in {folder}")  # noqa: T201

@@ -25,18 +25,18 @@ def interval(true: int, count: int) -> tuple[float, float]:
     return max(0.0, middle - half), min(1.0, middle + half)
 
 
-def draw(halves: Mapping[str, Sequence[tuple[float, bool]]], path: Path) -> None:
+def draw(parts: Mapping[str, Sequence[tuple[float, bool]]], path: Path) -> None:
     """Draw how often names are true over the probability that they were given with.
 
     Args:
-        halves: by what they are called, probability and truth of every name.
+        parts: by what they are called, probability and truth of every name.
         path: of the SVG.
     """
     with mpl.rc_context({"svg.hashsalt": "plants", "svg.fonttype": "none", "font.size": 9}):
         figure = Figure(figsize=(4.6, 3.6), layout="constrained")
         axes = figure.add_subplot()
         axes.plot([0, 1], [0, 1], color="0.7", linewidth=1, label="probabilities that hold")
-        for color, (half, names) in zip(("#1f6fb4", "#c8501e"), halves.items(), strict=False):
+        for color, (part, names) in zip(("#1f6fb4", "#c8501e"), parts.items(), strict=False):
             points = []
             for low, high in pairwise(_EDGES):
                 at = [(p, right) for p, right in names if low <= p < high]
@@ -57,7 +57,7 @@ def draw(halves: Mapping[str, Sequence[tuple[float, bool]]], path: Path) -> None
                 markersize=4,
                 capsize=2,
                 linewidth=1,
-                label=half,
+                label=part,
             )
             for i, (x_at, y_at, count) in enumerate(zip(x, y, counts, strict=True)):
                 axes.annotate(

@@ -81,7 +81,7 @@ class Geometry:
 
     Attributes:
         name: of the geometry.
-        aside: whether it is of the half that is looked at once, at the end.
+        part: of the bench that it belongs to: ``tuned``, ``set aside`` or ``drawn``.
         shaft: length and diameter of each element, m.
         discs: node, width and diameter of each, m.
         supports: what carries it.
@@ -94,7 +94,7 @@ class Geometry:
     """
 
     name: str
-    aside: bool
+    part: str
     shaft: tuple[tuple[float, float], ...]
     discs: tuple[tuple[int, float, float], ...]
     supports: tuple[Support, ...]
@@ -123,7 +123,7 @@ def _spring(node: int, x: float, y: float, damping: float) -> Support:
 GEOMETRIES = (
     Geometry(
         name="between bearings",
-        aside=False,
+        part="tuned",
         shaft=_even(0.6, 8, 0.03),
         discs=((4, 0.05, 0.20),),
         supports=(_spring(0, 6e6, 6e6, 1.6e4), _spring(8, 6e6, 6e6, 1.6e4)),
@@ -135,7 +135,7 @@ GEOMETRIES = (
     ),
     Geometry(
         name="overhung",
-        aside=False,
+        part="tuned",
         shaft=_even(0.7, 10, 0.04),
         discs=((10, 0.04, 0.24),),
         supports=(_spring(1, 1.5e7, 1.5e7, 1.5e4), _spring(6, 8e6, 8e6, 1.8e4)),
@@ -147,7 +147,7 @@ GEOMETRIES = (
     ),
     Geometry(
         name="journals on pedestals",
-        aside=False,
+        part="tuned",
         shaft=_even(1.2, 12, 0.06),
         discs=((4, 0.05, 0.30), (8, 0.05, 0.30)),
         supports=tuple(
@@ -168,7 +168,7 @@ GEOMETRIES = (
     ),
     Geometry(
         name="anisotropic supports",
-        aside=False,
+        part="tuned",
         shaft=_even(0.8, 8, 0.035),
         discs=((3, 0.05, 0.22),),
         supports=(_spring(0, 4e6, 7e6, 1e4), _spring(8, 4e6, 7e6, 1e4)),
@@ -180,7 +180,7 @@ GEOMETRIES = (
     ),
     Geometry(
         name="off centre",
-        aside=True,
+        part="set aside",
         shaft=_even(0.7, 10, 0.032),
         discs=((3, 0.04, 0.22),),
         supports=(_spring(0, 7e6, 7e6, 1.5e4), _spring(10, 4e6, 4e6, 1.2e4)),
@@ -192,7 +192,7 @@ GEOMETRIES = (
     ),
     Geometry(
         name="two discs",
-        aside=True,
+        part="set aside",
         shaft=_even(0.9, 12, 0.04),
         discs=((4, 0.05, 0.24), (9, 0.03, 0.20)),
         supports=(_spring(0, 8e6, 8e6, 1.6e4), _spring(12, 8e6, 8e6, 1.6e4)),
@@ -204,7 +204,7 @@ GEOMETRIES = (
     ),
     Geometry(
         name="long rotor on journals",
-        aside=True,
+        part="set aside",
         shaft=_even(1.6, 16, 0.075),
         discs=((5, 0.06, 0.32), (8, 0.06, 0.36), (11, 0.06, 0.32)),
         supports=tuple(
@@ -225,7 +225,7 @@ GEOMETRIES = (
     ),
     Geometry(
         name="overhung on soft supports",
-        aside=True,
+        part="set aside",
         shaft=_even(0.8, 10, 0.045),
         discs=((10, 0.05, 0.26), (4, 0.03, 0.18)),
         supports=(_spring(0, 1.5e7, 2.2e7, 1.5e4), _spring(7, 8e6, 1.2e7, 2e4)),

@@ -18,16 +18,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from plants.machines import (
-    GEOMETRIES,
-    GRAVITY_M_S2,
-    Condition,
-    Geometry,
-    Machine,
-    Model,
-    stable,
-    unbalance_force,
-)
+from plants.bench import ONSET_REV, Bench
+from plants.drawn import drawn
+from plants.machines import GEOMETRIES, GRAVITY_M_S2, Geometry, Machine, Model, stable
 from plants.simulate import PER_REV, Contact, Crack, Loose, Motion, Stage, move
 
 if TYPE_CHECKING:
@@ -37,14 +30,11 @@ if TYPE_CHECKING:
 
     Complexes = NDArray[np.complex128]
 
-ONSET_REV = 90
 REVOLUTIONS = 250
 HEALTHY_REVOLUTIONS = 700
-_RAMP_STEPS = 16
 RUNOUT = 0.05
 """Of the healthy whirl, in harmonics 1 to 3."""
 DRIFT_UM = 1.0
-_LARGEST_WHIRL_M = 60e-6
 _STOPPED = 15.0
 """No machine goes on with an orbit so many times the healthy one."""
 HUNTING = 0.01
@@ -57,7 +47,7 @@ class Case:
     Attributes:
         name: of the file.
         geometry: of the machine.
-        aside: whether it belongs to the half that is looked at once.
+        part: of the bench that it belongs to.
         speed_rpm: mean shaft speed.
         of_critical: the same in parts of the first critical speed.
         fault: what happens.
@@ -72,7 +62,7 @@ class Case:
 
     name: str
     geometry: str
-    aside: bool
+    part: str
     speed_rpm: float
     of_critical: float
     fault: str
@@ -83,68 +73,6 @@ class Case:
     clearance_um: float
     moved: float
     speed_hunts: bool
-
-
-class Bench:
-    """One geometry at one speed, with its healthy motion."""
-
-    def __init__(self, model: Model, of_critical: float, critical: tuple[float, float]) -> None:
-        self.model, self.geometry = model, model.geometry
-        self.of_critical, self.critical = of_critical, critical
-        self.speed_rad_s = of_critical * critical[0]
-        self.healthy = model.machine(Condition(), self.speed_rad_s)
-        self.unbalance = unbalance_force(self.healthy, self.geometry, self.speed_rad_s)
-        # A machine that runs near its critical speed is balanced for it.
-        self.unbalance *= min(1.0, _LARGEST_WHIRL_M / self.seen(self.unbalance, 1))
-        q = self._response(self.unbalance)
-        self.orbit_rub = q @ self.healthy.places["rub x"], q @ self.healthy.places["rub y"]
-        self.whirl_rub_m = float(max(abs(part) for part in self.orbit_rub))
-        self.rest_rub, self.rest_probe = self._rest("rub"), self._rest("probe")
-        self.whirl_m = self.seen(self.unbalance, 1)
-        self.clearance_um = 1e6 * (2.0 * abs(self._rest("probe")) + 5.0 * self.whirl_m)
-
-    def _rest(self, place: str) -> complex:
-        return complex(*(self.healthy.rest @ self.healthy.places[f"{place} {axis}"] for axis in "xy"))
-
-    def _response(self, force: Complexes, order: int = 1) -> Complexes:
-        m, w = self.healthy, order * self.speed_rad_s
-        damping = m.damping * 1j * w
-        return np.asarray(np.linalg.solve(m.stiffness - w**2 * m.mass + damping, force))
-
-    def seen(self, force: Complexes, order: int) -> float:
-        """Size of what the probes see of a force that turns at so many times the shaft speed, m."""
-        q = self._response(force, order)
-        x, y = q @ self.healthy.places["probe x"], q @ self.healthy.places["probe y"]
-        return float(np.hypot(abs(x + 1j * y), abs(x - 1j * y)) / 2.0)
-
-    def machine(self, **changes: object) -> Machine:
-        """The machine in another condition."""
-        return self.model.machine(Condition(**changes), self.speed_rad_s)
-
-    def turning(self, once: Complexes | None = None, twice: Complexes | None = None) -> Complexes:
-        """Forces at 0, 1 and 2 times the shaft speed: the residual unbalance, and what is added."""
-        forces = np.zeros((3, len(self.unbalance)), dtype=np.complex128)
-        forces[1] = self.unbalance if once is None else self.unbalance + once
-        if twice is not None:
-            forces[2] = twice
-        return forces
-
-    def stage(self, begin_rev: float, machine: Machine | None = None, **parts: object) -> Stage:
-        """A stage with the residual unbalance."""
-        turning = parts.pop("turning", None)
-        return Stage(
-            begin_rev=begin_rev,
-            machine=machine or self.healthy,
-            turning=self.turning() if turning is None else turning,
-            **parts,
-        )
-
-    def ramp(self, machine: Callable[[float], Machine], revolutions: float) -> list[Stage]:
-        """Stages from healthy to a fault, by parts of it; all at once if it takes no time."""
-        if not revolutions:
-            return [self.stage(ONSET_REV, machine(1.0))]
-        steps = np.arange(1, _RAMP_STEPS + 1) / _RAMP_STEPS
-        return [self.stage(ONSET_REV + revolutions * part, machine(float(part))) for part in steps]
 
 
 Fault = tuple[float, list[Stage]]
@@ -351,7 +279,7 @@ def _recorded(folder: Path, b: Bench, fault: str, copy: int) -> Case | None:
         rate_hz=motion.rate_hz,
     )
     return Case(
-        name, b.geometry.name, b.geometry.aside, b.speed_rad_s * 30.0 / math.pi, b.of_critical, fault,
+        name, b.geometry.name, b.geometry.part, b.speed_rad_s * 30.0 / math.pi, b.of_critical, fault,
         float(ONSET_REV), size, b.critical[0] / (2.0 * math.pi), b.critical[1], b.clearance_um,
         0.0 if healthy else float(np.sqrt((np.abs(after - before) ** 2).sum())) / whirl, hunts,
     )  # fmt: skip
@@ -377,11 +305,12 @@ def main(arguments: list[str]) -> int:
     """Write all records."""
     folder = Path(arguments[0])
     folder.mkdir(parents=True, exist_ok=True)
+    geometries = (*GEOMETRIES, *drawn())
     with ProcessPoolExecutor(2) as pool:
-        made = pool.map(_of_geometry, [folder] * len(GEOMETRIES), GEOMETRIES)
+        made = pool.map(_of_geometry, [folder] * len(geometries), geometries)
         cases = [case for of_one in made for case in of_one]
     (folder / "cases.json").write_text(json.dumps([asdict(case) for case in cases], indent=1) + "\n")
-    print(f"{len(cases)} records of {len(GEOMETRIES)} machines in {folder}")  # noqa: T201
+    print(f"{len(cases)} records of {len(geometries)} machines in {folder}")  # noqa: T201
     return 0
 
 

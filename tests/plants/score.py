@@ -258,10 +258,10 @@ def _summed(
 
 
 def scored(
-    folder: Path, *, aside: bool, seed: int = 0, snr_db: Sequence[int] = SNR_DB, run_up: bool = False
+    folder: Path, *, part: str, seed: int = 0, snr_db: Sequence[int] = SNR_DB, run_up: bool = False
 ) -> list[Said]:
-    """Judge all records of one half, with or without what the run-ups show."""
+    """Judge all records of one part, with or without what the run-ups show."""
     cases = json.loads((folder / "cases.json").read_text())
-    jobs = [(case, snr) for case in cases if case["aside"] == aside for snr in snr_db]
+    jobs = [(case, snr) for case in cases if case["part"] == part for snr in snr_db]
     with ProcessPoolExecutor(2) as pool:
         return list(pool.map(partial(judge, folder, seed, run_up=run_up), jobs, chunksize=8))

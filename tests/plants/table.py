@@ -1,8 +1,9 @@
 """Write the tables of docs/plants.md anew: what the product says of machines that nobody modelled.
 
-    python -m plants.table FOLDER [--aside] [--seed N]
+    python -m plants.table FOLDER [--aside | --drawn] [--seed N]
 
-Without ``--aside`` of the half of the geometries that thresholds were chosen with, the other at the end.
+Without either of the half of the geometries that thresholds were chosen with; ``--aside`` of the other half,
+``--drawn`` of the machines that were drawn by lot.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 
 PAGE = Path(__file__).parents[2] / "docs" / "plants.md"
 BEGIN, END = "<!-- table: make bench-diagnosis ({}) -->", "<!-- end of table ({}) -->"
+_PARTS = {"aside": "set aside", "drawn": "drawn"}
+_CALLED = {"tuned": "tuned half", "set aside": "set aside half", "drawn": "drawn machines"}
 _BINS = (0.0, 0.5, 0.7, 0.9, 0.99, 1.01)
 
 
@@ -97,20 +100,25 @@ def main(arguments: Sequence[str]) -> int:
     """Judge, print and write."""
     parser = argparse.ArgumentParser(prog="make bench-diagnosis", description="Write docs/plants.md anew.")
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--aside", action="store_true", help="the half that is looked at once, at the end")
+    parser.set_defaults(part="tuned")
+    parts = parser.add_mutually_exclusive_group()
+    for name, what in (("aside", "the half that was set aside"), ("drawn", "the machines drawn by lot")):
+        parts.add_argument(f"--{name}", dest="part", action="store_const", const=_PARTS[name], help=what)
     parser.add_argument("--seed", type=int, default=0, help="of the noise, and of what is stated wrongly")
     options = parser.parse_args(arguments)
-    half = "set aside" if options.aside else "tuned"
-    bank = bank_scored(options.folder, aside=options.aside, seed=options.seed)
-    _put(f"bank, {half}", [bank_summary(bank), *(bank_answers(bank, snr) for snr in SNR_DB)], options.seed)
+    part, seed = options.part, options.seed
+    bank = bank_scored(options.folder, part=part, seed=seed)
+    _put(f"bank, {part}", [bank_summary(bank), *(bank_answers(bank, snr) for snr in SNR_DB)], seed)
     names = {}
-    for run_up, place in ((False, half), (True, f"{half}, run-up")):
-        said = scored(options.folder, aside=options.aside, seed=options.seed, run_up=run_up)
-        _put(place, [summary(said), reliability(said), *(answers(said, snr) for snr in SNR_DB)], options.seed)
+    for run_up, place in ((False, part), (True, f"{part}, run-up")):
+        said = scored(options.folder, part=part, seed=seed, run_up=run_up)
+        _put(place, [summary(said), reliability(said), *(answers(said, snr) for snr in SNR_DB)], seed)
         known = "with a run-up" if run_up else "as stated"
-        names[f"{half} half, {known}"] = [(certain(s), s.decision in s.true_names) for s in first_names(said)]
-    if not options.seed:
-        draw(names, PAGE.with_name(f"plants-{half.replace(' ', '-')}.svg"))
+        names[f"{_CALLED[part]}, {known}"] = [
+            (certain(s), s.decision in s.true_names) for s in first_names(said)
+        ]
+    if not seed:
+        draw(names, PAGE.with_name(f"plants-{part.replace(' ', '-')}.svg"))
     return 0
 
 

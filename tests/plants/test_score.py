@@ -62,19 +62,19 @@ def record(folder, name, step_um, revolutions=160, onset=90):
 
 def test_records_are_judged_from_raw_channels(tmp_path):
     case = {
-        "geometry": "pump", "aside": False, "speed_rpm": SPEED_RPM, "of_critical": 0.8, "onset_rev": 90.0,
+        "geometry": "pump", "part": "tuned", "speed_rpm": SPEED_RPM, "of_critical": 0.8, "onset_rev": 90.0,
         "size": 1.0, "critical_hz": 62.0, "damping_ratio": 0.1, "clearance_um": 400.0, "moved": 0.7,
         "speed_hunts": False,
     }  # fmt: skip
     cases = [
         {**case, "name": "loaded", "fault": "static load"},
         {**case, "name": "well", "fault": "healthy"},
-        {**case, "name": "hidden", "fault": "static load", "aside": True},
+        {**case, "name": "hidden", "fault": "static load", "part": "drawn"},
     ]
     (tmp_path / "cases.json").write_text(json.dumps(cases))
     record(tmp_path, "loaded", 15.0)
     record(tmp_path, "well", 0.0)
-    loaded, well = scored(tmp_path, aside=False, snr_db=(20,))
+    loaded, well = scored(tmp_path, part="tuned", snr_db=(20,))
     assert loaded.right
     assert loaded.delay == pytest.approx(1.0, abs=1.5)
     assert (loaded.alarms_before, loaded.revolutions_before) == (0, 40.0)
@@ -85,5 +85,5 @@ def test_records_are_judged_from_raw_channels(tmp_path):
     # A change that comes before it is said to have come is a false alarm.
     cases[0]["onset_rev"] = 150.0
     (tmp_path / "cases.json").write_text(json.dumps(cases[:1]))
-    (early,) = scored(tmp_path, aside=False, snr_db=(20,))
+    (early,) = scored(tmp_path, part="tuned", snr_db=(20,))
     assert early.alarms_before == 1
