@@ -7,7 +7,6 @@ in the group ``daqsvc.questions``, under the word that ``--bus`` takes.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -18,12 +17,19 @@ from drivers.toml_lines import entry
 
 if TYPE_CHECKING:
     import threading
-    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
 BUS, STREAM = "main", "device"
 """Names of the only bus and the only stream of the file."""
 BEFOREHAND = "beforehand"
 """Key, beside the answers that `BusQuestions.listen` gets, of those that were given beforehand."""
+TYPE_OF_UNIT = {
+    "g": "accelerometer",
+    "m/s2": "accelerometer",
+    "mm/s": "velocity",
+    **dict.fromkeys(("um", "mm", "mil"), "proximity"),
+}
+"""Type of a sensor by the unit of its samples, if they are a waveform."""
 _BY_ID = Path("/dev/serial/by-id")
 
 SHARED = {
@@ -50,41 +56,63 @@ SHARED = {
 """What is asked about buses of several kinds."""
 
 
-@dataclass(frozen=True, slots=True)
-class Heard:
-    """What was found on a bus.
+class Heard(ABC):
+    """What was found on a bus; a driver overrides what it knows of it.
+
+    In all methods ``answers`` are those so far. ``taken`` are the keys of those that are nothing but a
+    default, be it proposed or not; ``assumed`` are the keys of those of them that were not proposed.
 
     Attributes:
         lines: what it is, for a person; a few lines.
-        proposals: answers by the key of their question, as they would be typed, that fit the answers so far;
-            one that cannot be used is not offered.
         missed: what is looked for and was not there, so that an answer before may have to be corrected, with
             its remedy; empty if all was there. Without a person, ``daqsvc new`` then writes nothing.
-        unheard: the same of the answers so far: what they state and was not heard.
-        notes: sentences for the file, of all answers and of the keys of those that are nothing but a default:
-            what of them listening cannot show.
-        guesses: sentences for the file, of all answers and of the keys of those that are a proposal or a
-            default: what of them is a guess, although something was heard.
-        not_read: what was heard and is not in the file by the answers, a sentence in each line; empty if it
-            all is.
-        not_offered: choices by the key of their question that a person is not shown, as what was heard shows
-            that they are wrong.
-        unknown: what must be answered because nothing that was heard shows it, with its remedy; empty if
-            all is known. It is made of the same as `notes`. Without a person, ``daqsvc new`` then writes
-            nothing.
-        beside: by the key of a question, what was heard of its proposal, for a person to judge it.
     """
 
-    lines: Sequence[str]
-    proposals: Callable[[Answers], Mapping[str, str]]
-    missed: str = ""
-    unheard: Callable[[Answers], str] = lambda _answers: ""
-    notes: Callable[[Answers, Collection[str]], Sequence[str]] = lambda _answers, _assumed: ()
-    not_read: Callable[[Answers], str] = lambda _answers: ""
-    not_offered: Callable[[Answers], Mapping[str, Collection[str]]] = lambda _answers: {}
-    unknown: Callable[[Answers, Collection[str]], str] = lambda _answers, _assumed: ""
-    guesses: Callable[[Answers, Collection[str]], Sequence[str]] = lambda _answers, _taken: ()
-    beside: Callable[[Answers], Mapping[str, str]] = lambda _answers: {}
+    def __init__(self, lines: Sequence[str], missed: str = "") -> None:
+        self.lines, self.missed = lines, missed
+
+    @abstractmethod
+    def proposals(self, answers: Answers) -> Mapping[str, str]:
+        """Answers by the key of their question, as they would be typed, that fit the answers so far.
+
+        One that cannot be used is not offered.
+        """
+
+    def beside(self, answers: Answers) -> Mapping[str, str]:
+        """By the key of a question, what was heard of its proposal, for a person to judge it."""
+        del answers
+        return {}
+
+    def not_offered(self, answers: Answers) -> Mapping[str, Collection[str]]:
+        """Choices, by the key of their question, that what was heard shows to be wrong."""
+        del answers
+        return {}
+
+    def unheard(self, answers: Answers) -> str:
+        """What the answers state and was not heard, with its remedy; empty if it may have been.
+
+        Without a person, ``daqsvc new`` then writes nothing.
+        """
+        del answers
+        return ""
+
+    def unknown(self, answers: Answers, assumed: Collection[str]) -> str:
+        """What must be answered because nothing that was heard shows it, with its remedy.
+
+        Empty if all is known. Without a person, ``daqsvc new`` then writes nothing.
+        """
+        del answers, assumed
+        return ""
+
+    def notes(self, answers: Answers, assumed: Collection[str], taken: Collection[str]) -> Iterable[str]:
+        """Sentences for the file, of all answers: what was heard of it, and what of it is a guess."""
+        del answers, assumed, taken
+        return ()
+
+    def not_read(self, answers: Answers) -> Iterable[str]:
+        """Sentences for the file, of all answers: what was heard and is not in it."""
+        del answers
+        return ()
 
 
 class BusQuestions(ABC):

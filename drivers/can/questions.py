@@ -7,34 +7,27 @@ from abc import abstractmethod
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from daqsvc.rounding import counted
 from drivers import packed_questions as packed
 from drivers import questions as q
-from drivers.bus_questions import BUS, BusQuestions, Heard, seconds_of
+from drivers.bus_questions import BUS, BusQuestions, seconds_of
+from drivers.can.heard import LAST_SHORT_ID, OF_BYTES, HeardFrames
 from drivers.can.sniff import CanSniffer
 from drivers.questions import Answers, Question, Topic
-from drivers.sniffing import (
-    NothingFoundError,
-    SniffError,
-    sniffed,
-    span,
-    usual_rate,
-)
+from drivers.sniffing import NothingFoundError, SniffError, sniffed
 from drivers.toml_lines import Hexadecimal, entry
 
 if TYPE_CHECKING:
     import threading
-    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterator, Mapping
+
+    from drivers.can.heard import HeardOnCan
 
 
 _SOCKETCAN = "socketcan"
 _RATES_HZ = (2560.0, 1280.0, 640.0, 100.0, 10.0)
 _MOST_FRAMES_HZ = 500.0
 """Of a default: a CAN bus of 500 kbit/s has time for some 4000 short frames a second."""
-_LAST_SHORT_ID = 0x7FF
-"""Of 11 bits; a higher id has 29."""
 _LISTEN_S = 5.0
-SHOWN = 8
 
 
 def _interface(text: str) -> str:
@@ -77,7 +70,7 @@ class CanQuestions(BusQuestions):
 
     def listen(
         self, answers: Answers, folder: Path, stop: threading.Event, tell: Callable[[str], None]
-    ) -> Heard:
+    ) -> HeardOnCan:
         """See `BusQuestions.listen`."""
         words = ["--interface", answers["interface"], *seconds_of(answers)]
         if "dbc" in answers:
@@ -93,61 +86,16 @@ class CanQuestions(BusQuestions):
             if answers["interface"] == "socketcan":
                 raise
             found = sniffed(CanSniffer(_LISTEN_S), [*words, *line], stop, tell)
-        return Heard(
-            list(_in_words(found)),
-            lambda so_far: self._proposals(found, so_far),
-            self.missed(found, answers),
-            lambda so_far: self.unheard(found, so_far),
-            lambda so_far, assumed: self.notes(found, so_far, assumed),
-            lambda so_far: self.not_read(found, so_far),
-            lambda so_far: self.not_offered(found, so_far),
-            lambda so_far, assumed: self.unknown(found, so_far, assumed),
-            self.guesses,
-        )
-
-    def _proposals(self, found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
-        fd = any(one["fd"] for one in found["ids"])
-        proposed = {"fd": "yes" if fd else "no", **self.proposals(found, answers)}
-        rates = {"bitrate": found["bitrate"], "data-bitrate": found["data_bitrate"]}
-        return proposed | {key: f"{rate}" for key, rate in rates.items() if rate is not None}
+        return self.heard(found, answers)
 
     @abstractmethod
-    def proposals(self, found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
-        """Those that are about frames; see `Heard.proposals`."""
+    def heard(self, found: Mapping[str, Any], answers: Answers) -> HeardOnCan:
+        """What the frames that were heard show of the answers behind `listens_behind`.
 
-    def missed(self, found: Mapping[str, Any], answers: Answers) -> str:
-        """See `Heard.missed`."""
-        del found, answers
-        return ""
-
-    @abstractmethod
-    def unheard(self, found: Mapping[str, Any], answers: Answers) -> str:
-        """See `Heard.unheard`."""
-
-    def notes(self, found: Mapping[str, Any], answers: Answers, assumed: Collection[str]) -> Sequence[str]:
-        """See `Heard.notes`."""
-        del found, answers, assumed
-        return ()
-
-    def not_offered(self, found: Mapping[str, Any], answers: Answers) -> Mapping[str, Collection[str]]:
-        """See `Heard.not_offered`."""
-        del found, answers
-        return {}
-
-    def unknown(self, found: Mapping[str, Any], answers: Answers, assumed: Collection[str]) -> str:
-        """See `Heard.unknown`."""
-        del found, answers, assumed
-        return ""
-
-    def guesses(self, answers: Answers, taken: Collection[str]) -> Sequence[str]:
-        """See `Heard.guesses`."""
-        del answers, taken
-        return ()
-
-    def not_read(self, found: Mapping[str, Any], answers: Answers) -> str:
-        """See `Heard.not_read`."""
-        del found, answers
-        return ""
+        Args:
+            found: figures of `CanSniffer`.
+            answers: those before.
+        """
 
     def _interface(self) -> Iterator[Question]:
         yield self.ask("interface", _interface, _SOCKETCAN, quiet=True)
@@ -220,71 +168,14 @@ class PackedQuestions(CanQuestions):
         del channel
         return packed.in_volts(answers)
 
-    def proposals(self, found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
-        """See `Heard.proposals`."""
-        ids = [
-            one
-            for one in found["ids"]
-            if one["rate_hz"] and not one["remote"] and one["extended"] == (one["id"] > _LAST_SHORT_ID)
-        ]
-        if not ids:
-            return {}
-        best = max(ids, key=lambda one: (one["counter"] is not None, one["rate_hz"]))
-        proposed = {"id": f"{best['id']:#x}"}
-        chosen = next((one for one in ids if one["id"] == answers.get("id", best["id"])), None)
-        if chosen is None:
-            return proposed
-        length = max(chosen["lengths"])
-        proposed |= packed.frame_proposals(length, chosen["counter"], answers) | {"length": f"{length}"}
-        if "samples-per-frame" in answers:
-            proposed["rate"] = f"{usual_rate(chosen['rate_hz'] * answers['samples-per-frame']):g}"
-        return proposed
-
-    def unheard(self, found: Mapping[str, Any], answers: Answers) -> str:
-        """See `Heard.unheard`."""
-        heard = [one["id"] for one in found["ids"]]
-        if answers.get("id", heard[0]) in heard:
-            return ""
-        others = ", ".join(f"{one:#x}" for one in heard[:SHOWN])
-        return f"{answers['id']:#x} was not heard. Remedy: correct --id; those that come: {others}"
-
-    def notes(self, found: Mapping[str, Any], answers: Answers, assumed: Collection[str]) -> Sequence[str]:
-        """See `Heard.notes`: of the layout, what is neither heard nor answered."""
-        if _OF_BYTES.intersection(assumed):
-            return ()  # all of it is an example then
-        guessed = _PLACES.keys() & set(assumed) - self.proposals(found, answers).keys()
-        if packed.RAW_BYTES[answers["raw-type"]] == 1:
-            guessed -= {"byte-order"}
-        places = [_PLACES[key].format(answers[key]) for key in _PLACES if key in guessed]
-        if sensors := [one for one in self.channels(answers) if q.sensor_key(one, "type") in assumed]:
-            places.append(f"which sensors are on {', '.join(sensors[:SHOWN])} (--sensor {sensors[0]}.type=)")
-        return (
-            (f"Neither heard nor answered: {'; '.join(places)}. See the device's manual.",) if places else ()
-        )
-
-    def guesses(self, answers: Answers, taken: Collection[str]) -> Sequence[str]:
-        """See `Heard.guesses`: a frame shows its bytes, and not what they mean."""
-        if "channels" not in taken:
-            return ()
-        return (f"The bytes of {answers['id']:#x} are not known: these channels are an example.",)
-
-    def unknown(self, found: Mapping[str, Any], answers: Answers, assumed: Collection[str]) -> str:
-        """See `Heard.unknown`."""
+    def heard(self, found: Mapping[str, Any], answers: Answers) -> HeardOnCan:
+        """See `CanQuestions.heard`."""
         del answers
-        if not _OF_BYTES.intersection(assumed):
-            return ""
-        heard = [line.strip() for line in _of_ids(found)]
-        more = len(found["ids"]) - len(heard)
-        return (
-            f"no frame states which of its bytes are which value. Heard: {'; '.join(heard)}"
-            f"{f'; and {more} more' if more else ''}. Remedy: give the DBC file of the device, with --bus "
-            "can-dbc --dbc; or give --channels, --raw-type and --scale as its manual states them, or answer "
-            "the questions in a terminal, without --yes; daqsvc sniff can shows the frames"
-        )
+        return HeardFrames(found, self.channels)
 
     def example(self, answers: Answers, assumed: Collection[str]) -> str:
         """See `BusQuestions.example`."""
-        if not {"id", *_OF_BYTES}.intersection(assumed):
+        if not {"id", *OF_BYTES}.intersection(assumed):
             return ""
         return (
             f"The frames are an example: nothing was heard, and nobody has stated what the bytes of "
@@ -297,20 +188,10 @@ class PackedQuestions(CanQuestions):
         yield from self._bus(answers)
         yield from self.stream(answers)
         yield entry("id", Hexadecimal(answers["id"]), "CAN id of the frames; candump shows those on the bus")
-        if answers["id"] > _LAST_SHORT_ID:
+        if answers["id"] > LAST_SHORT_ID:
             yield entry("extended", value=True, comment="an id of 29 bits")
         yield entry("length", answers["length"], "bytes of a frame")
         yield from packed.layout_lines(answers)
-
-
-_OF_BYTES = frozenset({"channels", "raw-type", "scale"})
-"""Questions that say what the bytes of a frame mean, which no frame shows."""
-_PLACES = {
-    "first-byte": "the byte where samples begin, {} (--first-byte)",
-    "byte-order": "the byte order, {} (--byte-order)",
-    "samples-per-frame": "how many samples of a channel a frame has, {} (--samples-per-frame)",
-}
-"""Questions that say where samples lie; their defaults are the usual ones."""
 
 
 class VirtualQuestions(PackedQuestions):
@@ -353,48 +234,3 @@ class VirtualQuestions(PackedQuestions):
         yield entry("channel", answers["socket"], "path of its socket")
         yield entry("fd", value=True)
         yield ""
-
-
-def decoded_signals(found: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """Messages of the DBC file whose signals were heard."""
-    return [one for one in found["dbc"]["messages"] if one["signals"]]
-
-
-def values_heard(signals: Sequence[Mapping[str, Any]]) -> str:
-    """The values of some signals as they were heard."""
-    shown = [
-        f"{one['signal']} {span(one['min'], one['max'])}{f' {unit}' if (unit := one['unit']) else ''}"
-        for one in signals[:SHOWN]
-    ]
-    return "; ".join(shown) + (f"; and {len(signals) - SHOWN} more" if len(signals) > SHOWN else "")
-
-
-def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
-    """What was heard, in a few lines: the ids that come most often."""
-    ids = sorted(found["ids"], key=lambda one: -(one["rate_hz"] or 0.0))
-    yield f"{counted(found['frames'], 'frame')} of {counted(len(ids), 'id')}:"
-    yield from _of_ids(found, values=True)
-    if len(ids) > SHOWN:
-        yield f"  ... and {len(ids) - SHOWN} more: daqsvc sniff can shows them"
-
-
-def _of_ids(found: Mapping[str, Any], *, values: bool = False) -> Iterator[str]:
-    """The ids that come most often: how long their frames are, how often they come, with which values."""
-    by_message = (
-        {one["message"]: one["signals"] for one in decoded_signals(found)}
-        if values and "dbc" in found
-        else {}
-    )
-    ids = sorted(found["ids"], key=lambda one: -(one["rate_hz"] or 0.0))
-    for one in ids[:SHOWN]:
-        lengths = ", ".join(map(str, one["lengths"]))
-        rate = "once" if one["rate_hz"] is None else f"{one['rate_hz']:.4g} a second"
-        counter, message = one["counter"], one["message"]
-        counts = f", byte {counter['byte']} counts" if counter else ""
-        if message is None and "dbc" in found:
-            message = "not in the DBC file"
-        yield f"  {one['id']:#x}: {lengths} bytes, {rate}{counts}{f', {message}' if message else ''}"
-        signals = by_message.pop(message, [])
-        if signals:
-            yield f"    {values_heard(signals)}"
-        yield from (f"    {signal['doubt']}" for signal in signals if signal["doubt"])

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from drivers.bus_questions import (
-    Heard,
-    guessed_sensors,
-)
+from drivers.bus_questions import Heard, guessed_sensors
 from drivers.modbus.manual_addresses import manual_note, table_meant
 from drivers.modbus.sniff import AUTO, registers_of
-from drivers.modbus.values_heard import SHOWN, values_heard
+from drivers.modbus.values_heard import SHOWN, in_register, values_heard
 from drivers.questions import Answers, sensor_key
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
 
 TABLES = {3: "holding", 4: "input"}
@@ -76,17 +73,206 @@ def in_words(found: Mapping[str, Any], timeout_ms: float) -> Iterator[str]:
             yield f"  ... and {len(shown) - SHOWN} more: daqsvc sniff modbus shows them"
 
 
-def place(found: Mapping[str, Any], answers: Answers) -> tuple[dict[str, str], list[Mapping[str, Any]]]:
-    """The unit and the table to propose, and what was found of those that are answered."""
-    tables = [one for one in found["tables"] if one["registers"]]
-    # Where all is 0, nothing shows that the values are there. Else units are as they were found.
-    proposed = {"unit": f"{min(tables, key=_is_0)['unit']}"}
-    tables = [one for one in tables if one["unit"] == answers.get("unit", int(proposed["unit"]))]
-    meant = table_meant(answers, "registers")
-    tables.sort(key=lambda one: (TABLES[one["function"]] != meant, _is_0(one), not one["moved"]))
-    if tables and not (len(tables) > 1 and all(map(_is_0, tables)) and meant is None):
-        proposed["table"] = TABLES[tables[0]["function"]]
-    return proposed, [one for one in tables if TABLES[one["function"]] == answers.get("table")]
+class HeardUnits(Heard):
+    """Units that have registers.
+
+    Attributes:
+        found: figures of `drivers.modbus.sniff.ModbusSniffer`.
+    """
+
+    def __init__(
+        self,
+        found: Mapping[str, Any],
+        lines: Sequence[str],
+        registers: str,
+        next_address: Callable[[Answers, str], int],
+    ) -> None:
+        super().__init__(lines, _only_0(found, registers))
+        self.found, self._next_address = found, next_address
+
+    def proposals(self, answers: Answers) -> dict[str, str]:
+        """See `Heard.proposals`."""
+        from drivers.modbus.readings import is_signed  # noqa: PLC0415 - only for who listens
+        from drivers.modbus.scan_report import NO_VALUE  # noqa: PLC0415
+
+        proposed, tables = self._place(answers)
+        if not tables or answers.get("way") != "values":
+            return proposed
+        if tables[0]["max_count"] is not None:
+            proposed["max-count"] = f"{tables[0]['max_count']}"
+        found_channels = {one["address"]: one for one in tables[0]["channels"]}
+        values = {one["address"]: one["int16"] for one in tables[0]["registers"]}
+        marks = {
+            one["address"]: one["uint16"]
+            for one in tables[0]["registers"]
+            if one["uint16"] in NO_VALUE and one["address"] not in tables[0]["moved"]
+        }
+        proposed["channels"] = ", ".join(one["name"] for one in found_channels.values())
+        for channel in answers.get("channels", ()):
+            if sensor_key(channel, "register-type") not in answers:
+                address = answers.get(sensor_key(channel, "address"))
+                if address is None:
+                    address = self._heard_address(answers, channel, found_channels, values)
+                    proposed[sensor_key(channel, "address")] = f"{address}"
+                kind = found_channels.get(address, {"type": "uint16", "order": "ABCD"})
+                negative = address not in found_channels and is_signed([values.get(address, 0) & 0xFFFF])
+                if kind["type"] != "uint16" or negative:
+                    proposed[sensor_key(channel, "register-type")] = "int16" if negative else kind["type"]
+                proposed[sensor_key(channel, "order")] = kind["order"]
+                break
+            address = answers[sensor_key(channel, "address")]
+            if address in found_channels:
+                proposed[sensor_key(channel, "order")] = found_channels[address]["order"]
+            if address in marks and register_count(answers[sensor_key(channel, "register-type")]) == 1:
+                proposed[sensor_key(channel, "no-value")] = f"0x{marks[address]:04X}"
+        return proposed
+
+    def beside(self, answers: Answers) -> dict[str, str]:
+        """See `Heard.beside`: what the register reads that a channel gets, whatever its name suggests."""
+        proposed, tables = self.proposals(answers), self._place(answers)[1]
+        channel = next(
+            (one for one in answers.get("channels", ()) if sensor_key(one, "address") in proposed), ""
+        )
+        if not channel or not tables:
+            return {}
+        address = int(proposed[sensor_key(channel, "address")])
+        kind = proposed.get(sensor_key(channel, "register-type"), "uint16")
+        order = proposed[sensor_key(channel, "order")]
+        return {sensor_key(channel, "address"): in_register(tables[0], address, kind, order)}
+
+    def _heard_address(
+        self, answers: Answers, channel: str, channels: Mapping[int, Any], values: Mapping[int, int]
+    ) -> int:
+        """The register that a channel is named after, the one behind the last, or the next that was found."""
+        by_name = next((address for address, one in channels.items() if one["name"] == channel), None)
+        following = self._next_address(answers, channel)
+        if by_name is not None or following in values:
+            return following if by_name is None else by_name
+        return next((address for address in sorted(values) if address > following), following)
+
+    def _place(self, answers: Answers) -> tuple[dict[str, str], list[Mapping[str, Any]]]:
+        """The unit and the table to propose, and what was found of those that are answered."""
+        tables = [one for one in self.found["tables"] if one["registers"]]
+        # Where all is 0, nothing shows that the values are there. Else units are as they were found.
+        proposed = {"unit": f"{min(tables, key=_is_0)['unit']}"}
+        tables = [one for one in tables if one["unit"] == answers.get("unit", int(proposed["unit"]))]
+        meant = table_meant(answers, "registers")
+        tables.sort(key=lambda one: (TABLES[one["function"]] != meant, _is_0(one), not one["moved"]))
+        if tables and not (len(tables) > 1 and all(map(_is_0, tables)) and meant is None):
+            proposed["table"] = TABLES[tables[0]["function"]]
+        return proposed, [one for one in tables if TABLES[one["function"]] == answers.get("table")]
+
+    def unheard(self, answers: Answers) -> str:
+        """See `Heard.unheard`: the unit that was answered has sent nothing."""
+        found = self.found
+        if found["units_alike"] or answers.get("unit", found["units"][0]) in found["units"]:
+            return ""
+        unit, others = answers["unit"], ", ".join(map(str, found["units"]))
+        first, last = found["units_asked"]
+        if not first <= unit <= last:
+            return (
+                f"Unit {unit} was not asked. Remedy: write --units {unit}, too; those that answer: {others}"
+            )
+        said = "has refused, like most units" if unit in found["units_left_out"] else "has not answered"
+        return f"Unit {unit} {said}. Remedy: correct --unit; those that answer: {others}"
+
+    def notes(self, answers: Answers, assumed: Collection[str], taken: Collection[str]) -> Iterable[str]:
+        """See `Heard.notes`: what was read of the channels, and what the values of registers do not show."""
+        del assumed
+        if answers["way"] != "values":
+            return
+        table = _table_read(self.found, answers)
+        if table is not None:
+            yield from values_heard(table, answers)
+        guessed = [name for name in answers["channels"] if sensor_key(name, "register-type") in taken]
+        yield from _guessed_addresses(answers, taken)
+        if guessed:
+            yield _guessed_words(answers, guessed, taken)
+        yield from guessed_sensors(answers, answers["channels"], taken)
+        if table is None:
+            return
+        yield from _may_be_halves(table, answers, guessed)
+        if _is_0(table):
+            yield "All registers that were read are 0: nothing shows that the values are there."
+
+    def not_read(self, answers: Answers) -> Iterable[str]:
+        """See `Heard.not_read`: the other table of the unit, if it has values, and the other units."""
+        found = self.found
+        others = [
+            TABLES[one["function"]]
+            for one in found["tables"]
+            if one["unit"] == answers["unit"] and one["registers"] and not _is_0(one)
+        ]
+        yield from (
+            f"Unit {answers['unit']} has {other} registers, too; "
+            f"this file reads {answers['table']} registers."
+            for other in others
+            if answers["way"] == "values" and other != answers["table"]
+        )
+        units = [unit for unit in found["units"] if unit != answers["unit"]]
+        named = "; ".join(f"unit {unit} ({_has(found, unit)})" for unit in units[:SHOWN])
+        more = f"; and {len(units) - SHOWN} more" if len(units) > SHOWN else ""
+        if units and not found["units_alike"]:
+            yield f"Not read: {named}{more}. daqsvc sniff modbus proposes a stream for each."
+
+
+class HeardNoRegisters(Heard):
+    """Units that answer, although none of the registers that were asked for is there."""
+
+    def __init__(self, found: Mapping[str, Any], registers: str) -> None:
+        note = "" if registers == AUTO else manual_note(registers_of(registers))
+        remedy = "Remedy: write the addresses of its manual, counted from 0, as --registers, e.g. 4000-4100"
+        unsure = found["units_alike"] or found["units_left_out"]
+        others = "; or name other units with --units" if unsure else ""
+        missed = note or f"No register that was asked for is there. {remedy}{others}"
+        super().__init__([*_units_in_words(found), *_tables_in_words(found)], missed)
+        self._unit: int = found["units"][0]
+        self._tables = {
+            table["unit"]: TABLES[table["function"]]
+            for table in reversed(found["tables"])
+            if table["asked"] and _has_function(table)
+        }
+
+    def proposals(self, answers: Answers) -> Mapping[str, str]:
+        """See `Heard.proposals`: the unit, and the table that it has."""
+        table = self._tables.get(answers.get("unit", self._unit))
+        return {"unit": f"{self._unit}"} | ({} if table is None else {"table": table})
+
+
+def _has_function(table: Mapping[str, Any]) -> bool:
+    """Whether the unit does not refuse to read tables of this kind at all."""
+    from drivers.modbus.scan import ILLEGAL_FUNCTION  # noqa: PLC0415 - only for who listens
+
+    return all(code != ILLEGAL_FUNCTION for _, code in table["refused"])
+
+
+def _tables_in_words(found: Mapping[str, Any]) -> Iterator[str]:
+    """Which tables units have of which no register was found."""
+    for table in found["tables"]:
+        name, unit = TABLES[table["function"]], table["unit"]
+        if not _has_function(table):
+            yield f"unit {unit} has no {name} registers: it refuses function {table['function']}"
+        elif table["asked"]:
+            none = "no" if len(set(table["asked"])) == 1 else "none of"
+            yield f"unit {unit} answers for {name} registers, but has {none} {_asked(table)}"
+
+
+def _may_be_halves(table: Mapping[str, Any], answers: Answers, guessed: Sequence[str]) -> Iterator[str]:
+    """That channels of one register may be the halves of a number of two."""
+    from drivers.modbus.scan_report import undecided_words  # noqa: PLC0415 - brings the settings
+
+    single = {
+        answers[sensor_key(name, "address")]
+        for name in guessed
+        if register_count(answers[sensor_key(name, "register-type")]) == 1
+    }
+    if halves := [one for one in table["undecided"] if single & {one["address"], one["address"] + 1}]:
+        one = halves[0]
+        keys = f'address = {one["address"]}, type = "{one["type"]}", order = "{one["order"]}"'
+        yield (
+            f"{undecided_words(each['address'] for each in halves)}. If so, write one channel in place of "
+            f"two{', e.g.' if len(halves) > 1 else ':'} {keys}."
+        )
 
 
 def _is_0(table: Mapping[str, Any]) -> bool:
@@ -99,7 +285,7 @@ def _is_only_0(found: Mapping[str, Any]) -> bool:
     return all(map(_is_0, found["tables"]))
 
 
-def only_0(found: Mapping[str, Any], registers: str) -> str:
+def _only_0(found: Mapping[str, Any], registers: str) -> str:
     """See `Heard.missed`: all registers are 0, and nobody has stated which of them are the values."""
     if not _is_only_0(found) or (registers != AUTO and not registers_of(registers).reason):
         return ""
@@ -111,43 +297,6 @@ def only_0(found: Mapping[str, Any], registers: str) -> str:
         "All registers that were read are 0, and nothing shows where the values are. Remedy: switch the "
         f"machine and its sensors on, or {manual}{'. ' * bool(meant)}{meant[:1].upper()}{meant[1:]}"
     )
-
-
-def notes(found: Mapping[str, Any], answers: Answers) -> Sequence[str]:
-    """See `Heard.notes`: what was read of the channels."""
-    table = _table_read(found, answers)
-    return values_heard(table, answers) if answers["way"] == "values" and table is not None else []
-
-
-def guesses(found: Mapping[str, Any], answers: Answers, taken: Collection[str]) -> Sequence[str]:
-    """See `Heard.guesses`: what the values of registers do not show."""
-    from drivers.modbus.scan_report import undecided_words  # noqa: PLC0415 - brings the settings
-
-    if answers["way"] != "values":
-        return ()
-    guessed = [name for name in answers["channels"] if sensor_key(name, "register-type") in taken]
-    notes = _guessed_addresses(answers, taken)
-    notes += [_guessed_words(answers, guessed, taken)] * bool(guessed)
-    notes += guessed_sensors(answers, answers["channels"], taken)
-    table = _table_read(found, answers)
-    if table is None:
-        return notes
-    single = {
-        answers[sensor_key(name, "address")]
-        for name in guessed
-        if register_count(answers[sensor_key(name, "register-type")]) == 1
-    }
-    halves = [one for one in table["undecided"] if single & {one["address"], one["address"] + 1}]
-    if halves:
-        one = halves[0]
-        keys = f'address = {one["address"]}, type = "{one["type"]}", order = "{one["order"]}"'
-        notes.append(
-            f"{undecided_words(each['address'] for each in halves)}. If so, write one channel in place of "
-            f"two{', e.g.' if len(halves) > 1 else ':'} {keys}."
-        )
-    if _is_0(table):
-        notes.append("All registers that were read are 0: nothing shows that the values are there.")
-    return notes
 
 
 def _guessed_addresses(answers: Answers, taken: Collection[str]) -> list[str]:
@@ -181,26 +330,6 @@ def _guessed_words(answers: Answers, guessed: Sequence[str], taken: Collection[s
         f"{what[0].upper()}{what[1:]} of {whose} {are} a guess by the values that were read: compare with "
         "the device's register map."
     )
-
-
-def not_read(found: Mapping[str, Any], answers: Answers) -> str:
-    """See `Heard.not_read`: the other table of the unit, if it has values, and the other units."""
-    others = [
-        TABLES[one["function"]]
-        for one in found["tables"]
-        if one["unit"] == answers["unit"] and one["registers"] and not _is_0(one)
-    ]
-    said = [
-        f"Unit {answers['unit']} has {other} registers, too; this file reads {answers['table']} registers."
-        for other in others
-        if answers["way"] == "values" and other != answers["table"]
-    ]
-    units = [unit for unit in found["units"] if unit != answers["unit"]]
-    named = "; ".join(f"unit {unit} ({_has(found, unit)})" for unit in units[:SHOWN])
-    more = f"; and {len(units) - SHOWN} more" if len(units) > SHOWN else ""
-    if units and not found["units_alike"]:
-        said.append(f"Not read: {named}{more}. daqsvc sniff modbus proposes a stream for each.")
-    return "\n".join(said)
 
 
 def _has(found: Mapping[str, Any], unit: int) -> str:
@@ -250,43 +379,3 @@ def _units_in_words(found: Mapping[str, Any]) -> Iterator[str]:
             f"the others from {left_out[0]} to {left_out[-1]} all refuse with one exception, as if they were "
             "not there: --units N reads unit N"
         )
-
-
-def unheard(found: Mapping[str, Any], answers: Answers) -> str:
-    """See `Heard.unheard`: the unit that was answered has sent nothing."""
-    if found["units_alike"] or answers.get("unit", found["units"][0]) in found["units"]:
-        return ""
-    unit, others = answers["unit"], ", ".join(map(str, found["units"]))
-    first, last = found["units_asked"]
-    if not first <= unit <= last:
-        return f"Unit {unit} was not asked. Remedy: write --units {unit}, too; those that answer: {others}"
-    said = "has refused, like most units" if unit in found["units_left_out"] else "has not answered"
-    return f"Unit {unit} {said}. Remedy: correct --unit; those that answer: {others}"
-
-
-def without_registers(found: Mapping[str, Any], registers: str) -> Heard:
-    """Units that answer, although none of the registers that were asked for is there."""
-    from drivers.modbus.scan import ILLEGAL_FUNCTION  # noqa: PLC0415 - only for who listens
-
-    lines = list(_units_in_words(found))
-    proposed = {"unit": f"{found['units'][0]}"}
-    by_unit: dict[int, list[str]] = {}
-    for table in found["tables"]:
-        name, unit = TABLES[table["function"]], table["unit"]
-        tables = by_unit.setdefault(unit, [])
-        if any(code == ILLEGAL_FUNCTION for _, code in table["refused"]):
-            lines.append(f"unit {unit} has no {name} registers: it refuses function {table['function']}")
-        elif table["asked"]:
-            tables.append(name)
-            none = "no" if len(set(table["asked"])) == 1 else "none of"
-            lines.append(f"unit {unit} answers for {name} registers, but has {none} {_asked(table)}")
-    note = "" if registers == AUTO else manual_note(registers_of(registers))
-    remedy = "Remedy: write the addresses of its manual, counted from 0, as --registers, e.g. 4000-4100"
-    others = "; or name other units with --units" if found["units_alike"] or found["units_left_out"] else ""
-    missed = note or f"No register that was asked for is there. {remedy}{others}"
-
-    def proposals(so_far: Answers) -> dict[str, str]:
-        tables = by_unit.get(so_far.get("unit", found["units"][0]), [])
-        return proposed | ({"table": tables[0]} if tables else {})
-
-    return Heard(lines, proposals, missed)

@@ -6,13 +6,12 @@ import math
 import re
 from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from drivers import questions as q
 from drivers.bus_questions import (
     BUS,
     BusQuestions,
-    Heard,
     only_port,
     seconds_of,
     unit_by_name,
@@ -27,7 +26,6 @@ from drivers.modbus.manual_addresses import (
     table_meant,
 )
 from drivers.modbus.sniff import AUTO, LAST_REGISTER, ModbusSniffer, registers_of, units_of
-from drivers.modbus.values_heard import in_register
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
 from drivers.sniffing import NothingFoundError, SniffError, is_waveform_rate, sniffed
 from drivers.toml_lines import Hexadecimal, array, entry
@@ -36,6 +34,8 @@ if TYPE_CHECKING:
     import threading
     from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
+
+    from drivers.bus_questions import Heard
 
 
 REGISTERS = ("uint16", "int16", "uint32", "int32", "float32", "uint64", "int64", "float64")
@@ -148,7 +148,7 @@ class _ModbusQuestions(BusQuestions):
             alike = error.figures.get("units_alike", False) and error.figures["units_asked"] == _first_units()
             further = chosen == AUTO and not stop.is_set()
             if error.figures.get("units") and not (alike and further):
-                return heard.without_registers(error.figures, answers["registers"])
+                return heard.HeardNoRegisters(error.figures, answers["registers"])
             # Some unit answers, and too late: no other one is to be taken for it.
             late = error.figures.get("replies_late") and not error.figures.get("units")
             if not further or late:
@@ -161,7 +161,7 @@ class _ModbusQuestions(BusQuestions):
                 found = sniffed(ModbusSniffer(), ["--units", _UNITS[1], *words], stop, tell)
             except NothingFoundError as other:
                 if other.figures.get("units"):
-                    return heard.without_registers(other.figures, answers["registers"])
+                    return heard.HeardNoRegisters(other.figures, answers["registers"])
                 raise
         except SniffError as error:
             raise SniffError(f"{error}".replace("TARGET", "its address")) from error
@@ -174,16 +174,7 @@ class _ModbusQuestions(BusQuestions):
         lines = list(heard.in_words(found, answers["timeout-ms"]))
         if chosen == AUTO and found["units_asked"][0] == int(_UNITS[0].partition("-")[0]):
             lines.append(f"units {_UNITS[1]} were not asked: daqsvc new --listen --units {_WHOLE} asks all")
-        return Heard(
-            lines,
-            lambda so_far: self._proposals(found, so_far),
-            heard.only_0(found, answers["registers"]),
-            unheard=lambda so_far: heard.unheard(found, so_far),
-            notes=lambda so_far, _: heard.notes(found, so_far),
-            guesses=lambda so_far, taken: heard.guesses(found, so_far, taken),
-            not_read=lambda so_far: heard.not_read(found, so_far),
-            beside=lambda so_far: self._beside(found, so_far),
-        )
+        return heard.HeardUnits(found, lines, answers["registers"], self._next_address)
 
     def _ask_timeout(self) -> Question:
         return self.ask("timeout-ms", q.number, f"{_TIMEOUT_MS:g}")
@@ -199,66 +190,6 @@ class _ModbusQuestions(BusQuestions):
     def _sniffed_as(self, answers: Answers) -> Sequence[str]:
         """Arguments of the sniffer that say where the units are."""
         raise NotImplementedError
-
-    def _proposals(self, found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
-        """See `Heard.proposals`."""
-        from drivers.modbus.readings import is_signed  # noqa: PLC0415 - only for who listens
-        from drivers.modbus.scan_report import NO_VALUE  # noqa: PLC0415 - brings the settings
-
-        proposed, tables = heard.place(found, answers)
-        if not tables or answers.get("way") != "values":
-            return proposed
-        if tables[0]["max_count"] is not None:
-            proposed["max-count"] = f"{tables[0]['max_count']}"
-        found_channels = {one["address"]: one for one in tables[0]["channels"]}
-        values = {one["address"]: one["int16"] for one in tables[0]["registers"]}
-        marks = {
-            one["address"]: one["uint16"]
-            for one in tables[0]["registers"]
-            if one["uint16"] in NO_VALUE and one["address"] not in tables[0]["moved"]
-        }
-        proposed["channels"] = ", ".join(one["name"] for one in found_channels.values())
-        for channel in answers.get("channels", ()):
-            if sensor_key(channel, "register-type") not in answers:
-                address = answers.get(sensor_key(channel, "address"))
-                if address is None:
-                    address = self._heard_address(answers, channel, found_channels, values)
-                    proposed[sensor_key(channel, "address")] = f"{address}"
-                kind = found_channels.get(address, {"type": "uint16", "order": "ABCD"})
-                negative = address not in found_channels and is_signed([values.get(address, 0) & 0xFFFF])
-                if kind["type"] != "uint16" or negative:
-                    proposed[sensor_key(channel, "register-type")] = "int16" if negative else kind["type"]
-                proposed[sensor_key(channel, "order")] = kind["order"]
-                break
-            address = answers[sensor_key(channel, "address")]
-            if address in found_channels:
-                proposed[sensor_key(channel, "order")] = found_channels[address]["order"]
-            if address in marks and register_count(answers[sensor_key(channel, "register-type")]) == 1:
-                proposed[sensor_key(channel, "no-value")] = f"0x{marks[address]:04X}"
-        return proposed
-
-    def _beside(self, found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
-        """See `Heard.beside`: what the register reads that a channel gets, whatever its name suggests."""
-        proposed, tables = self._proposals(found, answers), heard.place(found, answers)[1]
-        channel = next(
-            (one for one in answers.get("channels", ()) if sensor_key(one, "address") in proposed), ""
-        )
-        if not channel or not tables:
-            return {}
-        address = int(proposed[sensor_key(channel, "address")])
-        kind = proposed.get(sensor_key(channel, "register-type"), "uint16")
-        order = proposed[sensor_key(channel, "order")]
-        return {sensor_key(channel, "address"): in_register(tables[0], address, kind, order)}
-
-    def _heard_address(
-        self, answers: Answers, channel: str, channels: Mapping[int, Any], values: Mapping[int, int]
-    ) -> int:
-        """The register that a channel is named after, the one behind the last, or the next that was found."""
-        by_name = next((address for address, one in channels.items() if one["name"] == channel), None)
-        following = self._next_address(answers, channel)
-        if by_name is not None or following in values:
-            return following if by_name is None else by_name
-        return next((address for address in sorted(values) if address > following), following)
 
     def questions(self, answers: Answers, folder: Path) -> Iterator[Question]:
         """See `BusQuestions.questions`."""

@@ -3,44 +3,21 @@
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
-from daqsvc.rounding import counted
 from drivers import packed_questions as packed
 from drivers import questions as q
-from drivers.bus_questions import BEFOREHAND, BUS, BusQuestions, Heard, guessed_sensors, only_port, seconds_of
+from drivers.bus_questions import BEFOREHAND, BUS, TYPE_OF_UNIT, BusQuestions, only_port, seconds_of
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
+from drivers.serial.heard import CRCS, DELIMITERS, HeardOnSerial
 from drivers.serial.sniff import SerialSniffer
-from drivers.serial.sniff_report import (
-    ANY_BAUD,
-    LINES_NEED,
-    MUST_TURN,
-    NO_NUMBERS,
-    absent_words,
-    frames_need,
-    no_number_words,
-    other_kinds_words,
-    other_lines_words,
-    overrun_words,
-    turn_words,
-    unchecked_words,
-    unit_of_suffix,
-)
-from drivers.sniffing import (
-    LEAST_SWINGING_HZ,
-    by_name,
-    is_waveform_rate,
-    quoted,
-    sniffed,
-    table_name,
-    unused,
-    usual_rate,
-)
+from drivers.serial.sniff_report import MUST_TURN, unit_of_suffix
+from drivers.sniffing import is_waveform_rate, sniffed
 from drivers.toml_lines import array, entry
 
 if TYPE_CHECKING:
     import threading
-    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping
     from pathlib import Path
 
 _CHARACTERS = {
@@ -55,29 +32,19 @@ _FRAMINGS = {
     "cobs": "binary frames, encoded by COBS, with a zero byte behind each",
     "sync": "binary frames of one length, each behind a sync word",
 }
-_CRCS = {"ibm-3740": "begins with 0xffff", "xmodem": "begins with 0", "none": "frames have none"}
 _ENDS = {
     "lf": "line feed, with a carriage return before it or not",
     "cr": "carriage return",
     ";": "semicolon",
 }
-_DELIMITERS = {"lf": "\n", "cr": "\r", ";": ";"}
 _UNNAMED = re.compile(r"c\d+")
 """As the sniffer calls columns that have no header."""
 _RATES_HZ = (12_800.0, 2560.0, 1280.0, 640.0, 100.0, 10.0, 1.0, 0.1)
 _LONGEST_PAYLOAD = 4096
 _LONGEST_SYNC_WORD = 8
-_TYPE_OF = {
-    "g": "accelerometer",
-    "m/s2": "accelerometer",
-    "mm/s": "velocity",
-    **dict.fromkeys(("um", "mm", "mil"), "proximity"),
-}
-"""Type of a sensor by the unit of its samples, if they are a waveform."""
 _KINDS = dict.fromkeys(_CHARACTERS, "")
 _LISTEN_S = 3.0
 """Behind the search of the baud rate, which takes some seconds itself."""
-_SHOWN_LINES = 2
 
 
 class SerialQuestions(BusQuestions):
@@ -140,35 +107,13 @@ class SerialQuestions(BusQuestions):
 
     def listen(
         self, answers: Answers, folder: Path, stop: threading.Event, tell: Callable[[str], None]
-    ) -> Heard:
+    ) -> HeardOnSerial:
         """See `BusQuestions.listen`."""
         del folder
         baud = answers.get(BEFOREHAND, {}).get("baud", "")
         words = [*(["--baud", baud] if baud.isdecimal() else []), *seconds_of(answers)]
         found = sniffed(SerialSniffer(_LISTEN_S), [*words, "--", answers["port"]], stop, tell)
-        return Heard(
-            list(_in_words(found)),
-            lambda so_far: _proposals(found, so_far) | self._no_limits(so_far),
-            _missed(found),
-            notes=lambda so_far, _: [f"baud = {so_far['baud']} is {ANY_BAUD}."] * found["any_baud"],
-            not_read=lambda so_far: "\n".join(_not_read(found, so_far)),
-            guesses=lambda so_far, taken: _guesses(found, so_far, self.channels(so_far), taken),
-        )
-
-    def _no_limits(self, answers: Answers) -> dict[str, str]:
-        """No limits are proposed where type and unit of every sensor are a guess."""
-        if "rate" not in answers or "limits" in answers:
-            return {}
-        kinds = {one: answers.get(sensor_key(one, "type")) for one in self.channels(answers)}
-        vibrations = {one: kind for one, kind in kinds.items() if kind in _TYPE_OF.values()}
-        is_guess = [
-            kind in {self.guess(answers, one)[0], "accelerometer"}
-            and by_name(one) is None
-            and answers.get(sensor_key(one, "suffix")) is None
-            for one, kind in vibrations.items()
-        ]
-        levels = [one for one in kinds if answers.get(sensor_key(one, "unit")) == "mm/s"]
-        return {"limits": NONE} if is_guess and all(is_guess) and not levels else {}
+        return HeardOnSerial(found, self)
 
     def questions(self, answers: Answers, folder: Path) -> Iterator[Question]:
         """See `BusQuestions.questions`."""
@@ -182,7 +127,7 @@ class SerialQuestions(BusQuestions):
     def _ask_frames(self, answers: Answers) -> Iterator[Question]:
         if answers["framing"] == "sync":
             yield self.ask("sync-word", _sync_word, "a55a")
-        yield self.choose("crc", _CRCS, "ibm-3740")
+        yield self.choose("crc", CRCS, "ibm-3740")
         orders = {"big": "its high byte comes first", "little": "its low byte does"}
         yield self.choose("crc-order", orders, "big", quiet=True)
         yield from packed.sample_questions(self, answers, _LONGEST_PAYLOAD, must_count=True)
@@ -226,7 +171,7 @@ class SerialQuestions(BusQuestions):
         suffix = answers.get(sensor_key(channel, "suffix"))
         if suffix is not None:
             unit = unit_of_suffix(suffix)
-            usual = _TYPE_OF if is_waveform_rate(answers["rate"]) else {}
+            usual = TYPE_OF_UNIT if is_waveform_rate(answers["rate"]) else {}
             return kind if kind == "keyphasor" else usual.get(unit, "trend"), unit
         # A column without a name may be anything: limits of vibration are not for it.
         anything = _UNNAMED.fullmatch(channel) or answers.get(sensor_key(channel, "prefix")) is not None
@@ -280,7 +225,7 @@ class SerialQuestions(BusQuestions):
         checks = 'behind a * at the end of a line: "none", "xor", "crc16"'
         yield entry("checksum", answers["checksum"], checks)
         if answers["line-end"] != "lf":
-            yield entry("delimiter", _DELIMITERS[answers["line-end"]], "what ends a line")
+            yield entry("delimiter", DELIMITERS[answers["line-end"]], "what ends a line")
         yield ""
         yield from self.stream(answers, "lines a second")
         if answers["prefix"] is not None:
@@ -339,218 +284,3 @@ def _is_time(name: str) -> bool:
     """Whether the name of a column suggests a time."""
     words = ("time", "stamp", "milli", "micro", "clock")
     return name.lower() in {"t", "ts", "s", "ms", "us"} or any(word in name.lower() for word in words)
-
-
-def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
-    """What was heard, in a few lines."""
-    rate = "" if found["rate_hz"] is None else f", {found['rate_hz']:.4g} a second"
-    baud = "any baud rate" if found["any_baud"] else f"{found['baud']} bit/s"
-    line = f"{baud}, {found['character']}"
-    if found["overrun_baud"] is not None:
-        yield overrun_words(found["overrun_baud"], found["baud"])
-    if found["framing"] != "lines":
-        kind = "COBS frames" if found["framing"] == "cobs" else f"frames behind {found['sync_word']}"
-        counter = found["counter"]
-        counts = f"byte {counter['byte']} of the payload counts" if counter else "nothing counts"
-        check = f"CRC {found['crc'] or 'unknown'}"
-        if found["frames_passing"] < 1:
-            check += f" (passes in {100 * found['frames_passing']:.0f} % of the frames)"
-        yield f"{line}: {kind} of {found['frame_length']} bytes{rate}, {check}, {counts}"
-        return
-    prefix = f", each begins with {found['prefix']}" if found["prefix"] else ""
-    comma = ", numbers with a decimal comma" if found["decimal"] == "," else ""
-    yield f"{line}: lines of text{rate}, {counted(len(found['columns']), 'column')}{prefix}{comma}"
-    if found["lines_damaged"]:
-        yield f"  {other_lines_words(found['lines_damaged'], found['lines_heard'], found['damaged_line'])}"
-    yield from (f"  {one}" for one in found["lines"][:_SHOWN_LINES])
-    yield from (f"  {words}" for one in found["columns"] for words in _column_words(one))
-    if found["other_prefixes"]:
-        yield f"  {other_kinds_words(found['other_prefixes'])}"
-
-
-def _column_words(one: Mapping[str, Any]) -> Iterator[str]:
-    """What is known of a column, in a few lines."""
-    if one["turns_at"]:
-        yield turn_words(one["name"], one["turns_at"])
-    elif one["counts"]:
-        yield f"{one['name']} counts lines; {MUST_TURN}"
-    elif one["unit"]:
-        yield f"{one['name']} is in {one['unit']}, as the device writes it behind the number"
-    if one["prefix"]:
-        yield f"{one['name']} is the number behind {one['prefix']}"
-
-
-def _proposals(found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
-    """See `Heard.proposals`."""
-    proposed = {"baud": f"{found['baud']}", "character": found["character"]}
-    proposed["framing"] = found["framing"]
-    if found["framing"] != "lines":
-        return proposed | _frame_proposals(found, answers)
-    taken: set[str] = set()
-    named = {unused(table_name(one["name"], "column"), taken): one for one in found["columns"]}
-    proposed |= {
-        "prefix": found["prefix"] or NONE,
-        "line-end": next(name for name, end in _DELIMITERS.items() if end == found["delimiter"]),
-        "separator": {"\t": r"\t"}.get(found["separator"], found["separator"] or ","),
-        "decimal": found["decimal"],
-        "checksum": found["checksum"],
-        "columns": ", ".join(named),
-    }
-    if found["rate_hz"] is not None:
-        proposed["rate"] = f"{usual_rate(found['rate_hz']):g}"
-    # Most engineers name the columns themselves: what is known of each is known by its place.
-    for name, one in zip(answers.get("columns", named), named.values(), strict=False):
-        if one["numeric"] and one["prefix"]:
-            proposed[sensor_key(name, "prefix")] = one["prefix"]
-        if one["numeric"] and one["unit"]:
-            proposed[sensor_key(name, "suffix")] = one["unit"]
-        if kind := _swinging_type(one, name, answers.get("rate", found["rate_hz"])):
-            proposed[sensor_key(name, "type")] = kind
-        if one["counts"] or one["time_unit"]:
-            proposed |= {"counter": name, "counts": one["time_unit"] or "count"}
-        elif one["turns_at"] or not one["numeric"]:
-            # What begins again after 999 is no counter, and measures nothing: what was heard states it.
-            proposed[sensor_key(name, "type")] = NONE
-    # Else a person who takes all defaults would have lines counted by what counts nothing.
-    proposed.setdefault("counter", NONE)
-    return proposed
-
-
-def _swinging_type(one: Mapping[str, Any], name: str, rate_hz: float | None) -> str | None:
-    """The type of the sensor of a column whose values swing about 0; None if nothing is known."""
-    if not one["swings"] or rate_hz is None or rate_hz < LEAST_SWINGING_HZ:
-        return None
-    if by_name(name) not in {None, "accelerometer"}:
-        return None
-    return _TYPE_OF.get(unit_of_suffix(one["unit"])) if one["unit"] else "accelerometer"
-
-
-def _not_read(found: Mapping[str, Any], answers: Answers) -> Iterator[str]:
-    """See `Heard.not_read`."""
-    if found["framing"] != answers["framing"]:
-        return
-    if found["framing"] == "lines":
-        yield from _not_read_of_lines(found, answers)
-    elif found["crc"] and not _is_known_crc(found):
-        yield unchecked_words(found["crc"])
-
-
-def _not_read_of_lines(found: Mapping[str, Any], answers: Answers) -> Iterator[str]:
-    if missed := _missed(found):
-        yield f"What was heard does not fit this file: {missed}."
-        return
-    if found["lines_damaged"]:
-        words = other_lines_words(found["lines_damaged"], found["lines_heard"], found["damaged_line"])
-        yield f"{words}."
-    kinds = [found["prefix"], *found["other_prefixes"]]
-    if found["other_prefixes"] and answers["prefix"] in kinds:
-        yield other_kinds_words([one for one in kinds if one != answers["prefix"]])
-    if len(answers["columns"]) == len(found["columns"]):
-        yield from _columns_not_read(found, answers)
-
-
-def _columns_not_read(found: Mapping[str, Any], answers: Answers) -> Iterator[str]:
-    """What of the columns is not in the file, or not always."""
-    heard, texts = found["lines_heard"] - found["lines_damaged"], {}
-    for name, one in zip(answers["columns"], found["columns"], strict=True):
-        measured = answers.get(sensor_key(name, "type")) not in {None, NONE}
-        if not one["numeric"] and (measured or name == answers["counter"]):
-            yield (
-                f"No number was heard in column {name}, but e.g. {quoted(one['last'])}: a line without a "
-                "number there is not read."
-            )
-        elif not one["numeric"]:
-            texts[name] = one["last"]
-        elif measured and one["absent"]:
-            yield absent_words(name, one["absent"], heard, one["absent_text"])
-    if texts:
-        yield no_number_words(texts)
-
-
-def _guesses(
-    found: Mapping[str, Any], answers: Answers, channels: Sequence[str], taken: Collection[str]
-) -> list[str]:
-    """See `Heard.guesses`."""
-    notes = []
-    if answers["framing"] != "lines":
-        if {"channels", "raw-type", "byte-order", "scale"} & set(taken):
-            notes.append(
-                "What is behind the counter of a frame is a guess: channels, type, byte order and scale. "
-                "See the device's manual."
-            )
-        return [*notes, *guessed_sensors(answers, channels, taken)]
-    counter = answers["counter"]
-    if counter is not None and "counter" in taken:
-        what = (
-            "counts lines" if answers["counts"] == "count" else f"is the device's time in {answers['counts']}"
-        )
-        notes.append(f"That {counter} {what} is a guess by the lines that came: see the device's manual.")
-    swinging = _swinging(found, answers)
-    by_values = [
-        name for name in swinging if answers[sensor_key(name, "type")] in {"accelerometer", "velocity"}
-    ]
-    by_values = [name for name in by_values if sensor_key(name, "type") in taken]
-    if by_values:
-        notes.append(
-            f"{', '.join(by_values)}: type and unit of the sensor are a guess by the values, which swing "
-            "about 0; see the device's manual."
-        )
-    averaged = [name for name in swinging if answers[sensor_key(name, "type")] == "trend"]
-    if averaged:
-        notes.append(
-            f"{', '.join(averaged)}: the values swing about 0. A trend value is averaged over "
-            "window_s, so that an alarm on it may never come: if it is a vibration, have the device send its "
-            "RMS."
-        )
-    unstated = [name for name in channels if answers.get(sensor_key(name, "suffix")) is None]
-    return [*notes, *guessed_sensors(answers, [one for one in unstated if one not in by_values], taken)]
-
-
-def _swinging(found: Mapping[str, Any], answers: Answers) -> list[str]:
-    """The columns that swing about 0 and have a sensor, by the names that were answered."""
-    if found["framing"] != "lines" or len(answers["columns"]) != len(found["columns"]):
-        return []
-    pairs = zip(answers["columns"], found["columns"], strict=True)
-    return [name for name, one in pairs if one["swings"] and sensor_key(name, "type") in answers]
-
-
-def _missed(found: Mapping[str, Any]) -> str:
-    """See `Heard.missed`: what a stream needs, and the device does not send."""
-    if found["framing"] != "lines":
-        if found["counter"] is not None and found["counter_bits"] is not None:
-            return ""
-        return f"{frames_need(_payload_length(found))}. Remedy: see the manual of the device"
-    numbers = [one for one in found["columns"] if one["numeric"]]
-    if any(not (one["counts"] or one["time_unit"] or one["turns_at"]) for one in numbers):
-        return ""
-    begin = "" if numbers else f"{NO_NUMBERS} "
-    return f"{begin}{LINES_NEED}. Remedy: have the device send them"
-
-
-def _is_known_crc(found: Mapping[str, Any]) -> bool:
-    """Whether it is one of the two that the driver knows, which leave out the sync word."""
-    return found["crc"] in _CRCS and found["crc_from"] == len(found["sync_word"]) // 2
-
-
-def _payload_length(found: Mapping[str, Any]) -> int:
-    """Bytes of the payload for the driver; a check that it does not know is a part of it."""
-    length: int = found["payload_length"]
-    return length + (0 if _is_known_crc(found) else found["crc_bytes"])
-
-
-def _frame_proposals(found: Mapping[str, Any], answers: Answers) -> dict[str, str]:
-    """Those of binary frames; see `Heard.proposals`."""
-    known = _is_known_crc(found)
-    proposed = {"crc": found["crc"] if known else "none", "payload-length": f"{_payload_length(found)}"}
-    if found["sync_word"]:
-        proposed["sync-word"] = found["sync_word"]
-    if known:
-        proposed["crc-order"] = found["crc_order"]
-    # As the sniffer proposes it: what a count is worth is not known, and volts of a probe are not heard.
-    proposed["scale"] = "1"
-    if found["counter"] is not None:
-        counter = {**found["counter"], "bits": found["counter_bits"] or found["counter"]["bits"]}
-        proposed |= packed.frame_proposals(found["payload_length"], counter, answers)
-    if "samples-per-frame" in answers and found["rate_hz"] is not None:
-        proposed["rate"] = f"{usual_rate(found['rate_hz'] * answers['samples-per-frame']):g}"
-    return proposed

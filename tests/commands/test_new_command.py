@@ -30,6 +30,8 @@ from drivers.bus_questions import Heard
 from drivers.questions import bit_rate
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from drivers.bus_questions import BusQuestions
     from drivers.questions import Answers, Question
 
@@ -162,12 +164,24 @@ def test_whatever_is_heard_the_file_passes_check(data: st.DataObject) -> None:
     def listen(kind: BusQuestions, answers: Answers) -> Heard:
         heard.append(kind.listens_behind)
         assert kind.listens_behind in answers
-        return Heard([], lambda _answers: proposed)
+        return HeardThis(proposed)
 
     beforehand = Given({"bus": bus, **NEEDED_OF.get(bus, {})}, defaults=True)
     answers = conduct(file, beforehand, None, print, listen)
     assert len(heard) == 1
     checked(machine_text(answers, file.name), file)
+
+
+class HeardThis(Heard):
+    """Proposals, whatever has been answered."""
+
+    def __init__(self, proposed: Mapping[str, str]) -> None:
+        super().__init__([])
+        self._proposed = proposed
+
+    def proposals(self, answers: Answers) -> Mapping[str, str]:
+        del answers
+        return self._proposed
 
 
 SENSOR_ONES = ("type", "name", "unit", "angle", "address", "register-type", "order")
@@ -336,7 +350,7 @@ def test_what_enter_took_of_the_machine_is_marked_and_what_was_typed_is_not(tmp_
 
 def test_what_was_heard_is_not_assumed_though_it_is_the_usual_value(tmp_path):
     given = {"bus": "serial", "port": "/dev/ttyS0"}
-    heard = Heard([], lambda _answers: {"baud": "115200", "columns": "t, x", "rate": "100"})
+    heard = HeardThis({"baud": "115200", "columns": "t, x", "rate": "100"})
     answers = conduct(tmp_path / "m.toml", Given(given, defaults=True), None, print, lambda *_: heard)
     assert assumed_keys(machine_text(answers, "m.toml")) == {"speed_rpm", "zones"}
 

@@ -119,16 +119,11 @@ class _Interview:
 
     def notes(self) -> list[str]:
         """What in the file was neither answered nor heard, and what was heard and is not in it."""
-        not_read = "" if self._heard is None else self._heard.not_read(self.answers)
-        return [
-            *self._not_heard(),
-            *self._guesses(),
-            *not_read.splitlines(),
-            *notes_on_velocity(self.answers),
-        ]
+        not_read = () if self._heard is None else self._heard.not_read(self.answers)
+        return [*self._not_heard(), *not_read, *notes_on_velocity(self.answers)]
 
     def _not_heard(self) -> Sequence[str]:
-        """What in the file was neither answered nor heard, where it was listened for."""
+        """What in the file was neither answered nor heard, or is a guess by what was heard."""
         counters = {"counter", "counter-byte"}
         channels = self._assumed & (_OF_CHANNELS - counters)
         example = bool(channels) or any(key.endswith(".address") for key in self._assumed)
@@ -143,19 +138,13 @@ class _Interview:
                 return [f"The bus could not be listened to{so}: {self._deaf}"]
             return [f"Nothing was heard on the bus; the channels are {origin}."] * example
         if not self._heard.missed:
-            return [*self._heard.notes(self.answers, self._assumed)]
+            return [*self._heard.notes(self.answers, self._assumed, self._taken)]
         if example:
             unheard = f"None of these channels was heard on the bus; they are {origin}."
             return [unheard, f"{self._heard.missed}."]
         return [f"What was heard does not fit this file: {self._heard.missed}."] * bool(
             self._assumed & counters
         )
-
-    def _guesses(self) -> Sequence[str]:
-        """What in the file was heard and is a guess all the same."""
-        if self._heard is None or self._heard.missed:
-            return []
-        return self._heard.guesses(self.answers, self._taken)
 
     def is_over(self) -> bool:
         """Ask what is not answered yet; False if a person goes back, and the rest must be asked again."""

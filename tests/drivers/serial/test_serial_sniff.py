@@ -30,8 +30,9 @@ from daqsvc.commands.new.interview import Given, conduct
 from daqsvc.commands.new.machine_text import machine_text
 from drivers.serial import ports, questions, sniff
 from drivers.serial.framing import Pieces
+from drivers.serial.heard import HeardOnSerial
 from drivers.serial.lines import LineCodec
-from drivers.serial.questions import SerialQuestions, _in_words, _proposals
+from drivers.serial.questions import SerialQuestions
 from drivers.serial.recognise import recognised
 from drivers.serial.recognise_lines import TextLines
 from drivers.serial.settings import LineLayout
@@ -50,6 +51,12 @@ BEGIN = 'schema_version = 1\nsite = "lab"\nbox = "edge-1"\n\n[machine]\nname = "
 def cable(tmp_path: Path) -> Iterator[PseudoTerminal]:
     with PseudoTerminal(tmp_path / "ttyUSB0") as cable:
         yield cable
+
+
+@pytest.fixture(autouse=True)
+def _listens_briefly(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What nobody waits for: these devices send many lines a second."""
+    monkeypatch.setattr(questions, "_LISTEN_S", 0.6)
 
 
 @contextlib.contextmanager
@@ -129,9 +136,9 @@ def test_a_counter_that_begins_again_after_999_is_not_proposed(
     ]
     assert "\ncounter =" not in found["machine_file"]
     assert 'channels = [{ name = "c2" }, { name = "c3" }]' in found["machine_file"]
-    proposed = _proposals(found, {})
+    proposed = on_port(found).proposals({})
     assert (proposed["counter"], proposed["sensor.c1.type"]) == ("none", "none")
-    assert any("c1 begins again at 0 after 999" in line for line in _in_words(found))
+    assert any("c1 begins again at 0 after 999" in line for line in on_port(found).lines)
 
 
 def test_lines_with_neither_counter_nor_time_are_proposed_as_such(
@@ -141,7 +148,7 @@ def test_lines_with_neither_counter_nor_time_are_proposed_as_such(
         found = figures(cable, capsys)
     read = check(tmp_path, found["machine_file"], capsys)["streams"]["lines"]["layout"]
     assert (read["line"], read["no_counter"]) == (["c1"], True)
-    proposed = _proposals(found, {})
+    proposed = on_port(found).proposals({})
     assert (proposed["columns"], proposed["counter"]) == ("c1", "none")
 
 
@@ -151,7 +158,7 @@ def test_a_counter_whose_turn_was_not_seen_is_proposed_with_a_word(
     with talking(cable, line):
         found = figures(cable, capsys)
     assert f"bits = 8 }}    # as far as it was seen: {MUST_TURN}" in found["machine_file"].replace("16", "8")
-    assert f"  c1 counts lines; {MUST_TURN}" in _in_words(found)
+    assert f"  c1 counts lines; {MUST_TURN}" in on_port(found).lines
 
 
 def padded(number: int) -> bytes:
@@ -159,9 +166,8 @@ def padded(number: int) -> bytes:
 
 
 def test_columns_padded_with_blanks_are_proposed_as_they_are(
-    cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(questions, "_LISTEN_S", 0.6)
     with talking(cable, padded):
         found = figures(cable, capsys)
         new_layout = new(cable, tmp_path / "new.toml")["streams"]["device"]["layout"]
@@ -189,7 +195,7 @@ def test_no_baud_rate_is_named_where_all_of_them_come_out_alike(
     assert f"{cable.path} at any baud rate, 8N1: " in said
     assert "baud = 115_200    # any: the port does not use it" in said
     assert (found["baud"], found["any_baud"], len(found["tried"])) == (115_200, True, 3)
-    assert next(iter(_in_words(found))).startswith("any baud rate, 8N1: lines of text")
+    assert next(iter(on_port(found).lines)).startswith("any baud rate, 8N1: lines of text")
     check(tmp_path, found["machine_file"], capsys)
 
 
@@ -210,9 +216,8 @@ def test_what_it_proposes_for_lines_passes_check(
 
 @pytest.mark.long
 def test_decimal_commas_are_told_and_can_be_read(
-    cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(questions, "_LISTEN_S", 0.6)
     with talking(cable, lambda number: b"%d;0,%03d;-1,5\n" % (number, number % 900)):
         assert main(["sniff", "serial", f"{cable.path}", "--seconds", "0.6"]) == 0
         said = capsys.readouterr().out
@@ -229,9 +234,8 @@ def test_decimal_commas_are_told_and_can_be_read(
 
 
 def test_two_machines_on_one_port_are_two_kinds_of_lines(
-    cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(questions, "_LISTEN_S", 0.6)
 
     def both(number: int) -> bytes:
         turn = number // 2
@@ -265,6 +269,11 @@ def test_the_rate_is_that_of_the_clock_of_the_device_where_it_sends_one() -> Non
     found = Report("ttyUSB0", [], Tried(9600, "none", heard, recognised(data)), True).sniffed()
     assert found.figures["rate_hz"] == pytest.approx(1000 / 251, rel=1e-6)
     assert tomllib.loads(found.fragment)["streams"]["lines"]["rate_hz"] == pytest.approx(3.98)
+
+
+def on_port(found: dict[str, Any]) -> HeardOnSerial:
+    """What ``daqsvc new`` makes of figures."""
+    return HeardOnSerial(found, SerialQuestions())
 
 
 def heard_at(lines: list[tuple[float, bytes]], waiting: bytes = b"") -> Heard:
@@ -315,11 +324,11 @@ def test_values_that_swing_about_0_are_taken_for_a_waveform(rate_hz: float, kind
     assert types[0] == kind
     assert ("a guess by the values, which swing about 0" in found.fragment) == (rate_hz >= 30)
     assert [one["swings"] for one in found.figures["columns"]] == [True, False]
-    proposed = _proposals(found.figures, {})
+    proposed = on_port(found.figures).proposals({})
     assert proposed.get("sensor.c1.type", "trend") == kind
     assert "sensor.c2.type" not in proposed
     taken = {"sensor.c1.type": kind, "sensor.c2.type": "trend", "columns": ("c1", "c2"), "counter": None}
-    notes = " ".join(questions._guesses(found.figures, {"framing": "lines", **taken}, ("c1", "c2"), taken))
+    notes = " ".join(on_port(found.figures).notes({"framing": "lines", "baud": 9600, **taken}, (), taken))
     assert ("c1: type and unit of the sensor are a guess by the values" in notes) == (kind != "trend")
     assert ("c1: the values swing about 0. A trend value is averaged" in notes) == (kind == "trend")
 
@@ -443,19 +452,13 @@ def test_the_baud_rate_for_a_port_without_one_is_the_same_however_long_it_listen
     assert report.sniffed().figures["baud"] == 460_800
 
 
-def test_what_ends_a_line_is_in_the_file_of_new(
-    cable: PseudoTerminal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(questions, "_LISTEN_S", 0.6)
+def test_what_ends_a_line_is_in_the_file_of_new(cable: PseudoTerminal, tmp_path: Path) -> None:
     with talking(cable, lambda number: b"%d,2.5\r" % number):
         file = new(cable, tmp_path / "new.toml")
     assert file["buses"]["main"]["delimiter"] == "\r"
 
 
-def test_columns_without_a_name_get_no_limits_of_vibration(
-    cable: PseudoTerminal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(questions, "_LISTEN_S", 0.6)
+def test_columns_without_a_name_get_no_limits_of_vibration(cable: PseudoTerminal, tmp_path: Path) -> None:
     with talking(cable, lambda number: b"%d,58.5\n" % number):
         file = new(cable, tmp_path / "new.toml", "--rate", "10")
     assert [one["unit"] for one in file["sensors"]] == ["1"]
@@ -526,9 +529,8 @@ def slow(number: int) -> bytes:
 
 
 def test_a_device_that_sends_little_is_listened_to_longer(
-    cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(questions, "_LISTEN_S", 0.4)
     with talking(cable, slow):
         layout = new(cable, tmp_path / "new.toml", "--baud=9600")["streams"]["device"]["layout"]
         told = capsys.readouterr().out
@@ -536,7 +538,7 @@ def test_a_device_that_sends_little_is_listened_to_longer(
         short = capsys.readouterr().err
     assert layout["no_counter"] is True
     assert "trying" not in told  # the rate was given
-    assert "in 0.4 s, which is little to judge by: listening for up to 20 s more; --seconds sets" in told
+    assert "in 0.6 s, which is little to judge by: listening for up to 20 s more; --seconds sets" in told
     assert "more; --seconds" not in short
 
 
@@ -554,9 +556,8 @@ def test_new_listens_as_long_as_it_is_told(
 
 
 def test_what_new_takes_by_rate_or_name_is_called_a_guess(
-    cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(questions, "_LISTEN_S", 0.5)
     names = ["--baud=115200", "--columns=n, x, temp, z", "--rate=200"]
     with talking(cable, line):
         new(cable, tmp_path / "new.toml", *names)
@@ -703,9 +704,7 @@ def test_new_proposes_the_lines_that_it_hears(
     cable: PseudoTerminal,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(questions, "_LISTEN_S", 0.6)
     with talking(cable, line):
         heard = new(cable, tmp_path / "heard.toml")
         named = new(cable, tmp_path / "named.toml", "--columns=n, vib, temp, load")
@@ -756,10 +755,7 @@ def test_a_port_that_brings_more_than_its_baud_rate_is_proposed_with_one_that_ca
     assert "samples a second were heard, which cannot be used: buses.main.baud = 9600: is too slow" in refused
 
 
-def test_new_leaves_out_the_columns_that_are_no_numbers(
-    cable: PseudoTerminal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(questions, "_LISTEN_S", 0.6)
+def test_new_leaves_out_the_columns_that_are_no_numbers(cable: PseudoTerminal, tmp_path: Path) -> None:
     with talking(cable, lambda number: b"$LOG;%d;ok;%d.5\r\n" % (number, number % 9)):
         layout = new(cable, tmp_path / "log.toml")["streams"]["device"]["layout"]
     assert (layout["prefix"], layout["separator"]) == ("$LOG", ";")
@@ -797,11 +793,9 @@ def test_new_proposes_the_units_that_it_hears(
     cable: PseudoTerminal,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
     rate: str,
     kind: str,
 ) -> None:
-    monkeypatch.setattr(questions, "_LISTEN_S", 0.6)
     with talking(cable, with_units):
         file = new(cable, tmp_path / "units.toml", "--rate", rate)
     assert "c2 is in mm/s, as the device writes it behind the number" in capsys.readouterr().out
@@ -831,10 +825,7 @@ def test_new_says_what_to_do_when_it_hears_nothing(
         assert not file.exists()
 
 
-def test_new_reads_lines_that_only_have_what_is_measured(
-    cable: PseudoTerminal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(questions, "_LISTEN_S", 0.6)
+def test_new_reads_lines_that_only_have_what_is_measured(cable: PseudoTerminal, tmp_path: Path) -> None:
     file = tmp_path / "no-counter.toml"
     with talking(cable, lambda number: b"1.%d mm/s, 45.%d C\r\n" % (number * 7 % 10, number * 3 % 10)):
         assert main(["new", f"{file}", "--yes", "--listen", "--bus=serial", f"--port={cable.path}"]) == 0
@@ -844,10 +835,9 @@ def test_new_reads_lines_that_only_have_what_is_measured(
 
 
 def test_new_makes_no_counter_of_a_measured_column(
-    cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = "No column is a number, such as 22.5 or NAME=22.5: JSON and hex are not read."
-    monkeypatch.setattr(questions, "_LISTEN_S", 0.6)
     file = tmp_path / "no-counter.toml"
     with talking(cable, lambda number: b'{"v":1.%d} 0x%02X\r\n' % (number * 7 % 10, number * 3 % 10 + 160)):
         assert main(["new", f"{file}", "--yes", "--listen", "--bus=serial", f"--port={cable.path}"]) == 1
@@ -937,9 +927,7 @@ def test_new_proposes_no_counter_for_frames_without_one(
     cable: PseudoTerminal,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(questions, "_LISTEN_S", 0.6)
 
     def uncounted(number: int) -> bytes:
         payload = bytes([number * 7 % 256, 1, number * 31 % 256, 2, number * 57 % 256, 3])

@@ -1,0 +1,219 @@
+"""What ``daqsvc new --listen`` heard of the messages of a DBC file, for the questions and for the file."""
+
+from __future__ import annotations
+
+import shlex
+from typing import TYPE_CHECKING, Any
+
+from drivers.bus_questions import BUS
+from drivers.can.dbc_likely import likely_counter
+from drivers.can.heard import SHOWN, HeardOnCan, decoded_signals, values_heard
+from drivers.can.sniff import STATE
+from drivers.questions import NONE, Answers
+from drivers.sniffing import usual_rate
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+
+    from cantools.database.can import Message
+
+
+class HeardMessages(HeardOnCan):
+    """Frames that a DBC file describes, or should."""
+
+    def __init__(
+        self,
+        found: Mapping[str, Any],
+        dbc: str,
+        messages: Mapping[str, Message],
+        samples_in_frame: Callable[[Answers], int],
+    ) -> None:
+        self._decoded = decoded_signals(found)
+        missed = (
+            f"No frame is as {dbc} describes: it is most likely the file of another device. Remedy: give the "
+            "file of the device that sends"
+        )
+        super().__init__(found, "" if self._decoded else missed)
+        self._messages, self._samples_in_frame = messages, samples_in_frame
+
+    def proposals(self, answers: Answers) -> dict[str, str]:
+        """See `Heard.proposals`."""
+        proposed, heard = super().proposals(answers), self._decoded
+        if not heard:
+            return proposed
+
+        def score(message: Mapping[str, Any]) -> tuple[bool, bool, int]:
+            signals = message["signals"]
+            counted = any(one["counts_frames"] for one in signals)
+            return counted, any(one["unit"] for one in signals), message["frames"]
+
+        best = max(heard, key=score)
+        proposed["message"] = best["message"]
+        chosen = next((m for m in heard if m["message"] == answers.get("message", best["message"])), None)
+        if chosen is None:
+            return proposed
+        counters = [one["signal"] for one in chosen["signals"] if one["counts_frames"]]
+        if any(one["multiplexed"] for one in chosen["signals"]):
+            # Most signals that count do so on all pages, and a stream reads the frames of one.
+            likely = likely_counter(self._messages[chosen["message"]])
+            counters = [one for one in counters if one == likely]
+        proposed["counter"] = next(iter(counters), NONE)
+        rates = [one["rate_hz"] for one in self.found["ids"] if one["message"] == chosen["message"]]
+        if len(rates) == 1 and rates[0]:
+            measured = [one for one in chosen["signals"] if one["signal"] in answers.get("signals", ())]
+            share = _simple_share(
+                min((one["frames"] for one in measured), default=chosen["frames"]), chosen["frames"]
+            )
+            in_frame = self._samples_in_frame(answers) if "signals" in answers else 1
+            proposed["rate"] = f"{usual_rate(rates[0]) * share * in_frame:g}"
+        return proposed
+
+    def unheard(self, answers: Answers) -> str:
+        """See `Heard.unheard`."""
+        heard = [one["message"] for one in self._decoded]
+        chosen = answers.get("message", "")
+        if not heard or not chosen:
+            return ""
+        if chosen in heard:
+            return self._other_length(answers) or self._other_counter(answers)
+        return (
+            f"{answers['message']} was not heard. Remedy: correct --message; those that come: "
+            f"{', '.join(heard)}"
+        )
+
+    def _other_length(self, answers: Answers) -> str:
+        """That the frames of the message have another length than the file states; empty if not."""
+        message = answers["message"]
+        length = self._messages[message].length
+        lengths = {many for one in self.found["ids"] if one["message"] == message for many in one["lengths"]}
+        # Longer frames are of CAN FD, which pads them.
+        if not lengths or length in lengths or max(length, *lengths) > 8:
+            return ""
+        come = " and ".join(f"{many}" for many in sorted(lengths))
+        return (
+            f"the frames of {message} have {come} bytes, the DBC file states {length}. Remedy: give the file "
+            "of the device that sends"
+        )
+
+    def _other_counter(self, answers: Answers) -> str:
+        """That the signal which is to count the frames was heard and does not; empty if it may."""
+        if answers.get("counter") not in self._not_counting(answers):
+            return ""
+        counters = [one for one in self._signals(answers) if one["counts_frames"]]
+        instead = ", ".join([*(one["signal"] for one in counters), NONE])
+        return (
+            f"{answers['counter']} does not grow by 1 from frame to frame. Remedy: correct --counter; it may "
+            f"be {instead}"
+        )
+
+    def _signals(self, answers: Answers) -> list[Mapping[str, Any]]:
+        """The signals of the message as they were heard."""
+        chosen = (one["signals"] for one in self._decoded if one["message"] == answers.get("message"))
+        return list(next(chosen, []))
+
+    def _not_counting(self, answers: Answers) -> set[str]:
+        """Signals of the message that do not grow by 1 from frame to frame of those that a stream reads."""
+        from drivers.counter_search import LEAST_COUNTS  # noqa: PLC0415 - brings numpy
+
+        signals = self._signals(answers)
+        paged = any(one["multiplexed"] for one in signals)
+        # A counter of each page by itself has the same value in several frames in a row.
+        return {
+            one["signal"]
+            for one in signals
+            if not one["counts_frames"] and one["frames"] > LEAST_COUNTS and (one["multiplexed"] or not paged)
+        }
+
+    def not_offered(self, answers: Answers) -> Mapping[str, Collection[str]]:
+        """See `Heard.not_offered`."""
+        return {"counter": self._not_counting(answers)}
+
+    def notes(self, answers: Answers, assumed: Collection[str], taken: Collection[str]) -> Iterable[str]:
+        """See `Heard.notes`: what was heard of the channels, so that a person can judge it."""
+        del assumed, taken
+        heard = {one["signal"]: one for one in self._signals(answers)}
+        read = [heard[name] for name in answers["signals"] if name in heard]
+        notes = [f"Heard: {values_heard(read)}."] if read else []
+        if silent := [name for name in answers["signals"] if name not in heard]:
+            notes.append(f"No value was heard of {', '.join(silent[:SHOWN])}.")
+        notes += _doubts(one for message in self._decoded for one in message["signals"])
+        if answers["counter"] is None and not any(one["counts_frames"] for one in heard.values()):
+            offered = likely_counter(self._messages[answers["message"]])
+            few = offered is not None and offered not in self._not_counting(answers)
+            notes.append(
+                (
+                    f"Too few frames of {answers['message']} came to see whether {offered} counts them: "
+                    f"without --counter {offered} lost ones are found by the times of arrival only."
+                )
+                if few
+                else (
+                    f"No signal is known to count the frames of {answers['message']}: lost ones are found by "
+                    "the times of arrival only."
+                )
+            )
+        counter = heard.get(answers["counter"])
+        if counter is not None and not counter["counts_frames"]:
+            notes.append(f"It was not heard whether {counter['signal']} counts the frames that are read.")
+        return notes
+
+    def unknown(self, answers: Answers, assumed: Collection[str]) -> str:
+        """See `Heard.unknown`: values that contradict the file make it most likely that of another device."""
+        if "signals" not in answers:
+            return ""
+        named = None if "signals" in assumed else answers["signals"]
+        read = [one for one in self._signals(answers) if named is None or one["signal"] in named]
+        if not (doubts := _doubts(read)):
+            return ""
+        return (
+            f"{' '.join(doubts)} Remedy: give the file of the device that sends. If it is that one, name "
+            "with --signals those that are right, or answer the questions in a terminal, without --yes"
+        )
+
+    def not_read(self, answers: Answers) -> Iterable[str]:
+        """See `Heard.not_read`: the file reads one message, and of that no states if nobody names them."""
+        others = [
+            f"{one['message']} ({one['id']:#x})"
+            for one in self.found["ids"]
+            if one["message"] not in {None, answers["message"]}
+        ]
+        if others:
+            yield (
+                f"Not read: {_few(others)}; {_sniffed_by(answers)} prints their tables. Of these take the "
+                f'streams and sensors, and write bus = "{BUS}", as this file calls it.'
+            )
+        taken = {answers["counter"], *answers["signals"]}
+        signals = self._messages[answers["message"]].signals
+        states = [one.name for one in signals if one.choices and one.name not in taken]
+        yield from (f"{name} is left out: {STATE}." for name in states[:SHOWN])
+        heard = [one["signal"] for one in self._signals(answers)]
+        if rest := [name for name in heard if name not in {*taken, *states}]:
+            yield (
+                f"Not read of {answers['message']}: {_few(rest)}. Name with --signals what of them is "
+                "measured."
+            )
+
+
+def _few(names: Sequence[str]) -> str:
+    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    return f"{', '.join(names[:SHOWN])}{more}"
+
+
+def _sniffed_by(answers: Answers) -> str:
+    """The command that looks at the same bus with the same DBC file."""
+    adapter = [] if answers["interface"] == "socketcan" else ["--interface", answers["interface"]]
+    adapter += ["--fd"] if adapter and answers["fd"] else []
+    return shlex.join(["daqsvc", "sniff", "can", answers["channel"], *adapter, "--dbc", answers["dbc"]])
+
+
+def _doubts(signals: Iterable[Mapping[str, Any]]) -> list[str]:
+    """What of the values that were heard contradicts the DBC file."""
+    return [one["doubt"] for one in signals if one["doubt"]][:SHOWN]
+
+
+def _simple_share(frames: int, of_all: int) -> float:
+    """The simplest fraction that so many of all frames can be: of a short time, one frame more or less."""
+    for pages in range(1, of_all):
+        taken = max(round(frames / of_all * pages), 1)
+        if abs(frames - of_all * taken / pages) <= 1.0:
+            return taken / pages
+    return frames / of_all

@@ -1,0 +1,291 @@
+"""What ``daqsvc new --listen`` heard on a serial port, for the questions and for the file."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from daqsvc.rounding import counted
+from drivers import packed_questions as packed
+from drivers.bus_questions import TYPE_OF_UNIT, Heard, guessed_sensors
+from drivers.questions import NONE, Answers, sensor_key
+from drivers.serial.sniff_report import (
+    ANY_BAUD,
+    LINES_NEED,
+    MUST_TURN,
+    NO_NUMBERS,
+    absent_words,
+    frames_need,
+    no_number_words,
+    other_kinds_words,
+    other_lines_words,
+    overrun_words,
+    turn_words,
+    unchecked_words,
+    unit_of_suffix,
+)
+from drivers.sniffing import LEAST_SWINGING_HZ, by_name, quoted, table_name, unused, usual_rate
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+
+    from drivers.bus_questions import BusQuestions
+
+CRCS = {"ibm-3740": "begins with 0xffff", "xmodem": "begins with 0", "none": "frames have none"}
+DELIMITERS = {"lf": "\n", "cr": "\r", ";": ";"}
+_SHOWN_LINES = 2
+
+
+class HeardOnSerial(Heard):
+    """Lines of text or binary frames.
+
+    Attributes:
+        found: figures of `drivers.serial.sniff.SerialSniffer`.
+    """
+
+    def __init__(self, found: Mapping[str, Any], questions: BusQuestions) -> None:
+        super().__init__(list(_in_words(found)), _missed(found))
+        self.found, self._questions = found, questions
+
+    def proposals(self, answers: Answers) -> dict[str, str]:
+        """See `Heard.proposals`."""
+        proposed = {"baud": f"{self.found['baud']}", "character": self.found["character"]}
+        proposed["framing"] = self.found["framing"]
+        of_framing = self._of_lines if self.found["framing"] == "lines" else self._of_frames
+        return proposed | of_framing(answers) | self._no_limits(answers)
+
+    def _of_lines(self, answers: Answers) -> dict[str, str]:
+        """Proposals for lines of text."""
+        taken: set[str] = set()
+        named = {unused(table_name(one["name"], "column"), taken): one for one in self.found["columns"]}
+        proposed = {
+            "prefix": self.found["prefix"] or NONE,
+            "line-end": next(name for name, end in DELIMITERS.items() if end == self.found["delimiter"]),
+            "separator": {"\t": r"\t"}.get(self.found["separator"], self.found["separator"] or ","),
+            "decimal": self.found["decimal"],
+            "checksum": self.found["checksum"],
+            "columns": ", ".join(named),
+        }
+        if self.found["rate_hz"] is not None:
+            proposed["rate"] = f"{usual_rate(self.found['rate_hz']):g}"
+        # Most engineers name the columns themselves: what is known of each is known by its place.
+        for name, one in zip(answers.get("columns", named), named.values(), strict=False):
+            if one["numeric"] and one["prefix"]:
+                proposed[sensor_key(name, "prefix")] = one["prefix"]
+            if one["numeric"] and one["unit"]:
+                proposed[sensor_key(name, "suffix")] = one["unit"]
+            if kind := _swinging_type(one, name, answers.get("rate", self.found["rate_hz"])):
+                proposed[sensor_key(name, "type")] = kind
+            if one["counts"] or one["time_unit"]:
+                proposed |= {"counter": name, "counts": one["time_unit"] or "count"}
+            elif one["turns_at"] or not one["numeric"]:
+                # What begins again after 999 is no counter, and measures nothing: what was heard states it.
+                proposed[sensor_key(name, "type")] = NONE
+        # Else a person who takes all defaults would have lines counted by what counts nothing.
+        proposed.setdefault("counter", NONE)
+        return proposed
+
+    def _of_frames(self, answers: Answers) -> dict[str, str]:
+        """Proposals for binary frames."""
+        found = self.found
+        known = _is_known_crc(found)
+        proposed = {"crc": found["crc"] if known else "none", "payload-length": f"{_payload_length(found)}"}
+        if found["sync_word"]:
+            proposed["sync-word"] = found["sync_word"]
+        if known:
+            proposed["crc-order"] = found["crc_order"]
+        # As the sniffer proposes it: what a count is worth is not known, and volts of a probe are not heard.
+        proposed["scale"] = "1"
+        if found["counter"] is not None:
+            counter = {**found["counter"], "bits": found["counter_bits"] or found["counter"]["bits"]}
+            proposed |= packed.frame_proposals(found["payload_length"], counter, answers)
+        if "samples-per-frame" in answers and found["rate_hz"] is not None:
+            proposed["rate"] = f"{usual_rate(found['rate_hz'] * answers['samples-per-frame']):g}"
+        return proposed
+
+    def _no_limits(self, answers: Answers) -> dict[str, str]:
+        """No limits are proposed where type and unit of every sensor are a guess."""
+        if "rate" not in answers or "limits" in answers:
+            return {}
+        bus = self._questions
+        kinds = {one: answers.get(sensor_key(one, "type")) for one in bus.channels(answers)}
+        vibrations = {one: kind for one, kind in kinds.items() if kind in TYPE_OF_UNIT.values()}
+        is_guess = [
+            kind in {bus.guess(answers, one)[0], "accelerometer"}
+            and by_name(one) is None
+            and answers.get(sensor_key(one, "suffix")) is None
+            for one, kind in vibrations.items()
+        ]
+        levels = [one for one in kinds if answers.get(sensor_key(one, "unit")) == "mm/s"]
+        return {"limits": NONE} if is_guess and all(is_guess) and not levels else {}
+
+    def notes(self, answers: Answers, assumed: Collection[str], taken: Collection[str]) -> Iterable[str]:
+        """See `Heard.notes`."""
+        del assumed
+        if self.found["any_baud"]:
+            yield f"baud = {answers['baud']} is {ANY_BAUD}."
+        channels = self._questions.channels(answers)
+        if answers["framing"] != "lines":
+            if {"channels", "raw-type", "byte-order", "scale"} & set(taken):
+                yield (
+                    "What is behind the counter of a frame is a guess: channels, type, byte order and scale. "
+                    "See the device's manual."
+                )
+            yield from guessed_sensors(answers, channels, taken)
+            return
+        counter = answers["counter"]
+        if counter is not None and "counter" in taken:
+            what = (
+                "counts lines"
+                if answers["counts"] == "count"
+                else f"is the device's time in {answers['counts']}"
+            )
+            yield f"That {counter} {what} is a guess by the lines that came: see the device's manual."
+        yield from self._guessed_by_values(answers, channels, taken)
+
+    def _guessed_by_values(
+        self, answers: Answers, channels: Sequence[str], taken: Collection[str]
+    ) -> Iterator[str]:
+        """Which sensors are a guess, and by what."""
+        swinging = self._swinging(answers)
+        kinds = {name: answers[sensor_key(name, "type")] for name in swinging}
+        by_values = [
+            name
+            for name, kind in kinds.items()
+            if kind in {"accelerometer", "velocity"} and sensor_key(name, "type") in taken
+        ]
+        if by_values:
+            yield (
+                f"{', '.join(by_values)}: type and unit of the sensor are a guess by the values, which swing "
+                "about 0; see the device's manual."
+            )
+        if averaged := [name for name, kind in kinds.items() if kind == "trend"]:
+            yield (
+                f"{', '.join(averaged)}: the values swing about 0. A trend value is averaged over "
+                "window_s, so that an alarm on it may never come: if it is a vibration, have the device send "
+                "its RMS."
+            )
+        unstated = [name for name in channels if answers.get(sensor_key(name, "suffix")) is None]
+        yield from guessed_sensors(answers, [one for one in unstated if one not in by_values], taken)
+
+    def _swinging(self, answers: Answers) -> list[str]:
+        """The columns that swing about 0 and have a sensor, by the names that were answered."""
+        found = self.found
+        if found["framing"] != "lines" or len(answers["columns"]) != len(found["columns"]):
+            return []
+        pairs = zip(answers["columns"], found["columns"], strict=True)
+        return [name for name, one in pairs if one["swings"] and sensor_key(name, "type") in answers]
+
+    def not_read(self, answers: Answers) -> Iterable[str]:
+        """See `Heard.not_read`."""
+        found = self.found
+        if found["framing"] != answers["framing"]:
+            return
+        if found["framing"] == "lines":
+            yield from self._not_read_of_lines(answers)
+        elif found["crc"] and not _is_known_crc(found):
+            yield unchecked_words(found["crc"])
+
+    def _not_read_of_lines(self, answers: Answers) -> Iterator[str]:
+        """What of the lines is not in the file."""
+        found = self.found
+        if self.missed:
+            yield f"What was heard does not fit this file: {self.missed}."
+            return
+        if found["lines_damaged"]:
+            words = other_lines_words(found["lines_damaged"], found["lines_heard"], found["damaged_line"])
+            yield f"{words}."
+        kinds = [found["prefix"], *found["other_prefixes"]]
+        if found["other_prefixes"] and answers["prefix"] in kinds:
+            yield other_kinds_words([one for one in kinds if one != answers["prefix"]])
+        if len(answers["columns"]) == len(found["columns"]):
+            yield from self._columns_not_read(answers)
+
+    def _columns_not_read(self, answers: Answers) -> Iterator[str]:
+        """What of the columns is not in the file, or not always."""
+        found = self.found
+        heard, texts = found["lines_heard"] - found["lines_damaged"], {}
+        for name, one in zip(answers["columns"], found["columns"], strict=True):
+            measured = answers.get(sensor_key(name, "type")) not in {None, NONE}
+            if not one["numeric"] and (measured or name == answers["counter"]):
+                yield (
+                    f"No number was heard in column {name}, but e.g. {quoted(one['last'])}: a line without a "
+                    "number there is not read."
+                )
+            elif not one["numeric"]:
+                texts[name] = one["last"]
+            elif measured and one["absent"]:
+                yield absent_words(name, one["absent"], heard, one["absent_text"])
+        if texts:
+            yield no_number_words(texts)
+
+
+def _swinging_type(one: Mapping[str, Any], name: str, rate_hz: float | None) -> str | None:
+    """The type of the sensor of a column whose values swing about 0; None if nothing is known."""
+    if not one["swings"] or rate_hz is None or rate_hz < LEAST_SWINGING_HZ:
+        return None
+    if by_name(name) not in {None, "accelerometer"}:
+        return None
+    return TYPE_OF_UNIT.get(unit_of_suffix(one["unit"])) if one["unit"] else "accelerometer"
+
+
+def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
+    """What was heard, in a few lines."""
+    rate = "" if found["rate_hz"] is None else f", {found['rate_hz']:.4g} a second"
+    baud = "any baud rate" if found["any_baud"] else f"{found['baud']} bit/s"
+    line = f"{baud}, {found['character']}"
+    if found["overrun_baud"] is not None:
+        yield overrun_words(found["overrun_baud"], found["baud"])
+    if found["framing"] != "lines":
+        kind = "COBS frames" if found["framing"] == "cobs" else f"frames behind {found['sync_word']}"
+        counter = found["counter"]
+        counts = f"byte {counter['byte']} of the payload counts" if counter else "nothing counts"
+        check = f"CRC {found['crc'] or 'unknown'}"
+        if found["frames_passing"] < 1:
+            check += f" (passes in {100 * found['frames_passing']:.0f} % of the frames)"
+        yield f"{line}: {kind} of {found['frame_length']} bytes{rate}, {check}, {counts}"
+        return
+    prefix = f", each begins with {found['prefix']}" if found["prefix"] else ""
+    comma = ", numbers with a decimal comma" if found["decimal"] == "," else ""
+    yield f"{line}: lines of text{rate}, {counted(len(found['columns']), 'column')}{prefix}{comma}"
+    if found["lines_damaged"]:
+        yield f"  {other_lines_words(found['lines_damaged'], found['lines_heard'], found['damaged_line'])}"
+    yield from (f"  {one}" for one in found["lines"][:_SHOWN_LINES])
+    yield from (f"  {words}" for one in found["columns"] for words in _column_words(one))
+    if found["other_prefixes"]:
+        yield f"  {other_kinds_words(found['other_prefixes'])}"
+
+
+def _column_words(one: Mapping[str, Any]) -> Iterator[str]:
+    """What is known of a column, in a few lines."""
+    if one["turns_at"]:
+        yield turn_words(one["name"], one["turns_at"])
+    elif one["counts"]:
+        yield f"{one['name']} counts lines; {MUST_TURN}"
+    elif one["unit"]:
+        yield f"{one['name']} is in {one['unit']}, as the device writes it behind the number"
+    if one["prefix"]:
+        yield f"{one['name']} is the number behind {one['prefix']}"
+
+
+def _missed(found: Mapping[str, Any]) -> str:
+    """See `Heard.missed`: what a stream needs, and the device does not send."""
+    if found["framing"] != "lines":
+        if found["counter"] is not None and found["counter_bits"] is not None:
+            return ""
+        return f"{frames_need(_payload_length(found))}. Remedy: see the manual of the device"
+    numbers = [one for one in found["columns"] if one["numeric"]]
+    if any(not (one["counts"] or one["time_unit"] or one["turns_at"]) for one in numbers):
+        return ""
+    begin = "" if numbers else f"{NO_NUMBERS} "
+    return f"{begin}{LINES_NEED}. Remedy: have the device send them"
+
+
+def _is_known_crc(found: Mapping[str, Any]) -> bool:
+    """Whether it is one of the two that the driver knows, which leave out the sync word."""
+    return found["crc"] in CRCS and found["crc_from"] == len(found["sync_word"]) // 2
+
+
+def _payload_length(found: Mapping[str, Any]) -> int:
+    """Bytes of the payload for the driver; a check that it does not know is a part of it."""
+    length: int = found["payload_length"]
+    return length + (0 if _is_known_crc(found) else found["crc_bytes"])
