@@ -229,6 +229,7 @@ class StatusReport:
             "code": _id(NOT_BELIEVED if counted.get("doubt") else None),
             "samples_received": counted.get("samples_received", 0),
             "samples_lost": counted.get("samples_lost", 0),
+            "losses": stream.layout.losses,
         }
 
     def _channels(self, seen: _Seen, states: Mapping[str, tuple[SensorState, str]]) -> Iterator[Document]:

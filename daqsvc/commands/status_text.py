@@ -200,9 +200,12 @@ def _lost(stream: Document) -> str:
     lost, received = stream["samples_lost"], stream["samples_received"]
     if not lost + received:
         return "no samples yet" + (f" [{stream['doubt']}]" if stream["doubt"] else "")
-    share = f" ({100 * lost / (lost + received):.2g} %)" if lost else ""
+    share = [f"{100 * lost / (lost + received):.2g} %"] * bool(lost)
+    # A service of before has no such key.
+    share += ["estimated"] * (stream.get("losses") == "estimated")
+    behind = f" ({', '.join(share)})" if share else ""
     doubt = f" [{stream['doubt']}]" if stream["doubt"] else ""
-    return f"{lost:,} of {lost + received:,} samples{share}{doubt}"
+    return f"{lost:,} of {lost + received:,} samples{behind}{doubt}"
 
 
 def _figure(value: float | None, unit: str, digits: int = 4) -> str:

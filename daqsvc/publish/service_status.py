@@ -36,6 +36,10 @@ class StreamPayload(JsonPayload):
     code: str | None = Field(None, description="code of that doubt; null if there is none")
     samples_received: int = Field(description="samples that came")
     samples_lost: int = Field(description="samples that never came")
+    losses: Literal["counted", "estimated"] = Field(
+        description="how their number is known: estimated from the times of arrival if the device sends "
+        "neither a count nor a time"
+    )
 
 
 class ChannelPayload(JsonPayload):

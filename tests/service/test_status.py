@@ -123,6 +123,24 @@ async def test_newest_samples_and_statements_are_told(
         assert "alert active unacknowledged sensor-ok/probe-x" in text
 
 
+@pytest.mark.parametrize("losses", ["counted", "estimated"])
+async def test_losses_that_nothing_counts_are_told_as_an_estimate(tmp_path: Path, losses: str) -> None:
+    text = LAVAL.read_text().partition("[mqtt]")[0]
+    counter = 'counter = { byte = 0, bits = 16, counts = "samples" }'
+    assert counter in text
+    if losses == "estimated":
+        text = text.replace(counter, "no_counter = true")
+    machine = parse_machine_file(text.replace('interface = "socketcan"', 'interface = "virtual"'), LAVAL)
+    async with running(machine, tmp_path / "store") as service:
+        block = np.ones((8, 3), np.float32)
+        service._deliver(SampleBlock("shaft", 0, block, service.clock.monotonic_ns(), NS_PER_S / 640.0))
+        status = await told(tmp_path / "store")
+    assert status["streams"]["shaft"]["losses"] == losses
+    stream = status["streams"]["shaft"] | {"samples_received": 990, "samples_lost": 10}
+    shown = {"counted": "10 of 1,000 samples (1 %)", "estimated": "10 of 1,000 samples (1 %, estimated)"}
+    assert shown[losses] in status_text(status | {"streams": {"shaft": stream}}, 200)
+
+
 async def test_until_when_an_alarm_is_shelved_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
