@@ -7,7 +7,8 @@ has just been opened: whoever had it before may have asked for what is still to 
 
 A unit that is dead, or one request of a unit that lives, is set aside after a few requests without reply, and
 asked again ever more rarely. A unit is dead when nothing that it is asked is answered any more: a queue that
-it does not have must not cost its other streams their samples.
+it does not have must not cost its other streams their samples. What it answered before its silence began does
+not show that it lives: of that the last is asked once more, and so it is with units that are asked rarely.
 """
 
 from __future__ import annotations
@@ -137,6 +138,9 @@ class RequestHealth:
         wait_ns: how long it is set aside at a time.
         probe_ns: when to ask again; None if it is not set aside.
         answers: whether there was a reply when it was asked last, or it has not been asked yet.
+        run: the registers that were read when it was answered last; None if nothing was, or if reading
+            changes something, as in a queue.
+        answered_ns: when that was.
     """
 
     key: RequestKey
@@ -144,6 +148,8 @@ class RequestHealth:
     wait_ns: int = 0
     probe_ns: int | None = None
     answers: bool = False
+    run: RegisterRun | None = None
+    answered_ns: int = 0
 
     def set_aside(self, patience: RetryPolicy, now_ns: int) -> bool:
         """Make no request for a while; returns whether that is new."""
@@ -185,11 +191,28 @@ class UnitHealth:
         self._requests: dict[RequestKey, RequestHealth] = {}
         self._last_words = ""
         self._sparing: SparingByRequest = {} if sparing is None else sparing
+        self.silent_since_ns: int | None = None
+        """When the first request without reply ended since the last reply; None if that was a reply."""
+        self.heard_ns: int | None = None
+        """When the last reply came; None if none has."""
 
     @property
     def dead(self) -> bool:
         """Whether the whole unit is set aside."""
         return self._whole.probe_ns is not None
+
+    @property
+    def witness(self) -> RequestHealth | None:
+        """What to ask before anything is set aside, as nothing has been answered for so many requests."""
+        if self.dead or self._whole.failures < self._patience.demote_after:
+            return None
+        return self.last_answered
+
+    @property
+    def last_answered(self) -> RequestHealth | None:
+        """Of the requests that were answered when they were made last, the latest that can be repeated."""
+        known = [one for one in self._requests.values() if one.answers and one.run is not None]
+        return max(known, key=lambda one: one.answered_ns, default=None)
 
     def of(self, key: RequestKey) -> RequestHealth:
         """What is known of a request; one that is new may be answered."""
@@ -220,14 +243,20 @@ class UnitHealth:
         """Whether this, asked now, is to find out if somebody is back."""
         return self.dead or health.probe_ns is not None
 
-    def answered(self, health: RequestHealth, *, refused: bool = False) -> None:
+    def answered(
+        self, health: RequestHealth, now_ns: int, run: RegisterRun | None = None, *, refused: bool = False
+    ) -> None:
         """There was a reply.
 
         Args:
             health: of what was asked.
+            now_ns: monotonic time now.
+            run: the registers that were read, if they were.
             refused: whether the unit refuses: it lives now, but need not be asked that again.
         """
         health.answers = not refused and _is_repeated(health.key)
+        health.run, health.answered_ns = run, now_ns
+        self.silent_since_ns, self.heard_ns = None, now_ns
         if self.dead:
             self._counters.units_back += 1
             for other in self._requests.values():
@@ -243,12 +272,25 @@ class UnitHealth:
         health.end()
 
     def missed(self, health: RequestHealth, why: str, now_ns: int) -> None:
-        """There was no reply, because of ``why``."""
-        whole, patience = self._whole, self._patience
-        whole.failures += 1
+        """There was no reply, because of ``why``; if there is a `witness`, nothing is set aside yet."""
+        self._whole.failures += 1
         health.failures += 1
         health.answers = False
         self._last_words = why
+        if self.silent_since_ns is None:
+            self.silent_since_ns = now_ns
+        if self.witness is None:
+            self.judge(health, why, now_ns)
+
+    def doubt_all(self) -> None:
+        """The witness was silent, too: earlier replies to what could be asked again show nothing any more."""
+        for one in self._requests.values():
+            if one.run is not None:
+                one.answers = False
+
+    def judge(self, health: RequestHealth, why: str, now_ns: int) -> None:
+        """Set the unit, or a request without reply, aside if that is due."""
+        whole, patience = self._whole, self._patience
         lives = any(other.answers for other in self._requests.values())
         if not lives and whole.failures >= patience.demote_after:
             if whole.set_aside(patience, now_ns):
@@ -292,6 +334,9 @@ MOST_WRITTEN = 123
 MOST_VALUE = 0xFFFF
 
 Result = TypeVar("Result")
+
+if TYPE_CHECKING:
+    Request: TypeAlias = Callable[[], Awaitable[Result]]
 
 
 class WriteRefusedError(PermissionError):
@@ -365,7 +410,9 @@ class ModbusLine:
         """Read registers, and tell when that was; see `read`."""
         key = RequestKey(function, what)
         return RegisterValues(
-            *await self._ask(unit, key, lambda: self._client.read(unit, function, run.address, run.count))
+            *await self._ask(
+                unit, key, lambda: self._client.read(unit, function, run.address, run.count), run
+            )
         )
 
     async def read(self, unit: int, function: int, run: RegisterRun, what: str = "") -> bytes:
@@ -406,7 +453,7 @@ class ModbusLine:
         await self._ask(unit, RequestKey(WRITE_REGISTERS), lambda: self._client.write(unit, address, values))
 
     async def _ask(
-        self, unit: int, key: RequestKey, request: Callable[[], Awaitable[Result]]
+        self, unit: int, key: RequestKey, request: Request[Result], run: RegisterRun | None = None
     ) -> tuple[Result, int, int]:
         """Make a request as soon as it may be; returns its result, when it went out and when it ended."""
         asked = self._units.get(unit)
@@ -417,40 +464,102 @@ class ModbusLine:
             asked.check(health, self._clock.monotonic_ns())
             await self._let_others_go_first()
         async with self._lock:
-            asked_ns = self._clock.monotonic_ns()
-            if self._quiet_until() > asked_ns:
-                await self._keep_quiet()
-                asked_ns = self._clock.monotonic_ns()
+            await self._keep_quiet()
             if asked.doubts(health):
-                asked.check(health, asked_ns)
+                asked.check(health, self._clock.monotonic_ns())
                 self._counters.probes += asked.probes(health)
-            self._failed = True  # until a reply is there: also if this task is cancelled meanwhile
-            ended_ns = 0
+            was_dead = asked.dead
             try:
-                result = await request()
-            except LineLostError as error:
-                self._lose(f"{error}")
-                raise
+                return await self._exchange(asked, health, request, run)
             except NoReplyError as error:
-                self._miss(asked, health, f"{error}")
+                await self._look_for_life(unit, health, f"{error}", was_dead=was_dead)
                 raise
             except RequestRefusedError as error:
-                self._failed = False
                 if error.code in GATEWAY_CODES:
-                    self._miss(asked, health, f"{error}")
-                else:
-                    self._heard()
-                    asked.answered(health, refused=True)
+                    await self._look_for_life(unit, health, f"{error}", was_dead=was_dead)
                 raise
+
+    async def _exchange(
+        self, asked: UnitHealth, health: RequestHealth, request: Request[Result], run: RegisterRun | None
+    ) -> tuple[Result, int, int]:
+        """Send a request, and note how it ended; to be called with the lock, when the line is quiet."""
+        asked_ns = self._clock.monotonic_ns()
+        self._failed = True  # until a reply is there: also if this task is cancelled meanwhile
+        ended_ns = 0
+        try:
+            result = await request()
+        except LineLostError as error:
+            self._lose(f"{error}")
+            raise
+        except NoReplyError as error:
+            asked.missed(health, f"{error}", self._clock.monotonic_ns())
+            raise
+        except RequestRefusedError as error:
+            self._failed = False
+            if error.code in GATEWAY_CODES:
+                asked.missed(health, f"{error}", self._clock.monotonic_ns())
             else:
-                self._failed = False
                 self._heard()
-                asked.answered(health)
-                ended_ns = self._clock.monotonic_ns()
-                return result, asked_ns, ended_ns
-            finally:
-                silence_ns = self._patience.quiet_ns if self._failed else self._patience.gap_ns
-                self._quiet_until_ns = (ended_ns or self._clock.monotonic_ns()) + silence_ns
+                asked.answered(health, self._clock.monotonic_ns(), refused=True)
+            raise
+        else:
+            self._failed = False
+            self._heard()
+            ended_ns = self._clock.monotonic_ns()
+            asked.answered(health, ended_ns, run)
+            return result, asked_ns, ended_ns
+        finally:
+            silence_ns = self._patience.quiet_ns if self._failed else self._patience.gap_ns
+            self._quiet_until_ns = (ended_ns or self._clock.monotonic_ns()) + silence_ns
+
+    async def _look_for_life(self, unit: int, health: RequestHealth, why: str, *, was_dead: bool) -> None:
+        """After a request without reply: find out whether its unit lives, and whether any does.
+
+        A poll ends with its first request without reply, and a stream may be asked for once an hour. So what
+        was answered before the silence began is asked again, once.
+        """
+        asked = self._units[unit]
+        if (witness := asked.witness) is not None:
+            if not await self._is_answered(unit, witness):
+                asked.doubt_all()
+            asked.judge(health, why, self._clock.monotonic_ns())
+        all_dead = all(one.dead for one in self._units.values())
+        if all_dead or (asked.dead and not was_dead and await self._are_others_silent(asked)):
+            self._lose(f"no unit answers; the last one asked: {why}")
+
+    async def _are_others_silent(self, dead: UnitHealth) -> bool:
+        """Whether no unit answers since this one does not, which has just been set aside."""
+        since_ns = dead.silent_since_ns or 0
+        unknown = False
+        for unit, other in list(self._units.items()):
+            if other.dead:
+                continue
+            if (other.heard_ns or 0) > since_ns:
+                return False
+            last = other.last_answered
+            if last is None:  # not asked yet, or silent, too, and not for long enough
+                unknown = True
+            elif await self._is_answered(unit, last):
+                return False
+        return not unknown
+
+    async def _is_answered(self, unit: int, witness: RequestHealth) -> bool:
+        """Read again what a unit answered last; whether it still answers."""
+        await self._keep_quiet()
+        run, function = witness.run, witness.key.function
+        assert run is not None  # noqa: S101 - else it is none
+        try:
+            await self._exchange(
+                self._units[unit],
+                witness,
+                lambda: self._client.read(unit, function, run.address, run.count),
+                run,
+            )
+        except NoReplyError:
+            return False
+        except RequestRefusedError as error:
+            return error.code not in GATEWAY_CODES
+        return True
 
     async def _let_others_go_first(self) -> None:
         """Line up behind all that is due soon: what stays without reply holds the line for long.
@@ -473,17 +582,14 @@ class ModbusLine:
 
     async def _keep_quiet(self) -> None:
         """Wait out the quiet time; a late reply makes it longer by a frame's gap."""
+        if self._quiet_until() <= self._clock.monotonic_ns():
+            return
         longest_ns = self._quiet_until_ns + LONGEST_BABBLE * self._patience.quiet_ns
         while (left_ns := min(self._quiet_until(), longest_ns) - self._clock.monotonic_ns()) > 0:
             await self._clock.sleep_ns(left_ns)
 
     def _quiet_until(self) -> int:
         return max(self._quiet_until_ns, self._client.last_byte_ns + self._patience.gap_ns)
-
-    def _miss(self, asked: UnitHealth, health: RequestHealth, why: str) -> None:
-        asked.missed(health, why, self._clock.monotonic_ns())
-        if all(unit.dead for unit in self._units.values()):
-            self._lose(f"no unit answers; the last one asked: {why}")
 
     def _lose(self, why: str) -> None:
         if not self.lost.done():

@@ -195,7 +195,7 @@ def test_all_that_a_dead_unit_was_asked_shares_its_probes():
     now_ns = 0
     for request in requests:
         unit.check(request, 0)
-        unit.answered(request)
+        unit.answered(request, 0)
     for now_s_ in range(1000):
         for request in requests:
             now_ns = now_s_ * NS_PER_S
@@ -208,7 +208,7 @@ def test_all_that_a_dead_unit_was_asked_shares_its_probes():
     assert unit.dead
     # One each until it was dead, and then one for all of them, at most every 60 s but at first.
     assert asked <= 5 + 3 + 1000 // 60
-    unit.answered(requests[0])
+    unit.answered(requests[0], now_ns)
     for request in requests:
         unit.check(request, now_ns)
 
@@ -291,3 +291,106 @@ def test_what_no_register_holds_is_not_sent(values):
             assert any(written)
 
     simulate(main)
+
+
+def apart(unit, *addresses):
+    """A stream whose channels take a request each, as `daqsvc new` writes it."""
+    channels = [register(f"r{address}", address, "uint16") for address in addresses]
+    return registers_layout(unit, "holding", channels, max_gap=0)
+
+
+class HungSession:
+    """Units behind a connection that falls silent at ``at_s``, and answer over the next one at once.
+
+    Args:
+        at_s: when.
+        spared: which requests are answered all the same, by unit and first register.
+    """
+
+    def __init__(self, at_s, spared=()):
+        self._at_s = at_s
+        self._spared = set(spared)
+        self.lost_at_s = None
+        self.driver = None
+
+    def __call__(self, unit, pdu):
+        address = int.from_bytes(pdu[1:3], "big")
+        hangs = now_s() >= self._at_s and not self.driver.link.losses
+        return PlannedReply("silent" if hangs and (unit, address) not in self._spared else "none")
+
+
+def run_through(streams, plan, *, until_s, serial=False, **options):
+    rig = Rig(options_of(serial=serial, timeout_ms=TIMEOUT_MS, **options), streams, clock=LoopClock())
+    plan.driver = rig.driver
+
+    async def main():
+        async with responding(units(), plan, serial=serial), rig.running() as driver:
+            while now_s() < until_s:
+                await asyncio.sleep(0.1)
+                if driver.link.losses and plan.lost_at_s is None:
+                    plan.lost_at_s = now_s()
+
+    simulate(main)
+    return rig
+
+
+@pytest.mark.parametrize("serial", [False, True])
+@pytest.mark.parametrize("demote_after", first_of(3, 1))
+def test_a_session_that_hangs_is_lost_also_if_a_poll_takes_several_requests(serial, demote_after, caplog):
+    plan = HungSession(20.2)
+    with caplog.at_level(NOTICE):
+        rig = run_through(
+            {"s": (apart(1, 1, 20, 40), 1.0)}, plan, until_s=60, serial=serial, demote_after=demote_after
+        )
+    # Three polls without a reply, and one request more that shows that the other registers are silent, too.
+    assert plan.lost_at_s <= 20.2 + demote_after + 1
+    assert rig.driver.link.losses == 1
+    rig.check_books("s")
+    assert 1 <= rig.counters("s").samples_lost <= demote_after + 3
+    assert rig.counters("s").samples_received + rig.counters("s").samples_lost == pytest.approx(60, abs=2)
+    assert rig.driver.counters.requests_demoted == 0
+    assert "no unit answers" in caplog.text
+    assert "is back" in caplog.text
+    assert "function 3 for register" not in caplog.text
+
+
+def test_a_session_that_hangs_is_lost_also_with_two_units_of_which_one_is_asked_rarely():
+    streams = {
+        "fast": (apart(1, 1, 20), 1.0),
+        "second": (apart(1, 40, 50), 0.5),
+        "other": (apart(2, 1, 20, 40), 1.0),
+        "rare": (apart(3, 7, 30), 0.01),
+    }
+    plan = HungSession(130.2)
+    rig = run_through(streams, plan, until_s=400)
+    assert plan.lost_at_s <= 130.2 + 5
+    assert rig.driver.link.losses == 1
+    for name in streams:
+        rig.check_books(name)
+    assert 1 <= rig.counters("fast").samples_lost <= 6
+    assert rig.counters("rare").samples_lost == 0
+
+
+@pytest.mark.parametrize("polled", [(1, 20), (1,)])
+def test_a_unit_of_which_one_request_alone_fails_is_not_taken_for_dead(polled, caplog):
+    """The first request of a poll, or its only one: the rest is not asked any more, or rarely."""
+    streams = {"first": (apart(1, *polled), 1.0), "rare": (apart(1, 50), 0.02)}
+    plan = HungSession(60.2, spared=[(1, 20), (1, 50)])
+    with caplog.at_level(NOTICE):
+        rig = run_through(streams, plan, until_s=400)
+    counters = rig.driver.counters
+    assert rig.driver.link.losses == 0
+    assert counters.units_demoted == 0
+    assert counters.requests_demoted >= 1
+    assert rig.counters("rare").samples_lost == 0
+    assert "function 3 for register 1 is set aside" in caplog.text
+
+
+def test_a_unit_that_is_asked_rarely_keeps_the_line_of_a_dead_one_up():
+    """The dead unit is set aside; the other has not been asked since, and is asked before more is said."""
+    streams = {"dead": (apart(1, 1, 20), 1.0), "rare": (apart(2, 7, 30), 0.01)}
+    plan = HungSession(130.2, spared=[(2, 7), (2, 30)])
+    rig = run_through(streams, plan, until_s=400)
+    assert rig.driver.link.losses == 0
+    assert rig.driver.counters.units_demoted == 1
+    assert rig.counters("rare").samples_lost == 0
