@@ -24,8 +24,7 @@ BUS, STREAM = "main", "device"
 BEFOREHAND = "beforehand"
 """Key, beside the answers that `BusQuestions.listen` gets, of those that were given beforehand."""
 TYPE_OF_UNIT = {
-    "g": "accelerometer",
-    "m/s2": "accelerometer",
+    **dict.fromkeys(("g", "m/s2", "mg", "mm/s2"), "accelerometer"),
     "mm/s": "velocity",
     **dict.fromkeys(("um", "mm", "mil"), "proximity"),
 }

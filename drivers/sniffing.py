@@ -36,6 +36,10 @@ LEAST_SWINGING_HZ = 30.0
 """Rate from which on a vibration can be measured, where the values swing about 0."""
 
 
+_TYPE_OF_UNIT = {**dict.fromkeys(("g", "m/s2", "mg", "mm/s2"), "accelerometer"), "mm/s": "velocity"}
+"""Type of a sensor on the housing by the unit of its samples."""
+
+
 class SniffError(Exception):
     """Nothing can be seen; the message names the thing, what is wrong with it, and the remedy.
 
@@ -184,7 +188,7 @@ def sensor_lines(
         given = "g" if is_guess else text
         known = unit_of(given)
         unit = given.strip() if known is None else known.name
-        kind = {"g": "accelerometer", "m/s2": "accelerometer", "mm/s": "velocity"}.get(unit, "trend")
+        kind = _TYPE_OF_UNIT.get(unit, "trend")
         if kind == "velocity" and not waveform:
             kind = "trend"
         if kind == "trend":

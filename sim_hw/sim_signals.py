@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 
 G_M_S2 = 9.80665
 _PER_UM = {"um": 1.0, "mm": 1e-3, "mil": 1.0 / 25.4}
-_PER_M_S2 = {"m/s2": 1.0, "g": 1.0 / G_M_S2}
+_PER_M_S2 = {"m/s2": 1.0, "g": 1.0 / G_M_S2, "mm/s2": 1e3, "mg": 1e3 / G_M_S2}
 
 
 class SignalError(ValueError):

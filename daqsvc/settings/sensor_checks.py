@@ -54,6 +54,8 @@ _USUAL = {
     # Accelerometers for machines have 10 to 1000 mV/g, those for shocks 0.05, those for earthquakes 10,000.
     "g": _Usual(0.02, 0.5, 2_000.0, 100e3, 100.0),
     "m/s2": _Usual(0.002, 0.05, 200.0, 10e3, 10.2),
+    "mg": _Usual(20e-6, 0.5e-3, 2.0, 100.0, 0.1),
+    "mm/s2": _Usual(2e-6, 50e-6, 0.2, 10.0, 0.0102),
     # Velocity sensors have 4 (100 mV per in/s) to some 30.
     "mm/s": _Usual(0.01, 0.5, 200.0, 10e3, 4.0),
 }

@@ -114,7 +114,9 @@ class Accelerometer(BaseSensor):
     kind: ClassVar[str] = "an accelerometer"
 
     type: Annotated[Literal["accelerometer"], Field(description=TYPE, examples=["accelerometer"])]
-    unit: Annotated[Literal["g", "m/s2"], Field(description="unit of the acceleration", examples=["g"])]
+    unit: Annotated[
+        Literal["g", "m/s2", "mg", "mm/s2"], Field(description="unit of the acceleration", examples=["g"])
+    ]
     angle_deg: AngleDeg | None = Field(
         default=None, description="where the sensor points, from +x anticlockwise", examples=[45.0]
     )

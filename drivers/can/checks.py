@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from types import MappingProxyType
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, get_args
 
 from daqsvc import rounding
 from daqsvc.errors.buses import (
@@ -373,16 +373,29 @@ def check_dbc_unit(
         return
 
 
+def _units_of_type(sensor: Sensor) -> tuple[str, ...]:
+    """The units that sensors of this type can have; none where any can be."""
+    units: tuple[str, ...] = get_args(type(sensor).model_fields["unit"].annotation)
+    return units
+
+
 def _unit_remedy(sensor: Sensor, unit: str, factor: float | None) -> str:
-    meant = unit_of(unit)
+    meant, of_type = unit_of(unit), _units_of_type(sensor)
     if sensor.sensitivity_mv_per_unit is None and meant is not None and meant.quantity == "voltage":
         return "add sensitivity_mv_per_unit, if the channel carries a voltage; or correct the DBC file"
     if sensor.sensitivity_mv_per_unit is not None and factor is not None:
         return f"give the signal in V in the DBC file: multiply its scale and offset there by {factor:g}"
     if sensor.sensitivity_mv_per_unit is not None:
         return "remove sensitivity_mv_per_unit if the device sends the physical unit; or correct the DBC file"
+    if meant is not None and factor is not None and of_type and meant.name not in of_type:
+        units = f"{', '.join(of_type[:-1])} or {of_type[-1]}" if len(of_type) > 1 else of_type[0]
+        return (
+            f"{sensor.kind} has its samples in {units}: multiply scale and offset of the "
+            f'signal in the DBC file by {factor:.6g} and write "{sensor.unit}" as its unit there; if it is a '
+            'value that the device measures itself, write type = "trend"'
+        )
     if meant is not None and factor is not None:
-        return f'write unit = "{meant.name}" if sensors of this type have it, or correct the DBC file'
+        return f'write unit = "{meant.name}", or correct the DBC file'
     return "correct unit (or sensitivity_mv_per_unit), or the unit in the DBC file"
 
 

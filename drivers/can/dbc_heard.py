@@ -6,9 +6,9 @@ import shlex
 from typing import TYPE_CHECKING, Any
 
 from drivers.bus_questions import BUS
-from drivers.can.dbc_likely import likely_counter
+from drivers.can.dbc_likely import likely_counter, likely_measured
 from drivers.can.heard import SHOWN, HeardOnCan, decoded_signals, values_heard
-from drivers.can.sniff import STATE
+from drivers.can.sniff import CLOCK, STATE
 from drivers.questions import NONE, Answers
 from drivers.sniffing import usual_rate
 
@@ -58,6 +58,8 @@ class HeardMessages(HeardOnCan):
             likely = likely_counter(self._messages[chosen["message"]])
             counters = [one for one in counters if one == likely]
         proposed["counter"] = next(iter(counters), NONE)
+        if signals := self._without_clocks(answers | {"message": chosen["message"]}):
+            proposed["signals"] = ", ".join(signals)
         rates = [one["rate_hz"] for one in self.found["ids"] if one["message"] == chosen["message"]]
         if len(rates) == 1 and rates[0]:
             measured = [one for one in chosen["signals"] if one["signal"] in answers.get("signals", ())]
@@ -67,6 +69,23 @@ class HeardMessages(HeardOnCan):
             in_frame = self._samples_in_frame(answers) if "signals" in answers else 1
             proposed["rate"] = f"{usual_rate(rates[0]) * share * in_frame:g}"
         return proposed
+
+    def _clocks(self, answers: Answers) -> list[str]:
+        """Signals that rose all the time, as a clock does, and are no quantity by their unit."""
+        from daqsvc.settings.units import unit_of  # noqa: PLC0415 - brings the settings
+
+        rising = [one for one in self._signals(answers) if one["rises"] and not one["counts_frames"]]
+        units = {one["signal"]: unit_of(one["unit"]) for one in rising}
+        # A speed or a temperature may rise for as long as it is listened to.
+        return [name for name, unit in units.items() if unit is None or unit.quantity == "time"]
+
+    def _without_clocks(self, answers: Answers) -> list[str]:
+        """What is measured by the DBC file, without what was heard to be a clock; empty if there is none."""
+        clocks = {*self._clocks(answers), answers.get("counter")}
+        if clocks <= {answers.get("counter")}:
+            return []
+        signals = self._messages[answers["message"]].signals
+        return likely_measured([one for one in signals if one.name not in clocks])
 
     def unheard(self, answers: Answers) -> str:
         """See `Heard.unheard`."""
@@ -185,8 +204,10 @@ class HeardMessages(HeardOnCan):
         signals = self._messages[answers["message"]].signals
         states = [one.name for one in signals if one.choices and one.name not in taken]
         yield from (f"{name} is left out: {STATE}." for name in states[:SHOWN])
+        clocks = [name for name in self._clocks(answers) if name not in taken]
+        yield from (f"{name} is left out: {CLOCK}." for name in clocks[:SHOWN])
         heard = [one["signal"] for one in self._signals(answers)]
-        if rest := [name for name in heard if name not in {*taken, *states}]:
+        if rest := [name for name in heard if name not in {*taken, *states, *clocks}]:
             yield (
                 f"Not read of {answers['message']}: {_few(rest)}. Name with --signals what of them is "
                 "measured."

@@ -530,6 +530,7 @@ class _Report(NamedTuple):
                             "dbc_max": signal.stated[1],
                             "doubt": signal.doubt,
                             "counts_frames": signal.counts,
+                            "rises": signal.rises,
                             "multiplexed": signal.multiplexed,
                         }
                         for signal in message.signals
@@ -614,11 +615,10 @@ class _Report(NamedTuple):
 
 
 def _why_left_out(signal: SignalTraffic) -> str:
-    if not signal.named:
-        return "it rises all the time, as a clock does"
-    return STATE
+    return STATE if signal.named else CLOCK
 
 
+CLOCK = "it rises all the time, as a clock does"
 STATE = f'its values have names, as states have: see "A state or an enum signal" of {documented_in("alarms")}'
 """Why a signal is no measured value, and where what to do with it is described."""
 

@@ -73,6 +73,7 @@ class DbcSignalFigures(TypedDict):
         dbc_max: the greatest value by the DBC file; null if it states none.
         doubt: what is strange about its values if the file is that of the device; empty if nothing is.
         counts_frames: whether it grew by 1 from frame to frame.
+        rises: whether it rose all the time, as a clock does, until it began again at 0.
         multiplexed: whether only some frames of the message have it.
     """
 
@@ -86,6 +87,7 @@ class DbcSignalFigures(TypedDict):
     dbc_max: float | None
     doubt: str
     counts_frames: bool
+    rises: bool
     multiplexed: bool
 
 

@@ -29,6 +29,8 @@ def test_what_has_no_unit_is_taken_for_an_acceleration_where_it_comes_as_often_a
         ("mm/s", 20.0, "trend"),
         ("mm/s", WAVEFORM_HZ, "velocity"),
         ("g", 20.0, "accelerometer"),
+        ("mg", WAVEFORM_HZ, "accelerometer"),
+        ("mm/s^2", WAVEFORM_HZ, "accelerometer"),
         ("°C", 20.0, "trend"),
     ],
 )

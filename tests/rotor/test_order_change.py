@@ -274,7 +274,7 @@ def test_the_command_judges_each_recording(files: Path, capsys: pytest.CaptureFi
     [
         ([], "--baseline must be given too"),
         (["--baseline", "nowhere.csv"], "healthy run nowhere.csv: "),
-        (["--baseline", "{healthy}", "--unit", "um"], "--unit um: accelerometers measure in g, m/s2, V"),
+        (["--baseline", "{healthy}", "--unit", "um"], "--unit um: accelerometers measure in g, m/s2, mg, "),
         (["--baseline", "{healthy}", "--probes", "X,Y"], "--probes: not with --channels"),
         (["--baseline", "{short}"], "has 2.5 revolutions"),
         (["--baseline", "{healthy}", "--false-alarm-probability", "2"], "not a probability"),

@@ -35,10 +35,19 @@ TYPES = {
     "trend": "a value that the device measures itself, e.g. velocity RMS, temperature",
     NONE: "nothing that is of interest",
 }
-_UNITS = {"proximity": ("um", "mm", "mil"), "accelerometer": ("g", "m/s2")}
+_UNITS = {"proximity": ("um", "mm", "mil"), "accelerometer": ("g", "m/s2", "mg", "mm/s2")}
 _NO_UNIT = "1"
 _FIXED_UNITS = {"velocity": "mm/s", "keyphasor": "V"}
-_SENSITIVITY = {"um": 7.87, "mm": 7870.0, "mil": 200.0, "g": 100.0, "m/s2": 10.2, "mm/s": 4.0}
+_SENSITIVITY = {
+    "um": 7.87,
+    "mm": 7870.0,
+    "mil": 200.0,
+    "g": 100.0,
+    "m/s2": 10.2,
+    "mg": 0.1,
+    "mm/s2": 0.0102,
+    "mm/s": 4.0,
+}
 _PREFIX = {"proximity": "probe-", "accelerometer": "accel-", "velocity": "velocity-"}
 _ZERO_V, _OK_V = -10.0, (-18.0, -2.0)
 CLASSES = {

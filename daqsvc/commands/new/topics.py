@@ -60,9 +60,9 @@ TOPICS = {**_TOPICS_BEFORE, **_TOPICS_BEHIND}
 """Whatever the bus is."""
 
 _TYPE_HELP = (
-    "Many samples a second: proximity (the shaft, in um or mil), accelerometer (the housing, in g or m/s2), "
-    "velocity (the housing, in mm/s). One value some times a second or less, which the device has computed, "
-    "such as a velocity RMS or a temperature: trend. none leaves the channel out."
+    "Many samples a second: proximity (the shaft, in um or mil), accelerometer (the housing, in g, "
+    "m/s2, mg or mm/s2), velocity (the housing, in mm/s). One value some times a second or less, which the "
+    "device has computed, such as a velocity RMS or a temperature: trend. none leaves the channel out."
 )
 SENSOR_TOPICS = {
     "type": Topic("What is on channel {channel}?", _TYPE_HELP),

@@ -58,15 +58,14 @@ _LEAST_SAMPLES = 4
 _GLITCH = 2
 """Samples beyond the gap limits within a window, up to which they are interference and not the probe."""
 
-SensorUnit = Literal["um", "mm", "mil", "g", "m/s2", "mm/s"]
+SensorUnit = Literal["um", "mm", "mil", "g", "m/s2", "mg", "mm/s2", "mm/s"]
 
 _ANY = (0.0, math.inf)
 """Bounds of a size of which nothing is known."""
 
 # How a band velocity in mm/s comes from the samples: factor, and whether to integrate.
 _TO_VELOCITY: Mapping[str, tuple[float, bool]] = {
-    "g": (1000.0 * M_S2_PER_UNIT["g"], True),
-    "m/s2": (1000.0, True),
+    **{unit: (1000.0 * m_s2, True) for unit, m_s2 in M_S2_PER_UNIT.items()},
     "mm/s": (1.0, False),
 }
 

@@ -30,11 +30,11 @@ LENGTH_UNITS: tuple[LengthUnit, ...] = get_args(LengthUnit)
 
 UM_PER_UNIT: Mapping[str, float] = {"m": 1e6, "mm": 1e3, "um": 1.0, "mil": 25.4}
 
-AccelerationUnit = Literal["g", "m/s2", "V"]
+AccelerationUnit = Literal["g", "m/s2", "mg", "mm/s2", "V"]
 
 ACCELERATION_UNITS: tuple[AccelerationUnit, ...] = get_args(AccelerationUnit)
 
-M_S2_PER_UNIT: Mapping[str, float] = {"g": 9.80665, "m/s2": 1.0}
+M_S2_PER_UNIT: Mapping[str, float] = {"g": 9.80665, "m/s2": 1.0, "mg": 9.80665e-3, "mm/s2": 1e-3}
 """Of standard gravity (CGPM 1901). Volts are missing: what they mean only the sensor's sensitivity tells."""
 
 _USUAL_G = (1e-3, 50.0)
@@ -210,7 +210,7 @@ def accelerometer_quality(names: Sequence[str], samples: Floats, unit: Accelerat
         if m_s2 < _LEAST_M_S2 or m_s2 > _MOST_M_S2:
             quality = quality.with_problem(
                 f"{name}: vibrates with {rms:.3g} {unit} r.m.s., which no housing does: the unit looks "
-                "wrong; correct --unit (g, m/s2 or V)"
+                "wrong; correct --unit (g, m/s2, mg, mm/s2 or V)"
             )
     return quality
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from daqsvc.publish.output import Watched
     from daqsvc.publish.topics import Topics
 
-_UNITS = {"um": "µm", "m/s2": "m/s²", "deg": "°", "degC": "°C", "degF": "°F"}
+_UNITS = {"um": "µm", "m/s2": "m/s²", "mm/s2": "mm/s²", "deg": "°", "degC": "°C", "degF": "°F"}
 """Units as Home Assistant writes them, where that differs."""
 
 _CLASSES = {"mm/s": "speed", "V": "voltage", "degC": "temperature", "degF": "temperature"}

@@ -37,6 +37,8 @@ DIGITS: Mapping[str, int] = {
     "mm": 4,
     "g": 3,
     "m/s2": 2,
+    "mg": 1,
+    "mm/s2": 0,
     "mm/s": 2,
     "V": 2,
     "rpm": 1,

@@ -20,7 +20,11 @@ if TYPE_CHECKING:
     from daqsvc.recording.streams import RecordedStream
 
 TIME_RESPONSE, EVEN, TIME, UNKNOWN = 1, 1, 17, 0
-QUANTITIES = {"m/s2": 12, "g": 12, "mm/s": 11, "m/s": 11, "um": 8, "mm": 8, "m": 8, "mil": 8}
+QUANTITIES = {
+    **dict.fromkeys(("m/s2", "g", "mg", "mm/s2"), 12),
+    **dict.fromkeys(("mm/s", "m/s"), 11),
+    **dict.fromkeys(("um", "mm", "m", "mil"), 8),
+}
 """Data types of ordinates by unit: acceleration, velocity, displacement; others are unknown."""
 LONGEST, LONGEST_LABEL = 80, 20
 """Characters of a header line and of a label."""

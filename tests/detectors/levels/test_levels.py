@@ -50,12 +50,20 @@ def test_white_noise_keeps_its_power() -> None:
     assert band_rms(noise, RATE_HZ, 0.01, 1000) == pytest.approx(1.0, rel=0.01)
 
 
-def test_velocity_in_the_detector_is_in_mm_per_s() -> None:
-    acceleration_g = 0.1 * np.sin(2 * np.pi * 100 * T[:1000])
-    (said,) = detector(unit="g").process(window(acceleration_g))
-    expected = 0.1 * 9.80665 / (2 * np.pi * 100) / 2**0.5 * 1000
+@pytest.mark.parametrize(("unit", "per_g"), [("g", 1.0), ("mg", 1e3), ("m/s2", 9.80665), ("mm/s2", 9806.65)])
+@pytest.mark.parametrize(("zone_c", "decision"), [(1.0, "alert"), (1.2, "normal")])
+def test_velocity_in_the_detector_is_in_mm_per_s_whatever_the_unit_of_the_acceleration(
+    unit: str, per_g: float, zone_c: float, decision: str
+) -> None:
+    acceleration = per_g * 0.1 * np.sin(2 * np.pi * 100 * T[:1000])
+    limits = [Limits("velocity_rms", zone_c, 4.5)]
+    (said,) = detector(unit=unit, limits=limits).process(window(acceleration))
+    expected = 0.1 * 9.80665 / (2 * np.pi * 100) / 2**0.5 * 1000  # 1.10 mm/s
     assert said.statistics["velocity_rms"] == pytest.approx(expected, rel=0.01)
-    assert said.units == {"mean": "g", "rms": "g", "peak": "g", "peak_to_peak": "g", "velocity_rms": "mm/s"}
+    assert said.statistics["rms"] == pytest.approx(0.1 * per_g / 2**0.5, rel=1e-4)
+    own = dict.fromkeys(("mean", "rms", "peak", "peak_to_peak"), unit)
+    assert said.units == {**own, "velocity_rms": "mm/s"}
+    assert said.decision == decision
 
 
 def test_each_window_is_held_against_the_setpoints() -> None:

@@ -121,6 +121,27 @@ def test_the_unit_of_the_dbc_file_is_taken_over(
     assert ("[F40]" in capsys.readouterr().out) == (unit == "1")
 
 
+@pytest.mark.parametrize(("stated", "unit"), [("mg", "mg"), ("mm/s²", "mm/s2"), ("m/s^2", "m/s2")])
+def test_samples_in_any_unit_of_acceleration_make_an_accelerometer(
+    tmp_path: Path, stated: str, unit: str
+) -> None:
+    tables = new(tmp_path, GEARBOX.replace('"g"', f'"{stated}"'))
+    assert {(one["type"], one["unit"]) for one in tables["sensors"]} == {("accelerometer", unit)}
+    assert {one["measure"] for one in tables["alarms"]} == {"velocity_rms"}
+
+
+def test_no_remedy_names_a_unit_that_the_type_of_the_sensor_does_not_have(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "device.dbc").write_text(GEARBOX.replace('"g"', '"ft/s2"'))
+    given = ["--yes", "--bus=can-dbc", f"--dbc={tmp_path / 'device.dbc'}", "--sensor=AX_0.type=accelerometer"]
+    assert main(["new", f"{tmp_path / 'new.toml'}", *given]) == 2
+    refused = capsys.readouterr().err
+    assert "an accelerometer has its samples in g, m/s2, mg or mm/s2: multiply scale and offset of" in refused
+    assert 'by 0.031081 and write "g" as its unit there' in refused
+    assert 'unit = "ft/s2"' not in refused
+
+
 @pytest.mark.parametrize(
     ("stated", "written"),
     [

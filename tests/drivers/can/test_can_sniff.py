@@ -251,6 +251,7 @@ def test_a_page_is_proposed_at_its_own_rate(tmp_path: Path, signals: tuple[str, 
                             "frames": f,
                             "multiplexed": m,
                             "counts_frames": n == "Count",
+                            "rises": False,
                             "unit": "",
                             "min": 0.0,
                             "max": 1.0,
@@ -752,6 +753,20 @@ def test_new_names_the_messages_that_it_heard_and_does_not_read(
     state = "Status is left out: its values have names, as states have: see"
     assert f"\n{note}\n{state}" in capsys.readouterr().out
     assert f"{note} {state}" in comments(tmp_path / "new.toml")
+
+
+@pytest.mark.usefixtures("hub")
+def test_new_leaves_a_clock_out_as_sniff_does(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 0.5)
+    text = FAN.replace("TimeMs", "Tick").replace("VibDE_0", "Ax").replace("VibDE_1", "Ay")
+    (tmp_path / "fan.dbc").write_text(text)
+    with talking(tmp_path / "bus", fan):
+        found = new(tmp_path, "--bus=can-dbc", "--dbc=fan.dbc")
+    assert [one["channel"] for one in found["sensors"]] == ["Ax", "Ay"]
+    assert "Tick is left out: it rises all the time, as a clock does." in capsys.readouterr().out
+    assert "Tick is left out: it rises all the time, as a clock does." in comments(tmp_path / "new.toml")
 
 
 STATUS = """VERSION ""
