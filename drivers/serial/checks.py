@@ -239,7 +239,7 @@ def _check_texts(layout: LineLayout, delimiter: str, path: KeyPath) -> Iterator[
         if table is not None
         for key in ("prefix", "suffix")
     ]
-    for where, text in texts:
+    for where, text in (((*path, "prefix"), layout.prefix or ""), *texts):
         for what, mark in (("separator", layout.separator), ("delimiter", delimiter)):
             if mark in text:
                 yield Finding(

@@ -242,19 +242,17 @@ def _is_absent(buffer: Bytes, start: int, stop: int) -> bool:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _text_begins(buffer: Bytes, start: int, stop: int, prefix: Bytes, separator: int) -> int:
+def _text_begins(buffer: Bytes, start: int, stop: int, prefix: Texts, separator: int) -> int:
     """Where the fields behind the prefix begin; -1 if it is different, or the first if there is none."""
-    if not len(prefix):
+    if not prefix.shape[1]:
         return start
     while separator == SPACE and start < stop and buffer[start] == SPACE:
         start += 1
-    end = start + len(prefix)
-    if end > stop or (end < stop and buffer[end] != separator):
-        return -1
     for k in range(len(prefix)):
-        if buffer[start + k] != prefix[k]:
-            return -1
-    return end + 1
+        length = _length_there(buffer, start, stop, prefix[k], False)
+        if length >= 0 and (start + length == stop or buffer[start + length] == separator):
+            return start + length + 1
+    return -1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -308,7 +306,7 @@ def read_lines(
     buffer: Bytes,
     starts: Places,
     stops: Places,
-    prefix: Bytes,
+    prefix: Texts,
     separator: int,
     classes: Bytes,
     columns: int,
@@ -322,7 +320,8 @@ def read_lines(
         buffer: uint8, with the lines in it.
         starts: int64 ``[n]``, where each begins.
         stops: int64 ``[n]``, one past its last byte.
-        prefix: uint8, the first field of each line of the stream; empty if it has none.
+        prefix: uint8 ``[2, m]``, the first field of each line of the stream in two encodings, either of which
+            may be there, with zeros behind them; m is 0 if it has none.
         separator: the byte between fields; if it is a blank, there may be several.
         classes: one of `CLASSES`, by the decimal mark of the stream.
         columns: how many fields there are, without the prefix.

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 NUMBER: Mapping[str, re.Pattern[str]] = {
-    mark: re.compile(rf" *[+-]?(\d+{re.escape(mark)}?\d*|{re.escape(mark)}\d+)([eE][+-]?\d+)? *")
+    mark: re.compile(rf" *[+-]?([0-9]+{re.escape(mark)}?[0-9]*|{re.escape(mark)}[0-9]+)([eE][+-]?[0-9]+)? *")
     for mark in (".", ",")
 }
 """A number, by decimal mark."""
@@ -17,17 +17,17 @@ ABSENT_WORDS = ("nan", "na", "n/a", "null", "none", "ol", "ovl", "inf", "+inf", 
 """Words for no value, or for one beyond what the device can measure. ``err`` is none: a code may follow."""
 ABSENT = re.compile(rf" *(-*|{'|'.join(map(re.escape, ABSENT_WORDS))}) *", re.IGNORECASE)
 """What devices write where they have no value: nothing, dashes, or a word."""
-BEYOND_ASCII = "°µμ²³"
-"""Letters of units that have no code in ASCII; two of them are a mu."""
 _POWER = r"(?:\^?[23]|[²³])"
-_NAME = rf"[A-Za-z%µμ]+{_POWER}?"
+_NAME = rf"[A-Za-z%‰µμ\u2126Ω\u2103\u2109]+{_POWER}?"
 _UNIT = rf"°|°?{_NAME}(?:/{_NAME})?|1/[A-Za-z]+"
 _WITH_UNIT: Mapping[str, re.Pattern[str]] = {
     mark: re.compile(rf"({number.pattern})({_UNIT}) *") for mark, number in NUMBER.items()
 }
-_NAMED = re.compile(
-    r" *([A-Za-z_][\w.-]{0,13}[=:])(?=[ +.,\d-]|$|nan|inf|ol|n/?a|none|null)", re.ASCII | re.IGNORECASE
+_NAMED = re.compile(r" *([^\W\d][\w.-]{0,13}[=:])(?=[ +.,0-9-]|$|nan|inf|ol|n/?a|none|null)", re.IGNORECASE)
+_UNPRINTED = re.compile(
+    "(?<=[A-Za-z0-9])[\x80-\x9f]{1,2}(?![\x80-\x9f])|(?<![\x80-\x9f])[\x80-\x9f]{1,2}(?=[A-Za-z])|[\xa0\u202f\t]"
 )
+"""Letters of other tables than Latin-1, such as an umlaut of cp437, beside others; and blanks."""
 BLANK = " "
 RUN_OF_BLANKS = re.compile(" +")
 
@@ -49,6 +49,19 @@ def text_of(data: bytes) -> str:
         return data.decode("utf-8")
     except UnicodeDecodeError:
         return data.decode("latin-1")
+
+
+def encoded(text: str) -> tuple[bytes, bytes]:
+    """A text as devices may write it: in UTF-8, and in Latin-1 where that has its letters."""
+    try:
+        return text.encode(), text.encode("latin-1")
+    except UnicodeEncodeError:
+        return text.encode(), text.encode()
+
+
+def is_text(line: str) -> bool:
+    """Whether all of a line, as `text_of` has it, is what lines of a device are made of, in any language."""
+    return line.isprintable() or _UNPRINTED.sub("", line).isprintable()
 
 
 def number_within(text: str, prefix: str, suffix: str) -> str | None:

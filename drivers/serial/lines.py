@@ -32,9 +32,10 @@ from drivers.serial.line_kernels import (
 )
 from drivers.serial.line_numbers import (
     ABSENT,
-    BEYOND_ASCII,
     NUMBER,
+    encoded,
     fields_of,
+    is_text,
     number_within,
     parts_of,
     text_of,
@@ -131,11 +132,10 @@ class LineCodec:
         self._beside = layout.beside
         read = [*([] if place is None else [place.column]), *layout.channel_names]
         around = [("", "")] * (place is None) + [self._beside[name] for name in read]
-        texts = [encoded for pair in around for text in pair for encoded in _encoded(text)]
-        padded = [text.ljust(max(1, *map(len, texts)), b"\0") for text in texts]
-        self._texts = np.array([list(text) for text in padded], np.uint8).reshape(len(around), 4, -1)
+        texts = [one for pair in around for text in pair for one in encoded(text)]
+        self._texts = _side_by_side(texts, least=1).reshape(len(around), 4, -1)
         self._around = around
-        self._prefix = np.frombuffer((layout.prefix or "").encode("ascii"), np.uint8).copy()
+        self._prefix = _side_by_side(encoded(layout.prefix or ""))
 
     def read(self, lines: Pieces) -> Lines:
         """Read lines of any streams."""
@@ -273,19 +273,16 @@ class LineCodec:
         return layout.separator.join(fields).encode()
 
 
-def _encoded(text: str) -> tuple[bytes, bytes]:
-    """A text as devices may write it: in UTF-8, and in Latin-1 where that has its letters."""
-    try:
-        return text.encode(), text.encode("latin-1")
-    except UnicodeEncodeError:
-        return text.encode(), text.encode()
+def _names_stream(prefix: str) -> bool:
+    """Whether a first field may be the prefix of a stream that the file does not have, and no noise."""
+    ascii_letters = sum(map(str.isascii, prefix))
+    return prefix.isprintable() and (ascii_letters == len(prefix) or 2 * ascii_letters > len(prefix) > 2)
 
 
-def _is_text(text: str) -> bool:
-    """Whether all of it is what lines of a device are made of."""
-    return all(letter.isascii() or letter in BEYOND_ASCII for letter in text) and all(
-        letter.isprintable() or letter == "\t" for letter in text
-    )
+def _side_by_side(texts: Sequence[bytes], least: int = 0) -> NDArray[np.uint8]:
+    """Texts with zeros behind them, uint8 ``[n, m]``; m is that of the longest, and ``least`` at least."""
+    length = max(least, *map(len, texts))
+    return np.array([list(text.ljust(length, b"\0")) for text in texts], np.uint8).reshape(len(texts), length)
 
 
 def _other_unit(text: str) -> str:
@@ -357,10 +354,9 @@ class LineFraming(DelimitedFraming):
         self._codecs = {name: LineCodec(layout) for name, layout in layouts.items()}
         self._rates_hz = dict(rates_hz)
         self._checksum: Checksum = checksum
-        self._by_prefix: dict[bytes | None, str] = {}
+        self._by_prefix: dict[str | None, str] = {}
         for name, layout in layouts.items():
-            key = None if layout.prefix is None else layout.prefix.encode("ascii")
-            other = self._by_prefix.setdefault(key, name)
+            other = self._by_prefix.setdefault(layout.prefix, name)
             if other != name or (None in self._by_prefix and len(layouts) > 1):
                 raise LayoutError(f"streams {other!r} and {name!r} cannot be told apart; give each a prefix")
         separators = {layout.separator for layout in layouts.values()}
@@ -403,9 +399,9 @@ class LineFraming(DelimitedFraming):
     def _why_no_frame(self, piece: bytes) -> NoFrame:
         line = text_of(piece)
         shown = piece[:SHOWN_CHARACTERS].decode("ascii", "backslashreplace")
-        shown = line[:SHOWN_CHARACTERS] if _is_text(line) else shown
+        shown = line[:SHOWN_CHARACTERS] if is_text(line) else shown
         said = f'the first line is "{shown}{"..." if len(piece) > SHOWN_CHARACTERS else ""}"'
-        if not _is_text(line):
+        if not is_text(line):
             why = "no text, as at another baud rate or parity, or of a device that sends no lines"
             return NoFrame(f"{said}: {why}")
         if self._checksum != "none":
@@ -422,7 +418,7 @@ class LineFraming(DelimitedFraming):
         if None in self._by_prefix:
             why, remedy = self._codecs[self._by_prefix[None]].why_not(fields)
             return NoFrame(f"{said}: {why}", remedy)
-        name = self._by_prefix.get(fields[0].encode())
+        name = self._by_prefix.get(fields[0])
         if name is None:
             return NoFrame(f"{said}: of no stream", "correct prefix and separator of the layout")
         why, remedy = self._codecs[name].why_not(fields[1:])
@@ -461,9 +457,9 @@ class LineFraming(DelimitedFraming):
             arrival_ns = arrivals_of(pieces.ends[good])
             batch.frames[name] = DecodedFrames(counter, samples, sound, arrival_ns)
         for k in np.flatnonzero(strays).tolist():
-            text = pieces.buffer[pieces.starts[k] : pieces.stops[k]].tobytes().decode("ascii", "replace")
+            text = text_of(pieces.buffer[pieces.starts[k] : pieces.stops[k]].tobytes())
             prefix = fields_of(text, self._separator)[0]
-            if prefix.isascii() and prefix.isprintable():
+            if _names_stream(prefix):
                 batch.unknown[prefix] += 1
                 in_step[k] = True
         return in_step

@@ -32,7 +32,16 @@ _OF_UNITS = re.compile(
     rb"(?<=[ -~])(?:\xc2[\xb0\xb2\xb3\xb5]|\xce\xbc|[\xb0\xb2\xb3\xb5])(?=[A-Za-z/,;|*\t\r\n ]|$)"
 )
 """Letters of units such as a degree or a mu, in UTF-8 or Latin-1, between others of a text."""
-_ENCLOSED = re.compile(rb"\x02[\t\x20-\x7e]{3,}\x03")
+_UTF_8 = re.compile(rb"[\xc2-\xdf][\x80-\xbf]|[\xe0-\xef][\x80-\xbf]{2}|[\xf0-\xf4][\x80-\xbf]{3}")
+"""What may be a letter in UTF-8."""
+_OF_WORDS = re.compile(
+    rb"(?<=[A-Za-z])[\x80-\xff]{1,2}(?![\x80-\xff])|(?<![\x80-\xff])[\x80-\xff]{1,2}(?=[A-Za-z])"
+    rb"|(?<=[,;|\t ])[\xa1-\xff](?=[,;|\t\r\n ])|(?<=[0-9])[\x80-\xff](?=[,;|\t\r\n ])"
+)
+"""Letters in a table of 256 such as Latin-1 or cp1252: one or two beside others, or a sign alone."""
+_MOST_OF_WORDS = 0.15
+"""Share of the bytes that such letters are at most. In UTF-8 all of them may be beyond ASCII."""
+_ENCLOSED = re.compile(rb"\x02[\t\x20-\x7e\x80-\xff]{3,}\x03")
 _LEAST_ENCLOSED = 3
 _MOSTLY = 0.75
 
@@ -99,8 +108,23 @@ def recognised(data: bytes, line_errors: int = 0) -> Recognised:
 
 def _printable(data: bytes) -> float:
     """Share of bytes that are text; 0 of none."""
-    strange = sum(byte not in _TEXT for byte in _OF_UNITS.sub(b"", data))
-    return 1 - strange / len(data) if data else 0.0
+    if not data:
+        return 0.0
+    plain = _OF_UNITS.sub(b"", data)
+    # Of a few bytes, more letters would make more of them text by chance.
+    if len(data) >= LEAST_BYTES:
+        plain = _UTF_8.sub(_unless_letter, plain)
+        words = _OF_WORDS.sub(b"", plain)
+        plain = words if len(plain) - len(words) <= _MOST_OF_WORDS * len(data) else plain
+    return 1 - sum(byte not in _TEXT for byte in plain) / len(data)
+
+
+def _unless_letter(found: re.Match[bytes]) -> bytes:
+    """Nothing in place of a letter in UTF-8; what is none stays."""
+    try:
+        return b"" if found[0].decode().isprintable() else found[0]
+    except UnicodeDecodeError:
+        return found[0]
 
 
 def _is_enclosed(data: bytes) -> bool:

@@ -18,10 +18,11 @@ import numpy as np
 
 from drivers.serial.line_numbers import (
     ABSENT,
-    BEYOND_ASCII,
     BLANK,
     NUMBER,
+    encoded,
     fields_of,
+    is_text,
     number_within,
     parts_of,
     text_of,
@@ -51,16 +52,15 @@ _LEAST_SWINGING, _LEAST_DIFFERENT, _SWINGING = 16, 4, 0.1
 """A column may be a vibration from so many values on, different ones among them, and share of steps over
 the mean."""
 _CHECKSUM = re.compile(r"\*([0-9A-Fa-f]{4}|[0-9A-Fa-f]{2})$")
-_PREFIX = re.compile(r"[!$]?[A-Za-z_-][A-Za-z0-9_-]{0,14}")
+_PREFIX = re.compile(r"[!$]?(?!\d)[\w-]{1,15}")
 _MESSAGES = frozenset(
     {"err", "error", "fail", "failed", "fault", "warn", "warning", "info", "debug", "timeout"}
 )
 """Words that messages of a device begin with, which are neither names of columns nor kinds of lines."""
-_WORD = re.compile(r"\W*([A-Za-z]+)(?![\w,;|\t])")
+_WORD = re.compile(r"\W*([^\W\d_]+)(?![\w,;|\t])")
 _CODED = re.compile(r".*[ :]\d+ *")
 _DIGITS = re.compile(r"\d+")
-_LETTERS = re.compile(r"[A-Za-z]{3,}")
-_PRINTABLE = re.compile(rf"[\t -~{BEYOND_ASCII}]*")
+_LETTERS = re.compile(r"[^\W\d_]{3,}")
 TIME_UNITS: Mapping[str, str] = {"s": "s", "sec": "s", "ms": "ms", "us": "us", "µs": "us", "μs": "us"}
 """Units of a time as devices write them, and as the driver names them."""
 _SUMS: Mapping[int, tuple[str, Callable[[bytes], int]]] = {
@@ -287,7 +287,7 @@ def _columns_of(lines: Sequence[str], behind: Sequence[int], delimiter: str) -> 
     )
     names = [name.lstrip("#").strip() for name in rows[0]] if header else []
     sound = [
-        len(row) == width and _PRINTABLE.fullmatch(line) is not None and _sum_fits(line, checksum)
+        len(row) == width and is_text(line) and _sum_fits(line, checksum)
         for row, line in zip(rows, lines, strict=True)
     ]
     sound[0] &= not header
@@ -500,9 +500,9 @@ def _sum_fits(line: str, checksum: str) -> bool:
     match = _CHECKSUM.search(line)
     if match is None:
         return False
-    text = line[: match.start()].encode().lstrip(b"$!")
+    text, sent = line[: match.start()].lstrip("$!"), int(match[1], 16)
     name, made = _SUMS[len(match[1])]
-    return name == checksum and made(text) == int(match[1], 16)
+    return name == checksum and any(made(one) == sent for one in encoded(text))
 
 
 def _checksum_of(lines: Sequence[str]) -> str:

@@ -65,6 +65,19 @@ def _delimiter(text: str) -> str:
     return text
 
 
+def _first_field(text: str) -> str:
+    if not text.isprintable() or text != text.strip() or "*" in text:
+        raise PydanticCustomError(
+            "first_field",
+            "cannot be the first field of a line",
+            {
+                "remedy": 'write what each line begins with up to the first separator, e.g. "$VIB"',
+                "code": BAD_TEXT,
+            },
+        )
+    return text
+
+
 class SerialBus(Bus):
     """What all serial ports have."""
 
@@ -326,9 +339,10 @@ class LineLayout(Layout):
         description="character between two columns; of blanks there may be several, also in front",
     )
     decimal: Literal[".", ","] = Field(default=".", description="decimal mark of the numbers")
-    prefix: Annotated[str, Field(pattern=r"^[!$]?[A-Za-z0-9_-]+$", max_length=16)] | None = Field(
+    prefix: Annotated[str, AfterValidator(_first_field), Field(min_length=1, max_length=16)] | None = Field(
         default=None,
-        description="first field of each line of this stream; lines with another one are not of it",
+        description="first field of each line of this stream, in UTF-8 or Latin-1 if it has letters beyond "
+        "ASCII; lines with another one are not of it",
         examples=["$VIB"],
     )
     counter: LineCounter | None = Field(default=None, description="the column that counts lines")

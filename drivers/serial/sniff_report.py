@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, NamedTuple
 from daqsvc.documentation import documented_in
 from daqsvc.rounding import counted
 from daqsvc.settings.units import may_be_unit, unit_of
-from drivers.serial.line_numbers import BEYOND_ASCII
 from drivers.serial.ports import lasting_name
 from drivers.sniffing import (
     Sniffed,
@@ -733,10 +732,4 @@ def _names(columns: Sequence[Column]) -> dict[Column, str]:
 
 
 def _printable(text: str) -> str:
-    shown = (
-        letter
-        if (letter.isascii() and (letter.isprintable() or letter in "\n\t")) or letter in BEYOND_ASCII
-        else "?"
-        for letter in text
-    )
-    return "".join(shown)
+    return "".join(letter if letter.isprintable() or letter in "\n\t" else "?" for letter in text)

@@ -519,3 +519,21 @@ def test_lines_with_neither_counter_nor_time_are_read_as_they_come():
     np.testing.assert_array_equal(found.samples[:, 0, 0], read)
     written = framing.encode("a", np.arange(2), np.array([[[1.0]], [[2.0]]]))
     assert written == [b"1.000000C\r\n", b"2.000000C\r\n"]
+
+
+@pytest.mark.parametrize("table", ["utf-8", "latin-1"])
+def test_a_prefix_may_have_letters_beyond_ascii(table: str):
+    columns = [
+        line_layout(("seq", "x"), ("x",), counter="seq", separator=";", decimal=",", prefix=prefix)
+        for prefix in ("Lüfter", "Lüfter 1")
+    ]
+    framing = LineFraming({"a": columns[0], "b": columns[1]}, {"a": 100.0, "b": 100.0})
+    framing.cut("half a line\n".encode(table))
+    found = framing.cut("Lüfter;1;0,5\nLüfter 1;2;1,5\nKühler;3;2,5\n\xfc\xff\xfe;4;1\n".encode(table))
+    assert found.frames["a"].counter.tolist() == [1]
+    assert found.frames["a"].samples[0, 0].tolist() == [0.5]
+    assert found.frames["b"].counter.tolist() == [2]
+    assert found.unknown == {"Kühler": 1}
+    assert "first line is" in found.malformed
+    sent = framing.encode("a", np.array([7]), np.array([[[0.25]]]))
+    assert framing.cut(b"".join(sent)).frames["a"].counter.tolist() == [7]

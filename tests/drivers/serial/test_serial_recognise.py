@@ -538,3 +538,79 @@ def test_a_column_without_a_value_in_some_lines_is_a_column_of_numbers(
     assert (column.numeric, column.unit, column.absent_text) == (True, unit.strip(), text)
     assert column.absent == sum(k % each > 0 for k in range(1, 40))
     assert not what.damaged
+
+
+WORDS = ["gestört", "läuft", "Lüfter", "Öltemp", "arrêt", "démarré", "déjà", "prędkość", "łożysko", "℃", "§"]
+UNITS = [" °C", " µm", " μm", " Ω", " kΩ", " ℃", "‰", "", ""]
+
+
+@settings(max_examples=examples(25), deadline=None)
+@given(
+    words=st.lists(st.sampled_from(WORDS), min_size=1, max_size=2),
+    units=st.tuples(st.sampled_from(UNITS), st.sampled_from(UNITS)),
+    minus=st.sampled_from(["", "-", "\N{MINUS SIGN}"]),
+    table=st.sampled_from(["utf-8", "latin-1", "cp1252", "cp437"]),
+    begin=st.integers(0, 20),
+    seed=st.integers(0, 100),
+)
+def test_text_in_any_language_is_text(
+    words: list[str], units: tuple[str, str], minus: str, table: str, begin: int, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    text = "".join(
+        f"{number};{1.8 + rng.random() / 5:.2f}{units[0]};{minus}{58 + rng.random():.1f}{units[1]};"
+        f"{';'.join(words)}\r\n".replace(".", ",")
+        for number in range(60)
+    )
+    try:
+        data = text.encode(table)
+    except UnicodeEncodeError:
+        data = text.encode()
+    found = recognised(data[begin:])
+    assert isinstance(found.what, TextLines)
+    assert found.score >= CONCLUSIVE
+    assert len(found.what.columns) == 3 + len(words)
+    assert not found.what.damaged
+    assert found.what.columns[0].step == 1
+    assert found.what.columns[1].numeric
+
+
+@settings(max_examples=examples(25), deadline=None)
+@given(
+    framing=st.sampled_from(["sync", "cobs", "unchecked", "noise"]),
+    sync=st.binary(min_size=1, max_size=4).filter(lambda word: word.strip(b"\0\xff") != b""),
+    crc=st.sampled_from(["ibm-3740", "xmodem", "modbus", "sum-8"]),
+    channels=st.integers(1, 12),
+    spread=st.sampled_from([20, 700, 9000]),
+    begin=st.integers(0, 30),
+    seed=st.integers(0, 10_000),
+)
+def test_no_binary_frame_is_text(
+    framing: str, sync: bytes, crc: str, channels: int, spread: int, begin: int, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    rows = rng.normal(0, spread, (60, channels)).clip(-32_000, 32_000).astype("<i2")
+    sent = [struct.pack("<H", number) + row.tobytes() for number, row in enumerate(rows)]
+    data = {
+        "sync": lambda: b"".join(sync + one + checksum(crc, one) for one in sent),
+        "cobs": lambda: b"".join(cobs.encode(one + checksum(crc, one)) + b"\0" for one in sent),
+        "unchecked": lambda: b"".join(sync + one for one in sent),
+        "noise": lambda: rng.bytes(1000),
+    }[framing]()
+    found = recognised(data[begin:])
+    assert not isinstance(found.what, TextLines)
+    assert found.printable < 0.9
+
+
+@pytest.mark.parametrize("table", ["utf-8", "latin-1"])
+def test_kinds_of_lines_may_begin_with_words_of_any_language(table: str) -> None:
+    text = "".join(
+        f"Lüfter;{number};{number % 7},5\r\nKühler;{number};{number % 5},5\r\n" for number in range(30)
+    )
+    what = recognised(text.encode(table)).what
+    assert isinstance(what, TextLines)
+    assert {kind.prefix for kind in what.kinds} == {"Lüfter", "Kühler"}
+    named = "".join(f"{number} Öltemp={58 + number % 3},5 v={number % 7},5\r\n" for number in range(30))
+    what = recognised(named.encode(table)).what
+    assert isinstance(what, TextLines)
+    assert [column.name for column in what.columns] == ["c1", "Öltemp", "v"]

@@ -158,6 +158,20 @@ def test_the_driver_is_found_by_its_name():
             'has the separator "," in it',
             "a separate column in line",
         ),
+        (
+            'prefix = "$ACC"',
+            'prefix = "$A,C"',
+            "streams.casing.layout.prefix",
+            'has the separator "," in it',
+            "a separate column in line",
+        ),
+        (
+            'prefix = "$ACC"',
+            'prefix = "$A*C"',
+            "streams.casing.layout.prefix",
+            "cannot be the first field of a line",
+            "up to the first separator",
+        ),
         (LINE, LINE + 'separator = "."\n', "streams.casing.layout.separator", "cannot stand between", '";"'),
         (
             LINE,
