@@ -167,8 +167,8 @@ def paper(docs: Path) -> Iterator[Row]:
 
 def rotors(docs: Path) -> Iterator[Row]:
     """Rotors by finite elements, which nobody modelled."""
-    page, again = Page(docs, "plants.md"), 'make bench-diagnosis ARGS="--aside"'
-    place = "plants.md#the-half-that-was-set-aside"
+    page, again = Page(docs, "plants.md"), 'make bench-diagnosis ARGS="--drawn"'
+    place = "plants.md#the-machines-drawn-by-lot"
     calibrated = {
         "modelled: right": "named right",
         "told": "truth in the group",
@@ -193,24 +193,25 @@ def rotors(docs: Path) -> Iterator[Row]:
             },
         ),
     ):
-        aside, tuned = (
-            [page.row(snr, after=f"make bench-diagnosis ({table.format(half)})") for snr in SNR_DB]
-            for half in ("set aside", "tuned")
+        drawn, aside, tuned = (
+            [page.row(snr, after=f"make bench-diagnosis ({table.format(part)})") for snr in SNR_DB]
+            for part in ("drawn", "set aside", "tuned")
         )
         for column, name in columns.items():
             yield Row(
                 f"{title}: {name}",
-                ", ".join(row[column] for row in aside),
-                f"at {', '.join(SNR_DB)}; tuned half: {', '.join(row[column] for row in tuned)}",
+                ", ".join(row[column] for row in drawn),
+                f"at {', '.join(SNR_DB)}; set aside: {', '.join(row[column] for row in aside)}; "
+                f"tuned: {', '.join(row[column] for row in tuned)}",
                 again,
                 place,
             )
     for name in ("0.9 to 0.99", "0.5 to 0.7"):
-        row = page.row(name, after="make bench-diagnosis (set aside)")
+        row = page.row(name, after="make bench-diagnosis (drawn)")
         yield Row(
             f"how often a name given with a probability of {name} is true",
             f"{row['true']} of {row['names']}",
-            "the half that was set aside, all ratios",
+            "the drawn machines as stated, all ratios",
             again,
             place,
         )

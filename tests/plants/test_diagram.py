@@ -32,14 +32,14 @@ def test_the_same_names_make_the_same_picture(tmp_path: Path) -> None:
 
 
 @pytest.mark.sources
-@pytest.mark.parametrize("half", ["tuned", "set aside"])
-def test_the_pictures_of_the_page_count_the_names_of_its_tables(half: str) -> None:
+@pytest.mark.parametrize("part", ["tuned", "set aside", "drawn"])
+def test_the_pictures_of_the_page_count_the_names_of_its_tables(part: str) -> None:
     """If this fails, run: make bench-diagnosis."""
-    picture = PAGE.with_name(f"plants-{half.replace(' ', '-')}.svg").read_text("utf-8")
+    picture = PAGE.with_name(f"plants-{part.replace(' ', '-')}.svg").read_text("utf-8")
     drawn = [int(count) for count in re.findall(r">(\d+)</text>", picture)]
     page = PAGE.read_text("utf-8")
     tabled = []
-    for place in (half, f"{half}, run-up"):
+    for place in (part, f"{part}, run-up"):
         table = page.partition(BEGIN.format(place))[2].partition(END.format(place))[0]
         tabled += [
             int(count) for count in re.findall(r"^\| 0[.\d]* to [.\d]+ \| (\d+) \|", table, re.MULTILINE)
