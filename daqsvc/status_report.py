@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping, Sequence
 
     from daqsvc.acquisition.clock import Clock
+    from daqsvc.acquisition.link import Link
     from daqsvc.alarm_service import AlarmService
     from daqsvc.alarms.status import AlarmStatus
     from daqsvc.diagnosis.record import Diagnosis
@@ -47,6 +48,8 @@ FRESH_S = 0.2
 """Who asks within so long gets the same answer."""
 OLDEST_S = 1.0
 """The journal is waited for at most so long: a disk that hangs leaves the rest as it is."""
+MOST_AT_FAULT = 3
+"""Streams of a bus of which it is shown why they get no samples."""
 AT_ONCE = 64
 """Channels or alarms reported in one turn of the event loop."""
 
@@ -62,6 +65,7 @@ class _Seen(NamedTuple):
         newest: by stream, its newest sample ``[channels]`` and when that was taken; None before the first.
         latest: the last statement of each detector.
         measured: the same, with figures.
+        at_fault: by bus, why streams of it get no samples while it is up.
     """
 
     now_ns: int
@@ -71,6 +75,7 @@ class _Seen(NamedTuple):
     newest: Mapping[str, Newest]
     latest: Mapping[str, Diagnosis]
     measured: Mapping[str, Diagnosis]
+    at_fault: Mapping[str, str]
 
 
 class StatusReport:
@@ -149,6 +154,7 @@ class StatusReport:
             newest,
             latest,
             measured,
+            {driver.name: _at_fault(driver.link) for driver in self._drivers},
         )
 
     def _document(self, seen: _Seen) -> Document:
@@ -166,7 +172,7 @@ class StatusReport:
                 driver.name: {
                     "driver": self._machine.buses[driver.name].driver,
                     "state": driver.link.state,
-                    "reason": driver.link.reason,
+                    "reason": driver.link.reason or seen.at_fault[driver.name],
                     "code": _id(driver.link.code),
                 }
                 for driver in self._drivers
@@ -253,6 +259,13 @@ class StatusReport:
 
 _UNKNOWN: tuple[SensorState, str] = ("unknown", "")
 _WORSE: tuple[SensorState, ...] = ("unknown", "ok", "missing", "not_ok")
+
+
+def _at_fault(link: Link) -> str:
+    """Why streams of a bus that is up get no samples, in a clause; empty if all get some."""
+    faults = [f"stream {name!r}: {why}" for name, why in sorted(link.faults.items())]
+    more = [f"and {len(faults) - MOST_AT_FAULT} more"] * (len(faults) > MOST_AT_FAULT)
+    return "; ".join([*faults[:MOST_AT_FAULT], *more])
 
 
 def _sensor_states(

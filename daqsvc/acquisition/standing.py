@@ -41,6 +41,7 @@ class StreamState(NamedTuple):
 
 
 _FIGURE = re.compile("[0-9]")
+_NUMBER = re.compile(r"[-+]?\d[\d.,]*(e[-+]?\d+)?")
 
 Tell: TypeAlias = "Callable[[str, StreamState], None]"
 """Called with the name of a stream and its standing whenever that changes; a doubt also while frames come."""
@@ -53,6 +54,11 @@ def tell_nobody(stream: str, standing: StreamState) -> None:
 def cause_of(doubt: str) -> str:
     """What a doubt reports but for its figures, by which the same trouble may differ each time."""
     return _FIGURE.split(doubt, maxsplit=1)[0].strip()
+
+
+def wording_of(message: str) -> str:
+    """A message without its figures, which are others each time."""
+    return _NUMBER.sub("#", message)
 
 
 class StreamStanding:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import copy
-import re
 from collections import deque
 from typing import TYPE_CHECKING
 
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.acquisition.standing import wording_of
 from daqsvc.alarms.events import ANNUNCIATIONS, AlarmEvent, Doubt, EventKind
 from daqsvc.alarms.handling import CALM
 from daqsvc.alarms.states import (
@@ -115,8 +115,6 @@ FINDINGS = frozenset(
     }
 )
 """Events whose message states what is found."""
-
-_FIGURE = re.compile(r"[-+]?\d[\d.,]*(e[-+]?\d+)?")
 
 
 class Alarm:
@@ -302,7 +300,7 @@ class Alarm:
         """Whether something else is found at the same level."""
         if finding.identity != self._finding:
             return True
-        return finding.told_by_words and _wording(finding.sentence) not in _wording(self._last_message)
+        return finding.told_by_words and wording_of(finding.sentence) not in wording_of(self._last_message)
 
     def _held_back(self, finding: RuleFinding, cause: Diagnosis, at: ClockReading) -> list[AlarmEvent]:
         """A return while the alarm chatters; after a restart somebody must know who still doubts a sensor."""
@@ -550,11 +548,6 @@ class Alarm:
             doubts=self.doubts,
             found="" if kind in FINDINGS else self._last_message,
         )
-
-
-def _wording(message: str) -> str:
-    """A message without its figures, which are others each time."""
-    return _FIGURE.sub("#", message)
 
 
 def _signed(request: HandlingRequest, lasting: str = "") -> str:

@@ -8,10 +8,11 @@ from collections import defaultdict, deque
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.acquisition.standing import cause_of
+from daqsvc.acquisition.standing import cause_of, wording_of
 from daqsvc.alarms.events import Doubt
 from daqsvc.alarms.rules import RuleFinding
 from daqsvc.alarms.states import Level
+from daqsvc.diagnosis.record import NO_SAMPLES
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -43,6 +44,13 @@ MOST_LACKED = 0.1
 """A detector that lacked samples is good again when it lacks no larger share of them, ..."""
 GOOD_NS = 3 * NS_PER_S
 """... and has been able to judge for so long."""
+
+
+HEARD_NS = 10 * NS_PER_S
+"""Samples come again, and they do not do: after so long that is the reason, no longer the silence before."""
+
+LONGEST_CAUSE = 160
+"""A cause is compared with others by so many of its characters."""
 
 
 UNHEARD_NS = 30 * NS_PER_S
@@ -175,6 +183,8 @@ class SensorHealth:
         self._by_detector: dict[str, tuple[str, Doubt]] = {}
         # Why there are no samples by which to judge, by detector, until it states good.
         self._causes: dict[str, str] = {}
+        # When samples came again after that, by detector, while it lacks too many all the same.
+        self._heard_since_ns: dict[str, int] = {}
         # By detector, the stream that it cannot judge by.
         self._unjudged: dict[str, str] = {}
         self._by_alarm: defaultdict[str, dict[str, Doubt]] = defaultdict(dict)
@@ -219,14 +229,28 @@ class SensorHealth:
             doubt = doubt._replace(sensors=sensors)
             self._remember(name, doubt)
             touched |= _blames(doubt)
-            if diagnosis.quality == "missing" and diagnosis.end_index == diagnosis.first_index:
-                self._causes[detector] = f" ({cause_of(diagnosis.reason)})"
-                self._unjudged[detector] = diagnosis.stream
+            if diagnosis.quality == "missing":
+                self._note_cause(diagnosis)
         else:
             self._causes.pop(detector, None)
+            self._heard_since_ns.pop(detector, None)
         # A detector may rest on other sensors than before: then what it had against those is settled, too.
         alarms = (name,) if before is None or before[0] == name else (before[0], name)
         return Touched(alarms, frozenset(touched))
+
+    def _note_cause(self, diagnosis: Diagnosis) -> None:
+        """Note why samples are missing: by this one reason is told from another, whatever the words."""
+        detector = diagnosis.detector
+        if diagnosis.end_index == diagnosis.first_index:
+            self._causes[detector] = f" ({_cause_of_missing(diagnosis.reason)})"
+            self._unjudged[detector] = diagnosis.stream
+            self._heard_since_ns.pop(detector, None)
+        elif detector in self._causes:
+            # Mostly the next statements are good: another reason for a moment is no event.
+            since_ns = self._heard_since_ns.setdefault(detector, diagnosis.t_ns)
+            if diagnosis.t_ns - since_ns >= HEARD_NS:
+                del self._causes[detector]
+                del self._heard_since_ns[detector]
 
     def _doubt(self, diagnosis: Diagnosis, before: Doubt | None) -> Doubt | None:
         """What stands against the sensors after a statement."""
@@ -303,6 +327,7 @@ class SensorHealth:
             self._forget(detector)
             self._lacked_at_restart.pop(detector, None)
             self._causes.pop(detector, None)
+            self._heard_since_ns.pop(detector, None)
             self._unjudged.pop(detector, None)
             self._unheard.discard(detector)
 
@@ -418,6 +443,16 @@ def in_words(name: str, doubts: Sequence[Doubt]) -> str:
     if worst.quality == "missing":
         what = "cannot be judged, and was not OK" if any(d.not_ok for d in doubts) else "cannot be judged"
     return f"{name.partition('/')[2]} {what}" + (f": {worst.reason}" if worst.reason else "")
+
+
+def _cause_of_missing(reason: str) -> str:
+    """What tells one reason why there are no samples from another.
+
+    Figures do not. Of a doubt about samples nor does what comes behind the first of them.
+    """
+    if not reason.startswith(NO_SAMPLES):
+        return cause_of(reason)
+    return wording_of(reason)[:LONGEST_CAUSE].replace("|", "/")
 
 
 def _worst(doubts: Sequence[Doubt]) -> Doubt:

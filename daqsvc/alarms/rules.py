@@ -375,7 +375,7 @@ class MeasureWatch:
         measured = f"{self._measure} of {sensor} is {readable(value)}{unit}"
         if self._measure in diagnosis.bounds:
             most = "most" if limit is not None and limit.lower else "least"
-            lacks = f"{100.0 * (diagnosis.missing_share or 0.0):.2g} % of its samples are missing"
+            lacks = f"{readable(100.0 * (diagnosis.missing_share or 0.0), 2)} % of its samples are missing"
             measured = f"{self._measure} of {sensor} is at {most} {readable(value)}{unit} though {lacks}"
         elif self.setpoint.reference_deg is not None:
             phase, reference = diagnosis.statistics[self._measure], self.setpoint.reference_deg

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.commands.tables import ago, aligned, harmless, local_time, wrapped
-from daqsvc.rounding import counted, with_unit
+from daqsvc.rounding import counted, readable, with_unit
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -200,7 +200,7 @@ def _lost(stream: Document) -> str:
     lost, received = stream["samples_lost"], stream["samples_received"]
     if not lost + received:
         return "no samples yet" + (f" [{stream['doubt']}]" if stream["doubt"] else "")
-    share = [f"{100 * lost / (lost + received):.2g} %"] * bool(lost)
+    share = [f"{readable(100 * lost / (lost + received), 2)} %"] * bool(lost)
     # A service of before has no such key.
     share += ["estimated"] * (stream.get("losses") == "estimated")
     behind = f" ({', '.join(share)})" if share else ""

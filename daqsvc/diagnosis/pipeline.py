@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.ring import RingClosed, RingReader
-from daqsvc.acquisition.standing import StreamState
+from daqsvc.acquisition.standing import StreamState, wording_of
 from daqsvc.diagnosis.record import silence_reason
 from daqsvc.diagnosis.statements import asked, said_of_silence, said_of_window
 from daqsvc.dsp.quality.missing import Patience
@@ -225,6 +225,9 @@ LOOK_NS = NS_PER_S // 2
 _LONGEST_PREPARATION_NS = 300 * NS_PER_S
 """A driver that is not ready by then hangs, and the silence of its streams counts."""
 
+_SETTLED_NS = 10 * NS_PER_S
+"""A silence is reported once more after something else has been its reason for so long."""
+
 MOST_HELD = 4096
 """Statements of a stream that wait for its rate to be known, at most; the oldest are dropped."""
 
@@ -260,6 +263,29 @@ class DetectorCounters:
     samples_withheld: int = 0
     failures: int = 0
     busy_ns: int = 0
+
+
+@dataclass(slots=True)
+class _Cause:
+    """Why nothing comes of a stream, as it was said.
+
+    Attributes:
+        why: in a clause; empty if it is not known.
+        as_said_ns: when that was last so.
+    """
+
+    why: str
+    as_said_ns: int
+
+    def is_another(self, why: str, now_ns: int) -> bool:
+        """Whether something else is the reason, and has been for long enough to say so.
+
+        A unit that is asked now and then is silent by turns, and set aside because it is.
+        """
+        was, now = wording_of(self.why), wording_of(why)
+        if was == now or (was and now and (was in now or now in was)):
+            self.as_said_ns = now_ns
+        return now_ns - self.as_said_ns >= _SETTLED_NS
 
 
 class Pipeline:
@@ -447,7 +473,8 @@ class Pipeline:
     async def _listen_for_silence(self) -> None:
         """Have detectors say, once, that their stream has fallen silent: a window never comes to say it.
 
-        It is logged once more if the bus reports only then why nothing comes.
+        It is said once more if the bus reports only then why nothing comes, and when that is no longer so or
+        has become another reason, and has been for some seconds.
 
         Of a stream in doubt samples may not come as far as the ring; the doubt states that frames come.
 
@@ -458,6 +485,7 @@ class Pipeline:
         since_ns = {name: looked_ns + self._settling_ns.get(name, 0) for name in self._rings}
         silent: set[str] = set()
         unexplained: set[str] = set()
+        causes: dict[str, _Cause] = {}
         while True:
             await self._clock.sleep_ns(LOOK_NS)
             now_ns = self._clock.monotonic_ns()
@@ -479,9 +507,13 @@ class Pipeline:
                     silent.add(name)
                     why = self._say_nothing_comes(name, now_ns - since_ns[name], now_ns)
                     unexplained |= set() if why else {name}
-                elif name in unexplained and (self._why_over(name) or self._why_silent(name)):
-                    unexplained.discard(name)
-                    self._say_nothing_comes(name, now_ns - since_ns[name], now_ns)
+                    causes[name] = _Cause(why, now_ns)
+                elif name in silent:
+                    why = self._why_over(name) or self._why_silent(name)
+                    if (name in unexplained and why) or causes[name].is_another(why, now_ns):
+                        unexplained.discard(name)
+                        self._say_nothing_comes(name, now_ns - since_ns[name], now_ns)
+                        causes[name] = _Cause(why, now_ns)
 
     def _say_nothing_comes(self, stream: str, silence_ns: int, now_ns: int) -> str:
         """Have the detectors of a stream say that nothing comes; returns why, if that is known."""

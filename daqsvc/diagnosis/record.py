@@ -80,6 +80,10 @@ class Diagnosis:
         return self.quality == "missing" and bool(self.bounds)
 
 
+NO_SAMPLES = ("no samples of stream ", "no more samples of stream ")
+"""How a statement begins that nothing comes of a stream."""
+
+
 def silence_reason(stream: str, silence_s: float, why: str = "", beside: str = "") -> str:
     """Why a statement about a silent stream is not good.
 

@@ -463,3 +463,16 @@ TIMES_SHARED = Code(
     'not noticed. Remedy: have the device send a counter, or ms with unit = "ms"; if it sends decimals, e.g. '
     "12.345 s, leave it",
 )
+NEVER_WHOLE = Code(
+    "B47",
+    "A waveform is never read whole",
+    "A Modbus device replaces its block of samples before daqsvc has read all of it. 2048 samples take 17 "
+    "requests. Each waits for its reply, and for the requests of other streams on the line. A block that "
+    "was replaced meanwhile is a mixture of two, and is lost.",
+    "Have the device measure less often, or with fewer samples. With trigger, raise every_s. Else relieve "
+    "the line: a lower rate_hz of other streams, fewer requests (max_gap), a faster baud rate, a second bus.",
+    "modbus.md#waveforms-by-example",
+    example="stream 'wave': no block is read whole: reading one takes 4.7 s, and the device replaces it "
+    "after about 4.2 s, so all of them are lost; have the device take blocks less often, or have fewer "
+    "samples in a block, or fewer and rarer requests of other streams",
+)

@@ -21,7 +21,9 @@ class BusPayload(JsonPayload):
 
     driver: str = Field(description="name of the driver")
     state: Literal["up", "down"] = Field(description="whether the bus is up")
-    reason: str = Field(description="why it is down")
+    reason: str = Field(
+        description="why it is down, or, while it is up, why some of its streams get no samples"
+    )
     code: str | None = Field(None, description="code of that reason; null if there is none")
 
 

@@ -21,6 +21,7 @@ from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.acquisition.timebase import RECENT_DELAYS, TimeBaseState
 from daqsvc.errors.buses import REGISTER_REFUSED, SAMPLES_MISSING
 from daqsvc.errors.code import coded
+from daqsvc.rounding import readable
 from drivers.modbus.line import NS_PER_MS
 from drivers.modbus.reading import PollingReader, streams_in_words
 from drivers.modbus.refusals import ILLEGAL_VALUE, REFUSALS_OF_REGISTERS, RefusalSearch
@@ -339,14 +340,14 @@ class TrendReader(PollingReader):
         if self._slow_polls == SLOW_POLLS and not self._is_slow_said:
             self._is_slow_said = True
             logger.warning(
-                "%s: a poll takes %.3g ms, and at rate_hz = %.4g there are %.3g ms for it, so samples are "
-                "lost. Write rate_hz = %.2g or less, or have fewer requests on this line (max_gap, other "
+                "%s: a poll takes %s ms, and at rate_hz = %s there are %s ms for it, so samples are "
+                "lost. Write rate_hz = %s or less, or have fewer requests on this line (max_gap, other "
                 "streams)",
                 self._who,
-                took_ns / NS_PER_MS,
-                NS_PER_S / self._period_ns,
-                self._period_ns / NS_PER_MS,
-                ROOM * NS_PER_S / took_ns,
+                readable(took_ns / NS_PER_MS, 3),
+                readable(NS_PER_S / self._period_ns),
+                readable(self._period_ns / NS_PER_MS, 3),
+                readable(ROOM * NS_PER_S / took_ns, 2),
                 extra=coded(SAMPLES_MISSING),
             )
 

@@ -12,8 +12,10 @@ from daqsvc.acquisition.assembler import StreamCounters, note_received
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.acquisition.timebase import TimeBaseState
-from daqsvc.errors.buses import TIME_UNSURE
+from daqsvc.errors.buses import NEVER_WHOLE, TIME_UNSURE
 from daqsvc.errors.code import coded
+from daqsvc.notice import notice
+from daqsvc.rounding import readable
 from drivers.modbus.counted import SURE, SampleClock
 from drivers.modbus.reading import PollingReader
 from drivers.modbus.registers import RegisterRecord, RegisterRun
@@ -36,6 +38,9 @@ IDS = 65_535
 
 NO_BLOCK = 0
 
+TORN = 3
+"""Blocks in a row that were replaced while they were read, by which it is known that the line is too slow."""
+
 
 class _Ended(NamedTuple):
     """When a block ended, and how far that may be off."""
@@ -49,6 +54,18 @@ class _Ended(NamedTuple):
         if after_ns is None:
             return cls(by_ns, math.inf)
         return cls((after_ns + by_ns) // 2, (by_ns - after_ns) / 2)
+
+
+class _Torn(NamedTuple):
+    """The first of several blocks in a row that were replaced while they were read.
+
+    Attributes:
+        block_id: its id.
+        ended_ns: when it ended.
+    """
+
+    block_id: int
+    ended_ns: int
 
 
 def pages_of(layout: WaveformLayout) -> tuple[tuple[RegisterRun, ...], ...]:
@@ -115,6 +132,11 @@ class WaveformReader(PollingReader):
         self._shown: int | None = None
         self._asked_ns: int | None = None
         self._ended = _Ended(0, math.inf)
+        self._torn: _Torn | None = None
+        self._torn_in_a_row = 0
+        self._never_whole = ""
+        """Why no block is read whole, in a clause; empty as long as one is now and then."""
+        self._is_said = False
 
     @property
     def streams(self) -> Mapping[str, tuple[StreamCounters, TimeBaseState]]:
@@ -135,8 +157,9 @@ class WaveformReader(PollingReader):
         if block_id in {NO_BLOCK, self._last_id}:
             await self._clock.sleep_ns(self._poll_ns)
             return
-        ended = self._ended
+        ended, begun_ns = self._ended, self._clock.monotonic_ns()
         rows = await self._read_block(line, block_id)
+        self._watch_pace(None if rows else _Torn(block_id, ended.t_ns), begun_ns)
         self._stream_counters.frames_received += 1
         self._lose_until(block_id)
         if rows is None:
@@ -144,6 +167,46 @@ class WaveformReader(PollingReader):
             self._lose(1)
             return
         self._hand_on(rows, ended)
+
+    def _watch_pace(self, torn: _Torn | None, begun_ns: int) -> None:
+        """State once that blocks are replaced before they are read; ``torn`` is one that was."""
+        if torn is None:
+            if self._never_whole and self._is_said:
+                notice(logger, "%s: a block was read whole again", self._who)
+            self._torn, self._torn_in_a_row, self._never_whole = None, 0, ""
+            return
+        self._torn = self._torn or torn
+        self._torn_in_a_row += 1
+        taken = ((self._shown or 0) - self._torn.block_id) % IDS
+        if self._torn_in_a_row < TORN or not taken:
+            return
+        took_s = (self._clock.monotonic_ns() - begun_ns) / NS_PER_S
+        stands_s = (self._ended.t_ns - self._torn.ended_ns) / taken / NS_PER_S
+        fault = (
+            f"no block is read whole: reading one takes {readable(took_s, 2)} s, and the "
+            f"device replaces it after about {readable(stands_s, 2)} s"
+        )
+        self._never_whole = f"{fault}; {self._remedy}"
+        if not self._is_said:
+            self._is_said = True
+            logger.warning(
+                "%s: %s, so all of them are lost; %s",
+                self._who,
+                fault,
+                self._remedy,
+                extra=coded(NEVER_WHOLE),
+            )
+
+    @property
+    def _remedy(self) -> str:
+        often = "have the device take blocks less often"
+        if self._layout.trigger is not None:
+            often = "raise every_s of trigger"
+        return f"{often}, or have fewer samples in a block, or fewer and rarer requests of other streams"
+
+    def _stand(self, faults: Mapping[str, str]) -> None:
+        """See `PollingReader`: that the unit answers does not bring a whole block."""
+        super()._stand({self._name: self._never_whole} | dict(faults) if self._never_whole else faults)
 
     async def _read_block(self, line: ModbusLine, block_id: int) -> bytes | None:
         """Read all pages of a block; None if another block has taken its place meanwhile."""

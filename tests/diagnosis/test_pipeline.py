@@ -373,6 +373,39 @@ async def test_what_the_bus_knows_of_a_silence_is_said_also_when_it_comes_later(
     await running
 
 
+@pytest.mark.parametrize("stands", [True, False])
+async def test_another_reason_for_a_silence_is_said_once_it_stands(stands) -> None:
+    clock, ring = DrivenClock(), SampleRing("s", ("a",), 50)
+    said: list[Diagnosis] = []
+    known = {"s": ""}
+    pipeline = Pipeline(
+        {"s": ring}, [Listener("one", 10)], said.append, clock, why_silent=lambda stream: known[stream]
+    )
+    running = asyncio.create_task(pipeline.run())
+    silent, aside = "unit 33 has not answered within 500 ms", "unit 33 is set aside: unit 33 has not answered"
+    reasons = [silent, silent, f"{aside} within 500 ms"]
+    for half in range(1, 181):
+        # Asked now and then, the unit is silent; else it is set aside: that is one reason.
+        known["s"] = reasons[half % 3]
+        if half > 60 and (stands or half % 10):
+            known["s"] = "unit 33 refuses function 3: illegal data address (register 4)"
+        if half > 120 and (stands or half % 10):
+            known["s"] = ""
+        await asyncio.sleep(0.005)
+        clock.advance_to(clock.monotonic_ns() + 500_000_000)
+    begin = "no samples of stream 's'"
+    first, *later = [one.reason for one in said]
+    assert first.startswith(f"{begin}: unit 33 ")
+    if stands:
+        refused, unknown = later
+        assert refused == f"{begin}: unit 33 refuses function 3: illegal data address (register 4)"
+        assert "has not answered" not in unknown
+    else:
+        assert later == [], "as long as the first reason comes back, it is the one"
+    ring.close()
+    await running
+
+
 async def test_a_bus_on_which_nothing_comes_is_named_and_what_comes_later_too() -> None:
     clock, ring = DrivenClock(), SampleRing("s", ("a",), 50)
     said: list[Diagnosis] = []

@@ -92,6 +92,8 @@ async def test_alarm_and_status_say_why_a_stream_has_not_begun(tmp_path):
     text = " ".join(status_text(status, 200).split())
     assert "gap io - of 10 - no samples yet" in text
     assert why in text
+    assert status["buses"]["io"]["reason"].startswith(why.removeprefix("no samples of "))
+    assert status["buses"]["io"]["state"] == "up"
 
 
 async def test_a_fault_is_told_of_the_streams_that_have_it_and_until_it_is_over(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import re
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from support.modbus_layouts import (
 from support.modbus_lines import Rig, options_of, ramp, responding, simulate, until
 
 from daqsvc.acquisition.samples import Quality
+from daqsvc.notice import NOTICE
 from drivers.modbus.registers import RegisterRecord, RegisterRun
 from sim_hw.nodes.modbus_node import ModbusTcpServer, PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit, encode, store_for
@@ -267,3 +269,46 @@ def test_a_block_is_triggered_as_often_as_is_asked_for_and_no_more(unheard):
     assert all(not block.quality & Quality.AFTER_LOSS and block.lost_before == 0 for block in blocks)
     apart_s = np.array([block.pause_before for block in blocks[1:]]) / 1000.0
     assert apart_s == pytest.approx(every_s - taking_s, abs=0.3)
+
+
+@pytest.mark.gives("B47")
+def test_a_waveform_that_is_never_read_whole_is_stated_once_with_what_to_do(caplog):
+    """Blocks of 4 s on a unit that takes 120 ms to answer: 33 requests each. Later it is faster."""
+    x = (in_sample("x", 0, "int16"),)
+    layout = waveform_layout(1, "holding", 0, 100, 4096, x)
+    trend = registers_layout(1, "holding", [register("v", 20, "int16")])
+    rig = Rig(
+        options_of(serial=False, timeout_ms=500.0),
+        {"wave": (layout, 4096.0), "v": (trend, 1.0)},
+        clock=LoopClock(),
+    )
+    units, slow, fault = {1: ModbusUnit()}, [True], {}
+    store = store_for(units[1], layout)
+    units[1].put("holding", 20, b"\0\1")
+
+    async def main():
+        plan = lambda *_: PlannedReply(delay_ns=120_000_000 if slow[0] else 1_000_000)  # noqa: E731
+        async with responding(units, plan, serial=False), rig.running() as driver:
+            for k in range(60):
+                store.put(4096 * k, encode(layout, ramp(4096, channels=1, first=4096 * k)))
+                await asyncio.sleep(4.0)
+                slow[0] = k < 40
+                if k == 10:
+                    assert not rig.blocks["wave"]
+                fault[k] = driver.link.why_silent("wave")
+
+    with caplog.at_level(NOTICE):
+        simulate(main)
+    said = [record.getMessage() for record in caplog.records if "read whole" in record.getMessage()]
+    stated, again = said
+    assert stated.startswith("stream 'wave': no block is read whole: reading one takes ")
+    took_s, stands_s = (float(one) for one in re.findall(r"([\d.]+) s", stated)[:2])
+    assert took_s == pytest.approx(34 * 0.12, abs=1.0)
+    assert stands_s == pytest.approx(4.0, abs=0.6)
+    assert "; have the device take blocks less often, or have fewer samples in a block" in stated
+    assert again == "stream 'wave': a block was read whole again"
+    assert fault[20].startswith("no block is read whole: ")
+    assert fault[59] == ""
+    assert len(rig.blocks["wave"]) > 10
+    assert rig.counters("v").samples_lost == 0
+    rig.check_books("wave")
