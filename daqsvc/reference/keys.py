@@ -79,7 +79,7 @@ class Variant:
 
     def row(self) -> tuple[str, ...]:
         """Type, unit, range, default and example."""
-        schema, unit = self.schema, unit_of_key(self.name)
+        schema, unit = self.schema, unit_of_key(self.name, self.field)
         example = self.example or (
             code(_header(f"{_dotted(self.path, self.name)}", schema)) if self.is_table else ""
         )

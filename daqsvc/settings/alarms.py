@@ -18,6 +18,7 @@ from daqsvc.settings.section import (
     Quantity,
     Section,
     Text,
+    Unit,
 )
 from daqsvc.settings.zones import Boundaries, Zones  # noqa: TC001 - pydantic reads the annotations
 
@@ -112,13 +113,13 @@ class PhaseLimits(Section):
     reference_deg: Annotated[
         AngleDeg, Field(description="phase lag of the machine in good order", examples=[135.0])
     ]
-    alert: DeviationDeg | None = Field(
+    alert: Annotated[DeviationDeg | None, Unit("deg")] = Field(
         default=None, description="first setpoint, in degrees either way", examples=[30.0]
     )
-    danger: DeviationDeg | None = Field(
+    danger: Annotated[DeviationDeg | None, Unit("deg")] = Field(
         default=None, description="second setpoint, in degrees either way", examples=[60.0]
     )
-    deadband: Annotated[float, Field(ge=0, le=180)] = Field(
+    deadband: Annotated[float, Field(ge=0, le=180), Unit("deg")] = Field(
         default=0.0,
         description="how far within a setpoint the phase must be before the alarm returns, in degrees",
     )

@@ -56,7 +56,7 @@ def key_schema(name: str, field: FieldInfo) -> Schema:
     """
     schema = _value(field_type(field))
     words = {"description": description} if (description := field.description) else {}
-    unit = unit_of_key(name)
+    unit = unit_of_key(name, field)
     if unit is not None and words:
         words["description"] += f" [{unit}]"
     schema = {**words, **{key: value for key, value in schema.items() if key not in words}}

@@ -34,6 +34,13 @@ class InSchema:
         return {**handler(core), **self._keywords}
 
 
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """A mark on the type of a key: the unit of its value, where the name of the key cannot state it."""
+
+    name: str
+
+
 NOT_ZERO = InSchema("not 0", **{"not": {"const": 0}})
 
 Name = Annotated[str, Field(pattern=r"^\.*[A-Za-z0-9_-][A-Za-z0-9_.-]*$", max_length=64)]

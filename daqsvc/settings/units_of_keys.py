@@ -1,6 +1,13 @@
-"""The unit of a key, which the end of its name states."""
+"""The unit of a key: the end of its name states it, or a mark on its type where the name cannot."""
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from daqsvc.settings.section import Unit
+
+if TYPE_CHECKING:
+    from pydantic.fields import FieldInfo
 
 _UNITS = {
     "_n_s_per_m": "N s/m",
@@ -32,8 +39,15 @@ _UNITS = {
 _WHOLE = {"baud": "bit/s", "bitrate": "bit/s", "data_bitrate": "bit/s"}
 
 
-def unit_of_key(name: str) -> str | None:
-    """The unit of a key's value, e.g. ``ms`` of ``reorder_window_ms``; None if its name states none."""
+def unit_of_key(name: str, field: FieldInfo) -> str | None:
+    """The unit of a key's value, e.g. ``ms`` of ``reorder_window_ms``; None if nothing states one.
+
+    Args:
+        name: the key.
+        field: as the model declares it.
+    """
+    if marked := next((mark.name for mark in field.metadata if isinstance(mark, Unit)), None):
+        return marked
     if name in _WHOLE:
         return _WHOLE[name]
     return next((unit for end, unit in _UNITS.items() if name.endswith(end)), None)

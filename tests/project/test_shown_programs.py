@@ -33,7 +33,7 @@ UNIT = "runs the unit under systemd in a guest: tests/hil/test_systemd.py"
 RUN_HERE = "tests/project/test_shown_programs_run.py"
 INSTALL = "tests/project/test_install_docs.py"
 INGEST = "tests/publish/mqtt/test_postgresql_ingest.py"
-PIP = "fetches packages; that the file or the extra is there is looked at here"
+PIP = "tests/project/test_shown_pip.py"
 ALLOWED = {
     "apt install './daqsvc_*.deb'": HIL,
     "apt install --allow-downgrades ./daqsvc_OLDER_amd64.deb": HIL,
