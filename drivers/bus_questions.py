@@ -23,12 +23,6 @@ BUS, STREAM = "main", "device"
 """Names of the only bus and the only stream of the file."""
 BEFOREHAND = "beforehand"
 """Key, beside the answers that `BusQuestions.listen` gets, of those that were given beforehand."""
-TYPE_OF_UNIT = {
-    **dict.fromkeys(("g", "m/s2", "mg", "mm/s2"), "accelerometer"),
-    "mm/s": "velocity",
-    **dict.fromkeys(("um", "mm", "mil"), "proximity"),
-}
-"""Type of a sensor by the unit of its samples, if they are a waveform."""
 _BY_ID = Path("/dev/serial/by-id")
 
 SHARED = {

@@ -34,10 +34,14 @@ _NEAR_WAVEFORM = 0.95
 """The clock of a device, and what was measured in a few seconds, are not exact."""
 LEAST_SWINGING_HZ = 30.0
 """Rate from which on a vibration can be measured, where the values swing about 0."""
-
-
-_TYPE_OF_UNIT = {**dict.fromkeys(("g", "m/s2", "mg", "mm/s2"), "accelerometer"), "mm/s": "velocity"}
-"""Type of a sensor on the housing by the unit of its samples."""
+TYPE_OF_UNIT = {
+    **dict.fromkeys(("g", "m/s2", "mg", "mm/s2"), "accelerometer"),
+    "mm/s": "velocity",
+    **dict.fromkeys(("um", "mm", "mil"), "proximity"),
+}
+"""Type of a sensor by the unit of its samples, if they are a waveform."""
+_LEVEL_WORDS = ("rms", "peak", "level", "crest", "kurt")
+"""What is in the names of values that a device has computed from a waveform."""
 
 
 class SniffError(Exception):
@@ -132,11 +136,65 @@ def by_name(channel: str) -> str | None:
     low = channel.lower()
     if any(part in low for part in ("kph", "key", "phas", "tacho")):
         return "keyphasor"
+    if _names_level(channel):
+        return "trend"
     if low.startswith(("acc", "a_")) or low == "a":
         return "accelerometer"
-    if any(part in low for part in ("temp", "press", "speed", "rpm", "rms")):
+    if any(part in low for part in ("temp", "press", "speed", "rpm")):
         return "trend"
     return None
+
+
+def _names_level(channel: str) -> bool:
+    return any(part in channel.lower() for part in _LEVEL_WORDS)
+
+
+class Values(NamedTuple):
+    """What is known of the values of a channel.
+
+    Attributes:
+        unsigned: whether none can be below 0.
+        least: the least one that was heard; NaN if none was.
+        most: the greatest one.
+    """
+
+    unsigned: bool = False
+    least: float = math.nan
+    most: float = math.nan
+
+    @property
+    def keep_off_0(self) -> bool:
+        """Whether they stay farther from 0 than they are apart, as those of a vibration never do."""
+        nearest = min(abs(self.least), abs(self.most))
+        return self.least * self.most > 0.0 and nearest > self.most - self.least
+
+
+UNKNOWN_VALUES = Values()
+
+
+def type_by_unit(
+    channel: str, unit: str | None, *, waveform: bool, values: Values = UNKNOWN_VALUES
+) -> str | None:
+    """The type of the sensor on a channel, by the unit of its samples; None if the unit tells none.
+
+    A value that the device has computed, such as an RMS, may come as often as a waveform. An alarm on the RMS
+    of it would never come, as it hardly changes.
+
+    Args:
+        channel: its name.
+        unit: as machine files write it; None where it is not known.
+        waveform: whether the samples come as often as those of a waveform.
+        values: what is known of them.
+    """
+    kind = TYPE_OF_UNIT.get(unit or "")
+    if not waveform:
+        return "trend"
+    if kind is None:
+        return None
+    unsigned = values.unsigned and kind in {"accelerometer", "velocity"}
+    # An accelerometer may measure gravity, too, and a probe its gap: the values of both keep off 0.
+    still = values.keep_off_0 and kind == "velocity"
+    return "trend" if _names_level(channel) or unsigned or still else kind
 
 
 def span(least: float, most: float) -> str:
@@ -164,6 +222,7 @@ def sensor_lines(
     by_stream: bool = False,
     guess: bool = False,
     swinging: Collection[str] = (),
+    values: Mapping[str, Values] | None = None,
 ) -> list[str]:
     """A table ``[[sensors]]`` for each channel of a stream, of the type that its unit is usual for.
 
@@ -171,11 +230,12 @@ def sensor_lines(
         stream: its name.
         channels: the unit of each channel; ``1`` where none is known.
         taken: names of sensors that there are; the new ones are added.
-        rate_hz: samples per second; of a velocity, below `WAVEFORM_HZ`, they are levels, no vibration.
+        rate_hz: samples per second; below `WAVEFORM_HZ` they are levels, no vibration.
         by_stream: whether a sensor is named after its stream, too, as others have channels of the same names.
         guess: whether what has no unit and comes as often as a waveform is taken for an acceleration, as
             ``daqsvc new`` takes it, unless its name suggests something else.
         swinging: channels whose values were seen to swing about 0, as those of a vibration do.
+        values: what else is known of the values of channels.
     """
     lines: list[str] = []
     before = f"{stream}-" if by_stream else ""
@@ -188,10 +248,10 @@ def sensor_lines(
         given = "g" if is_guess else text
         known = unit_of(given)
         unit = given.strip() if known is None else known.name
-        kind = _TYPE_OF_UNIT.get(unit, "trend")
-        if kind == "velocity" and not waveform:
+        known_values = (values or {}).get(channel, UNKNOWN_VALUES)
+        kind = type_by_unit(channel, unit, waveform=waveform, values=known_values) or "trend"
+        if kind in {"trend", "proximity"}:  # a probe needs more keys than can be known here
             kind = "trend"
-        if kind == "trend":
             unit = text.strip()
         if not (0 < len(unit) <= LONGEST_UNIT and unit.isprintable()):
             unit = "1"

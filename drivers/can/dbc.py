@@ -123,6 +123,15 @@ def selecting_values(signals: Mapping[str, Signal], names: Iterable[str]) -> dic
     return wanted
 
 
+def never_negative(signal: Signal) -> bool:
+    """Whether no value of a signal can be below 0: by its bits, or by what the DBC file states of it."""
+    least, most = signal.minimum, signal.maximum
+    if least is not None and most is not None and float(least) < float(most) and float(least) >= 0.0:
+        return True
+    bits = not signal.is_signed and not signal.is_float
+    return bits and float(signal.offset) >= 0.0 and float(signal.scale) > 0.0
+
+
 def signals_by_page(message: Message) -> dict[str, list[str]]:
     """Names of the signals on each page of a multiplexed message; no page if it is not multiplexed.
 

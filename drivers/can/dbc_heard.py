@@ -9,7 +9,7 @@ from drivers.bus_questions import BUS
 from drivers.can.dbc_likely import likely_counter, likely_measured
 from drivers.can.heard import SHOWN, HeardOnCan, decoded_signals, values_heard
 from drivers.can.sniff import CLOCK, STATE
-from drivers.questions import NONE, Answers
+from drivers.questions import NONE, Answers, sensor_key
 from drivers.sniffing import usual_rate
 
 if TYPE_CHECKING:
@@ -27,6 +27,7 @@ class HeardMessages(HeardOnCan):
         dbc: str,
         messages: Mapping[str, Message],
         samples_in_frame: Callable[[Answers], int],
+        types: Callable[[Answers, Mapping[str, Mapping[str, Any]]], Mapping[str, str]],
     ) -> None:
         self._decoded = decoded_signals(found)
         missed = (
@@ -34,7 +35,7 @@ class HeardMessages(HeardOnCan):
             "file of the device that sends"
         )
         super().__init__(found, "" if self._decoded else missed)
-        self._messages, self._samples_in_frame = messages, samples_in_frame
+        self._messages, self._samples_in_frame, self._types = messages, samples_in_frame, types
 
     def proposals(self, answers: Answers) -> dict[str, str]:
         """See `Heard.proposals`."""
@@ -68,6 +69,11 @@ class HeardMessages(HeardOnCan):
             )
             in_frame = self._samples_in_frame(answers) if "signals" in answers else 1
             proposed["rate"] = f"{usual_rate(rates[0]) * share * in_frame:g}"
+        if "rate" in answers:
+            guessed = self._types(answers, {})
+            types = self._types(answers, {one["signal"]: one for one in chosen["signals"]})
+            changed = {one: kind for one, kind in types.items() if kind != guessed[one]}
+            proposed |= {sensor_key(channel, "type"): kind for channel, kind in changed.items()}
         return proposed
 
     def _clocks(self, answers: Answers) -> list[str]:

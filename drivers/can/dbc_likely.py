@@ -6,8 +6,9 @@ import functools
 import math
 from typing import TYPE_CHECKING, Any
 
-from drivers.bus_questions import TYPE_OF_UNIT, is_count
+from drivers.bus_questions import is_count
 from drivers.can.sniff import number_of, numbered
+from drivers.sniffing import TYPE_OF_UNIT
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -87,6 +88,13 @@ def unit_names(signals: Iterable[Any], names: Iterable[str]) -> dict[str, str]:
     chosen = set(names)
     known = {one.name: unit_of(one.unit or "") for one in signals if one.name in chosen}
     return {name: unit.name for name, unit in known.items() if unit is not None}
+
+
+def never_negative(signal: Any) -> bool:
+    """See `drivers.can.dbc.never_negative`."""
+    from drivers.can import dbc  # noqa: PLC0415 - cantools is slow to import
+
+    return dbc.never_negative(signal)
 
 
 def likely_message(messages: Mapping[str, Message]) -> str:

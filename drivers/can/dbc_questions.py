@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from daqsvc.rounding import counted
 from drivers import questions as q
-from drivers.bus_questions import TYPE_OF_UNIT
 from drivers.can.dbc_heard import HeardMessages
 from drivers.can.dbc_likely import (
     by_page_of,
@@ -19,6 +18,7 @@ from drivers.can.dbc_likely import (
     likely_message,
     may_be_counters,
     most_likely_samples,
+    never_negative,
     samples_of_one,
     share_of_frames,
     unit_names,
@@ -28,7 +28,7 @@ from drivers.can.heard import SHOWN
 from drivers.can.questions import CanQuestions
 from drivers.can.sniff import of_one_channel
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
-from drivers.sniffing import LONGEST_UNIT, by_name, is_waveform_rate
+from drivers.sniffing import LONGEST_UNIT, Values, by_name, is_waveform_rate, type_by_unit
 from drivers.toml_lines import array, behind, entry, toml
 
 if TYPE_CHECKING:
@@ -104,7 +104,9 @@ class DbcQuestions(CanQuestions):
 
     def heard(self, found: Mapping[str, Any], answers: Answers) -> HeardOnCan:
         """See `CanQuestions.heard`."""
-        return HeardMessages(found, answers["dbc"], self._messages(answers), self._samples_in_frame)
+        return HeardMessages(
+            found, answers["dbc"], self._messages(answers), self._samples_in_frame, self._types
+        )
 
     def origin(self, answers: Answers) -> str:
         """See `BusQuestions.origin`."""
@@ -146,11 +148,29 @@ class DbcQuestions(CanQuestions):
 
     def guess(self, answers: Answers, channel: str) -> tuple[str, str | None]:
         """See `BusQuestions.guess`."""
-        unit = self._units(answers).get(channel)
-        kind = TYPE_OF_UNIT.get(unit or "")
-        if not is_waveform_rate(answers["rate"]):
-            kind = "trend"
-        return kind or by_name(channel) or "trend", unit
+        return self._types(answers, {})[channel], self._units(answers).get(channel)
+
+    def _types(self, answers: Answers, heard: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
+        """The most likely type of the sensor on each channel.
+
+        Args:
+            answers: so far.
+            heard: figures of the signals that were heard, by name.
+        """
+        units, waveform = self._units(answers), is_waveform_rate(answers["rate"])
+        signals = {one.name: one for one in self._messages(answers)[answers["message"]].signals}
+
+        def kind_of(channel: str, names: Sequence[str]) -> str:
+            found = [heard[name] for name in names if name in heard]
+            values = Values(
+                all(never_negative(signals[name]) for name in names),
+                min((one["min"] for one in found), default=math.nan),
+                max((one["max"] for one in found), default=math.nan),
+            )
+            kind = type_by_unit(channel, units.get(channel), waveform=waveform, values=values)
+            return kind or by_name(channel) or "trend"
+
+        return {name: kind_of(name, names) for name, names in self._by_channel(answers).items()}
 
     def measuring_range(self, answers: Answers, channel: str) -> tuple[float, float] | None:
         """See `BusQuestions.measuring_range`: what the file states, unless it is what the bits can carry."""

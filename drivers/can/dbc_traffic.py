@@ -9,7 +9,7 @@ import numpy as np
 
 from drivers.can.batches import ERROR, EXTENDED, EXTENDED_ID, PRIORITY, REMOTE, by_id
 from drivers.can.checks import LEAST_COUNTER_BITS
-from drivers.can.dbc import selecting_values, signal_field
+from drivers.can.dbc import never_negative, selecting_values, signal_field
 from drivers.counter_search import LEAST_COUNTS
 from drivers.fields import FieldGroup, LayoutError, j1939_valid_raw
 from drivers.sniffing import span
@@ -43,6 +43,7 @@ class SignalTraffic:
     Attributes:
         name: its name.
         unit: its unit; empty if the DBC file gives none.
+        unsigned: whether none of its values can be below 0.
         multiplexed: whether only some frames of the message have it.
         frames: how many frames had a value of it.
         last: the last value in its unit; NaN if none came.
@@ -59,6 +60,7 @@ class SignalTraffic:
         self.name, self.unit = str(signal.name), str(signal.unit or "")
         self.frames = 0
         self.last = self.least = self.most = math.nan
+        self.unsigned = never_negative(signal)
         cell = signal_field(signal)
         length = int(message.length)
         if not all(0 <= position < 8 * length for position in cell.positions):

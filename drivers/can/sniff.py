@@ -18,6 +18,7 @@ from drivers.sniffing import (
     Sniffer,
     SniffError,
     SniffTable,
+    Values,
     quoted,
     rounded_rate,
     sensor_lines,
@@ -610,6 +611,7 @@ class _Report(NamedTuple):
                 or dict.fromkeys((s.name for s in channels), "1"),
                 sensors,
                 rate_hz,
+                values={s.name: Values(s.unsigned, s.least, s.most) for s in channels},
             ),
         ]
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from daqsvc.rounding import counted
 from drivers import packed_questions as packed
-from drivers.bus_questions import TYPE_OF_UNIT, Heard, guessed_sensors
+from drivers.bus_questions import Heard, guessed_sensors
 from drivers.questions import NONE, Answers, sensor_key
 from drivers.serial.sniff_report import (
     ANY_BAUD,
@@ -23,7 +23,15 @@ from drivers.serial.sniff_report import (
     unchecked_words,
     unit_of_suffix,
 )
-from drivers.sniffing import LEAST_SWINGING_HZ, by_name, quoted, table_name, unused, usual_rate
+from drivers.sniffing import (
+    LEAST_SWINGING_HZ,
+    TYPE_OF_UNIT,
+    by_name,
+    quoted,
+    table_name,
+    unused,
+    usual_rate,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, ClassVar
 
 from drivers import packed_questions as packed
 from drivers import questions as q
-from drivers.bus_questions import BEFOREHAND, BUS, TYPE_OF_UNIT, BusQuestions, only_port, seconds_of
+from drivers.bus_questions import BEFOREHAND, BUS, BusQuestions, only_port, seconds_of
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
 from drivers.serial.heard import CRCS, DELIMITERS, HeardOnSerial
 from drivers.serial.sniff import SerialSniffer
 from drivers.serial.sniff_report import MUST_TURN, unit_of_suffix
-from drivers.sniffing import is_waveform_rate, sniffed
+from drivers.sniffing import is_waveform_rate, sniffed, type_by_unit
 from drivers.toml_lines import array, entry
 
 if TYPE_CHECKING:
@@ -171,8 +171,8 @@ class SerialQuestions(BusQuestions):
         suffix = answers.get(sensor_key(channel, "suffix"))
         if suffix is not None:
             unit = unit_of_suffix(suffix)
-            usual = TYPE_OF_UNIT if is_waveform_rate(answers["rate"]) else {}
-            return kind if kind == "keyphasor" else usual.get(unit, "trend"), unit
+            by_unit = type_by_unit(channel, unit, waveform=is_waveform_rate(answers["rate"]))
+            return kind if kind == "keyphasor" else by_unit or "trend", unit
         # A column without a name may be anything: limits of vibration are not for it.
         anything = _UNNAMED.fullmatch(channel) or answers.get(sensor_key(channel, "prefix")) is not None
         return kind, "1" if unit is None and anything else unit

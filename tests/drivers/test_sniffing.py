@@ -6,7 +6,7 @@ import tomllib
 
 import pytest
 
-from drivers.sniffing import WAVEFORM_HZ, sensor_lines
+from drivers.sniffing import WAVEFORM_HZ, Values, sensor_lines, type_by_unit
 
 
 def test_what_has_no_unit_is_taken_for_an_acceleration_where_it_comes_as_often_as_a_waveform() -> None:
@@ -28,15 +28,40 @@ def test_what_has_no_unit_is_taken_for_an_acceleration_where_it_comes_as_often_a
     [
         ("mm/s", 20.0, "trend"),
         ("mm/s", WAVEFORM_HZ, "velocity"),
-        ("g", 20.0, "accelerometer"),
+        ("g", 20.0, "trend"),
+        ("g", WAVEFORM_HZ, "accelerometer"),
         ("mg", WAVEFORM_HZ, "accelerometer"),
         ("mm/s^2", WAVEFORM_HZ, "accelerometer"),
         ("°C", 20.0, "trend"),
     ],
 )
-def test_a_velocity_that_comes_slowly_is_a_level_and_no_waveform(
+def test_a_vibration_that_comes_slowly_is_a_level_and_no_waveform(
     unit: str, rate_hz: float, kind: str
 ) -> None:
     # Of a level the RMS of its changes says nothing: 6.2 mm/s would be shown as next to nothing.
-    [sensor] = tomllib.loads("\n".join(sensor_lines("device", {"VRMS": unit}, set(), rate_hz)))["sensors"]
+    [sensor] = tomllib.loads("\n".join(sensor_lines("device", {"V": unit}, set(), rate_hz)))["sensors"]
     assert sensor["type"] == kind
+
+
+@pytest.mark.parametrize(
+    ("channel", "unit", "values", "kind"),
+    [
+        ("VelRms_DE", "mm/s", Values(), "trend"),
+        ("AccPeak", "g", Values(), "trend"),
+        ("Vib", "mm/s", Values(unsigned=True), "trend"),
+        ("Vib", "g", Values(unsigned=True), "trend"),
+        ("Vib", "mm/s", Values(least=1.58, most=1.62), "trend"),
+        ("Vib", "mm/s", Values(least=1.28, most=1.28), "trend"),  # it stands still
+        ("Vib", "mm/s", Values(least=-1.3, most=1.4), "velocity"),
+        ("Vib", "mm/s", Values(least=0.2, most=1.4), "velocity"),  # too short to see the other half
+        ("Vib", "mm/s", Values(least=0.0, most=0.0), "velocity"),
+        ("Vib", "g", Values(least=0.98, most=1.02), "accelerometer"),  # gravity is in it
+        ("Gap", "um", Values(unsigned=True, least=990.0, most=1010.0), "proximity"),
+        ("Temp", "degC", Values(), None),
+    ],
+)
+def test_a_level_that_comes_as_often_as_a_waveform_is_none(
+    channel: str, unit: str, values: Values, kind: str | None
+) -> None:
+    # An alarm on the RMS of an RMS would never come: that of a steady one is about 0.
+    assert type_by_unit(channel, unit, waveform=True, values=values) == kind

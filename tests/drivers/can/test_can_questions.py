@@ -195,3 +195,25 @@ def test_a_name_that_is_too_long_is_refused_at_its_own_question(tmp_path: Path) 
         assert take(question, "can-dbc", answers, tmp_path / "new.toml") is None
     tables = new(tmp_path, GEARBOX, f"--name={'x' * 256}")
     assert len(tables["machine"]["description"]) == 256
+
+
+LEVELS = """VERSION ""
+BU_: A
+BO_ 700 Fast: 8 A
+ SG_ VelRms_DE : 0|16@1- (0.01,0) [0|0] "mm/s" A
+ SG_ Vel_NDE : 16|16@1+ (0.01,0) [0|100] "mm/s" A
+ SG_ AccRms_DE : 32|16@1+ (0.001,0) [0|30] "g" A
+ SG_ Raw : 48|12@1- (0.01,0) [0|0] "mm/s" A
+ SG_ Cnt : 60|4@1+ (1,0) [0|0] "" A
+BA_DEF_ BO_ "GenMsgCycleTime" INT 0 10000;
+BA_ "GenMsgCycleTime" BO_ 700 10;
+"""
+"""Values that a device has computed from a waveform, as often as a waveform."""
+
+
+def test_an_rms_that_comes_as_often_as_a_waveform_has_its_alarm_on_its_value(tmp_path: Path) -> None:
+    tables = new(tmp_path, LEVELS)
+    kinds = {one["channel"]: one["type"] for one in tables["sensors"]}
+    assert kinds == {"VelRms_DE": "trend", "Vel_NDE": "trend", "AccRms_DE": "trend", "Raw": "velocity"}
+    measures = {one["sensor"]: one["measure"] for one in tables["alarms"]}
+    assert measures == {"VelRms_DE": "value", "Vel_NDE": "value", "velocity-Raw": "velocity_rms"}

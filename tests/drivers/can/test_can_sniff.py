@@ -934,3 +934,32 @@ def test_new_says_what_to_do_when_no_frame_comes(
 def test_the_path_of_a_bus_between_programs_is_known_as_one(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["sniff", "can", "/nowhere/bus"]) == 1
     assert "for the path of a bus between programs write --interface unixbus" in capsys.readouterr().err
+
+
+SEVERITY = """VERSION ""
+BU_: A
+BO_ 700 Fast: 4 A
+ SG_ Cnt : 0|8@1+ (1,0) [0|0] "" A
+ SG_ Severity : 8|16@1- (0.01,0) [0|0] "mm/s" A
+"""
+
+
+def severity(bus: UnixBus, number: int) -> None:
+    value = 158 + number % 4
+    payload = bytes([number % 256]) + value.to_bytes(2, "little", signed=True) + b"\0"
+    bus.send(can.Message(arbitration_id=700, is_extended_id=False, data=payload))
+
+
+@pytest.mark.usefixtures("hub")
+def test_sniff_and_new_take_a_velocity_that_keeps_off_0_for_a_level(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 0.5)
+    (tmp_path / "s.dbc").write_text(SEVERITY)
+    with talking(tmp_path / "bus", severity):
+        assert main(words(tmp_path, "--seconds", "0.5", "--dbc", f"{tmp_path / 's.dbc'}")) == 0
+        proposed = capsys.readouterr().out
+        [sensor] = new(tmp_path, "--bus=can-dbc", "--dbc=s.dbc", "--rate=200")["sensors"]
+    assert 'type = "trend"' in proposed
+    assert 'type = "velocity"' not in proposed
+    assert (sensor["type"], sensor["unit"]) == ("trend", "mm/s")
