@@ -20,6 +20,7 @@ from daqsvc.settings.measures import (
 from drivers import questions as q
 from drivers.bus_questions import STREAM
 from drivers.questions import NONE, Answers, Question, sensor_key
+from drivers.sniffing import TYPE_OF_UNIT
 from drivers.toml_lines import array, behind, entry, toml
 
 if TYPE_CHECKING:
@@ -362,12 +363,41 @@ def _ok_between(sensor: Sensor, answers: Answers) -> Iterator[str]:
     """What the sensor can measure: by it a wrong type, order or scale is found, and a broken sensor."""
     # Only what somebody has stated: beyond it the alarms are suppressed, also those of a hot machine.
     stated = bus_of(answers).measuring_range(answers, sensor.channel)
-    own = [answers[key] for key in ("alert", "danger") if key in answers]
-    if stated is None or any(not stated[0] < limit < stated[1] for limit in own):
+    covered = stated is not None and _covers(stated, _limits_of(sensor, answers), sensor.unit)
+    if stated is not None and not covered:
+        unit = "" if sensor.unit == _NO_UNIT else f" {sensor.unit}"
+        yield f"# The DBC file states {stated[0]:g} to {stated[1]:g}{unit}. It is no ok_between here: beyond"
+        yield "# it the alarm would be suppressed, where the machine is at its worst."
+    if stated is None or not covered:
         about = "from the sensor's data sheet: beyond, its alarms are suppressed"
         yield f"# ok_between = [LEAST, GREATEST]    # {about}"
     else:
         yield entry("ok_between", list(stated), "by the DBC file; beyond, its alarms are suppressed")
+
+
+def _limits_of(sensor: Sensor, answers: Answers) -> tuple[float, float] | None:
+    """Alert and danger of the value of a sensor; None where it has no alarm by them."""
+    limits = answers.get("limits", NONE)
+    if limits == "iso" and sensor.iso == "housing":
+        _, alert, danger = _zones(answers, sensor)[1]
+        return alert, danger
+    if limits == "own" and sensor in _with_own_limits(sensors(answers)):
+        return answers["alert"], answers["danger"]
+    return None
+
+
+def _covers(stated: tuple[float, float], limits: tuple[float, float] | None, unit: str) -> bool:
+    """Whether values that call for an alarm lie within a range that a DBC file states.
+
+    Many files state the range of a display, which ends a little above danger. A machine that is about to fail
+    vibrates several times as much. So the range of a vibration must reach four times as far beyond danger as
+    danger is beyond alert: for ISO 20816-3 to 2.5 times the danger limit. A temperature goes less far.
+    """
+    if limits is None:
+        return True
+    alert, danger = limits
+    times = 4.0 if unit in TYPE_OF_UNIT else 1.0
+    return stated[0] < alert and danger + times * (danger - alert) < stated[1]
 
 
 def pipeline_tables(answers: Answers) -> Iterator[str]:
@@ -451,7 +481,8 @@ def alarm_tables(answers: Answers) -> Iterator[str]:
         yield ""
 
 
-def _iso_alarm(answers: Answers, sensor: Sensor) -> Iterator[str]:
+def _zones(answers: Answers, sensor: Sensor) -> tuple[dict[str, Any], Boundaries]:
+    """The zones of a sensor as a table, and where B, C and D begin."""
     from daqsvc.settings.zones import Zones, boundaries  # noqa: PLC0415 - brings the settings
 
     table: dict[str, Any] = {"standard": "iso-20816-3"}
@@ -464,6 +495,11 @@ def _iso_alarm(answers: Answers, sensor: Sensor) -> Iterator[str]:
         Zones(**table), answers["speed"], sensor.unit if sensor.iso == "shaft" else "mm/s"
     )
     assert at is not None  # noqa: S101 - for the type checker: the table is complete
+    return table, at
+
+
+def _iso_alarm(answers: Answers, sensor: Sensor) -> Iterator[str]:
+    table, at = _zones(answers, sensor)
     measure, unit = sensor.measure or ("", "")
     if sensor.iso == "shaft":
         measure = "peak_to_peak"

@@ -217,3 +217,25 @@ def test_an_rms_that_comes_as_often_as_a_waveform_has_its_alarm_on_its_value(tmp
     assert kinds == {"VelRms_DE": "trend", "Vel_NDE": "trend", "AccRms_DE": "trend", "Raw": "velocity"}
     measures = {one["sensor"]: one["measure"] for one in tables["alarms"]}
     assert measures == {"VelRms_DE": "value", "Vel_NDE": "value", "velocity-Raw": "velocity_rms"}
+
+
+@pytest.mark.parametrize(
+    ("most", "limits", "written"),
+    [
+        (10, ["--limits=iso"], False),  # 14 mm/s would have no alarm
+        (4, ["--limits=iso"], False),  # the danger limit lies beyond it
+        (50, ["--limits=iso"], True),
+        (10, ["--limits=none"], True),
+        (10, ["--limits=own", "--alert=3", "--danger=6"], False),
+        (20, ["--limits=own", "--alert=3", "--danger=6"], True),
+    ],
+)
+def test_a_range_that_ends_near_the_danger_limit_suppresses_no_alarm(
+    tmp_path: Path, most: int, limits: list[str], *, written: bool
+) -> None:
+    dbc = LEVELS.replace("[0|100]", f"[0|{most}]")
+    [sensor] = new(tmp_path, dbc, "--signals=Vel_NDE", *limits)["sensors"]
+    assert sensor.get("ok_between") == ([0.0, float(most)] if written else None)
+    text = (tmp_path / "new.toml").read_text("utf-8")
+    left_out = f"# The DBC file states 0 to {most} mm/s. It is no ok_between here: beyond"
+    assert (left_out in text) == (not written)
