@@ -28,6 +28,7 @@ TOPICS = {
     "first-byte": Topic("Byte of a frame where the samples begin", "From 0; mostly behind the counter."),
     "samples-per-frame": Topic("Samples of each channel in a frame", "The device's manual states it."),
 }
+COUNTS = {"samples": "it grows by the samples in a frame", "frames": "it grows by 1"}
 _PROBE_V = 18.0
 """Lowest voltage of a proximity probe, in V below 0."""
 
@@ -50,8 +51,7 @@ def sample_questions(
     yield bus.ask("counter-byte", q.whole if must_count else q.whole_or_none, "0", quiet=True)
     if answers["counter-byte"] is not None:
         yield bus.choose("counter-bits", dict.fromkeys(("8", "16", "32"), ""), "16", quiet=True)
-        kinds = {"samples": "it grows by the samples in a frame", "frames": "it grows by 1"}
-        yield bus.choose("counter-counts", kinds, "samples", quiet=True)
+        yield bus.choose("counter-counts", COUNTS, "samples", quiet=True)
     yield bus.choose("byte-order", dict.fromkeys(("little", "big"), ""), "little", quiet=True)
     yield bus.ask("first-byte", q.whole, f"{_first_byte(answers, room)}", quiet=True)
     yield bus.ask("samples-per-frame", q.whole, f"{max(min(_most_samples(answers, room), 10), 1)}", **more)

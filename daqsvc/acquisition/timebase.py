@@ -434,7 +434,8 @@ class TimeBase:
         if nominal:
             self.rate_doubt, self._doubted_hz = "", 0.0
         elif abs(rate_hz - self._doubted_hz) > AS_BEFORE * rate_hz:
-            self.rate_doubt, self._doubted_hz = rate_in_words(rate_hz, self._nominal_ns), rate_hz
+            self.rate_doubt = rate_in_words(rate_hz, self._nominal_ns, self._samples_per_count)
+            self._doubted_hz = rate_hz
 
     def _is_faster(self) -> bool:
         """Whether the latest arrivals are those of a faster device than the line's, which they only bend."""
@@ -465,17 +466,27 @@ class TimeBase:
         return float(np.percentile(late, 90)) <= STRAIGHT * abs(found_ns - period_ns) * float(np.ptp(x))
 
 
-def rate_in_words(rate_hz: float, nominal_ns: float) -> str:
+_LIKE_SAMPLES = 0.02
+"""How near the rate must be to that of a counter of samples."""
+
+
+def rate_in_words(rate_hz: float, nominal_ns: float, samples_per_count: int = 1) -> str:
     """What to report about a device whose rate is not the nominal one.
 
     Args:
         rate_hz: what it sends, samples per second.
         nominal_ns: nominal time between samples.
+        samples_per_count: samples of a channel by which the counter grows by 1, as the file has it.
     """
-    return (
-        f"the device sends {readable(rate_hz)} Hz, the file states {readable(NS_PER_S / nominal_ns)}; "
-        "correct rate_hz in the machine file, or the device's setting"
-    )
+    stated_hz = NS_PER_S / nominal_ns
+    begin = f"the device sends {readable(rate_hz)} Hz, the file states {readable(stated_hz)}"
+    if samples_per_count > 1 and abs(rate_hz / stated_hz / samples_per_count - 1.0) < _LIKE_SAMPLES:
+        # A frame seems to be that many frames, of which all but one are lost.
+        return (
+            f'{begin}, {samples_per_count} times less: write counts = "samples" for the counter if it grows '
+            "by the samples in a frame, or correct rate_hz"
+        )
+    return f"{begin}; correct rate_hz in the machine file, or the device's setting"
 
 
 def _apart(one: Late, other: Late) -> int:

@@ -6,9 +6,9 @@ import shlex
 from typing import TYPE_CHECKING, Any
 
 from drivers.bus_questions import BUS
-from drivers.can.dbc_likely import likely_counter, likely_measured
+from drivers.can.dbc_likely import beside_samples, likely_counter, likely_measured, samples_of_one
 from drivers.can.heard import SHOWN, HeardOnCan, decoded_signals, values_heard
-from drivers.can.sniff import CLOCK, STATE
+from drivers.can.sniff import CLOCK, STATE, numbered, of_another_stream
 from drivers.questions import NONE, Answers, sensor_key
 from drivers.sniffing import usual_rate
 
@@ -28,6 +28,8 @@ class HeardMessages(HeardOnCan):
         messages: Mapping[str, Message],
         samples_in_frame: Callable[[Answers], int],
         types: Callable[[Answers, Mapping[str, Mapping[str, Any]]], Mapping[str, str]],
+        *,
+        rate_is_stated: bool,
     ) -> None:
         self._decoded = decoded_signals(found)
         missed = (
@@ -35,6 +37,7 @@ class HeardMessages(HeardOnCan):
             "file of the device that sends"
         )
         super().__init__(found, "" if self._decoded else missed)
+        self._rate_is_stated = rate_is_stated
         self._messages, self._samples_in_frame, self._types = messages, samples_in_frame, types
 
     def proposals(self, answers: Answers) -> dict[str, str]:
@@ -58,7 +61,14 @@ class HeardMessages(HeardOnCan):
             # Most signals that count do so on all pages, and a stream reads the frames of one.
             likely = likely_counter(self._messages[chosen["message"]])
             counters = [one for one in counters if one == likely]
-        proposed["counter"] = next(iter(counters), NONE)
+        sampled = self._counting_samples(chosen["signals"])
+        proposed["counter"] = next(iter([*counters, *sampled]), NONE)
+        if "signals" in answers and answers.get("counter") in sampled:
+            together = samples_of_one(answers["signals"]).values()
+            fits = {len(names) for names in together} == {sampled[answers["counter"]]}
+            proposed["consecutive"] = "yes" if fits else "no"
+            counts = "samples" if self._samples_in_frame(answers) == sampled[answers["counter"]] else "frames"
+            proposed["counter-counts"] = counts
         if signals := self._without_clocks(answers | {"message": chosen["message"]}):
             proposed["signals"] = ", ".join(signals)
         rates = [one["rate_hz"] for one in self.found["ids"] if one["message"] == chosen["message"]]
@@ -80,7 +90,8 @@ class HeardMessages(HeardOnCan):
         """Signals that rose all the time, as a clock does, and are no quantity by their unit."""
         from daqsvc.settings.units import unit_of  # noqa: PLC0415 - brings the settings
 
-        rising = [one for one in self._signals(answers) if one["rises"] and not one["counts_frames"]]
+        heard = [one for one in self._signals(answers) if one["rises"] or one["step"]]
+        rising = [one for one in heard if not one["counts_frames"]]
         units = {one["signal"]: unit_of(one["unit"]) for one in rising}
         # A speed or a temperature may rise for as long as it is listened to.
         return [name for name, unit in units.items() if unit is None or unit.quantity == "time"]
@@ -109,10 +120,15 @@ class HeardMessages(HeardOnCan):
     def _other_length(self, answers: Answers) -> str:
         """That the frames of the message have another length than the file states; empty if not."""
         message = answers["message"]
+        one = self._message(answers)
+        if one["length_doubt"]:
+            return f"{one['length_doubt']} Remedy: give the file of the device that sends"
+        return self._shorter(message)
+
+    def _shorter(self, message: str) -> str:
         length = self._messages[message].length
         lengths = {many for one in self.found["ids"] if one["message"] == message for many in one["lengths"]}
-        # Longer frames are of CAN FD, which pads them.
-        if not lengths or length in lengths or max(length, *lengths) > 8:
+        if not lengths or max(lengths) >= length:
             return ""
         come = " and ".join(f"{many}" for many in sorted(lengths))
         return (
@@ -122,19 +138,37 @@ class HeardMessages(HeardOnCan):
 
     def _other_counter(self, answers: Answers) -> str:
         """That the signal which is to count the frames was heard and does not; empty if it may."""
-        if answers.get("counter") not in self._not_counting(answers):
+        counter, sampled = answers.get("counter"), self._counting_samples(self._signals(answers))
+        if counter in sampled and "rate" in answers and self._samples_in_frame(answers) != sampled[counter]:
+            return (
+                f"{counter} grows by {sampled[counter]} from frame to frame, as what counts samples does. "
+                f"Remedy: --consecutive yes, if {sampled[counter]} numbered signals are samples of one "
+                "channel; else --counter none"
+            )
+        if counter not in self._not_counting(answers):
             return ""
         counters = [one for one in self._signals(answers) if one["counts_frames"]]
         instead = ", ".join([*(one["signal"] for one in counters), NONE])
-        return (
-            f"{answers['counter']} does not grow by 1 from frame to frame. Remedy: correct --counter; it may "
-            f"be {instead}"
-        )
+        step = next(one["step"] for one in self._signals(answers) if one["signal"] == counter)
+        grows = "does not grow by 1" if step is None else f"grows by {step:,} and not by 1"
+        return f"{counter} {grows} from frame to frame. Remedy: correct --counter; it may be {instead}"
+
+    @staticmethod
+    def _counting_samples(signals: Sequence[Mapping[str, Any]]) -> dict[str, int]:
+        """Signals that grow by as many as there are numbered signals of one channel, and by how much."""
+        many = {len(names) for names in numbered([one["signal"] for one in signals]).values()}
+        return {
+            one["signal"]: one["step"] for one in signals if one["step"] in many and not one["multiplexed"]
+        }
+
+    def _message(self, answers: Answers) -> Mapping[str, Any]:
+        """The message as it was heard; without signals if it was not."""
+        chosen = (one for one in self._decoded if one["message"] == answers.get("message"))
+        return next(chosen, {"signals": [], "length_doubt": "", "rate_doubt": ""})
 
     def _signals(self, answers: Answers) -> list[Mapping[str, Any]]:
         """The signals of the message as they were heard."""
-        chosen = (one["signals"] for one in self._decoded if one["message"] == answers.get("message"))
-        return list(next(chosen, []))
+        return list(self._message(answers)["signals"])
 
     def _not_counting(self, answers: Answers) -> set[str]:
         """Signals of the message that do not grow by 1 from frame to frame of those that a stream reads."""
@@ -142,11 +176,15 @@ class HeardMessages(HeardOnCan):
 
         signals = self._signals(answers)
         paged = any(one["multiplexed"] for one in signals)
+        sampled = self._counting_samples(signals)
         # A counter of each page by itself has the same value in several frames in a row.
         return {
             one["signal"]
             for one in signals
-            if not one["counts_frames"] and one["frames"] > LEAST_COUNTS and (one["multiplexed"] or not paged)
+            if not one["counts_frames"]
+            and one["signal"] not in sampled
+            and one["frames"] > LEAST_COUNTS
+            and (one["multiplexed"] or not paged)
         }
 
     def not_offered(self, answers: Answers) -> Mapping[str, Collection[str]]:
@@ -155,14 +193,30 @@ class HeardMessages(HeardOnCan):
 
     def notes(self, answers: Answers, assumed: Collection[str], taken: Collection[str]) -> Iterable[str]:
         """See `Heard.notes`: what was heard of the channels, so that a person can judge it."""
-        del assumed, taken
+        del assumed
         heard = {one["signal"]: one for one in self._signals(answers)}
-        read = [heard[name] for name in answers["signals"] if name in heard]
-        notes = [f"Heard: {values_heard(read)}."] if read else []
+        left_out = beside_samples(answers["signals"]) if answers.get("consecutive") else []
+        read = [heard[name] for name in answers["signals"] if name in heard and name not in left_out]
+        message = self._message(answers)
+        notes = [message["length_doubt"]] if message["length_doubt"] else []
+        notes += [f"Heard: {values_heard(read)}."] if read and not notes else []
+        notes += [message["rate_doubt"]] if message["rate_doubt"] else []
         if silent := [name for name in answers["signals"] if name not in heard]:
             notes.append(f"No value was heard of {', '.join(silent[:SHOWN])}.")
         notes += _doubts(one for message in self._decoded for one in message["signals"])
-        if answers["counter"] is None and not any(one["counts_frames"] for one in heard.values()):
+        if "consecutive" in taken and not answers["consecutive"]:
+            notes += [
+                f"{names[0]} to {names[-1]} are read as {len(names)} channels: nothing shows whether they "
+                f"are {len(names)} samples of one. If they are, give --consecutive yes."
+                for names in samples_of_one(answers["signals"]).values()
+                if all(answers.get(sensor_key(name, "type")) != "trend" for name in names)
+            ]
+        sampled = self._counting_samples([*heard.values()])
+        if (
+            answers["counter"] is None
+            and not sampled
+            and not any(one["counts_frames"] for one in heard.values())
+        ):
             offered = likely_counter(self._messages[answers["message"]])
             few = offered is not None and offered not in self._not_counting(answers)
             notes.append(
@@ -177,7 +231,8 @@ class HeardMessages(HeardOnCan):
                 )
             )
         counter = heard.get(answers["counter"])
-        if counter is not None and not counter["counts_frames"]:
+        counted = {1, self._samples_in_frame(answers)}
+        if counter is not None and counter["step"] not in counted:
             notes.append(f"It was not heard whether {counter['signal']} counts the frames that are read.")
         return notes
 
@@ -185,6 +240,11 @@ class HeardMessages(HeardOnCan):
         """See `Heard.unknown`: values that contradict the file make it most likely that of another device."""
         if "signals" not in answers:
             return ""
+        if (doubt := self._message(answers)["rate_doubt"]) and not self._rate_is_stated:
+            return (
+                f"{doubt} Remedy: give each device its own id, or watch one of them alone. If one "
+                "device sends so often, state its rate with --rate"
+            )
         named = None if "signals" in assumed else answers["signals"]
         read = [one for one in self._signals(answers) if named is None or one["signal"] in named]
         if not (doubts := _doubts(read)):
@@ -206,6 +266,10 @@ class HeardMessages(HeardOnCan):
                 f"Not read: {_few(others)}; {_sniffed_by(answers)} prints their tables. Of these take the "
                 f'streams and sensors, and write bus = "{BUS}", as this file calls it.'
             )
+        left_out = beside_samples(answers["signals"]) if answers.get("consecutive") else []
+        if left_out:
+            in_frame = self._samples_in_frame(answers)
+            yield f"Not read: {_few(left_out)}. Each {of_another_stream(in_frame)}."
         taken = {answers["counter"], *answers["signals"]}
         signals = self._messages[answers["message"]].signals
         states = [one.name for one in signals if one.choices and one.name not in taken]

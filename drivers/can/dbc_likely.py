@@ -64,10 +64,18 @@ def _of_pages(signals: Iterable[Any]) -> bool:
 
 
 def samples_of_one(signals: Sequence[str]) -> dict[str, list[str]]:
-    """Signals that may be samples of one channel, by its name; none if a stream cannot read all as such."""
+    """Signals that may be samples of one channel, by its name; none if a stream cannot read them as such.
+
+    Others may be beside them: these come once a frame, and a stream of their own reads them.
+    """
     found = numbered(signals)
-    lengths = {len(names) for names in found.values()}
-    return found if len(lengths) == 1 and sum(map(len, found.values())) == len(signals) else {}
+    return found if len({len(names) for names in found.values()}) == 1 else {}
+
+
+def beside_samples(signals: Sequence[str]) -> list[str]:
+    """Signals beside those that may be samples of one channel."""
+    samples = {name for names in samples_of_one(signals).values() for name in names}
+    return [name for name in signals if samples and name not in samples]
 
 
 def most_likely_samples(signals: Iterable[Any], names: Sequence[str]) -> list[str]:

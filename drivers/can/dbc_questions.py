@@ -8,9 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from daqsvc.rounding import counted
+from drivers import packed_questions as packed
 from drivers import questions as q
+from drivers.bus_questions import BEFOREHAND
 from drivers.can.dbc_heard import HeardMessages
 from drivers.can.dbc_likely import (
+    beside_samples,
     by_page_of,
     come_together,
     likely_counter,
@@ -26,7 +29,7 @@ from drivers.can.dbc_likely import (
 )
 from drivers.can.heard import SHOWN
 from drivers.can.questions import CanQuestions
-from drivers.can.sniff import of_one_channel
+from drivers.can.sniff import of_another_stream, of_one_channel
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
 from drivers.sniffing import LONGEST_UNIT, Values, by_name, is_waveform_rate, type_by_unit
 from drivers.toml_lines import array, behind, entry, toml
@@ -60,8 +63,10 @@ class DbcQuestions(CanQuestions):
         "consecutive": Topic(
             "Are numbered signals such as AX_0, AX_1 consecutive samples of one channel?",
             "yes: the device measures faster than it sends, and puts several samples into a frame, the "
-            "oldest first. no: they are of separate sensors, as Temp1, Temp2 may be.",
+            "oldest first; what has no number is then left out, as it comes once a frame. no: they are of "
+            "separate sensors, as Temp1, Temp2 may be.",
         ),
+        "counter-counts": packed.TOPICS["counter-counts"],
     }
 
     def questions(self, answers: Answers, folder: Path) -> Iterator[Question]:
@@ -93,28 +98,47 @@ class DbcQuestions(CanQuestions):
         )
         if samples := samples_of_one(answers["signals"]):
             together = "; ".join(f"{stem}: {', '.join(names)}" for stem, names in samples.items())
+            others = beside_samples(answers["signals"])
+            likely = not others and most_likely_samples(message.signals, answers["signals"])
+            if others:
+                together += f"; not {', '.join(others)}"
             yield self.ask(
                 "consecutive",
                 q.yes_no,
-                "yes" if most_likely_samples(message.signals, answers["signals"]) else "no",
+                "yes" if likely else "no",
                 choices={"yes": together, "no": counted(len(answers["signals"]), "channel")},
             )
+        if answers["counter"] is not None and self._samples_in_frame(answers) > 1:
+            yield self.choose("counter-counts", packed.COUNTS, "frames", quiet=True)
 
     listens_behind = "dbc"
 
     def heard(self, found: Mapping[str, Any], answers: Answers) -> HeardOnCan:
         """See `CanQuestions.heard`."""
         return HeardMessages(
-            found, answers["dbc"], self._messages(answers), self._samples_in_frame, self._types
+            found,
+            answers["dbc"],
+            self._messages(answers),
+            self._samples_in_frame,
+            self._types,
+            rate_is_stated="rate" in answers.get(BEFOREHAND, {}),
         )
 
     def origin(self, answers: Answers) -> str:
         """See `BusQuestions.origin`."""
         return f"as {answers['dbc']} describes them"
 
+    def example(self, answers: Answers, assumed: Collection[str]) -> str:
+        """See `BusQuestions.example`: what the file states is none, but may leave something out."""
+        del assumed
+        left_out = beside_samples(answers["signals"]) if answers.get("consecutive") else []
+        if not left_out:
+            return ""
+        return f"Not read: {', '.join(left_out)}. Each {of_another_stream(self._samples_in_frame(answers))}."
+
     def stated(self, answers: Answers) -> Collection[str]:
         """See `BusQuestions.stated`."""
-        known = {"message", "signals", "consecutive"}
+        known = {"message", "signals", "consecutive", "counter-counts"}
         if self._messages(answers)[answers["message"]].cycle_time:
             known.add("rate")
         units = self._units(answers)
@@ -216,9 +240,14 @@ class DbcQuestions(CanQuestions):
         if answers["counter"] is None:
             yield entry("no_counter", value=True, comment="losses are estimated from the times of arrival")
         else:
-            counter = toml({"signal": answers["counter"], "counts": "frames"})
-            yield behind(f"counter = {counter}", "grows by 1 with each frame: losses are counted by it")
-        if not answers.get("consecutive"):
+            counts = answers.get("counter-counts", "frames")
+            counter = toml({"signal": answers["counter"], "counts": counts})
+            grows = "1 with" if counts == "frames" else "the samples in"
+            yield behind(f"counter = {counter}", f"grows by {grows} each frame: losses are counted by it")
+        if answers.get("consecutive"):
+            for name in beside_samples(answers["signals"]):
+                yield f"# {name} is left out: it {of_another_stream(in_frame)}"
+        else:
             yield from of_one_channel(answers["signals"])
         yield from self._other_pages(answers)
         channels = self._by_channel(answers).items()

@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daqsvc.rounding import counted
 from drivers.can.batches import ERROR, EXTENDED, EXTENDED_ID, PRIORITY, REMOTE, by_id
 from drivers.can.checks import LEAST_COUNTER_BITS
-from drivers.can.dbc import never_negative, selecting_values, signal_field
+from drivers.can.dbc import never_negative, selecting_values, signal_field, signals_by_page
+from drivers.can.settings import CAN_FD_LENGTHS
 from drivers.counter_search import LEAST_COUNTS
 from drivers.fields import FieldGroup, LayoutError, j1939_valid_raw
 from drivers.sniffing import span
@@ -27,8 +29,12 @@ if TYPE_CHECKING:
 
 _LEAST_CLOCK_BITS = 12
 _FEW = 0.01
+_MOST_STEPS = 100
+"""Of different sizes: what has more of them varies, and counts nothing."""
 _LEAST_JUMP_BITS = 8
 _LEAST_STEPS = 20
+_TOO_OFTEN = 1.5
+"""Of the rate that a DBC file states: above it, it is no clock that is not exact."""
 _MANY_JUMPS = 0.05
 """Of the steps from value to value: a noisy signal hardly ever crosses half of its range in one of them."""
 
@@ -84,13 +90,26 @@ class SignalTraffic:
         self._may_count = cell.kind == "unsigned" and self._scale == 1 and cell.bits >= LEAST_COUNTER_BITS
         self._may_rise = cell.kind == "unsigned" and cell.bits >= _LEAST_CLOCK_BITS and not self.multiplexed
         self._mask = np.uint64(2**cell.bits - 1)
-        self._odd = 0
+        self._grew: dict[int, tuple[int, int]] = {}
+        """By how much it grew from frame to frame: how often, and the least value behind that."""
         self._before = np.empty(0, np.uint64)
+
+    @property
+    def step(self) -> int | None:
+        """By how much it grew from frame to frame, but for a few frames that were lost; None if it varied."""
+        if not self._may_count or self.frames <= LEAST_COUNTS or not self._grew:
+            return None
+        step = max(self._grew, key=lambda one: self._grew[one][0])
+        others = [self._grew[one] for one in self._grew if one != step]
+        # Frames may be lost while it is listened; what begins again too early counts nothing.
+        steady = sum(many for many, _ in others) <= _FEW * self.frames
+        begins_again = any(least <= step for _, least in others)
+        return step if 0 < step <= int(self._mask) // 2 and steady and not begins_again else None
 
     @property
     def counts(self) -> bool:
         """Whether it grew by 1 from frame to frame, but for a few frames that were lost."""
-        return self._may_count and self.frames > LEAST_COUNTS and self._odd <= _FEW * self.frames
+        return self.step == 1
 
     @property
     def rises(self) -> bool:
@@ -125,7 +144,7 @@ class SignalTraffic:
                 f"{self.frames:,} frames beyond what the DBC file states ({ends}): is it the file of this "
                 "device?"
             )
-        may_jump = self._may_jump and not self.counts and not self.rises
+        may_jump = self._may_jump and self.step is None and not self.rises
         if may_jump and self._steps >= _LEAST_STEPS and self._jumps > _MANY_JUMPS * self._steps:
             return (
                 f"{self.name} jumps by more than half of what its {self._bits} bits can carry, in "
@@ -143,14 +162,23 @@ class SignalTraffic:
         if self._may_count or self._may_rise:
             counts = np.concatenate((self._before, raw.astype(np.uint64)))
             steps = np.diff(counts) & self._mask
-            odd = steps != 1
-            # Frames may be lost while it is listened; what begins again too early counts no frames.
-            self._may_count = self._may_count and not bool((counts[1:][odd] <= 1).any())
-            self._odd += int(odd.sum())
+            self._note_steps(steps, counts[1:])
             self._may_rise = self._may_rise and bool(((steps > 0) & (steps < self._mask // 2)).all())
             self._before = counts[-1:]
         self._note(raw.astype(np.float64))
         self._last_raw = None if raw.dtype.kind == "f" else int(raw[-1])
+
+    def _note_steps(self, steps: NDArray[np.uint64], behind: NDArray[np.uint64]) -> None:
+        """Keep by how much it grew, and the values behind that, unless too many steps show that it varies."""
+        if not self._may_count:
+            return
+        for step in np.unique(steps):
+            values = behind[steps == step]
+            many, least = self._grew.get(int(step), (0, int(values[0])))
+            self._grew[int(step)] = many + len(values), min(least, int(values.min()))
+        self._may_count = len(self._grew) <= _MOST_STEPS
+        if not self._may_count:
+            self._grew.clear()
 
     def _note(self, raw: NDArray[np.float64]) -> None:
         if self._valid is not None:
@@ -188,6 +216,7 @@ class MessageTraffic:
         ids: ids that came, with their flags; several where SAE J1939 messages come with several priorities.
         frames: frames that came.
         short: those of them that are shorter than the DBC file states; they are left out.
+        long: those of them that are longer, beyond what CAN FD pads them to.
         signals: those that came, and those that did not.
         unusable: why a signal cannot be read.
     """
@@ -196,7 +225,10 @@ class MessageTraffic:
         self.name, self.frame_id = str(message.name), int(message.frame_id)
         self.extended, self.length = bool(message.is_extended_frame), int(message.length)
         self.ids: set[int] = set()
-        self.frames = self.short = 0
+        self.frames = self.short = self.long = 0
+        self._padded = next((one for one in CAN_FD_LENGTHS if one >= self.length), self.length)
+        # Each page may come as often as the DBC file states.
+        self._cycle_s = float(message.cycle_time or 0.0) / 1000.0 / max(len(signals_by_page(message)), 1)
         self.signals: list[SignalTraffic] = []
         self.unusable: list[str] = []
         self._told_apart = EXTENDED | EXTENDED_ID
@@ -213,6 +245,33 @@ class MessageTraffic:
         """The first signal that counts all frames."""
         return next((one for one in self.signals if one.counts and not one.multiplexed), None)
 
+    @property
+    def length_doubt(self) -> str:
+        """That its frames are longer than the DBC file states, so that no stream reads them; empty if not."""
+        if not self.long:
+            return ""
+        return (
+            f"{self.long:,} of {counted(self.frames, 'frame')} of {self.name} have more than the "
+            f"{self.length} bytes of the DBC file, and a stream does not read them: is it the file of this "
+            "device?"
+        )
+
+    def rate_doubt(self, rate_hz: float | None) -> str:
+        """That its frames come clearly more often than the DBC file states; empty if not.
+
+        Args:
+            rate_hz: of the id that comes most often.
+        """
+        # Who counts every frame is one device, however often it has been set to send.
+        few = rate_hz is None or self.frames < _LEAST_STEPS or self.counter is not None
+        if few or rate_hz is None or rate_hz * self._cycle_s < _TOO_OFTEN:
+            return ""
+        return (
+            f"{self.name} comes {rate_hz:.3g} times a second, the DBC file states {1.0 / self._cycle_s:.3g} "
+            f"(every {1000.0 * self._cycle_s:.3g} ms): most likely two devices send it with one id, and "
+            "their values mix."
+        )
+
     def has(self, frame_id: int) -> bool:
         """Whether an id, with its flags, is the message's."""
         own = self.frame_id | (EXTENDED if self.extended else 0)
@@ -224,6 +283,7 @@ class MessageTraffic:
         self.frames += len(lengths)
         long_enough = lengths >= self.length
         self.short += int((~long_enough).sum())
+        self.long += int((lengths > self._padded).sum())
         payloads = np.ascontiguousarray(data[long_enough, : self.length])
         if len(payloads):
             for signal in self.signals:

@@ -144,11 +144,7 @@ def in_words(found: Mapping[str, Any]) -> Iterator[str]:
 
 def _of_ids(found: Mapping[str, Any], *, values: bool = False) -> Iterator[str]:
     """The ids that come most often: how long their frames are, how often they come, with which values."""
-    by_message = (
-        {one["message"]: one["signals"] for one in decoded_signals(found)}
-        if values and "dbc" in found
-        else {}
-    )
+    by_message = {one["message"]: one for one in decoded_signals(found)} if values and "dbc" in found else {}
     ids = sorted(found["ids"], key=lambda one: -(one["rate_hz"] or 0.0))
     for one in ids[:SHOWN]:
         lengths = ", ".join(map(str, one["lengths"]))
@@ -158,7 +154,8 @@ def _of_ids(found: Mapping[str, Any], *, values: bool = False) -> Iterator[str]:
         if message is None and "dbc" in found:
             message = "not in the DBC file"
         yield f"  {one['id']:#x}: {lengths} bytes, {rate}{counts}{f', {message}' if message else ''}"
-        signals = by_message.pop(message, [])
-        if signals:
-            yield f"    {values_heard(signals)}"
-        yield from (f"    {signal['doubt']}" for signal in signals if signal["doubt"])
+        if (heard := by_message.pop(message, None)) is None:
+            continue
+        yield f"    {values_heard(heard['signals'])}"
+        doubts = [heard["length_doubt"], heard["rate_doubt"], *(one["doubt"] for one in heard["signals"])]
+        yield from (f"    {doubt}" for doubt in doubts if doubt)

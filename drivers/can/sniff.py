@@ -44,6 +44,7 @@ LONGER_S = 20.0
 _FEW = 3
 TYPICAL_BITRATE = 500_000
 _POLL_S = 0.1
+_EXACT = "the device's manual has the exact one"
 _SHOWN_BYTES = 16
 _NETWORK = Path("/sys/class/net")
 _ARPHRD_CAN = 280
@@ -445,7 +446,7 @@ class _Report(NamedTuple):
                 signal.name,
                 *_values(signal.last, signal.least, signal.most),
                 signal.unit or "-",
-                signal.choice or ("counts frames" if signal.counts else ""),
+                signal.choice or _as_counter(signal.step),
             ]
             for message in dbc.heard
             for signal in message.signals
@@ -460,6 +461,7 @@ class _Report(NamedTuple):
                     f"{message.name}: {message.short} of {message.frames} frames have fewer than the "
                     f"{message.length} bytes of the DBC file, and are left out above."
                 )
+            yield from (doubt for doubt in (message.length_doubt, self._rate_doubt(message)) if doubt)
             yield from (f"{message.name}: {reason}." for reason in message.unusable)
         if dbc.missing:
             named = [f"{one.name} ({_id(one.frame_id, extended=one.extended)})" for one in dbc.missing]
@@ -468,6 +470,10 @@ class _Report(NamedTuple):
         if strange:
             named = [_id(one.arbitration_id, extended=one.extended) for one in strange]
             yield f"Heard, but not in the DBC file: {', '.join(named)}"
+
+    def _rate_doubt(self, message: MessageTraffic) -> str:
+        rates = (self.traffic.ids[one].rate_hz for one in message.ids)
+        return message.rate_doubt(max((rate for rate in rates if rate is not None), default=None))
 
     def _figures(self) -> CanFigures:
         load = self._load
@@ -519,6 +525,9 @@ class _Report(NamedTuple):
                     "id": message.frame_id,
                     "frames": message.frames,
                     "frames_short": message.short,
+                    "frames_long": message.long,
+                    "length_doubt": message.length_doubt,
+                    "rate_doubt": self._rate_doubt(message),
                     "signals": [
                         {
                             "signal": signal.name,
@@ -532,6 +541,7 @@ class _Report(NamedTuple):
                             "doubt": signal.doubt,
                             "counts_frames": signal.counts,
                             "rises": signal.rises,
+                            "step": signal.step,
                             "multiplexed": signal.multiplexed,
                         }
                         for signal in message.signals
@@ -577,43 +587,80 @@ class _Report(NamedTuple):
         """A stream of a message, as far as one can be made of what is known."""
         of_ids = [one for key in sorted(message.ids) if (one := self.traffic.ids[key]).rate_hz is not None]
         measured = [s for s in message.signals if s.frames and not s.counts and not s.multiplexed]
-        channels = [s for s in measured if not s.named and not s.rises]
+        channels = [s for s in measured if not s.named and not s.rises and s.step is None]
         if any(signal.multiplexed for signal in message.signals):
             return [
                 f"# {message.name} is multiplexed: make a stream for each page; daqsvc new makes that of one"
             ]
+        if message.length_doubt:
+            return [f"# {message.length_doubt}"]
         if len(of_ids) != 1 or not channels or message.short:
             return [f"# {message.name} came too seldom, or not as the DBC file describes it"]
         rate_hz = of_ids[0].rate_hz
         assert rate_hz is not None and self.dbc_file is not None  # noqa: S101, PT018 - for the type checker
         name = unused(table_name(message.name.lower(), "stream"), taken)
         counter = message.counter
+        samples = {s.name: [s.name] for s in channels}
+        if counter is None and (counter := _counter_of_samples(message)) is not None:
+            together = numbered([s.name for s in channels]).items()
+            samples = {stem: names for stem, names in together if len(names) == counter.step}
+        read = [s for s in channels if any(s.name in names for names in samples.values())]
+        first = {name: next(s for s in channels if s.name == names[0]) for name, names in samples.items()}
+        in_frame = len(next(iter(samples.values())))
         return [
             f"[streams.{name}]",
             f"bus = {quoted(bus)}",
-            f"rate_hz = {rounded_rate(rate_hz)}    # as measured; the device's manual has the exact one",
+            *([f"# {doubt}"] if (doubt := self._rate_doubt(message)) else []),
+            f"rate_hz = {rounded_rate(rate_hz * in_frame)}    # as measured; {_EXACT}",
             "",
             f"[streams.{name}.layout]",
             f"dbc = {quoted(f'{self.dbc_file.absolute()}')}",
             f"message = {quoted(message.name)}",
             "no_counter = true    # none was seen"
             if counter is None
-            else f'counter = {{ signal = {quoted(counter.name)}, counts = "frames" }}',
+            else f"counter = {{ signal = {quoted(counter.name)}, "
+            f'counts = "{"frames" if counter.counts else "samples"}" }}',
             "channels = [",
-            *(f"  {{ name = {quoted(s.name)}, signals = [{quoted(s.name)}] }}," for s in channels),
+            *(f"  {{ name = {quoted(one)}, signals = {_array(names)} }}," for one, names in samples.items()),
             "]",
-            *(f"# {s.name} is left out: {_why_left_out(s)}" for s in measured if s not in channels),
-            *(f"# {s.doubt}" for s in channels if s.doubt),
-            *of_one_channel([signal.name for signal in channels]),
+            *(
+                f"# {s.name} is left out: {_why_left_out(s)}"
+                for s in measured
+                if s not in channels and s is not counter
+            ),
+            *(f"# {s.name} is left out: it {of_another_stream(in_frame)}" for s in channels if s not in read),
+            *(f"# {s.doubt}" for s in read if s.doubt),
+            *(of_one_channel([s.name for s in channels]) if in_frame == 1 else ()),
             *sensor_lines(
                 name,
-                {s.name: s.unit for s in channels if s.unit}
-                or dict.fromkeys((s.name for s in channels), "1"),
+                {one: s.unit for one, s in first.items() if s.unit} or dict.fromkeys(first, "1"),
                 sensors,
-                rate_hz,
-                values={s.name: Values(s.unsigned, s.least, s.most) for s in channels},
+                rate_hz * in_frame,
+                values={one: Values(s.unsigned, s.least, s.most) for one, s in first.items()},
             ),
         ]
+
+
+def _counter_of_samples(message: MessageTraffic) -> SignalTraffic | None:
+    """A signal that counts the samples: it grows by as many as there are numbered signals of one channel."""
+    many = {len(names) for names in numbered([one.name for one in message.signals if one.frames]).values()}
+    found = (one for one in message.signals if not one.multiplexed and one.step in many)
+    return next(found, None)
+
+
+def _as_counter(step: int | None) -> str:
+    if step is None:
+        return ""
+    return "counts frames" if step == 1 else f"grows by {step:,} with each frame"
+
+
+def _array(names: Sequence[str]) -> str:
+    return f"[{', '.join(map(quoted, names))}]"
+
+
+def of_another_stream(samples: int) -> str:
+    """Why a signal is not read beside several samples of other channels."""
+    return f"comes once a frame, the channels have {samples} samples in it; another stream reads it"
 
 
 def _why_left_out(signal: SignalTraffic) -> str:

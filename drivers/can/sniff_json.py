@@ -74,6 +74,7 @@ class DbcSignalFigures(TypedDict):
         doubt: what is strange about its values if the file is that of the device; empty if nothing is.
         counts_frames: whether it grew by 1 from frame to frame.
         rises: whether it rose all the time, as a clock does, until it began again at 0.
+        step: by how much it grew from frame to frame; null if that varied.
         multiplexed: whether only some frames of the message have it.
     """
 
@@ -88,6 +89,7 @@ class DbcSignalFigures(TypedDict):
     doubt: str
     counts_frames: bool
     rises: bool
+    step: int | None
     multiplexed: bool
 
 
@@ -99,6 +101,9 @@ class DbcMessageFigures(TypedDict):
         id: its id.
         frames: how many frames there were.
         frames_short: how many of them were too short.
+        frames_long: how many of them were too long.
+        length_doubt: that they were too long for a stream to read them; empty if not.
+        rate_doubt: that they came clearly more often than the DBC file states; empty if not.
         signals: its signals of which there were values.
     """
 
@@ -106,6 +111,9 @@ class DbcMessageFigures(TypedDict):
     id: int
     frames: int
     frames_short: int
+    frames_long: int
+    length_doubt: str
+    rate_doubt: str
     signals: list[DbcSignalFigures]
 
 

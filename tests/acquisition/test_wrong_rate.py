@@ -11,6 +11,7 @@ from support.examples import examples, first_of
 
 from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.standing import StreamState
+from daqsvc.acquisition.timebase import rate_in_words
 
 pytestmark = pytest.mark.property
 PER_FRAME = 10
@@ -162,3 +163,19 @@ def test_what_ends_too_soon_to_be_measured_is_judged_as_it_is() -> None:
     stream.play(np.arange(len(arrival_ns)), arrival_ns)
     stream.unit.flush()
     assert stream.told[-1][1] == StreamState("", proven=True)
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "samples_per_count", "remedy"),
+    [
+        (3601.0, 3, 'write counts = "samples" for the counter'),
+        (3601.0, 1, "correct rate_hz in the machine file"),
+        (2400.0, 3, "correct rate_hz in the machine file"),
+    ],
+)
+def test_a_rate_that_is_wrong_by_the_samples_of_a_frame_may_be_a_wrong_counts(
+    rate_hz: float, samples_per_count: int, remedy: str
+) -> None:
+    words = rate_in_words(rate_hz, 1e9 / 1200.0, samples_per_count)
+    assert words.startswith(f"the device sends {rate_hz:g} Hz, the file states 1200")
+    assert remedy in words

@@ -162,10 +162,21 @@ def test_what_a_sensor_can_measure_is_as_the_dbc_file_states(
         assert "ok_between" not in new(tmp_path, dbc, *more, "--danger=230")["sensors"][0]
 
 
-def test_it_is_not_asked_where_one_stream_could_not_read_them_so(tmp_path: Path) -> None:
+def test_samples_beside_another_signal_are_read_together_by_request(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     layout = layout_of(new(tmp_path, GEARBOX, "--signals=AX_0, AX_1, Supply"))
     assert [one["name"] for one in layout["channels"]] == ["AX_0", "AX_1", "Supply"]
     assert layout["rate_hz"] == 500.0
+    capsys.readouterr()
+    given = ("--signals=AX_0, AX_1, Supply", "--consecutive=yes", "--counter=Count")
+    layout = layout_of(new(tmp_path, GEARBOX, *given))
+    assert layout["channels"] == [{"name": "AX", "signals": ["AX_0", "AX_1"]}]
+    assert layout["rate_hz"] == 1000.0
+    assert layout["counter"] == {"signal": "Count", "counts": "frames"}
+    left_out = "comes once a frame, the channels have 2 samples in it; another stream reads it"
+    assert f"Not read: Supply. Each {left_out}.\n" in capsys.readouterr().out
+    assert f"# Supply is left out: it {left_out}\n" in (tmp_path / "new.toml").read_text("utf-8")
 
 
 def test_an_answer_is_not_refused_for_a_sensor_that_was_not_asked_about(tmp_path: Path) -> None:
