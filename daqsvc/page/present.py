@@ -43,13 +43,15 @@ def _row_of(live: MachineLive, sensor: str, statements: list[Document]) -> str:
     values = "<br>".join(escape(value) for one in own for value in _values(one))
     levels = [str(one["severity"]) for one in own]
     level = next((one for one in ("danger", "alert") if one in levels), "normal")
+    # Where nothing can be measured, nothing is within its limits; what was worse before is held.
+    is_judged = bool(values) or level != "normal" or any(one["quality"] == "good" for one in own)
     worst = min(statements, key=lambda one: WORST_FIRST.index(one["quality"]))
     state = OK[worst["quality"]] + (f": {worst['reason']}" if worst["reason"] else "")
     newest_ns = max(int(one["monotonic_ns"]) for one in statements)
     return row(
         escape(sensor),
         values or ("no value" if own else "see the detectors below"),
-        level_mark(level) if own else "",
+        level_mark(level) if own and is_judged else "",
         escape(state),
         time_mark(live.wall_ns_at_0 + newest_ns),
     )

@@ -76,6 +76,15 @@ def test_present_values_stand_with_their_limits_and_the_state_of_the_sensor() ->
     assert "key" in key
 
 
+@pytest.mark.parametrize("severity", ["normal", "danger"])
+def test_a_sensor_without_a_value_has_no_level_but_one_that_is_held(severity: str) -> None:
+    nothing = levels("missing", severity=severity, statistics={}, units={}, reason="no values came")
+    [line] = [one for one in value_rows(looking(nothing)).split("</tr>") if "<td>left</td>" in one]
+    assert "no value" in line
+    assert "missing: no values came" in line
+    assert ('class="level' in line) == (severity == "danger")
+
+
 def test_a_value_with_zones_says_in_which_it_is_and_a_phase_how_far_it_is_off() -> None:
     at = {"zone_b": 1.4, "zone_c": 2.8, "zone_d": 4.5}
     asked = levels(
