@@ -68,7 +68,8 @@ class Heard(ABC):
     def proposals(self, answers: Answers) -> Mapping[str, str]:
         """Answers by the key of their question, as they would be typed, that fit the answers so far.
 
-        One that cannot be used is not offered.
+        One that cannot be used is not offered. A default that is not among them was not heard: its line is
+        marked as assumed, unless it was typed.
         """
 
     def beside(self, answers: Answers) -> Mapping[str, str]:
@@ -183,7 +184,7 @@ class BusQuestions(ABC):
         return "an example"
 
     def stated(self, answers: Answers) -> Collection[str]:
-        """Keys of questions whose defaults a file of the device states."""
+        """Keys of questions whose defaults the device or a file of it states."""
         del answers
         return ()
 

@@ -17,7 +17,7 @@ from drivers.toml_lines import array, entry
 
 if TYPE_CHECKING:
     import threading
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Collection, Iterator, Mapping
     from pathlib import Path
 
 _CHARACTERS = {
@@ -176,6 +176,11 @@ class SerialQuestions(BusQuestions):
         # A column without a name may be anything: limits of vibration are not for it.
         anything = _UNNAMED.fullmatch(channel) or answers.get(sensor_key(channel, "prefix")) is not None
         return kind, "1" if unit is None and anything else unit
+
+    def stated(self, answers: Answers) -> Collection[str]:
+        """See `BusQuestions.stated`: the device writes the unit behind a number."""
+        named = [one for one in self.channels(answers) if answers.get(sensor_key(one, "suffix")) is not None]
+        return {sensor_key(name, topic) for name in named for topic in ("type", "unit")}
 
     def of_channel(self, answers: Answers, channel: str) -> Iterator[Question]:
         """See `BusQuestions.of_channel`."""

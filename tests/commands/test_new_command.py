@@ -343,16 +343,47 @@ def test_what_enter_took_of_the_machine_is_marked_and_what_was_typed_is_not(tmp_
         )
         return assumed_keys(machine_text(answers, "m.toml"))
 
-    assert marked() == {"speed_rpm", "rate_hz", "channels", "zones"}  # the register, too
-    typed = {"speed": "1480", "class": "2-rigid", "rate": "1", "sensor.vibration.address": "0"}
+    assert marked() == {"speed_rpm", "rate_hz", "way", "unit", "channels", "zones"}
+    typed = {"speed": "1480", "class": "2-rigid", "rate": "1", "way": "values", "unit": "1"}
+    values = {"address": "0", "register-type": "uint16", "scale": "0.01", "unit": "mm/s"}
+    typed |= {f"sensor.vibration.{key}": text for key, text in values.items()}
     assert marked(**typed) == set()
+    del typed["sensor.vibration.scale"]
+    assert marked(**typed) == {"channels"}
 
 
 def test_what_was_heard_is_not_assumed_though_it_is_the_usual_value(tmp_path):
     given = {"bus": "serial", "port": "/dev/ttyS0"}
-    heard = HeardThis({"baud": "115200", "columns": "t, x", "rate": "100"})
+    shown = {"baud": "115200", "framing": "lines", "columns": "t, x", "counter": "t", "counts": "ms"}
+    shown |= {"separator": ",", "checksum": "none", "sensor.x.suffix": "mm/s", "rate": "100"}
+    heard = HeardThis(shown)
     answers = conduct(tmp_path / "m.toml", Given(given, defaults=True), None, print, lambda *_: heard)
     assert assumed_keys(machine_text(answers, "m.toml")) == {"speed_rpm", "zones"}
+    del shown["baud"], shown["separator"], shown["sensor.x.suffix"]
+    answers = conduct(tmp_path / "m.toml", Given(given, defaults=True), None, print, lambda *_: heard)
+    assert assumed_keys(machine_text(answers, "m.toml")) == {
+        *("speed_rpm", "zones", "baud", "separator", "type", "unit")
+    }
+
+
+@pytest.mark.parametrize("way", ["waveform", "ring", "fifo"])
+@pytest.mark.parametrize("defaults", [True, False])
+def test_listening_shows_nothing_of_how_samples_lie_in_registers(tmp_path, way, defaults):
+    given = {"bus": "modbus-tcp", "host": "h", "unit": "33", "way": way, "speed": "1500", "class": "2-rigid"}
+    heard = HeardThis({"unit": "33", "table": "holding", "channels": "r4352, r4353"})
+
+    def marked(listen) -> tuple[set[str], list[str]]:
+        beforehand = Given(given, defaults)
+        ask = None if defaults else lambda _question: ""
+        answers = conduct(tmp_path / "m.toml", beforehand, ask, print, listen)
+        return assumed_keys(machine_text(answers, "m.toml")), answers["notes"]
+
+    keys, notes = marked(lambda *_: heard)
+    layouts = {"waveform": {"block_id", "samples"}, "ring": {"count", "depth"}, "fifo": {"count"}}
+    assert keys == {"rate_hz", "address", "channels", "type", "unit"} | layouts[way]
+    [words] = [one for one in notes if one.startswith("Assumed, as nobody has stated it: ")]
+    assert set(words.partition(": ")[2].partition(". ")[0].split(", ")) == keys
+    assert marked(None)[0] - keys <= {"table"}
 
 
 def test_two_figures_are_limits_of_one_quantity_only(tmp_path, capsys):

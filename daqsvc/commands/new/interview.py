@@ -104,18 +104,21 @@ class _Interview:
         self._has_listened = False
         self._deaf: SniffError | None = None
         """Why nothing was heard."""
-        self._assumed: set[str] = set()
-        """Keys of questions whose default was taken, and was not heard."""
-        self._taken: set[str] = set()
-        """Keys of questions whose default was taken, whether it was heard or not."""
-        self._unstated: set[str] = set()
-        """Keys of what nobody has stated and nothing has shown, for the comments behind their lines."""
+        self._taken: dict[str, bool] = {}
+        """Keys of questions whose default was taken, by Enter or unasked, and whether it was heard."""
         self._unheard = ""
 
     def assumed(self) -> frozenset[str]:
         """Keys of answers that nobody has given and nothing has shown; none of a simulated machine."""
         bus = bus_of(self.answers)
-        return frozenset() if bus.simulated else frozenset(self._unstated - set(bus.stated(self.answers)))
+        if bus.simulated:
+            return frozenset()
+        return frozenset(self._unheard_defaults - set(bus.stated(self.answers)))
+
+    @property
+    def _unheard_defaults(self) -> set[str]:
+        """Keys of questions whose default was taken, and was not heard."""
+        return {key for key, heard in self._taken.items() if not heard}
 
     def notes(self) -> list[str]:
         """What in the file was neither answered nor heard, and what was heard and is not in it."""
@@ -124,11 +127,10 @@ class _Interview:
 
     def _not_heard(self) -> Sequence[str]:
         """What in the file was neither answered nor heard, or is a guess by what was heard."""
-        counters = {"counter", "counter-byte"}
-        channels = self._assumed & (_OF_CHANNELS - counters)
-        example = bool(channels) or any(key.endswith(".address") for key in self._assumed)
+        assumed = self._unheard_defaults
+        example = bool(assumed & _OF_CHANNELS) or any(key.endswith(".address") for key in assumed)
         if not self._has_listened:
-            example_only = bus_of(self.answers).example(self.answers, self._assumed)
+            example_only = bus_of(self.answers).example(self.answers, assumed)
             return [example_only] if example_only else []
         origin = bus_of(self.answers).origin(self.answers)
         if self._heard is None:
@@ -138,13 +140,11 @@ class _Interview:
                 return [f"The bus could not be listened to{so}: {self._deaf}"]
             return [f"Nothing was heard on the bus; the channels are {origin}."] * example
         if not self._heard.missed:
-            return [*self._heard.notes(self.answers, self._assumed, self._taken)]
+            return [*self._heard.notes(self.answers, assumed, self._taken.keys())]
         if example:
             unheard = f"None of these channels was heard on the bus; they are {origin}."
             return [unheard, f"{self._heard.missed}."]
-        return [f"What was heard does not fit this file: {self._heard.missed}."] * bool(
-            self._assumed & counters
-        )
+        return [f"What was heard does not fit this file: {self._heard.missed}."] * bool(assumed & _COUNTERS)
 
     def is_over(self) -> bool:
         """Ask what is not answered yet; False if a person goes back, and the rest must be asked again."""
@@ -160,8 +160,8 @@ class _Interview:
         return True
 
     def _take(self, plain: Question) -> None:
-        question, entered = self._as_heard(plain), False
-        shown = self._is_shown(question)
+        question, is_entered = self._as_heard(plain), False
+        is_heard = self._is_heard(question)
         key, texts = question.key, self._given.texts
         given = self._given_key(key)
         if given in texts:
@@ -172,35 +172,24 @@ class _Interview:
                     raise AnswerError(refused)
                 # What a person has typed by now is not lost for that.
                 self._say(refused)
-                entered = _answer(question, self._ask, self._say, self.answers, self._file)
+                is_entered = _answer(question, self._ask, self._say, self.answers, self._file)
                 self._typed.append(key)
         elif question.default is not None and (self._given.defaults or self._is_quiet(question)):
-            reason = take(question, question.default, self.answers, self._file)
+            reason, is_entered = take(question, question.default, self.answers, self._file), True
             if reason is not None:
                 raise AnswerError(f"{option(key)} must be given: {question.default} cannot be used: {reason}")
         elif self._ask is None:
             raise AnswerError(_missing(question))
         else:
-            entered = _answer(question, self._ask, self._say, self.answers, self._file)
+            is_entered = _answer(question, self._ask, self._say, self.answers, self._file)
             self._typed.append(key)
-        if given not in texts and self._is_default(question):
-            heard = self._heard is not None and question.default != plain.default
-            self._note_default(key, heard=heard)
-            if not shown and not (question.quiet and key.startswith(f"{SENSOR}.")):
-                self._note_unstated(key, entered=entered)
+        if is_entered and self._is_default(question):
+            self._taken[key] = is_heard
         if self._answered is not None:
             self._answered(question, self.answers)
         self._see_unheard()
         self._see_unknown()
         self._behind(key)
-
-    def _note_default(self, key: str, *, heard: bool) -> None:
-        """Keep that an answer is nothing but a default, or what was heard."""
-        self._taken.add(key)
-        # Whoever takes a default most often knows it; what the channels are, nobody has by chance.
-        unasked = key not in self._typed or key in _OF_CHANNELS or key.endswith(".address")
-        if not heard and unasked:
-            self._assumed.add(key)
 
     def _as_heard(self, plain: Question) -> Question:
         """The question with what was heard as its default."""
@@ -210,24 +199,12 @@ class _Interview:
         self._see_rate(question, self._heard)
         return question
 
-    def _is_shown(self, question: Question) -> bool:
+    def _is_heard(self, question: Question) -> bool:
         """Whether its default was heard, also where it is the usual one."""
+        if question.quiet and question.key.startswith(f"{SENSOR}."):
+            return True  # of what the channel has not, as the byte order of one register
         proposed = None if self._heard is None else self._heard.proposals(self.answers).get(question.key)
         return proposed is not None and proposed == question.default
-
-    def _note_unstated(self, key: str, *, entered: bool) -> None:
-        """Keep that an answer is a default that nobody has stated and nothing has shown."""
-        if self._heard is not None and not self._heard.missed:
-            # What else was taken from there is in its notes and guesses.
-            matters = key in _OF_MACHINE or key in _BIT_RATES
-        elif key in self._typed:
-            # Of the rest, whoever takes a default most often knows it.
-            silent = self._has_listened and key in _BIT_RATES
-            matters = silent or key in _OF_MACHINE or key in _OF_CHANNELS or key.endswith(".address")
-        else:
-            matters = True
-        if matters and (entered or key not in self._typed):
-            self._unstated.add(key)
 
     def _given_key(self, key: str) -> str:
         """The key itself, or that of an answer given beforehand to which listening is narrowed."""
@@ -275,7 +252,7 @@ class _Interview:
         Raises:
             NothingFoundError: there is such a thing, and nobody can be asked.
         """
-        unknown = "" if self._heard is None else self._heard.unknown(self.answers, self._assumed)
+        unknown = "" if self._heard is None else self._heard.unknown(self.answers, self._unheard_defaults)
         if unknown and self._ask is None:
             raise NothingFoundError(unknown)
 
@@ -304,6 +281,9 @@ class _Interview:
             self._deaf = heard if isinstance(heard, SniffError) else None
             self._heard = None if isinstance(heard, SniffError) else heard
             self._has_listened = True
+            if self._heard is not None:
+                # By these it was found: a wrong baud rate or parity would have shown nothing.
+                self._taken |= dict.fromkeys(self._taken, True)
             if self._heard is not None and self._heard.missed:
                 if self._ask is None:
                     raise NothingFoundError(self._heard.missed)
@@ -320,18 +300,15 @@ class _Interview:
         keys = list(self.answers)
         for key in keys[keys.index(self._typed.pop()) :]:
             del self.answers[key]
-            self._assumed.discard(key)
-            self._taken.discard(key)
-            self._unstated.discard(key)
+            self._taken.pop(key, None)
         if listens_behind not in self.answers:
             self._heard, self._has_listened, self._deaf = None, False, None
 
 
-_OF_CHANNELS = {"channels", "columns", "signals", "counter", "counter-byte"}
-"""Questions that say what is measured, and by what samples are counted."""
-_OF_MACHINE = {"speed", "rate", "class", "alert", "danger"}
-"""Questions whose defaults are of no machine: nobody can mean them by chance."""
-_BIT_RATES = {"bitrate", "data-bitrate"}
+_OF_CHANNELS = {"channels", "columns", "signals"}
+"""Questions that say what is measured."""
+_COUNTERS = {"counter", "counter-byte"}
+"""Questions that say by what samples are counted."""
 
 
 def _answer(
@@ -344,7 +321,7 @@ def _answer(
     """Ask a person until there is an answer that can be used, and that is not most likely a mistake.
 
     Returns:
-        Whether Enter took the default.
+        Whether Enter took what is in brackets.
     """
     before = None
     while True:

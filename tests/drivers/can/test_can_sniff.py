@@ -609,7 +609,7 @@ def test_a_person_who_takes_all_defaults_is_told_that_the_channels_are_an_exampl
     def notes(**more: str) -> list[str]:
         texts = Given(given | more, defaults=False)
         file = tmp_path / "new.toml"
-        answers = conduct(file, texts, lambda question: question.default or "", print, listen)
+        answers = conduct(file, texts, lambda _question: "", print, listen)
         return list(answers["notes"])
 
     with pytest.MonkeyPatch.context() as patch, talking(tmp_path / "bus", accelerations):

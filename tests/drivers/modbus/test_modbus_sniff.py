@@ -563,7 +563,7 @@ def as_asked(tmp_path: Path, target: str, **given: str) -> tuple[Answers, list[s
 
     def ask(question: Question) -> str:
         shown[question.key] = question.default
-        return f"{question.default}"
+        return ""
 
     listen = functools.partial(_heard, tmp_path, person=True)
     beforehand = Given({"bus": "modbus-tcp", "host": target, **given}, defaults=False)
@@ -760,7 +760,7 @@ def test_what_was_read_of_a_channel_is_shown_with_its_register_and_is_in_the_fil
 
     def ask(question: Question) -> str:
         beside[question.key] = question.beside
-        return typed.get(question.key) or f"{question.default}"
+        return typed.get(question.key, "")
 
     unit = Still(20, swapped(1.83, 2.19) + struct.pack(">2H", 2970, 0x8000))
     listen = functools.partial(_heard, tmp_path, person=True)
@@ -979,7 +979,7 @@ def test_at_a_terminal_it_asks_which_registers_and_going_back_asks_again(
         text = texts[question.key].pop(0) if question.key in texts else ""
         if text == "<":
             raise BackError
-        return text or f"{question.default}"
+        return text
 
     def listen(bus: BusQuestions, answers: Answers) -> Heard:
         return bus.listen(answers, tmp_path, threading.Event(), lambda _line: None)

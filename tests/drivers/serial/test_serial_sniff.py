@@ -852,7 +852,7 @@ def test_new_makes_no_counter_of_a_measured_column(
     # A person is told the same, goes on, and finds it in the file.
     told: list[str] = []
     given = Given({"bus": "serial", "port": f"{cable.path}"}, defaults=False)
-    answers = conduct(file, given, lambda question: f"{question.default}", told.append, lambda *_: heard)
+    answers = conduct(file, given, lambda _question: "", told.append, lambda *_: heard)
     assert words in told[0]
     assert answers["notes"][0] == f"What was heard does not fit this file: {told[0]}."
 
@@ -893,7 +893,7 @@ def test_whoever_takes_all_defaults_gets_the_file_of_yes_and_it_reads_the_lines(
         )
     given = Given({"bus": "serial", "port": f"{cable.path}", "name": "fan", "rate": "200"}, defaults=False)
     named = tmp_path / "new.toml"
-    answers = conduct(named, given, lambda one: f"{one.default}", lambda _: None, lambda *_: heard)
+    answers = conduct(named, given, lambda _one: "", lambda _: None, lambda *_: heard)
     assert tomllib.loads(machine_text(answers, named.name)) == file
     written = file["streams"]["device"]["layout"]
     assert {key: written[key] for key in layout} == layout
@@ -1061,9 +1061,7 @@ def test_a_port_that_was_not_opened_is_stated_at_the_end_and_in_the_file(
     given = Given({"bus": "serial", "port": f"{cable.path}"}, defaults=False)
     listen = functools.partial(_heard, tmp_path, person=True)
     with serial.Serial(f"{cable.path}", exclusive=True):
-        answers = conduct(
-            tmp_path / "m.toml", given, lambda one: f"{one.default}", lambda _reason: None, listen
-        )
+        answers = conduct(tmp_path / "m.toml", given, lambda _one: "", lambda _reason: None, listen)
     why = f"{cable.path} cannot be opened: another program has it open; stop that program"
     assert f"  The bus could not be listened to: {why}" in capsys.readouterr().out
     assert f"The bus could not be listened to; the channels are an example: {why}" in answers["notes"]
