@@ -69,8 +69,8 @@ class _ModbusQuestions(BusQuestions):
         ),
         "registers": Topic(
             "Which registers does --listen read, e.g. 4000-4100?",
-            "As on the wire, from 0: see the register map of the device. auto: 0 to 200, and on if the last "
-            "one exists.",
+            "As on the wire, from 0: see the register map of the device. Hexadecimal with 0x: 0x1000-0x1030. "
+            "auto: 0 to 200, and on if the last one exists.",
         ),
         "timeout-ms": Topic(
             "How long may the unit take to answer, in ms",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -26,6 +27,8 @@ LONGEST_SECONDS = 3600.0
 _LONG_MANUALS_FIRST = (300_001, 400_001)
 """What manuals with six digits call the first input register and the first holding register."""
 _INPUT = (30_001, 300_001)
+_FIRST_LAST = re.compile(r"(0x[0-9a-f]+|[0-9]+)(?:\s*-\s*(0x[0-9a-f]+|[0-9]+))?", re.IGNORECASE)
+"""Decimal, or hexadecimal as in many register maps."""
 
 
 class ModbusSniffer(Sniffer):
@@ -52,8 +55,8 @@ class ModbusSniffer(Sniffer):
         parser.add_argument(
             "--registers",
             metavar="A-B",
-            help=f"addresses of registers to read, counted from 0, e.g. 0-99 (default: {REGISTERS}, and on "
-            "if the last one exists)",
+            help=f"addresses of registers to read, counted from 0, e.g. 0-99 or 0x1000-0x1030 (default: "
+            f"{REGISTERS}, and on if the last one exists)",
         )
         parser.add_argument(
             "--function",
@@ -228,9 +231,12 @@ def _range(text: str, option: str, most: int) -> tuple[int, int]:
     Raises:
         SniffError: it is none.
     """
-    low, _, high = text.partition("-")
-    if low.isdecimal() and (high or low).isdecimal() and int(low) <= int(high or low) <= most:
-        return int(low), int(high or low)
+    if (match := _FIRST_LAST.fullmatch(text.strip())) is not None:
+        low, high = (
+            int(one, 16 if one[:2] in {"0x", "0X"} else 10) for one in (match[1], match[2] or match[1])
+        )
+        if low <= high <= most:
+            return low, high
     raise SniffError(_no_range(option, text, LAST_REGISTER if option == "--registers" else most), usage=True)
 
 

@@ -27,6 +27,7 @@ from daqsvc.commands.new.command import _heard
 from daqsvc.commands.new.interview import BackError, Given, conduct
 from daqsvc.commands.new.machine_text import machine_text
 from drivers.modbus import questions, scan, sniff
+from drivers.sniffing import SniffError
 from sim_hw.nodes.modbus_node import ModbusRtuServer, ModbusTcpServer, PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit
 
@@ -963,6 +964,24 @@ def test_new_looks_at_the_registers_that_it_is_told(
     shown = capsys.readouterr()
     assert "answers for holding registers, but has none of 40001 to 40004\n" in shown.out
     assert "on the line they are 0-3. Remedy: write --registers 0-3 --table holding [C20]\n" in shown.err
+
+
+def test_registers_may_be_hexadecimal_as_in_many_register_maps(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert sniff.registers_of("0x1000-0x1030")[:2] == (4096, 4144)
+    assert sniff.registers_of("0X1F")[:2] == (31, 31)
+    assert sniff.registers_of("0-0x1F").end == 31
+    for wrong in ("0x", "0xG0-0xH0", "1000-0x10", "0x10000", "1-2-3"):
+        with pytest.raises(SniffError, match="write FIRST-LAST"):
+            sniff.registers_of(wrong)
+    with tcp({3: Elsewhere()}) as target:
+        assert main(words(target, "--units", "0x3", "--registers", "0xFA0-0xFA9", *PATIENT)) == 0
+        assert "Unit 3, holding registers (function 3): 8 at 4000-4007" in capsys.readouterr().out
+        layout = new(tmp_path, target, "--unit=3", "--registers=0xFA0-0xFA9")["streams"]["device"]["layout"]
+        answers, _, shown = as_asked(tmp_path, target, unit="3", registers="0xFA0")
+    assert [one["address"] for one in layout["channels"]] == [4000, 4002, 4004, 4006]
+    assert (shown["channels"], answers["sensor.r4000.address"]) == ("r4000", 4000)
 
 
 def test_at_a_terminal_it_asks_which_registers_and_going_back_asks_again(
