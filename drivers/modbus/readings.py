@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import struct
 from collections import Counter
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
@@ -64,6 +64,7 @@ class Reading(NamedTuple):
         value: the number when it was read first; not finite where floats are none.
         evidence: that it is a quantity, from `NONE` to `SURE`.
         change: part of its value by which it changed while it was read.
+        may_move: whether it is a float32 that may move, with evidence or without.
     """
 
     address: int
@@ -73,6 +74,7 @@ class Reading(NamedTuple):
     value: float
     evidence: int
     change: float
+    may_move: bool
 
     @property
     def plausible(self) -> bool:
@@ -103,7 +105,8 @@ def readings(rounds: Sequence[Registers], address: int) -> list[Reading]:
             numbers = _Numbers(kind, order, raw, [float(struct.unpack(code, one)[0]) for one in raw])
             evidence = numbers.evidence()
             change = numbers.change if evidence else math.inf
-            found.append(Reading(address, count, kind, order, numbers.values[0], evidence, change))
+            value, may_move = numbers.values[0], numbers.may_move()
+            found.append(Reading(address, count, kind, order, value, evidence, change, may_move))
     return found
 
 
@@ -164,6 +167,13 @@ class _Numbers(NamedTuple):
         if self._is_zero(1):
             return ALONE if max(map(self._digits, self.values)) <= _ROUND else NONE
         return SURE if self._carries(0) else NONE
+
+    def may_move(self) -> bool:
+        """See `Reading.may_move`: the value moves a little, and its lower register wildly."""
+        if self.kind != "float32" or not self._is_usual or self.change > SMOOTH or self._is_exchanged:
+            return False
+        steps = [_around(after - before) for before, after in pairwise(self._words(1))]
+        return bool(steps) and 2 * sum(step >= _WILD for step in steps) >= len(steps)
 
     def _float64(self) -> int:
         if not _in_range(self.values) or self.change > SMOOTH:
@@ -289,11 +299,61 @@ def chosen(rounds: Sequence[Registers]) -> list[Reading]:
     """
     if not rounds:
         return []
-    found = [one for address in sorted(rounds[0]) for one in readings(rounds, address) if one.evidence]
+    every = [one for address in sorted(rounds[0]) for one in readings(rounds, address)]
+    found = [one for one in every if one.evidence]
     sure = {one.order for one in found if one.evidence == SURE} | _agreed(found)
     likely = [one for one in found if one.plausible or one.order in sure]
     doubles = _apart([one for one in likely if one.type == "float64" and one.evidence == SURE], [])
-    return sorted(doubles + _apart(likely, doubles), key=lambda one: one.address)
+    kept = doubles + _apart(likely, doubles)
+    floats = [one for one in every if one.type == "float32" and (one.evidence or one.may_move)]
+    for run in _in_a_row([one for one in likely if one.type == "float32"]):
+        kept = _paired(run, kept, floats)
+    return sorted(kept, key=lambda one: one.address)
+
+
+def _is_usual(one: Reading) -> bool:
+    return _USUAL[0] <= abs(one.value) <= _USUAL[1]
+
+
+def _in_a_row(likely: Sequence[Reading]) -> Iterable[list[Reading]]:
+    """Readings in groups: each overlaps another one of its group or is beside it, and none of others."""
+    run: list[Reading] = []
+    for one in likely:
+        if run and one.address > max(before.places[-1] for before in run) + 1:
+            yield run
+            run = []
+        run.append(one)
+    if run:
+        yield run
+
+
+def _paired(run: Sequence[Reading], kept: Sequence[Reading], floats: Sequence[Reading]) -> list[Reading]:
+    """What is kept, with other pairs in place of those across the border of two numbers.
+
+    A float32 has the value of another one, nearly, with its lower register taken from the number beside it.
+    Such pairs leave registers over at both ends, where the right ones have a partner.
+
+    Args:
+        run: likely float32 in a row.
+        kept: the likeliest of all, which do not.
+        floats: every float32 with evidence, or that may move.
+    """
+    places = {place for one in run for place in one.places}
+    beside = [one for one in floats if places & set(one.places)]
+    places |= {place for one in beside for place in one.places}
+    here = [one for one in kept if places & set(one.places)]
+    if not here or any(one.type != "float32" for one in here):
+        return [*kept]
+    taken = {place for one in here for place in one.places}
+    orders = {one.order for one in here}
+    more = [one for one in beside if one.order in orders and not taken & set(one.places)]
+    most, best = 2 * (len(here) + len(_side_by_side(more))), here
+    for order, odd in product(ORDERS, (0, 1)):
+        pairs = [one for one in beside if one.order == order and one.address % 2 == odd]
+        these = [one for one in pairs if one in run]
+        if 2 * len(pairs) > most and 2 * len(these) >= len(here):
+            most, best = 2 * len(pairs), these
+    return [*(one for one in kept if one not in here), *best]
 
 
 def _agreed(found: Sequence[Reading]) -> set[Order]:
@@ -304,8 +364,7 @@ def _agreed(found: Sequence[Reading]) -> set[Order]:
 
 
 def _stands_still(one: Reading) -> bool:
-    usual = _USUAL[0] <= abs(one.value) <= _USUAL[1]
-    return one.type == "float32" and one.order in USUAL_ORDERS and one.change == 0 and usual
+    return one.type == "float32" and one.order in USUAL_ORDERS and one.change == 0 and _is_usual(one)
 
 
 def undecided(rounds: Sequence[Registers], numbers: Sequence[Reading]) -> list[Reading]:
@@ -325,7 +384,7 @@ def undecided(rounds: Sequence[Registers], numbers: Sequence[Reading]) -> list[R
         for one in found
         if one.type == "float32"
         and not taken & set(one.places)
-        and (one.evidence or (_USUAL[0] <= abs(one.value) <= _USUAL[1] and not moved & set(one.places)))
+        and (one.evidence or (_is_usual(one) and not moved & set(one.places)))
     ]
     of_others = {one.order for one in numbers if one.type == "float32"}
     by_order = {

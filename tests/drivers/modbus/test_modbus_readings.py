@@ -279,3 +279,50 @@ def test_registers_that_are_no_float_are_not_doubted() -> None:
     # Zeros that touch no float are nothing.
     zeros = dict.fromkeys(range(4), 0)
     assert undecided([zeros, zeros], []) == []
+
+
+STRADDLED = {
+    # In each of these some scan made one float of the halves of two, which looked right to within 1 %.
+    "two": ("CDAB", [1.4, 3.3], 0.03),
+    "three": ("CDAB", [0.9, 1.2, 1485.0], 0.003),
+    "four": ("CDAB", [2.4, 0.31, 55.2, 1480.0], 0.003),
+    "six alike": ("DCBA", [1.2, 1.3, 1.1, 1.5, 1.25, 1.45], 0.03),
+    "the usual order": ("ABCD", [0.9, 1.2, 1485.0], 0.003),
+    "exchanged bytes": ("BADC", [0.9, 1.2, 1485.0], 0.03),
+}
+
+
+@pytest.mark.parametrize(("order", "values", "noise"), STRADDLED.values(), ids=STRADDLED)
+def test_a_float_is_not_made_of_the_halves_of_two(order: str, values: list[float], noise: float) -> None:
+    rng = np.random.default_rng(18)
+    places = {(100 + 2 * k, "float32", order) for k in range(len(values))}
+    found = 0
+    for _ in range(examples(300)):
+        rounds = []
+        for _ in range(ROUNDS):
+            now = [value * (1.0 + rng.uniform(-noise, noise)) for value in values]
+            parts = [registers(struct.pack(">f", one), order, 100 + 2 * k) for k, one in enumerate(now)]
+            rounds.append({place: word for part in parts for place, word in part.items()})
+        read = {(one.address, one.type, one.order) for one in chosen(rounds)}
+        assert read <= places, rounds
+        found += len(read)
+    assert found > 0.5 * examples(300) * len(values)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_floats_between_single_registers_keep_their_places(order: str) -> None:
+    rng = np.random.default_rng(19)
+    lost = 0
+    for _ in range(examples(300)):
+        base = [int(one) for one in rng.integers(0, 3000, 5)]
+        rounds = []
+        for _ in range(ROUNDS):
+            words = {99 + k: word for k, word in enumerate(base)} | {104 + k: base[k] for k in range(3)}
+            words[99] = base[0] + int(rng.integers(0, 9))
+            for k, value in enumerate((2.4, 55.2)):
+                raw = struct.pack(">f", value * (1.0 + rng.uniform(-0.03, 0.03)))
+                words |= registers(raw, order, 100 + 2 * k)
+            rounds.append(words)
+        read = {one.address for one in chosen(rounds) if one.type == "float32"}
+        lost += not read <= {100, 102}
+    assert lost <= 0.02 * examples(300)
