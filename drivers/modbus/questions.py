@@ -46,6 +46,7 @@ _WAYS = {
     "ring": "the last samples in a ring, with a count of all",
     "fifo": "a queue of samples, emptied by function 24",
 }
+_ORDERS = ("ABCD", "CDAB", "BADC", "DCBA")
 _COUNT_BITS = {"16": "", "32": ""}
 ADDRESSES = 65_536
 _READ_REGISTERS, _FIFO_REGISTERS = 125, 31
@@ -256,7 +257,7 @@ class _ModbusQuestions(BusQuestions):
         if answers["way"] != "values":
             return
 
-        types, orders = dict.fromkeys(REGISTERS, ""), dict.fromkeys(("ABCD", "CDAB", "BADC", "DCBA"), "")
+        types, orders = dict.fromkeys(REGISTERS, ""), dict.fromkeys(_ORDERS, "")
         following = f"{self._next_address(answers, channel)}"
         key = sensor_key(channel, "address")
         only = channel == answers["channels"][0]
@@ -277,7 +278,7 @@ class _ModbusQuestions(BusQuestions):
         wide = register_count(answers[sensor_key(channel, "register-type")]) > 1
         is_word = _WORD.search(channel) is not None and _is_unsigned(answers, channel)
         yield self.ask_of(channel, "bits", _bits, NONE, quiet=not is_word)
-        yield self.ask_of(channel, "order", q.exactly(orders), "ABCD", choices=orders, quiet=not wide)
+        yield self.ask_of(channel, "order", _order, "ABCD", choices=orders, quiet=not wide)
         is_float = answers[sensor_key(channel, "register-type")].startswith("float")
         scale = "1" if is_float else _USUAL_SCALES.get(unit or "", "1")
         yield self.ask_of(channel, "scale", q.number, scale)
@@ -509,6 +510,11 @@ def _bits(text: str) -> tuple[int, int] | None:
             f'"{text}" is no bit: write its number from 0, e.g. 3, or the first and last, e.g. 4-7'
         )
     return first, last - first + 1
+
+
+def _order(text: str) -> str | None:
+    """An order of bytes; small letters mean the same."""
+    return q.exactly(dict.fromkeys(_ORDERS, ""))(text.upper())
 
 
 _USUAL_SCALES = {"degC": "0.1", "mm/s": "0.01"}

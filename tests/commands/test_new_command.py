@@ -437,6 +437,15 @@ def test_the_mark_for_no_value_of_a_register_is_an_option_and_a_hint_in_the_file
     assert "int16 cannot hold 98304" in capsys.readouterr().err
 
 
+def test_the_byte_order_of_registers_may_be_in_small_letters(tmp_path, capsys):
+    given = {"bus": "modbus-tcp", "host": "h", "channels": "flow", "sensor.flow.order": "cdab"}
+    answers = conduct(tmp_path / "m.toml", Given(given, defaults=True), None, print)
+    assert answers["sensor.flow.order"] == "CDAB"
+    words = ["new", f"{tmp_path / 'm.toml'}", "--yes", "--bus=modbus-tcp", "--host=h", "--channels=flow"]
+    assert main([*words, "--sensor=flow.order=acbd"]) == 2
+    assert "is not one of ABCD, CDAB, BADC, DCBA" in capsys.readouterr().err
+
+
 def test_bits_are_asked_of_a_word_only_and_written_as_the_file_has_them(tmp_path, capsys):
     asked_of = []
 
