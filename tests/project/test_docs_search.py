@@ -43,6 +43,8 @@ PLAIN = {
     "clock of the box is wrong": "alarms.html#clocks-and-restarts",
     "exception 3": "modbus.html#errors-that-you-may-meet reference/errors.html#b33-",
     "illegal data value": "reference/errors.html#b33-",
+    "function 4 for register 1 is set aside": "reference/errors.html#b32-",
+    "unit mm/sec": "reference/errors.html#a14-",
     "value table": "alarms.html#a-state-or-an-enum-signal",
     "bit rate": "reference/keys-buses.html#buses-name-bitrate",
     "baud rate": "reference/keys-buses.html#buses-name-baud",
