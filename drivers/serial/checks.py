@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from contextlib import suppress
 from itertools import combinations
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 from daqsvc.errors.buses import (
     BUS_TOO_SLOW,
@@ -18,13 +19,22 @@ from daqsvc.errors.buses import (
     TIMES_SHARED,
     WRONG_LAYOUT,
 )
-from daqsvc.errors.machine_file import CONTRADICTION, INCOMPLETE, NAMED_TWICE, NO_EFFECT, NO_SUCH_NAME
+from daqsvc.errors.machine_file import (
+    CONTRADICTION,
+    INCOMPLETE,
+    NAMED_TWICE,
+    NO_EFFECT,
+    NO_SUCH_NAME,
+    WRONG_SCALE,
+)
 from daqsvc.settings.buses import BUSY
 from daqsvc.settings.problems import Finding, choice
 from daqsvc.settings.section import UnusableValueError
+from daqsvc.settings.units import factor_between, unit_of
 from drivers.serial.settings import (
     UNITS_PER_S,
     CobsBus,
+    LineChannel,
     LineLayout,
     LinesBus,
     SerialBus,
@@ -35,7 +45,7 @@ from drivers.serial.settings import (
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from daqsvc.settings.models import MachineFile, Stream
+    from daqsvc.settings.models import MachineFile, Sensor, Stream
     from daqsvc.settings.problems import KeyPath
 
 _CHECKSUM_CHARACTERS = {"none": 0, "xor": 3, "crc16": 5}
@@ -46,6 +56,9 @@ EXACT_STAMPS = 4.0
 
 HARDLY_LONGER = 1.1
 """Units of time from line to line below which one of two units cannot be told from a lost line."""
+
+_LIKE_SCALE = 0.02
+"""Share by which a scale may differ from the factor between two units, as people round it."""
 
 _NUMBERED = re.compile(r"/dev/tty(USB|ACM)\d+")
 
@@ -112,6 +125,49 @@ def check_serial_ports(draft: MachineFile) -> Iterator[Finding]:
                     code=PORT_MAY_CHANGE,
                 )
             yield from _check_streams(draft, name, bus)
+
+
+def check_suffixes(draft: MachineFile) -> Iterator[Finding]:
+    """What the device writes behind a number is the unit of the sensor, unless the scale converts it."""
+    for index, sensor in enumerate(draft.sensors):
+        with suppress(UnusableValueError):
+            layout = draft.streams[sensor.stream].layout if sensor.stream in draft.streams else None
+            if not isinstance(layout, LineLayout):
+                continue
+            channel = next((one for one in layout.channels if one.name == sensor.channel), None)
+            if channel is not None and channel.suffix is not None:
+                yield from _check_suffix(sensor, channel, channel.suffix, ("sensors", index, "unit"))
+
+
+def _check_suffix(sensor: Sensor, channel: LineChannel, suffix: str, path: KeyPath) -> Iterator[Finding]:
+    """A sensor has the unit that its channel has behind the number."""
+    wanted = sensor.unit if sensor.sensitivity_mv_per_unit is None else "V"
+    sent, taken = unit_of(suffix), unit_of(wanted)
+    if sent is None or taken is None or sent == taken:
+        return
+    # 58.3° is a temperature more often than an angle.
+    if sent.name == "deg" and taken.quantity == "temperature":
+        return
+    factor = factor_between(suffix, wanted)
+    converts = channel.scale != 1.0 or channel.offset != 0.0
+    if converts and (factor is None or math.isclose(channel.scale, factor, rel_tol=_LIKE_SCALE)):
+        return
+    alike = sent.quantity == taken.quantity
+    statement = f'the device writes "{suffix}" behind the number, but this sensor takes it as "{wanted}"'
+    if factor is not None:
+        off = factor / channel.scale
+        statement += f": wrong by a factor of {max(off, 1 / off):.4g}"
+    of_type = get_args(type(sensor).model_fields["unit"].annotation)
+    remedies = []
+    if sensor.sensitivity_mv_per_unit is None and (not of_type or sent.name in of_type):
+        remedies.append(f'write unit = "{sent.name}"')
+    if factor is not None:
+        remedies.append(f'write scale = {factor:.6g} in the channel "{channel.name}", which converts it')
+    elif alike:
+        remedies.append(f'write scale and offset in the channel "{channel.name}", which convert it')
+    else:
+        remedies.append(f'correct suffix of the channel "{channel.name}", or unit and type of the sensor')
+    yield Finding(path, statement, "; or ".join(remedies), fatal=alike and not converts, code=WRONG_SCALE)
 
 
 def _check_id(bus: CobsBus | SyncBus, name: str, layout: SerialLayout, path: KeyPath) -> Iterator[Finding]:

@@ -8,7 +8,7 @@ from daqsvc.errors.buses import WRONG_LAYOUT
 from daqsvc.settings.problems import AssemblyError
 from drivers.frames import FrameLayout
 from drivers.plugin import DriverPlugin, in_units, packed, raw_limits
-from drivers.serial.checks import check_serial, check_serial_ports
+from drivers.serial.checks import check_serial, check_serial_ports, check_suffixes
 from drivers.serial.settings import FRAMINGS, CobsBus, LineLayout, LinesBus, SerialBus, SerialLayout, SyncBus
 
 if TYPE_CHECKING:
@@ -37,6 +37,7 @@ class SerialPlugin(DriverPlugin[SerialBus]):
         """See `BusTable.checks`."""
         del facts
         yield check_serial_ports(draft)
+        yield check_suffixes(draft)
 
     def stream_checks(
         self, draft: MachineFile, stream: Stream, facts: Any, at: KeyPath

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.machine_files import MACHINES, changed, parsed, problems_of
 
-from daqsvc.settings import load_machine_file, parse_machine_file
+from daqsvc.settings import MachineFileError, load_machine_file, parse_machine_file
 from drivers.make import bus_drivers, stream_layout
 from drivers.serial.driver import SerialDriver
 from drivers.serial.settings import CobsBus, LineLayout, LinesBus, SerialLayout
@@ -295,3 +295,57 @@ def test_a_port_belongs_to_one_bus_whatever_it_carries_and_whatever_it_is_called
     for name, owner in (("one", "casing"), ("third", "other")):
         assert f'buses.{name}.serial_port = "' in found
         assert f'belongs to bus "{owner}" already' in found
+
+
+def suffixed(suffix: str, unit: str, *, more: str = "", kind: str = "trend", sensor: str = "") -> list[str]:
+    """What check finds in a file whose device writes that unit behind the number of that sensor."""
+    text, _ = changed(
+        SERIAL,
+        ('channels = [{ name = "v" }', f'channels = [{{ name = "v", suffix = "{suffix}"{more} }}'),
+        (
+            'type = "accelerometer"\nstream = "casing"\nchannel = "v"\nunit = "g"',
+            f'type = "{kind}"\nstream = "casing"\nchannel = "v"\nunit = "{unit}"\n{sensor}',
+        ),
+    )
+    try:
+        warnings = parse_machine_file(text, SERIAL).warnings
+    except MachineFileError as error:
+        return [f"{problem}" for problem in error.problems if "behind the number" in f"{problem}"]
+    return [f"warning: {one}" for one in warnings if "behind the number" in f"{one}"]
+
+
+@pytest.mark.parametrize(
+    ("suffix", "unit", "more", "words"),
+    [
+        ("mm/s", "in/s", "", ['"mm/s" behind the number', 'as "in/s"', "25.4", 'unit = "mm/s"', "0.0393701"]),
+        ("mm/s", "in/s", ", scale = 0.03937", []),
+        ("mm/s", "in/s", ", scale = 0.5", ["warning", "factor of 12.7"]),
+        ("mm/s RMS", "mm/s", "", []),
+        ("°C", "degF", "", ['unit = "degC"', "scale and offset"]),
+        ("°C", "degF", ", scale = 1.8, offset = 32.0", []),
+        ("C", "degC", "", []),
+        ("°", "degC", "", []),
+        ("Hz", "rpm", "", ["factor of 60"]),
+        ("mA", "bar", "", ["warning", "correct suffix"]),
+        ("mA", "bar", ", scale = 0.625, offset = -2.5", []),
+        ("Grad", "degC", "", []),
+    ],
+)
+def test_a_unit_behind_the_number_is_compared_with_that_of_the_sensor(suffix, unit, more, words):
+    found = suffixed(suffix, unit, more=more)
+    assert len(found) == bool(words), found
+    for word in words:
+        assert word in found[0]
+    if words:
+        assert "F40" in found[0]
+        assert ("warning" in found[0]) == ("warning" in words)
+
+
+def test_of_a_sensor_in_volts_the_unit_behind_the_number_is_a_voltage():
+    volts = {"kind": "accelerometer", "sensor": "sensitivity_mv_per_unit = 100.0\n"}
+    assert not suffixed("V", "g", **volts)
+    [found] = suffixed("mV", "g", **volts)
+    assert 'takes it as "V": wrong by a factor of 1000' in found
+    assert 'write scale = 0.001 in the channel "v"' in found
+    [found] = suffixed("mm/s2", "g", kind="accelerometer")
+    assert "factor of 9807" in found
