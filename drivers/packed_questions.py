@@ -112,7 +112,7 @@ def guess(answers: Answers, channel: str) -> tuple[str, str | None]:
     carried_v = abs(answers["scale"]) * 2.0 ** (8 * RAW_BYTES[answers["raw-type"]] - 1)
     probe = signed and carried_v > _PROBE_V and in_volts(answers)
     if named == "keyphasor" and not probe:
-        named = None
+        named = "trend"  # marks of a shaft are no vibration, whatever their unit is
     slow = not is_waveform_rate(answers["rate"])
     return named or ("proximity" if probe and not slow else "trend" if slow else "accelerometer"), None
 

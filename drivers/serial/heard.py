@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 CRCS = {"ibm-3740": "begins with 0xffff", "xmodem": "begins with 0", "none": "frames have none"}
 DELIMITERS = {"lf": "\n", "cr": "\r", ";": ";"}
 _SHOWN_LINES = 2
+_UNKNOWN_CHANNELS = "c1, c2, c3"
 
 
 class HeardOnSerial(Heard):
@@ -106,6 +107,8 @@ class HeardOnSerial(Heard):
         if found["counter"] is not None:
             counter = {**found["counter"], "bits": found["counter_bits"] or found["counter"]["bits"]}
             proposed |= packed.frame_proposals(found["payload_length"], counter, answers)
+        # Where more channels fit than are worth proposing, the names of an example would seem to be known.
+        proposed.setdefault("channels", _UNKNOWN_CHANNELS)
         if "samples-per-frame" in answers and found["rate_hz"] is not None:
             proposed["rate"] = f"{usual_rate(found['rate_hz'] * answers['samples-per-frame']):g}"
         return proposed

@@ -1,0 +1,74 @@
+"""What ``daqsvc new --listen`` makes of what came over a serial port: its file, and its words."""
+
+from __future__ import annotations
+
+import math
+import struct
+import tomllib
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from cobs import cobs
+
+from daqsvc.commands.new.interview import Given, conduct
+from daqsvc.commands.new.machine_text import machine_text
+from daqsvc.settings import parse_machine_file
+from drivers.serial.checksums import CHECKSUMS
+from drivers.serial.heard import HeardOnSerial
+from drivers.serial.questions import SerialQuestions
+from drivers.serial.recognise import recognised
+from drivers.serial.sniff_report import Heard, Report, Tried
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from drivers.sniffing import Sniffed
+
+
+def sniffed(sends: Callable[[int], bytes], rate_hz: float, *, seconds: float = 3.0) -> Sniffed:
+    """What a port is found to bring from a device that sends so often."""
+    data, marks = bytearray(), []
+    for number in range(1 + round(seconds * rate_hz)):
+        data += sends(number)
+        marks.append((len(data), number / rate_hz))
+    heard = Heard(bytes(data), len(data), 0.0, marks[-1][1], 0, marks=tuple(marks))
+    return Report("ttyS1", [], Tried(115_200, "none", heard, recognised(heard.data)), True).sniffed()
+
+
+def written(found: Sniffed, file: Path, **given: str) -> tuple[dict[str, Any], str]:
+    """The file of ``daqsvc new --listen --yes``, which check accepts; and its text, unwrapped."""
+    heard = HeardOnSerial(found.figures, SerialQuestions())
+    texts = {"bus": "serial", "port": "/dev/ttyS1", "name": "fan"} | given
+    answers = conduct(file, Given(texts, defaults=True), None, print, lambda *_: heard)
+    text = machine_text(answers, file.name)
+    parse_machine_file(text, file)
+    return tomllib.loads(text), text.replace("\n# ", " ")
+
+
+def crc(name: str, payload: bytes, order: str) -> bytes:
+    number = int(CHECKSUMS[name].of(np.frombuffer(payload, np.uint8)[None])[0])
+    return number.to_bytes(2, "big" if order == "big" else "little")
+
+
+def many_values(number: int) -> bytes:
+    """A count and ten values, high byte first."""
+    values = [int(1800 * math.sin(0.7 * (8 * number + k))) for k in range(8)]
+    payload = struct.pack(">H10h", number, *values, 583, 1478 + number % 3)
+    return cobs.encode(payload + crc("ibm-3740", payload, "big")) + b"\0"
+
+
+@pytest.mark.parametrize("rate_hz", [50.0, 400.0])
+def test_names_that_nobody_gave_are_no_reason_for_limits(tmp_path: Path, rate_hz: float) -> None:
+    file, text = written(sniffed(many_values, rate_hz, seconds=8.0), tmp_path / "m.toml")
+    assert "alarms" not in file
+    assert {one["channel"] for one in file["sensors"]} == {"c1", "c2", "c3"}
+    assert "a guess by the rate" in text
+
+
+def test_a_keyphasor_by_name_is_no_accelerometer_where_it_is_not_in_volts(tmp_path: Path) -> None:
+    found = sniffed(many_values, 400.0, seconds=8.0)
+    file, _ = written(found, tmp_path / "m.toml", channels="x, y, kph")
+    assert [one["type"] for one in file["sensors"]] == ["accelerometer", "accelerometer", "trend"]
+    assert "alarms" not in file
