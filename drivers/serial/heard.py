@@ -22,6 +22,7 @@ from drivers.serial.sniff_report import (
     turn_words,
     unchecked_words,
     unit_of_suffix,
+    width_words,
 )
 from drivers.sniffing import (
     LEAST_SWINGING_HZ,
@@ -105,7 +106,9 @@ class HeardOnSerial(Heard):
         # As the sniffer proposes it: what a count is worth is not known, and volts of a probe are not heard.
         proposed["scale"] = "1"
         if found["counter"] is not None:
-            counter = {**found["counter"], "bits": found["counter_bits"] or found["counter"]["bits"]}
+            counter = found["counter"]
+            if found["counter_bits"] is not None:
+                counter = {**counter, **{key: found[f"counter_{key}"] for key in ("byte", "bits", "order")}}
             proposed |= packed.frame_proposals(found["payload_length"], counter, answers)
         # Where more channels fit than are worth proposing, the names of an example would seem to be known.
         proposed.setdefault("channels", _UNKNOWN_CHANNELS)
@@ -141,6 +144,8 @@ class HeardOnSerial(Heard):
                     "What is behind the counter of a frame is a guess: channels, type, byte order and scale. "
                     "See the device's manual."
                 )
+            if "counter-bits" in taken and (guess := _width(self.found)):
+                yield guess
             yield from guessed_sensors(answers, channels, taken)
             return
         counter = answers["counter"]
@@ -254,6 +259,8 @@ def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
         if found["frames_passing"] < 1:
             check += f" (passes in {100 * found['frames_passing']:.0f} % of the frames)"
         yield f"{line}: {kind} of {found['frame_length']} bytes{rate}, {check}, {counts}"
+        if guess := _width(found):
+            yield f"  {guess}"
         return
     prefix = f", each begins with {found['prefix']}" if found["prefix"] else ""
     comma = ", numbers with a decimal comma" if found["decimal"] == "," else ""
@@ -264,6 +271,13 @@ def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
     yield from (f"  {words}" for one in found["columns"] for words in _column_words(one))
     if found["other_prefixes"]:
         yield f"  {other_kinds_words(found['other_prefixes'])}"
+
+
+def _width(found: Mapping[str, Any]) -> str:
+    """That the width of the counter is a guess; empty if it is none."""
+    if not found["counter_guess"]:
+        return ""
+    return width_words(found["counter_bits"], found["counter"]["step"], found["rate_hz"])
 
 
 def _column_words(one: Mapping[str, Any]) -> Iterator[str]:

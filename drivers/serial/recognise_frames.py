@@ -32,6 +32,7 @@ _CONSTANT = 0.95
 _MOST_LAGS = 12
 _MOST_ANCHORS = 3
 _MOST_CHECKED = 64
+_MOST_WORDS = 4
 _LEAST_PASSING = {1: 0.8, 2: 0.5}
 """Share of the frames that must pass a check, by its bytes: by chance, one in 256 or one in 65536 does."""
 _ORDERS: tuple[Literal["big", "little"], ...] = ("big", "little")
@@ -194,13 +195,16 @@ def _behind_sync(numbers: NDArray[np.uint8], length: int) -> BinaryFrames | None
         constant = (grid == modes).mean(axis=0) >= _CONSTANT
         if constant.all() or not constant.any():
             continue
-        sync = _sync_word(modes, constant)
-        if sync in tried or not sync:
-            continue
-        tried.add(sync)
-        found = _with_sync(numbers, length, sync)
-        if found is not None and (best is None or found.score > best.score):
-            best = found
+        # A value that stands still may tell more than the sync word does: a check shows which is which.
+        for sync in _sync_words(modes, constant):
+            if sync in tried:
+                continue
+            tried.add(sync)
+            found = _with_sync(numbers, length, sync)
+            if found is not None and (best is None or found.score > best.score):
+                best = found
+            if best is not None and best.crc_bytes == 2:
+                return best
     return best
 
 
@@ -224,23 +228,22 @@ def _rows(numbers: NDArray[np.uint8], places: NDArray[np.int64], length: int) ->
     return rows
 
 
-def _sync_word(modes: NDArray[np.uint8], constant: NDArray[np.bool_]) -> bytes:
-    """The bytes in a row that tell most, of those that are the same in all frames.
+def _sync_words(modes: NDArray[np.uint8], constant: NDArray[np.bool_]) -> list[bytes]:
+    """Bytes in a row that are the same in all frames, those that tell most first; a few of them.
 
     Args:
         modes: uint8 ``[length]``, what each place of a frame holds most often.
         constant: bool ``[length]``, where that is so in nearly all frames; not everywhere.
     """
     length = len(modes)
-    best, told = b"", 0
+    words: list[bytes] = []
     for first in np.flatnonzero(constant & ~np.roll(constant, 1)).tolist():
         run = next(k for k in range(length) if not constant[(first + k) % length])
         word = bytes(int(modes[(first + k) % length]) for k in range(run))
         # What idles and what counts far have such bytes everywhere.
         word = word.lstrip(_IDLE).rstrip(_IDLE)[:LONGEST_SYNC]
-        if (tells := sum(byte not in _IDLE for byte in word)) > told:
-            best, told = word, tells
-    return best
+        words += [word] * bool(word)
+    return sorted(words, key=lambda word: -sum(byte not in _IDLE for byte in word))[:_MOST_WORDS]
 
 
 def _with_sync(numbers: NDArray[np.uint8], length: int, sync: bytes) -> BinaryFrames | None:

@@ -91,7 +91,10 @@ class SerialFigures(TypedDict):
         crc_from: of frames: the first byte that the check covers.
         frames_passing: of frames: share of those that are not damaged.
         counter: of frames: what looks like a counter; null if nothing does.
-        counter_bits: of frames: bits of a counter that shares bytes with something else; null without one.
+        counter_bits: of frames: bits that the counter is taken to have; null without one.
+        counter_byte: of frames: the first byte of these; null without one.
+        counter_order: of frames: byte order of these; null without one.
+        counter_guess: of frames: whether bits of the counter are a guess, as its upper bytes did not change.
     """
 
     bus: str
@@ -129,3 +132,6 @@ class SerialFigures(TypedDict):
     frames_passing: NotRequired[float]
     counter: NotRequired[Annotated[dict[str, Any], FrameCounter] | None]
     counter_bits: NotRequired[int | None]
+    counter_byte: NotRequired[int | None]
+    counter_order: NotRequired[str | None]
+    counter_guess: NotRequired[bool]

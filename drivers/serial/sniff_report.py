@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from bisect import bisect_left, bisect_right
 from operator import itemgetter
@@ -25,6 +26,10 @@ from drivers.sniffing import (
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from drivers.counter_search import FrameCounter
     from drivers.serial.recognise import Recognised
     from drivers.serial.recognise_frames import BinaryFrames
     from drivers.serial.recognise_lines import Column, TextLines
@@ -359,13 +364,19 @@ class Report(NamedTuple):
             count = len(what.frames) + what.damaged
             share = f"{100 * what.passing:.0f} %" if what.damaged else "all"
             check += f", passes in {share} of {count} frames"
+        packed = _packed(what)
         counter = f"counter at {what.counter}" if what.counter else "no counter"
+        guess = (
+            f"\n{width_words(packed.counter.bits, packed.counter.step, rate_hz)}"
+            if packed and packed.is_guess
+            else ""
+        )
         stray = ""
         if what.coverage < _WHOLE:
             stray = f"; {100 * (1 - what.coverage):.0f} % of the bytes are in no frame"
         return (
             f"{name}{rate}: {what.length} bytes, of them {what.payload_length} of payload; {check}; "
-            f"{counter} (bytes of the payload count from 0){stray}"
+            f"{counter} (bytes of the payload count from 0){stray}{guess}"
         )
 
     def _figures(self) -> SerialFigures:
@@ -433,7 +444,10 @@ class Report(NamedTuple):
                 "crc_from": what.crc_from,
                 "frames_passing": round(what.passing, 4),
                 "counter": None if what.counter is None else what.counter._asdict(),
-                "counter_bits": None if (packed := _packed(what)) is None else packed.counter_bits,
+                "counter_bits": None if (packed := _packed(what)) is None else packed.counter.bits,
+                "counter_byte": None if packed is None else packed.counter.byte,
+                "counter_order": None if packed is None else packed.counter.order,
+                "counter_guess": packed is not None and packed.is_guess,
             }
         return figures
 
@@ -539,13 +553,17 @@ class Report(NamedTuple):
             yield 'crc_order = "little"'
         payload = what.payload_length + (0 if driver_checks else what.crc_bytes)
         yield ""
-        counter, packed = what.counter, _packed(what)
+        packed = _packed(what)
         rate_hz = self._rate_hz(what)
-        if counter is None or packed is None or rate_hz is None:
+        if packed is None or rate_hz is None:
             needed = f"{frames_need(payload)}. See the manual of the device."
             yield from (f"# {line}" for line in textwrap.wrap(needed, 90))
             return
-        samples = packed.samples_per_frame
+        counter, samples = packed.counter, packed.samples_per_frame
+        if packed.is_guess:
+            yield from (
+                f"# {line}" for line in textwrap.wrap(width_words(counter.bits, counter.step, rate_hz), 98)
+            )
         yield "[streams.frames]"
         yield f"bus = {quoted(bus)}"
         yield f"rate_hz = {rounded_rate(rate_hz * samples)}    # as measured; see the device's manual"
@@ -557,8 +575,8 @@ class Report(NamedTuple):
             known = "a guess; big if the values jump"
         yield f'byte_order = "{counter.order}"    # {known}'
         counts = "frames" if counter.step == 1 else "samples"
-        yield f'counter = {{ byte = {counter.byte}, bits = {packed.counter_bits}, counts = "{counts}" }}'
-        yield f"first_byte = {counter.byte + packed.counter_bits // 8}"
+        yield f'counter = {{ byte = {counter.byte}, bits = {counter.bits}, counts = "{counts}" }}'
+        yield f"first_byte = {counter.byte + counter.bits // 8}"
         yield f"samples_per_frame = {samples}"
         names = [f"c{k + 1}" for k in range(packed.channels)]
         listed = ", ".join(f'{{ name = "{one}", type = "int16", scale = 1.0 }}' for one in names)
@@ -569,24 +587,52 @@ class Report(NamedTuple):
 class _Packed(NamedTuple):
     """How samples of two bytes may lie behind the counter of a frame."""
 
-    counter_bits: int
+    counter: FrameCounter
     samples_per_frame: int
     channels: int
+    is_guess: bool
 
 
 def _packed(what: BinaryFrames) -> _Packed | None:
     """What fits; None if nothing does."""
-    counter = what.counter
-    if counter is None:
+    if what.counter is None:
         return None
-    bits, end = counter.bits, len(what.sync) + counter.byte + counter.bits // 8
-    if bits == 16 and counter.order == "little" and what.payload_length - counter.byte >= 6:
-        # The upper half of 32 bits, which has not carried yet.
-        upper = what.frames[:, end : end + 2]
-        bits = 16 if upper.any() else 32
-    room = what.payload_length - counter.byte - bits // 8
+    payloads = what.frames[:, len(what.sync) : len(what.sync) + what.payload_length]
+    counter, is_guess = _widened(what.counter, payloads)
+    room = what.payload_length - counter.byte - counter.bits // 8
     channels = room // (2 * counter.step)
-    return None if channels < 1 else _Packed(bits, counter.step, channels)
+    return None if channels < 1 else _Packed(counter, counter.step, channels, is_guess)
+
+
+def _widened(counter: FrameCounter, payloads: NDArray[np.uint8]) -> tuple[FrameCounter, bool]:
+    """A counter with the bytes beside it that it may have, too; and whether that is a guess.
+
+    Args:
+        counter: by what was seen of it.
+        payloads: uint8 ``[n, length]``.
+    """
+    still = (payloads == payloads[0]).all(axis=0)
+    byte, end, length = counter.byte, counter.byte + counter.bits // 8, payloads.shape[1]
+    is_guess = False
+    if counter.bits == 8:
+        carried = (payloads[1:, byte] < payloads[:-1, byte]).any()
+        behind, before = end < length and still[end], byte > 0 and still[byte - 1]
+        if carried or not (behind or before):
+            return counter, False
+        is_guess = True
+        if before and not payloads[0, byte - 1] and not (behind and not payloads[0, end]):
+            # Samples of two bytes fill what is behind it; they do not behind a byte more or less.
+            if (length - end) % 2:
+                return counter, is_guess
+            counter = counter._replace(byte=byte - 1, bits=16, order="big")
+        elif behind and (length - end) % 2:
+            counter, end = counter._replace(bits=16), end + 1
+        else:
+            return counter, is_guess
+    if counter.order == "little" and length - byte >= 6 and not payloads[:, end : end + 2].any():
+        # The upper half of 32 bits, which has not carried yet.
+        return counter._replace(bits=32), True
+    return counter, is_guess
 
 
 def _lines_hz(heard: Heard, what: TextLines) -> float | None:
@@ -630,6 +676,18 @@ def frames_need(payload: int) -> str:
 def unchecked_words(crc: str) -> str:
     """What it means that frames have a CRC that the driver does not know."""
     return f"The driver does not check {crc}: a damaged frame is taken for a good one."
+
+
+def width_words(bits: int, step: int, rate_hz: float | None) -> str:
+    """What it means that a counter may be wider, or narrower, than it is taken for."""
+    longer = ""
+    if rate_hz and bits < 32:
+        seconds = math.ceil(1.2 * 256 / step / rate_hz)
+        longer = f", or listen until a byte of it carries: --seconds {seconds}"
+    return (
+        f"That the counter has {bits} bits is a guess: its upper bytes did not change. With another "
+        f"width all values are of wrong bytes. Remedy: see the device's manual{longer}."
+    )
 
 
 def overrun_words(baud: int, proposed: int) -> str:

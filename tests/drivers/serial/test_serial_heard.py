@@ -72,3 +72,44 @@ def test_a_keyphasor_by_name_is_no_accelerometer_where_it_is_not_in_volts(tmp_pa
     file, _ = written(found, tmp_path / "m.toml", channels="x, y, kph")
     assert [one["type"] for one in file["sensors"]] == ["accelerometer", "accelerometer", "trend"]
     assert "alarms" not in file
+
+
+def counted(number: int, *, width: str = "<H", begin: int = 0, crc_name: str = "xmodem") -> bytes:
+    """A count, four values that swing, a temperature and a speed, low byte first."""
+    values = [int(1800 * math.sin(0.7 * (4 * number + k))) for k in range(4)]
+    order = width[0]
+    count = (begin + number) % 256 ** struct.calcsize(width)
+    payload = struct.pack(width, count) + struct.pack(f"{order}6h", *values, 583 + number % 5, 1478)
+    return b"\x55\xaa" + payload + crc(crc_name, payload, "big")
+
+
+@pytest.mark.parametrize(
+    ("width", "begin", "seconds", "expected"),
+    [
+        ("<H", 0, 3.0, {"byte": 0, "bits": 16}),
+        ("<H", 0x1210, 3.0, {"byte": 0, "bits": 16}),
+        (">H", 0, 3.0, {"byte": 0, "bits": 16}),
+        ("<I", 0, 3.0, {"byte": 0, "bits": 32}),
+        ("<B", 0, 3.0, {"byte": 0, "bits": 8}),
+        ("<B", 0, 8.0, {"byte": 0, "bits": 8}),
+        ("<H", 0x12FF, 8.0, {"byte": 0, "bits": 16}),
+    ],
+)
+def test_a_counter_that_has_not_carried_shifts_no_values(
+    tmp_path: Path, width: str, begin: int, seconds: float, expected: dict[str, int]
+) -> None:
+    found = sniffed(lambda number: counted(number, width=width, begin=begin), 50.0, seconds=seconds)
+    file, text = written(found, tmp_path / "m.toml")
+    proposed = tomllib.loads(found.fragment)["streams"]["frames"]["layout"]
+    for layout in (file["streams"]["device"]["layout"], proposed):
+        assert {key: layout["counter"][key] for key in expected} == expected
+        assert layout["first_byte"] == struct.calcsize(width)
+        assert len(layout["channels"]) == 6
+    assert file["streams"]["device"]["layout"]["byte_order"] == ("big" if width == ">H" else "little")
+    carried = seconds == 8.0 or width == "<B"
+    words = f"That the counter has {expected['bits']} bits is a guess: its upper bytes did not change."
+    shown = "\n".join(one for one in found.parts if isinstance(one, str))
+    heard = "\n".join(HeardOnSerial(found.figures, SerialQuestions()).lines)
+    for place in (shown, heard, text, found.fragment.replace("\n# ", " ")):
+        assert (words in place) != carried
+        assert ("--seconds 7" in place) == (not carried and expected["bits"] < 32)
