@@ -17,6 +17,7 @@ from daqsvc.dsp.quality.misread import Misread
 from daqsvc.dsp.quality.missing import BRIDGED, MOST_MISSING, not_judged, nothing_known, partly_missing
 from daqsvc.dsp.quality.unit import RESCALE, beyond_any_value
 from daqsvc.rounding import unit_behind
+from daqsvc.settings.units import unit_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -37,6 +38,8 @@ LEAST_RMS_MM_S = 1.0
 """A velocity RMS so far below 0 is no offset of an analogue input."""
 MOST_RMS_MM_S = 1000.0
 """A hundred times where zone D begins: no machine stands that, and few sensors measure it."""
+MOST_RPM = 1_000_000.0
+"""No shaft turns faster; a machine file states no such speed either."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +161,12 @@ class TrendDetector:
             return self._missing(channel, evidence, reason)
         self._missed[channel.sensor] = 0
         misread = self._misread[channel.sensor].update(known)
-        if wrong := misread or beyond_any_value(known) or _no_rms(channel, known):
+        if (
+            wrong := misread
+            or beyond_any_value(known)
+            or _no_rms(channel, known)
+            or _no_speed(channel, known)
+        ):
             reason = f"{channel.sensor} {wrong}; {channel.remedy}"
             share = 1.0 - len(known) / len(samples)
             return self._statements.state(
@@ -213,6 +221,14 @@ def _no_rms(channel: TrendChannel, known: NDArray[np.float32]) -> str:
     if worst < -LEAST_RMS_MM_S or worst > MOST_RMS_MM_S:
         return f"reads {worst:.4g} {channel.unit}, which is no velocity RMS of a machine"
     return ""
+
+
+def _no_speed(channel: TrendChannel, known: NDArray[np.float32]) -> str:
+    """Why values are the speed of no shaft, in a clause; empty if they may be, or are something else."""
+    worst = float(known[np.argmax(np.abs(known))])
+    if abs(worst) <= MOST_RPM or (unit := unit_of(channel.unit)) is None or unit.name != "rpm":
+        return ""
+    return f"reads {worst:.4g} {channel.unit}, and no shaft turns faster than {MOST_RPM:,.0f} rpm"
 
 
 def _beyond_ok(channel: TrendChannel, known: NDArray[np.float32]) -> str:

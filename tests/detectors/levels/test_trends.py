@@ -97,6 +97,30 @@ def noisy(mean, n=200):
     return mean * (1.0 + 0.02 * np.random.default_rng(5).standard_normal(n))
 
 
+@pytest.mark.parametrize(
+    ("value", "unit", "quality"),
+    [
+        (97_320_960.0, "rpm", "not_ok"),  # 1485 as uint32 with its words exchanged
+        (-97_320_960.0, "1/min", "not_ok"),
+        (1_000_000.0, "rpm", "good"),
+        (97_320_960.0, "count", "good"),
+        (97_320_960.0, "", "good"),
+    ],
+)
+def test_a_speed_that_no_shaft_has_is_not_judged(value, unit, quality):
+    speed = detector(
+        unit=unit, limits=[Limits("value", None, None, 1400.0, None)], number_keys="order and type"
+    )
+    (said,) = speed.process(window([value]))
+    assert said.quality == quality
+    if quality == "not_ok":
+        assert said.reason == (
+            f"oil reads {value:.4g} {unit}, and no shaft turns faster than 1,000,000 rpm; correct order and "
+            "type of its channel in the layout, or its scale or unit"
+        )
+        assert said.statistics == {}
+
+
 @pytest.mark.parametrize("mean", [2.8, -9.4, 25.9, 1480.0])
 def test_floats_in_the_wrong_order_are_told_and_do_not_flap(mean):
     subject = detector(limits=[], number_keys="order and type")
