@@ -386,6 +386,38 @@ def test_listening_shows_nothing_of_how_samples_lie_in_registers(tmp_path, way, 
     assert marked(None)[0] - keys <= {"table"}
 
 
+@pytest.mark.parametrize(
+    ("typed", "unit", "iso"),
+    [
+        ("mm/sec", "mm/s", True),
+        ("MM/S rms", "mm/s", True),
+        ("mm/s peak", "mm/s peak", False),
+        ("in/s", "in/s", False),
+        ("ips", "in/s", False),
+        ("°C", "degC", None),
+        ("pulses", "pulses", None),
+    ],
+)
+def test_a_unit_is_understood_as_it_is_typed_and_a_velocity_without_zones_is_named(
+    tmp_path, capsys, typed, unit, iso
+):
+    file = tmp_path / "m.toml"
+    words = ["new", f"{file}", "--yes", "--overwrite", "--bus=modbus-tcp", "--host=h", "--limits=iso"]
+    both = [*words, "--channels=velocity, vib2", f"--sensor=velocity.unit={typed}"]
+    assert main(both) == 0
+    said = capsys.readouterr().out
+    machine = load_machine_file(file)
+    assert [one.unit for one in machine.sensors] == [unit, "mm/s"]
+    assert [one.sensor for one in machine.alarms] == ["velocity"] * bool(iso) + ["vib2"]
+    note = f"they are of a velocity RMS in mm/s, and velocity ({unit}) is not."
+    assert (note in said) == (iso is False)
+    assert ("1 in/s is 25.4 mm/s" in said) == (unit == "in/s")
+    # Where no other one has zones, whoever wants them is told the same.
+    alone = [*words, "--channels=velocity", f"--sensor=velocity.unit={typed}"]
+    assert main(alone) == (0 if iso else 2)
+    assert (f"--limits iso: No zones of ISO 20816-3: {note}" in capsys.readouterr().err) == (iso is False)
+
+
 def test_two_figures_are_limits_of_one_quantity_only(tmp_path, capsys):
     """Values without a unit are anything: one of them may be a temperature."""
     file = tmp_path / "m.toml"

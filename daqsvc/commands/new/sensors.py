@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -17,6 +18,7 @@ from daqsvc.settings.measures import (
     highest_hz,
     shows_1x,
 )
+from daqsvc.settings.units import factor_between, unit_of
 from drivers import questions as q
 from drivers.bus_questions import STREAM
 from drivers.questions import NONE, Answers, Question, sensor_key
@@ -192,11 +194,22 @@ def _of_channel(answers: Answers, channel: str) -> Iterator[Question]:
         yield ask("unit", q.one_of(units), unit if unit in units else next(iter(units)), choices=units)
     elif chosen == "trend":
         # Of mm/s limits of ISO 20816-3 are proposed: only a name that means a vibration has it.
-        yield ask("unit", q.line, unit or _NO_UNIT)
+        yield ask("unit", _unit, unit or _NO_UNIT)
     if chosen in {"proximity", "accelerometer", "velocity"}:
         yield from _of_waveform(answers, channel, ask)
     if chosen == "keyphasor":
         yield ask("threshold", q.number, "-6")
+
+
+_OF_PEAKS = re.compile(r"(?:0-?p|p-?p|pp|pk|peak)\W*$", re.IGNORECASE)
+"""At the end of a unit: the values are no RMS."""
+
+
+def _unit(text: str) -> str:
+    """A unit as machine files spell it, however it was typed: ``mm/sec`` is ``mm/s``."""
+    written = q.line(text)
+    known = None if _OF_PEAKS.search(written) else unit_of(written)
+    return written if known is None else known.name
 
 
 def _of_waveform(answers: Answers, channel: str, ask: Any) -> Iterator[Question]:
@@ -272,8 +285,9 @@ def limit_questions(answers: Answers) -> Iterator[Question]:
     if not in_range or not any(one.iso for one in limited):
         del choices["iso"]
         read = q.one_of(choices)
-        if in_range and any(one.housing for one in limited):
-            why = f"No zones of ISO 20816-3: {_too_slow(answers)}"
+        slow = _too_slow(answers) if any(one.housing for one in limited) else ""
+        if in_range and (reason := slow or _other_velocities(limited)):
+            why = f"No zones of ISO 20816-3: {reason}"
             topic, read = q.Topic(f"{why}\n{topic.text}", f"{why} {topic.help}"), _without_zones(read, why)
     probes = limited[0].type == "proximity"
     default = "own" if quiet and probes else "iso" if "iso" in choices else NONE
@@ -304,9 +318,31 @@ def _with_own_limits(there: Sequence[Sensor]) -> list[Sensor]:
     return [one for one in limited if one.measure == limited[0].measure]
 
 
+def _other_velocities(there: Sequence[Sensor]) -> str:
+    """Which velocities have no zones, as they are in another unit; empty if none is."""
+    units = {one.name: one.unit for one in there if one.type == "trend" and one.iso is None}
+    known = {name: unit_of(unit) for name, unit in units.items()}
+    others = [name for name, unit in known.items() if unit is not None and unit.quantity == "velocity"]
+    if not others:
+        return ""
+    first = units[others[0]]
+    factor = None if _OF_PEAKS.search(first) else factor_between(first, "mm/s")
+    remedy = (
+        "Have the device send its RMS"
+        if factor is None
+        else f"1 {first} is {factor:g} mm/s: write mm/s as its unit, and multiply its scale by that"
+    )
+    named = ", ".join(f"{name} ({units[name]})" for name in others)
+    return (
+        f"they are of a velocity RMS in mm/s, and {named} is not. {remedy}; or write a separate alarm for it."
+    )
+
+
 def limits_words(answers: Answers) -> list[str]:
-    """Which sensors two figures are for, and which have no alarm by them; nothing if they are for all."""
+    """What the limits are not for, and so has no alarm; nothing if they are for all."""
     there = [one for one in sensors(answers) if one.measure is not None]
+    if answers.get("limits") == "iso" and (why := _other_velocities(there)):
+        return [f"The zones of ISO 20816-3 are not for every velocity: {why}"]
     with_limits = _with_own_limits(there)
     others = ", ".join(one.name for one in there if one not in with_limits)
     if answers.get("limits") != "own" or not others:
