@@ -213,7 +213,10 @@ class HeardUnits(Heard):
         named = "; ".join(f"unit {unit} ({_has(found, unit)})" for unit in units[:SHOWN])
         more = f"; and {len(units) - SHOWN} more" if len(units) > SHOWN else ""
         if units and not found["units_alike"]:
-            yield f"Not read: {named}{more}. daqsvc sniff modbus proposes a stream for each."
+            with_registers = [unit for unit in units if _has(found, unit) != _NO_REGISTERS]
+            which = "each" if with_registers == units else "each that has registers"
+            proposes = f" daqsvc sniff modbus --function both proposes a stream for {which}."
+            yield f"Not read: {named}{more}.{proposes if with_registers else ''}"
 
 
 class HeardNoRegisters(Heard):
@@ -332,6 +335,9 @@ def _guessed_words(answers: Answers, guessed: Sequence[str], taken: Collection[s
     )
 
 
+_NO_REGISTERS = "no registers were found"
+
+
 def _has(found: Mapping[str, Any], unit: int) -> str:
     """Which registers were found of a unit."""
     tables = [one for one in found["tables"] if one["unit"] == unit and one["registers"]]
@@ -340,7 +346,7 @@ def _has(found: Mapping[str, Any], unit: int) -> str:
             f"{TABLES[one['function']]} registers {_runs_in_words(one)}{', all 0' if _is_0(one) else ''}"
             for one in tables
         )
-        or "no registers were found"
+        or _NO_REGISTERS
     )
 
 

@@ -208,6 +208,13 @@ class ScanReport:
             yield f"{asked}, and {last} exists: --registers {table.begin}-{further} looks further."
         else:
             yield f"{asked}; --registers {table.begin}-{further} looks further."
+        if self._may_be_in_inputs(table):
+            yield "None of them moves: --function both reads the input registers of the unit, too."
+
+    def _may_be_in_inputs(self, table: FoundTable) -> bool:
+        """Whether the measured values may be in the other table: many devices have only settings in this."""
+        asked = {one.function for one, _ in self._tables if one.unit == table.unit}
+        return bool(table.complete and table.first and not table.moved and asked == {3})
 
     def _row(
         self, table: FoundTable, numbers: Sequence[Reading], doubted: Sequence[Reading], address: int

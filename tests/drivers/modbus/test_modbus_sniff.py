@@ -801,8 +801,29 @@ def test_units_that_the_file_does_not_read_are_named(
     others = (
         "unit 4 (holding registers 20); unit 5 (no registers were found); unit 6 (holding registers 20 to "
     )
-    assert f"\nNot read: {others}21, all 0). daqsvc sniff modbus proposes a stream for each.\n" in several
+    proposes = "daqsvc sniff modbus --function both proposes a stream for each that has registers."
+    assert f"\nNot read: {others}21, all 0). {proposes}\n" in several
     assert "Not read" not in capsys.readouterr().out
+    with tcp({3: units[3], 4: units[4]}) as target:
+        new(tmp_path, target, "--registers=20-30", "--units=3-4")
+    assert "--function both proposes a stream for each.\n" in capsys.readouterr().out
+    with tcp({3: units[3], 5: ModbusUnit()}) as target:
+        new(tmp_path, target, "--registers=20-30", "--units=3-5")
+    assert "\nNot read: unit 5 (no registers were found).\n" in capsys.readouterr().out
+
+
+def test_where_no_holding_register_moves_sniff_names_the_input_registers(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    hint = "None of them moves: --function both reads the input registers of the unit, too.\n"
+    unit = Still(0, struct.pack(">3H", 1, 19_200, 2), "holding", "input")
+    with tcp({1: unit, 2: pump()}) as target:
+        assert main(words(target, "--units", "1", "--registers", "0-9", *PATIENT)) == 0
+        assert hint in capsys.readouterr().out
+        assert main(words(target, "--units", "1", "--registers", "0-9", "--function", "both", *PATIENT)) == 0
+        assert main(words(target, "--units", "1", "--registers", "0-9", "--function", "4", *PATIENT)) == 0
+        assert main(words(target, "--units", "2", "--registers", "40-45", *PATIENT)) == 0
+    assert hint not in capsys.readouterr().out
 
 
 def test_two_registers_that_may_be_one_float_are_not_halves_without_a_word(
