@@ -66,7 +66,7 @@ def _delimiter(text: str) -> str:
 
 
 def _first_field(text: str) -> str:
-    if not text.isprintable() or text != text.strip() or "*" in text:
+    if not text or not text.isprintable() or text != text.strip() or "*" in text:
         raise PydanticCustomError(
             "first_field",
             "cannot be the first field of a line",
@@ -339,7 +339,7 @@ class LineLayout(Layout):
         description="character between two columns; of blanks there may be several, also in front",
     )
     decimal: Literal[".", ","] = Field(default=".", description="decimal mark of the numbers")
-    prefix: Annotated[str, AfterValidator(_first_field), Field(min_length=1, max_length=16)] | None = Field(
+    prefix: Annotated[str, AfterValidator(_first_field), Field(max_length=16)] | None = Field(
         default=None,
         description="first field of each line of this stream, in UTF-8 or Latin-1 if it has letters beyond "
         "ASCII; lines with another one are not of it",
