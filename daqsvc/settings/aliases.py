@@ -91,6 +91,7 @@ _WORDS: Mapping[tuple[str, ...], str] = {
     ("bits",): "width size bit",
     ("byte",): "position start_byte first_byte offset",
     ("start",): "on_start if_absent",
+    ("listen",): "port address bind host",
 }
 _KEYS: dict[str, tuple[str, ...]] = {}
 for _keys, _words in _WORDS.items():

@@ -56,6 +56,12 @@ def test_a_word_of_the_trade_is_understood(path, old, new, meant):
     assert problem.remedy == f"did you mean {meant}?"
 
 
+def test_a_port_of_the_metrics_is_where_they_listen():
+    text, _ = changed(SERIAL, ("[pipeline]\n", '[metrics]\nport = "127.0.0.1:9555"\n\n[pipeline]\n'))
+    (problem,) = problems_of(text, SERIAL)
+    assert problem.remedy == "did you mean listen?"
+
+
 @pytest.mark.parametrize(
     ("path", "old", "new", "home"),
     [
