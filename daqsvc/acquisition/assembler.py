@@ -184,9 +184,9 @@ class StreamAssembler:
         if not intact.all():
             if not self.counters.frames_corrupt:
                 logger.warning(
-                    "stream %r: the CRC of a frame, or the checksum of a line, does not match; it is counted "
-                    "and left out. If it is every one, compare crc and its place, or checksum, with those of "
-                    "the device",
+                    "stream %r: the CRC of a frame, or the checksum of a line, does not match, or no sync "
+                    "word follows a frame without a CRC; it is counted and left out. If it is every one, "
+                    "compare crc and its place, sync_word, or checksum with those of the device",
                     self.stream,
                     extra=coded(NO_FRAME),
                 )

@@ -366,7 +366,8 @@ TIME_UNSURE = Code(
     "The time of samples is not certain",
     "The device has restarted, its counter does not go on, or its frames come late or unevenly. Each turn of "
     "a counter of lines that begins again at 0 after 999, 9999 or the like looks like a restart, too.",
-    "Nothing, if the device was restarted. Else compare rate_hz and the counter with the device.",
+    "Nothing, if the device was restarted. Else compare rate_hz and the counter with the device: of one that "
+    "begins again at 0 after 255, bits = 8; after 65535, bits = 16.",
     "alignment.md",
     "stream 'shaft': the device has restarted its counter, or has not counted for a while; how many "
     "samples are "

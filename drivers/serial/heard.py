@@ -19,6 +19,7 @@ from drivers.serial.sniff_report import (
     other_kinds_words,
     other_lines_words,
     overrun_words,
+    sync_words,
     turn_words,
     unchecked_words,
     unit_of_suffix,
@@ -144,6 +145,8 @@ class HeardOnSerial(Heard):
                     "What is behind the counter of a frame is a guess: channels, type, byte order and scale. "
                     "See the device's manual."
                 )
+            if "sync-word" in taken and self.found["sync_word"] and not self.found["crc"]:
+                yield sync_words(self.found["sync_word"])
             if "counter-bits" in taken and (guess := _width(self.found)):
                 yield guess
             yield from guessed_sensors(answers, channels, taken)
@@ -259,6 +262,8 @@ def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
         if found["frames_passing"] < 1:
             check += f" (passes in {100 * found['frames_passing']:.0f} % of the frames)"
         yield f"{line}: {kind} of {found['frame_length']} bytes{rate}, {check}, {counts}"
+        if found["sync_word"] and not found["crc"]:
+            yield f"  {sync_words(found['sync_word'])}"
         if guess := _width(found):
             yield f"  {guess}"
         return

@@ -181,7 +181,7 @@ class LineCodec:
             why = f"{many}, the file lists {len(columns)} ({', '.join(columns)})"
             return NoFrame(why, self._other_columns(len(fields) - len(columns)))
         for name in filter(None, (self._place, *self._layout.channel_names)):
-            why_no_number = self._why_no_number(name, fields[columns.index(name)])
+            why_no_number = self._why_no_number(name, fields)
             if why_no_number is not None:
                 return why_no_number
         return NoFrame("it cannot be read") if self._place is None else self._why_no_place(fields)
@@ -204,8 +204,9 @@ class LineCodec:
             return NoFrame(f"counter {self._place} is {place}, {most}", "correct bits of counter")
         return NoFrame("it cannot be read")
 
-    def _why_no_number(self, name: str, text: str) -> NoFrame | None:
+    def _why_no_number(self, name: str, fields: Sequence[str]) -> NoFrame | None:
         """Why a column has no number; None if it has one, or none need be there."""
+        text = fields[self._layout.line.index(name)]
         prefix, suffix = self._beside[name]
         number = number_within(text, prefix, suffix)
         if number is None and number_within(text, prefix, "") is None:
@@ -217,9 +218,9 @@ class LineCodec:
             return None
         if NUMBER[self._layout.decimal].fullmatch(number):
             return None
-        return NoFrame(f"column {name} is {text!r}, no number", self._other_number(name, text))
+        return NoFrame(f"column {name} is {text!r}, no number", self._other_number(name, text, fields))
 
-    def _other_number(self, name: str, text: str) -> str:
+    def _other_number(self, name: str, text: str, fields: Sequence[str]) -> str:
         """What to do if all lines have such a text where a number should be."""
         named, unit = parts_of(text, self._layout.decimal) or ("", "")
         texts = {"prefix": named, "suffix": unit}
@@ -228,12 +229,27 @@ class LineCodec:
             return f"write {' and '.join(keys)} in {self._table(name)} of the layout"
         other = "." if self._layout.decimal == "," else ","
         if other != self._layout.separator and NUMBER[other].fullmatch(text):
+            if self._needs_mark(fields) and name != self._place:
+                return (
+                    "have the device write one decimal mark, and none between thousands; or leave "
+                    f"{name} out of channels of the layout, and its sensor out of the file"
+                )
             return f"write decimal = {json.dumps(other)} in the layout"
         order = "put the names in line in the order in which the device sends its columns"
         if name == self._place or any(map(str.isdigit, text)):
             return order
         change = f"leave {name} out of channels of the layout, and its sensor out of the file"
         return f"{change}, if the device sends words there; else {order}"
+
+    def _needs_mark(self, fields: Sequence[str]) -> bool:
+        """Whether a column that is read is a number with the decimal mark of the layout only."""
+        columns = self._layout.line
+        texts = [
+            number_within(fields[columns.index(name)], *self._beside[name]) or ""
+            for name in self._layout.channel_names
+        ]
+        mark = self._layout.decimal
+        return any(mark in text and NUMBER[mark].fullmatch(text) for text in texts)
 
     def _table(self, name: str) -> str:
         """The table of the layout that a column has."""

@@ -60,6 +60,7 @@ _MESSAGES = frozenset(
 _WORD = re.compile(r"\W*([^\W\d_]+)(?![\w,;|\t])")
 _CODED = re.compile(r".*[ :]\d+ *")
 _DIGITS = re.compile(r"\d+")
+_HEX = re.compile(r"[0-9A-Fa-f]{2,8}")
 _LETTERS = re.compile(r"[^\W\d_]{3,}")
 TIME_UNITS: Mapping[str, str] = {"s": "s", "sec": "s", "ms": "ms", "us": "us", "µs": "us", "μs": "us"}
 """Units of a time as devices write them, and as the driver names them."""
@@ -297,6 +298,7 @@ def _columns_of(lines: Sequence[str], behind: Sequence[int], delimiter: str) -> 
         _texts_of([row[k] for row, good in zip(rows, sound, strict=True) if good], decimal)
         for k in range(first, width)
     ]
+    around = _without_hex([row[first:] for row, good in zip(rows, sound, strict=True) if good], around)
     for at, row in enumerate(rows):
         sound[at] = (
             sound[at]
@@ -330,6 +332,30 @@ def _columns_of(lines: Sequence[str], behind: Sequence[int], delimiter: str) -> 
     return TextLines(
         lines, delimiter, separator, decimal, prefix, checksum, columns, header, damaged, behind=ends
     )
+
+
+def _without_hex(
+    rows: Sequence[Sequence[str]], around: Sequence[tuple[str, str] | None]
+) -> list[tuple[str, str] | None]:
+    """The texts around the numbers of columns; None also of those that are hex by chance without a letter.
+
+    Beside columns of hex with letters, one of the same width with zeros in front is hex, too.
+    """
+    columns = [[row[k] for row in rows] for k in range(len(around))]
+    widths = {
+        len(fields[0])
+        for fields, texts in zip(columns, around, strict=True)
+        if fields and texts is None and len(set(map(len, fields))) == 1 and all(map(_HEX.fullmatch, fields))
+    }
+
+    def is_hex(fields: Sequence[str]) -> bool:
+        same = {len(field) for field in fields}
+        return same <= widths and all(map(str.isdigit, fields)) and any(one[0] == "0" for one in fields)
+
+    return [
+        None if widths and texts == ("", "") and fields and is_hex(fields) else texts
+        for fields, texts in zip(columns, around, strict=True)
+    ]
 
 
 def _is_other(
@@ -402,7 +428,9 @@ def _column(
     written = texts
     texts = [(number_within(text, *around) or "").strip() for text in texts] if decimal else texts
     if not decimal or all(map(ABSENT.fullmatch, texts)):
-        return Column(name, numeric=False, last=last)
+        # Where some are numbers, one that is none shows why it is no column of them.
+        none = (text for text in reversed(texts) if not any(one.fullmatch(text) for one in NUMBER.values()))
+        return Column(name, numeric=False, last=next(none, last))
     there = [k for k, text in enumerate(texts) if not ABSENT.fullmatch(text)]
     absent = [text for k, text in enumerate(written) if ABSENT.fullmatch(texts[k])]
     texts, places = [texts[k] for k in there], places[there]

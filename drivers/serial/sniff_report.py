@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import textwrap
 from bisect import bisect_left, bisect_right
 from operator import itemgetter
@@ -46,6 +47,8 @@ WAITING_S = 0.05
 """Within this time from the first byte on, those come that had been waiting in the port."""
 LEAST_TEXT = 8
 """Bytes that are text by chance at a wrong baud rate once in 2000 times."""
+_BEHIND_NUMBER = re.compile(r" *[+-]?[0-9]+(?:[.,][0-9]+)? *([^0-9.,: ][^0-9]*?) *")
+_LONGEST_SUFFIX = 16
 _LEAST_ALIKE = 3
 _FEW = 64
 _SURELY = 1.05
@@ -364,6 +367,7 @@ class Report(NamedTuple):
             count = len(what.frames) + what.damaged
             share = f"{100 * what.passing:.0f} %" if what.damaged else "all"
             check += f", passes in {share} of {count} frames"
+        sync = f"\n{sync_words(what.sync.hex())}" if what.sync and not what.crc else ""
         packed = _packed(what)
         counter = f"counter at {what.counter}" if what.counter else "no counter"
         guess = (
@@ -376,7 +380,7 @@ class Report(NamedTuple):
             stray = f"; {100 * (1 - what.coverage):.0f} % of the bytes are in no frame"
         return (
             f"{name}{rate}: {what.length} bytes, of them {what.payload_length} of payload; {check}; "
-            f"{counter} (bytes of the payload count from 0){stray}{guess}"
+            f"{counter} (bytes of the payload count from 0){stray}{guess}{sync}"
         )
 
     def _figures(self) -> SerialFigures:
@@ -543,6 +547,8 @@ class Report(NamedTuple):
 
     def _frames_tables(self, what: BinaryFrames, bus: str) -> Iterator[str]:
         yield f"framing = {quoted(what.framing)}"
+        if what.sync and not what.crc:
+            yield from (f"# {line}" for line in textwrap.wrap(sync_words(what.sync.hex()), 98))
         if what.sync:
             yield f"sync_word = {quoted(what.sync.hex())}"
         driver_checks = what.crc in {"ibm-3740", "xmodem"} and what.crc_from == len(what.sync)
@@ -690,6 +696,15 @@ def width_words(bits: int, step: int, rate_hz: float | None) -> str:
     )
 
 
+def sync_words(sync: str) -> str:
+    """What it means that frames without a check begin with the same bytes."""
+    return (
+        f"That frames begin with {sync} is a guess, as they have no check that is known. A byte of a value "
+        "may be among these that did not change yet: when it does, all frames are lost. Remedy: correct "
+        "sync_word by the device's manual."
+    )
+
+
 def overrun_words(baud: int, proposed: int) -> str:
     """What it means that more bytes come than a baud rate carries."""
     return (
@@ -698,7 +713,7 @@ def overrun_words(baud: int, proposed: int) -> str:
     )
 
 
-ANY_BAUD = "any: the port does not use it"
+ANY_BAUD = "as good as any: the port does not use it"
 """What the baud rate of a port is that brings the same at all of them."""
 
 
@@ -750,12 +765,20 @@ def no_number_words(texts: Mapping[str, str]) -> str:
     name, text = next(iter(texts.items()))
     example = quoted(_printable(text[:_WIDEST]))
     if len(texts) == 1:
-        begin = f"Column {name} is left out, as no number is there, but e.g. {example}. If it is"
+        begin = (
+            f"Column {name} is left out, as not every line has a number there, but e.g. {example}. If it is"
+        )
     else:
         begin = (
-            f"Columns {', '.join(texts)} are left out: no numbers are there, but e.g. {example}. If they are"
+            f"Columns {', '.join(texts)} are left out: not every line has numbers there, but e.g. {example}. "
+            "If they are"
         )
-    return f"{begin} to be watched, have the device send numbers."
+    beside = _BEHIND_NUMBER.fullmatch(text)
+    remedy = "have the device send decimal numbers"
+    if beside is not None and len(beside[1]) <= _LONGEST_SUFFIX:
+        suffix = quoted(_printable(beside[1]))
+        remedy = f"write suffix = {suffix} in its channel if this is always there, or {remedy}"
+    return f"{begin} to be watched, {remedy}."
 
 
 def _counter(what: TextLines) -> Column | None:

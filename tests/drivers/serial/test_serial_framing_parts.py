@@ -537,3 +537,13 @@ def test_a_prefix_may_have_letters_beyond_ascii(table: str):
     assert "first line is" in found.malformed
     sent = framing.encode("a", np.array([7]), np.array([[[0.25]]]))
     assert framing.cut(b"".join(sent)).frames["a"].counter.tolist() == [7]
+
+
+@pytest.mark.parametrize(("mark", "text"), [(",", "7278;1.475;1,71"), (".", "7278;1,475;1.71")])
+def test_no_other_decimal_mark_is_named_where_a_column_needs_this_one(mark: str, text: str):
+    columns = line_layout(("seq", "n", "x"), ("n", "x"), counter="seq", separator=";", decimal=mark)
+    framing = LineFraming({"a": columns}, {"a": 100.0})
+    framing.cut(b"half a line\n")
+    found = framing.cut(f"{text}\n".encode())
+    assert "column n is" in found.malformed
+    assert "one decimal mark, and none between thousands; or leave n out of channels" in found.remedy

@@ -113,3 +113,63 @@ def test_a_counter_that_has_not_carried_shifts_no_values(
     for place in (shown, heard, text, found.fragment.replace("\n# ", " ")):
         assert (words in place) != carried
         assert ("--seconds 7" in place) == (not carried and expected["bits"] < 32)
+
+
+def unchecked(number: int) -> bytes:
+    """A sync word, a count, and a temperature whose upper byte stands still."""
+    return b"\x7e" + struct.pack("<Bhh", number & 255, int(1800 * math.sin(1.7 * number)), 583 + number % 5)
+
+
+def test_without_a_check_the_sync_word_is_called_a_guess(tmp_path: Path) -> None:
+    found = sniffed(unchecked, 50.0, seconds=8.0)
+    assert found.figures["crc"] == ""
+    file, text = written(found, tmp_path / "m.toml")
+    words = f"That frames begin with {file['buses']['main']['sync_word']} is a guess, as they have no check"
+    shown = "\n".join(one for one in found.parts if isinstance(one, str))
+    heard = "\n".join(HeardOnSerial(found.figures, SerialQuestions()).lines)
+    for place in (shown, heard, text, found.fragment.replace("\n# ", " ")):
+        assert words in place
+        assert "correct sync_word by the device's manual" in place
+    checked = sniffed(counted, 50.0)
+    assert "is a guess, as they have no check" not in checked.fragment
+
+
+def of_lines(form: str, rate_hz: float = 10.0) -> Sniffed:
+    """What a device is found to send; n counts, v is a vibration, t a temperature, both as 1.85."""
+    rng = np.random.default_rng(1)
+
+    def line(number: int) -> bytes:
+        v, t = 1.7 + rng.random() / 5, 58 + rng.random() / 2
+        over = ">20.00" if number % 20 > 10 else f"{v:.2f}"
+        hexed = f"{number:04X},{int(v * 100):04X},{int(t * 10):04X}"
+        return f"{form.format(n=number, v=v, t=t, over=over, hexed=hexed)}\r\n".encode()
+
+    return sniffed(line, rate_hz, seconds=6.0)
+
+
+@pytest.mark.parametrize(
+    ("form", "suffixes"),
+    [
+        ("{n};{v:.2f} mm/s RMS;{t:.1f} Grad", ["mm/s RMS", "Grad"]),
+        ("{n};{v:.2f}mm/s(eff);{t:.1f} °C", ["mm/s(eff)", "°C"]),
+        ("{n};{v:.2f} um p-p;{t:.1f}C", ["um p-p", "C"]),
+    ],
+)
+def test_how_a_level_was_made_may_be_behind_its_unit(tmp_path: Path, form: str, suffixes: list[str]) -> None:
+    file, _ = written(of_lines(form), tmp_path / "m.toml")
+    assert [one["suffix"] for one in file["streams"]["device"]["layout"]["channels"]] == suffixes
+
+
+def test_why_a_column_is_left_out_shows_what_is_no_number(tmp_path: Path) -> None:
+    _, text = written(of_lines("{n};{over};{t:.1f}"), tmp_path / "m.toml")
+    assert 'c2 is left out, as not every line has a number there, but e.g. ">20.00".' in text
+    _, text = written(of_lines("{n};{v:.2f} mm of oil;{t:.1f}"), tmp_path / "m.toml")
+    assert 'write suffix = "mm of oil" in its channel if this is always there' in text
+
+
+def test_of_columns_of_hex_none_is_kept_as_a_decimal_number() -> None:
+    found = of_lines("{hexed}")
+    assert [one["numeric"] for one in found.figures["columns"]] == [False, False, False]
+    assert "channels" not in found.fragment
+    plain = of_lines("{n:04d},{v:.2f},00AE")
+    assert [one["numeric"] for one in plain.figures["columns"]][1] is True

@@ -193,7 +193,7 @@ def test_no_baud_rate_is_named_where_all_of_them_come_out_alike(
         said = capsys.readouterr().out
         found = figures(cable, capsys)
     assert f"{cable.path} at any baud rate, 8N1: " in said
-    assert "baud = 115_200    # any: the port does not use it" in said
+    assert "baud = 115_200    # as good as any: the port does not use it" in said
     assert (found["baud"], found["any_baud"], len(found["tried"])) == (115_200, True, 3)
     assert next(iter(on_port(found).lines)).startswith("any baud rate, 8N1: lines of text")
     check(tmp_path, found["machine_file"], capsys)
@@ -388,7 +388,7 @@ def test_a_slow_device_on_a_port_without_a_rate_gets_no_rate(
     assert main(["sniff", "serial", "ttyUSB0", *seconds]) == 0
     said = capsys.readouterr().out
     assert "ttyUSB0 at any baud rate, 8N1" in said
-    assert "baud = 115_200    # any: the port does not use it" in said
+    assert "baud = 115_200    # as good as any: the port does not use it" in said
 
 
 def test_too_few_bytes_at_all_rates_are_called_so_and_seconds_makes_the_tries_longer(
@@ -436,7 +436,7 @@ def test_what_of_the_lines_is_no_sample_is_stated_on_the_terminal_and_in_both_fi
     for words in (
         'lines are not of this layout, e.g. "ERR 12": daqsvc counts such lines, and does not read them',
         'lines: "---" is there. Only these samples of it are missing.',
-        'Column c3 is left out, as no number is there, but e.g. "ok".',
+        'Column c3 is left out, as not every line has a number there, but e.g. "ok".',
     ):
         for place in (table, fragment.replace("# ", ""), said, text):
             assert words in place
@@ -744,7 +744,7 @@ def test_a_port_that_brings_more_than_its_baud_rate_is_proposed_with_one_that_ca
         assert main([*slow, f"--port={cable.path}"]) == 2
     refused = capsys.readouterr().err
     assert words in said
-    any_baud = f"baud = {file['buses']['main']['baud']} is any: the port does not use it."
+    any_baud = f"baud = {file['buses']['main']['baud']} is as good as any: the port does not use it."
     assert any_baud in said
     assert f"# {any_baud}\n" in (tmp_path / "fast.toml").read_text("utf-8")
     assert file["buses"]["main"]["baud"] in {460_800, 921_600}
