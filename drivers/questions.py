@@ -160,6 +160,20 @@ def number(text: str) -> float:
     return value
 
 
+_HZ = ("Hz", "1/s", "s-1", "samples/s", "Sa/s", "S/s", "SPS")
+_RPM = ("rpm", "1/min", "min-1", "r/min", "rev/min", "U/min")
+
+
+def number_in(*units: str) -> Callable[[str], float]:
+    """A number; one of these units may be written behind it."""
+    behind = "|".join(map(re.escape, units))
+
+    def read(text: str) -> float:
+        return number(re.sub(rf"(?<=[\d. ])\s*(?:{behind})\s*$", "", text, flags=re.IGNORECASE))
+
+    return read
+
+
 AUTO = "auto"
 """Answer that leaves a question to the program."""
 _LONGEST_S = 3600.0
@@ -169,26 +183,49 @@ def seconds_or_auto(text: str) -> float | None:
     """A time to listen; None for ``auto``."""
     if text.lower() == AUTO:
         return None
-    value = number(text)
+    value = number_in("s", "sec", "second", "seconds")(text)
     if not 0 < value <= _LONGEST_S:
         raise ValueError(f'"{text}": give a time above 0, up to {_LONGEST_S:g} s, or {AUTO}')
     return value
 
 
 def rate_hz(text: str) -> float:
-    """A sampling rate."""
-    value = number(text)
+    """A sampling rate; its unit may be written behind it."""
+    value = number_in(*_HZ)(text)
     if value < 1e-4:
         raise ValueError(f'"{text}" is not a rate: write how many samples there are in a second, e.g. 2560')
     return value
 
 
 def speed_rpm(text: str) -> float:
-    """The speed of a shaft that turns."""
-    value = number(text)
+    """The speed of a shaft that turns; its unit may be written behind it."""
+    value = number_in(*_RPM)(text)
     if abs(value) < 1e-3:
         raise ValueError(f'"{text}" is a shaft that stands still: write its usual speed')
     return value
+
+
+_SLOW_RPM = 60.0
+_DECIMALS = 3
+
+
+def doubt_of_speed(speed_rpm: float) -> tuple[str, str] | None:
+    """See `Question.doubt`: 1.485 is most likely 1485, with a point between the thousands."""
+    meant = thousands(speed_rpm)
+    if meant is None:
+        return None
+    reason = (
+        f"{speed_rpm:g} rpm is very slow, and the point is a decimal point here. Enter takes {meant}; type "
+        f"{speed_rpm:g} again if the shaft turns so slowly"
+    )
+    return reason, f"{meant}"
+
+
+def thousands(speed_rpm: float) -> int | None:
+    """The speed that is meant where the point of a slow one may be between thousands; None if it is none."""
+    meant = round(speed_rpm * 10**_DECIMALS)
+    slow = abs(speed_rpm) < _SLOW_RPM and speed_rpm != int(speed_rpm)
+    return meant if slow and math.isclose(meant, speed_rpm * 10**_DECIMALS, rel_tol=1e-9) else None
 
 
 def whole(text: str) -> int:

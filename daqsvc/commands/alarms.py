@@ -11,6 +11,7 @@ import json
 import os
 import pwd
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
 
 from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, alarm_id, count, duration, one_line
@@ -28,7 +29,6 @@ from daqsvc.errors.service import JOURNAL_BEHIND
 
 if TYPE_CHECKING:
     import argparse
-    from pathlib import Path
 
     from daqsvc.commands.alarm_targets import Target
     from daqsvc.commands.machine_files import Load
@@ -273,10 +273,12 @@ class AlarmVerb:
         from daqsvc.outbox.messages import OutboxError  # noqa: PLC0415
 
         name = arguments.verb
+        _take_file(arguments)
         try:
             chosen = chosen_store(arguments, self._load)
             chosen.refuse_other()
             store = chosen.directory
+            _refuse_none(arguments, chosen)
             targets = meant(store, arguments.alarms, Verb(self._verb), chosen.machine)
         except BadFileError:
             return EXIT_USAGE
@@ -337,6 +339,38 @@ class AlarmVerb:
             _complain(arguments.verb, f"refused:{of} {outcome.reason}", outcome.code or COMMAND_REFUSED)
         # Accepted with a reason: the disk has not got it yet.
         return EXIT_OK if outcome.accepted and not outcome.reason else EXIT_FAILED
+
+
+def _take_file(arguments: argparse.Namespace) -> None:
+    """Take a machine file for FILE wherever it was written: many write it in front of the alarm."""
+    if arguments.file is None and arguments.store is None:
+        files = [word for word in arguments.alarms if word.endswith(".toml")]
+        if len(files) == 1:
+            arguments.alarms.remove(files[0])
+            arguments.file = Path(files[0])
+
+
+def _refuse_none(arguments: argparse.Namespace, chosen: ChosenStore) -> None:
+    """Refuse a machine file that was named alone, with the alarms that there are.
+
+    Raises:
+        NoSuchAlarmError: no alarm was named.
+        OutboxError: there is no journal, or it cannot be read.
+    """
+    from daqsvc.commands.alarm_journal import current  # noqa: PLC0415 - each verb imports only what it needs
+    from daqsvc.commands.alarm_targets import MOST_NAMED, NoSuchAlarmError  # noqa: PLC0415
+
+    if arguments.alarms:
+        return
+    events = current(chosen.directory)
+    names = sorted({one["alarm"] for one in events if chosen.machine in {None, one["machine"]}})
+    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    raised = f"raised so far: {', '.join(names[:MOST_NAMED])}{more}" if names else "none was raised so far"
+    file = arguments.file
+    raise NoSuchAlarmError(
+        f"{file} is the machine file, and no alarm is named: write daqsvc {arguments.verb} ALARM {file}; "
+        f"{raised}"
+    )
 
 
 def alarm_verbs(load: Load) -> dict[str, AlarmVerb]:

@@ -438,3 +438,13 @@ UNIT_UNKNOWN = Code(
     example='machine.toml:78: sensors[2].unit = "float32": is not known as a unit. Remedy: write the unit of '
     "its values, e.g. mm/s, degC, kW or 1; or leave it if it is one",
 )
+THOUSANDS = Code(
+    "F45",
+    "A speed is so low that its point may be one between thousands",
+    "1.485 is one revolution and a half a minute. In German and in other languages 1.485 is 1485, but the "
+    "point is a decimal point in machine files.",
+    "Write the speed in rpm without a point between thousands; or leave it if the shaft turns so slowly.",
+    "machine-file.md",
+    example="machine.toml:12: machine.speed_rpm = 1.485: is very slow, and the point is a decimal point. "
+    "Remedy: write speed_rpm = 1485.0 if that is meant; or leave it",
+)

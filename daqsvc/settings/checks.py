@@ -22,6 +22,7 @@ from daqsvc.errors.machine_file import (
     PLUGIN_FAILED,
     SNAPSHOTS_OVERLAP,
     SPEED_UNKNOWN,
+    THOUSANDS,
     TOO_MUCH_MEMORY,
     UNUSED_BUS,
 )
@@ -138,6 +139,7 @@ def _checks(draft: MachineFile, facts: Mapping[str, Any]) -> Iterator[Iterator[F
     yield from _sensor_checks(draft, facts)
     yield _check_memory(draft)
     yield _names(draft)
+    yield _check_speed(draft)
     yield _check_speed_steps(draft)
     yield _check_schedule(draft)
     yield from physics_checks(draft)
@@ -403,6 +405,24 @@ def needed_bytes(draft: MachineFile) -> dict[str, float]:
             if (block := stream.layout.block) is not None:
                 needed[name] += block.buffer_bytes
     return needed
+
+
+_SLOW_RPM = 60.0
+"""Below it few machines turn, and none has a speed that is known to a thousandth."""
+
+
+def _check_speed(draft: MachineFile) -> Iterator[Finding]:
+    """The point of the speed is no point between thousands, as in 1.485 for 1485."""
+    speed_rpm = draft.machine.speed_rpm
+    to_a_thousandth = round(speed_rpm, 3) == speed_rpm != round(speed_rpm, 2)
+    if abs(speed_rpm) < _SLOW_RPM and to_a_thousandth:
+        yield Finding(
+            ("machine", "speed_rpm"),
+            "is very slow, and the point is a decimal point",
+            f"write speed_rpm = {round(1000 * speed_rpm)}.0 if that is meant; or leave it",
+            fatal=False,
+            code=THOUSANDS,
+        )
 
 
 def _check_speed_steps(draft: MachineFile) -> Iterator[Finding]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -76,7 +77,7 @@ class DbcQuestions(CanQuestions):
         yield self.ask("dbc", partial(_dbc_file, folder))
         messages = self._messages(answers)
         choices = {name: _about(one) for name, one in messages.items()}
-        yield self.ask("message", q.exactly(choices), likely_message(messages), choices=choices)
+        yield self.ask("message", partial(_message, messages), likely_message(messages), choices=choices)
         message = messages[answers["message"]]
         answers["fd"] = message.length > 8
         yield from self._bit_rates(answers, fd=answers["fd"])
@@ -267,6 +268,16 @@ def _dbc_file(folder: Path, text: str) -> str:
     if not messages:
         raise ValueError(f"{text} describes no message with signals; give another DBC file")
     return f"{path}"
+
+
+def _message(messages: Mapping[str, Message], text: str) -> str:
+    """A message, by its name or by its id."""
+    with suppress(ValueError):
+        number = int(text.lower().removeprefix("id").strip(), 0)
+        of_id = [name for name, one in messages.items() if one.frame_id == number]
+        if len(of_id) == 1 and text not in messages:
+            return of_id[0]
+    return q.exactly(dict.fromkeys(messages, ""))(text) or text
 
 
 def _about(message: Message) -> str:

@@ -178,7 +178,7 @@ class _ModbusQuestions(BusQuestions):
         return heard.HeardUnits(found, lines, answers["registers"], self._next_address)
 
     def _ask_timeout(self) -> Question:
-        return self.ask("timeout-ms", q.number, f"{_TIMEOUT_MS:g}")
+        return self.ask("timeout-ms", q.number_in("ms"), f"{_TIMEOUT_MS:g}")
 
     def _ask_units(self) -> Question:
         """Which units are to be found; only an option is asked for them."""

@@ -512,6 +512,23 @@ async def test_an_id_that_names_nothing_is_refused_in_words(tmp_path: Path, noth
     assert f"{nothing!r} names no alarm; write its name, or how its id begins in daqsvc alarms" in err
 
 
+async def test_the_machine_file_may_stand_in_front_of_the_alarm(tmp_path: Path) -> None:
+    file = tmp_path / "motor.toml"
+    file.write_text(MACHINE.format(gateway=1, broker=2, alarms=ALARMS))
+    xdg = {"XDG_STATE_HOME": str(tmp_path / "state"), "STATE_DIRECTORY": ""}
+    state = tmp_path / "state" / "daqsvc"
+    await write_journal(state / "lab-edge-1-motor", {})
+    await write_journal(state / "lab-edge-1-pump", OTHER)  # without a file it is not known which is meant
+    for order in ((file, "shaking"), ("shaking", file)):
+        code, _, err = await daqsvc("ack", *order, env=xdg)
+        assert code == 1
+        assert "no daqsvc runs on the store" in err
+        assert "name the machine file" not in err
+    code, _, err = await daqsvc("ack", file, env=xdg)
+    assert code == 1
+    assert f"no alarm is named: write daqsvc ack ALARM {file}; raised so far: shaking" in err
+
+
 async def test_a_machine_file_and_a_store_exclude_each_other(tmp_path: Path) -> None:
     code, _, err = await daqsvc("ack", "rotor-fault", "machine.toml", "--store", tmp_path)
     assert code == 2

@@ -27,7 +27,7 @@ from daqsvc.commands.new.machine_text import machine_text, questions
 from daqsvc.commands.new.topics import all_topics
 from daqsvc.settings import load_machine_file
 from drivers.bus_questions import Heard
-from drivers.questions import bit_rate
+from drivers.questions import bit_rate, doubt_of_speed, number_in, rate_hz, seconds_or_auto, speed_rpm
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -1005,6 +1005,60 @@ def test_a_bit_rate_may_be_written_as_it_is_said(text, rate):
 def test_what_is_no_bit_rate_is_told_how_one_is_written(text):
     with pytest.raises(ValueError, match=r"; write (it in bit/s, )?e.g. 500000 or 500k$"):
         bit_rate(text)
+
+
+@pytest.mark.parametrize(
+    ("read", "text", "value"),
+    [
+        (rate_hz, "10 Hz", 10.0),
+        (rate_hz, "2560hz", 2560.0),
+        (rate_hz, "1e3 samples/s", 1000.0),
+        (speed_rpm, "1485 rpm", 1485.0),
+        (speed_rpm, "-1485 1/min", -1485.0),
+        (speed_rpm, "1485 U/min", 1485.0),
+        (seconds_or_auto, "20 s", 20.0),
+        (number_in("mm/s"), "2.8 mm/s", 2.8),
+    ],
+)
+def test_the_unit_of_a_number_may_be_typed_behind_it(read, text, value):
+    assert read(text) == value
+
+
+@pytest.mark.parametrize(
+    ("read", "text"), [(rate_hz, "10 kHz"), (speed_rpm, "25 Hz"), (rate_hz, "Hz"), (number_in("mm/s"), "2 g")]
+)
+def test_another_unit_behind_a_number_is_refused(read, text):
+    with pytest.raises(ValueError, match=f'^"{text}" is not a number; write e.g. 0.5 or 1480$'):
+        read(text)
+
+
+@pytest.mark.parametrize(
+    ("speed", "meant"),
+    [(1.485, "1485"), (1.48, "1480"), (1.5, "1500"), (-2.955, "-2955"), (12.5, "12500")],
+)
+def test_a_point_between_thousands_of_a_speed_is_doubted_once(speed, meant):
+    said, instead = doubt_of_speed(speed)
+    assert instead == meant
+    assert said.startswith(f"{speed:g} rpm is very slow, and the point is a decimal point here. Enter takes")
+
+
+@pytest.mark.parametrize("speed", [1485.0, 1485.5, 120.5, 12.0, 0.0123])
+def test_a_speed_that_a_machine_has_is_not_doubted(speed):
+    assert doubt_of_speed(speed) is None
+
+
+def test_a_speed_with_a_point_between_thousands_is_asked_again():
+    typed, offered, said = ["1.485", ""], [], []
+
+    def ask(question: Question) -> str:
+        if question.key != "speed":
+            return f"{question.default}"
+        offered.append(question.default)
+        return typed.pop(0)
+
+    answers = conduct(Path("m.toml"), Given({"bus": "can"}, defaults=False), ask, said.append)
+    assert (answers["speed"], offered) == (1485.0, ["1480", "1485"])
+    assert [one for one in said if one.startswith("1.485 rpm is very slow")]
 
 
 def test_a_can_bus_is_asked_for_its_bit_rate_as_it_is_said(tmp_path):

@@ -42,6 +42,7 @@ GIVEN: list[tuple[str, Path, list[tuple[str, str]]]] = [
         MACHINES / "modbus-vibration-temperature.toml",
         [('"degC"\nok_between = [-40.0, 105.0]', '"float32"\nok_between = [-40.0, 105.0]')],
     ),
+    ("F45", LAVAL, [("speed_rpm = 600.0", "speed_rpm = 1.485")]),
     ("B04", CAN, [("valid_raw = [-32767, 32767]", "valid_raw = [-40000, 32767]")]),
     ("B16", MODBUS, [('table = "input"\nunit = 1', 'table = "input"\nunit = 250')]),
     ("B17", MODBUS, [("address = 16\ndepth = 1024", "address = 65000\ndepth = 1024")]),

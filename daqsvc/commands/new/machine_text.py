@@ -47,7 +47,8 @@ def questions(answers: Answers, folder: Path) -> Iterator[Question]:
     yield Question("box", TOPICS["box"], q.name, "edge-1", quiet=True)
     yield Question("seconds", TOPICS["seconds"], q.seconds_or_auto, q.AUTO, quiet=True)
     yield from bus.questions(answers, folder)
-    yield Question("speed", TOPICS["speed"], q.speed_rpm, "600" if virtual else "1480", quiet=virtual)
+    speed, usual = TOPICS["speed"], "600" if virtual else "1480"
+    yield Question("speed", speed, q.speed_rpm, usual, quiet=virtual, doubt=q.doubt_of_speed)
     yield Question("rate", TOPICS["rate"], q.rate_hz, f"{bus.rate_hz(answers):g}", quiet=virtual)
     yield from sensor_questions(answers)
     yield from limit_questions(answers)

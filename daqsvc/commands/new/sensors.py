@@ -198,7 +198,7 @@ def _of_channel(answers: Answers, channel: str) -> Iterator[Question]:
     if chosen in {"proximity", "accelerometer", "velocity"}:
         yield from _of_waveform(answers, channel, ask)
     if chosen == "keyphasor":
-        yield ask("threshold", q.number, "-6")
+        yield ask("threshold", q.number_in("V"), "-6")
 
 
 _OF_PEAKS = re.compile(r"(?:0-?p|p-?p|pp|pk|peak)\W*$", re.IGNORECASE)
@@ -219,7 +219,7 @@ def _of_waveform(answers: Answers, channel: str, ask: Any) -> Iterator[Question]
     yield ask("sensitivity", q.number_or_none, f"{_SENSITIVITY[unit]:g}" if volts else NONE)
     if kind == "proximity":
         probes = [one for one in sensors(answers) if one.type == "proximity"]
-        yield ask("angle", q.number, "0" if len(probes) % 2 else "90")
+        yield ask("angle", q.number_in("deg", "degrees", "°"), "0" if len(probes) % 2 else "90")
     if kind == "accelerometer" and _tells_bearings(answers):
         yield ask("bearing", _bearing, NONE)
 
@@ -307,7 +307,12 @@ def limit_questions(answers: Answers) -> Iterator[Question]:
         what = f"{limited[0].measure[0].replace('_', ' ')} of {names} in {unit}" if limited[0].measure else ""
         for key, factor in (("alert", 1.0), ("danger", 1.5)):
             words = q.Topic(f"{TOPICS[key].text} ({what})", TOPICS[key].help)
-            yield Question(key, words, q.number, alert if factor == 1.0 else _higher(answers["alert"]))
+            yield Question(
+                key,
+                words,
+                q.number_in(unit) if unit else q.number,
+                alert if factor == 1.0 else _higher(answers["alert"]),
+            )
 
 
 def _with_own_limits(there: Sequence[Sensor]) -> list[Sensor]:

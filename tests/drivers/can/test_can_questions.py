@@ -121,6 +121,11 @@ def test_the_unit_of_the_dbc_file_is_taken_over(
     assert ("[F40]" in capsys.readouterr().out) == (unit == "1")
 
 
+@pytest.mark.parametrize("text", ["Slow", "0x321", "id 0x321", "801"])
+def test_a_message_may_be_named_by_the_id_that_the_list_shows(tmp_path: Path, text: str) -> None:
+    assert layout_of(new(tmp_path, GEARBOX, f"--message={text}", "--rate=10 Hz"))["message"] == "Slow"
+
+
 @pytest.mark.parametrize(("stated", "unit"), [("mg", "mg"), ("mm/s²", "mm/s2"), ("m/s^2", "m/s2")])
 def test_samples_in_any_unit_of_acceleration_make_an_accelerometer(
     tmp_path: Path, stated: str, unit: str
