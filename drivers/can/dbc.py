@@ -13,6 +13,7 @@ from daqsvc.settings.files import UnreadableFileError, read_bounded, shortened
 from daqsvc.settings.packing import LARGEST_SCALE, LEAST_SCALE
 from daqsvc.settings.problems import Finding, choice
 from drivers.can.settings import DbcMessage
+from drivers.fields import j1939_valid_raw
 from drivers.frames import ByteOrder, Counts, Field, FrameLayout, Kind, LayoutError, Selector
 
 if TYPE_CHECKING:
@@ -87,6 +88,10 @@ def layout_from_dbc(
         )
     rows = list(zip(*channels.values(), strict=True))
     gain, shift = np.array([(units or {}).get(name, (1.0, 0.0)) for name in channels]).reshape(-1, 2).T
+    by_channel = {
+        name: {j1939_valid(described, signals[one]) for one in column} for name, column in channels.items()
+    }
+    of_j1939 = {name: only for name, (only, *more) in by_channel.items() if only is not None and not more}
     return FrameLayout(
         frame_id=described.frame_id,
         extended=described.is_extended_frame,
@@ -98,9 +103,27 @@ def layout_from_dbc(
         counter=None if counter is None else cells[counter],
         counts=counts,
         any_priority=described.protocol == "j1939",
-        valid_raw=valid_raw or {},
+        valid_raw={**of_j1939, **(valid_raw or {})},
         selectors=tuple(Selector(name, field(name), values) for name, values in pages.items()),
     )
+
+
+def j1939_valid(message: Message, signal: Signal) -> tuple[float, float] | None:
+    """Raw values of a signal that are a measurement by SAE J1939; None where all are.
+
+    A file often leaves out which of its messages are those of J1939 (the attribute VFrameFormat). Then a
+    signal of a 29-bit id is one if its stated range is exactly that of the standard, e.g. 0 to 0xFAFF raw.
+    """
+    valid = j1939_valid_raw(signal_field(signal))
+    if valid is None or message.protocol == "j1939":
+        return valid
+    if not message.is_extended_frame or signal.choices or signal.minimum is None or signal.maximum is None:
+        return None
+    scale, offset = float(signal.scale), float(signal.offset)
+    ends = sorted(raw * scale + offset for raw in valid)
+    stated = (float(signal.minimum), float(signal.maximum))
+    near = all(abs(one - other) < 0.5 * abs(scale) for one, other in zip(ends, stated, strict=True))
+    return valid if near else None
 
 
 def selecting_values(signals: Mapping[str, Signal], names: Iterable[str]) -> dict[str, frozenset[int]]:
@@ -189,6 +212,11 @@ def check_dbc(layout: DbcLayout, file: Path, at: KeyPath) -> tuple[DbcMessage | 
         signal_units={signal.name: signal.unit or "" for signal in message.signals},
         signal_ranges={signal.name: _range(signal) for signal in message.signals if not signal.is_float},
         any_priority=message.protocol == "j1939",
+        valid_raw={
+            signal.name: valid
+            for signal in message.signals
+            if (valid := j1939_valid(message, signal)) is not None
+        },
         pages=_pages(message, [name for _, name in _asked(layout, at)]),
     )
     return facts, list(_signal_findings(layout, message, at))

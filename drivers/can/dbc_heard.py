@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from drivers.bus_questions import BUS
 from drivers.can.dbc_likely import beside_samples, likely_counter, likely_measured, samples_of_one
 from drivers.can.heard import SHOWN, HeardOnCan, decoded_signals, values_heard
+from drivers.can.other_source import other_sources
 from drivers.can.sniff import CLOCK, STATE, numbered, of_another_stream
 from drivers.questions import NONE, Answers, sensor_key
 from drivers.sniffing import usual_rate
@@ -32,7 +33,11 @@ class HeardMessages(HeardOnCan):
         rate_is_stated: bool,
     ) -> None:
         self._decoded = decoded_signals(found)
-        missed = (
+        strangers = [one["id"] for one in found["ids"] if one["message"] is None and one.get("extended")]
+        silent = set(messages) - {one["message"] for one in found["ids"]}
+        extended = {name: messages[name].frame_id for name in silent if messages[name].is_extended_frame}
+        self._other_sources = list(other_sources(strangers, extended))
+        missed = ". ".join(self._other_sources) or (
             f"No frame is as {dbc} describes: it is most likely the file of another device. Remedy: give the "
             "file of the device that sends"
         )
@@ -270,6 +275,7 @@ class HeardMessages(HeardOnCan):
         if left_out:
             in_frame = self._samples_in_frame(answers)
             yield f"Not read: {_few(left_out)}. Each {of_another_stream(in_frame)}."
+        yield from (f"Not read: {words}." for words in self._other_sources)
         taken = {answers["counter"], *answers["signals"]}
         signals = self._messages[answers["message"]].signals
         states = [one.name for one in signals if one.choices and one.name not in taken]

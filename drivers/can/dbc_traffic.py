@@ -10,10 +10,10 @@ import numpy as np
 from daqsvc.rounding import counted
 from drivers.can.batches import ERROR, EXTENDED, EXTENDED_ID, PRIORITY, REMOTE, by_id
 from drivers.can.checks import LEAST_COUNTER_BITS
-from drivers.can.dbc import never_negative, selecting_values, signal_field, signals_by_page
+from drivers.can.dbc import j1939_valid, never_negative, selecting_values, signal_field, signals_by_page
 from drivers.can.settings import CAN_FD_LENGTHS
 from drivers.counter_search import LEAST_COUNTS
-from drivers.fields import FieldGroup, LayoutError, j1939_valid_raw
+from drivers.fields import FieldGroup, LayoutError
 from drivers.sniffing import span
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ class SignalTraffic:
             raise LayoutError(f"{self.name} does not lie within the {length} bytes of its message")
         self._group = FieldGroup([cell], [0], length)
         self._scale, self._offset = float(signal.scale), float(signal.offset)
-        self._valid = j1939_valid_raw(cell) if message.protocol == "j1939" else None
+        self._valid = j1939_valid(message, signal)
         signals = {one.name: one for one in message.signals}
         self._selectors = [
             (FieldGroup([signal_field(signals[name])], [0], length), sorted(values))

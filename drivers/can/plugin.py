@@ -26,7 +26,7 @@ from drivers.can.checks import (
     frame_facts,
 )
 from drivers.can.dbc import check_dbc, layout_from_dbc
-from drivers.can.settings import CanBus, DbcLayout, PlainLayout
+from drivers.can.settings import CanBus, DbcLayout, DbcMessage, PlainLayout
 from drivers.plugin import DriverPlugin, in_units, packed_layout, units_of
 
 if TYPE_CHECKING:
@@ -141,13 +141,26 @@ def stream_words(machine: MachineFile, name: str) -> StreamWords:
     if facts is None:
         return StreamWords(share=shown_share)
     samples = samples_in_words(facts.samples_per_frame, len(layout.channels))
+    channels: tuple[tuple[str, ...], ...] = ()
+    message = machine.layout_facts.get(name)
+    if isinstance(layout, DbcLayout) and isinstance(message, DbcMessage):
+        channels = tuple(_absent_by_j1939(layout, message))
     return StreamWords(
         f"{facts.frame_id:#x}",
         f"{stream.rate_hz / facts.samples_per_frame:.4g}/s",
         f"{facts.length} bytes, {samples}",
         "none: by time" if layout.counter is None else f"{facts.counter_bits} bit {layout.counter.counts}",
         shown_share,
+        (("channel", "signals", "no value (SAE J1939)"), *channels) if channels else (),
     )
+
+
+def _absent_by_j1939(layout: DbcLayout, message: DbcMessage) -> Iterator[tuple[str, ...]]:
+    """Rows on the channels whose highest raw values are no measurements by SAE J1939."""
+    for channel in layout.channels:
+        valid = {message.valid_raw.get(signal) for signal in channel.signals}
+        if channel.valid_raw is None and len(valid) == 1 and (only := valid.pop()) is not None:
+            yield channel.name, ", ".join(channel.signals), f"raw values above 0x{int(only[1]):X}"
 
 
 def _bit_rate(rate: int) -> str:

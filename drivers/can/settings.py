@@ -151,6 +151,7 @@ class DbcMessage:
         signal_units: unit of each signal, by name; empty if the DBC gives none.
         signal_ranges: least and largest value that each signal can carry, in its unit; none of a float.
         any_priority: whether it is one of SAE J1939, whatever the priority in its id.
+        valid_raw: least and largest raw value that is a measurement, by signal, where SAE J1939 has others.
         pages: which values of which multiplexers the frames have that hold the layout's signals.
     """
 
@@ -161,6 +162,7 @@ class DbcMessage:
     signal_units: Mapping[str, str]
     signal_ranges: Mapping[str, tuple[float, float]]
     any_priority: bool
+    valid_raw: Mapping[str, tuple[float, float]]
     pages: Mapping[str, frozenset[int]]
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from daqsvc.documentation import documented_in
 from daqsvc.rounding import counted
+from drivers.can.other_source import other_sources
 from drivers.sniffing import (
     Sniffed,
     Sniffer,
@@ -470,6 +471,9 @@ class _Report(NamedTuple):
         if strange:
             named = [_id(one.arbitration_id, extended=one.extended) for one in strange]
             yield f"Heard, but not in the DBC file: {', '.join(named)}"
+            missing = {one.name: one.frame_id for one in dbc.missing if one.extended}
+            extended = [one.arbitration_id for one in strange if one.extended]
+            yield from (f"{words}." for words in other_sources(extended, missing))
 
     def _rate_doubt(self, message: MessageTraffic) -> str:
         rates = (self.traffic.ids[one].rate_hz for one in message.ids)

@@ -761,6 +761,30 @@ def test_new_names_the_messages_that_it_heard_and_does_not_read(
 
 
 @pytest.mark.usefixtures("hub")
+def test_a_message_that_comes_from_another_source_address_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(questions, "_LISTEN_S", 0.3)
+    text = f'VERSION ""\nBU_: N\nBO_ {0x98FEF2FE} Engine: 8 N\n SG_ T : 0|16@1+ (0.1,0) [0|0] "degC" N\n'
+    (tmp_path / "engine.dbc").write_text(text)
+
+    def engine(bus: UnixBus, number: int) -> None:
+        bus.send(can.Message(arbitration_id=0x18FEF221, data=bytes([number % 256, *bytes(7)])))
+
+    said = (
+        "0x18FEF221 is Engine from the source address 0x21; in the DBC file it has 0xFE (SAE J1939). Remedy: "
+    )
+    remedy = f"in a copy of the DBC file write BO_ {0x98FEF221} in place of BO_ {0x98FEF2FE}"
+    with talking(tmp_path / "bus", engine):
+        assert main(words(tmp_path, "--seconds", "0.3", "--dbc", f"{tmp_path / 'engine.dbc'}")) == 0
+        assert f"{said}{remedy}." in capsys.readouterr().out
+        assert not_written(tmp_path, "--bus=can-dbc", "--dbc=engine.dbc") == 1
+        assert f"{said}{remedy}" in capsys.readouterr().err
+        (tmp_path / "engine.dbc").write_text(text.replace(f"{0x98FEF2FE}", f"{0x98FEF221}"))
+        assert new(tmp_path, "--bus=can-dbc", "--dbc=engine.dbc")["sensors"][0]["channel"] == "T"
+
+
+@pytest.mark.usefixtures("hub")
 def test_new_leaves_a_clock_out_as_sniff_does(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -16,11 +16,13 @@ from support.machine_files import MACHINES, changed, problems_of
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.acquisition.samples import Quality
+from daqsvc.cli import main
 from daqsvc.settings import load_machine_file
 from drivers.base import BusPort, StreamSpec
 from drivers.can.batches import EXTENDED, CanBatch, IdMatch
 from drivers.can.dbc import layout_from_dbc
 from drivers.can.driver import CanDriver
+from drivers.can.other_source import other_sources
 from drivers.can.plugin import frame_layout
 
 if TYPE_CHECKING:
@@ -142,6 +144,47 @@ def test_a_message_of_a_j1939_data_base_has_any_priority(tmp_path: Path) -> None
     match = IdMatch.of(layout)
     assert all(priority << 26 | GROUP_AND_SOURCE | EXTENDED in match for priority in range(8))
     assert GROUP_AND_SOURCE not in match  # of 11 bits
+
+
+ENGINE = (
+    'VERSION ""\nBU_: N\n'
+    f"BO_ {0x98FEF2FE} Engine: 8 N\n"
+    ' SG_ Speed : 24|16@1+ (0.125,0) [0|8031.875] "rpm" N\n'
+    ' SG_ Oil : 16|8@1+ (1,-40) [-40|210] "degC" N\n'
+    ' SG_ Level : 40|16@1+ (0.01,0) [0|655.35] "mm/s" N\n'
+)
+"""With the ranges of SAE J1939, but for the last; which format it has is not stated."""
+
+
+def test_ranges_of_j1939_mark_values_that_are_none_where_the_file_states_no_format(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "engine.dbc"
+    path.write_text(ENGINE)
+    channels = {one.lower(): [one] for one in ("Speed", "Oil", "Level")}
+    layout = layout_from_dbc(path, "Engine", counter=None, counts="frames", channels=channels)
+    assert layout.valid_raw == {"speed": (0.0, 0xFAFF), "oil": (0.0, 0xFA)}
+    path.write_text(ENGINE.replace(f"{0x98FEF2FE}", "801"))  # of 11 bits
+    assert not layout_from_dbc(path, "Engine", counter=None, counts="frames", channels=channels).valid_raw
+
+    path.write_text(ENGINE)
+    file = tmp_path / "engine.toml"
+    given = ["--yes", "--bus=can-dbc", f"--dbc={path}", "--rate=10"]
+    assert main(["new", f"{file}", *given]) == 0
+    capsys.readouterr()
+    assert main(["check", f"{file}"]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "channel signals no value (SAE J1939)" in shown
+    assert "Oil Oil raw values above 0xFA Speed Speed raw values above 0xFAFF" in shown
+
+
+def test_a_message_of_another_source_address_is_named_with_the_number_to_write() -> None:
+    messages = {"Engine": 0x18FEF2FE, "Fan": 0x18FEF3FE}
+    [words] = other_sources([0x0CFEF221, 0x18FF0021], messages)
+    assert words == (
+        "0x0CFEF221 is Engine from the source address 0x21; in the DBC file it has 0xFE (SAE J1939). Remedy: "
+        f"in a copy of the DBC file write BO_ {0x8CFEF221} in place of BO_ {0x98FEF2FE}"
+    )
 
 
 def test_a_priority_needs_an_id_that_has_one() -> None:
