@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from daqsvc.errors.command_line import NOT_OPENED, NOTHING_ON_BUS, WRONG_VALUE
-from daqsvc.settings.units import unit_of
+from daqsvc.settings.units import is_of_peak, unit_of
 
 if TYPE_CHECKING:
     import threading
@@ -249,7 +249,8 @@ def sensor_lines(
         known = unit_of(given)
         unit = given.strip() if known is None else known.name
         known_values = (values or {}).get(channel, UNKNOWN_VALUES)
-        kind = type_by_unit(channel, unit, waveform=waveform, values=known_values) or "trend"
+        by_unit = type_by_unit(channel, unit, waveform=waveform, values=known_values)
+        kind = "trend" if is_of_peak(given) else by_unit or "trend"
         if kind in {"trend", "proximity"}:  # a probe needs more keys than can be known here
             kind = "trend"
             unit = text.strip()

@@ -86,6 +86,7 @@ _BY_SPELLING = {
 _OTHERS = frozenset(("Nm", "NM", "mPa", "gal"))
 # How a level was made shows nothing of its unit: "mm/s RMS", "um p-p".
 _QUALIFIER = re.compile(r"[_ ]*\(?(?:rms|pk-?pk|p-?p|pp|0-?p|0-?pk|peak|pk)\)?$", re.IGNORECASE)
+_OF_PEAK = re.compile(r"(?:[_ (]|\b)(?:pk-?pk|p-?p|pp|0-?p|0-?pk|peak|pk)\)?$", re.IGNORECASE)
 _DROPPED = re.compile(r"[\s^*()\[\]{}·⋅]+")
 _SECONDS = re.compile(r"(?<![a-z])seconds?|(?<![a-z])sec(?![a-z])")
 _PER = re.compile(r"(?<=[a-z])per(?=[a-z])")
@@ -145,6 +146,11 @@ def unit_of(text: str) -> Unit | None:
     plain = _DROPPED.sub("", _plain(text))
     plain = _SECONDS.sub("s", _PER.sub("/", plain)).replace("squared", "2")
     return _BY_SPELLING.get(plain)
+
+
+def is_of_peak(text: str) -> bool:
+    """Whether a text is a unit with a word for peak or peak to peak, e.g. ``mm/s pk``: no RMS."""
+    return _OF_PEAK.search(text.strip()) is not None and unit_of(text) is not None
 
 
 def _plain(text: str) -> str:

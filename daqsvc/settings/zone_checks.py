@@ -11,7 +11,7 @@ from daqsvc.settings.measures import UNITS, VELOCITIES
 from daqsvc.settings.problems import Finding
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.sensors import ProximityProbe, TrendValue
-from daqsvc.settings.units import same_unit
+from daqsvc.settings.units import is_of_peak, same_unit
 from daqsvc.settings.zones import boundaries
 
 if TYPE_CHECKING:
@@ -126,6 +126,6 @@ def _of_housing(
 def _remedy(other: TrendValue | None) -> str:
     if other is None:
         return 'write measure = "velocity_rms", or setpoints in place of zones'
-    if same_unit(other.unit, "mm/s"):
+    if same_unit(other.unit, "mm/s") and not is_of_peak(other.unit):
         return f'write unit = "mm/s" for "{other.name}"'
     return "give it its own alarm, with setpoints in place of zones"

@@ -90,11 +90,15 @@ def most_likely_samples(signals: Iterable[Any], names: Sequence[str]) -> list[st
 
 
 def unit_names(signals: Iterable[Any], names: Iterable[str]) -> dict[str, str]:
-    """Units of the signals of these names, as far as they are known, as machine files write them."""
-    from daqsvc.settings.units import unit_of  # noqa: PLC0415 - brings the settings
+    """Units of the signals of these names, as far as they are known, as machine files write them.
+
+    Those of peak values are not among them: what is known of ``mm/s`` is not so of ``mm/s pk``.
+    """
+    from daqsvc.settings.units import is_of_peak, unit_of  # noqa: PLC0415 - brings the settings
 
     chosen = set(names)
-    known = {one.name: unit_of(one.unit or "") for one in signals if one.name in chosen}
+    stated = {one.name: one.unit or "" for one in signals if one.name in chosen}
+    known = {name: unit_of(text) for name, text in stated.items() if not is_of_peak(text)}
     return {name: unit.name for name, unit in known.items() if unit is not None}
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from daqsvc.documentation import documented_in
 from daqsvc.rounding import counted
-from daqsvc.settings.units import may_be_unit, unit_of
+from daqsvc.settings.units import is_of_peak, may_be_unit, unit_of
 from drivers.serial.ports import lasting_name
 from drivers.sniffing import (
     Sniffed,
@@ -790,7 +790,7 @@ def _counter(what: TextLines) -> Column | None:
 def unit_of_suffix(suffix: str) -> str:
     """The unit that a text behind numbers means, as a machine file spells it; ``1`` if it is none."""
     known = unit_of(suffix)
-    if known is not None:
+    if known is not None and not is_of_peak(suffix):
         return known.name
     return suffix if suffix and may_be_unit(suffix) else "1"
 

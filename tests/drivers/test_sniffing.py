@@ -31,6 +31,8 @@ def test_what_has_no_unit_is_taken_for_an_acceleration_where_it_comes_as_often_a
         ("g", 20.0, "trend"),
         ("g", WAVEFORM_HZ, "accelerometer"),
         ("mg", WAVEFORM_HZ, "accelerometer"),
+        ("mm/s pk", WAVEFORM_HZ, "trend"),
+        ("g p-p", WAVEFORM_HZ, "trend"),
         ("mm/s^2", WAVEFORM_HZ, "accelerometer"),
         ("°C", 20.0, "trend"),
     ],

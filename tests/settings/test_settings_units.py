@@ -6,7 +6,7 @@ import pytest
 from support.machine_files import MACHINES, parsed
 
 from daqsvc.errors.machine_file import UNIT_UNKNOWN
-from daqsvc.settings.units import factor_between, may_be_unit, same_unit, unit_of
+from daqsvc.settings.units import factor_between, is_of_peak, may_be_unit, same_unit, unit_of
 
 TRENDS = MACHINES / "modbus-vibration-temperature.toml"
 
@@ -90,3 +90,15 @@ def test_the_unit_of_a_value_that_is_none_is_a_warning(unit, warns):
     machine = parsed(TRENDS, ('"temperature"\nunit = "degC"', f'"temperature"\nunit = "{unit}"'))
     said = [warning for warning in machine.warnings if warning.code is UNIT_UNKNOWN]
     assert [(one.key, one.message) for one in said] == warns * [("sensors[2].unit", "is not known as a unit")]
+
+
+@pytest.mark.parametrize(
+    "text", ["mm/s pk", "mm/s 0-p", "mm/s p-p", "um pp", "mm/s peak", "mm/s (peak)", "g_pk"]
+)
+def test_a_word_for_peak_behind_a_unit_is_seen(text: str) -> None:
+    assert is_of_peak(text)
+
+
+@pytest.mark.parametrize("text", ["mm/s", "mm/s RMS", "rpm", "ppm", "mps", "bar", "peak", "pk", ""])
+def test_a_unit_without_one_is_not_of_a_peak(text: str) -> None:
+    assert not is_of_peak(text)

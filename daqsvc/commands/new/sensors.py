@@ -18,7 +18,7 @@ from daqsvc.settings.measures import (
     highest_hz,
     shows_1x,
 )
-from daqsvc.settings.units import factor_between, unit_of
+from daqsvc.settings.units import factor_between, is_of_peak, same_unit, unit_of
 from drivers import questions as q
 from drivers.bus_questions import STREAM
 from drivers.questions import NONE, Answers, Question, sensor_key
@@ -68,6 +68,13 @@ _PULSE_SAMPLES, _HARMONIC_SAMPLES = 4.0, 12.0
 _LONGEST_WINDOW_S = 10.0
 
 
+_NO_RMS = re.compile(
+    r"peak|max|set_?point|limit|belt|conveyor|pk(?=[_\d]|$)",
+    re.IGNORECASE,
+)
+"""In names of channels in mm/s that are no RMS of a vibration: zones of ISO 20816-3 are not for them."""
+
+
 class Sensor(NamedTuple):
     """A sensor, as it was answered."""
 
@@ -92,11 +99,20 @@ class Sensor(NamedTuple):
         return {"proximity": ("rms", self.unit), "trend": ("value", self.unit)}.get(self.type)
 
     @property
+    def no_rms(self) -> bool:
+        """Whether it is a value in mm/s that is no RMS by its unit, or hardly by the name of its channel."""
+        if self.type != "trend" or not same_unit(self.unit, "mm/s"):
+            return False
+        return is_of_peak(self.unit) or _NO_RMS.search(self.channel) is not None
+
+    @property
     def iso(self) -> str | None:
         """Which zones of ISO 20816-3 are there for it: ``housing`` or ``shaft``."""
         if self.type == "proximity":
             return "shaft"
         measured_there = self.type == "trend" and self.unit == "mm/s"
+        if measured_there and self.no_rms:
+            return None
         return "housing" if measured_there or (self.housing and self.shows_speed) else None
 
 
@@ -201,14 +217,10 @@ def _of_channel(answers: Answers, channel: str) -> Iterator[Question]:
         yield ask("threshold", q.number_in("V"), "-6")
 
 
-_OF_PEAKS = re.compile(r"(?:0-?p|p-?p|pp|pk|peak)\W*$", re.IGNORECASE)
-"""At the end of a unit: the values are no RMS."""
-
-
 def _unit(text: str) -> str:
     """A unit as machine files spell it, however it was typed: ``mm/sec`` is ``mm/s``."""
     written = q.line(text)
-    known = None if _OF_PEAKS.search(written) else unit_of(written)
+    known = None if is_of_peak(written) else unit_of(written)
     return written if known is None else known.name
 
 
@@ -286,7 +298,7 @@ def limit_questions(answers: Answers) -> Iterator[Question]:
         del choices["iso"]
         read = q.one_of(choices)
         slow = _too_slow(answers) if any(one.housing for one in limited) else ""
-        if in_range and (reason := slow or _other_velocities(limited)):
+        if in_range and (reason := slow or _other_velocities(limited) or _no_rms_words(limited)):
             why = f"No zones of ISO 20816-3: {reason}"
             topic, read = q.Topic(f"{why}\n{topic.text}", f"{why} {topic.help}"), _without_zones(read, why)
     probes = limited[0].type == "proximity"
@@ -325,13 +337,14 @@ def _with_own_limits(there: Sequence[Sensor]) -> list[Sensor]:
 
 def _other_velocities(there: Sequence[Sensor]) -> str:
     """Which velocities have no zones, as they are in another unit; empty if none is."""
-    units = {one.name: one.unit for one in there if one.type == "trend" and one.iso is None}
+    levels = [one for one in there if one.type == "trend" and one.iso is None]
+    units = {one.name: one.unit for one in levels if one.unit != "mm/s"}
     known = {name: unit_of(unit) for name, unit in units.items()}
     others = [name for name, unit in known.items() if unit is not None and unit.quantity == "velocity"]
     if not others:
         return ""
     first = units[others[0]]
-    factor = None if _OF_PEAKS.search(first) else factor_between(first, "mm/s")
+    factor = None if is_of_peak(first) else factor_between(first, "mm/s")
     remedy = (
         "Have the device send its RMS"
         if factor is None
@@ -343,6 +356,17 @@ def _other_velocities(there: Sequence[Sensor]) -> str:
     )
 
 
+def _no_rms_words(there: Sequence[Sensor]) -> str:
+    """Which values in mm/s have no zones, as they are hardly an RMS; empty if none is."""
+    if not (left := [one for one in there if one.no_rms]):
+        return ""
+    shown = ", ".join(f"{one.name} ({one.unit})" for one in left)
+    return (
+        f"they are for its RMS, and unit or name of {shown} tells of another value. Write [[alarms]] with "
+        "limits of your own for it, or name the channel otherwise if it is an RMS."
+    )
+
+
 def limits_words(answers: Answers) -> list[str]:
     """What the limits are not for, and so has no alarm; nothing if they are for all."""
     there = [one for one in sensors(answers) if one.measure is not None]
@@ -350,6 +374,8 @@ def limits_words(answers: Answers) -> list[str]:
         return [f"The zones of ISO 20816-3 are not for every velocity: {why}"]
     with_limits = _with_own_limits(there)
     others = ", ".join(one.name for one in there if one not in with_limits)
+    if answers.get("limits") != "own" and (why := _no_rms_words(there)):
+        return [f"No limits of ISO 20816-3 are proposed for every velocity: {why}"]
     if answers.get("limits") != "own" or not others:
         return []
     names = ", ".join(one.name for one in with_limits)

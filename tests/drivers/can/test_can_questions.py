@@ -121,6 +121,35 @@ def test_the_unit_of_the_dbc_file_is_taken_over(
     assert ("[F40]" in capsys.readouterr().out) == (unit == "1")
 
 
+@pytest.mark.parametrize(
+    ("name", "stated", "unit"),
+    [
+        *(
+            ("OilTemp", f"mm/s {word}", f"mm/s {word}")
+            for word in ("pk", "0-p", "p-p", "pp", "peak", "(peak)")
+        ),
+        *((name, "mm/s", "mm/s") for name in ("VPeak", "Vmax", "AlarmSetpoint", "BeltSpeed", "Vib_pk")),
+    ],
+)
+def test_what_is_no_rms_gets_no_zones_of_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, stated: str, unit: str
+) -> None:
+    dbc = GEARBOX.replace("OilTemp", name).replace('"degC"', f'"{stated}"')
+    tables = new(tmp_path, dbc, "--message=Slow", f"--signals={name}", "--rate=10")
+    assert [one["unit"] for one in tables["sensors"]] == [unit]
+    assert "alarms" not in tables
+    said = f"No limits of ISO 20816-3 are proposed for {name} ({unit}): these are for the RMS of the velocity"
+    assert said in " ".join(capsys.readouterr().out.split())
+    assert said in " ".join((tmp_path / "new.toml").read_text("utf-8").replace("\n# ", " ").split())
+
+
+@pytest.mark.parametrize(("name", "stated"), [("VelRms", "mm/s"), ("OilTemp", "mm/s RMS"), ("Vib", "mm/s")])
+def test_an_rms_has_the_zones(tmp_path: Path, name: str, stated: str) -> None:
+    dbc = GEARBOX.replace("OilTemp", name).replace('"degC"', f'"{stated}"')
+    tables = new(tmp_path, dbc, "--message=Slow", f"--signals={name}", "--rate=10")
+    assert [one["zones"]["standard"] for one in tables["alarms"]] == ["iso-20816-3"]
+
+
 @pytest.mark.parametrize("text", ["Slow", "0x321", "id 0x321", "801"])
 def test_a_message_may_be_named_by_the_id_that_the_list_shows(tmp_path: Path, text: str) -> None:
     assert layout_of(new(tmp_path, GEARBOX, f"--message={text}", "--rate=10 Hz"))["message"] == "Slow"
