@@ -290,6 +290,28 @@ def test_a_value_whose_name_tells_no_vibration_gets_no_limits_of_one(tmp_path):
     assert [one["sensor"] for one in alarms] == ["vibration"]
 
 
+@pytest.mark.parametrize(
+    ("options", "unit"),
+    [
+        (["--bus=modbus-tcp", "--host=::1", "--channels=vib_peak"], "mm/s"),
+        (
+            [
+                *("--bus=serial", "--port=/dev/ttyS0", "--columns=n,v", "--counter=n", "--rate=10"),
+                "--sensor=v.suffix=mm/s pk",
+            ],
+            "mm/s pk",
+        ),
+    ],
+)
+def test_a_peak_value_gets_no_zones_of_an_rms_on_any_bus(tmp_path, options, unit):
+    file = tmp_path / "m.toml"
+    assert main(["new", "--yes", *options, f"{file}"]) == 0
+    machine = load_machine_file(file)
+    assert [one.unit for one in machine.sensors] == [unit]
+    assert not machine.alarms
+    assert "No limits of ISO 20816-3 are proposed for" in file.read_text()
+
+
 def assumed_keys(text: str) -> set[str]:
     """Keys of the lines that are marked; of a channel, ``channels``."""
     marked = [line.strip() for line in text.splitlines() if "  # assumed" in line]
