@@ -362,8 +362,8 @@ def _no_rms_words(there: Sequence[Sensor]) -> str:
         return ""
     shown = ", ".join(f"{one.name} ({one.unit})" for one in left)
     return (
-        f"they are for its RMS, and unit or name of {shown} tells of another value. Write [[alarms]] with "
-        "limits of your own for it, or name the channel otherwise if it is an RMS."
+        f"they are for its RMS, and by unit or name {shown} is another value. Write [[alarms]] with limits "
+        "of your own for it, or name the channel otherwise if it is an RMS."
     )
 
 

@@ -138,7 +138,7 @@ def test_what_is_no_rms_gets_no_zones_of_one(
     tables = new(tmp_path, dbc, "--message=Slow", f"--signals={name}", "--rate=10")
     assert [one["unit"] for one in tables["sensors"]] == [unit]
     assert "alarms" not in tables
-    said = f"No limits of ISO 20816-3 are proposed for {name} ({unit}): these are for the RMS of the velocity"
+    said = f"by unit or name {name} ({unit}) is another value. Write [[alarms]]"
     assert said in " ".join(capsys.readouterr().out.split())
     assert said in " ".join((tmp_path / "new.toml").read_text("utf-8").replace("\n# ", " ").split())
 
