@@ -418,7 +418,7 @@ def _check_speed(draft: MachineFile) -> Iterator[Finding]:
     if abs(speed_rpm) < _SLOW_RPM and to_a_thousandth:
         yield Finding(
             ("machine", "speed_rpm"),
-            "is very slow, and the point is a decimal point",
+            "is slow for a shaft, and the point is a decimal point",
             f"write speed_rpm = {round(1000 * speed_rpm)}.0 if that is meant; or leave it",
             fatal=False,
             code=THOUSANDS,

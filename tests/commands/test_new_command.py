@@ -1061,7 +1061,9 @@ def test_another_unit_behind_a_number_is_refused(read, text):
 def test_a_point_between_thousands_of_a_speed_is_doubted_once(speed, meant):
     said, instead = doubt_of_speed(speed)
     assert instead == meant
-    assert said.startswith(f"{speed:g} rpm is very slow, and the point is a decimal point here. Enter takes")
+    assert said.startswith(
+        f"{speed:g} rpm is slow for a shaft, and the point is a decimal point here. Enter takes"
+    )
 
 
 @pytest.mark.parametrize("speed", [1485.0, 1485.5, 120.5, 12.0, 0.0123])
@@ -1080,7 +1082,7 @@ def test_a_speed_with_a_point_between_thousands_is_asked_again():
 
     answers = conduct(Path("m.toml"), Given({"bus": "can"}, defaults=False), ask, said.append)
     assert (answers["speed"], offered) == (1485.0, ["1480", "1485"])
-    assert [one for one in said if one.startswith("1.485 rpm is very slow")]
+    assert [one for one in said if one.startswith("1.485 rpm is slow for a shaft")]
 
 
 def test_a_can_bus_is_asked_for_its_bit_rate_as_it_is_said(tmp_path):
