@@ -55,6 +55,15 @@ RAISED = {"UnknownAlarmError": "C05"}
 HAD = ROOT / "tests" / "errors" / "messages.txt"
 """Messages that tests have had from the program, each behind its code."""
 ERRORS_PAGE = "reference/errors"
+SPOKEN = {
+    "drivers/can/": "sniff#can",
+    "drivers/serial/": "sniff#serial-ports",
+    "drivers/modbus/": "sniff#modbus",
+    "daqsvc/commands/new/": "sniff",
+}
+"""Where is described what ``daqsvc sniff`` and ``daqsvc new`` state of a bus: messages without codes."""
+SPEAKERS = re.compile(r"heard|sniff|traffic|likely|recognise|scan|source|interview|sensors")
+"""Names of the modules that state it."""
 
 
 def _words_apart(node: nodes.Node) -> Iterator[str]:
@@ -124,6 +133,18 @@ def messages() -> dict[str, set[str]]:
                     found[codes.pop()].update(_texts(node))
     for code, text in (*_raised_messages(trees.values()), *_had_messages()):
         found[code].add(text)
+    return found
+
+
+def spoken() -> dict[str, set[str]]:
+    """The texts of what ``daqsvc sniff`` and ``daqsvc new`` state, by the place that describes them."""
+    coded = {text for those in messages().values() for text in those}
+    found: dict[str, set[str]] = {}
+    for folder, place in SPOKEN.items():
+        for file in sorted((ROOT / folder).glob("*.py")):
+            if SPEAKERS.search(file.stem):
+                texts = {text for text in _texts(ast.parse(file.read_text("utf-8"))) if text.count(" ") > 1}
+                found.setdefault(place, set()).update(texts - coded)
     return found
 
 
@@ -205,6 +226,11 @@ def _write_index(app: Sphinx, failure: Exception | None) -> None:
     index = {"pages": pages, "titles": titles, "entries": found, "lengths": lengths, "terms": terms}
     index["messages"] = said
     places = {f"{pages[one]}#{anchor}".rstrip("#"): number for number, (one, anchor, *_) in enumerate(found)}
+    for place, texts in spoken().items():
+        if place in places:
+            said.append((places[place], sorted(texts)))
+        else:
+            _log.warning("SPOKEN: no such place: %s", place)
     index["questions"] = [*questions(places, language)]
     text = json.dumps(index, ensure_ascii=False, separators=(",", ":"), sort_keys=True)
     (Path(app.outdir) / "_static" / INDEX).write_text(f"const SITE_INDEX = {text};\n", encoding="utf-8")

@@ -215,8 +215,8 @@ def doubt_of_speed(speed_rpm: float) -> tuple[str, str] | None:
     if meant is None:
         return None
     reason = (
-        f"{speed_rpm:g} rpm is slow for a shaft, and the point is a decimal point here. Enter takes {meant}; type "
-        f"{speed_rpm:g} again if the shaft turns so slowly"
+        f"{speed_rpm:g} rpm is slow for a shaft, and the point is a decimal point here. Enter takes {meant}; "
+        f"type {speed_rpm:g} again if the shaft turns so slowly"
     )
     return reason, f"{meant}"
 

@@ -140,7 +140,7 @@ const rankByQuestions = (text, scores) => {
 /* A message that was copied has pairs of words that its text in the source has; names and figures are between them. */
 const LEAST_PAIRS = 3;
 /* A question is no message, though it has such pairs, too; the name of a CAN bus is no question. */
-const QUESTION = /^\s*(how|what|where|why|when|which|who|can(?! (bus|interface)\b)|does|do|is)\b|\?\s*$/i;
+const QUESTION = /^\s*(how|what|where|why|when|which|who|can(?! (bus|interface)\b)|does(?! not\b)|do(?! not\b)|is)\b|\?\s*$/i;
 
 const pairsOf = (text) => {
   const pairs = new Set();
