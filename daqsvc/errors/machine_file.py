@@ -445,6 +445,6 @@ THOUSANDS = Code(
     "point is a decimal point in machine files.",
     "Write the speed in rpm without a point between thousands; or leave it if the shaft turns so slowly.",
     "machine-file.md",
-    example="machine.toml:12: machine.speed_rpm = 1.485: is slow for a shaft, and the point is a decimal "
+    example="machine.toml:20: machine.speed_rpm = 1.485: is slow for a shaft, and the point is a decimal "
     "point. Remedy: write speed_rpm = 1485.0 if that is meant; or leave it",
 )
