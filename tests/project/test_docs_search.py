@@ -140,7 +140,6 @@ PLAIN = {
     "more than 4 times as many frames come as the file states": "reference/errors.html#b38-",
     "is it the file of this device?": "sniff.html#can",
     "SensorState is left out: its values have names": "sniff.html#can alarms.html#a-state-or-an-enum-signal",
-    "does not grow by 1 from frame to frame": "sniff.html#can",
     "two devices same CAN id": "can.html#if-no-frames",
     "accelerometer in mg": "can.html#the-frames reference/keys-sensors",
     "not available 0xFFFF J1939": "can.html#the-frames",
