@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from daqsvc.diagnosis.detector import Window
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.rotor.discretise import BankMode
-    from daqsvc.rotor.model import RotorParameters
+    from daqsvc.rotor.model import NormalisedRotor, RotorParameters
 
     Floats = NDArray[np.float64]
 
@@ -181,6 +181,7 @@ class RotorBankDetector:
             rest=self._bank_modes[0].rotor.rest,
             probes=(probes[0].name, probes[1].name),
             keyphasor=keyphasor.name,
+            backward=_backward_share(self._bank_modes[0].rotor),
         )
         if calibrate_revolutions < 0:
             raise ValueError(
@@ -530,3 +531,10 @@ class RotorBankDetector:
             misfit=self._misfit,
             missing_share=float(np.isnan(self._last_revolution[:, :2]).any(axis=1).mean()),
         )
+
+
+def _backward_share(healthy: NormalisedRotor) -> float:
+    """Backward over forward radius of the healthy orbit, the most of it at the speeds about its own."""
+    forward, backward = np.abs(hunting(healthy, healthy.w)[:, :2]).T
+    seen = forward > 0.0
+    return float(np.max(backward[seen] / forward[seen], initial=0.0))

@@ -24,6 +24,8 @@ _CONTACT_FREE = 0.9
 """An orbit that stays within this part of the clearance is not driven backwards by a rub."""
 _BACKWARD = 2.0
 """Backward over forward radius from which the orbit as a whole turns backwards."""
+_ERROR = 1.5
+"""By this factor a model of the healthy machine may be wrong in how much of its orbit turns backwards."""
 _DIRECTION_REVOLUTIONS = 4
 _DC_REVOLUTIONS = 4
 _NO_DC = 0.25
@@ -43,14 +45,25 @@ class OrbitWatch:
         rest: expected static position, in clearances; 0 if none is to be seen.
         probes: names of the two probes.
         keyphasor: name of the keyphasor.
+        backward: backward over forward radius of the healthy orbit. Near a critical speed, supports that are
+            softer in one direction turn the whole orbit backwards.
     """
 
-    def __init__(self, *, noise: float, rest: complex, probes: tuple[str, str], keyphasor: str) -> None:
+    def __init__(
+        self,
+        *,
+        noise: float,
+        rest: complex,
+        probes: tuple[str, str],
+        keyphasor: str,
+        backward: float = 0.0,
+    ) -> None:
         self._noise = noise
         self._expected_rest = rest
         self._pair = f"{probes[0]} and {probes[1]}"
         self._keyphasor = keyphasor
         self._static_seen = rest == 0.0
+        self._most_backward = max(1.0, _ERROR * backward)
         self.reset()
 
     def reset(self) -> None:
@@ -60,6 +73,7 @@ class OrbitWatch:
         self._forward = False
         self._motions: deque[SteadyMotion] = deque(maxlen=_SLIP_REVOLUTIONS)
         self._doubt = ""
+        self._unclear = ""
 
     def add(self, xy: Floats, cos: Floats, sin: Floats, revolution: int) -> None:
         """Take in a block.
@@ -83,7 +97,7 @@ class OrbitWatch:
 
     @property
     def confirmed(self) -> bool:
-        """Whether the orbit has been seen to turn with the shaft, or to meet the housing, where it need not.
+        """Whether the orbit has been seen to turn as it should, or to meet the housing, where it need not.
 
         Until then the models may not be compared: what is strange to all of them favours the one that
         expects the least.
@@ -102,13 +116,16 @@ class OrbitWatch:
     def _look(self) -> None:
         """Look at the orbit with one more revolution."""
         motions = list(self._motions)
-        self._doubt = self._direction() or self._static_position() or self._slip()
         if not self._forward:
             forward = _radius([motion.forward for motion in motions])
             backward = _radius([motion.backward for motion in motions])
             rest = _radius([motion.rest for motion in motions])
-            clear = forward > max(backward, _SIGNIFICANT * self._sigma(motions))
+            seen = max(forward, backward) > _SIGNIFICANT * self._sigma(motions)
+            clear = seen and backward < self._most_backward * forward
             self._forward = clear or forward + backward + rest > _CONTACT_FREE
+            unclear = seen and not self._forward and len(motions) == _SLIP_REVOLUTIONS
+            self._unclear = _unclear_words(self._pair, forward, backward) if unclear else ""
+        self._doubt = self._direction() or self._static_position() or self._slip() or self._unclear
 
     def _sigma(self, motions: list[SteadyMotion]) -> float:
         """Standard deviation of a mean of one part, complex, over several revolutions."""
@@ -121,7 +138,7 @@ class OrbitWatch:
         forward = _radius([motion.forward for motion in motions])
         backward = _radius([motion.backward for motion in motions])
         rest = _radius([motion.rest for motion in motions])
-        if backward < max(_BACKWARD * forward, _SIGNIFICANT * self._sigma(motions)):
+        if backward < max(_BACKWARD * self._most_backward * forward, _SIGNIFICANT * self._sigma(motions)):
             return ""
         if forward + backward + rest > _CONTACT_FREE:
             return ""
@@ -171,6 +188,15 @@ class OrbitWatch:
             f"than the pulses of {self._keyphasor}; they do not see the same shaft, or pulses are "
             "miscounted: check the keyphasor's channel and its threshold"
         )
+
+
+def _unclear_words(pair: str, forward: float, backward: float) -> str:
+    return (
+        f"{pair}: the orbit does not turn clearly with the shaft (1X radius {forward:.3g} clearances "
+        f"forward, {backward:.3g} backward), so the models cannot be compared. Near a critical speed, "
+        "supports that are softer in one direction do this: calibrate the rotor by a run-up. Else correct "
+        "angle_deg of the probes"
+    )
 
 
 def _radius(parts: Sequence[complex]) -> float:

@@ -54,13 +54,17 @@ def channels(position, angle, seed=0):
 @pytest.fixture(scope="module")
 def calibrated(tmp_path_factory) -> Path:
     """A folder with the calibration that ``daqsvc calibrate`` makes of a run-up, and the run-up."""
-    folder = tmp_path_factory.mktemp("rig")
-    position, angle = run_up(MACHINE, 8.0, 50.0, 20.0)
+    return calibrated_in(tmp_path_factory.mktemp("rig"), MACHINE, clearance_um=250)
+
+
+def calibrated_in(folder: Path, machine: Machine, clearance_um: int) -> Path:
+    position, angle = run_up(machine, 8.0, 50.0, 20.0)
     table = channels(position, angle)
     header = "x,y,kph"
     np.savetxt(folder / "run-up.csv", table, fmt="%.3f", delimiter=",", header=header, comments="")
     arguments = ["calibrate", str(folder / "run-up.csv"), "--probes", "x,y", "--keyphasor", "kph"]
-    arguments += ["--fs", str(RATE_HZ), "--unit", "um", "--clearance-um", "250"]
+    arguments += ["--fs", str(RATE_HZ), "--unit", "um"]
+    arguments += ["--clearance-um", f"{clearance_um}"]
     assert main([*arguments, "--out", str(folder / "rotor.toml")]) == 0
     return folder
 
@@ -132,6 +136,32 @@ def test_faults_of_a_machine_that_is_no_laval_rotor_are_named(calibrated, fault,
     assert {one.decision for one in healthy} <= {"undetermined", "N"}
     assert healthy[-1].decision == "N"
     assert detector.faults[said[-1].decision] == fault
+
+
+BACKWARD = Machine(supports=(1.7, 3.8), dampers=(0.5, 0.5))
+"""Between its two critical speeds the orbit turns backwards: 49 um against 36 um forward."""
+WIDE = ("clearance_um = 250.0", "clearance_um = 400.0")
+
+
+def test_a_healthy_orbit_that_turns_backwards_is_watched_by_a_bank_of_its_run_up(tmp_path):
+    calibrated_in(tmp_path, BACKWARD, clearance_um=400)
+    detector, said = said_of(machine_of(tmp_path, WIDE), [BACKWARD, BACKWARD.softened(0.7)])
+    healthy = [one for one in said if one.end_index < 60.0 * RATE_HZ / SPEED_HZ]
+    assert {one.quality for one in healthy[8:]} == {"good"}
+    assert healthy[-1].decision == "N"
+    assert said[-1].decision != "N"
+    assert "stiffness_loss" in {detector.faults[name] for name in (said[-1].decision, *said[-1].group)}
+
+
+def test_an_orbit_of_no_clear_direction_is_said_where_nothing_tells_that_it_may_be(tmp_path):
+    without = [(old, new.partition("\ncalibration")[0]) for old, new in (*ON_THIS_RIG, WIDE)]
+    path = tmp_path / "machine.toml"
+    path.write_text(changed(TWELVE, *without)[0], encoding="utf-8")
+    _, said = said_of(parse_machine_file(path.read_text(encoding="utf-8"), path), [BACKWARD])
+    assert {one.decision for one in said} == {"undetermined"}
+    assert said[-1].quality == "not_ok"
+    assert "the orbit does not turn clearly with the shaft (1X radius 0.0" in said[-1].reason
+    assert "calibrate the rotor by a run-up" in said[-1].reason
 
 
 RUB_ROOM_UM = 130.0
