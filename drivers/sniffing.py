@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from daqsvc.errors.command_line import NOT_OPENED, NOTHING_ON_BUS, WRONG_VALUE
-from daqsvc.settings.units import is_of_peak, unit_of
+from daqsvc.settings.units import is_of_peak, may_be_unit, unit_of
 
 if TYPE_CHECKING:
     import threading
@@ -322,3 +322,11 @@ def sniffed(
     if found.problem:
         raise NothingFoundError(found.problem, found.figures)
     return found.figures
+
+
+def unit_of_suffix(suffix: str) -> str:
+    """The unit that a text behind numbers means, as a machine file spells it; ``1`` if it is none."""
+    known = unit_of(suffix)
+    if known is not None and not is_of_peak(suffix):
+        return known.name
+    return suffix if suffix and may_be_unit(suffix) else "1"

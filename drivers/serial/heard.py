@@ -8,7 +8,7 @@ from daqsvc.rounding import counted
 from drivers import packed_questions as packed
 from drivers.bus_questions import Heard, guessed_sensors
 from drivers.questions import NONE, Answers, sensor_key
-from drivers.serial.sniff_report import (
+from drivers.serial.sniff_words import (
     ANY_BAUD,
     LINES_NEED,
     MUST_TURN,
@@ -22,7 +22,6 @@ from drivers.serial.sniff_report import (
     sync_words,
     turn_words,
     unchecked_words,
-    unit_of_suffix,
     width_words,
 )
 from drivers.sniffing import (
@@ -31,6 +30,7 @@ from drivers.sniffing import (
     by_name,
     quoted,
     table_name,
+    unit_of_suffix,
     unused,
     usual_rate,
 )

@@ -11,8 +11,8 @@ from drivers.bus_questions import BEFOREHAND, BUS, BusQuestions, only_port, seco
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
 from drivers.serial.heard import CRCS, DELIMITERS, HeardOnSerial
 from drivers.serial.sniff import SerialSniffer
-from drivers.serial.sniff_report import MUST_TURN, unit_of_suffix
-from drivers.sniffing import is_waveform_rate, sniffed, type_by_unit
+from drivers.serial.sniff_words import MUST_TURN
+from drivers.sniffing import is_waveform_rate, sniffed, type_by_unit, unit_of_suffix
 from drivers.toml_lines import array, entry
 
 if TYPE_CHECKING:

@@ -2,18 +2,31 @@
 
 from __future__ import annotations
 
-import math
-import re
 import textwrap
 from bisect import bisect_left, bisect_right
 from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from daqsvc.documentation import documented_in
 from daqsvc.rounding import counted
-from daqsvc.settings.units import is_of_peak, may_be_unit, unit_of
 from drivers.serial.ports import lasting_name
+from drivers.serial.sniff_words import (
+    ANY_BAUD,
+    LINES_NEED,
+    MUST_TURN,
+    NO_NUMBERS,
+    WIDEST,
+    absent_words,
+    frames_need,
+    no_number_words,
+    other_lines_words,
+    overrun_words,
+    printable,
+    sync_words,
+    turn_words,
+    unchecked_words,
+    width_words,
+)
 from drivers.sniffing import (
     Sniffed,
     SniffTable,
@@ -21,6 +34,7 @@ from drivers.sniffing import (
     rounded_rate,
     sensor_lines,
     table_name,
+    unit_of_suffix,
     unused,
 )
 
@@ -39,7 +53,6 @@ if TYPE_CHECKING:
 _SHOWN_LINES = 8
 _SHOWN_ROWS = 8
 _ROW = 16
-_WIDEST = 100
 _PER_S = {"s": 1.0, "ms": 1e3, "us": 1e6}
 _FAST = (9600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_800, 921_600, 2_000_000, 4_000_000, 12_000_000)
 """Baud rates to propose where the port has none."""
@@ -47,8 +60,6 @@ WAITING_S = 0.05
 """Within this time from the first byte on, those come that had been waiting in the port."""
 LEAST_TEXT = 8
 """Bytes that are text by chance at a wrong baud rate once in 2000 times."""
-_BEHIND_NUMBER = re.compile(r" *[+-]?[0-9]+(?:[.,][0-9]+)? *([^0-9.,: ][^0-9]*?) *")
-_LONGEST_SUFFIX = 16
 _LEAST_ALIKE = 3
 _FEW = 64
 _SURELY = 1.05
@@ -293,8 +304,8 @@ class Report(NamedTuple):
             yield self._frames(what)
 
     def _lines(self, what: TextLines) -> Iterator[str | SniffTable]:
-        shown = "\n".join(line[:_WIDEST] for line in what.lines[:_SHOWN_LINES])
-        yield f"The first lines:\n{_printable(shown)}"
+        shown = "\n".join(line[:WIDEST] for line in what.lines[:_SHOWN_LINES])
+        yield f"The first lines:\n{printable(shown)}"
         words = [counted(len(what.columns), "column")]
         between = "blanks" if what.separator == " " else quoted(what.separator)
         words += [f"separated by {between}"] * bool(what.separator)
@@ -667,132 +678,14 @@ def _tried_row(one: Tried) -> Sequence[str]:
     )
 
 
-NO_NUMBERS = "No column is a number, such as 22.5 or NAME=22.5: JSON and hex are not read."
-
-
-LINES_NEED = "A stream needs a column of numbers, best beside one that counts lines or has the device's time"
-"""Why nothing is proposed of lines."""
-
-
-def frames_need(payload: int) -> str:
-    """The same of binary frames with so many bytes between sync word and CRC."""
-    return f"A stream needs a counter: none was found in the {payload} bytes of payload, or nothing behind it"
-
-
-def unchecked_words(crc: str) -> str:
-    """What it means that frames have a CRC that the driver does not know."""
-    return f"The driver does not check {crc}: a damaged frame is taken for a good one."
-
-
-def width_words(bits: int, step: int, rate_hz: float | None) -> str:
-    """What it means that a counter may be wider, or narrower, than it is taken for."""
-    longer = ""
-    if rate_hz and bits < 32:
-        seconds = math.ceil(1.2 * 256 / step / rate_hz)
-        longer = f", or listen until a byte of it carries: --seconds {seconds}"
-    return (
-        f"That the counter has {bits} bits is a guess: its upper bytes did not change. With another "
-        f"width all values are of wrong bytes. Remedy: see the device's manual{longer}."
-    )
-
-
-def sync_words(sync: str) -> str:
-    """What it means that frames without a check begin with the same bytes."""
-    return (
-        f"That frames begin with {sync} is a guess, as they have no check that is known. A byte of a value "
-        "may be among these that did not change yet: when it does, all frames are lost. Remedy: correct "
-        "sync_word by the device's manual."
-    )
-
-
-def overrun_words(baud: int, proposed: int) -> str:
-    """What it means that more bytes come than a baud rate carries."""
-    return (
-        f"More bytes come than {baud} bit/s carry: the port does not use its baud rate, as USB devices often "
-        f"do not. {proposed} bit/s, which carry them, are proposed."
-    )
-
-
-ANY_BAUD = "as good as any: the port does not use it"
-"""What the baud rate of a port is that brings the same at all of them."""
-
-
-MUST_TURN = "one that begins again at 0 after 999, 9999 or the like is no counter for daqsvc"
-"""What a few seconds of a counter do not show."""
-
-
-def turn_words(name: str, turns_at: int) -> str:
-    """What a column means for daqsvc that begins again at 0 after 99, 999, ..."""
-    return (
-        f"{name} begins again at 0 after {turns_at - 1}: daqsvc cannot count lines by it. It would report "
-        "each turn as a restarted counter [B37], and samples as lost that are not. Use a column with the "
-        f"device's time, if there is one. See {documented_in('serial')}."
-    )
-
-
-def other_lines_words(count: int, heard: int, example: str) -> str:
-    """What it means that some lines are not like the others."""
-    are = "is" if count == 1 else "are"
-    return (
-        f"{count} of {heard} lines {are} not of this layout, e.g. {quoted(_printable(example[:_WIDEST]))}: "
-        "daqsvc counts such lines, and does not read them"
-    )
-
-
-def other_kinds_words(prefixes: Sequence[str]) -> str:
-    """What it means for a file with one stream that lines of other kinds come, too."""
-    return (
-        f"Lines that begin with {', '.join(prefixes)} come, too. This file reads one kind of line: add a "
-        "stream for each other one, as daqsvc sniff serial writes it."
-    )
-
-
 def _other_lines(what: TextLines) -> str:
     return other_lines_words(len(what.damaged), len(what.lines), what.damaged[0])
-
-
-def absent_words(name: str, absent: int, heard: int, text: str) -> str:
-    """What it means that a column has no value in some lines."""
-    shown = quoted(_printable(text)) if text else "nothing"
-    return (
-        f"{name} has no value in {absent} of {heard} lines: {shown} is there. Only these samples of it are "
-        f"missing. See {documented_in('serial')}."
-    )
-
-
-def no_number_words(texts: Mapping[str, str]) -> str:
-    """What it means that columns, by name, are no numbers."""
-    name, text = next(iter(texts.items()))
-    example = quoted(_printable(text[:_WIDEST]))
-    if len(texts) == 1:
-        begin = (
-            f"Column {name} is left out, as not every line has a number there, but e.g. {example}. If it is"
-        )
-    else:
-        begin = (
-            f"Columns {', '.join(texts)} are left out: not every line has numbers there, but e.g. {example}. "
-            "If they are"
-        )
-    beside = _BEHIND_NUMBER.fullmatch(text)
-    remedy = "have the device send decimal numbers"
-    if beside is not None and len(beside[1]) <= _LONGEST_SUFFIX:
-        suffix = quoted(_printable(beside[1]))
-        remedy = f"write suffix = {suffix} in its channel if this is always there, or {remedy}"
-    return f"{begin} to be watched, {remedy}."
 
 
 def _counter(what: TextLines) -> Column | None:
     """The column that counts lines: whole numbers, always by 1, to a power of two."""
     counts = (one for one in what.columns if one.numeric and one.step == 1 and one.least >= 0)
     return next((one for one in counts if not one.turns_at), None)
-
-
-def unit_of_suffix(suffix: str) -> str:
-    """The unit that a text behind numbers means, as a machine file spells it; ``1`` if it is none."""
-    known = unit_of(suffix)
-    if known is not None and not is_of_peak(suffix):
-        return known.name
-    return suffix if suffix and may_be_unit(suffix) else "1"
 
 
 def _prefixes(what: TextLines) -> str:
@@ -810,7 +703,3 @@ def _names(columns: Sequence[Column]) -> dict[Column, str]:
     """Names of columns that a machine file can have, each once."""
     taken: set[str] = set()
     return {one: unused(table_name(one.name, "column"), taken) for one in columns}
-
-
-def _printable(text: str) -> str:
-    return "".join(letter if letter.isprintable() or letter in "\n\t" else "?" for letter in text)

@@ -36,7 +36,8 @@ from drivers.serial.questions import SerialQuestions
 from drivers.serial.recognise import recognised
 from drivers.serial.recognise_lines import TextLines
 from drivers.serial.settings import LineLayout
-from drivers.serial.sniff_report import MUST_TURN, WAITING_S, Heard, Report, Tried
+from drivers.serial.sniff_report import WAITING_S, Heard, Report, Tried
+from drivers.serial.sniff_words import MUST_TURN
 from sim_hw.nodes.serial_node import PseudoTerminal
 
 if TYPE_CHECKING:
