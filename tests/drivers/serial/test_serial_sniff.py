@@ -126,10 +126,10 @@ def test_a_counter_that_begins_again_after_999_is_not_proposed(
     cable: PseudoTerminal, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def decimal(number: int) -> bytes:
-        return b"%d,%d.25,-1.5\r\n" % ((960 + number) % 1000, number % 7)
+        return b"%d,%d.25,-1.5\r\n" % ((850 + number) % 1000, number % 7)
 
     with talking(cable, decimal):
-        found = figures(cable, capsys)
+        found = figures(cable, capsys, "--seconds", "2")  # behind the first lines
     assert [(one["counts"], one["turns_at"]) for one in found["columns"]] == [
         (False, 1000),
         (False, None),
