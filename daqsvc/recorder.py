@@ -753,14 +753,15 @@ class MachineRecorder:
             oldest_ns = min(oldest_ns, max(self._continuous.waiting[0].at_ns, oldest_ns - 2 * HOLD_NS))
         history, kept = self._history, self._kept
         while history and history[0].at_ns < oldest_ns:
-            what = history.popleft().what
+            item = history.popleft()
+            what = item.what
             kept.since_begin = False
             if isinstance(what, AlarmEvent):
                 kept.alarms[what.alarm] = what
             elif isinstance(what, _Stands):
                 kept.standings[what.stream] = what.standing
             elif isinstance(what, Diagnosis):
-                kept.health.update(what)
+                kept.health.update(what, item.at_ns)
             elif isinstance(what, SampleBlock):
                 kept.streams.add(what.stream)
 
@@ -985,7 +986,7 @@ class MachineRecorder:
             elif isinstance(item.what, _Stands):
                 standings[item.what.stream] = item.what.standing
             elif isinstance(item.what, Diagnosis):
-                health.update(item.what)
+                health.update(item.what, item.at_ns)
         return {
             "schema": SCHEMA,
             "version": __version__,

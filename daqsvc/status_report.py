@@ -235,7 +235,8 @@ class StatusReport:
             "code": _id(NOT_BELIEVED if counted.get("doubt") else None),
             "samples_received": counted.get("samples_received", 0),
             "samples_lost": counted.get("samples_lost", 0),
-            "losses": stream.layout.losses,
+            # What no layout with a count or time has, be it of a driver that we do not know.
+            "losses": "estimated" if getattr(stream.layout, "no_counter", False) else "counted",
         }
 
     def _channels(self, seen: _Seen, states: Mapping[str, tuple[SensorState, str]]) -> Iterator[Document]:

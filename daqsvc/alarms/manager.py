@@ -341,7 +341,7 @@ class AlarmManager:
 
     def _events(self, diagnosis: Diagnosis, at: ClockReading) -> Iterator[AlarmEvent]:
         self._start_up.note(diagnosis)
-        touched = self._doubts.update(diagnosis)
+        touched = self._doubts.update(diagnosis, self._clock.monotonic_ns())
         yield from self._quality(touched.alarms, diagnosis, at)
         followers = self._ruled.fed_by(diagnosis.detector)
         for ruled in followers:

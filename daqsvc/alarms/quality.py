@@ -47,7 +47,7 @@ GOOD_NS = 3 * NS_PER_S
 
 
 HEARD_NS = 10 * NS_PER_S
-"""Samples come again, and they do not do: after so long that is the reason, no longer the silence before."""
+"""Samples come again, and no smaller share is missing: after so long that is the reason, not the silence."""
 
 LONGEST_CAUSE = 160
 """A cause is compared with others by so many of its characters."""
@@ -183,8 +183,8 @@ class SensorHealth:
         self._by_detector: dict[str, tuple[str, Doubt]] = {}
         # Why there are no samples by which to judge, by detector, until it states good.
         self._causes: dict[str, str] = {}
-        # When samples came again after that, by detector, while it lacks too many all the same.
-        self._heard_since_ns: dict[str, int] = {}
+        # After that, by detector, the least share that was missing since samples come again, and since when.
+        self._lacking_since: dict[str, tuple[float, int]] = {}
         # By detector, the stream that it cannot judge by.
         self._unjudged: dict[str, str] = {}
         self._by_alarm: defaultdict[str, dict[str, Doubt]] = defaultdict(dict)
@@ -210,8 +210,13 @@ class SensorHealth:
                 sensors[stream].update(doubted[1].sensors)
         return {stream: len(those) for stream, those in sorted(sensors.items())}
 
-    def update(self, diagnosis: Diagnosis) -> Touched:
-        """Take in a statement; returns what it is about."""
+    def update(self, diagnosis: Diagnosis, now_ns: int) -> Touched:
+        """Take in a statement; returns what it is about.
+
+        Args:
+            diagnosis: the statement.
+            now_ns: monotonic time; of what was missed in a silence, all statements come when it ends.
+        """
         detector = diagnosis.detector
         self._unjudged.pop(detector, None)
         name = quality_alarm(detector, diagnosis.sensors)
@@ -230,27 +235,30 @@ class SensorHealth:
             self._remember(name, doubt)
             touched |= _blames(doubt)
             if diagnosis.quality == "missing":
-                self._note_cause(diagnosis)
+                self._note_cause(diagnosis, now_ns)
         else:
             self._causes.pop(detector, None)
-            self._heard_since_ns.pop(detector, None)
+            self._lacking_since.pop(detector, None)
         # A detector may rest on other sensors than before: then what it had against those is settled, too.
         alarms = (name,) if before is None or before[0] == name else (before[0], name)
         return Touched(alarms, frozenset(touched))
 
-    def _note_cause(self, diagnosis: Diagnosis) -> None:
+    def _note_cause(self, diagnosis: Diagnosis, now_ns: int) -> None:
         """Note why samples are missing: by this one reason is told from another, whatever the words."""
         detector = diagnosis.detector
         if diagnosis.end_index == diagnosis.first_index:
             self._causes[detector] = f" ({_cause_of_missing(diagnosis.reason)})"
             self._unjudged[detector] = diagnosis.stream
-            self._heard_since_ns.pop(detector, None)
+            self._lacking_since.pop(detector, None)
         elif detector in self._causes:
-            # Mostly the next statements are good: another reason for a moment is no event.
-            since_ns = self._heard_since_ns.setdefault(detector, diagnosis.t_ns)
-            if diagnosis.t_ns - since_ns >= HEARD_NS:
+            # Where a mean of some values fills up, it will be good soon: that is no event of its own.
+            share = 1.0 if diagnosis.missing_share is None else diagnosis.missing_share
+            least, since_ns = self._lacking_since.get(detector, (math.inf, 0))
+            if share < least:
+                self._lacking_since[detector] = share, now_ns
+            elif now_ns - since_ns >= HEARD_NS:
                 del self._causes[detector]
-                del self._heard_since_ns[detector]
+                del self._lacking_since[detector]
 
     def _doubt(self, diagnosis: Diagnosis, before: Doubt | None) -> Doubt | None:
         """What stands against the sensors after a statement."""
@@ -327,7 +335,7 @@ class SensorHealth:
             self._forget(detector)
             self._lacked_at_restart.pop(detector, None)
             self._causes.pop(detector, None)
-            self._heard_since_ns.pop(detector, None)
+            self._lacking_since.pop(detector, None)
             self._unjudged.pop(detector, None)
             self._unheard.discard(detector)
 

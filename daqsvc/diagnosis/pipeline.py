@@ -226,7 +226,8 @@ _LONGEST_PREPARATION_NS = 300 * NS_PER_S
 """A driver that is not ready by then hangs, and the silence of its streams counts."""
 
 _SETTLED_NS = 10 * NS_PER_S
-"""A silence is reported once more after something else has been its reason for so long."""
+"""A silence is reported once more after something else has been its reason for so long, or for as long as the
+stream may be silent: a bus that is back need not have brought its next value yet."""
 
 MOST_HELD = 4096
 """Statements of a stream that wait for its rate to be known, at most; the oldest are dropped."""
@@ -277,7 +278,7 @@ class _Cause:
     why: str
     as_said_ns: int
 
-    def is_another(self, why: str, now_ns: int) -> bool:
+    def is_another(self, why: str, now_ns: int, patience_ns: int) -> bool:
         """Whether something else is the reason, and has been for long enough to say so.
 
         A unit that is asked now and then is silent by turns, and set aside because it is.
@@ -285,7 +286,7 @@ class _Cause:
         was, now = wording_of(self.why), wording_of(why)
         if was == now or (was and now and (was in now or now in was)):
             self.as_said_ns = now_ns
-        return now_ns - self.as_said_ns >= _SETTLED_NS
+        return now_ns - self.as_said_ns >= max(_SETTLED_NS, patience_ns)
 
 
 class Pipeline:
@@ -510,7 +511,8 @@ class Pipeline:
                     causes[name] = _Cause(why, now_ns)
                 elif name in silent:
                     why = self._why_over(name) or self._why_silent(name)
-                    if (name in unexplained and why) or causes[name].is_another(why, now_ns):
+                    other = causes[name].is_another(why, now_ns, self._patience[name].ns)
+                    if (name in unexplained and why) or other:
                         unexplained.discard(name)
                         self._say_nothing_comes(name, now_ns - since_ns[name], now_ns)
                         causes[name] = _Cause(why, now_ns)

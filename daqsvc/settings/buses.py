@@ -132,11 +132,6 @@ class Layout(Hooks, Section):
         """Whether it is asked for present values, so that there is no waveform."""
         return False
 
-    @property
-    def losses(self) -> Literal["counted", "estimated"]:
-        """How many samples were lost: by a count or time that the device sends, or from the arrivals."""
-        return "estimated" if getattr(self, "no_counter", False) else "counted"
-
     def wire_range(self, channel: str, facts: Any) -> WireRange | None:
         """What a channel can carry; None of a float or a text, and where it is not known.
 

@@ -24,7 +24,7 @@ def test_a_wrong_rate_takes_over_from_silence() -> None:
     found = []
     for reason in (SILENCE.format(2.0), SILENCE.format(7.5), RATE.format(100.1), RATE.format(99)):
         doubts.update(
-            Diagnosis("m", "levels", 1, "s", 5, 5, "N", quality="missing", reason=reason, sensors=("a",))
+            Diagnosis("m", "levels", 1, "s", 5, 5, "N", quality="missing", reason=reason, sensors=("a",)), 1
         )
         found.append(doubts.finding("sensor-ok/a"))
     silent, longer, rate, other_rate = found
@@ -38,7 +38,7 @@ SILENT = "no samples of stream 'fan2': unit 33 at 192.0.2.1:502 {}"
 NO_VALUE = "the last {} values of spare did not arrive, or the device had none; check sensor, device and bus"
 
 
-def missing(rig: AlarmRig, reason: str, *, samples: bool) -> Sequence[AlarmEvent]:
+def missing(rig: AlarmRig, reason: str, *, samples: bool, share: float | None = None) -> Sequence[AlarmEvent]:
     end = 7 if samples else 0
     return rig.take(
         detector="levels/spare",
@@ -49,6 +49,7 @@ def missing(rig: AlarmRig, reason: str, *, samples: bool) -> Sequence[AlarmEvent
         quality="missing",
         reason=reason,
         sensors=("spare",),
+        missing_share=share,
     )
 
 
@@ -91,3 +92,13 @@ def test_a_statement_about_samples_just_after_a_silence_is_no_event() -> None:
     for number in range(3, 8):
         assert missing(rig, NO_VALUE.format(number), samples=True) == []
     assert missing(rig, SILENT.format("has not answered within 500 ms"), samples=False) == []
+
+
+def test_a_mean_that_fills_up_after_a_silence_is_no_event_of_its_own() -> None:
+    """Of ten values one more comes each second, and the next statement is good: that is the event."""
+    rig = AlarmRig()
+    missing(rig, SILENT.format("has not answered within 500 ms"), samples=False)
+    rig.tick(30.0)
+    for number in range(40):
+        rig.tick(1.0)
+        assert missing(rig, NO_VALUE.format(number), samples=True, share=1.0 - number / 50) == []

@@ -63,7 +63,8 @@ class WalkingDoubts(SensorHealth):
         self.assumed = {}
         self.unsettled = {}
 
-    def update(self, diagnosis):
+    def update(self, diagnosis, now_ns):
+        del now_ns
         detector, sensors = diagnosis.detector, diagnosis.sensors
         name = quality_alarm(detector, sensors)
         before = self.table.pop(detector, None) or self.assumed.pop(detector, None)
@@ -142,7 +143,7 @@ class WalkingManager(AlarmManager):
         self._doubts = WalkingDoubts()
 
     def _events(self, diagnosis, at):
-        yield from self._quality(self._doubts.update(diagnosis).alarms, diagnosis, at)
+        yield from self._quality(self._doubts.update(diagnosis, at.t_ns).alarms, diagnosis, at)
         followers = [ruled for ruled in self._ruled if diagnosis.detector in ruled.rule.detectors]
         for ruled in followers:
             if not ruled.rule.sensors and diagnosis.sensors and diagnosis.quality != "missing":

@@ -234,7 +234,7 @@ def test_a_replay_from_amid_a_shortage_returns_the_alarm_when_it_returned(cut):
         revolution(rig, one)
         taken.append(rig.last)
         if number < cut:
-            until_then.update(rig.last)
+            until_then.update(rig.last, rig.last.t_ns)
     before = [event for event in rig.events if event.t_ns <= taken[cut - 1].t_ns]
     replayed = AlarmManager(RIG, (BEARING,), SettableClock())
     replayed.resume(before[-1:], {"bank": ("probe-x", "probe-y")}, restarted=False)
