@@ -235,7 +235,7 @@ class StatusReport:
             "code": _id(NOT_BELIEVED if counted.get("doubt") else None),
             "samples_received": counted.get("samples_received", 0),
             "samples_lost": counted.get("samples_lost", 0),
-            # What no layout with a count or time has, be it of a driver that we do not know.
+            # A layout with a count or time has no such key, also one of another package.
             "losses": "estimated" if getattr(stream.layout, "no_counter", False) else "counted",
         }
 

@@ -226,8 +226,10 @@ _LONGEST_PREPARATION_NS = 300 * NS_PER_S
 """A driver that is not ready by then hangs, and the silence of its streams counts."""
 
 _SETTLED_NS = 10 * NS_PER_S
-"""A silence is reported once more after something else has been its reason for so long, or for as long as the
-stream may be silent: a bus that is back need not have brought its next value yet."""
+"""A silence is reported once more after something else has been its reason for so long.
+
+For as long as the stream may be silent, where that is longer: its next value comes some time after its bus.
+"""
 
 MOST_HELD = 4096
 """Statements of a stream that wait for its rate to be known, at most; the oldest are dropped."""

@@ -84,8 +84,8 @@ _BY_SPELLING = {
 }
 # Units that are not converted, and that in lower case are others: a torque, a millipascal, a gallon.
 _OTHERS = frozenset(("Nm", "NM", "mPa", "gal"))
-# How a level was made shows nothing of its unit: "mm/s RMS", "um p-p".
-_QUALIFIER = re.compile(r"[_ ]*\(?(?:rms|pk-?pk|p-?p|pp|0-?p|0-?pk|peak|pk)\)?$", re.IGNORECASE)
+# How a level was made shows nothing of its unit: "mm/s RMS", "mm/s eff.", "um p-p".
+_QUALIFIER = re.compile(r"[_ ]*\(?(?:rms|eff\.?|pk-?pk|p-?p|pp|0-?p|0-?pk|peak|pk)\)?$", re.IGNORECASE)
 _OF_PEAK = re.compile(r"(?:[_ (]|\b)(?:pk-?pk|p-?p|pp|0-?p|0-?pk|peak|pk)\)?$", re.IGNORECASE)
 _DROPPED = re.compile(r"[\s^*()\[\]{}·⋅]+")
 _SECONDS = re.compile(r"(?<![a-z])seconds?|(?<![a-z])sec(?![a-z])")

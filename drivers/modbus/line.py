@@ -233,7 +233,8 @@ class UnitHealth:
         """
         for kept in (self._whole, health):
             if kept.probe_ns is not None and now_ns < kept.probe_ns:
-                raise UnitSetAsideError(f"unit {self._unit} is set aside: {self._last_words}")
+                what = "" if kept is self._whole else f"{health.key} of "
+                raise UnitSetAsideError(f"{what}unit {self._unit} is set aside: {self._last_words}")
 
     def doubts(self, health: RequestHealth) -> bool:
         """Whether this may well stay without reply."""

@@ -69,10 +69,12 @@ _LONGEST_WINDOW_S = 10.0
 
 
 _NO_RMS = re.compile(
-    r"peak|max|set_?point|limit|belt|conveyor|pk(?=[_\d]|$)",
+    r"peak|max(?:imum)?(?![a-z])|set_?point|limit|(?:belt|conveyor|feed)_?(?:speed|rate|vel)|pk(?=[_\d]|$)",
     re.IGNORECASE,
 )
 """In names of channels in mm/s that are no RMS of a vibration: zones of ISO 20816-3 are not for them."""
+_RMS = re.compile(r"R(?:MS|ms)|E(?:FF|ff)|(?<![A-Za-z])(?:rms|eff)|(?:rms|eff)(?![A-Za-z])")
+"""In names of those that are, whatever else is in them; but no part of AlarmSetpoint."""
 
 
 class Sensor(NamedTuple):
@@ -103,7 +105,10 @@ class Sensor(NamedTuple):
         """Whether it is a value in mm/s that is no RMS by its unit, or hardly by the name of its channel."""
         if self.type != "trend" or not same_unit(self.unit, "mm/s"):
             return False
-        return is_of_peak(self.unit) or _NO_RMS.search(self.channel) is not None
+        if is_of_peak(self.unit):
+            return True
+        is_named_rms = any(_RMS.search(name) for name in (self.channel, self.name))
+        return not is_named_rms and _NO_RMS.search(self.channel) is not None
 
     @property
     def iso(self) -> str | None:
@@ -363,7 +368,8 @@ def _no_rms_words(there: Sequence[Sensor]) -> str:
     shown = ", ".join(f"{one.name} ({one.unit})" for one in left)
     return (
         f"they are for its RMS, and by unit or name {shown} is another value. Write [[alarms]] with limits "
-        "of your own for it, or name the channel otherwise if it is an RMS."
+        f"of your own for it. If it is an RMS, give it a name with RMS: --sensor {left[0].channel}.name="
+        f"{left[0].channel}-RMS."
     )
 
 
@@ -375,7 +381,7 @@ def limits_words(answers: Answers) -> list[str]:
     with_limits = _with_own_limits(there)
     others = ", ".join(one.name for one in there if one not in with_limits)
     if answers.get("limits") != "own" and (why := _no_rms_words(there)):
-        return [f"No limits of ISO 20816-3 are proposed for every velocity: {why}"]
+        return [f"The zones of ISO 20816-3 are not for every velocity: {why}"]
     if answers.get("limits") != "own" or not others:
         return []
     names = ", ".join(one.name for one in with_limits)

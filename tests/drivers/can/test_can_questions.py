@@ -143,11 +143,23 @@ def test_what_is_no_rms_gets_no_zones_of_one(
     assert said in " ".join((tmp_path / "new.toml").read_text("utf-8").replace("\n# ", " ").split())
 
 
-@pytest.mark.parametrize(("name", "stated"), [("VelRms", "mm/s"), ("OilTemp", "mm/s RMS"), ("Vib", "mm/s")])
+@pytest.mark.parametrize(
+    ("name", "stated"),
+    [
+        *((name, "mm/s") for name in ("VelRms", "Vib", "MaxVelRms", "ClimaxMill_Vel", "BeltFan_Vel")),
+        *(("OilTemp", stated) for stated in ("mm/s RMS", "mm/s eff", "mm/s eff.")),
+    ],
+)
 def test_an_rms_has_the_zones(tmp_path: Path, name: str, stated: str) -> None:
     dbc = GEARBOX.replace("OilTemp", name).replace('"degC"', f'"{stated}"')
     tables = new(tmp_path, dbc, "--message=Slow", f"--signals={name}", "--rate=10")
     assert [one["zones"]["standard"] for one in tables["alarms"]] == ["iso-20816-3"]
+
+
+def test_a_name_with_rms_gets_the_zones(tmp_path: Path) -> None:
+    dbc = GEARBOX.replace("OilTemp", "Vmax").replace('"degC"', '"mm/s"')
+    named = ("--message=Slow", "--signals=Vmax", "--rate=10", "--sensor=Vmax.name=Vmax-RMS")
+    assert [one["zones"]["standard"] for one in new(tmp_path, dbc, *named)["alarms"]] == ["iso-20816-3"]
 
 
 @pytest.mark.parametrize("text", ["Slow", "0x321", "id 0x321", "801"])
