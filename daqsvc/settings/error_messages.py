@@ -223,9 +223,17 @@ class ErrorFormatter:
 
     def _string_type(self, path: KeyPath, _context: Mapping[str, Any]) -> tuple[str, str]:
         value = value_at(self._document, path)
-        if isinstance(value, bool | int | float):
+        if isinstance(value, bool | int | float) and self._is_valid(path, f"{value}"):
             return "must be text in quotes", f"write {self._key(path)} = {json.dumps(str(value))}"
         return "must be text in quotes", self._write_example(path)
+
+    def _is_valid(self, path: KeyPath, value: object) -> bool:
+        """Whether a value could be there by itself."""
+        try:
+            adapter(declared_at(self._root, self._document, path)).validate_python(value)
+        except (LookupError, ValidationError):
+            return False
+        return True
 
     def _path_type(self, path: KeyPath, _context: Mapping[str, Any]) -> tuple[str, str]:
         return "must be a path in quotes", self._write_example(path)
@@ -386,11 +394,7 @@ class ErrorFormatter:
             meant, supposed = float(alike[0]), f", {alike[1]}"
         if meant is None or isinstance(path[-1], int) or (whole and not meant.is_integer()):
             return self._write_example(path)
-        try:
-            adapter(declared_at(self._root, self._document, path)).validate_python(
-                int(meant) if whole else meant
-            )
-        except ValidationError:
+        if not self._is_valid(path, int(meant) if whole else meant):
             return self._write_example(path)
         return f"write {self._key(path)} = {as_toml(meant, whole=whole)}{supposed or ', a number alone'}"
 

@@ -164,3 +164,10 @@ def test_every_word_leads_to_a_key_that_there_is():
 def test_what_is_called_by_no_word_is_not_guessed():
     assert meant_key("flux_capacitor", ["rate_hz", "baud"]) is None
     assert meant_key("baudrate", ["rate_hz"]) is None
+
+
+def test_a_number_where_an_address_belongs_gets_an_address_as_its_remedy():
+    text, _ = changed(SERIAL, ("[pipeline]\n", "[metrics]\nlisten = 9555\n\n[pipeline]\n"))
+    (problem,) = problems_of(text)
+    assert problem.message == "must be text in quotes"
+    assert problem.remedy.startswith('write listen = "127.0.0.1:9464"')
