@@ -374,7 +374,7 @@ def _no_rms_words(there: Sequence[Sensor]) -> str:
 
 
 def limits_words(answers: Answers) -> list[str]:
-    """What the limits are not for, and so has no alarm; nothing if they are for all."""
+    """What the limits are not for, and so has no alarm, and the unit that they are in, if it is another."""
     there = [one for one in sensors(answers) if one.measure is not None]
     if answers.get("limits") == "iso" and (why := _other_velocities(there)):
         return [f"The zones of ISO 20816-3 are not for every velocity: {why}"]
@@ -382,10 +382,17 @@ def limits_words(answers: Answers) -> list[str]:
     others = ", ".join(one.name for one in there if one not in with_limits)
     if answers.get("limits") != "own" and (why := _no_rms_words(there)):
         return [f"The zones of ISO 20816-3 are not for every velocity: {why}"]
-    if answers.get("limits") != "own" or not others:
+    if answers.get("limits") != "own" or not with_limits:
         return []
-    names = ", ".join(one.name for one in with_limits)
-    return [f"Alert and danger are for {names}. No alarm watches {others} yet: write one for each."]
+    words, names, first = [], ", ".join(one.name for one in with_limits), with_limits[0]
+    if first.measure is not None and first.measure[1] != first.unit:
+        words.append(
+            f"Alert and danger of {names} are of the {first.measure[0].replace('_', ' ')} in "
+            f"{first.measure[1]}, and not in {first.unit}."
+        )
+    if others:
+        words.append(f"Alert and danger are for {names}. No alarm watches {others} yet: write one for each.")
+    return words
 
 
 def _without_zones(read: Callable[[str], Any], why: str) -> Callable[[str], Any]:

@@ -167,6 +167,24 @@ def test_a_message_may_be_named_by_the_id_that_the_list_shows(tmp_path: Path, te
     assert layout_of(new(tmp_path, GEARBOX, f"--message={text}", "--rate=10 Hz"))["message"] == "Slow"
 
 
+def test_limits_in_another_unit_than_the_samples_are_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dbc = GEARBOX.replace("OilTemp", "AccX").replace('"degC"', '"mg"')
+    own = ("--limits=own", "--alert=100", "--danger=150")
+    new(
+        tmp_path,
+        dbc,
+        "--message=Slow",
+        "--signals=AccX",
+        "--rate=2000",
+        "--sensor=AccX.type=accelerometer",
+        *own,
+    )
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Alert and danger of accel-AccX are of the velocity rms in mm/s, and not in mg." in said
+
+
 @pytest.mark.parametrize(("stated", "unit"), [("mg", "mg"), ("mm/s²", "mm/s2"), ("m/s^2", "m/s2")])
 def test_samples_in_any_unit_of_acceleration_make_an_accelerometer(
     tmp_path: Path, stated: str, unit: str
