@@ -166,12 +166,14 @@ _RPM = ("rpm", "1/min", "min-1", "r/min", "rev/min", "U/min")
 
 def number_in(*units: str) -> Callable[[str], float]:
     """A number; one of these units may be written behind it."""
-    behind = "|".join(map(re.escape, units))
+    # The end of a number is no unit: the unit 1 means none, and 1481/min is no speed of 148.
+    with_letters = [unit for unit in units if re.search("[^\\W\\d]|[%°]", unit)]
+    behind = "|".join(rf"{' +' if unit[0].isdigit() else ' *'}{re.escape(unit)}" for unit in with_letters)
 
     def read(text: str) -> float:
-        return number(re.sub(rf"(?<=[\d. ])\s*(?:{behind})\s*$", "", text, flags=re.IGNORECASE))
+        return number(re.sub(rf"(?<=[\d. ])(?:{behind})\s*$", "", text, flags=re.IGNORECASE))
 
-    return read
+    return read if with_letters else number
 
 
 AUTO = "auto"

@@ -1040,6 +1040,8 @@ def test_what_is_no_bit_rate_is_told_how_one_is_written(text):
         (speed_rpm, "1485 U/min", 1485.0),
         (seconds_or_auto, "20 s", 20.0),
         (number_in("mm/s"), "2.8 mm/s", 2.8),
+        (number_in("1"), "11", 11.0),
+        (number_in("1"), "0.001", 0.001),
     ],
 )
 def test_the_unit_of_a_number_may_be_typed_behind_it(read, text, value):
@@ -1047,7 +1049,14 @@ def test_the_unit_of_a_number_may_be_typed_behind_it(read, text, value):
 
 
 @pytest.mark.parametrize(
-    ("read", "text"), [(rate_hz, "10 kHz"), (speed_rpm, "25 Hz"), (rate_hz, "Hz"), (number_in("mm/s"), "2 g")]
+    ("read", "text"),
+    [
+        (rate_hz, "10 kHz"),
+        (speed_rpm, "25 Hz"),
+        (rate_hz, "Hz"),
+        (number_in("mm/s"), "2 g"),
+        (speed_rpm, "1481/min"),
+    ],
 )
 def test_another_unit_behind_a_number_is_refused(read, text):
     with pytest.raises(ValueError, match=f'^"{text}" is not a number; write e.g. 0.5 or 1480$'):
