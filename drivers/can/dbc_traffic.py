@@ -33,8 +33,8 @@ _MOST_STEPS = 100
 """Of different sizes: what has more of them varies, and counts nothing."""
 _LEAST_JUMP_BITS = 8
 _LEAST_STEPS = 20
-_NEARLY_WHOLE = 0.15
-"""Of two devices with one id, frames come about twice as often."""
+_TWICE = 1.8
+"""From two devices with one id, frames come about twice as often."""
 _TOO_OFTEN = 1.5
 """Of the rate that a DBC file states: above it, it is no clock that is not exact."""
 _MANY_JUMPS = 0.05
@@ -268,10 +268,9 @@ class MessageTraffic:
         few = rate_hz is None or self.frames < _LEAST_STEPS or self.counter is not None
         if few or rate_hz is None or rate_hz * self._cycle_s < _TOO_OFTEN:
             return ""
-        many = rate_hz * self._cycle_s
         why = (
             "most likely two devices send it with one id, and their values mix."
-            if abs(many - round(many)) < _NEARLY_WHOLE
+            if rate_hz * self._cycle_s >= _TWICE
             else "the device is set to send it more often, or two devices send it with one id, and their "
             "values mix."
         )

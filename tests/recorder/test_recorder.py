@@ -835,7 +835,7 @@ async def test_a_snapshot_states_what_detectors_had_lacked_when_it_begins(
             said = Diagnosis("laval-rig", "levels/x", one.clock.monotonic_ns(), "shaft", 0, 1, "normal")
             said = replace(said, quality=quality, missing_share=share, sensors=("probe-x",))
             one.recorder.diagnosis(said)
-            until_then.update(said)
+            until_then.update(said, said.t_ns)
             blind_ns = said.t_ns if share == 1.0 else blind_ns
         await one.passes(since_s)
         one.alarm()

@@ -27,7 +27,7 @@ from daqsvc.commands.new.machine_text import machine_text
 from drivers.can import questions, sniff, socketcan
 from drivers.can.dbc import messages_of
 from drivers.can.dbc_questions import DbcQuestions
-from drivers.can.dbc_traffic import SignalTraffic
+from drivers.can.dbc_traffic import MessageTraffic, SignalTraffic
 from drivers.sniffing import is_waveform_rate, sniffed
 from sim_hw.bus_socket import UnixBus
 from sim_hw.bus_socket_hub import Hub
@@ -1118,3 +1118,18 @@ def test_frames_that_are_longer_than_the_dbc_file_states_make_no_stream(
     for said in (shown, refused, text, "".join(answers["notes"])):
         assert longer in said
     assert "Heard: Severity" not in text
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "why"),
+    [(14.0, ""), (15.0, "the device is set to send it more often, or two"), (19.7, "most likely two")],
+)
+def test_how_likely_two_devices_are_turns_on_how_often_frames_come(
+    tmp_path: Path, rate_hz: float, why: str
+) -> None:
+    cycle = 'BA_DEF_ BO_ "GenMsgCycleTime" INT 0 10000;\nBA_ "GenMsgCycleTime" BO_ 700 '
+    (tmp_path / "s.dbc").write_text(f"{SEVERITY}{cycle}100;\n")
+    traffic = next(one for one in map(MessageTraffic, messages_of(tmp_path / "s.dbc")) if one.name == "Fast")
+    traffic.frames = 100
+    doubt = traffic.rate_doubt(rate_hz)
+    assert (f"{why} devices send it with one id" in doubt) if why else not doubt
