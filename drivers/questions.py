@@ -207,13 +207,11 @@ def speed_rpm(text: str) -> float:
     return value
 
 
-_SLOW_RPM = 60.0
-_DECIMALS = 3
-
-
 def doubt_of_speed(speed_rpm: float) -> tuple[str, str] | None:
     """See `Question.doubt`: 1.485 is most likely 1485, with a point between the thousands."""
-    meant = thousands(speed_rpm)
+    from daqsvc.settings.written_numbers import thousands_meant  # noqa: PLC0415 - brings the settings
+
+    meant = thousands_meant(speed_rpm)
     if meant is None:
         return None
     reason = (
@@ -221,13 +219,6 @@ def doubt_of_speed(speed_rpm: float) -> tuple[str, str] | None:
         f"type {speed_rpm:g} again if the shaft turns so slowly"
     )
     return reason, f"{meant}"
-
-
-def thousands(speed_rpm: float) -> int | None:
-    """The speed that is meant where the point of a slow one may be between thousands; None if it is none."""
-    meant = round(speed_rpm * 10**_DECIMALS)
-    slow = abs(speed_rpm) < _SLOW_RPM and speed_rpm != int(speed_rpm)
-    return meant if slow and math.isclose(meant, speed_rpm * 10**_DECIMALS, rel_tol=1e-9) else None
 
 
 def whole(text: str) -> int:

@@ -51,6 +51,7 @@ from daqsvc.settings.sensor_checks import (
     check_voltages,
 )
 from daqsvc.settings.speed_signals import speed_signals
+from daqsvc.settings.written_numbers import thousands_meant
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Hashable, Iterator, Mapping
@@ -407,19 +408,16 @@ def needed_bytes(draft: MachineFile) -> dict[str, float]:
     return needed
 
 
-_SLOW_RPM = 60.0
-"""Below it few machines turn, and none has a speed that is known to a thousandth."""
-
-
 def _check_speed(draft: MachineFile) -> Iterator[Finding]:
     """The point of the speed is no point between thousands, as in 1.485 for 1485."""
     speed_rpm = draft.machine.speed_rpm
-    to_a_thousandth = round(speed_rpm, 3) == speed_rpm != round(speed_rpm, 2)
-    if abs(speed_rpm) < _SLOW_RPM and to_a_thousandth:
+    meant = thousands_meant(speed_rpm)
+    # Of a file nobody is asked: only a third decimal that is not 0 is known to have been written.
+    if meant is not None and round(speed_rpm, 2) != speed_rpm:
         yield Finding(
             ("machine", "speed_rpm"),
             "is slow for a shaft, and the point is a decimal point",
-            f"write speed_rpm = {round(1000 * speed_rpm)}.0 if that is meant; or leave it",
+            f"write speed_rpm = {meant}.0 if that is meant; or leave it",
             fatal=False,
             code=THOUSANDS,
         )

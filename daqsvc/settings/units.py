@@ -85,8 +85,11 @@ _BY_SPELLING = {
 # Units that are not converted, and that in lower case are others: a torque, a millipascal, a gallon.
 _OTHERS = frozenset(("Nm", "NM", "mPa", "gal"))
 # How a level was made shows nothing of its unit: "mm/s RMS", "mm/s eff.", "um p-p".
-_QUALIFIER = re.compile(r"[_ ]*\(?(?:rms|eff\.?|pk-?pk|p-?p|pp|0-?p|0-?pk|peak|pk)\)?$", re.IGNORECASE)
-_OF_PEAK = re.compile(r"(?:[_ (]|\b)(?:pk-?pk|p-?p|pp|0-?p|0-?pk|peak|pk)\)?$", re.IGNORECASE)
+_PEAK = "pk-?pk|p-?p|pp|0-?p|0-?pk|peak|pk"
+QUALIFIER = rf"\(?(?:rms|eff\.?|{_PEAK})\)?"
+"""Regular expression of how a level was made, behind its unit; case does not matter."""
+_QUALIFIER = re.compile(rf"[_ ]*{QUALIFIER}$", re.IGNORECASE)
+_OF_PEAK = re.compile(rf"(?:[_ (]|\b)(?:{_PEAK})\)?$", re.IGNORECASE)
 _DROPPED = re.compile(r"[\s^*()\[\]{}·⋅]+")
 _SECONDS = re.compile(r"(?<![a-z])seconds?|(?<![a-z])sec(?![a-z])")
 _PER = re.compile(r"(?<=[a-z])per(?=[a-z])")

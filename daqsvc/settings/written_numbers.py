@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 
 _NUMBER = re.compile(r"(?P<number>[+-]?\d[\d_]*(?:[.,]\d+)?(?:[eE][+-]?\d+)?)\s*(?P<unit>[^\s#]*)")
@@ -71,3 +72,17 @@ def number_meant(text: str, key: str) -> float | None:
 def as_toml(value: float, *, whole: bool) -> str:
     """A number as it is written in a machine file; a whole one has no decimal point."""
     return f"{value:.0f}" if whole else repr(float(f"{value:.12g}"))
+
+
+_SLOW_RPM = 60.0
+"""Below it few machines turn."""
+
+
+def thousands_meant(speed_rpm: float) -> int | None:
+    """The speed that may be meant where the point of a slow one is one between thousands, e.g. 1485 of 1.485.
+
+    None where it cannot be: of a whole number, a faster shaft, or with more than three decimals.
+    """
+    meant = round(1000 * speed_rpm)
+    is_slow = abs(speed_rpm) < _SLOW_RPM and speed_rpm != int(speed_rpm)
+    return meant if is_slow and math.isclose(meant, 1000 * speed_rpm, rel_tol=1e-9) else None

@@ -150,12 +150,12 @@ def _check_suffix(sensor: Sensor, channel: LineChannel, suffix: str, path: KeyPa
         return
     factor = factor_between(suffix, wanted)
     converts = channel.scale != 1.0 or channel.offset != 0.0
-    if converts and (factor is None or math.isclose(channel.scale, factor, rel_tol=_LIKE_SCALE)):
+    if converts and (factor is None or math.isclose(abs(channel.scale), factor, rel_tol=_LIKE_SCALE)):
         return
     alike = sent.quantity == taken.quantity
     statement = f'the device writes "{suffix}" behind the number, but this sensor takes it as "{wanted}"'
     if factor is not None:
-        off = factor / channel.scale
+        off = abs(factor / channel.scale)
         statement += f": wrong by a factor of {max(off, 1 / off):.4g}"
     of_type = get_args(type(sensor).model_fields["unit"].annotation)
     remedies = []

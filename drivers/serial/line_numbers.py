@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING
 
+from daqsvc.settings.units import QUALIFIER
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
@@ -19,9 +21,7 @@ ABSENT = re.compile(rf" *(-*|{'|'.join(map(re.escape, ABSENT_WORDS))}) *", re.IG
 """What devices write where they have no value: nothing, dashes, or a word."""
 _POWER = r"(?:\^?[23]|[²³])"
 _NAME = rf"[A-Za-z%‰µμ\u2126Ω\u2103\u2109]+{_POWER}?"
-_QUALIFIER = r"(?: ?\(?(?:rms|eff|pk-?pk|p-?p|pp|0-?p|0-?pk|peak|pk)\)?)?"
-"""How a level was made, behind its unit, as in mm/s RMS."""
-_UNIT = rf"(?:°|°?{_NAME}(?:/{_NAME})?|1/[A-Za-z]+)(?i:{_QUALIFIER})"
+_UNIT = rf"(?:°|°?{_NAME}(?:/{_NAME})?|1/[A-Za-z]+)(?i:(?: ?{QUALIFIER})?)"
 _WITH_UNIT: Mapping[str, re.Pattern[str]] = {
     mark: re.compile(rf"({number.pattern})({_UNIT}) *") for mark, number in NUMBER.items()
 }

@@ -356,14 +356,16 @@ async def test_a_silence_is_said_once_and_again_after_the_next() -> None:
     await running
 
 
-async def test_what_the_bus_knows_of_a_silence_is_said_also_when_it_comes_later() -> None:
-    clock, ring = DrivenClock(), SampleRing("s", ("a",), 50)
+def explained() -> tuple[DrivenClock, SampleRing, dict[str, str], list[Diagnosis], asyncio.Task[None]]:
+    """A pipeline over a silent stream ``s``, what the bus knows of that, and what is said."""
+    clock, ring, known = DrivenClock(), SampleRing("s", ("a",), 50), {"s": ""}
     said: list[Diagnosis] = []
-    known = {"s": ""}
-    pipeline = Pipeline(
-        {"s": ring}, [Listener("one", 10)], said.append, clock, why_silent=lambda stream: known[stream]
-    )
-    running = asyncio.create_task(pipeline.run())
+    pipeline = Pipeline({"s": ring}, [Listener("one", 10)], said.append, clock, why_silent=known.__getitem__)
+    return clock, ring, known, said, asyncio.create_task(pipeline.run())
+
+
+async def test_what_the_bus_knows_of_a_silence_is_said_also_when_it_comes_later() -> None:
+    clock, ring, known, said, running = explained()
     for quarter in range(1, 41):
         known["s"] = "unit 1 refuses that" if quarter > 20 else ""
         await asyncio.sleep(0.005)
@@ -375,13 +377,7 @@ async def test_what_the_bus_knows_of_a_silence_is_said_also_when_it_comes_later(
 
 @pytest.mark.parametrize("stands", [True, False])
 async def test_another_reason_for_a_silence_is_said_once_it_stands(stands) -> None:
-    clock, ring = DrivenClock(), SampleRing("s", ("a",), 50)
-    said: list[Diagnosis] = []
-    known = {"s": ""}
-    pipeline = Pipeline(
-        {"s": ring}, [Listener("one", 10)], said.append, clock, why_silent=lambda stream: known[stream]
-    )
-    running = asyncio.create_task(pipeline.run())
+    clock, ring, known, said, running = explained()
     silent, aside = "unit 33 has not answered within 500 ms", "unit 33 is set aside: unit 33 has not answered"
     reasons = [silent, silent, f"{aside} within 500 ms"]
     for half in range(1, 181):

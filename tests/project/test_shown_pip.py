@@ -43,6 +43,8 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
     try:
         urllib.request.urlopen("https://pypi.org/simple/pip/", timeout=10).close()
     except (urllib.error.URLError, OSError) as error:
+        if os.environ.get("DAQSVC_REQUIRE_CHROMIUM"):
+            raise  # CI, which has installed all from there
         pytest.skip(f"the package index cannot be reached: {error}")
     folder = tmp_path_factory.mktemp("clone") / "daqsvc"
     subprocess.run(["git", "clone", "--quiet", ROOT, folder], check=True)

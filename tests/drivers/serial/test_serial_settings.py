@@ -320,6 +320,8 @@ def suffixed(suffix: str, unit: str, *, more: str = "", kind: str = "trend", sen
         ("mm/s", "in/s", "", ['"mm/s" behind the number', 'as "in/s"', "25.4", 'unit = "mm/s"', "0.0393701"]),
         ("mm/s", "in/s", ", scale = 0.03937", []),
         ("mm/s", "in/s", ", scale = 0.5", ["warning", "factor of 12.7"]),
+        ("mm/s", "in/s", ", scale = -0.03937", []),  # turned round
+        ("mm/s", "in/s", ", scale = -0.5", ["warning", "factor of 12.7"]),
         ("mm/s RMS", "mm/s", "", []),
         ("°C", "degF", "", ['unit = "degC"', "scale and offset"]),
         ("°C", "degF", ", scale = 1.8, offset = 32.0", []),
