@@ -264,7 +264,15 @@ class JournalWriter:
             raise
         finally:
             self._journal.close()
+            post(self._answer_the_rest, post)
             post(succeed, ended, None)
+
+    def _answer_the_rest(self, post: _Post) -> None:
+        """Answer what came while the thread ended; on the event loop, which lets nothing more come then."""
+        batch = Batch()
+        self._gather(batch, wait=False)
+        if batch.is_urgent():
+            self._abandon(batch, OutboxError("its thread has ended"), post)
 
     def _begin(self, post: _Post) -> int | None:
         """Open the journal; the number of unsent messages, or None if it cannot be opened for now.
@@ -310,6 +318,7 @@ class JournalWriter:
                 continue
             post(self._reports.failed, failure)
             if self._closing.is_set():
+                self._gather(batch, wait=False)  # what came during the turn that failed
                 self._show(batch, post)  # what the broker has is not lost
                 self._abandon(batch, error, post)
                 return

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import os
 import subprocess
+import threading
 
 import pytest
 from support.waiting import eventually
@@ -231,6 +232,66 @@ async def test_what_waits_in_memory_is_bounded_and_what_is_refused_is_said_loudl
         with pytest.raises(OutboxError, match="closed while it could not be written"):
             await each
     assert outbox.counters.lost == 5
+
+
+@pytest.mark.parametrize("mistake", [OSError("the disk is gone"), RuntimeError("a mistake")])
+async def test_what_comes_while_the_last_write_fails_is_answered_and_counted(tmp_path, monkeypatch, mistake):
+    """By a close, or by a mistake in this program: nobody waits in vain, and each message is counted."""
+    outbox = await opened(tmp_path)
+    is_writing, may_fail = threading.Event(), threading.Event()
+
+    def write(*_):
+        is_writing.set()
+        may_fail.wait(10)
+        raise mistake
+
+    monkeypatch.setattr(outbox._journal, "write", write)
+    monkeypatch.setattr("threading.excepthook", lambda _: None)
+    waiting = [outbox.submit(TOPIC, kilobyte, retain=False)]
+    await eventually(is_writing.is_set, "the writer is at the disk")
+    waiting += [outbox.submit(TOPIC, kilobyte, retain=False) for _ in range(3)]
+    reading = asyncio.create_task(outbox.following(0, 10))
+    await asyncio.sleep(0)
+    closing = asyncio.create_task(outbox.close())
+    await asyncio.sleep(0)
+    may_fail.set()
+    outcomes = await asyncio.wait_for(asyncio.gather(*waiting, reading, return_exceptions=True), 10)
+    assert [type(outcome) for outcome in outcomes[:4]] == [OutboxError] * 4
+    assert outbox.counters.waiting == 0
+    assert outbox.counters.lost == 4
+    await closing
+
+
+async def test_what_comes_after_the_last_look_of_a_writer_that_ends_is_answered(tmp_path, monkeypatch):
+    outbox = await opened(tmp_path)
+    late = []
+
+    def write(*_):
+        raise RuntimeError("a mistake")
+
+    def abandon(*words):
+        abandoned(*words)
+        if not late:
+            # The event loop may put in what comes until it hears that the thread has ended.
+            asked = asyncio.run_coroutine_threadsafe(submitted(), loop)
+            late.append(asked.result(10))
+
+    async def submitted():
+        return outbox.submit(TOPIC, kilobyte, retain=False)
+
+    loop = asyncio.get_running_loop()
+    abandoned = outbox._writer._abandon
+    monkeypatch.setattr(outbox._journal, "write", write)
+    monkeypatch.setattr(outbox._writer, "_abandon", abandon)
+    monkeypatch.setattr(outbox._books, "stopped", lambda _: None)  # has not come yet
+    monkeypatch.setattr("threading.excepthook", lambda _: None)
+    with pytest.raises(OutboxError, match="a mistake"):
+        await asyncio.wait_for(outbox.append(TOPIC, kilobyte, retain=False), 10)
+    await eventually(lambda: late, "a message has come too late")
+    with pytest.raises(OutboxError, match="its thread has ended"):
+        await asyncio.wait_for(late[0], 10)
+    assert outbox.counters.waiting == 0
+    await outbox.close()
 
 
 async def test_a_mistake_of_the_writer_is_told_to_all_who_wait(tmp_path, monkeypatch):
