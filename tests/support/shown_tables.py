@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 _CELLS = re.compile(r"\s{2,}")
 _PHRASES = re.compile(r"[,;:] |\s{2,}")
 _ID = re.compile(r"\b[0-9a-f]{8}\b")
-_MODE = re.compile(r"\b(?:N|F\d(?:L\d)?)\b")
+_MODE = re.compile(r"\b(?:N|F\d(?:L\d)?)\b(?: \((?:alert|danger)\))?")
 _TIME = re.compile(r"# (?:ms|s|min|h|d|days?)\b")
 _BARS = re.compile("[▁-█]+")
 _IN_A_COLUMN = 20
