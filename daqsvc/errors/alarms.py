@@ -184,3 +184,15 @@ BAND_WITHOUT_1X = Code(
     "band at 0.4 times the rate. Best are 2560, 2.56 times the 1000 Hz of ISO 20816-3. Or write another "
     'measure, e.g. measure = "rms" with limits of your own in g',
 )
+OK_LIMITS_TOO_NEAR = Code(
+    "A19",
+    "The sensor is not OK just above its setpoint",
+    "Beyond ok_between a sensor counts as broken, and its alarms are suppressed. A machine that is about to "
+    "fail may vibrate more than that.",
+    "End ok_between where the sensor can measure no more, at 1.5 times the highest setpoint or beyond.",
+    _PAGE,
+    example="machine.toml:63: sensors[0].ok_between = [0.0, 5.0]: ends just above danger = 4.5 of alarm "
+    '"de-vibration". If the machine vibrates more than 5 mm/s, the sensor counts as broken, and the alarm is '
+    "suppressed. Remedy: ok_between is for what the sensor cannot measure, e.g. with a broken wire: end it "
+    "at 6.8 mm/s or more",
+)

@@ -46,6 +46,7 @@ from daqsvc.settings.sensor_checks import (
     check_alarm_reach,
     check_probe_angles,
     check_reach,
+    check_room_above,
     check_sensitivity,
     check_unit,
     check_voltages,
@@ -214,6 +215,7 @@ def _sensor_checks(draft: MachineFile, facts: Mapping[str, Any]) -> Iterator[Ite
     yield _check_channel_use(draft)
     yield check_probe_angles(draft)
     yield check_alarm_reach(draft, facts)
+    yield check_room_above(draft, facts)
 
 
 def _names(draft: MachineFile) -> Iterator[Finding]:

@@ -6,7 +6,7 @@ import math
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from daqsvc.errors.alarms import NEVER_REACHED
+from daqsvc.errors.alarms import NEVER_REACHED, OK_LIMITS_TOO_NEAR
 from daqsvc.errors.machine_file import (
     BEYOND_CHANNEL,
     GAP_VOLTAGE,
@@ -16,13 +16,13 @@ from daqsvc.errors.machine_file import (
     UNLIKELY_SENSITIVITY,
     WRONG_SCALE,
 )
-from daqsvc.rounding import unit_behind
+from daqsvc.rounding import rounded_up, unit_behind
 from daqsvc.settings.alarms import SetpointAlarm
 from daqsvc.settings.measures import NOT_1X
 from daqsvc.settings.problems import Finding
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.sensors import Keyphasor, ProximityProbe, TrendValue
-from daqsvc.settings.units import factor_between, may_be_unit
+from daqsvc.settings.units import factor_between, is_of_vibration, may_be_unit
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -34,6 +34,10 @@ if TYPE_CHECKING:
 _ALONG_ONE_LINE_DEG = 1.0
 _COARSE_V = 0.5
 """No device resolves the voltage of a sensor so coarsely."""
+_TIMES_SETPOINT = 1.5
+"""How far beyond its highest setpoint a vibration must be believed: a machine that fails goes beyond it."""
+_WHOLE_CHANNEL = 0.95
+"""Part of what a channel carries beyond which a value is a mark for a broken sensor, or nearly one."""
 
 
 class _Usual(NamedTuple):
@@ -266,6 +270,49 @@ def check_alarm_reach(draft: MachineFile, facts: Mapping[str, Any]) -> Iterator[
                                 "correct it, or scale and sensitivity of the channel and its sensor",
                                 code=NEVER_REACHED,
                             )
+
+
+def check_room_above(draft: MachineFile, facts: Mapping[str, Any]) -> Iterator[Finding]:
+    """A vibration is still believed where the machine is at its worst.
+
+    Temperatures and pressures seldom go far beyond danger, and many of their sensors end there.
+    """
+    for index, sensor in enumerate(draft.sensors):
+        with suppress(UnusableValueError):
+            if not isinstance(sensor, TrendValue) or sensor.ok_between is None:
+                continue
+            low, high = sensor.ok_between
+            setpoints = [one for one in _upper_setpoints(draft, sensor) if 0 < one[0] <= high]
+            # Beside 0 a position of the shaft has limits on both sides, as the machine has.
+            if not setpoints or not is_of_vibration(sensor.unit) or low < -high / 2:
+                continue
+            highest, key, alarm = max(setpoints)
+            wire = wire_range(draft, sensor, facts)
+            if high >= _TIMES_SETPOINT * highest or (
+                wire is not None and high >= _WHOLE_CHANNEL * _in_units(sensor, wire)[1]
+            ):
+                continue
+            unit = unit_behind(sensor.unit)
+            yield Finding(
+                ("sensors", index, "ok_between"),
+                f'ends just above {key} = {highest:g} of alarm "{alarm}". If the machine vibrates more than '
+                f"{high:g}{unit}, the sensor counts as broken, and the alarm is suppressed",
+                "ok_between is for what the sensor cannot measure, e.g. with a broken wire: end it at "
+                f"{rounded_up(_TIMES_SETPOINT * highest, 2)}{unit} or more",
+                fatal=False,
+                code=OK_LIMITS_TOO_NEAR,
+            )
+
+
+def _upper_setpoints(draft: MachineFile, sensor: Sensor) -> Iterator[tuple[float, str, str]]:
+    """Value, key and alarm of the upper setpoints of a sensor, also of those that zones represent."""
+    with suppress(UnusableValueError):
+        for alarm in draft.alarms:
+            with suppress(UnusableValueError):
+                if isinstance(alarm, SetpointAlarm) and sensor.name in alarm.watched:
+                    for key in ("alert", "danger"):
+                        if key in alarm.setpoints:
+                            yield alarm.setpoints[key], key, alarm.name
 
 
 def _range(reach: tuple[float, float], unit: str) -> str:

@@ -156,6 +156,16 @@ def is_of_peak(text: str) -> bool:
     return _OF_PEAK.search(text.strip()) is not None and unit_of(text) is not None
 
 
+def is_of_vibration(text: str) -> bool:
+    """Whether a value in this unit is most likely the level of a vibration, and no position or flow."""
+    known = unit_of(text)
+    if known is None:
+        return False
+    if known.quantity == "length":
+        return known.name in {"um", "mil"} or is_of_peak(text)
+    return known.quantity == "acceleration" or (known.quantity == "velocity" and known.name != "m/s")
+
+
 def _plain(text: str) -> str:
     """A unit in lower case, in few signs, and without how a level was made."""
     plain = unicodedata.normalize("NFKC", text).replace("μ", "u").replace("\N{MINUS SIGN}", "-")

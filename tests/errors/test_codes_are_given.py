@@ -76,6 +76,11 @@ GIVEN: list[tuple[str, Path, list[tuple[str, str]]]] = [
             ('measure = "rms"', 'measure = "velocity_rms"'),
         ],
     ),
+    (
+        "A19",
+        MACHINES / "modbus-vibration-temperature.toml",
+        [("ok_between = [0.0, 65.0]", "ok_between = [0.0, 5.0]")],
+    ),
     ("O04", LAVAL, [("[store]", PAGE.format("192.0.2.1:8420"))]),
     ("O05", LAVAL, [("[store]", PAGE.format("0.0.0.0:8420"))]),
     ("O07", LAVAL, [(TOPICS, f'{TOPICS}\n[mqtt.sparkplug]\nclient_id = "daqsvc-lab:edge-1"')]),

@@ -343,3 +343,72 @@ def test_a_number_of_32_bits_has_such_a_mark_and_a_float_has_none():
     assert "0xFFFFFFFF in its uint32" in warning.message
     real = ('address = 19, type = "int16", scale = 0.05', 'address = 65, type = "float32", scale = 0.05')
     assert "no ok_between" not in "".join(one.message for one in parsed(PUMP, bare, real).warnings)
+
+
+OK = "ok_between = [0.0, 65.0]"
+IN_ZONES = (
+    "alert = 2.8\ndanger = 4.5",
+    'zones = { standard = "iso-20816-3", group = 1, support = "flexible" }',
+)
+
+
+def too_near(*changes):
+    """The warnings about OK limits that end just above a setpoint, and no others."""
+    warnings = parsed(PUMP, *changes).warnings
+    assert {f"{one.code}" for one in warnings} <= {"A19"}
+    return warnings
+
+
+@pytest.mark.parametrize(
+    ("high", "changes", "said", "least"),
+    [
+        (5.0, [], "danger = 4.5 of alarm", "6.8"),
+        (6.7, [], "danger = 4.5 of alarm", "6.8"),
+        (6.8, [], "", ""),
+        (16.0, [IN_ZONES], "danger = 11 of alarm", "17"),
+        (16.5, [IN_ZONES], "", ""),
+        (4.0, [("alert = 2.8\ndanger = 4.5", "alert = 2.8")], "alert = 2.8 of alarm", "4.2"),
+    ],
+)
+def test_ok_limits_that_end_just_above_danger_are_warned_of(high, changes, said, least):
+    warnings = too_near((OK, f"ok_between = [0.0, {high}]"), *changes)
+    assert len(warnings) == bool(said)
+    for one in warnings:
+        assert one.key == "sensors[0].ok_between"
+        assert f'ends just above {said} "de-vibration". If the machine vibrates more than' in one.message
+        assert f"end it at {least} mm/s or more" in one.remedy
+
+
+def test_zones_are_held_against_the_ok_limits():
+    text, _ = changed(PUMP, (OK, "ok_between = [0.0, 10.0]"), IN_ZONES)
+    (problem,) = problems_of(text, PUMP)
+    assert (f"{problem.code}", problem.key) == ("A06", "alarms[0].danger")
+    assert 'it lies outside the OK limits 0 to 10 of "de-axial"' in problem.message
+
+
+@pytest.mark.parametrize(
+    ("unit", "low", "warned"),
+    [
+        ("g", 0.0, True),
+        ("in/s pk", 0.0, True),
+        ("um", 0.0, True),
+        ("mm p-p", 0.0, True),
+        ("um", -5.0, False),  # a position of the shaft
+        ("mm", 0.0, False),  # a level of oil, an expansion
+        ("m/s", 0.0, False),  # a belt
+        ("bar", 0.0, False),
+        ("rpm", 0.0, False),
+        ("V", 0.0, False),
+    ],
+)
+def test_only_a_vibration_is_expected_far_beyond_danger(unit, low, warned):
+    alone = ('sensors = ["de-axial", "de-radial"]\nvote = 1', 'sensor = "de-axial"')
+    changes = [('unit = "mm/s" ', f'unit = "{unit}" '), (OK, f"ok_between = [{low}, 5.0]"), alone]
+    assert len(too_near(*changes)) == warned
+
+
+def test_ok_limits_that_end_where_the_channel_does_are_not_warned_of():
+    channel = 'name = "vz", address = 17, type = "uint16", scale = 0.001'
+    narrow = (channel, channel.replace("0.001", "0.0001"))
+    assert too_near(narrow, (OK, "ok_between = [0.0, 6.5]")) == ()
+    assert len(too_near(narrow, (OK, "ok_between = [0.0, 6.0]"))) == 1

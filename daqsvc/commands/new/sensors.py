@@ -471,13 +471,14 @@ def _covers(stated: tuple[float, float], limits: tuple[float, float] | None, uni
 
     Many files state the range of a display, which ends a little above danger. A machine that is about to fail
     vibrates several times as much. So the range of a vibration must reach four times as far beyond danger as
-    danger is beyond alert: for ISO 20816-3 to 2.5 times the danger limit. A temperature goes less far.
+    danger is beyond alert: for ISO 20816-3 to 2.5 times the danger limit. It must reach half as far beyond
+    danger as danger is from 0, too, else ``daqsvc check`` warns. A temperature goes less far.
     """
     if limits is None:
         return True
     alert, danger = limits
-    times = 4.0 if unit in TYPE_OF_UNIT else 1.0
-    return stated[0] < alert and danger + times * (danger - alert) < stated[1]
+    room = max(4.0 * (danger - alert), 0.5 * danger) if unit in TYPE_OF_UNIT else danger - alert
+    return stated[0] < alert and danger + room < stated[1]
 
 
 def pipeline_tables(answers: Answers) -> Iterator[str]:

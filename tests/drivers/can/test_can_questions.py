@@ -303,6 +303,7 @@ def test_an_rms_that_comes_as_often_as_a_waveform_has_its_alarm_on_its_value(tmp
         (10, ["--limits=none"], True),
         (10, ["--limits=own", "--alert=3", "--danger=6"], False),
         (20, ["--limits=own", "--alert=3", "--danger=6"], True),
+        (9, ["--limits=own", "--alert=6", "--danger=6.5"], False),  # of which `daqsvc check` would warn
     ],
 )
 def test_a_range_that_ends_near_the_danger_limit_suppresses_no_alarm(
