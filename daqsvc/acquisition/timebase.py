@@ -46,7 +46,9 @@ CONTRADICTED_NS = 4 * NS_PER_S
 FELL_BEHIND_NS = 10 * NS_PER_S
 """How long arrivals must be later and later until the device is taken to be slower than it was."""
 RATE_SURE_NS = 3 * NS_PER_S
-"""Of how much time the arrivals must agree on another rate than the nominal one."""
+"""Of how much time the arrivals must agree on another rate than the nominal one, ..."""
+RATE_SURE_BUCKETS = 7
+"""... and in how many buckets: of a frame every two seconds, one that is late makes another rate of three."""
 PLAUSIBLE_NS = 2 * NS_PER_S // 5
 """The nominal rate is taken for the device's if the first arrivals of so long fit within `PLAUSIBLE`."""
 STRAIGHT = 1.0 / 20.0
@@ -395,7 +397,7 @@ class TimeBase:
         drift_ns = FITS * self._nominal_ns
         line = self._line_of_any_rate() or clock_line(self._buckets, self._nominal_ns, (-drift_ns, drift_ns))
         off = line is not None and abs(line.slope_ns) > drift_ns
-        if line is None or (off and np.ptp(self._buckets[:, 1]) < RATE_SURE_NS):
+        if line is None or (off and not self._may_show_rate):
             return
         self._period_ns = self._nominal_ns + line.slope_ns
         self._offset_ns, self._error_ns = line.offset_ns, line.error_ns
@@ -406,6 +408,12 @@ class TimeBase:
             drift = CLOCK_DRIFT + 2.0 * line.error_ns / counted_ns
             self._unwrapper.measured(NS_PER_S / self._period_ns / self._samples_per_count, drift)
 
+    @property
+    def _may_show_rate(self) -> bool:
+        """Whether there are arrivals enough to show another rate than the nominal one."""
+        enough = len(self._buckets) >= RATE_SURE_BUCKETS
+        return enough and float(np.ptp(self._buckets[:, 1])) >= RATE_SURE_NS
+
     def _line_of_any_rate(self) -> ClockLine | None:
         """The line, if the arrivals are those of a device with its own rate, whatever that is.
 
@@ -415,7 +423,7 @@ class TimeBase:
         drift_ns = FITS * self._nominal_ns
         any_slope = (self._nominal_ns / MOST_RATIO - self._nominal_ns, self._nominal_ns * MOST_RATIO)
         line = clock_line(self._buckets, self._nominal_ns, any_slope)
-        if line is None or abs(line.slope_ns) <= drift_ns or np.ptp(self._buckets[:, 1]) < RATE_SURE_NS:
+        if line is None or abs(line.slope_ns) <= drift_ns or not self._may_show_rate:
             return line
         if self._is_straight(line, self._buckets, self._nominal_ns):
             return line

@@ -102,6 +102,40 @@ def test_it_is_over_when_the_device_has_the_rate_again() -> None:
     assert stream.unit.counters.samples_lost == 0
 
 
+def one_by_one(stated_hz: float, late: dict[int, float], frames: int = 20, hz: float | None = None) -> Stream:
+    """A stream of one sample in a frame from its start on; some frames are late by a part of their period."""
+    stream = Stream()
+    stream.unit = StreamAssembler(
+        "s",
+        stated_hz,
+        counter_bits=16,
+        samples_per_frame=1,
+        counts_per_frame=1,
+        deliver=lambda _: None,
+        tell=lambda _, standing: stream.told.append((stream.now_ns, standing)),
+    )
+    period_ns = 1e9 / (hz or stated_hz)
+    for at in range(frames):
+        stream.now_ns = START_NS + round((at + late.get(at, 0.0)) * period_ns)
+        come = np.array([at]), np.ones((1, 1, 1), np.float32), np.ones(1, bool)
+        stream.unit.accept(*come, np.array([stream.now_ns], np.int64))
+    return stream
+
+
+@pytest.mark.parametrize("late", [{2: 0.4}, {0: 0.3, 1: 0.15}, {1: 0.2, 2: 0.35}], ids=str)
+@pytest.mark.parametrize("hz", [0.5, 0.2])
+def test_a_slow_device_with_a_late_frame_at_its_start_has_its_rate(hz: float, late: dict[int, float]) -> None:
+    stream = one_by_one(hz, late)
+    assert stream.doubts == []
+    assert stream.unit.time_base.rate_hz == pytest.approx(hz, rel=0.02)
+
+
+def test_a_slow_device_of_another_rate_is_found_out_by_eight_frames() -> None:
+    assert one_by_one(0.5, {}, 7, hz=0.8).doubts == []
+    stream = one_by_one(0.5, {}, 8, hz=0.8)
+    assert stream.doubts == ["the device sends 0.8 Hz, the file states 0.5"]
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("hz", [500.0, 2000.0])
 def test_a_device_that_changes_its_rate_while_it_is_watched_is_found_out(hz: float) -> None:
