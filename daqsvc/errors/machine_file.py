@@ -335,7 +335,8 @@ SAMPLED_TOO_SLOWLY = Code(
     "The sampling rate is too low",
     "Samples show nothing above half of their rate, and pulses or orders of the shaft need several "
     "samples each revolution.",
-    "Sample faster, or correct rate_hz, machine.speed_rpm or the frequencies that are asked for.",
+    "Sample faster, or take a level that the device computes as a trend value. Or correct rate_hz, "
+    "machine.speed_rpm or the frequencies that are asked for.",
     _PAGE,
     example='machine.toml:72: pipeline.bearing.bearings[0].sensor = "accel-de": is sampled at 2000 Hz: a '
     "bearing rings above 400 Hz. Remedy: sample at 2500 Hz or faster",

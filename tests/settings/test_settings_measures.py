@@ -425,7 +425,7 @@ def test_a_velocity_that_begins_above_a_slow_machine_is_warned_of():
 
 
 def test_a_stream_too_slow_for_1x_has_no_velocity_unless_a_band_is_stated():
-    slow = [("12_000.0", "50.0"), (BAND, "")]
+    slow = [("12_000.0", "60.0"), (BAND, "")]
     machine = parsed(MOTOR, *slow)
     assert machine.warnings == ()
     assert "no velocity RMS of accel-de: sampled too slowly" in " ".join(describe(machine).split())
@@ -443,3 +443,61 @@ def test_a_stream_too_slow_for_1x_has_no_velocity_unless_a_band_is_stated():
     # A band could be stated: 1X is 29.93 Hz, and 640 samples a second show 256 Hz.
     problem, _ = only_problem(MOTOR, ("12_000.0", "640.0"), (BAND, ""))
     assert "write velocity_band_hz = [10.0, 256.0]" in problem.remedy
+
+
+RMS_ONLY = [(BAND, ""), ("window_s = 0.5", "window_s = 2.0")]
+SLOW = 'write type = "trend" for the sensor'
+
+
+@pytest.mark.parametrize(("rate_hz", "warned"), [(10, True), (59, True), (60, False), (12_000, False)])
+def test_samples_too_slow_for_1x_are_warned_of(rate_hz, warned):
+    warnings = parsed(MOTOR, ("12_000.0", f"{rate_hz:.1f}"), *RMS_ONLY).warnings
+    assert len(warnings) == warned
+    for one in warnings:
+        assert (f"{one.code}", one.key) == ("F34", "streams.drive-end.rate_hz")
+        assert f"nothing above {rate_hz / 2:g} Hz, and the machine turns at 29.93 Hz" in one.message
+        assert "RMS and peak of accel-de do not show" in one.message
+        assert "send 76.7 samples a second or more; or, if the device sends a level" in one.remedy
+        assert SLOW in one.remedy
+
+
+def test_samples_too_slow_for_1x_are_warned_of_once():
+    slow = [("12_000.0", "10.0"), ("[10.0, 1000.0]", "[1.0, 4.0]"), ("window_s = 0.5", "window_s = 2.0")]
+    (warning,) = parsed(MOTOR, *slow, ON_VELOCITY).warnings
+    assert f"{warning.code}" == "A18"
+    assert SLOW in warning.remedy
+    assert 'measure = "rms"' not in warning.remedy  # of which the next warning would be
+
+
+def test_too_short_a_window_of_slow_samples_may_be_one_of_levels():
+    problem, _ = only_problem(MOTOR, ("12_000.0", "10.0"), (BAND, ""))
+    assert problem.key == "pipeline.levels.window_s"
+    assert 'or type = "trend" for sensors whose level the device measures itself' in problem.remedy
+
+
+@pytest.mark.parametrize(
+    ("limits", "warned"),
+    [
+        ('measure = "rms"\nalert = 40.0\ndanger = 60.0', True),
+        ('measure = "gap_voltage"\nalert = -5.0\ndanger = -3.0', False),
+    ],
+)
+def test_slow_samples_of_a_probe_show_the_position_of_the_shaft_only(limits, warned):
+    text = LAVAL.read_text(encoding="utf-8")
+    bank, alarm, fault, handling = map(
+        text.index, ("[pipeline.rotor_bank]", "[[alarms]]", "# on what the model", "[alarm_handling]")
+    )
+    text = text[:bank] + text[alarm:fault].rpartition("[[alarms]]")[0] + text[handling:]
+    for old, new in (
+        ("rate_hz = 640.0", "rate_hz = 10.0"),
+        ("window_s = 0.5", "window_s = 2.0"),
+        ('  # "rms", "peak" or "crest_factor"', ""),
+        ('measure = "rms"\nalert = 40.0\ndanger = 60.0', limits),
+    ):
+        assert old in text
+        text = "\n".join(line.rstrip() for line in text.replace(old, new).split("\n"))
+    found = [one for one in parse_machine_file(text, LAVAL).warnings if f"{one.code}" == "F34"]
+    assert len(found) == warned
+    for one in found:
+        assert one.key == "streams.shaft.rate_hz"
+        assert "RMS and peak of probe-x, probe-y do not show" in one.message

@@ -47,6 +47,8 @@ _LEAST_REVOLUTIONS = 2.0
 _LEAST_PERIODS = 2.0
 _SAMPLED = ("proximity", "accelerometer", "velocity")
 _CASING = ("accelerometer", "velocity")
+_OF_STEADY_PARTS = ("gap_voltage", *OF_THE_SHAFT)
+"""Measures that need no samples of a motion, or have their own check of how many a revolution has."""
 
 
 class _Asked(NamedTuple):
@@ -83,6 +85,7 @@ def measure_checks(draft: MachineFile, levels: Levels) -> Iterator[Iterator[Find
     yield _listed(draft, levels)
     yield _zones(draft, levels)
     yield _speed_in_band(draft, levels)
+    yield _speed_in_samples(draft)
 
 
 def _all_asked(draft: MachineFile, levels: Levels) -> Iterator[_Asked]:
@@ -286,18 +289,65 @@ def _speed_in_band(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
                     f'does not see 1X: "{alarm.name}" watches {low_hz:g} Hz to {high_hz:g} Hz, and the '
                     f"machine turns at {once_hz:.4g} Hz ({speed_rpm:g} rpm). An unbalance does not show. "
                     f'Stream "{sensor.stream}" has rate_hz = {rate_hz:g}',
-                    _remedy_for_1x(alarm.measure, once_hz, bands_hz[alarm.measure], rate_hz, sensor.unit),
+                    _remedy_for_1x(alarm.measure, once_hz, bands_hz[alarm.measure], rate_hz, sensor),
                     fatal=False,
                     code=BAND_WITHOUT_1X,
                 )
                 break
 
 
+_IF_A_LEVEL = (
+    'if the device sends a level that it has computed, e.g. an RMS, write type = "trend" for the sensor, and '
+    'measure = "value" in its alarms'
+)
+
+
+def _speed_in_samples(draft: MachineFile) -> Iterator[Finding]:
+    """Samples show 1X of the machine: of slower ones RMS and peak depend on chance.
+
+    A probe may be there for the position of the shaft, and of an alarm on a velocity `_speed_in_band` warns.
+    """
+    speed_rpm = abs(draft.machine.speed_rpm)
+    once_hz = speed_rpm / 60.0
+    watched: dict[str, set[str]] = {}
+    for alarm in draft.alarms:
+        with suppress(UnusableValueError):
+            if isinstance(alarm, SetpointAlarm):
+                for name in alarm.watched:
+                    watched.setdefault(name, set()).add(alarm.measure)
+    for stream, table in draft.streams.items():
+        with suppress(UnusableValueError):
+            rate_hz = table.rate_hz
+            if rate_hz >= 2.0 * once_hz:
+                continue
+            there = [one for one in draft.sensors if one.stream == stream and one.type in _SAMPLED]
+            if any(watched.get(one.name, set()) & set(VELOCITIES) for one in there):
+                continue
+            moving = [
+                one.name
+                for one in there
+                if one.type in _CASING or watched.get(one.name, set()) - set(_OF_STEADY_PARTS)
+            ]
+            if not moving:
+                continue
+            yield Finding(
+                ("streams", stream, "rate_hz"),
+                f"shows nothing above {rate_hz / 2:g} Hz, and the machine turns at {once_hz:.4g} Hz "
+                f"({speed_rpm:g} rpm). RMS and peak of {', '.join(moving)} do not show its vibration",
+                f"have the device send {rounded_up(SAMPLES_PER_PERIOD * once_hz)} samples a second or more; "
+                f"or, {_IF_A_LEVEL}",
+                fatal=False,
+                code=SAMPLED_TOO_SLOWLY,
+            )
+
+
 def _remedy_for_1x(
-    measure: str, once_hz: float, band_hz: tuple[float, float], rate_hz: float, unit: str
+    measure: str, once_hz: float, band_hz: tuple[float, float], rate_hz: float, sensor: Sensor
 ) -> str:
     low_hz, high_hz = band_hz
-    other = f'write another measure, e.g. measure = "rms" with limits of your own in {unit}'
+    other = f'write another measure, e.g. measure = "rms" with limits of your own in {sensor.unit}'
+    if rate_hz < 2.0 * once_hz:
+        other = _IF_A_LEVEL  # an RMS of such samples does not show 1X either
     if measure == SLOW_VELOCITY or once_hz < SLOW_BAND_HZ[0]:
         return other
     if once_hz > highest_hz(rate_hz):

@@ -6,6 +6,7 @@ And whether their settings fit the streams and sensors.
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from daqsvc.acquisition.clock import NS_PER_S
@@ -407,6 +408,9 @@ def _lowest_frequency(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
 
 
 def _if_no_waveform(draft: MachineFile, stream: str) -> str:
-    """What else to do about a stream that is too slow for waveforms, if its registers are polled."""
-    polled = draft.streams[stream].layout.polled
-    return ', or type = "trend" for sensors whose level the device measures itself' if polled else ""
+    """What else to do about a stream that is too slow for waveforms: it is polled, or does not show 1X."""
+    table = draft.streams[stream]
+    slow = table.layout.polled
+    with suppress(UnusableValueError):
+        slow = slow or table.rate_hz < 2.0 * abs(draft.machine.speed_rpm) / 60.0
+    return ', or type = "trend" for sensors whose level the device measures itself' if slow else ""
