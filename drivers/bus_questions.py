@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from drivers import questions as q
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
-from drivers.sniffing import by_name, is_waveform_rate
+from drivers.sniffing import by_name, is_waveform_rate, plain_name
 from drivers.toml_lines import entry
 
 if TYPE_CHECKING:
@@ -258,18 +258,26 @@ _UNIT_OF = {
     "temp": "degC",
     "speed": "rpm",
     "rpm": "rpm",
+    "drehz": "rpm",
     "curr": "A",
+    "motorstrom": "A",
     "volt": "V",
+    "spannung": "V",
     "press": "bar",
+    "druck": "bar",
+    "schwingweg": "um",
+    "beschl": "g",
     "vib": "mm/s",
     "veloc": "mm/s",
+    "schwing": "mm/s",
 }
-"""Unit by what is in a name; what comes first counts."""
+"""Unit by what is in a name, in English or German; what comes first counts. Volumenstrom is no current."""
 
 
 def unit_by_name(channel: str) -> str | None:
     """The unit that the name of a channel suggests; None if it suggests none."""
-    return next((unit for word, unit in _UNIT_OF.items() if word in channel.lower()), None)
+    low = plain_name(channel)
+    return next((unit for word, unit in _UNIT_OF.items() if word in low), None)
 
 
 def guessed_sensors(answers: Answers, channels: Sequence[str], taken: Collection[str]) -> list[str]:
@@ -304,7 +312,8 @@ def seconds_of(answers: Answers) -> list[str]:
 
 def is_count(name: str) -> bool:
     """Whether the name of a signal or column suggests a counter."""
-    return any(part in name.lower() for part in ("seq", "count", "cnt", "ctr", "zaehl", "alive", "index"))
+    words = ("seq", "count", "cnt", "ctr", "zaehl", "alive", "index")
+    return any(part in plain_name(name) for part in words)
 
 
 def only_port() -> str | None:

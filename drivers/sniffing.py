@@ -11,6 +11,7 @@ import argparse
 import json
 import math
 import re
+import unicodedata
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
@@ -40,8 +41,16 @@ TYPE_OF_UNIT = {
     **dict.fromkeys(("um", "mm", "mil"), "proximity"),
 }
 """Type of a sensor by the unit of its samples, if they are a waveform."""
-_LEVEL_WORDS = ("rms", "peak", "level", "crest", "kurt")
-"""What is in the names of values that a device has computed from a waveform."""
+_LEVEL_WORDS = (
+    *("rms", "peak", "level", "crest", "kurt"),
+    *("effektiv", "spitz", "scheitel", "pegel", "kennwert", "mittelwert", "gleichwert"),
+)
+"""What is in the names of values that a device has computed from a waveform: in English, and in German."""
+_EFF = re.compile(r"E(?:FF|ff)(?![A-Za-z])|(?<![A-Za-z])eff(?![A-Za-z])")
+"""Short for effective, or Effektivwert: the RMS. It is no part of Efficiency or Coeff."""
+_UMLAUTS = str.maketrans(
+    {**{umlaut: f"{base}e" for umlaut, base in zip("äöü", "aou", strict=True)}, "ß": "ss"}
+)
 
 
 class SniffError(Exception):
@@ -131,22 +140,28 @@ def is_waveform_rate(rate_hz: float) -> bool:
     return rate_hz >= _NEAR_WAVEFORM * WAVEFORM_HZ
 
 
+def plain_name(channel: str) -> str:
+    """The name of a channel in small letters, with umlauts as two letters, as most devices write them."""
+    return unicodedata.normalize("NFC", channel).lower().translate(_UMLAUTS)
+
+
 def by_name(channel: str) -> str | None:
     """The type of sensor that the name of a channel suggests; None if it suggests none."""
-    low = channel.lower()
+    low = plain_name(channel)
     if any(part in low for part in ("kph", "key", "phas", "tacho")):
         return "keyphasor"
     if _names_level(channel):
         return "trend"
-    if low.startswith(("acc", "a_")) or low == "a":
+    if low.startswith(("acc", "a_", "beschl")) or low == "a":
         return "accelerometer"
-    if any(part in low for part in ("temp", "press", "speed", "rpm")):
+    if any(part in low for part in ("temp", "press", "druck", "speed", "rpm", "drehz")):
         return "trend"
     return None
 
 
 def _names_level(channel: str) -> bool:
-    return any(part in channel.lower() for part in _LEVEL_WORDS)
+    low = plain_name(channel)
+    return any(part in low for part in _LEVEL_WORDS) or _EFF.search(channel) is not None
 
 
 class Values(NamedTuple):

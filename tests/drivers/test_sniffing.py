@@ -6,7 +6,8 @@ import tomllib
 
 import pytest
 
-from drivers.sniffing import WAVEFORM_HZ, Values, sensor_lines, type_by_unit
+from drivers.bus_questions import is_count, unit_by_name
+from drivers.sniffing import WAVEFORM_HZ, Values, by_name, sensor_lines, type_by_unit
 
 
 def test_what_has_no_unit_is_taken_for_an_acceleration_where_it_comes_as_often_as_a_waveform() -> None:
@@ -67,3 +68,53 @@ def test_a_level_that_comes_as_often_as_a_waveform_is_none(
 ) -> None:
     # An alarm on the RMS of an RMS would never come: that of a steady one is about 0.
     assert type_by_unit(channel, unit, waveform=True, values=values) == kind
+
+
+@pytest.mark.parametrize(
+    ("channel", "kind", "unit"),
+    [
+        ("Effektivwert", "trend", None),
+        ("Schwinggeschwindigkeit_Effektivwert", "trend", "mm/s"),
+        ("Schwing_eff", "trend", "mm/s"),
+        ("VibEff", "trend", "mm/s"),
+        ("Spitze", "trend", None),
+        ("Spitzenwert", "trend", None),
+        ("Scheitelwert", "trend", None),
+        ("Scheitelfaktor", "trend", None),
+        ("Kennwert_DE", "trend", None),
+        ("Mittelwert", "trend", None),
+        ("Gleichwert", "trend", None),
+        ("Schwingpegel", "trend", "mm/s"),
+        ("Schwingung", None, "mm/s"),
+        ("Schwingweg", None, "um"),
+        ("Beschleunigung_x", "accelerometer", "g"),
+        ("Schwingbeschl", None, "g"),
+        ("Drehzahl", "trend", "rpm"),
+        ("MotDrehz", "trend", "rpm"),
+        ("Lagertemperatur", "trend", "degC"),
+        ("Oeldruck", "trend", "bar"),
+        ("\u00d6ldruck", "trend", "bar"),
+        ("Motorstrom", None, "A"),
+        ("Spannung_U1", None, "V"),
+        ("Volumenstrom", None, None),
+        ("Efficiency", None, None),
+        ("Coeff", None, None),
+        ("x", None, None),
+    ],
+)
+def test_names_in_german_suggest_what_those_in_english_do(
+    channel: str, kind: str | None, unit: str | None
+) -> None:
+    assert by_name(channel) == kind
+    assert unit_by_name(channel) == unit
+
+
+@pytest.mark.parametrize("name", ["Zaehler", "Z\u00e4hler", "Za\u0308hler", "BotschaftsZAEHLER"])
+def test_a_counter_in_german_is_one_with_and_without_umlaut(name: str) -> None:
+    assert is_count(name)
+
+
+@pytest.mark.parametrize("channel", ["SchwingEffektivwert", "v_eff", "Spitzenwert"])
+def test_a_level_with_a_german_name_is_no_waveform(channel: str) -> None:
+    assert type_by_unit(channel, "mm/s", waveform=True) == "trend"
+    assert type_by_unit("Schwinggeschwindigkeit", "mm/s", waveform=True) == "velocity"

@@ -22,7 +22,7 @@ from daqsvc.settings.units import factor_between, is_of_peak, same_unit, unit_of
 from drivers import questions as q
 from drivers.bus_questions import STREAM
 from drivers.questions import NONE, Answers, Question, sensor_key
-from drivers.sniffing import TYPE_OF_UNIT
+from drivers.sniffing import TYPE_OF_UNIT, plain_name
 from drivers.toml_lines import array, behind, entry, toml
 
 if TYPE_CHECKING:
@@ -69,11 +69,15 @@ _LONGEST_WINDOW_S = 10.0
 
 
 _NO_RMS = re.compile(
-    r"peak|max(?:imum)?(?![a-z])|set_?point|limit|(?:belt|conveyor|feed)_?(?:speed|rate|vel)|pk(?=[_\d]|$)",
-    re.IGNORECASE,
+    r"peak|max(?:imum)?(?![a-z])|set_?point|limit|(?:belt|conveyor|feed)_?(?:speed|rate|vel)|pk(?=[_\d]|$)"
+    r"|spitz|scheitel|maximal|hoe?chstwert|grenz|soll|vorgabe|schwelle?n?_?wert|(?:alarm|warn)_?wert"
+    r"|(?:band|foe?rder|transport|vorschub)_?(?:geschw|v(?![a-z]))|vorschub(?![a-z])"
 )
-"""In names of channels in mm/s that are no RMS of a vibration: zones of ISO 20816-3 are not for them."""
-_RMS = re.compile(r"R(?:MS|ms)|E(?:FF|ff)|(?<![A-Za-z])(?:rms|eff)|(?:rms|eff)(?![A-Za-z])")
+"""In names of channels in mm/s that are no RMS of a vibration: zones of ISO 20816-3 are not for them.
+
+In English and German, in small letters; also where ö is written as o.
+"""
+_RMS = re.compile(r"R(?:MS|ms)|E(?:FF|ff)|(?<![A-Za-z])(?:rms|eff)|(?:rms|eff)(?![A-Za-z])|effektiv")
 """In names of those that are, whatever else is in them; but no part of AlarmSetpoint."""
 
 
@@ -108,7 +112,7 @@ class Sensor(NamedTuple):
         if is_of_peak(self.unit):
             return True
         is_named_rms = any(_RMS.search(name) for name in (self.channel, self.name))
-        return not is_named_rms and _NO_RMS.search(self.channel) is not None
+        return not is_named_rms and _NO_RMS.search(plain_name(self.channel)) is not None
 
     @property
     def iso(self) -> str | None:

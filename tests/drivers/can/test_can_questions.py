@@ -129,6 +129,15 @@ def test_the_unit_of_the_dbc_file_is_taken_over(
             for word in ("pk", "0-p", "p-p", "pp", "peak", "(peak)")
         ),
         *((name, "mm/s", "mm/s") for name in ("VPeak", "Vmax", "AlarmSetpoint", "BeltSpeed", "Vib_pk")),
+        *(
+            (name, "mm/s", "mm/s")
+            for name in (
+                *("Schwing_Spitze", "Spitzenwert_DE", "Scheitelwert", "v_Maximalwert"),
+                *("Hoechstwert", "Hochstwert", "GrenzwertVib", "Vib_Grenze", "SollwertAlarm", "v_Soll"),
+                *("Schwellwert", "Schwellenwert", "Alarmwert", "Warnwert_2", "Vorgabe_v"),
+                *("Bandgeschwindigkeit", "FoerderGeschw", "Fordergeschw", "Vorschub"),
+            )
+        ),
     ],
 )
 def test_what_is_no_rms_gets_no_zones_of_one(
@@ -147,6 +156,8 @@ def test_what_is_no_rms_gets_no_zones_of_one(
     ("name", "stated"),
     [
         *((name, "mm/s") for name in ("VelRms", "Vib", "MaxVelRms", "ClimaxMill_Vel", "BeltFan_Vel")),
+        *((name, "mm/s") for name in ("Schwinggeschwindigkeit_DE", "Effektivwert", "SpitzeEff", "Band_Vib")),
+        *((name, "mm/s") for name in ("Grenzschwingeffektivwert", "Konsole_Schwing", "Vorschubmotor_Vib")),
         *(("OilTemp", stated) for stated in ("mm/s RMS", "mm/s eff", "mm/s eff.")),
     ],
 )
