@@ -94,11 +94,12 @@ def recognised(data: bytes, line_errors: int = 0) -> Recognised:
         regular = 1 - damaged / sum(len(kind.lines) for kind in lines.kinds)
         score = (0.6 + 0.35 * regular) * printable + 0.05 * (lines.checksum in {"xor", "crc16"})
         candidates.append(Recognised(min(score, 1.0), lines, parity, printable))
-    candidates += [
-        Recognised(frames.score, frames, None, printable)
-        for frames in (cobs_frames(data), sync_frames(data))
-        if frames is not None
-    ]
+    if all(one.score < CONCLUSIVE for one in candidates):  # the search for frames takes seconds
+        candidates += [
+            Recognised(frames.score, frames, None, printable)
+            for frames in (cobs_frames(data), sync_frames(data))
+            if frames is not None
+        ]
     best = max(candidates, key=lambda one: one.score)
     # A few characters are cut where the port was opened; at a wrong rate many are without stop bit.
     return Recognised(
