@@ -28,7 +28,7 @@ from drivers.can import questions, sniff, socketcan
 from drivers.can.dbc import messages_of
 from drivers.can.dbc_questions import DbcQuestions
 from drivers.can.dbc_traffic import MessageTraffic, SignalTraffic
-from drivers.sniffing import is_waveform_rate, sniffed
+from drivers.sniffing import NothingFoundError, is_waveform_rate, sniffed
 from sim_hw.bus_socket import UnixBus
 from sim_hw.bus_socket_hub import Hub
 
@@ -529,7 +529,8 @@ def test_a_bus_with_few_frames_is_listened_to_longer(tmp_path: Path) -> None:
     where = ["--interface", "unixbus", "--fd", f"{tmp_path / 'bus'}"]
     with talking(tmp_path / "bus", rare):
         longer = sniffed(sniff.CanSniffer(0.5), where, threading.Event(), told.append)
-        sniffed(sniff.CanSniffer(0.5), [*where, "--seconds", "0.5"], threading.Event(), told.append)
+        with contextlib.suppress(NothingFoundError):  # on a busy computer none may come in so short a time
+            sniffed(sniff.CanSniffer(0.5), [*where, "--seconds", "0.5"], threading.Event(), told.append)
     assert min(one["frames"] for one in longer["ids"]) >= 2
     assert [line.partition(" for up to")[0] for line in told] == [
         f"listening to {tmp_path / 'bus'} for 0.5 s; Ctrl-C ends it early",
