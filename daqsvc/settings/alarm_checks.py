@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import suppress
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -433,7 +434,8 @@ def _believed(draft: MachineFile, alarm: SetpointAlarm, at: KeyPath) -> Iterator
     """Whether the setpoints can be reached, and left, while the sensors are believed."""
     if alarm.measure not in _TWO_SIDED:
         return
-    sensors = _named(draft)
+    sensors, grows = _named(draft), alarm.trip_multiply
+    uppers = [value for key, value in alarm.setpoints.items() if key in _UPPER]
     for name in alarm.watched:
         sensor = sensors.get(name)
         key, limits = _ok_limits(sensor)
@@ -446,6 +448,15 @@ def _believed(draft: MachineFile, alarm: SetpointAlarm, at: KeyPath) -> Iterator
                     (*at, setpoint),
                     f"is never reached: it lies outside {limits_text}, where that is not believed",
                     f"correct it, or {key} of the sensor",
+                    code=NEVER_REACHED,
+                )
+            elif setpoint in _UPPER and all(upper > 0 for upper in uppers) and value * grows > limits[1]:
+                yield Finding(
+                    (*at, "trip_multiply"),
+                    f"has {setpoint} = {value:g} wait for {value * grows:g} at a start-up, which "
+                    f"is never reached: it lies outside {limits_text}, where that is not believed",
+                    f"make it at most {math.floor(10.0 * limits[1] / value) / 10.0:g}, or correct {key} of "
+                    "the sensor",
                     code=NEVER_REACHED,
                 )
             room = value - limits[0] if setpoint in _UPPER else limits[1] - value

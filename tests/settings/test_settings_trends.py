@@ -379,6 +379,15 @@ def test_ok_limits_that_end_just_above_danger_are_warned_of(high, changes, said,
         assert f"end it at {least} mm/s or more" in one.remedy
 
 
+def test_a_start_up_may_not_take_a_limit_beyond_the_ok_limits():
+    text, _ = changed(PUMP, *starting_up((OK, "ok_between = [0.0, 8.9]")))
+    (problem,) = problems_of(text, PUMP)
+    assert (f"{problem.code}", problem.key) == ("A06", "alarms[0].trip_multiply")
+    assert "has danger = 4.5 wait for 9 at a start-up, which is never reached" in problem.message
+    assert "make it at most 1.9" in problem.remedy
+    assert not parsed(PUMP, *starting_up((OK, "ok_between = [0.0, 9.0]"))).warnings
+
+
 def test_zones_are_held_against_the_ok_limits():
     text, _ = changed(PUMP, (OK, "ok_between = [0.0, 10.0]"), IN_ZONES)
     (problem,) = problems_of(text, PUMP)
