@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from drivers import questions as q
+from drivers.names import BUS, STREAM
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
 from drivers.sniffing import by_name, is_waveform_rate, plain_name
 from drivers.toml_lines import entry
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
     import threading
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
-BUS, STREAM = "main", "device"
-"""Names of the only bus and the only stream of the file."""
 BEFOREHAND = "beforehand"
 """Key, beside the answers that `BusQuestions.listen` gets, of those that were given beforehand."""
 _BY_ID = Path("/dev/serial/by-id")
@@ -193,6 +192,16 @@ class BusQuestions(ABC):
         named: tuple[str, ...] = answers["channels"]
         return named
 
+    def bus_name(self, answers: Answers) -> str:
+        """What the only bus of the file is called; `drivers.names` has what ``daqsvc sniff`` calls it."""
+        del answers
+        return BUS
+
+    def stream_name(self, answers: Answers) -> str:
+        """What the only stream of the file is called."""
+        del answers
+        return STREAM
+
     def of_channel(self, answers: Answers, channel: str) -> Iterator[Question]:
         """What is asked about a channel before its sensor."""
         del answers, channel
@@ -244,11 +253,12 @@ class BusQuestions(ABC):
 
     def stream(self, answers: Answers, comment: str = "samples a second of each channel") -> Iterator[str]:
         """Lines of ``[streams]``, up to the keys of the layout."""
-        yield f"[streams.{STREAM}]"
-        yield entry("bus", BUS)
+        name = self.stream_name(answers)
+        yield f"[streams.{name}]"
+        yield entry("bus", self.bus_name(answers))
         yield entry("rate_hz", answers["rate"], comment)
         yield ""
-        yield f"[streams.{STREAM}.layout]"
+        yield f"[streams.{name}.layout]"
 
     def _topic(self, key: str) -> Topic:
         return self.topics[key] if key in self.topics else SHARED[key]

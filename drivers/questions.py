@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
+from drivers.names import LONGEST_NAME
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
@@ -19,9 +21,8 @@ Answers = dict[str, Any]
 """Values by the key of their question."""
 
 NONE = "none"
-LONGEST_NAME = 64
 LONGEST_LINE = 256
-"""Characters of a name, and of any other text of a machine file."""
+"""Characters of a text of a machine file; for names see `drivers.names`."""
 SENSOR = "sensor"
 """First part of the keys that belong to one channel: ``sensor.CHANNEL.TOPIC``."""
 

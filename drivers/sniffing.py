@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from daqsvc.errors.command_line import NOT_OPENED, NOTHING_ON_BUS, WRONG_VALUE
 from daqsvc.settings.units import is_of_peak, may_be_unit, unit_of
+from drivers.names import sensor_name, unused
 
 if TYPE_CHECKING:
     import threading
@@ -223,11 +224,6 @@ def quoted(text: str) -> str:
     return json.dumps(text, ensure_ascii=False)
 
 
-def table_name(text: str, otherwise: str) -> str:
-    """A name for a table of a machine file, which needs no quotes; ``otherwise`` if nothing is left of it."""
-    return re.sub(r"[^A-Za-z0-9_]+", "-", text).strip("-")[:40] or otherwise
-
-
 def sensor_lines(
     stream: str,
     channels: Mapping[str, str],
@@ -253,7 +249,6 @@ def sensor_lines(
         values: what else is known of the values of channels.
     """
     lines: list[str] = []
-    before = f"{stream}-" if by_stream else ""
     for channel, text in channels.items():
         swings = channel in swinging and rate_hz >= LEAST_SWINGING_HZ
         waveform = is_waveform_rate(rate_hz) or swings
@@ -274,22 +269,13 @@ def sensor_lines(
         lines += [
             "",
             "[[sensors]]",
-            f"name = {quoted(unused(table_name(f'{before}{channel.lower()}', 'sensor'), taken))}",
+            f"name = {quoted(unused(sensor_name(channel, kind, stream if by_stream else ''), taken))}",
             f"type = {quoted(kind)}{by if is_guess else ''}",
             f"stream = {quoted(stream)}",
             f"channel = {quoted(channel)}",
             f"unit = {quoted(unit)}",
         ]
     return lines
-
-
-def unused(name: str, taken: set[str]) -> str:
-    """A name that nothing has yet; it is taken then."""
-    free, number = name, 2
-    while free in taken:
-        free, number = f"{name}-{number}", number + 1
-    taken.add(free)
-    return free
 
 
 def rounded_rate(rate_hz: float) -> float:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import shlex
 from typing import TYPE_CHECKING, Any
 
-from drivers.bus_questions import BUS
 from drivers.can.dbc_likely import beside_samples, likely_counter, likely_measured, samples_of_one
 from drivers.can.heard import SHOWN, HeardOnCan, decoded_signals, values_heard
 from drivers.can.other_source import other_sources
@@ -269,7 +268,7 @@ class HeardMessages(HeardOnCan):
         if others:
             yield (
                 f"Not read: {_few(others)}; {_sniffed_by(answers)} prints their tables. Of these take the "
-                f'streams and sensors, and write bus = "{BUS}", as this file calls it.'
+                "streams and sensors: they are on the same bus."
             )
         left_out = beside_samples(answers["signals"]) if answers.get("consecutive") else []
         if left_out:

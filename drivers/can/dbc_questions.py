@@ -31,6 +31,7 @@ from drivers.can.dbc_likely import (
 from drivers.can.heard import SHOWN
 from drivers.can.questions import CanQuestions
 from drivers.can.sniff import of_another_stream, of_one_channel
+from drivers.names import LONGEST_NAME, message_stream
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
 from drivers.sniffing import LONGEST_UNIT, Values, by_name, is_waveform_rate, type_by_unit
 from drivers.toml_lines import array, behind, entry, toml
@@ -150,6 +151,10 @@ class DbcQuestions(CanQuestions):
     def _messages(self, answers: Answers) -> dict[str, Message]:
         return with_signals(answers["dbc-folder"] / answers["dbc"])
 
+    def stream_name(self, answers: Answers) -> str:
+        """See `BusQuestions.stream_name`."""
+        return message_stream(answers["message"])
+
     def channels(self, answers: Answers) -> tuple[str, ...]:
         """See `BusQuestions.channels`."""
         return tuple(self._by_channel(answers))
@@ -158,8 +163,8 @@ class DbcQuestions(CanQuestions):
         """Signals of each channel."""
         if answers.get("consecutive"):
             samples = samples_of_one(answers["signals"])
-            return {stem[: q.LONGEST_NAME]: names for stem, names in samples.items()}
-        return {signal[: q.LONGEST_NAME]: [signal] for signal in answers["signals"]}
+            return {stem[:LONGEST_NAME]: names for stem, names in samples.items()}
+        return {signal[:LONGEST_NAME]: [signal] for signal in answers["signals"]}
 
     def _samples_in_frame(self, answers: Answers) -> int:
         return len(next(iter(self._by_channel(answers).values())))
@@ -317,7 +322,7 @@ def _signals(known: tuple[str, ...], signals: Mapping[str, Any], text: str) -> t
     for one in chosen:
         if one not in known:
             raise ValueError(f'there is no signal "{one}"; there are {", ".join(known)}')
-    if len({one[: q.LONGEST_NAME] for one in chosen}) < len(chosen):
+    if len({one[:LONGEST_NAME] for one in chosen}) < len(chosen):
         raise ValueError(f'"{text}" has a signal twice')
     if not come_together(signals, chosen):
         paged = sorted(one for one in chosen if signals[one].multiplexer_ids)

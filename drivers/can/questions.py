@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from drivers import packed_questions as packed
 from drivers import questions as q
-from drivers.bus_questions import BUS, BusQuestions, seconds_of
+from drivers.bus_questions import BusQuestions, seconds_of
 from drivers.can.heard import LAST_SHORT_ID, OF_BYTES, HeardFrames
 from drivers.can.sniff import CanSniffer
+from drivers.names import BUS, CAN, bus_name
 from drivers.questions import Answers, Question, Topic
 from drivers.sniffing import NothingFoundError, SniffError, sniffed
 from drivers.toml_lines import Hexadecimal, entry
@@ -97,6 +98,10 @@ class CanQuestions(BusQuestions):
             answers: those before.
         """
 
+    def bus_name(self, answers: Answers) -> str:
+        """See `BusQuestions.bus_name`."""
+        return bus_name(answers["channel"], CAN)
+
     def _interface(self) -> Iterator[Question]:
         yield self.ask("interface", _interface, _SOCKETCAN, quiet=True)
         yield self.ask("channel", q.line, "can0")
@@ -112,7 +117,7 @@ class CanQuestions(BusQuestions):
         if answers["interface"] == "socketcan":
             yield "# Bring the interface up before the service starts, with the bit rates of the bus:"
             yield f"#   ip link set {channel} up type can bitrate {rate}{fd}"
-        yield f"[buses.{BUS}]"
+        yield f"[buses.{self.bus_name(answers)}]"
         yield entry("driver", "can")
         yield entry("interface", answers["interface"], "any interface that python-can knows")
         yield entry("channel", channel)
@@ -177,9 +182,10 @@ class PackedQuestions(CanQuestions):
         """See `BusQuestions.example`."""
         if not {"id", *OF_BYTES}.intersection(assumed):
             return ""
+        layout = f"[streams.{self.stream_name(answers)}.layout]"
         return (
             f"The frames are an example: nothing was heard, and nobody has stated what the bytes of "
-            f"{answers['id']:#x} mean. Before the first run correct [streams.device.layout] by the device's "
+            f"{answers['id']:#x} mean. Before the first run correct {layout} by the device's "
             "manual; if there is a DBC file of the device, use daqsvc new --bus can-dbc."
         )
 
@@ -211,6 +217,11 @@ class VirtualQuestions(PackedQuestions):
         yield self.ask("socket", q.line, f"{Path(tempfile.gettempdir()) / 'daqsvc-can0'}", quiet=True)
         answers["fd"] = True
         yield from self._frame(answers, quiet=True)
+
+    def bus_name(self, answers: Answers) -> str:
+        """See `BusQuestions.bus_name`."""
+        del answers
+        return BUS
 
     def rate_hz(self, answers: Answers) -> float:
         """See `BusQuestions.rate_hz`: 64 samples a revolution."""

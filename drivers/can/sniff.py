@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from daqsvc.documentation import documented_in
 from daqsvc.rounding import counted
 from drivers.can.other_source import other_sources
+from drivers.names import CAN, bus_name, message_stream, unused
 from drivers.sniffing import (
     Sniffed,
     Sniffer,
@@ -23,8 +24,6 @@ from drivers.sniffing import (
     quoted,
     rounded_rate,
     sensor_lines,
-    table_name,
-    unused,
 )
 
 if TYPE_CHECKING:
@@ -558,7 +557,7 @@ class _Report(NamedTuple):
         }
 
     def _fragment(self) -> str:
-        name = table_name(self.bus.channel.rpartition("/")[2], "can0")
+        name = bus_name(self.bus.channel, CAN)
         lines = [
             f"[buses.{name}]",
             'driver = "can"',
@@ -602,7 +601,7 @@ class _Report(NamedTuple):
             return [f"# {message.name} came too seldom, or not as the DBC file describes it"]
         rate_hz = of_ids[0].rate_hz
         assert rate_hz is not None and self.dbc_file is not None  # noqa: S101, PT018 - for the type checker
-        name = unused(table_name(message.name.lower(), "stream"), taken)
+        name = unused(message_stream(message.name), taken)
         counter = message.counter
         samples = {s.name: [s.name] for s in channels}
         if counter is None and (counter := _counter_of_samples(message)) is not None:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, ClassVar
 
 from drivers import questions as q
 from drivers.bus_questions import (
-    BUS,
     BusQuestions,
     only_port,
     seconds_of,
@@ -26,6 +25,7 @@ from drivers.modbus.manual_addresses import (
     table_meant,
 )
 from drivers.modbus.sniff import AUTO, LAST_REGISTER, ModbusSniffer, registers_of, units_of
+from drivers.names import MODBUS, unit_stream
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
 from drivers.sniffing import NothingFoundError, SniffError, is_waveform_rate, sniffed
 from drivers.toml_lines import Hexadecimal, array, entry
@@ -252,6 +252,15 @@ class _ModbusQuestions(BusQuestions):
         del answers
         return math.inf
 
+    def bus_name(self, answers: Answers) -> str:
+        """See `BusQuestions.bus_name`."""
+        del answers
+        return MODBUS
+
+    def stream_name(self, answers: Answers) -> str:
+        """See `BusQuestions.stream_name`."""
+        return unit_stream(answers["unit"], answers.get("table", "holding"))
+
     def of_channel(self, answers: Answers, channel: str) -> Iterator[Question]:
         """See `BusQuestions.of_channel`."""
         if answers["way"] != "values":
@@ -319,7 +328,7 @@ class _ModbusQuestions(BusQuestions):
 
     def tables(self, answers: Answers) -> Iterator[str]:
         """See `BusQuestions.tables`."""
-        yield f"[buses.{BUS}]"
+        yield f"[buses.{self.bus_name(answers)}]"
         yield entry("driver", "modbus")
         yield from self._line_keys(answers)
         yield entry("timeout_ms", answers["timeout-ms"], "how long the unit may take to answer")

@@ -10,6 +10,7 @@ from drivers.modbus.readings import chosen, is_signed, readings, undecided
 from drivers.modbus.replies import EXCEPTIONS
 from drivers.modbus.scan import ILLEGAL_FUNCTION, LAST_REGISTER, TABLES, units_in_words
 from drivers.modbus.settings import ModbusTcpBus
+from drivers.names import MODBUS, unit_stream
 from drivers.sniffing import Sniffed, SniffTable, quoted, sensor_lines
 
 if TYPE_CHECKING:
@@ -267,7 +268,7 @@ class ScanReport:
         if not tables:
             return ""
         bus = self._bus
-        lines = ["[buses.modbus]", 'driver = "modbus"']
+        lines = [f"[buses.{MODBUS}]", 'driver = "modbus"']
         if isinstance(bus, ModbusTcpBus):
             lines += ['transport = "tcp"', f"host = {quoted(bus.host)}", f"tcp_port = {bus.tcp_port}"]
         else:
@@ -365,9 +366,9 @@ def _stream(
     table: FoundTable, numbers: Sequence[Reading], doubted: Sequence[Reading], sensors: set[str]
 ) -> Iterator[str]:
     channels = list(_channels(table, numbers))
-    name = f"unit-{table.unit}" + ("" if table.function == 3 else "-input")
+    name = unit_stream(table.unit, TABLES[table.function])
     yield f"[streams.{name}]"
-    yield 'bus = "modbus"'
+    yield f"bus = {quoted(MODBUS)}"
     yield "rate_hz = 1.0"
     yield ""
     guessed = "types and no_value" if any(one.no_value is not None for one in channels) else "types"

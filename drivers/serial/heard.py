@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from daqsvc.rounding import counted
 from drivers import packed_questions as packed
 from drivers.bus_questions import Heard, guessed_sensors
+from drivers.names import lines_stream, sensor_name, table_name, unused
 from drivers.questions import NONE, Answers, sensor_key
 from drivers.serial.sniff_words import (
     ANY_BAUD,
@@ -29,9 +30,7 @@ from drivers.sniffing import (
     TYPE_OF_UNIT,
     by_name,
     quoted,
-    table_name,
     unit_of_suffix,
-    unused,
     usual_rate,
 )
 
@@ -86,6 +85,9 @@ class HeardOnSerial(Heard):
                 proposed[sensor_key(name, "suffix")] = one["unit"]
             if kind := _swinging_type(one, name, answers.get("rate", self.found["rate_hz"])):
                 proposed[sensor_key(name, "type")] = kind
+            if (chosen := answers.get(sensor_key(name, "type"))) and self._is_of_several(answers):
+                named_after = sensor_name(name, chosen, lines_stream(answers["prefix"]))
+                proposed[sensor_key(name, "name")] = named_after
             if one["counts"] or one["time_unit"]:
                 proposed |= {"counter": name, "counts": one["time_unit"] or "count"}
             elif one["turns_at"] or not one["numeric"]:
@@ -94,6 +96,10 @@ class HeardOnSerial(Heard):
         # Else a person who takes all defaults would have lines counted by what counts nothing.
         proposed.setdefault("counter", NONE)
         return proposed
+
+    def _is_of_several(self, answers: Answers) -> bool:
+        """Whether the stream is of one kind of lines out of several: columns may have the same names."""
+        return bool(answers.get("prefix") and self.found["other_prefixes"])
 
     def _of_frames(self, answers: Answers) -> dict[str, str]:
         """Proposals for binary frames."""

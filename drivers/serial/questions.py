@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, ClassVar
 
 from drivers import packed_questions as packed
 from drivers import questions as q
-from drivers.bus_questions import BEFOREHAND, BUS, BusQuestions, only_port, seconds_of
+from drivers.bus_questions import BEFOREHAND, BusQuestions, only_port, seconds_of
+from drivers.names import FRAMES, SERIAL, bus_name, lines_stream
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
 from drivers.serial.heard import CRCS, DELIMITERS, HeardOnSerial
 from drivers.serial.sniff import SerialSniffer
@@ -157,6 +158,14 @@ class SerialQuestions(BusQuestions):
         yield self.ask_of(column, "prefix", q.text_or_none, NONE, quiet=True)
         yield self.ask_of(column, "suffix", q.text_or_none, NONE, quiet=True)
 
+    def bus_name(self, answers: Answers) -> str:
+        """See `BusQuestions.bus_name`."""
+        return bus_name(answers["port"], SERIAL)
+
+    def stream_name(self, answers: Answers) -> str:
+        """See `BusQuestions.stream_name`."""
+        return lines_stream(answers["prefix"]) if answers["framing"] == "lines" else FRAMES
+
     def channels(self, answers: Answers) -> tuple[str, ...]:
         """See `BusQuestions.channels`."""
         if answers["framing"] != "lines":
@@ -204,7 +213,7 @@ class SerialQuestions(BusQuestions):
 
     def tables(self, answers: Answers) -> Iterator[str]:
         """See `BusQuestions.tables`."""
-        yield f"[buses.{BUS}]"
+        yield f"[buses.{self.bus_name(answers)}]"
         yield entry("driver", "serial")
         yield entry("port", answers["port"], "best its path below /dev/serial/by-id")
         yield entry("baud", answers["baud"], "bit/s, as the device is set")

@@ -5,10 +5,10 @@ from __future__ import annotations
 import textwrap
 from bisect import bisect_left, bisect_right
 from operator import itemgetter
-from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from daqsvc.rounding import counted
+from drivers.names import FRAMES, SERIAL, bus_name, lines_stream, table_name, unused
 from drivers.serial.ports import lasting_name
 from drivers.serial.sniff_words import (
     ANY_BAUD,
@@ -33,9 +33,7 @@ from drivers.sniffing import (
     quoted,
     rounded_rate,
     sensor_lines,
-    table_name,
     unit_of_suffix,
-    unused,
 )
 
 if TYPE_CHECKING:
@@ -472,7 +470,7 @@ class Report(NamedTuple):
         what = self._what
         if what is None:
             return ""
-        name = table_name(Path(self.port).name.lower(), "serial0")
+        name = bus_name(self.port, SERIAL)
         head = [
             f"[buses.{name}]",
             'driver = "serial"',
@@ -494,10 +492,10 @@ class Report(NamedTuple):
         sensors: set[str] = set()
         for kind in what.kinds:
             yield ""
-            stream = table_name(kind.prefix.lower(), "lines") if what.others else "lines"
-            yield from self._stream(kind, bus, stream, sensors)
+            yield from self._stream(kind, bus, sensors, of_several=bool(what.others))
 
-    def _stream(self, what: TextLines, bus: str, stream: str, sensors: set[str]) -> Iterator[str]:
+    def _stream(self, what: TextLines, bus: str, sensors: set[str], *, of_several: bool) -> Iterator[str]:
+        stream = lines_stream(what.prefix)
         counter, time_column = _counter(what), self._time(what)
         # What begins again after 999 counts, and measures nothing.
         numbers = [
@@ -544,8 +542,8 @@ class Report(NamedTuple):
             comment = "    # a line with other texts there is not read: it is counted as damaged"
         yield f"channels = [{', '.join(listed)}]{comment}"
         channels = {names[one]: unit_of_suffix(one.unit) for one in numbers}
-        by_stream = bool(what.prefix) and stream != "lines"
         swinging = {names[one] for one in numbers if one.swings}
+        by_stream = of_several and bool(what.prefix)
         yield from sensor_lines(
             stream, channels, sensors, rate_hz, by_stream=by_stream, guess=True, swinging=swinging
         )
@@ -581,11 +579,12 @@ class Report(NamedTuple):
             yield from (
                 f"# {line}" for line in textwrap.wrap(width_words(counter.bits, counter.step, rate_hz), 98)
             )
-        yield "[streams.frames]"
+        yield f"[streams.{FRAMES}]"
         yield f"bus = {quoted(bus)}"
         yield f"rate_hz = {rounded_rate(rate_hz * samples)}    # as measured; see the device's manual"
         yield ""
-        yield "[streams.frames.layout]    # what is behind the counter is a guess: see the device's manual"
+        guess = "what is behind the counter is a guess: see the device's manual"
+        yield f"[streams.{FRAMES}.layout]    # {guess}"
         yield f"payload_length = {payload}"
         known = f"as the counter has; {'little' if counter.order == 'big' else 'big'} if the values jump"
         if counter.bits == 8:
@@ -598,7 +597,7 @@ class Report(NamedTuple):
         names = [f"c{k + 1}" for k in range(packed.channels)]
         listed = ", ".join(f'{{ name = "{one}", type = "int16", scale = 1.0 }}' for one in names)
         yield f"channels = [{listed}]"
-        yield from sensor_lines("frames", dict.fromkeys(names, "1"), set(), rate_hz * samples, guess=True)
+        yield from sensor_lines(FRAMES, dict.fromkeys(names, "1"), set(), rate_hz * samples, guess=True)
 
 
 class _Packed(NamedTuple):

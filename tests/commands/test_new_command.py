@@ -18,6 +18,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from support.examples import examples
+from support.only_table import only_bus, only_stream
 from support.paths import ROOT
 
 from daqsvc.cli import main
@@ -513,8 +514,8 @@ def test_bits_are_asked_of_a_word_only_and_written_as_the_file_has_them(tmp_path
     answers = conduct(tmp_path / "m.toml", Given(given, defaults=False), ask, print)
     assert [key for key in asked_of if key.endswith(".bits")] == ["sensor.status.bits"]
     machine = tomllib.loads(machine_text(answers, "m.toml"))
-    assert machine["buses"]["main"]["timeout_ms"] == 1500.0
-    channels = machine["streams"]["device"]["layout"]["channels"]
+    assert only_bus(machine)["timeout_ms"] == 1500.0
+    channels = only_stream(machine)["layout"]["channels"]
     assert [channel.get("bits") for channel in channels] == [None, [3, 1], None]
     words = ["new", f"{tmp_path / 'm.toml'}", "--yes", "--overwrite", "--bus=modbus-tcp", "--host=192.0.2.10"]
     assert main([*words, "--channels=power", "--sensor=power.bits=4-7"]) == 0
@@ -527,7 +528,7 @@ def test_bits_are_asked_of_a_word_only_and_written_as_the_file_has_them(tmp_path
         assert main([*words, "--channels=power", f"--sensor=power.bits={wrong}"]) == 2
         assert why in capsys.readouterr().err
     assert main([*words, "--timeout-ms=0"]) == 2
-    assert "--timeout-ms 0: buses.main.timeout_ms = 0.0: must be 1 or more" in capsys.readouterr().err
+    assert "--timeout-ms 0: buses.modbus.timeout_ms = 0.0: must be 1 or more" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("bus", ["can-dbc", "can"])
@@ -569,7 +570,7 @@ def test_answers_of_a_file_are_those_of_the_options(tmp_path, capsys):
     assert machine.machine.description == "Lüfter \"7\" 'süd' 泵"
     assert machine.machine.name == "lufter-7-sud"
     assert machine.machine.speed_rpm == -1480.0
-    layout = tomllib.loads(file.read_text(encoding="utf-8"))["streams"]["device"]["layout"]
+    layout = only_stream(tomllib.loads(file.read_text(encoding="utf-8")))["layout"]
     assert layout["unit"] == 4
     assert [(one["address"], one["scale"]) for one in layout["channels"]] == [(17, 1.0), (32, 0.001)]
     assert [alarm.alert for alarm in machine.alarms] == [7.1, 7.1]

@@ -6,7 +6,7 @@ import re
 import tomllib
 from typing import TYPE_CHECKING
 
-from drivers.bus_questions import BUS, STREAM
+from daqsvc.commands.new.buses import bus_of
 from drivers.questions import Answers, sensor_key
 from drivers.toml_lines import behind
 
@@ -54,7 +54,9 @@ def marked(lines: Iterable[str], answers: Answers) -> tuple[list[str], list[str]
     keys: dict[str, None] = {}
     if not assumed:
         return found, []
-    table, channel = "", ""
+    bus, table, channel = bus_of(answers), "", ""
+    stream = f"streams.{bus.stream_name(answers)}"
+    tables = {f"buses.{bus.bus_name(answers)}", stream, f"{stream}.layout"}
     for place, line in enumerate(found):
         if line.startswith("["):
             table = line.partition("#")[0].strip().strip("[]")
@@ -67,7 +69,7 @@ def marked(lines: Iterable[str], answers: Answers) -> tuple[list[str], list[str]
             key = "channels"
         elif (begin := _KEY.match(line)) is not None:
             key = begin[1]
-            one = _questions(table, key, channel)
+            one = _questions(table, key, channel, tables)
         else:
             continue
         if line.endswith("[") or line == _ONLY_TYPE:
@@ -78,11 +80,11 @@ def marked(lines: Iterable[str], answers: Answers) -> tuple[list[str], list[str]
     return found, [*keys]
 
 
-def _questions(table: str, key: str, channel: str) -> list[str]:
-    """The questions whose answers are in a line."""
+def _questions(table: str, key: str, channel: str, tables: Collection[str]) -> list[str]:
+    """The questions whose answers are in a line; ``tables`` are those of the bus and of the stream."""
     if table == "machine":
         return ["speed"] if key == "speed_rpm" else []
-    if table in {f"buses.{BUS}", f"streams.{STREAM}", f"streams.{STREAM}.layout"}:
+    if table in tables:
         return [key.replace("_", "-"), *_OTHER.get(key, ())]
     if table == "sensors":
         return [sensor_key(channel, _OF_SENSOR[key])] if key in _OF_SENSOR else []

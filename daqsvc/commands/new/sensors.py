@@ -20,7 +20,7 @@ from daqsvc.settings.measures import (
 )
 from daqsvc.settings.units import factor_between, is_of_peak, same_unit, unit_of
 from drivers import questions as q
-from drivers.bus_questions import STREAM
+from drivers.names import SENSOR_PREFIX, sensor_name, unused
 from drivers.questions import NONE, Answers, Question, sensor_key
 from drivers.sniffing import TYPE_OF_UNIT, plain_name
 from drivers.toml_lines import array, behind, entry, toml
@@ -51,7 +51,6 @@ _SENSITIVITY = {
     "mm/s2": 0.0102,
     "mm/s": 4.0,
 }
-_PREFIX = {"proximity": "probe-", "accelerometer": "accel-", "velocity": "velocity-"}
 _ZERO_V, _OK_V = -10.0, (-18.0, -2.0)
 CLASSES = {
     "2-rigid": "15 to 300 kW on a stiff foundation",
@@ -213,7 +212,7 @@ def _of_channel(answers: Answers, channel: str) -> Iterator[Question]:
     if chosen == NONE:
         return
     taken = {one.name for one in sensors(answers)}
-    yield ask("name", q.name, _free_name(f"{_PREFIX.get(chosen, '')}{channel}", taken))
+    yield ask("name", q.name, unused(sensor_name(channel, chosen), taken))
     if chosen in _UNITS:
         units = dict.fromkeys(_UNITS[chosen], "")
         yield ask("unit", q.one_of(units), unit if unit in units else next(iter(units)), choices=units)
@@ -263,12 +262,6 @@ def why_no_bearing(answers: Answers) -> str:
         f"bearings need {_BEARING_RATE_HZ:g} samples a second or more, {_BEARING_RPM:g} rpm or more, and "
         f"blocks of {_BEARING_BLOCK_S:g} s or more"
     )
-
-
-def _free_name(wanted: str, taken: set[str]) -> str:
-    begin = wanted[: q.LONGEST_NAME]
-    numbered = (f"{wanted[: q.LONGEST_NAME - 5]}-{number}" for number in range(2, 9999))
-    return begin if begin not in taken else next(name for name in numbered if name not in taken)
 
 
 def _bearing(text: str) -> Any:
@@ -421,13 +414,13 @@ def sensor_tables(answers: Answers) -> Iterator[str]:
         yield "[[sensors]]"
         yield entry("name", sensor.name)
         yield entry("type", sensor.type)
-        yield entry("stream", STREAM)
+        yield entry("stream", bus_of(answers).stream_name(answers))
         yield entry("channel", sensor.channel)
         yield entry("unit", sensor.unit)
         sensitivity = get("sensitivity")
         if sensitivity is not None:
             yield entry("sensitivity_mv_per_unit", sensitivity, "from the sensor's calibration sheet")
-        elif sensor.type in _PREFIX:
+        elif sensor.type in SENSOR_PREFIX:
             yield "# no sensitivity_mv_per_unit: the samples are in this unit already"
         if sensor.type == "proximity":
             if sensitivity is not None:
@@ -489,7 +482,7 @@ def pipeline_tables(answers: Answers) -> Iterator[str]:
     """Lines of ``[pipeline]`` and its detectors."""
     there = sensors(answers)
     rate_hz, speed_rpm = answers["rate"], abs(answers["speed"])
-    waveforms = [one for one in there if one.type in _PREFIX]
+    waveforms = [one for one in there if one.type in SENSOR_PREFIX]
     keyphasor = next((one.name for one in there if one.type == "keyphasor"), None)
     per_revolution = 60.0 * rate_hz / speed_rpm
     housing = any(one.housing for one in there)
@@ -560,7 +553,7 @@ def alarm_tables(answers: Answers) -> Iterator[str]:
         yield ""
     if any(one.bearing is not None for one in there):
         yield "[[alarms]]"
-        yield entry("name", _free_name("bearing-damage", {one.name for one in there}))
+        yield entry("name", unused("bearing-damage", {one.name for one in there}))
         yield entry("detector", "bearing", "level and cause are what it finds")
         yield entry("latching", value=True, comment="damage does not heal: it stays until it is reset")
         yield ""

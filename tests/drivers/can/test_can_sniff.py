@@ -18,6 +18,7 @@ import can
 import numpy as np
 import pytest
 from support.formats import fits
+from support.only_table import names_in, only_bus, only_stream
 from support.paths import ROOT
 from support.waiting import PATIENCE_S
 
@@ -28,6 +29,7 @@ from drivers.can import questions, sniff, socketcan
 from drivers.can.dbc import messages_of
 from drivers.can.dbc_questions import DbcQuestions
 from drivers.can.dbc_traffic import MessageTraffic, SignalTraffic
+from drivers.names import sensor_name
 from drivers.sniffing import NothingFoundError, is_waveform_rate, sniffed
 from sim_hw.bus_socket import UnixBus
 from sim_hw.bus_socket_hub import Hub
@@ -143,7 +145,7 @@ def test_what_it_proposes_passes_check_in_a_whole_file(
     # A busy computer does not send as often as it should here.
     kind = "accelerometer" if is_waveform_rate(by_id[513]["rate_hz"]) else "trend"
     assert [(one["name"], one["type"], one["unit"]) for one in sensors] == [
-        (name, kind, "g") for name in ("accelx", "accely", "accelz")
+        (sensor_name(name, kind), kind, "g") for name in ("AccelX", "AccelY", "AccelZ")
     ]
 
 
@@ -551,16 +553,16 @@ def test_new_proposes_the_frames_that_it_hears(
         one = ["--id=0x80", "--channels=state", "--raw-type=uint8", "--scale=1"]
         other = new(tmp_path, "--bus=can", *one)
     assert "0x2a1: 12 bytes" in said
-    assert tables["buses"]["main"]["fd"] is True
-    layout = tables["streams"]["device"]["layout"]
+    assert only_bus(tables)["fd"] is True
+    layout = only_stream(tables)["layout"]
     assert (layout["id"], layout["length"], layout["samples_per_frame"]) == (0x2A1, 12, 2)
     assert layout["counter"] == {"byte": 0, "bits": 16, "counts": "samples"}
     assert (layout["byte_order"], layout["first_byte"]) == ("big", 2)
     assert len(layout["channels"]) == 2
     # Of another id than the one that is proposed, what was heard of that.
-    layout = other["streams"]["device"]["layout"]
+    layout = only_stream(other)["layout"]
     assert (layout["length"], layout["no_counter"], layout["samples_per_frame"]) == (1, True, 1)
-    assert other["streams"]["device"]["rate_hz"] < tables["streams"]["device"]["rate_hz"] / 2
+    assert only_stream(other)["rate_hz"] < only_stream(tables)["rate_hz"] / 2
 
 
 @pytest.mark.usefixtures("hub")
@@ -646,10 +648,10 @@ def test_new_proposes_the_message_that_comes(
     assert ", Acceleration\n" in said
     assert ", not in the DBC file\n" in said
     assert "another device" not in said
-    layout = tables["streams"]["device"]["layout"]
+    layout = only_stream(tables)["layout"]
     assert layout["message"] == "Acceleration"
     assert layout["counter"] == {"signal": "Sequence", "counts": "frames"}
-    assert 50 < tables["streams"]["device"]["rate_hz"] < 300
+    assert 50 < only_stream(tables)["rate_hz"] < 300
 
 
 @pytest.mark.usefixtures("hub")
@@ -753,8 +755,8 @@ def test_new_names_the_messages_that_it_heard_and_does_not_read(
         new(tmp_path, "--bus=can-dbc", "--dbc=two.dbc", "--message=Acceleration")
     command = f"daqsvc sniff can {tmp_path / 'bus'} --interface unixbus --dbc two.dbc"
     note = (
-        f"Not read: Slow (0x321); {command} prints their tables. Of these take the streams and sensors, and "
-        'write bus = "main", as this file calls it.'
+        f"Not read: Slow (0x321); {command} prints their tables. Of these take the streams and sensors: "
+        "they are on the same bus."
     )
     state = "Status is left out: its values have names, as states have: see"
     assert f"\n{note}\n{state}" in capsys.readouterr().out
@@ -827,7 +829,7 @@ def test_new_takes_no_signal_for_the_counter_that_was_not_heard_to_count(
         said = capsys.readouterr().out
         (tmp_path / "new.toml").unlink()
         assert not_written(tmp_path, *given, "--counter=StatusCount") == 1
-    assert tables["streams"]["device"]["layout"]["no_counter"] is True
+    assert only_stream(tables)["layout"]["no_counter"] is True
     assert [one["unit"] for one in tables["sensors"]] == ["degC", "l/min"]
     text = (
         "Heard: OilTemp 61 to 62.9 degC; Flow 45 l/min.\n"
@@ -1033,8 +1035,10 @@ def test_a_counter_of_samples_is_found_and_shows_which_signals_are_samples(
     machine = tmp_path / "machine.toml"
     machine.write_text(BEGIN + found["machine_file"])
     assert main(["check", f"{machine}"]) == 0
+    assert names_in(written) == names_in(tomllib.loads(found["machine_file"]))
+    assert names_in(written) == {("bus", "Wave", "accel-AccHor")}
     [proposed] = tomllib.loads(found["machine_file"])["streams"].values()
-    for layout in (proposed["layout"], written["streams"]["device"]["layout"]):
+    for layout in (proposed["layout"], only_stream(written)["layout"]):
         assert layout["counter"] == {"signal": "WaveSeq", "counts": "samples"}
         assert layout["channels"] == [{"name": "AccHor", "signals": ["AccHor_0", "AccHor_1"]}]
     frames_hz = next(one["rate_hz"] for one in found["ids"] if one["id"] == 417)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from cobs import cobs
+from support.only_table import only_bus, only_stream
 
 from daqsvc.commands.new.interview import Given, conduct
 from daqsvc.commands.new.machine_text import machine_text
@@ -101,11 +102,11 @@ def test_a_counter_that_has_not_carried_shifts_no_values(
     found = sniffed(lambda number: counted(number, width=width, begin=begin), 50.0, seconds=seconds)
     file, text = written(found, tmp_path / "m.toml")
     proposed = tomllib.loads(found.fragment)["streams"]["frames"]["layout"]
-    for layout in (file["streams"]["device"]["layout"], proposed):
+    for layout in (only_stream(file)["layout"], proposed):
         assert {key: layout["counter"][key] for key in expected} == expected
         assert layout["first_byte"] == struct.calcsize(width)
         assert len(layout["channels"]) == 6
-    assert file["streams"]["device"]["layout"]["byte_order"] == ("big" if width == ">H" else "little")
+    assert only_stream(file)["layout"]["byte_order"] == ("big" if width == ">H" else "little")
     carried = seconds == 8.0 or width == "<B"
     words = f"That the counter has {expected['bits']} bits is a guess: its upper bytes did not change."
     shown = "\n".join(one for one in found.parts if isinstance(one, str))
@@ -124,7 +125,7 @@ def test_without_a_check_the_sync_word_is_called_a_guess(tmp_path: Path) -> None
     found = sniffed(unchecked, 50.0, seconds=8.0)
     assert found.figures["crc"] == ""
     file, text = written(found, tmp_path / "m.toml")
-    words = f"That frames begin with {file['buses']['main']['sync_word']} is a guess, as they have no check"
+    words = f"That frames begin with {only_bus(file)['sync_word']} is a guess, as they have no check"
     shown = "\n".join(one for one in found.parts if isinstance(one, str))
     heard = "\n".join(HeardOnSerial(found.figures, SerialQuestions()).lines)
     for place in (shown, heard, text, found.fragment.replace("\n# ", " ")):
@@ -157,7 +158,7 @@ def of_lines(form: str, rate_hz: float = 10.0) -> Sniffed:
 )
 def test_how_a_level_was_made_may_be_behind_its_unit(tmp_path: Path, form: str, suffixes: list[str]) -> None:
     file, _ = written(of_lines(form), tmp_path / "m.toml")
-    assert [one["suffix"] for one in file["streams"]["device"]["layout"]["channels"]] == suffixes
+    assert [one["suffix"] for one in only_stream(file)["layout"]["channels"]] == suffixes
 
 
 def test_why_a_column_is_left_out_shows_what_is_no_number(tmp_path: Path) -> None:

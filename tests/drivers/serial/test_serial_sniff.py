@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 import serial
 from support.formats import fits
+from support.only_table import names_in, only_bus, only_stream
 from support.waiting import PATIENCE_S
 
 from daqsvc.cli import main
@@ -171,7 +172,7 @@ def test_columns_padded_with_blanks_are_proposed_as_they_are(
 ) -> None:
     with talking(cable, padded):
         found = figures(cable, capsys)
-        new_layout = new(cable, tmp_path / "new.toml")["streams"]["device"]["layout"]
+        new_layout = only_stream(new(cable, tmp_path / "new.toml"))["layout"]
     assert (found["score"], found["lines_damaged"], found["any_baud"]) == (0.95, 0, False)
     [stream] = check(tmp_path, found["machine_file"], capsys)["streams"].values()
     for layout in (stream["layout"], new_layout):
@@ -223,7 +224,7 @@ def test_decimal_commas_are_told_and_can_be_read(
         assert main(["sniff", "serial", f"{cable.path}", "--seconds", "0.6"]) == 0
         said = capsys.readouterr().out
         found = figures(cable, capsys)
-        new_layout = new(cable, tmp_path / "new.toml")["streams"]["device"]["layout"]
+        new_layout = only_stream(new(cable, tmp_path / "new.toml"))["layout"]
     assert '3 columns; separated by ";"; numbers have a decimal comma' in said
     (row,) = [text.split() for text in said.splitlines() if text.startswith("c3")]
     assert row == ["c3", "number", "-1,5", "-1,5", "-1,5"]
@@ -246,15 +247,17 @@ def test_two_machines_on_one_port_are_two_kinds_of_lines(
         assert main(["sniff", "serial", f"{cable.path}", "--seconds", "0.6"]) == 0
         said = capsys.readouterr().out
         found = figures(cable, capsys)
-        new_layout = new(cable, tmp_path / "new.toml")["streams"]["device"]["layout"]
+        file = new(cable, tmp_path / "new.toml")
+    new_layout = only_stream(file)["layout"]
     heard, written = capsys.readouterr().out, (tmp_path / "new.toml").read_text("utf-8")
     assert "2 kinds of lines, by their first column: K" in said
     assert "are damaged" not in said
     streams = check(tmp_path, found["machine_file"], capsys)["streams"]
-    assert {name: one["layout"]["prefix"] for name, one in streams.items()} == {"k1": "K1", "k2": "K2"}
-    assert [len(streams[name]["layout"]["channels"]) for name in ("k1", "k2")] == [1, 2]
-    sensors = tomllib.loads(found["machine_file"])["sensors"]
-    assert {one["name"] for one in sensors} == {"k1-c2", "k2-c2", "k2-c3"}
+    assert {name: one["layout"]["prefix"] for name, one in streams.items()} == {"K1": "K1", "K2": "K2"}
+    assert [len(streams[name]["layout"]["channels"]) for name in ("K1", "K2")] == [1, 2]
+    proposed = names_in(tomllib.loads(found["machine_file"]))
+    assert {name.removeprefix("accel-") for _, _, name in proposed} == {"K1-c2", "K2-c2", "K2-c3"}
+    assert names_in(file) == {names for names in proposed if names[1] == "K2"}
     rates = [one["rate_hz"] for one in streams.values()]
     assert max(rates) < 1.1 * min(rates)
     assert new_layout["prefix"] == "K2", "the one with the most numbers"
@@ -431,7 +434,7 @@ def test_what_of_the_lines_is_no_sample_is_stated_on_the_terminal_and_in_both_fi
         shown = capsys.readouterr().out
         file = new(cable, tmp_path / "new.toml")
         said = capsys.readouterr().out
-    assert file["streams"]["device"]["layout"]["channels"] == [{"name": "c2"}]
+    assert only_stream(file)["layout"]["channels"] == [{"name": "c2"}]
     table, fragment = " ".join(shown.split()).split("To begin a machine file")
     text = " ".join((tmp_path / "new.toml").read_text("utf-8").replace("\n# ", " ").split())
     for words in (
@@ -456,7 +459,7 @@ def test_the_baud_rate_for_a_port_without_one_is_the_same_however_long_it_listen
 def test_what_ends_a_line_is_in_the_file_of_new(cable: PseudoTerminal, tmp_path: Path) -> None:
     with talking(cable, lambda number: b"%d,2.5\r" % number):
         file = new(cable, tmp_path / "new.toml")
-    assert file["buses"]["main"]["delimiter"] == "\r"
+    assert only_bus(file)["delimiter"] == "\r"
 
 
 def test_columns_without_a_name_get_no_limits_of_vibration(cable: PseudoTerminal, tmp_path: Path) -> None:
@@ -533,7 +536,7 @@ def test_a_device_that_sends_little_is_listened_to_longer(
     cable: PseudoTerminal, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with talking(cable, slow):
-        layout = new(cable, tmp_path / "new.toml", "--baud=9600")["streams"]["device"]["layout"]
+        layout = only_stream(new(cable, tmp_path / "new.toml", "--baud=9600"))["layout"]
         told = capsys.readouterr().out
         assert main(["sniff", "serial", f"{cable.path}", "--seconds", "0.4", "--baud", "9600"]) == 1
         short = capsys.readouterr().err
@@ -712,12 +715,12 @@ def test_new_proposes_the_lines_that_it_hears(
     said = capsys.readouterr().out
     assert "115200 bit/s, 8N1: lines of text" in said
     assert "4 columns\n" in said
-    layout = heard["streams"]["device"]["layout"]
+    layout = only_stream(heard)["layout"]
     assert layout["line"] == ["c1", "c2", "c3", "c4"]
     assert layout["counter"] == {"column": "c1"}
     # What is known of a column is known by its place, whatever it is called.
-    assert named["streams"]["device"]["layout"]["counter"] == {"column": "n"}
-    assert 50 < heard["streams"]["device"]["rate_hz"] < 400
+    assert only_stream(named)["layout"]["counter"] == {"column": "n"}
+    assert 50 < only_stream(heard)["rate_hz"] < 400
 
 
 def test_a_port_that_brings_more_than_its_baud_rate_is_proposed_with_one_that_carries_it(
@@ -745,20 +748,22 @@ def test_a_port_that_brings_more_than_its_baud_rate_is_proposed_with_one_that_ca
         assert main([*slow, f"--port={cable.path}"]) == 2
     refused = capsys.readouterr().err
     assert words in said
-    any_baud = f"baud = {file['buses']['main']['baud']} is as good as any: the port does not use it."
+    any_baud = f"baud = {only_bus(file)['baud']} is as good as any: the port does not use it."
     assert any_baud in said
     assert f"# {any_baud}\n" in (tmp_path / "fast.toml").read_text("utf-8")
-    assert file["buses"]["main"]["baud"] in {460_800, 921_600}
-    assert 800 < file["streams"]["device"]["rate_hz"] < 2100
+    assert only_bus(file)["baud"] in {460_800, 921_600}
+    assert 800 < only_stream(file)["rate_hz"] < 2100
     assert (found["any_baud"], found["overrun_baud"]) == (True, 115_200)
     proposed = check(tmp_path, found["machine_file"], capsys)
-    assert proposed["buses"]["ttyusb0"]["baud"] == found["baud"]
-    assert "samples a second were heard, which cannot be used: buses.main.baud = 9600: is too slow" in refused
+    assert proposed["buses"]["ttyUSB0"]["baud"] == found["baud"]
+    assert (
+        "samples a second were heard, which cannot be used: buses.ttyUSB0.baud = 9600: is too slow" in refused
+    )
 
 
 def test_new_leaves_out_the_columns_that_are_no_numbers(cable: PseudoTerminal, tmp_path: Path) -> None:
     with talking(cable, lambda number: b"$LOG;%d;ok;%d.5\r\n" % (number, number % 9)):
-        layout = new(cable, tmp_path / "log.toml")["streams"]["device"]["layout"]
+        layout = only_stream(new(cable, tmp_path / "log.toml"))["layout"]
     assert (layout["prefix"], layout["separator"]) == ("$LOG", ";")
     assert layout["line"] == ["c1", "c2", "c3"]
     assert layout["channels"] == [{"name": "c3"}]
@@ -800,7 +805,7 @@ def test_new_proposes_the_units_that_it_hears(
     with talking(cable, with_units):
         file = new(cable, tmp_path / "units.toml", "--rate", rate)
     assert "c2 is in mm/s, as the device writes it behind the number" in capsys.readouterr().out
-    assert file["streams"]["device"]["layout"]["channels"] == [
+    assert only_stream(file)["layout"]["channels"] == [
         {"name": "c2", "suffix": "mm/s"},
         {"name": "c3", "suffix": "C"},
     ]
@@ -896,7 +901,7 @@ def test_whoever_takes_all_defaults_gets_the_file_of_yes_and_it_reads_the_lines(
     named = tmp_path / "new.toml"
     answers = conduct(named, given, lambda _one: "", lambda _: None, lambda *_: heard)
     assert tomllib.loads(machine_text(answers, named.name)) == file
-    written = file["streams"]["device"]["layout"]
+    written = only_stream(file)["layout"]
     assert {key: written[key] for key in layout} == layout
     assert written["channels"] == channels
     codec = LineCodec(LineLayout.model_validate({**written, "line": tuple(written["line"])}))
@@ -921,7 +926,7 @@ def test_a_time_with_a_unit_behind_it_is_proposed_as_it_is(
     time_keys = {"column": "t", "unit": "ms", "prefix": "t=", "suffix": "ms"}
     proposed = check(tmp_path, found["machine_file"], capsys)
     assert proposed["streams"]["lines"]["layout"]["time"] == time_keys
-    assert file["streams"]["device"]["layout"]["time"] == time_keys
+    assert only_stream(file)["layout"]["time"] == time_keys
 
 
 def test_new_proposes_no_counter_for_frames_without_one(
@@ -951,7 +956,7 @@ def test_new_proposes_the_frames_that_it_hears(
     with talking(cable, frame):
         tables = new(cable, tmp_path / "frames.toml")
     assert "frames behind a55a of 12 bytes" in capsys.readouterr().out
-    bus, stream = tables["buses"]["main"], tables["streams"]["device"]
+    bus, stream = only_bus(tables), only_stream(tables)
     assert (bus["framing"], bus["sync_word"], bus["crc"]) == ("sync", "a55a", "ibm-3740")
     layout = stream["layout"]
     assert layout["payload_length"] == 8
@@ -1029,8 +1034,9 @@ def test_of_frames_new_proposes_the_sensors_of_sniff(
         file = new(cable, tmp_path / "frames.toml")
     kinds = [(one["channel"], one["type"], one["unit"]) for one in file["sensors"]]
     assert kinds == [(one["channel"], one["type"], one["unit"]) for one in sniffed["sensors"]]
+    assert names_in(file) == names_in(sniffed)
     [heard] = sniffed["streams"].values()
-    assert file["streams"]["device"]["layout"]["channels"] == heard["layout"]["channels"]
+    assert only_stream(file)["layout"]["channels"] == heard["layout"]["channels"]
 
 
 def test_of_frames_new_writes_no_limits_that_nobody_stated_and_names_the_guesses(
