@@ -153,11 +153,12 @@ class HeardUnits(Heard):
     def _place(self, answers: Answers) -> tuple[dict[str, str], list[Mapping[str, Any]]]:
         """The unit and the table to propose, and what was found of those that are answered."""
         tables = [one for one in self.found["tables"] if one["registers"]]
-        # Where all is 0, nothing shows that the values are there. Else units are as they were found.
-        proposed = {"unit": f"{min(tables, key=_is_0)['unit']}"}
+        # Where all is 0, or stands still, nothing shows that the values are there.
+        likely = min(tables, key=lambda one: (_is_0(one), not one["moved"]))
+        proposed = {"unit": f"{likely['unit']}"}
         tables = [one for one in tables if one["unit"] == answers.get("unit", int(proposed["unit"]))]
         meant = table_meant(answers, "registers")
-        tables.sort(key=lambda one: (TABLES[one["function"]] != meant, _is_0(one), not one["moved"]))
+        tables.sort(key=lambda one: (TABLES[one["function"]] != meant, _is_0(one), *_stillness(one)))
         if tables and not (len(tables) > 1 and all(map(_is_0, tables)) and meant is None):
             proposed["table"] = TABLES[tables[0]["function"]]
         return proposed, [one for one in tables if TABLES[one["function"]] == answers.get("table")]
@@ -198,17 +199,8 @@ class HeardUnits(Heard):
     def not_read(self, answers: Answers) -> Iterable[str]:
         """See `Heard.not_read`: the other table of the unit, if it has values, and the other units."""
         found = self.found
-        others = [
-            TABLES[one["function"]]
-            for one in found["tables"]
-            if one["unit"] == answers["unit"] and one["registers"] and not _is_0(one)
-        ]
-        yield from (
-            f"Unit {answers['unit']} has {other} registers, too; "
-            f"this file reads {answers['table']} registers."
-            for other in others
-            if answers["way"] == "values" and other != answers["table"]
-        )
+        if answers["way"] == "values":
+            yield from self._not_read_of_unit(answers)
         units = [unit for unit in found["units"] if unit != answers["unit"]]
         named = "; ".join(f"unit {unit} ({_has(found, unit)})" for unit in units[:SHOWN])
         more = f"; and {len(units) - SHOWN} more" if len(units) > SHOWN else ""
@@ -217,6 +209,24 @@ class HeardUnits(Heard):
             which = "each" if with_registers == units else "each that has registers"
             proposes = f" daqsvc sniff modbus --function both proposes a stream for {which}."
             yield f"Not read: {named}{more}.{proposes if with_registers else ''}"
+
+    def _not_read_of_unit(self, answers: Answers) -> Iterator[str]:
+        """What else the unit has: its other table, and registers that stand still."""
+        unit, read = answers["unit"], answers["table"]
+        mine = [one for one in self.found["tables"] if one["unit"] == unit and one["registers"]]
+        still = (
+            " None of both moved: see the device's register map for which are measured."
+            if not any(one["moved"] for one in mine)
+            else ""
+        )
+        for table in mine:
+            other = TABLES[table["function"]]
+            if other != read and not _is_0(table):
+                yield f"Unit {unit} has {other} registers, too; this file reads {read} registers.{still}"
+            if other == read and (left := _left_out(table, answers)):
+                moved = len(left & {*table["moved"]}) or "none"
+                runs = _runs_in_words({"runs": _runs(left)})
+                yield f"Not read of unit {unit}: {read} registers {runs}; of these {moved} moved."
 
 
 class HeardNoRegisters(Heard):
@@ -276,6 +286,34 @@ def _may_be_halves(table: Mapping[str, Any], answers: Answers, guessed: Sequence
             f"{undecided_words(each['address'] for each in halves)}. If so, write one channel in place of "
             f"two{', e.g.' if len(halves) > 1 else ':'} {keys}."
         )
+
+
+def _stillness(table: Mapping[str, Any]) -> tuple[bool, int]:
+    """Less where registers move; among tables that stand still, less where nothing but measured values are.
+
+    Holding registers may be settings, and input registers are none.
+    """
+    return not table["moved"], 0 if table["moved"] else -table["function"]
+
+
+def _left_out(table: Mapping[str, Any], answers: Answers) -> set[int]:
+    """Registers that are neither proposed nor read by a channel."""
+    channels = [(one["address"], one["type"]) for one in table["channels"]]
+    channels += [
+        (answers[sensor_key(name, "address")], answers[sensor_key(name, "register-type")])
+        for name in answers["channels"]
+    ]
+    read = {address + number for address, kind in channels for number in range(register_count(kind))}
+    return {one["address"] for one in table["registers"]} - read
+
+
+def _runs(addresses: Collection[int]) -> list[tuple[int, int]]:
+    """First and last of those in a row."""
+    runs: list[tuple[int, int]] = []
+    for address in sorted(addresses):
+        begin = runs.pop()[0] if runs and address == runs[-1][1] + 1 else address
+        runs.append((begin, address))
+    return runs
 
 
 def _is_0(table: Mapping[str, Any]) -> bool:

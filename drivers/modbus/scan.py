@@ -213,7 +213,7 @@ class Scan:
             functions: 3, 4 or both.
             begin: first register.
             end: last one.
-            until_found: whether no further function is tried on a unit that has registers.
+            until_found: whether no further function is tried on a unit that has registers that move.
             read_on: whether registers behind the last one are read, too, if that one is there.
             seconds: for which they are read again and again; None for a few times.
 
@@ -232,8 +232,11 @@ class Scan:
                     await self._read_table(table, end, most)
                     if until_found and (table.first or self.stop.is_set()):
                         break
-            if any(table.first for table in self.tables):
-                await self._read_again(seconds)
+            await self._read_again(self.tables, seconds)
+            if until_found:
+                await self._read_beside_still(functions, end, most, seconds)
+            if seconds is None:
+                await self._wait_for_moves()
         except LineLostError as error:
             self.lost = f"{error}"
         finally:
@@ -396,8 +399,34 @@ class Scan:
             except NoReplyError:
                 return
 
-    async def _read_again(self, seconds: float | None) -> None:
+    async def _read_beside_still(
+        self, functions: Sequence[int], end: int, most: int, seconds: float | None
+    ) -> None:
+        """The next function of each unit whose registers all stand still: they may be only settings."""
+        found: list[FoundTable] = []
+        for still in [one for one in self.tables if one.complete and one.first and not one.moved]:
+            for function in functions[functions.index(still.function) + 1 :]:
+                if self.stop.is_set():
+                    return
+                found.append(FoundTable(still.unit, function, still.begin))
+                self.tables.insert(self.tables.index(still) + 1, found[-1])
+                await self._read_table(found[-1], end, most)
+        await self._read_again(found, seconds)
+
+    async def _wait_for_moves(self) -> None:
+        """Read the registers of units that all stand still some more times: a value may change slowly."""
+        for _ in range(ROUNDS - 1):
+            moving = {table.unit for table in self.tables if table.moved}
+            still = [table for table in self.tables if table.first and table.unit not in moving]
+            if not still:
+                return
+            await self._pause(None)
+            await self._read_rounds(still)
+
+    async def _read_again(self, tables: Sequence[FoundTable], seconds: float | None) -> None:
         """What is there, so often that what moves is seen to, also if the device measures once a second."""
+        if not any(table.first for table in tables):
+            return
         rounds, pause_s = ROUNDS - 1, ROUND_S
         if seconds is not None:
             rounds = max(1, min(MOST_ROUNDS, math.ceil(seconds / ROUND_S) if ROUND_S else MOST_ROUNDS))
@@ -408,9 +437,7 @@ class Scan:
             await self._pause(begin_s + number * pause_s if seconds else None)
             if self.stop.is_set():
                 return
-            for table in self.tables:
-                table.again.append({})
-                await self._read_round(table, table.again[-1])
+            await self._read_rounds(tables)
             if seconds and self.clock.monotonic_ns() / NS_PER_S >= begin_s + seconds:
                 return
 
@@ -426,6 +453,14 @@ class Scan:
             if self.stop.is_set():
                 return
             await asyncio.sleep(left_s / parts)
+
+    async def _read_rounds(self, tables: Sequence[FoundTable]) -> None:
+        """Each of them once."""
+        for table in tables:
+            if self.stop.is_set():
+                return
+            table.again.append({})
+            await self._read_round(table, table.again[-1])
 
     async def _read_round(self, table: FoundTable, again: dict[int, int]) -> None:
         most = table.max_count or BLOCK

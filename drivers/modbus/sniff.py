@@ -63,7 +63,7 @@ class ModbusSniffer(Sniffer):
             choices=tuple(_FUNCTIONS),
             default=AUTO,
             help="function code: 3 reads holding registers, 4 input registers (default: auto: 3, and 4 for "
-            "a unit without holding registers)",
+            "a unit without holding registers that move)",
         )
         parser.add_argument(
             "--timeout-ms",

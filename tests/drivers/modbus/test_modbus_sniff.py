@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from support.formats import fits
+from support.only_table import names_in, only_stream
 from support.ports import free_port
 from support.waiting import PATIENCE_S
 
@@ -187,7 +188,7 @@ def test_registers_beyond_the_usual_ones_are_read_as_far_as_there_are_any(
         unit.put("holding", address, bytes(2 * count))
     with tcp({1: unit}) as target:
         assert main(words(target, "--units", "1", "--json")) == 0
-        [table] = figures(capsys)["tables"]
+        table, *_ = figures(capsys)["tables"]
         assert main(words(target, "--units", "1")) == 0
         on = capsys.readouterr().out
         assert main(words(target, "--units", "1", "--registers", "0-200")) == 0
@@ -349,7 +350,7 @@ def test_units_whose_values_differ_are_several_devices(capsys: pytest.CaptureFix
         assert main(words(target, "--units", "1-10", "--registers", "0-1", "--json")) == 0
     found = figures(capsys)
     assert (found["units"], found["units_alike"]) == (list(range(1, 11)), False)
-    assert len(found["tables"]) == 10
+    assert len([one for one in found["tables"] if one["function"] == 3]) == 10
 
 
 def all_refuse_but(number: int, unit: ModbusUnit, code: int = 4) -> dict[int, ModbusUnit]:
@@ -394,13 +395,13 @@ def test_new_finds_the_unit_where_the_server_refuses_all_others(
 ) -> None:
     monkeypatch.setattr(questions, "_UNITS", ("1-10", "11-22"))
     with tcp(all_refuse_but(7, Elsewhere())) as target:
-        layout = new(tmp_path, target, "--registers=4000-4020")["streams"]["device"]["layout"]
+        layout = only_stream(new(tmp_path, target, "--registers=4000-4020"))["layout"]
     assert (layout["unit"], layout["channels"][0]["address"]) == (7, 4000)
     said = capsys.readouterr().out
     assert "units that answer: 7 (units 1 to 10 were asked)" in said
     assert "the others from 1 to 10 all refuse with one exception, as if they were not there" in said
     with tcp(all_refuse_but(20, Elsewhere())) as target:
-        layout = new(tmp_path, target, "--registers=4000-4020")["streams"]["device"]["layout"]
+        layout = only_stream(new(tmp_path, target, "--registers=4000-4020"))["layout"]
         assert layout["unit"] == 20
         said = capsys.readouterr().out
         assert "none of units 1-10 has such registers: 11-22 are asked, too" in said
@@ -583,7 +584,7 @@ def test_new_proposes_the_registers_that_it_finds(tmp_path: Path, capsys: pytest
     assert "unit 3 has holding registers 0 to 3, 40 to 41 (0 to 45 were asked; " in said
     assert "  40: 23.37" in said
     assert "as float32 ABCD, moves" in said
-    layout = tables["streams"]["device"]["layout"]
+    layout = only_stream(tables)["layout"]
     assert (layout["unit"], layout["table"]) == (3, "holding")
     assert "  1: -1, no value?" in said
     assert [one.get("no_value") for one in layout["channels"]] == [None, 0xFFFF, None, None, None]
@@ -595,7 +596,7 @@ def test_new_proposes_the_registers_that_it_finds(tmp_path: Path, capsys: pytest
         ("r40", 40, "float32"),
     ]
     # Names of one's own: registers in a row as far as they are there.
-    channels = named["streams"]["device"]["layout"]["channels"]
+    channels = only_stream(named)["layout"]["channels"]
     assert [(one["address"], one["type"]) for one in channels] == [(0, "uint16"), (1, "int16"), (2, "uint16")]
     assert all(pdu[0] in {3, 4} for pdu in unit.asked)
 
@@ -622,7 +623,7 @@ def test_new_asks_the_other_units_where_none_of_the_first_answers(
 ) -> None:
     monkeypatch.setattr(questions, "_UNITS", ("1-2", "3-4"))
     with tcp({4: pump()}) as target:
-        assert new(tmp_path, target)["streams"]["device"]["layout"]["unit"] == 4
+        assert only_stream(new(tmp_path, target))["layout"]["unit"] == 4
     said = capsys.readouterr().out
     assert "none of units 1-2 answers: 3-4 are asked, too; Ctrl-C ends that" in said
     assert "units that answer: 4" in said
@@ -635,7 +636,7 @@ def test_new_says_which_units_it_did_not_ask_and_asks_them_if_told_so(
 ) -> None:
     monkeypatch.setattr(questions, "_UNITS", ("1-2", "3-4"))
     with tcp({2: pump(), 4: pump()}) as target:
-        assert new(tmp_path, target)["streams"]["device"]["layout"]["unit"] == 2
+        assert only_stream(new(tmp_path, target))["layout"]["unit"] == 2
         said = capsys.readouterr().out
         new(tmp_path, target, "--units=1-4")
         more = capsys.readouterr().out
@@ -701,7 +702,7 @@ def test_new_looks_only_for_the_unit_that_is_given(
         assert not_written(tmp_path, target, "--unit=9", "--registers=0-45") == 1
         refused = capsys.readouterr().err
         assert not_written(tmp_path, target, "--unit=x") == 2
-    assert tables["streams"]["device"]["layout"]["unit"] == 15
+    assert only_stream(tables)["layout"]["unit"] == 15
     assert "for unit 15, at most" in told
     assert "units that answer: 15 (unit 15 was asked)" in told
     assert "not asked" not in told
@@ -741,7 +742,7 @@ def test_floats_that_stand_still_are_proposed_as_such_and_called_a_guess(
             "--sensor=a.address=20",
             "--sensor=a.register-type=float32",
         )
-    channels = tables["streams"]["device"]["layout"]["channels"]
+    channels = only_stream(tables)["layout"]["channels"]
     assert [(one["address"], one["type"], one["order"]) for one in channels] == [
         (address, "float32", "CDAB") for address in (20, 22, 24)
     ]
@@ -818,7 +819,7 @@ def test_where_no_holding_register_moves_sniff_names_the_input_registers(
     hint = "None of them moves: --function both reads the input registers of the unit, too.\n"
     unit = Still(0, struct.pack(">3H", 1, 19_200, 2), "holding", "input")
     with tcp({1: unit, 2: pump()}) as target:
-        assert main(words(target, "--units", "1", "--registers", "0-9", *PATIENT)) == 0
+        assert main(words(target, "--units", "1", "--registers", "0-9", "--function", "3", *PATIENT)) == 0
         assert hint in capsys.readouterr().out
         assert main(words(target, "--units", "1", "--registers", "0-9", "--function", "both", *PATIENT)) == 0
         assert main(words(target, "--units", "1", "--registers", "0-9", "--function", "4", *PATIENT)) == 0
@@ -836,14 +837,14 @@ def test_two_registers_that_may_be_one_float_are_not_halves_without_a_word(
         assert main(words(target, "--units", "1", "--registers", "20-30", *PATIENT)) == 0
         shown = capsys.readouterr().out
         assert main(words(target, "--units", "1", "--registers", "20-30", "--json", *PATIENT)) == 0
-    assert [one["type"] for one in tables["streams"]["device"]["layout"]["channels"]] == ["uint16", "uint16"]
+    assert [one["type"] for one in only_stream(tables)["layout"]["channels"]] == ["uint16", "uint16"]
     assert "  20: 40213, or with 21 23.4517 as float32 CDAB" in told
     assert f"\n{note} values that stand still do not show it. See the device's" in told
     assert 'place of two: address = 20, type = "float32", order = "CDAB".' in told
     assert "# Registers 20 and 21 may be one 32-bit number" in (tmp_path / "new.toml").read_text("utf-8")
     assert "float32 CDAB 23.4517?" in shown
     assert shown.count("Registers 20 and 21 may be one 32-bit number") == 2  # and in the proposal
-    [table] = figures(capsys)["tables"]
+    table, _ = figures(capsys)["tables"]
     assert [(one["address"], one["order"]) for one in table["undecided"]] == [(20, "CDAB")]
 
 
@@ -863,10 +864,10 @@ def test_floats_with_exchanged_bytes_that_stand_still_are_not_halves_without_a_w
     assert 'e.g. address = 20, type = "float32", order = "BADC".' in told
     assert "float32 BADC 2.2159?" in shown
     # Both propose the mark by which a register has no value.
-    assert tables["streams"]["device"]["layout"]["channels"][-1]["no_value"] == 0x8000
+    assert only_stream(tables)["layout"]["channels"][-1]["no_value"] == 0x8000
     assert 'name = "r26", address = 26, type = "uint16", no_value = 0x8000 },' in shown
     assert "[streams.unit-1.layout]    # types and no_value are a guess: see" in shown
-    [table] = figures(capsys)["tables"]
+    table, _ = figures(capsys)["tables"]
     assert [one["no_value"] for one in table["channels"]] == [None] * 6 + [0x8000]
 
 
@@ -928,6 +929,64 @@ def test_new_writes_nothing_of_a_device_whose_registers_are_all_0(
     assert shown["channels"] == "r0, r1, r2, r3"
 
 
+class Slow(Still):
+    """Settings as holding registers; the input registers have a value that changes after some readings."""
+
+    def __init__(self, readings: int = 0) -> None:
+        super().__init__(0, struct.pack(">3H", 1, 19_200, 2))
+        self.put("input", 0, struct.pack(">40H", 230, *range(1, 40)))
+        self._readings = readings
+
+    def answer(self, pdu: bytes) -> bytes:
+        if pdu[0] == 4:
+            self._readings -= 1
+            self.put("input", 0, struct.pack(">H", 230 + (self._readings < 0)))
+        return super().answer(pdu)
+
+
+def test_where_all_holding_registers_stand_still_sniff_reads_the_input_registers_by_itself(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with tcp({1: Slow(readings=2), 2: pump()}) as target:
+        assert main(words(target, "--units", "1-2", "--registers", "0-39", "--json", *PATIENT)) == 0
+    tables = figures(capsys)["tables"]
+    assert [(one["unit"], one["function"], one["moved"]) for one in tables[:2]] == [(1, 3, []), (1, 4, [0])]
+    assert [(one["unit"], one["function"]) for one in tables[2:]] == [(2, 3), (2, 4)][: len(tables) - 2]
+
+
+def test_a_value_that_changes_slowly_is_waited_for_and_what_stands_still_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The input registers are read five times as a rule; here they move after that."""
+    with tcp({1: Slow(readings=5)}) as target:
+        layout = only_stream(new(tmp_path, target, "--unit=1", "--registers=0-39"))["layout"]
+    assert layout["table"] == "input"
+    assert [one["address"] for one in layout["channels"]] == [0]
+    said = capsys.readouterr().out
+    assert "\nUnit 1 has holding registers, too; this file reads input registers.\n" in said
+    assert "\nNot read of unit 1: input registers 1 to 39; of these none moved.\n" in said
+
+
+def test_the_unit_whose_values_move_is_proposed_and_the_others_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with tcp({1: Still(0, struct.pack(">3H", 1, 19_200, 2)), 2: pump()}) as target:
+        layout = only_stream(new(tmp_path, target, "--units=1-2", "--registers=0-45"))["layout"]
+    assert layout["unit"] == 2
+    assert "\nNot read: unit 1 (holding registers 0 to 2)." in capsys.readouterr().out
+
+
+def test_of_two_tables_that_stand_still_the_input_registers_are_proposed_as_a_guess(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with tcp({1: Still(0, struct.pack(">3H", 1, 19_200, 2), "holding", "input")}) as target:
+        layout = only_stream(new(tmp_path, target, "--unit=1", "--registers=0-9"))["layout"]
+    assert layout["table"] == "input"
+    assert "None of both moved: see the device's register map for which are measured." in (
+        capsys.readouterr().out
+    )
+
+
 def test_the_table_whose_values_move_is_proposed_and_the_other_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -940,11 +999,15 @@ def test_the_table_whose_values_move_is_proposed_and_the_other_named(
         count = 0
 
     with tcp({1: Both(0, struct.pack(">3H", 1, 19_200, 2))}) as target:
-        layout = new(tmp_path, target, "--unit=1", "--registers=0-9")["streams"]["device"]["layout"]
-    assert layout["table"] == "input"
-    assert (
-        "\nUnit 1 has holding registers, too; this file reads input registers.\n" in capsys.readouterr().out
-    )
+        written = new(tmp_path, target, "--unit=1", "--registers=0-9")
+        said = capsys.readouterr().out
+        both = words(target, "--units", "1", "--registers", "0-9", "--function", "both", "--json", *PATIENT)
+        assert main(both) == 0
+    assert only_stream(written)["layout"]["table"] == "input"
+    proposed = names_in(tomllib.loads(figures(capsys)["machine_file"]))
+    assert {names[:2] for names in names_in(written)} == {("modbus", "unit-1-input")}
+    assert ("modbus", "unit-1-input") in {names[:2] for names in proposed}
+    assert "\nUnit 1 has holding registers, too; this file reads input registers.\n" in said
 
 
 class Elsewhere(ModbusUnit):
@@ -965,9 +1028,9 @@ def test_new_looks_at_the_registers_that_it_is_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with tcp({3: Elsewhere()}) as target:
-        holding = new(tmp_path, target, "--units=3", "--registers=4000-4009")["streams"]["device"]["layout"]
+        holding = only_stream(new(tmp_path, target, "--units=3", "--registers=4000-4009"))["layout"]
         said = capsys.readouterr().out
-        inputs = new(tmp_path, target, "--units=3", "--registers=30001-30004")["streams"]["device"]["layout"]
+        inputs = only_stream(new(tmp_path, target, "--units=3", "--registers=30001-30004"))["layout"]
         capsys.readouterr()
         assert not_written(tmp_path, target, "--units=3", "--registers=40001-40004") == 1
     assert "units that answer: 3 (unit 3 was asked)" in said
@@ -999,7 +1062,7 @@ def test_registers_may_be_hexadecimal_as_in_many_register_maps(
     with tcp({3: Elsewhere()}) as target:
         assert main(words(target, "--units", "0x3", "--registers", "0xFA0-0xFA9", *PATIENT)) == 0
         assert "Unit 3, holding registers (function 3): 8 at 4000-4007" in capsys.readouterr().out
-        layout = new(tmp_path, target, "--unit=3", "--registers=0xFA0-0xFA9")["streams"]["device"]["layout"]
+        layout = only_stream(new(tmp_path, target, "--unit=3", "--registers=0xFA0-0xFA9"))["layout"]
         answers, _, shown = as_asked(tmp_path, target, unit="3", registers="0xFA0")
     assert [one["address"] for one in layout["channels"]] == [4000, 4002, 4004, 4006]
     assert (shown["channels"], answers["sensor.r4000.address"]) == ("r4000", 4000)
@@ -1064,7 +1127,7 @@ def test_numbers_of_a_manual_of_input_registers_are_read_as_input_registers(tmp_
     assert tables == ["input"]
     assert (answers["registers"], answers["table"]) == ("0-2", "input")
     assert [answers[f"sensor.{name}.address"] for name in answers["channels"]] == [0, 1, 2]
-    assert option["streams"]["device"]["layout"]["table"] == "input"
+    assert only_stream(option)["layout"]["table"] == "input"
 
 
 def test_without_listening_nobody_is_asked_for_registers_to_look_at(tmp_path: Path) -> None:
@@ -1190,7 +1253,7 @@ def test_how_many_registers_a_unit_answers_for_at_once_is_found_and_proposed(
         said = capsys.readouterr().out
         assert main(words(target, "--units", "1", "--registers", "0-45", "--json")) == 0
         found = figures(capsys)
-        layout = new(tmp_path, target)["streams"]["device"]["layout"]
+        layout = only_stream(new(tmp_path, target))["layout"]
     assert found["tables"][0]["max_count"] == most
     assert found["tables"][0]["runs"] == [[0, 9], [40, 41]]
     assert found["tables"][0]["moved"] == [41]
@@ -1215,6 +1278,6 @@ def test_a_unit_that_refuses_registers_as_illegal_values_has_no_limit(
     unit.put("holding", 3, struct.pack(">6H", *range(5, 11)))
     with tcp({1: unit}) as target:
         assert main(words(target, "--units", "1", "--registers", "0-45", "--json")) == 0
-    [table] = figures(capsys)["tables"]
+    table, *_ = figures(capsys)["tables"]
     assert table["runs"] == [[3, 8], [40, 41]]
     assert table["max_count"] is None
