@@ -274,8 +274,10 @@ class SyncFraming(_BinaryFraming):
         batch.note("bytes_garbage", hunted.garbage_bytes)
         batch.note("frames_malformed", hunted.malformed)
         batch.note("resyncs", hunted.resyncs)
-        if hunted.malformed and not self._told:
-            batch.malformed, batch.remedy = self._between_frames(buffer, hunted, before)
+        # Before the first frame nothing is malformed: what a device sends may be in no frame at all.
+        nothing_else = bool(hunted.garbage_bytes) and not len(hunted.ends)
+        if nothing_else or (hunted.malformed and not self._told):
+            batch.malformed, batch.remedy = self._no_frame(buffer, hunted, before)
             self._told = True
         step = hunted.step
         start = min(step.taken, step.tried)
@@ -287,14 +289,18 @@ class SyncFraming(_BinaryFraming):
             self._codec.sort(Bodies(buffer, hunted.starts, lengths, hunted.intact, arrival_ns), batch)
         return batch
 
-    def _between_frames(self, buffer: NDArray[np.uint8], hunted: Hunted, before: SyncSearch) -> NoFrame:
-        """What is between two whole frames, if anything is: devices may end their frames by it.
+    def _no_frame(self, buffer: NDArray[np.uint8], hunted: Hunted, before: SyncSearch) -> NoFrame:
+        """The first bytes that are in no frame; of those between two whole ones, that they cost none.
+
+        Devices may end their frames by such bytes.
 
         Args:
             buffer: the bytes.
             hunted: what was found in them.
             before: how far the search had come.
         """
+        if not len(hunted.ends):
+            return self._none_in(buffer[before.taken : hunted.step.taken].tobytes())
         begins, ends = hunted.starts - len(self._sync), hunted.ends
         whole = hunted.intact
         if not (before.fresh or before.astray):
@@ -303,10 +309,29 @@ class SyncFraming(_BinaryFraming):
         gaps = begins[1:] - ends[:-1]
         few = np.flatnonzero(whole[1:] & whole[:-1] & (gaps > 0) & (gaps <= SHOWN_BYTES))
         if not len(few):
-            return NoFrame("")
+            begin = int([*ends[:-1][gaps > 0], *hunted.ends[-1:]][0])
+            shown = buffer[begin : begin + SHOWN_BYTES].tobytes().hex(" ")
+            return NoFrame(f"the first of them: {shown} ...")
         count, begin = int(gaps[few[0]]), int(ends[few[0]])
         shown = buffer[begin : begin + count].tobytes().hex(" ")
         return NoFrame(
             f"the first are between two whole frames, {counted(count, 'byte')}: {shown}",
             "the device sends them behind each frame, and no frame is lost by them",
+        )
+
+    def _none_in(self, came: bytes) -> NoFrame:
+        """Bytes without a frame, and what that shows of the settings."""
+        word = self._sync.tobytes()
+        shown = f"{came[:SHOWN_BYTES].hex(' ')}{' ...' if len(came) > SHOWN_BYTES else ''}"
+        many = counted(len(came), "byte")
+        if word not in came:
+            return NoFrame(
+                f"the sync word {word.hex()} is not in {many}: {shown}",
+                "compare baud, parity and sync_word with the device's",
+            )
+        length = counted(self._codec.longest, "byte")
+        checked = "no frame with a good CRC" if self._codec.checked else "no other one"
+        return NoFrame(
+            f"the sync word {word.hex()} is in {many}, but {checked} {length} behind it: {shown}",
+            "compare payload_length, stream_ids and crc with the device's",
         )

@@ -176,7 +176,7 @@ class SerialDriver:
         """Take in what the reader thread has found; runs on the event loop."""
         for name, count in batch.notes.items():
             self.note(name, count)
-        if "frames_malformed" in batch.notes:
+        if batch.malformed or "frames_malformed" in batch.notes:
             self._say_once(
                 "malformed",
                 NO_FRAME,

@@ -22,6 +22,7 @@ from daqsvc.acquisition.clock import DrivenClock
 from daqsvc.notice import NOTICE
 from daqsvc.settings import parse_machine_file
 from drivers.base import BusPort, StreamSpec
+from drivers.frames import FrameLayout
 from drivers.make import bus_drivers, stream_layout
 from drivers.serial import driver as serial_driver
 from drivers.serial import reader as serial_reader
@@ -145,6 +146,36 @@ async def test_what_is_wrong_is_said_once_with_its_remedy(tmp_path: Path, caplog
     assert driver.counters.bytes_garbage == 12 + 2 + 6
     assert driver.counters.bytes_received == 32
     assert driver.counters.resyncs == 2
+
+
+async def test_bytes_without_any_frame_of_a_sync_word_are_logged_once_and_stated_of_the_stream(
+    tmp_path: Path, caplog: Any
+) -> None:
+    layout = FrameLayout.plain(
+        frame_id=0,
+        length=4,
+        channels=[("x", 8, "unsigned", 1.0, 0.0)],
+        samples_per_frame=3,
+        counter_byte=0,
+        counter_bits=8,
+        first_byte=1,
+    )
+    given = {"port": str(tmp_path / "port"), "framing": "sync", "sync_word": "a55a", "crc": "none"}
+    spec = StreamSpec("x", layout, 100.0)
+    driver = SerialDriver(serial_bus(**given), BusPort("ser0", [spec], QuickClock(), lambda _: None))
+    with caplog.at_level(logging.INFO), PseudoTerminal(tmp_path / "port") as cable:
+        async with running(driver):
+            await eventually(lambda: driver.link.state == "up", "the port is there")
+            for number in range(1, 4):
+                os.write(cable.fd, b"\x11\x22\x33\x44" * 20)
+                least = 60 * number
+                await eventually(lambda: driver.counters.bytes_garbage > least, "all is read")  # noqa: B023
+            stated = driver.link.faults["x"]
+    [said] = [record.message for record in caplog.records if "are no frame" in record.message]
+    assert "left out; the sync word a55a is not in " in said
+    assert "bytes: 11 22 33 44 11 22 " in said
+    assert "compare baud, parity and sync_word with the device's" in said
+    assert "bytes come on ser0, but no frame as its layout states; the sync word a55a is not in" in stated
 
 
 async def test_errors_of_the_uart_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

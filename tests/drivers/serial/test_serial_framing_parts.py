@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -123,6 +124,34 @@ def test_bytes_behind_every_frame_cost_no_frame_and_are_told_once(crc, stray, ch
     many = "1 byte" if len(stray) == 1 else "2 bytes"
     assert told.malformed == f"the first are between two whole frames, {many}: {stray.hex(' ')}"
     assert "no frame is lost" in told.remedy
+
+
+def test_where_no_frame_comes_at_all_the_first_bytes_and_the_settings_to_compare_are_stated():
+    """Nothing is malformed before the first frame: with a wrong sync word all bytes are garbage."""
+    sent = SyncFraming(BodyCodec({"a": layout(6)}, crc="none"), b"\xaa\x55")
+    data = b"".join(sent.encode("a", np.arange(20) * 5, np.full((20, 5, 1), 5.0)))
+    other = SyncFraming(BodyCodec({"a": layout(6)}, crc="none"), b"\x55\xaa").cut(data)
+    assert other.notes["frames_malformed"] == 0
+    assert other.notes["bytes_garbage"] > 100
+    shown = r"1\d\d bytes: aa 55 00 05 05 05 05 05 aa 55 05 05 05 05 05 05 \.\.\."
+    assert re.fullmatch(rf"the sync word 55aa is not in {shown}", other.malformed)
+    assert "sync_word" in other.remedy
+    longer = SyncFraming(BodyCodec({"a": layout(7)}, crc="none"), b"\xaa\x55").cut(data)
+    assert re.fullmatch(
+        rf"the sync word aa55 is in {shown.replace(':', ', but no other one 7 bytes behind it:')}",
+        longer.malformed,
+    )
+    assert "payload_length" in longer.remedy
+    checked = SyncFraming(BodyCodec({"a": layout(6)}), b"\xaa\x55").cut(data)
+    assert "but no frame with a good CRC 8 bytes behind it: aa 55 00" in checked.malformed
+
+
+def test_the_first_bytes_are_shown_also_of_many_that_are_no_frame():
+    framing = SyncFraming(BodyCodec({"a": layout()}, crc="none"), b"\xaa\x55")
+    frames = framing.encode("a", np.arange(20) * 3, np.full((20, 3, 1), 5.0))
+    found = framing.cut(b"".join(frames[:10]) + bytes(range(1, 31)) + b"".join(frames[10:]))
+    assert found.notes["frames_malformed"] == 1
+    assert found.malformed == "the first of them: 01 02 03 04 05 06 07 08 09 0a 0b 0c 0d 0e 0f 10 ..."
 
 
 def test_bytes_put_into_two_neighbours_do_not_make_later_ones_intact():
