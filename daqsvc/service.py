@@ -264,9 +264,10 @@ class Service:
         return Looking(looker.lines, partial(watch.live.leave, looker))
 
     def _alarms_of(self, machine: MachineFile) -> AlarmManager:
+        names = machine.value_names
         return AlarmManager(
             Identity(machine.site, machine.box, machine.machine.name),
-            [alarm_rule(alarm) for alarm in machine.alarms],
+            [alarm_rule(alarm, names) for alarm in machine.alarms],
             self.clock,
             handling=machine.alarm_handling,
         )

@@ -109,6 +109,7 @@ class StatusReport:
         self._patience_ns = {n: patience(machine, n, s.rate_hz).ns for n, s in machine.streams.items()}
         self._latest: dict[str, Diagnosis] = {}
         self._measured: dict[str, Diagnosis] = {}
+        self._value_names = machine.value_names
         self._sensors: dict[tuple[str, str], list[Sensor]] = {}
         for sensor in machine.sensors:
             self._sensors.setdefault((sensor.stream, sensor.channel), []).append(sensor)
@@ -243,19 +244,27 @@ class StatusReport:
         for name, stream in self._machine.streams.items():
             sample = seen.newest[name]
             for column, channel in enumerate(stream.layout.channel_names):
+                value = None if sample is None else sample[0][column]
                 for sensor in self._sensors.get((name, channel), [None]):
                     state, reason = states.get(sensor.name, _UNKNOWN) if sensor else _UNKNOWN
                     yield {
                         "stream": name,
                         "channel": channel,
                         "sensor": sensor and sensor.name,
-                        "value": None if sample is None else sample[0][column],
+                        "value": value,
+                        "value_name": self._name_of(sensor, value),
                         "unit": sensor.unit if sensor else "",
                         "age_s": None if sample is None else _age_s(sample[1], seen.now_ns),
                         "state": state,
                         "reason": reason,
                         "code": _id(code_of_quality(state)),
                     }
+
+    def _name_of(self, sensor: Sensor | None, value: float | None) -> str | None:
+        """What a value means, where its sensor is a state whose values have names."""
+        if sensor is None or value is None:
+            return None
+        return self._value_names.get(sensor.name, {}).get(value)
 
 
 _UNKNOWN: tuple[SensorState, str] = ("unknown", "")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from daqsvc.acquisition.clock import NS_PER_S
@@ -12,12 +13,23 @@ from daqsvc.settings.alarms import DiagnosisAlarm, LevelAlarm
 from daqsvc.settings.measures import PHASE_OF
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from daqsvc.alarms.rules import Rule
     from daqsvc.settings.alarms import Alarm
 
 
-def alarm_rule(alarm: Alarm) -> Rule:
-    """The rule of one alarm."""
+_VALUE = "value"
+"""The measure of a trend value."""
+
+
+def alarm_rule(alarm: Alarm, value_names: Mapping[str, Mapping[float, str]] = MappingProxyType({})) -> Rule:
+    """The rule of one alarm.
+
+    Args:
+        alarm: its table in the machine file.
+        value_names: by sensor, what some of its values mean; see `MachineFile.value_names`.
+    """
     if isinstance(alarm, DiagnosisAlarm):
         return DiagnosisRule(
             alarm.name, alarm.detector, alarm.latching, alarm.evidence_nats, alarm.first_out_group
@@ -35,7 +47,8 @@ def alarm_rule(alarm: Alarm) -> Rule:
     )
     rest = (alarm.measure, setpoint, alarm.latching, alarm.trip_multiply, alarm.first_out_group)
     if isinstance(alarm, LevelAlarm):
-        return LevelRule(alarm.name, alarm.sensor, *rest, _phase(alarm))
+        named = value_names.get(alarm.sensor, {}) if alarm.measure == _VALUE else {}
+        return LevelRule(alarm.name, alarm.sensor, *rest, _phase(alarm), tuple(named.items()))
     return VotingRule(alarm.name, alarm.sensors, alarm.vote, *rest)
 
 

@@ -15,7 +15,7 @@ from daqsvc.errors.code import coded
 from daqsvc.rounding import readable, unit_behind, with_unit
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
     from collections.abc import Set as AbstractSet
 
     from daqsvc.alarms.events import AlarmEvent
@@ -181,6 +181,7 @@ class LevelRule:
         group: the first-out group that it competes in.
         beside: another measure of the sensor with limits of its own: the phase of an amplitude. The level is
             that of the worse of the two; start-up does not multiply its limits.
+        value_names: values of the measure that have a name, and that name: those of a state.
     """
 
     alarm: str
@@ -191,6 +192,7 @@ class LevelRule:
     trip_multiply: float = 1.0
     group: str = MACHINE_GROUP
     beside: Beside | None = None
+    value_names: tuple[tuple[float, str], ...] = ()
 
     @property
     def detectors(self) -> tuple[str, ...]:
@@ -303,12 +305,21 @@ class MeasureWatch:
         measure: key in `Diagnosis.statistics`.
         setpoint: the limits.
         trip_multiply: factor on the limits while the machine starts up.
+        value_names: names of values of the measure, if it is a state.
     """
 
-    def __init__(self, alarm: str, measure: str, setpoint: Setpoint, trip_multiply: float) -> None:
+    def __init__(
+        self,
+        alarm: str,
+        measure: str,
+        setpoint: Setpoint,
+        trip_multiply: float,
+        value_names: Iterable[tuple[float, str]] = (),
+    ) -> None:
         self._alarm = alarm
         self._measure = measure
         self._trip_multiply = trip_multiply
+        self._value_names = dict(value_names)
         self._reported_absent = False
         self._factor = 1.0
         self.monitor = SetpointMonitor(setpoint)
@@ -372,7 +383,8 @@ class MeasureWatch:
         """
         unit = unit_behind(diagnosis.units.get(self._measure, ""))
         limit = self.monitor.reached(value)
-        measured = f"{self._measure} of {sensor} is {readable(value)}{unit}"
+        named = f" ({name})" if (name := self._value_names.get(value)) else ""
+        measured = f"{self._measure} of {sensor} is {readable(value)}{unit}{named}"
         if self._measure in diagnosis.bounds:
             most = "most" if limit is not None and limit.lower else "least"
             lacks = f"{readable(100.0 * (diagnosis.missing_share or 0.0), 2)} % of its samples are missing"
@@ -412,7 +424,9 @@ class MeasureWatch:
 class _LevelWatch:
     def __init__(self, rule: LevelRule) -> None:
         self._sensor = rule.sensor
-        self._watch = MeasureWatch(rule.alarm, rule.measure, rule.setpoint, rule.trip_multiply)
+        self._watch = MeasureWatch(
+            rule.alarm, rule.measure, rule.setpoint, rule.trip_multiply, rule.value_names
+        )
         self._beside = None if rule.beside is None else MeasureWatch(rule.alarm, *rule.beside, 1.0)
 
     def find(self, diagnosis: Diagnosis, circumstances: Circumstances) -> RuleFinding | None:

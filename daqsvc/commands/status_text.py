@@ -106,10 +106,15 @@ def _channel(channel: Document, alone: Mapping[str, Sequence[Document]]) -> list
     return [
         channel["sensor"] or f"{channel['stream']}.{channel['channel']}",
         f"{state}, {'danger' if 'danger' in severities else 'alert'}" if severities else state,
-        _figure(channel["value"], channel["unit"]),
+        _figure(channel["value"], channel["unit"]) + _named(channel),
         _age(channel["age_s"]),
         " ".join(said),
     ]
+
+
+def _named(channel: Document) -> str:
+    """What the value of a state means; services of earlier versions do not state it."""
+    return f" ({harmless(name)})" if (name := channel.get("value_name")) else ""
 
 
 def _finding(statement: Document) -> str:

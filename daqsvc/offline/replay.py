@@ -303,9 +303,10 @@ class Replay:
         self._readers: dict[str, GivenWindows] = {}
         self._watch = self._made()
         self._see_who_judges()
+        value_names = named.value_names
         self._alarms = AlarmManager(
             Identity(named.site, named.box, named.machine.name),
-            [alarm_rule(alarm) for alarm in named.alarms],
+            [alarm_rule(alarm, value_names) for alarm in named.alarms],
             self._clock,
             handling=named.alarm_handling,
         )

@@ -51,6 +51,9 @@ class ChannelPayload(JsonPayload):
     channel: str = Field(description="name of the channel")
     sensor: str | None = Field(description="null if no sensor of the machine file is on it")
     value: Number = Field(description="null if the newest sample is missing, or none has come")
+    value_name: str | None = Field(
+        None, description="what the value means, if it is a state with names in a DBC file"
+    )
     unit: str = Field(description="unit of the value")
     age_s: Number = Field(description="age of the newest sample; null before the first one")
     state: SensorState = Field(description="what the detectors state about the sensor")

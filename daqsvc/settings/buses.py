@@ -10,7 +10,7 @@ from daqsvc.settings.hooks import Hooks, contract
 from daqsvc.settings.section import Name, Section, UnusableValueError
 
 if TYPE_CHECKING:
-    from collections.abc import Hashable
+    from collections.abc import Hashable, Mapping
 
 StartPolicy = Literal["error", "retry", "ignore"]
 
@@ -141,6 +141,16 @@ class Layout(Hooks, Section):
         """
         del channel, facts
         return None
+
+    def value_names(self, channel: str, facts: Any) -> Mapping[float, str]:
+        """What some values of a channel mean, as of a state; empty where that is not known.
+
+        Args:
+            channel: its name.
+            facts: what was read from the files that the layout names; None without any.
+        """
+        del channel, facts
+        return {}
 
 
 class UnknownLayout(Layout):

@@ -263,6 +263,17 @@ class MachineFile(Section):
         return self._origin.layout_facts
 
     @property
+    def value_names(self) -> dict[str, Mapping[float, str]]:
+        """By sensor, what some of its values mean, as a file that its layout names states it."""
+        found = {}
+        for sensor in self.sensors:
+            # In another unit, or with a sensitivity, a value is another number than the file's.
+            if isinstance(sensor, TrendValue) and sensor.unit == "1" and sensor.stream in self.streams:
+                layout = self.streams[sensor.stream].layout
+                found[sensor.name] = layout.value_names(sensor.channel, self.layout_facts.get(sensor.stream))
+        return {name: names for name, names in found.items() if names}
+
+    @property
     def detectors(self) -> tuple[str, ...]:
         """Names of the detectors that an alarm can follow."""
         names = (plugin.detector for _, plugin, _ in configured(self.pipeline))

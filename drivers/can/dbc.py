@@ -211,6 +211,7 @@ def check_dbc(layout: DbcLayout, file: Path, at: KeyPath) -> tuple[DbcMessage | 
         signal_bits={signal.name: signal.length for signal in message.signals},
         signal_units={signal.name: signal.unit or "" for signal in message.signals},
         signal_ranges={signal.name: _range(signal) for signal in message.signals if not signal.is_float},
+        signal_names={signal.name: _names(signal) for signal in message.signals if signal.choices},
         any_priority=message.protocol == "j1939",
         valid_raw={
             signal.name: valid
@@ -220,6 +221,15 @@ def check_dbc(layout: DbcLayout, file: Path, at: KeyPath) -> tuple[DbcMessage | 
         pages=_pages(message, [name for _, name in _asked(layout, at)]),
     )
     return facts, list(_signal_findings(layout, message, at))
+
+
+def _names(signal: Signal) -> dict[float, str]:
+    """What values of a signal mean, by the value in its unit."""
+    return {
+        raw * float(signal.scale) + float(signal.offset): text
+        for raw, choice in (signal.choices or {}).items()
+        if (text := f"{choice}".strip()) and text.isprintable()
+    }
 
 
 def messages_of(file: Path) -> list[Message]:

@@ -6,6 +6,7 @@ import math
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from daqsvc.rounding import counted
@@ -33,7 +34,7 @@ from drivers.can.questions import CanQuestions
 from drivers.can.sniff import of_another_stream, of_one_channel
 from drivers.names import LONGEST_NAME, message_stream
 from drivers.questions import NONE, Answers, Question, Topic, sensor_key
-from drivers.sniffing import LONGEST_UNIT, Values, by_name, is_waveform_rate, type_by_unit
+from drivers.sniffing import LONGEST_UNIT, Values, by_name, is_waveform_rate, quoted, type_by_unit
 from drivers.toml_lines import array, behind, entry, toml
 
 if TYPE_CHECKING:
@@ -224,6 +225,13 @@ class DbcQuestions(CanQuestions):
             yield f"# {answers['message']} is multiplexed. For these pages make separate streams:"
             yield from (f"#   {page} {names}".rstrip() for page, names in _shown(others, ":").items())
 
+    def _states(self, answers: Answers) -> Iterator[str]:
+        """Comments on what the values of states mean: limits of alarms lie between them."""
+        for signal in self._messages(answers)[answers["message"]].signals:
+            if signal.choices and signal.name in answers["signals"]:
+                meanings = ", ".join(f"{value} {quoted(f'{text}')}" for value, text in signal.choices.items())
+                yield from (f"# {line}" for line in wrap(f"{signal.name} is a state: {meanings}", 98))
+
     def _units(self, answers: Answers) -> dict[str, str]:
         """Units of the channels: as machine files write them, or as the DBC file does where none is known."""
         signals = self._messages(answers)[answers["message"]].signals
@@ -256,6 +264,7 @@ class DbcQuestions(CanQuestions):
         else:
             yield from of_one_channel(answers["signals"])
         yield from self._other_pages(answers)
+        yield from self._states(answers)
         channels = self._by_channel(answers).items()
         yield from array("channels", [{"name": name, "signals": [*signals]} for name, signals in channels])
 

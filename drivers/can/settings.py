@@ -150,6 +150,7 @@ class DbcMessage:
         signal_bits: width of each signal in bits, by name.
         signal_units: unit of each signal, by name; empty if the DBC gives none.
         signal_ranges: least and largest value that each signal can carry, in its unit; none of a float.
+        signal_names: what values of each signal mean, where the DBC file names some.
         any_priority: whether it is one of SAE J1939, whatever the priority in its id.
         valid_raw: least and largest raw value that is a measurement, by signal, where SAE J1939 has others.
         pages: which values of which multiplexers the frames have that hold the layout's signals.
@@ -161,6 +162,7 @@ class DbcMessage:
     signal_bits: Mapping[str, int]
     signal_units: Mapping[str, str]
     signal_ranges: Mapping[str, tuple[float, float]]
+    signal_names: Mapping[str, Mapping[float, str]]
     any_priority: bool
     valid_raw: Mapping[str, tuple[float, float]]
     pages: Mapping[str, frozenset[int]]
@@ -244,3 +246,9 @@ class DbcLayout(Layout):
         if not known or len(known) < len(signals):
             return None
         return WireRange(min(low for low, _ in known), max(high for _, high in known), 0.0)
+
+    def value_names(self, channel: str, facts: Any) -> Mapping[float, str]:
+        """See `Layout.value_names`: by the value table of the DBC file."""
+        signals = next((item.signals for item in self.channels if item.name == channel), ())
+        names = facts.signal_names if isinstance(facts, DbcMessage) else {}
+        return names.get(signals[0], {}) if len(signals) == 1 else {}

@@ -349,6 +349,14 @@ def test_new_points_out_signals_that_may_be_samples_of_one_channel(tmp_path: Pat
     assert f"# If these are samples of one channel: {one}" in file.read_text("utf-8")
 
 
+def test_new_writes_the_names_of_a_state_beside_its_channel(tmp_path: Path) -> None:
+    dbc, file = tmp_path / "fan.dbc", tmp_path / "new.toml"
+    dbc.write_text(FAN)
+    command = ["new", f"{file}", "--yes", "--bus=can-dbc", f"--dbc={dbc}", "--message=Vibration"]
+    assert main([*command, "--signals=VibDE_0, State"]) == 0
+    assert '# State is a state: 0 "off", 1 "on"' in file.read_text("utf-8")
+
+
 @pytest.mark.usefixtures("hub")
 def test_without_a_dbc_file_the_proposal_has_the_bus_and_says_what_is_missing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
