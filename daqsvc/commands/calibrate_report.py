@@ -401,7 +401,7 @@ def _steady_json(record: CalibrationRecord, calibration: Calibration, source: st
     deviations = _deviations(calibration)
     return {
         "source": source,
-        **calibration_json(calibration),
+        **calibration_json(record.as_watched(calibration)),
         "vector_um": {
             str(order): [value.real, value.imag]
             for order, value in zip(HARMONICS, calibration.baseline.tolist(), strict=True)
@@ -476,7 +476,7 @@ def _steady_lines(record: CalibrationRecord, calibration: Calibration, source: s
     lines += [
         f"mean position ({mean.real:.4g}, {mean.imag:.4g}) +- {deviations[0]:.2g} um",
         f"noise {calibration.noise_um:.3g} um a sample, SNR {calibration.snr_db:.1f} dB",
-        f"the machine {calibration.describe()}",
+        f"the machine {record.as_watched(calibration).describe()}",
     ]
     head = f"{source}: {calibration.revolutions} revolutions at {calibration.speed_rpm:.2f} rpm"
     return [head, *_indented(lines)]

@@ -59,6 +59,22 @@ class CalibrationRecord:
     two_modes: TwoModeFit | None = None
     written: str = ""
 
+    def with_modes(self, rotor: LavalRotor, speed_rpm: float | None) -> LavalRotor:
+        """What is known of a rotor, and its two modes if they explain the run-up and that passed the speed.
+
+        Args:
+            rotor: the Laval rotor that is nearest to it.
+            speed_rpm: shaft speed of either sign; None if it is not known.
+        """
+        modes = self.two_modes
+        if modes is None or not (speed_rpm is None or modes.holds_at(speed_rpm)):
+            return rotor
+        return modes.beside(rotor)
+
+    def as_watched(self, calibration: Calibration) -> Calibration:
+        """A baseline with what the run-up shows of the rotor, as whoever watches by the file has it."""
+        return replace(calibration, rotor=self.with_modes(calibration.rotor, calibration.speed_rpm))
+
     def at(self, speed_rpm: float | None = None) -> Calibration:
         """The baseline of a speed.
 
@@ -420,8 +436,7 @@ def load_healthy(
     if clearance_um is not None:
         rotor = replace(rotor, clearance_um=clearance_um)
     rotor = replace(rotor, plain_bearings=plain_bearings)
-    if record.two_modes is not None and (speed_rpm is None or record.two_modes.holds_at(speed_rpm)):
-        rotor = record.two_modes.beside(rotor)
+    rotor = record.with_modes(rotor, speed_rpm)
     return rotor, tuple(replace(baseline, rotor=rotor) for baseline in baselines)
 
 
@@ -503,7 +518,7 @@ def _lines(record: CalibrationRecord) -> Iterator[str]:
                 f"the baseline at {calibration.speed_rpm:.1f} rpm was made with {calibration.rotor}, the "
                 f"record has {rotor}; make all baselines of a record with one rotor"
             )
-        yield from _steady_lines(calibration, source)
+        yield from _steady_lines(calibration, record.as_watched(calibration).describe(), source)
 
 
 def _run_up_lines(fit: RunUpFit, source: str) -> Iterator[str]:
@@ -549,9 +564,9 @@ def _two_modes_lines(fit: TwoModeFit) -> Iterator[str]:
     yield f"fit_error = {fit.fit_error!r}  # of the whirl, not explained by two modes"
 
 
-def _steady_lines(calibration: Calibration, source: str) -> Iterator[str]:
+def _steady_lines(calibration: Calibration, verdict: str, source: str) -> Iterator[str]:
     yield "\n[[steady]]"
-    yield f"verdict = {_quoted(calibration.describe())}"
+    yield f"verdict = {_quoted(verdict)}"
     yield f"source = {_quoted(source)}"
     yield f"speed_rpm = {calibration.speed_rpm!r}"
     yield f"revolutions = {calibration.revolutions}"

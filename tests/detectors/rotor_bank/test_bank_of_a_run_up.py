@@ -58,15 +58,17 @@ def calibrated(tmp_path_factory) -> Path:
 
 
 def calibrated_in(folder: Path, machine: Machine, clearance_um: int) -> Path:
-    position, angle = run_up(machine, 8.0, 50.0, 20.0)
-    table = channels(position, angle)
-    header = "x,y,kph"
-    np.savetxt(folder / "run-up.csv", table, fmt="%.3f", delimiter=",", header=header, comments="")
+    write(folder / "run-up.csv", *run_up(machine, 8.0, 50.0, 20.0))
     arguments = ["calibrate", str(folder / "run-up.csv"), "--probes", "x,y", "--keyphasor", "kph"]
     arguments += ["--fs", str(RATE_HZ), "--unit", "um"]
     arguments += ["--clearance-um", f"{clearance_um}"]
     assert main([*arguments, "--out", str(folder / "rotor.toml")]) == 0
     return folder
+
+
+def write(file: Path, position, angle) -> None:
+    table = channels(position, angle)
+    np.savetxt(file, table, fmt="%.3f", delimiter=",", header="x,y,kph", comments="")
 
 
 def machine_of(folder: Path, *more: tuple[str, str]):
@@ -125,6 +127,22 @@ def test_the_run_up_is_in_the_file(calibrated):
     text = (calibrated / "rotor.toml").read_text(encoding="utf-8")
     assert "two modes explain 1X from" in text
     assert "[two_modes]" in text
+
+
+@pytest.mark.long
+def test_a_steady_recording_is_stated_to_have_the_two_modes_of_the_run_up(calibrated, tmp_path, capsys):
+    angle = 0.4 + math.tau * SPEED_HZ / RATE_HZ * np.arange(round(120.0 * RATE_HZ / SPEED_HZ))
+    write(tmp_path / "steady.csv", positions_of(MACHINE)(angle), angle)
+    recordings = [str(calibrated / "run-up.csv"), str(tmp_path / "steady.csv")]
+    options = ["--probes", "x,y", "--keyphasor", "kph", "--fs", str(RATE_HZ), "--unit", "um"]
+    options += ["--clearance-um", "250"]
+    assert main(["calibrate", *recordings, *options, "--out", str(tmp_path / "rotor.toml")]) == 0
+    for told in (capsys.readouterr().out, (tmp_path / "rotor.toml").read_text(encoding="utf-8")):
+        assert "the two modes of its run-up show how faults move it" in told
+        assert "generic mode" not in told
+    assert main(["calibrate", *recordings, *options, "--json"]) == 0
+    (steady,) = json.loads(capsys.readouterr().out)["steady"]
+    assert "the two modes of its run-up show how faults move it" in steady["verdict"]
 
 
 @pytest.mark.parametrize(
