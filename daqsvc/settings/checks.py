@@ -49,6 +49,7 @@ from daqsvc.settings.sensor_checks import (
     check_room_above,
     check_sensitivity,
     check_unit,
+    check_value_names,
     check_voltages,
 )
 from daqsvc.settings.speed_signals import speed_signals
@@ -212,6 +213,7 @@ def _sensor_checks(draft: MachineFile, facts: Mapping[str, Any]) -> Iterator[Ite
             yield check_sensitivity(sensor, at)
             yield check_unit(sensor, at)
             yield check_reach(draft, sensor, facts, at)
+            yield check_value_names(draft, sensor, facts)
     yield _check_channel_use(draft)
     yield check_probe_angles(draft)
     yield check_alarm_reach(draft, facts)

@@ -265,13 +265,21 @@ class MachineFile(Section):
     @property
     def value_names(self) -> dict[str, Mapping[float, str]]:
         """By sensor, what some of its values mean, as a file that its layout names states it."""
-        found = {}
-        for sensor in self.sensors:
-            # In another unit, or with a sensitivity, a value is another number than the file's.
-            if isinstance(sensor, TrendValue) and sensor.unit == "1" and sensor.stream in self.streams:
-                layout = self.streams[sensor.stream].layout
-                found[sensor.name] = layout.value_names(sensor.channel, self.layout_facts.get(sensor.stream))
+        found = {sensor.name: self.value_names_of(sensor, self.layout_facts) for sensor in self.sensors}
         return {name: names for name, names in found.items() if names}
+
+    def value_names_of(self, sensor: Sensor, facts: Mapping[str, Any]) -> Mapping[float, str]:
+        """What some values of a sensor mean; empty where that is not known.
+
+        Args:
+            sensor: one of its sensors.
+            facts: by stream, what was read from the files that its layout names.
+        """
+        stream = self.streams.get(sensor.stream)
+        # In another unit, or with a sensitivity, a value is another number than the file's.
+        if stream is None or not isinstance(sensor, TrendValue) or sensor.unit != "1":
+            return {}
+        return stream.layout.value_names(sensor.channel, facts.get(sensor.stream))
 
     @property
     def detectors(self) -> tuple[str, ...]:

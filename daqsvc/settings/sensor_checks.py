@@ -340,6 +340,12 @@ def _reach(
     return (-math.inf, high - low) if measure in ranged else None
 
 
+def check_value_names(draft: MachineFile, sensor: Sensor, facts: Mapping[str, Any]) -> Iterator[Finding]:
+    """Whether the layout can be asked for the names of values: else it would fail when the service starts."""
+    draft.value_names_of(sensor, facts)
+    yield from ()
+
+
 def wire_range(draft: MachineFile, sensor: Sensor, facts: Mapping[str, Any]) -> WireRange | None:
     """What the channel of a sensor can carry; None of a float or a text, and where it is not known.
 

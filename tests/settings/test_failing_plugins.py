@@ -43,9 +43,16 @@ if TYPE_CHECKING:
 
 pytestmark = pytest.mark.integration
 MACHINE = DRIVER / "machine.toml"
-TABLES = (
-    f'{MACHINE.read_text()}\n[pipeline.crest]\nsensor = "casing-x"\n[event_file]\npath = "events.jsonl"\n'
-)
+STATE = '[[sensors]]\nname = "state"\ntype = "trend"\nstream = "casing"\nchannel = "y"\nunit = "1"\n'
+"""A value that a layout may have names for."""
+TABLES = f"""
+{MACHINE.read_text()}
+{STATE}
+[pipeline.crest]
+sensor = "casing-x"
+[event_file]
+path = "events.jsonl"
+"""
 HERE = Path(__file__).name
 
 
@@ -324,6 +331,7 @@ def test_a_hook_that_fails_takes_no_other_table_down(
         ("tcp_frames.LoggerPlugin", "read_files", "streams.casing.layout"),
         ("tcp_frames.LoggerBus", "device", "buses.logger"),
         ("daqsvc.settings.packing.PackedLayout", "channel_names", "streams.casing.layout"),
+        ("daqsvc.settings.packing.PackedLayout", "value_names", "streams.casing.layout"),
         ("crest.CrestPlugin", "checks", "pipeline.crest"),
         ("crest.CrestPlugin", "sampled_together", "pipeline.crest"),
         ("event_file.EventFilePlugin", "checks", "event_file"),
@@ -348,7 +356,9 @@ def test_sensors_that_a_plugin_takes_together_and_there_are_none_of_are_its_fail
     monkeypatch.setattr(class_at("crest.CrestPlugin"), "sampled_together", lambda *_: names)
     [problem] = problems_of(TABLES, MACHINE)
     assert problem.key == "pipeline.crest"
-    words = "it names 'ghost', which is no sensor; name some of casing-x (test_failing_plugins.py, line"
+    words = (
+        "it names 'ghost', which is no sensor; name some of casing-x, state (test_failing_plugins.py, line"
+    )
     assert f"sampled_together of crest.CrestPlugin has failed: {words}" in problem.message
     assert problem.remedy == "have the authors of daqsvc-crest 1.0 fix it, or remove [pipeline.crest]"
     # A table that names them is to blame for it, and says so itself.
