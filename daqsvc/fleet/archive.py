@@ -151,7 +151,7 @@ class Archive:
         """
         folder = f"{self.root}/{name}"
         description: list[ArchivedFile] = []
-        found: list[ArchivedRecording] = []
+        recordings: list[ArchivedRecording] = []
         others = 0
         is_machine = False
         for path, below, about in self._walk(folder, ""):
@@ -164,13 +164,13 @@ class Archive:
                 others += 1
             elif about is None:
                 wrong = f"{rest} is no regular file; archive what it leads to"
-                found.append(ArchivedRecording(printable(rest), path, (), wrong))
+                recordings.append(ArchivedRecording(printable(rest), path, (), wrong))
             else:
                 file = _file(path, rest, about)
-                found.append(ArchivedRecording(printable(rest), path, (file,)))
-        if not (is_machine or found):
+                recordings.append(ArchivedRecording(printable(rest), path, (file,)))
+        if not (is_machine or recordings):
             return None
-        return ArchivedMachine(name, tuple(description), tuple(_with_folders(found)), others)
+        return ArchivedMachine(name, tuple(description), tuple(_with_folders(recordings)), others)
 
     def read(self, path: str, most_bytes: int) -> bytes:
         """A small file.
@@ -252,10 +252,10 @@ def _file(path: str, name: str, about: dict[str, Any]) -> ArchivedFile:
     return ArchivedFile(path, name, int(about.get("size") or 0), stamp)
 
 
-def _with_folders(found: list[ArchivedRecording]) -> Iterator[ArchivedRecording]:
+def _with_folders(recordings: list[ArchivedRecording]) -> Iterator[ArchivedRecording]:
     """The recordings, CAN logs of one folder below ``recordings`` as one, as ``daqsvc analyze`` has it."""
     folders: dict[str, list[ArchivedRecording]] = {}
-    for recording in found:
+    for recording in recordings:
         folder = str(PurePosixPath(recording.file).parent)
         if folder == "." or not named_as_can_log(Path(recording.file)):
             yield recording

@@ -95,7 +95,7 @@ def _client(make: Any, address: str) -> Any:
     try:
         return make(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError, TypeError, RuntimeError) as error:
-        # The libraries below say why in several lines, and of an address without a port by a TypeError.
+        # The libraries below give the reason in several lines; an address without a port is a TypeError.
         why = " ".join(f"{error}".split())[:200]
         raise FleetError(
             f"no Dask scheduler answers at {address} ({why}); start one there (dask scheduler), or use "
@@ -105,7 +105,7 @@ def _client(make: Any, address: str) -> Any:
 
 @contextlib.contextmanager
 def _silent() -> Iterator[None]:
-    """Have Dask log nothing: what there is to say of a cluster that is lost is said in a sentence."""
+    """Have Dask log nothing: the loss of a cluster is reported in one sentence."""
     with contextlib.ExitStack() as stack:
         # Some have a level and a handler of their own, so that to silence their parent is not enough.
         for name, logger in list(logging.root.manager.loggerDict.items()):

@@ -16,9 +16,9 @@ _OF_CONTENT = {errno.EINVAL, errno.EOVERFLOW, errno.ERANGE, errno.EDOM, errno.EI
 _OWN_FAULTS = ("SIGSEGV", "SIGABRT", "SIGFPE", "SIGILL")
 """Ends of a process that the bytes it reads bring about; any other comes from outside."""
 _KILLED = "SIGKILL"
-_SAID = tuple(
-    f"cannot be read: {said}"
-    for said in (
+_SYSTEM_ERRORS = tuple(
+    f"cannot be read: {reason}"
+    for reason in (
         "there is no such file",
         *(os.strerror(code) for code in sorted(errno.errorcode) if code not in _OF_CONTENT),
     )
@@ -47,7 +47,7 @@ def _is_passing(error: BaseException) -> bool:
     if isinstance(error, ConfinedError):
         return error.reason != "crash" or not any(fault in error.how for fault in _OWN_FAULTS)
     if isinstance(error, RaisedThereError):
-        return any(said in error.message for said in _SAID)
+        return any(text in error.message for text in _SYSTEM_ERRORS)
     if isinstance(error, OSError):  # of libraries' own kinds, as for a damaged gzip, there is no number
         return error.errno is not None and error.errno not in _OF_CONTENT
     return isinstance(error, MemoryError)

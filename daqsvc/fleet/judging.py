@@ -92,10 +92,10 @@ def describe_machine(
 ) -> tuple[str, str]:
     """The digest of a machine file and all that lies beside it; and why it cannot be used, or nothing.
 
-    What options say of the recordings is part of the digest.
+    What options state of the recordings is part of the digest.
 
     Raises:
-        FleetError: one of them cannot be read. There is no digest then, and no row can be told from others.
+        FleetError: one of them cannot be read. There is no digest then, and rows cannot be distinguished.
     """
     digest, name = hashlib.sha256(), printable(machine.name)
     if any((options.channels, options.rate_hz is not None, options.unit is not None)):
@@ -177,10 +177,10 @@ def _judge(batch: RecordingBatch, folder: Path) -> Judged:
     if not wrong:
         try:
             runner = _runner(archive, batch)
-        except Exception as error:  # noqa: BLE001 - a machine file of somebody else: its rows say so
+        except Exception as error:  # noqa: BLE001 - a machine file of somebody else: its rows state it
             passing = is_passing(error)
             wrong = f"{batch.machine}/{MACHINE_FILE} cannot be used: {error}"
-            wrong = _told(_again(wrong) if passing else wrong, archive, _kept_in(batch))
+            wrong = _archived_reason(_again(wrong) if passing else wrong, archive, _kept_in(batch))
     rows: list[Row] = []
     unchanged: dict[str, tuple[int, str]] = {}
     for recording in batch.recordings:
@@ -194,7 +194,7 @@ def _judge(batch: RecordingBatch, folder: Path) -> Judged:
         except (OSError, MemoryError) as error:
             why = (error.strerror or error) if isinstance(error, OSError) else "memory ran out"
             where = f"{batch.machine}/{RECORDINGS}/{recording.file}"
-            row["reason"] = _told(_again(f"{where} cannot be read: {why}"), archive)
+            row["reason"] = _archived_reason(_again(f"{where} cannot be read: {why}"), archive)
             rows.append(row)
             continue
         if batch.known.get(recording.file) == row["digest"]:
@@ -210,16 +210,16 @@ def _judge(batch: RecordingBatch, folder: Path) -> Judged:
 
 def _add_judgement(row: Row, runner: PatientRunner, path: Path, places: tuple[Archive, Path, Path]) -> None:
     """Fill in what the runner states; without a digest if another run may get further with the same bytes."""
-    found = dict(row)
+    filled = dict(row)
     try:
         analysis = runner.judge(str(path), None).json
-        add_analysis(found, _archived(analysis, _prefixes(*places)))
+        add_analysis(filled, _archived(analysis, _prefixes(*places)))
     except Exception as error:  # noqa: BLE001 - whatever a file brings about costs its row
         passing = is_passing(error)
         reason = f"daqsvc failed at it: {error_text(error)}" + ("" if passing else "; report this")
-        row["reason"] = _told(reason, *places)
+        row["reason"] = _archived_reason(reason, *places)
     else:
-        row.update(found)
+        row.update(filled)
         passing = runner.is_passing
     if row["judged"]:
         return
@@ -349,10 +349,10 @@ def _prefixes(archive: Archive, *folders: Path) -> tuple[str, ...]:
     return (*root, *(f"{folder}/" for folder in folders))
 
 
-def _told(text: str, archive: Archive, *folders: Path) -> str:
+def _archived_reason(text: str, archive: Archive, *folders: Path) -> str:
     """A reason on one line, with paths as in the archive."""
-    said: str = _archived(text, _prefixes(archive, *folders))
-    return one_line(said)[:_LONGEST_REASON]
+    reason: str = _archived(text, _prefixes(archive, *folders))
+    return one_line(reason)[:_LONGEST_REASON]
 
 
 def _archived(value: Any, prefixes: tuple[str, ...]) -> Any:

@@ -45,7 +45,7 @@ def address_of(url: str, files: Any, root: str, path: str) -> str:
 
 
 def why(error: OSError) -> str:
-    """What has gone wrong, in words: stores say no more than the path of what they do not have."""
+    """What has gone wrong, in words: stores report no more than the path of what they do not have."""
     if error.strerror:
         return error.strerror
     return "No such file or directory" if isinstance(error, FileNotFoundError) else f"{error}"

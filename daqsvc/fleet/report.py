@@ -50,7 +50,7 @@ class KnownFault:
         fault: what it was; any text, a verdict's name where there is one for it.
         first: the first recording that it is in, or a time; empty: from the beginning.
         last: the last one, or a time; empty: to the end.
-        where: table and line that say so.
+        where: table and line that state it.
     """
 
     machine: str
@@ -78,7 +78,7 @@ class _Span:
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What the recordings say of a known fault.
+    """What the recordings show of a known fault.
 
     Attributes:
         fault: the fault.
@@ -234,7 +234,7 @@ class FleetReportJson(TypedDict):
 
 @dataclass
 class MachineReport:
-    """What the results say of a machine.
+    """What the results show of a machine.
 
     Attributes:
         machine: its name.
@@ -304,7 +304,7 @@ class MachineReport:
 
 @dataclass
 class FleetReport:
-    """What the results say of a fleet.
+    """What the results show of a fleet.
 
     Attributes:
         machines: by name.
@@ -468,7 +468,7 @@ def fleet_report(
 def machine_report(
     machine: str, rows: Iterable[Row], truth: Sequence[KnownFault] | None, interval_s: float | None
 ) -> MachineReport:
-    """What the rows of a machine say; arguments as of `fleet_report`.
+    """What the rows of a machine show; arguments as of `fleet_report`.
 
     Raises:
         TruthError: as `fleet_report`.

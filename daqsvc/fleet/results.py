@@ -247,7 +247,7 @@ class Results:
 def folder_of(machine: str) -> str:
     """The folder of a machine, named as Hive names partitions.
 
-    A name that would be too long for a file system is cut, and told from others by its digest.
+    A name that would be too long for a file system is cut, and is made unique by its digest.
     """
     text = printable(machine)
     quoted = quote(text, safe=" ")

@@ -104,10 +104,10 @@ def bound_at(text: str) -> tuple[datetime, datetime] | None:
         text: a time and nothing else, e.g. ``2026-03-08`` or ``2026-03-08T10:00``; None comes of any other.
     """
     text = text.removesuffix("Z").removesuffix("+00:00")
-    found, begin = _TIME_IN_NAME.fullmatch(text), recorded_at(text)
-    if found is None or begin is None:
+    match, begin = _TIME_IN_NAME.fullmatch(text), recorded_at(text)
+    if match is None or begin is None:
         return None
-    return begin, begin if found[4] else begin + timedelta(days=1) - timedelta(microseconds=1)
+    return begin, begin if match[4] else begin + timedelta(days=1) - timedelta(microseconds=1)
 
 
 def begun_row(machine: str, machine_digest: str, version: str, recording: ArchivedRecording) -> Row:
@@ -170,15 +170,15 @@ def _probability(analysis: Mapping[str, Any]) -> float | None:
 
 def _worst(detectors: Mapping[str, Any]) -> tuple[str | None, str | None]:
     """The detector with the most severe statement, the first of those that are equally so."""
-    found = [
+    ranked = [
         (_SEVERITIES.index(severity), name)
         for name, one in detectors.items()
         if (severity := (one.get("worst") or {}).get("severity")) in _SEVERITIES
     ]
-    if not found:
+    if not ranked:
         return None, None
-    rank = max(rank for rank, _ in found)
-    return next(name for at, name in found if at == rank), _SEVERITIES[rank]
+    rank = max(rank for rank, _ in ranked)
+    return next(name for at, name in ranked if at == rank), _SEVERITIES[rank]
 
 
 def _seconds(instant: Mapping[str, Any] | None) -> float | None:

@@ -44,7 +44,7 @@ _COUNTED: Mapping[str, type[Any]] = {
     "sparkplug": SparkplugCounters,
     "recorders.NAME": RecorderCounters,
 }
-"""Classes of counters by where they stand: their docstrings say what each is."""
+"""Classes of counters by where they stand: their docstrings state what each is."""
 WORDS: Mapping[str, str] = {
     "streams.NAME.rate_hz": "samples per second by the device's clock; by the machine file until it is known",
     "streams.NAME.doubt": "why nothing can be judged by the samples; empty if it can",
@@ -101,9 +101,9 @@ def attributes(kind: type[Any]) -> dict[str, str]:
         _, _, listed = inspect.cleandoc(base.__doc__ or "").partition("Attributes:\n")
         name = ""
         for line in listed.splitlines():
-            if found := _ATTRIBUTE.match(line):
-                name = found[1]
-                words[name] = line[found.end() :]
+            if match := _ATTRIBUTE.match(line):
+                name = match[1]
+                words[name] = line[match.end() :]
             elif name and line.startswith("        "):
                 words[name] += f" {line.strip()}"
             else:
@@ -113,7 +113,7 @@ def attributes(kind: type[Any]) -> dict[str, str]:
 
 def figures() -> tuple[str, ...]:
     """The path of every figure that the services of the examples have, and of what needs more than a file."""
-    found: dict[str, None] = {}
+    paths: dict[str, None] = {}
 
     def walk(below: Mapping[str, Any], path: tuple[str, ...], names: int) -> None:
         for key, value in below.items():
@@ -121,11 +121,11 @@ def figures() -> tuple[str, ...]:
             if isinstance(value, dict) and key not in _FREE:
                 walk(value, here, names - 1 if path else _NAMED.get(key, 0))
             else:
-                found[".".join(here)] = None
+                paths[".".join(here)] = None
 
     for service in services():
         walk(service.figures(), (), 0)
-    return (*found, "failures.NAME", *_ONLY_WITH_TLS)
+    return (*paths, "failures.NAME", *_ONLY_WITH_TLS)
 
 
 def words() -> dict[str, dict[str, list[str]]]:
@@ -133,14 +133,14 @@ def words() -> dict[str, dict[str, list[str]]]:
     known = {
         f"{where}.{name}": text for where, kind in _COUNTED.items() for name, text in attributes(kind).items()
     }
-    found = {path: {text: list[str]()} for path, text in {**known, **WORDS}.items()}
+    by_path = {path: {text: list[str]()} for path, text in {**known, **WORDS}.items()}
     for service in services():
         for report in service.driver_reports:
             driver = service.box.own.buses[report.name].driver
             for name, text in attributes(type(report.counters)).items():
-                drivers = found.setdefault(f"buses.{NAME}.{name}", {}).setdefault(text, [])
+                drivers = by_path.setdefault(f"buses.{NAME}.{name}", {}).setdefault(text, [])
                 drivers += [] if driver in drivers else [driver]
-    return found
+    return by_path
 
 
 def gaps() -> Iterator[str]:

@@ -201,7 +201,7 @@ def named_in_code() -> set[str]:
     """Every value of a ``schema`` key that is in the code."""
     package = Path(f"{daqsvc.__file__}").parent
     texts = (file.read_text(encoding="utf-8") for file in package.rglob("*.py"))
-    return {found for text in texts for found in _NAMED.findall(text)}
+    return {name for text in texts for name in _NAMED.findall(text)}
 
 
 def gaps() -> Iterator[str]:

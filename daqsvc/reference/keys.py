@@ -108,12 +108,12 @@ class Table:
 
 def tables() -> dict[str, Table]:
     """Every table of the machine file by its path, those of all plugins with them."""
-    found: dict[str, Table] = {}
+    by_path: dict[str, Table] = {}
 
     def walk(declared: Any, path: str, within: str) -> None:
         kinds, bare, element = kinds_of(declared), bare_type(declared), element_type(declared)
         if kinds is not None or is_section(bare):
-            here = found.setdefault(path, Table(path))
+            here = by_path.setdefault(path, Table(path))
             for section in kinds.sections if kinds is not None else (bare,):
                 kind = section.kind or within
                 if (section, kind) in here.kinds:
@@ -127,7 +127,7 @@ def tables() -> dict[str, Table]:
             walk(element, f"{path}.{NAME}" if get_origin(bare) is dict else f"{path}[]", within)
 
     walk(machine_file_model(), "", "")
-    return found
+    return by_path
 
 
 def gaps() -> Iterator[str]:
@@ -144,12 +144,12 @@ def gaps() -> Iterator[str]:
 
 def pages() -> dict[str, str]:
     """Text of each page, by file name."""
-    found = tables()
-    top = found[""]
+    by_path = tables()
+    top = by_path[""]
     made = {}
     listed = []
     for name, variants in top.keys.items():
-        below = [held for path, held in found.items() if _top(path) == name]
+        below = [held for path, held in by_path.items() if _top(path) == name]
         if not below:
             continue
         file = _file(name)
@@ -158,7 +158,7 @@ def pages() -> dict[str, str]:
             header = f"[{name}.{NAME}]"
         number = sum(len(held.keys) for held in below)
         listed.append((f"[`{header}`]({file})", variants[0].about, f"{number}"))
-        text = [_table_text(held, found) for held in below]
+        text = [_table_text(held, by_path) for held in below]
         made[file] = page(f"Keys of `{header}`", f"{_sentence(variants[0].about)} {_HOW}", *text)
     scalars = {name: variants for name, variants in top.keys.items() if not variants[0].is_table}
     made["keys.md"] = page(
@@ -171,7 +171,7 @@ def pages() -> dict[str, str]:
         "## All keys",
         "\n".join(
             f"- [`{_dotted(path, name)}`]({_file(_top(path)) if path else ''}#{anchor(path, name)})"
-            for path, held in found.items()
+            for path, held in by_path.items()
             for name in held.keys
             if path or name in scalars
         ),
@@ -210,11 +210,11 @@ def _sentence(text: str) -> str:
     return text if text.endswith(".") else f"{text}."
 
 
-def _table_text(held: Table, found: Mapping[str, Table]) -> str:
+def _table_text(held: Table, by_path: Mapping[str, Table]) -> str:
     above, _, last = held.path.removesuffix("[]").rpartition(".")
     heading = f"## `{held.header}`"
     # A table that is a key of another one has the anchor of that.
-    is_key = above in found and last in found[above].keys and above != ""
+    is_key = above in by_path and last in by_path[above].keys and above != ""
     parts = [heading if is_key else anchored(heading, held.path.replace("[]", ""))]
     sections = list(dict.fromkeys(section for section, _ in held.kinds))
     if len(sections) == 1:
@@ -222,8 +222,8 @@ def _table_text(held: Table, found: Mapping[str, Table]) -> str:
     else:
         rows = []
         for section, kind in held.kinds:
-            told = tags(section, sections) if section.kind else {}
-            by = [f"{key} = {toml(value)}" if value is not None else key for key, value in told.items()]
+            tag_values = tags(section, sections) if section.kind else {}
+            by = [f"{key} = {toml(value)}" if value is not None else key for key, value in tag_values.items()]
             keys = ", ".join(
                 f"**`{name}`**" if info.is_required() else f"`{name}`"
                 for name, info in section.model_fields.items()

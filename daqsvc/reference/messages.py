@@ -117,7 +117,7 @@ def other_topics() -> dict[str, Topic]:
     """Topics of Home Assistant and of Sparkplug, by the name of what goes there."""
     discovery = Discovery(HomeAssistant(prefix="PREFIX"), MqttCommands(), Watched("MACHINE"), _BOX)
     # The id is made of ROOT, SITE, BOX and MACHINE.
-    found = f"{discovery.topic.rpartition('/device/')[0]}/device/ID/config"
+    discovery_topic = f"{discovery.topic.rpartition('/device/')[0]}/device/ID/config"
     node, host = EdgeNode("GROUP", "NODE"), PrimaryHost("HOST")
     node_births = node.births(0, 0, (), {"DEVICE": ()})
     sent = [
@@ -130,7 +130,9 @@ def other_topics() -> dict[str, Topic]:
     by_kind = {one.topic.split("/")[2]: one for one in sent}
     entities, metrics = "[entities](home-assistant.md)", "[metrics](sparkplug.md)"
     rows = {
-        "discovery": Topic(found, entities, 1, "yes", "the machine as a device, with all its entities"),
+        "discovery": Topic(
+            discovery_topic, entities, 1, "yes", "the machine as a device, with all its entities"
+        ),
         "birth": Topic(
             discovery.birth_topic,
             "`online`",
@@ -328,9 +330,10 @@ def gaps() -> Iterator[str]:
         for name in made
         if name not in known
     )
-    told = {one.schema for one in known.values()}
+    described = {one.schema for one in known.values()}
     yield from (
-        f"{name} goes over no topic that is described" for name in {*PAYLOADS} - told - {_OVER_THE_SOCKET}
+        f"{name} goes over no topic that is described"
+        for name in {*PAYLOADS} - described - {_OVER_THE_SOCKET}
     )
     for name, schema in json_schemas().items():
         for one in fields(schema):
@@ -391,9 +394,11 @@ def pages() -> dict[str, str]:
         )
         for one in discovery().values()
     ]
-    told = [(m.name or "", owner, m.datatype.name if m.datatype else "") for owner, m in sparkplug()]
+    sparkplug_metrics = [
+        (m.name or "", owner, m.datatype.name if m.datatype else "") for owner, m in sparkplug()
+    ]
     metrics = [
-        *((code(name), owner, kind, SPARKPLUG_WORDS[name]) for name, owner, kind in told),
+        *((code(name), owner, kind, SPARKPLUG_WORDS[name]) for name, owner, kind in sparkplug_metrics),
         *((code(name), owner, kind, about) for name, owner, kind, about in _WRITTEN),
     ]
     return {

@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 
 def metrics() -> dict[str, tuple[Metric, tuple[str, ...]]]:
     """Every metric by the name that it is asked for by, with its labels."""
-    found: dict[str, tuple[Metric, tuple[str, ...]]] = {}
+    by_name: dict[str, tuple[Metric, tuple[str, ...]]] = {}
     for metric in _made():
         for sample in metric.samples:
-            found.setdefault(sample.name, (metric, tuple(sample.labels)))
-    return found
+            by_name.setdefault(sample.name, (metric, tuple(sample.labels)))
+    return by_name
 
 
 def _made() -> Iterator[Metric]:
@@ -39,8 +39,8 @@ def _made() -> Iterator[Metric]:
         yield from machine_metrics(name, figures, dict.fromkeys(figures["streams"], 1.0))
         yield from service_metrics(name, figures, 0.0)
     reading = Reading("levels/probe-x", "statistics", "rms", "um")
-    said: Any = SimpleNamespace(quality="good", statistics={"rms": 1.0}, probabilities={})
-    yield from reading_metrics("machine", [reading], {"levels/probe-x": (said, time.time())})
+    statement: Any = SimpleNamespace(quality="good", statistics={"rms": 1.0}, probabilities={})
+    yield from reading_metrics("machine", [reading], {"levels/probe-x": (statement, time.time())})
     yield health_metric("machine", is_healthy=True)
     yield from ProcessCollector(registry=None).collect()
 

@@ -66,7 +66,7 @@ def schema_of(name: str, kinds: Sequence[tuple[type[Any], ...]], *, taken_in: bo
 
 
 def about(kind: type[Any]) -> str:
-    """The first sentence of what is said of a type."""
+    """The first sentence of the description of a type."""
     return inspect.cleandoc(kind.__doc__ or "").partition("\n\n")[0].replace("``", "`").replace("\n", " ")
 
 
@@ -80,22 +80,22 @@ def _schema(kind: Any, held: dict[str, Any], *, taken_in: bool) -> dict[str, Any
     def of(one: Any) -> dict[str, Any]:
         return _schema(one, held, taken_in=taken_in)
 
-    origin, given = get_origin(kind), get_args(kind)
+    origin, args = get_origin(kind), get_args(kind)
     made: dict[str, Any] | None = None
     if kind is Any or kind is object:
         made = {}
     elif kind in _PLAIN:
         made = {"type": _PLAIN[kind]}
     elif origin is Literal:
-        made = {"const": given[0]} if len(given) == 1 else {"enum": list(given)}
+        made = {"const": args[0]} if len(args) == 1 else {"enum": list(args)}
     elif origin in {Union, types.UnionType}:
-        made = {"anyOf": [of(one) for one in given]}
+        made = {"anyOf": [of(one) for one in args]}
     elif origin is list:
-        made = {"type": "array", "items": of(given[0])}
+        made = {"type": "array", "items": of(args[0])}
     elif origin in {dict, Mapping}:
-        made = {"type": "object", "additionalProperties": True if given[1] is Any else of(given[1])}
+        made = {"type": "object", "additionalProperties": True if args[1] is Any else of(args[1])}
     elif origin is Annotated:
-        made = _payload(given[1], held) if isinstance(given[1], str) else of(given[1])
+        made = _payload(args[1], held) if isinstance(args[1], str) else of(args[1])
     elif isinstance(kind, type) and issubclass(kind, BaseModel):
         made = _model(kind, held, taken_in=taken_in)
     elif is_typeddict(kind) or dataclasses.is_dataclass(kind) or hasattr(kind, "_asdict"):

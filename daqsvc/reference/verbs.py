@@ -65,11 +65,11 @@ def pages() -> dict[str, str]:
         for titled, action in options(verb):
             mark = f'<a id="{anchor}{action.option_strings[-1]}"></a>' if action.option_strings else ""
             name = f"{mark}{code(_name(action))}"
-            told = _help(verb, action)
+            help_text = _help(verb, action)
             if action.option_strings and (printed := formats.printed(verb.prog, action.option_strings[-1])):
-                told += f": {', '.join(map(formats.link, printed))}"
+                help_text += f": {', '.join(map(formats.link, printed))}"
             title = "arguments" if titled == "positional arguments" else titled
-            groups.setdefault(title, []).append((name, told, _default(action)))
+            groups.setdefault(title, []).append((name, help_text, _default(action)))
         parts += [
             f"{title[:1].upper()}{title[1:]}:\n\n{table(('argument', 'what it does', 'default'), rows)}"
             for title, rows in groups.items()
@@ -102,8 +102,8 @@ def _name(action: argparse.Action) -> str:
 
 
 def _help(verb: argparse.ArgumentParser, action: argparse.Action) -> str:
-    told = {**vars(action), "prog": verb.prog}
-    return " ".join(((action.help or "") % told).split())
+    fields = {**vars(action), "prog": verb.prog}
+    return " ".join(((action.help or "") % fields).split())
 
 
 def _default(action: argparse.Action) -> str:
