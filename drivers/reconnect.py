@@ -14,7 +14,7 @@ from weakref import WeakKeyDictionary
 from daqsvc.acquisition.link import Backoff
 from daqsvc.errors.buses import DRIVER_FAILED
 from daqsvc.errors.code import coded
-from daqsvc.settings.failures import BrokenContractError, said_by
+from daqsvc.settings.failures import BrokenContractError, message_of
 from daqsvc.threads import call_in_thread
 from drivers.base import DeviceAbsentError
 
@@ -108,7 +108,7 @@ async def _outcome(attempt: Callable[[], Awaitable[Attempt | None]]) -> Attempt 
 
 
 def _failed(error: BaseException) -> Attempt:
-    reason = f"its driver failed: {said_by(error) or type(error).__name__}"
+    reason = f"its driver failed: {message_of(error) or type(error).__name__}"
     return Attempt(present=True, useful=False, reason=reason, error=error)
 
 
@@ -194,7 +194,7 @@ def words(error: BaseException) -> str:
     """An error as a person should read it."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
-    return said_by(error) or type(error).__name__
+    return message_of(error) or type(error).__name__
 
 
 Call: TypeAlias = "tuple[Callable[..., object], tuple[Any, ...]]"

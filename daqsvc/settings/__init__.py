@@ -1,4 +1,4 @@
-"""The machine file: its models, reading it with every problem named, and saying what was understood."""
+"""The machine file: its models, reading it with every problem named, and stating what was understood."""
 
 from daqsvc.settings.describe import describe
 from daqsvc.settings.load import load_machine_file, parse_machine_file

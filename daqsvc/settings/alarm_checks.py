@@ -474,7 +474,7 @@ def _ok_limits(sensor: Sensor | None) -> tuple[str, tuple[float, float] | None]:
 def _measured(draft: MachineFile, alarm: SetpointAlarm, at: KeyPath) -> Iterator[Finding]:
     with suppress(UnusableValueError):
         if not set(alarm.watched) <= set(_named(draft)):
-            return  # said already, about the same key
+            return  # reported already, for the same key
     if not any(plugin.measures_levels for _, plugin, _ in configured(draft.pipeline)):
         tables = (f"[pipeline.{key}]" for key, plugin in detector_tables().items() if plugin.measures_levels)
         one = isinstance(alarm, LevelAlarm)

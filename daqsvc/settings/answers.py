@@ -49,9 +49,9 @@ def misfit(value: object, wanted: Any, *, inside: bool = False) -> str:
         return misfit(value, args[0] if args else getattr(origin, "__bound__", Any), inside=inside)
     wrong = _no(value, wanted)
     if origin in {Union, UnionType}:
-        found = {one: misfit(value, one, inside=inside) for one in args}
-        closer = (words for one, words in found.items() if words != _no(value, one))
-        return next(closer, wrong) if all(found.values()) else ""
+        misfits = {one: misfit(value, one, inside=inside) for one in args}
+        closer = (words for one, words in misfits.items() if words != _no(value, one))
+        return next(closer, wrong) if all(misfits.values()) else ""
     if getattr(origin, "_is_protocol", False):
         return _lacking(value, origin)
     if not _is_one(value, origin, args, inside=inside):
@@ -101,7 +101,7 @@ def _is_one(value: object, origin: Any, args: tuple[Any, ...], *, inside: bool) 
 
 
 def _is_hashable(value: object) -> bool:
-    """Whether it can be told apart from others: a tuple looks as if it could, whatever is in it."""
+    """Whether it can be a key: a tuple looks as if it could, whatever is in it."""
     try:
         hash(value)
     except Exception:  # noqa: BLE001 - a hash of a plugin's own may raise anything

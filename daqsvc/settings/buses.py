@@ -110,7 +110,7 @@ class Layout(Hooks, Section):
     usual_rate_hz: ClassVar[float] = 640.0
     """The rate that a remedy shows for streams of this kind."""
     number_keys: ClassVar[str] = ""
-    """The keys that say how bytes become numbers, e.g. ``"order and type"``; of texts there are none."""
+    """The keys that define how bytes become numbers, e.g. ``"order and type"``; of texts there are none."""
 
     @property
     def channel_names(self) -> tuple[str, ...]:

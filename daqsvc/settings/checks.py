@@ -105,7 +105,7 @@ def failure(draft: MachineFile, failed: PluginFailedError) -> Finding:
     at = next(_places(draft, failed), ())
     table = at[:2] if at[:1] in {("buses",), ("streams",)} else at
     remedy = failed.failure.or_remove(dotted(table))
-    return Finding(at, failed.failure.said, remedy, fatal=bool(at), code=PLUGIN_FAILED)
+    return Finding(at, failed.failure.message, remedy, fatal=bool(at), code=PLUGIN_FAILED)
 
 
 def _places(draft: MachineFile, failed: PluginFailedError) -> Iterator[KeyPath]:
@@ -234,7 +234,7 @@ def _check_drivers(draft: MachineFile) -> Iterator[Finding]:
             at = ("buses", name, "driver")
             if bus.driver in broken:
                 why = broken[bus.driver]
-                yield Finding(at, why.said, why.or_remove(f"buses.{name}"), code=PLUGIN_FAILED)
+                yield Finding(at, why.message, why.or_remove(f"buses.{name}"), code=PLUGIN_FAILED)
             elif bus.driver not in installed:
                 remedy = f"{choice(bus.driver, installed)}; or install the package that brings it"
                 yield Finding(at, "no such driver is installed", remedy, code=NO_SUCH_DRIVER)

@@ -106,7 +106,7 @@ def _words(say: Callable[[], str]) -> str:
     try:
         return one_line(str(say()))
     except PluginFailedError as failed:
-        return failed.failure.said
+        return failed.failure.message
 
 
 _STREAM_HEADER = ("name", "bus", "id", "rate", "frames", "frame", "counter", "bus (est.)")
@@ -129,7 +129,7 @@ def _stream_words(machine: MachineFile, name: str) -> StreamWords:
     try:
         return StreamWords() if plugin is None else plugin.describe_stream(machine, name)
     except PluginFailedError as failed:
-        return StreamWords(frame=failed.failure.said)
+        return StreamWords(frame=failed.failure.message)
 
 
 _MOST_CHANNELS = 64

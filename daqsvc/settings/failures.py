@@ -40,12 +40,12 @@ class Failure(NamedTuple):
     """What code of a plugin has failed at.
 
     Attributes:
-        said: that, in words for its author, with the line of the plugin's file.
+        message: that, in words for its author, with the line of the plugin's file.
         remedy: who can put it right.
         cause: alike for failures of one kind in one place, whatever the words.
     """
 
-    said: str
+    message: str
     remedy: str
     cause: Hashable
 
@@ -58,7 +58,7 @@ class Failure(NamedTuple):
         return f"{self.remedy}, or remove [{table}]" if table else self.remedy
 
     def __str__(self) -> str:
-        return f"{self.said}; {self.remedy}"
+        return f"{self.message}; {self.remedy}"
 
 
 def failure(error: BaseException, kind: type[Any], part: str) -> Failure:
@@ -104,19 +104,19 @@ def import_failure(error: BaseException, module: str) -> Failure:
         module: that its entry point names.
     """
     again = "install the package that brings it again"
-    said = one_line(said_by(error))
+    message = one_line(message_of(error))
     missing = error.name if isinstance(error, ModuleNotFoundError) else None
     if missing is not None and f"{module}.".startswith(f"{missing}."):
-        return Failure(said, again, said)
+        return Failure(message, again, message)
     mend = authors_of(module)
     places = [(frame.f_code.co_filename, line) for frame, line in _foreign_frames(error)]
     if isinstance(error, SyntaxError) and error.filename:
-        said, places = error.msg, [(error.filename, error.lineno or 0)]
+        message, places = error.msg, [(error.filename, error.lineno or 0)]
     if not places:
-        return Failure(said, mend, said)
+        return Failure(message, mend, message)
     file, line = places[-1]
     remedy = mend if missing is None else f"install {missing}, or {mend}"
-    return Failure(f"{type(error).__name__}: {said} ({Path(file).name}, line {line})", remedy, said)
+    return Failure(f"{type(error).__name__}: {message} ({Path(file).name}, line {line})", remedy, message)
 
 
 def cause_of(error: BaseException) -> Hashable:
@@ -130,7 +130,7 @@ def in_words(error: BaseException) -> str:
     foreign = foreign_failure(error)
     if foreign is not None:
         return str(foreign)
-    first_line = one_line(next(iter(said_by(error).splitlines()), ""))
+    first_line = one_line(next(iter(message_of(error).splitlines()), ""))
     if isinstance(error, BrokenContractError):
         return first_line
     kind = type(error).__name__
@@ -143,7 +143,7 @@ def in_words(error: BaseException) -> str:
     return f"failed with {what}{place}"
 
 
-def said_by(error: BaseException) -> str:
+def message_of(error: BaseException) -> str:
     """What an error states; empty if that fails, too."""
     try:
         return f"{error}"
@@ -162,9 +162,9 @@ def one_line(text: str) -> str:
 
 def error_text(error: BaseException) -> str:
     """The kind of an error and what it reports, on one line."""
-    said = one_line(said_by(error))
+    message = one_line(message_of(error))
     name = "" if isinstance(error, BrokenContractError | ExitRaisedError) else type(error).__name__
-    return ": ".join(word for word in (name, said) if word)
+    return ": ".join(word for word in (name, message) if word)
 
 
 def authors_of(module: str) -> str:

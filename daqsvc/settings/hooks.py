@@ -95,7 +95,7 @@ class PluginFailedError(AssemblyError, UnusableValueError):
         self.failure = failure(error, type(by), hook)
         self.file: Path | None = None
         self.table = by.__table__
-        super().__init__(self.failure.said, code=PLUGIN_FAILED)
+        super().__init__(self.failure.message, code=PLUGIN_FAILED)
 
     def __str__(self) -> str:
         return self.followed_by("")
@@ -108,7 +108,7 @@ class PluginFailedError(AssemblyError, UnusableValueError):
     @property
     def words(self) -> str:
         """What has failed, and who can put it right."""
-        return f"{self.failure.said}; {self.failure.or_remove(self.table)}"
+        return f"{self.failure.message}; {self.failure.or_remove(self.table)}"
 
 
 def contract(kind: ClassT) -> ClassT:

@@ -106,14 +106,14 @@ def tags(section: type[Section], kinds: Sequence[type[Section]]) -> Mapping[str,
         section: the kind.
         kinds: it and all others.
     """
-    said = {
+    values = {
         name: single_value(section, name)
         for name in section.model_fields
         # A sensor's unit is not enough: some kinds have one of several.
         if all(single_value(kind, name) is not None for kind in kinds if name in kind.model_fields)
     }
-    if said:
-        return said
+    if values:
+        return values
     if issubclass(section, Layout) and section.mark:
         return {section.mark: None}
     own = (
@@ -248,20 +248,22 @@ def _beyond(table: Schema, properties: Schema, every: Sequence[str]) -> Schema:
 
 def _decided(kinds: Kinds, tables: Mapping[type[Section], Schema]) -> Schema:
     """The tables, each under the condition that tells its kind."""
-    told = {section: tags(section, kinds.sections) for section in kinds.sections}
+    tag_values = {section: tags(section, kinds.sections) for section in kinds.sections}
     fallback = kinds.choose({})
     last: Schema = {}
-    untold = [section for section in tables if all(value is None for value in told[section].values())]
-    if fallback in untold:
+    untagged = [section for section in tables if all(value is None for value in tag_values[section].values())]
+    if fallback in untagged:
         # What has a key that tells another kind is of none that is known: no more is known of it.
-        values = {name for tag in told.values() for name, value in tag.items() if value is not None}
+        values = {name for tag in tag_values.values() for name, value in tag.items() if value is not None}
         foreign = [{"required": [name]} for name in sorted(values - fallback.model_fields.keys())]
         last = {"if": {"anyOf": foreign}, "else": tables[fallback]} if foreign else tables[fallback]
     for section in reversed(kinds.sections):
-        if section is fallback and section in untold:
+        if section is fallback and section in untagged:
             continue
-        condition: Schema = {"required": [next(iter(told[section]))]} if told[section] else {}
-        values_of = {name: {"const": value} for name, value in told[section].items() if value is not None}
+        condition: Schema = {"required": [next(iter(tag_values[section]))]} if tag_values[section] else {}
+        values_of = {
+            name: {"const": value} for name, value in tag_values[section].items() if value is not None
+        }
         if values_of:
             condition["properties"] = values_of
         last = {"if": condition, "then": tables[section], **({"else": last} if last else {})}

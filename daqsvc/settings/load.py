@@ -1,4 +1,4 @@
-"""Reading a machine file: either it is good, or everything wrong with it is said at once."""
+"""Reading a machine file: either it is good, or everything wrong with it is reported at once."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ class _Reading:
                 table = value_at(self._document, path[:-1])
                 if isinstance(table, dict):
                     del table[path[-1]]
-                    self.findings.append(Finding(path, why.said, why.or_remove(name), code=PLUGIN_FAILED))
+                    self.findings.append(Finding(path, why.message, why.or_remove(name), code=PLUGIN_FAILED))
                     self._lacks_detector |= path[0] == "pipeline"
 
     def note_failures(self, draft: MachineFile, failures: Iterable[PluginFailedError]) -> None:
@@ -296,8 +296,8 @@ def _validated(document: dict[str, Any]) -> tuple[MachineFile | None, list[Error
     try:
         return machine_file_model().model_validate(document), []
     except ValidationError as error:
-        found = [item for item in error.errors(include_url=False) if not only_follows(item, document)]
-        return None, [*without_guesses(found, machine_file_model(), document)]
+        items = [item for item in error.errors(include_url=False) if not only_follows(item, document)]
+        return None, [*without_guesses(items, machine_file_model(), document)]
 
 
 def _copy(value: Any) -> Any:
@@ -308,7 +308,7 @@ def _copy(value: Any) -> Any:
 
 
 def _read_files(draft: MachineFile, path: Path, findings: list[Finding]) -> dict[str, Any]:
-    """By stream, what the files say that its layout names."""
+    """By stream, what the files that its layout names state."""
     known: dict[str, Any] = {}
     with suppress(UnusableValueError):
         for name, stream in draft.streams.items():

@@ -265,8 +265,8 @@ class MachineFile(Section):
     @property
     def value_names(self) -> dict[str, Mapping[float, str]]:
         """By sensor, what some of its values mean, as a file that its layout names states it."""
-        found = {sensor.name: self.value_names_of(sensor, self.layout_facts) for sensor in self.sensors}
-        return {name: names for name, names in found.items() if names}
+        by_sensor = {sensor.name: self.value_names_of(sensor, self.layout_facts) for sensor in self.sensors}
+        return {name: names for name, names in by_sensor.items() if names}
 
     def value_names_of(self, sensor: Sensor, facts: Mapping[str, Any]) -> Mapping[float, str]:
         """What some values of a sensor mean; empty where that is not known.

@@ -1,4 +1,4 @@
-"""What is wrong with a machine file, said so that it can be put right at once."""
+"""What is wrong with a machine file, reported so that it can be corrected at once."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """The plugins that tables of a machine file belong to, found by their entry points, once a process.
 
-No driver, detector or output is named in `daqsvc.settings`: what a machine file may say of them, they say.
+No driver, detector or output is named in `daqsvc.settings`: they define what a machine file states of them.
 The plugins are looked for when a file is read, not when the models are imported: they import these.
 """
 
@@ -103,7 +103,7 @@ class DriverKind(Hooks):
         self_checks: what the service can watch of such a bus, of ``"overrun"``, ``"controller"`` and
             ``"recording"``: each is an alarm of the service.
         place: where it stands among other drivers; the smallest first. The first one reads a bus that does
-            not say its driver, and its first layout is that of a table which no other layout's mark is in.
+            not state its driver, and its first layout is that of a table which no other layout's mark is in.
     """
 
     buses: ClassVar[tuple[type[Bus], ...]]
@@ -157,8 +157,8 @@ def _installed(group: str, what: str, contract: type[Any]) -> _Installed:
             plugins[point.name] = _made(point, what, contract)
         except (Exception, SystemExit) as error:  # noqa: BLE001  whatever a plugin does when it is imported
             why = import_failure(error, point.module)
-            said = f"the {what} cannot be loaded from {point.value}: {why.said}"
-            broken[point.name] = why._replace(said=said)
+            message = f"the {what} cannot be loaded from {point.value}: {why.message}"
+            broken[point.name] = why._replace(message=message)
     ordered = sorted(plugins.items(), key=lambda item: (item[1].place, item[0]))
     return _Installed(MappingProxyType(dict(ordered)), MappingProxyType(broken))
 

@@ -269,7 +269,7 @@ def adapter(declared: Any) -> TypeAdapter[Any]:
     """What validates a value of that type; to make one takes longer than to use it."""
     known = _adapters.get(id(declared))
     if known is None:
-        # A section brings its configuration along; for any other type it must be said.
+        # A section brings its configuration along; for any other type it must be given.
         config = None if is_section(bare_type(declared)) else _STRICT
         known = _adapters[id(declared)] = (declared, TypeAdapter(declared, config=config))
     return known[1]

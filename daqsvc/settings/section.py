@@ -107,15 +107,15 @@ class Section(BaseModel):
     @model_validator(mode="wrap")
     @classmethod
     def _whatever_validators_do(cls, value: Any, validate: ModelWrapValidatorHandler[Self]) -> Self:
-        """Have validators of a plugin's table that fail say so of the table, and cost no other."""
+        """Have a validator of a plugin that fails reported at its table; other tables are unaffected."""
         try:
             return validate(value)
-        except (ValueError, AssertionError):  # it is not valid, which validators say so
+        except (ValueError, AssertionError):  # it is not valid, which validators report this way
             raise
         except Exception as error:
-            said, remedy, _ = failure(error, cls, "a validator")
+            message, remedy, _ = failure(error, cls, "a validator")
             raise PydanticCustomError(
-                "validator_failed", "{said}", {"said": said, "remedy": remedy, "code": PLUGIN_FAILED}
+                "validator_failed", "{message}", {"message": message, "remedy": remedy, "code": PLUGIN_FAILED}
             ) from error
 
     if not TYPE_CHECKING:  # a type checker must go on refusing attributes that do not exist
@@ -145,7 +145,7 @@ class NamesDetector:
 
 @dataclass(frozen=True)
 class Kinds:
-    """Annotation of a key whose table is of one of several kinds, told apart before it is validated.
+    """Annotation of a key whose table is of one of several kinds, distinguished before it is validated.
 
     Only the errors of the kind that was meant are reported, not those of every kind tried in turn.
 

@@ -1,4 +1,4 @@
-"""Whether what is said of a sensor can be true: unit, sensitivity, voltages, and what its channel carries."""
+"""Whether the table of a sensor can be true: unit, sensitivity, voltages, and what its channel carries."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ _USUAL = {
 
 
 def check_voltages(draft: MachineFile, sensor: Sensor, at: KeyPath) -> Iterator[Finding]:
-    """What is said in volts has a sensitivity to go with it, and a healthy probe lies within its limits."""
+    """What is stated in volts has a sensitivity to go with it, and a healthy probe lies within its limits."""
     probe = sensor if isinstance(sensor, ProximityProbe) else None
     if sensor.sensitivity_mv_per_unit is None:
         if sensor.zero_v != 0:

@@ -22,11 +22,11 @@ def speed_signals(draft: MachineFile) -> dict[str, tuple[str, ...]]:
         draft: the machine file, or what is valid of it.
     """
     trends = {f"levels/{one.name}" for one in draft.sensors if one.type == "trend" and one.unit == RPM}
-    found: dict[str, tuple[str, ...]] = {}
+    signals: dict[str, tuple[str, ...]] = {}
     for _, plugin, settings in configured(draft.pipeline, valid_only=True):
         with suppress(UnusableValueError):
             for detector, names in plugin.start_up_signals(draft, settings).items():
                 speeds = tuple(name for name in names if name == "speed" or detector in trends)
                 if speeds:
-                    found[detector] = speeds
-    return found
+                    signals[detector] = speeds
+    return signals

@@ -269,8 +269,8 @@ def _remedy_in(text: str, line: int | None) -> str:
     if (path := _BACKSLASHES.search(wrong)) is not None and "'" not in path["word"]:
         return f"write {path['key']} = '{path['word']}', in single quotes: there a backslash is only itself"
     for slip, remedy in _SLIPS:
-        if (found := slip.match(wrong)) is not None:
-            words = found.groupdict()
+        if (match := slip.match(wrong)) is not None:
+            words = match.groupdict()
             return remedy.format(**words, lower=words.get("word", "").lower())
     if (curly := re.search(f"[{_CURLY}]", _TEXTS.sub("", wrong))) is not None:
         return f'write straight quotes (") in place of {curly[0]}'
@@ -300,20 +300,18 @@ _UNIT = re.compile(
 def _number_in(line: str) -> str | None:
     """What to write for a number with a comma, marks between thousands, or a unit; None if there is none."""
     bare = _TEXTS.sub(lambda text: " " * len(text[0]), line)
-    for found in _THOUSANDS.finditer(bare):
-        if found["point"] != found["mark"] and (
-            found["point"] or found["whole"].count(found["mark"]) > 1 or found["mark"] == " "
+    for match in _THOUSANDS.finditer(bare):
+        if match["point"] != match["mark"] and (
+            match["point"] or match["whole"].count(match["mark"]) > 1 or match["mark"] == " "
         ):
-            digits = found["whole"].replace(found["mark"], "")
-            digits += f".{found['part']}" if found["part"] else ""
-            return f"write {found['key']} = {digits}, without marks between thousands"
+            digits = match["whole"].replace(match["mark"], "")
+            digits += f".{match['part']}" if match["part"] else ""
+            return f"write {match['key']} = {digits}, without marks between thousands"
     if (either := _EITHER_COMMA.search(bare)) is not None:
         key, whole, part = either["key"], either["whole"], either["part"]
         return f"write {key} = {whole}{part}, or {key} = {whole}.{part} if the comma is a decimal comma"
-    if (found_comma := _COMMA.search(bare)) is not None:
-        return (
-            f"write {found_comma['key']} = {found_comma['whole']}.{found_comma['part']}, with a decimal point"
-        )
+    if (comma := _COMMA.search(bare)) is not None:
+        return f"write {comma['key']} = {comma['whole']}.{comma['part']}, with a decimal point"
     if (bare_value := _VALUE.match(bare)) is not None:
         alike = with_digits(bare_value["text"])
         if alike is not None:

@@ -34,11 +34,11 @@ def with_digits(text: str) -> tuple[str, str] | None:
     Returns:
         e.g. ``50`` and ``if the letter O is a zero``; None if it is something else.
     """
-    found = _ALIKE.fullmatch(text.strip())
-    letters = [] if found is None else [one for one in dict.fromkeys(found[0]) if one in _DIGITS]
-    if found is None or not letters:
+    match = _ALIKE.fullmatch(text.strip())
+    letters = [] if match is None else [one for one in dict.fromkeys(match[0]) if one in _DIGITS]
+    if match is None or not letters:
         return None
-    number = "".join(_DIGITS.get(one, one) for one in found[0])
+    number = "".join(_DIGITS.get(one, one) for one in match[0])
     number = re.sub(r"^([+-]?)0+(?=\d)", r"\1", number)
     return number, "if " + " and ".join(f"the letter {one} is a {_NAMES[_DIGITS[one]]}" for one in letters)
 
@@ -55,11 +55,11 @@ def number_meant(text: str, key: str) -> float | None:
     """
     if with_digits(text) is not None:
         return None  # the number that it begins with has lost a digit
-    found = _NUMBER.match(text.strip())
-    if found is None or text.strip()[found.end("number") :][:1] in {".", ",", ":", "-"}:
+    match = _NUMBER.match(text.strip())
+    if match is None or text.strip()[match.end("number") :][:1] in {".", ",", ":", "-"}:
         return None
-    value = float(found["number"].replace("_", "").replace(",", "."))
-    unit = found["unit"]
+    value = float(match["number"].replace("_", "").replace(",", "."))
+    unit = match["unit"]
     prefixed = _PREFIXED.fullmatch(unit)
     if prefixed is not None and _RATE.search(key):
         return value * _PREFIXES.get(prefixed["prefix"], 1.0)

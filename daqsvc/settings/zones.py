@@ -53,7 +53,7 @@ class Zones(Section):
 
 
 def boundaries(zones: Zones, speed_rpm: float, unit: str) -> Boundaries | None:
-    """A/B, B/C and C/D in the unit of a measure; None if the table does not say enough.
+    """A/B, B/C and C/D in the unit of a measure; None if the table does not state enough.
 
     Args:
         zones: the table.
