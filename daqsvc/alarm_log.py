@@ -33,7 +33,7 @@ class AlarmLog:
 
     Args:
         clock: for how fast they come.
-        of_several: whether there are several machines, and each line has to say which one it is about.
+        of_several: whether there are several machines, and each line has to name its machine.
     """
 
     def __init__(self, clock: Clock, *, of_several: bool = False) -> None:

@@ -93,7 +93,7 @@ class AlarmService:
         bus_health: gives the state of the buses.
         supervisor: counts what outputs do wrong.
         stalls: finds the parts of the service that have stalled, for outputs that report it.
-        heard: told, on the event loop, of each event that comes about.
+        heard: called, on the event loop, with each event.
         snapshot: makes snapshots of machines. None if none can be asked for.
         look: begins to send what happens at a machine. None if there is no such service.
     """
@@ -325,7 +325,7 @@ class AlarmService:
     def _take_witness(self, payload: bytes) -> None:
         """See whether the broker has messages of a run that the disk has no trace of.
 
-        Such a run leaves nothing on the disk, but what it has said of the journal is retained at the broker.
+        Such a run leaves nothing on the disk, but its report on the journal is retained at the broker.
         """
         try:
             witness = json.loads(payload)

@@ -405,7 +405,7 @@ class ControlServer:
     async def serve(self) -> None:
         """Listen until cancelled, and begin again where that fails, or where the socket is removed.
 
-        Each new reason why it fails is said, but for one that `open` has raised.
+        Each new reason why it fails is logged, but for one that `open` has raised.
         """
         backoff, is_reported = Backoff(), self._server is None
         try:
@@ -442,7 +442,7 @@ class ControlServer:
             await self.close()
 
     async def _mend_link(self, link: Path) -> None:
-        """Make the link in the store again, by which people find the socket; say once why that fails."""
+        """Make the link in the store again, by which people find the socket; log once why that fails."""
         try:
             await asyncio.to_thread(_make_link, link, self.path)
         except (ControlError, OSError) as error:
@@ -544,7 +544,7 @@ class ControlServer:
                 if self._look is not None and line.startswith(_LIVE_VERB):
                     await self._tell_live(self._look, line, client, reader, writer)
                     return
-                answer = await self._told(line, client.source)
+                answer = await self._answer_to(line, client.source)
                 client.busy = False
                 self._clients.append(self._clients.pop(self._clients.index(client)))
                 writer.write(answer)
@@ -568,13 +568,13 @@ class ControlServer:
             else:
                 writer.close()
 
-    async def _told(self, line: bytes, source: str) -> bytes:
+    async def _answer_to(self, line: bytes, source: str) -> bytes:
         """The answer to a question or a command."""
         if self._status is not None and line.startswith(_STATUS_VERB):
             return await self._tell_status(self._status, line)
         if self._reload is not None and line.strip() in _RELOADS:
-            told = await _reloaded(self._reload, dry_run=_RELOADS[line.strip()])
-            return _json_line(told.model_copy(update={"files": self._files}))
+            reloaded = await _reloaded(self._reload, dry_run=_RELOADS[line.strip()])
+            return _json_line(reloaded.model_copy(update={"files": self._files}))
         if self._snapshot is not None and line.startswith(_SNAPSHOT_VERB):
             return _json_line(await _snapshot_answer(self._snapshot, line, source))
         return _json_line(await self._answer(line, source))
@@ -587,11 +587,11 @@ class ControlServer:
             asked = json.loads(line).get("machine")
         except (ValueError, RecursionError):
             asked = ""
-        told = await status(asked if isinstance(asked, str | None) else "")
-        if isinstance(told, bytes):
-            return told
+        reply = await status(asked if isinstance(asked, str | None) else "")
+        if isinstance(reply, bytes):
+            return reply
         self.counters.malformed += asked is not None
-        return _json_line(_which_machine(asked, told))
+        return _json_line(_which_machine(asked, reply))
 
     async def _tell_live(
         self,
@@ -616,10 +616,10 @@ class ControlServer:
             while not gone.done():
                 telling = asyncio.ensure_future(looking.lines())
                 await asyncio.wait({telling, gone}, return_when=asyncio.FIRST_COMPLETED)
-                if not telling.done() or not (told := telling.result()):
+                if not telling.done() or not (data := telling.result()):
                     return
-                for at in range(0, len(told), LIVE_PIECE_BYTES):
-                    writer.write(told[at : at + LIVE_PIECE_BYTES])
+                for at in range(0, len(data), LIVE_PIECE_BYTES):
+                    writer.write(data[at : at + LIVE_PIECE_BYTES])
                     async with asyncio.timeout(PATIENCE_S):
                         await writer.drain()
         finally:
@@ -630,7 +630,7 @@ class ControlServer:
             await asyncio.wait(ending)
 
     def _begun_looking(self, look: Look, line: bytes, client: _Client) -> Looking | ControlAnswer:
-        """Begin to look at the machine that a request names, or say why not."""
+        """Begin to look at the machine that a request names, or answer why not."""
         try:
             asked = LiveRequest.read(line)
         except (ValueError, RecursionError) as error:
@@ -838,11 +838,11 @@ def ask_status(store: Path, machine: str | None = None, timeout_s: float = STATU
     status = _status_of(store, machine, timeout_s)
     if isinstance(status, dict):
         return [status]
-    told = [_status_of(store, one, timeout_s) for one in status if machine is None]
-    if machine is not None or not told:
+    statuses = [_status_of(store, one, timeout_s) for one in status if machine is None]
+    if machine is not None or not statuses:
         raise NotAmongThemError(f"the daqsvc of {store} watches {', '.join(status)}, not {machine}")
     # One that was taken out in between is left out.
-    return [one for one in told if isinstance(one, dict)]
+    return [one for one in statuses if isinstance(one, dict)]
 
 
 def _status_of(store: Path, machine: str | None, timeout_s: float) -> dict[str, Any] | tuple[str, ...]:
@@ -951,10 +951,10 @@ async def _until_end(reader: asyncio.StreamReader) -> None:
 
 
 def _json_line(message: ControlRequest | ControlAnswer) -> bytes:
-    # What a request does not say is left out: a service of an older version knows no such key.
+    # What a request does not state is left out: a service of an older version knows no such key.
     is_request = isinstance(message, ControlRequest)
-    told = message.model_dump(mode="json", by_alias=True, exclude_defaults=is_request)
-    return json.dumps(told).encode("ascii") + b"\n"
+    document = message.model_dump(mode="json", by_alias=True, exclude_defaults=is_request)
+    return json.dumps(document).encode("ascii") + b"\n"
 
 
 def _is_ending(client: _Client) -> bool:

@@ -33,7 +33,7 @@ class _Odd(NamedTuple):
 
 
 class DriverReports:
-    """Counters, streams and link of a driver; what is not as its contract reports is left out, and said once.
+    """Counters, streams and link of a driver; what breaks its contract is left out, and logged once.
 
     Args:
         name: of its bus in the machine file.
@@ -51,17 +51,17 @@ class DriverReports:
     @property
     def counters(self) -> BusCounters:
         """See `drivers.base.Driver.counters`."""
-        return self._told("counters", _odd_counters, BusCounters(), "the counts of its bus are missing")
+        return self._checked("counters", _odd_counters, BusCounters(), "the counts of its bus are missing")
 
     @property
     def streams(self) -> Mapping[str, tuple[StreamCounters, TimeBaseState]]:
         """See `drivers.base.Driver.streams`."""
-        return self._told("streams", self._odd_streams, {}, "the figures of its streams are missing")
+        return self._checked("streams", self._odd_streams, {}, "the figures of its streams are missing")
 
     @property
     def link(self) -> Link:
         """See `drivers.base.Driver`."""
-        return self._told("link", _odd_link, Link(self.name), "its bus counts as down")
+        return self._checked("link", _odd_link, Link(self.name), "its bus counts as down")
 
     @property
     def has_heard(self) -> bool:
@@ -70,28 +70,28 @@ class DriverReports:
         others = counters.frames_unknown + counters.frames_remote + counters.frames_error
         return others > 0 or any(stream.frames_received for stream, _ in self.streams.values())
 
-    def _told(self, what: str, odd: Callable[[T], _Odd | None], instead: T, then: str) -> T:
+    def _checked(self, what: str, odd: Callable[[T], _Odd | None], instead: T, then: str) -> T:
         kind = type(self._driver)
         owner = f"{kind.__module__}.{kind.__qualname__}"
         try:
-            told: T = getattr(self._driver, what)
-            found = odd(told)
-        except Exception as error:  # noqa: BLE001  said and counted below
-            said = f"{what} of {owner} has failed: {error_text(error)}"
+            value: T = getattr(self._driver, what)
+            fault = odd(value)
+        except Exception as error:  # noqa: BLE001  logged and counted below
+            problem = f"{what} of {owner} has failed: {error_text(error)}"
         else:
-            if found is None:
-                return told
-            said = f"{found.name} of {owner} is {short(found.value)}, not {found.wanted}"
-        self._supervisor.failed(f"driver {self.name}", f"{said}; {authors_of(kind.__module__)}", then)
+            if fault is None:
+                return value
+            problem = f"{fault.name} of {owner} is {short(fault.value)}, not {fault.wanted}"
+        self._supervisor.failed(f"driver {self.name}", f"{problem}; {authors_of(kind.__module__)}", then)
         return instead
 
     def _odd_streams(self, streams: object) -> _Odd | None:
         if not isinstance(streams, Mapping):
             return _Odd("streams", streams, "counters and clock by stream")
-        for name, told in dict(streams).items():
+        for name, report in dict(streams).items():
             if name not in self.names:
                 return _Odd("streams", name, f"one of {', '.join(self.names)}")
-            if (odd := _odd_stream(f"stream {name}", told)) is not None:
+            if (odd := _odd_stream(f"stream {name}", report)) is not None:
                 return odd
         return None
 
@@ -121,10 +121,10 @@ def _odd_counters(counters: object) -> _Odd | None:
     return None
 
 
-def _odd_stream(name: str, told: Any) -> _Odd | None:
-    counters, base = told if isinstance(told, tuple) and len(told) == _PAIR else (told, None)
+def _odd_stream(name: str, report: Any) -> _Odd | None:
+    counters, base = report if isinstance(report, tuple) and len(report) == _PAIR else (report, None)
     if not isinstance(counters, StreamCounters) or not isinstance(base, TimeBaseState):
-        return _Odd(name, told, "StreamCounters and TimeBaseState")
+        return _Odd(name, report, "StreamCounters and TimeBaseState")
     for count in _STREAM_COUNTS:
         if not isinstance(value := getattr(counters, count), Integral):
             return _Odd(f"{count} of {name}", value, "a count")

@@ -37,22 +37,22 @@ class _UnusableError(Exception):
 
 
 def prepare(*, say: bool = True, first: Callable[[], bool] = lambda: True) -> None:
-    """Choose the directory; call before any kernel is imported. When the first one is compiled, that is said.
+    """Choose the directory; call before any kernel is imported. The first one that is compiled is logged.
 
     It is ``$NUMBA_CACHE_DIR``; else systemd's ``$CACHE_DIRECTORY``; else that of the installed service, if
     this is its account. Else the user's cache directory (XDG); else one in the folder for temporary files
     that only this user may enter. If none of these can be written, kernels are compiled at every start. Both
-    of the latter are said.
+    of the latter are logged.
 
     Args:
-        say: False in a process whose parent has said where they are kept.
-        first: asked once, when a kernel is compiled: whether no other process has said so.
+        say: False in a process whose parent has logged where they are kept.
+        first: asked once, when a kernel is compiled: whether no other process has logged it.
     """
     _Compiling.kept, _Compiling.first = _choose(say=say), first
 
 
 class _Compiling:
-    """What is to be said when a kernel is compiled, once."""
+    """What is to be logged when a kernel is compiled, once."""
 
     kept = True
     failed = False

@@ -47,7 +47,7 @@ class KernelCompiler:
         self._asked_s = 0.0
         self._ending: Thread | None = None
         self._lost = False
-        self._has_said = False
+        self._has_logged = False
 
     def compile(self, function: Callable[..., Any], signature: bytes) -> bool:
         """Have a kernel compiled and kept; blocks.
@@ -57,7 +57,7 @@ class KernelCompiler:
             signature: what Numba compiles it for, pickled.
 
         Returns:
-            Whether that was done. If not, it is said why, once.
+            Whether that was done. If not, the reason is logged once.
         """
         with self._turn:
             if self._lost:
@@ -90,8 +90,8 @@ class KernelCompiler:
 
     def say_why_not(self, reason: str) -> None:
         """Say that a kernel must be compiled here, once."""
-        if not self._has_said:
-            self._has_said = True
+        if not self._has_logged:
+            self._has_logged = True
             words = (
                 "the service compiles kernels by itself, and takes some 130 MB more until its next start: %s"
             )

@@ -294,7 +294,7 @@ class LiveFeed:
                 looker.add(block)
 
     def diagnosis(self, diagnosis: Diagnosis) -> None:
-        """A detector has said something."""
+        """A detector has made a statement."""
         self._tell(diagnosis)
 
     def alarm(self, event: AlarmEvent) -> None:
@@ -329,14 +329,14 @@ def _before(ring: SampleRing, most_bytes: int) -> SampleBlock | None:
 
 def _encoded(about: Callable[[], LiveBegin] | None, items: Iterable[_Happened], left_out: int) -> bytes:
     """Lines of JSON; on a thread."""
-    told: list[LiveBegin | LiveLine] = [] if about is None else [about()]
-    told += _told(items)
+    lines: list[LiveBegin | LiveLine] = [] if about is None else [about()]
+    lines += _lines(items)
     if left_out:
-        told.append({"left_out": left_out})
-    return b"".join(map(_line, told))
+        lines.append({"left_out": left_out})
+    return b"".join(map(_line, lines))
 
 
-def _told(items: Iterable[_Happened]) -> Iterator[LiveLine]:
+def _lines(items: Iterable[_Happened]) -> Iterator[LiveLine]:
     """Each thing that has happened; blocks of a stream that go on from each other are one."""
     held: dict[str, list[SampleBlock]] = {}
     for item in items:

@@ -100,8 +100,8 @@ def fault_names(machine: MachineFile) -> dict[str, dict[str, str]]:
     named: dict[str, dict[str, str]] = {}
     for plugin, settings in plugins(machine):
         try:
-            told = plugin.faults(machine, settings)
-            named |= {str(detector): {**faults} for detector, faults in told.items()}
+            by_detector = plugin.faults(machine, settings)
+            named |= {str(detector): {**faults} for detector, faults in by_detector.items()}
         except PluginFailedError as failed:
             log.error(  # noqa: TRY400 - the message is enough
                 "%s", failed.followed_by("; its decisions are shown as they are"), extra=coded(failed.code)

@@ -1,4 +1,4 @@
-"""One machine under watch: from the samples of its streams to what its detectors say."""
+"""One machine under watch: from the samples of its streams to what its detectors state."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class MachineWatch:
         machine: the machine file.
         store: directory of the state of its detectors that survives restarts.
         clock: the service's clock.
-        report: takes what the detectors say.
+        report: takes what the detectors state.
         supervisor: keeps its parts going.
         bus_over: why nothing more can come from a bus; empty if something can.
         stream_silent: why nothing comes of a stream, as far as its bus knows; empty if it does not.
@@ -54,7 +54,7 @@ class MachineWatch:
         alignment: makes the grids.
         standings: how each stream stands.
         pipeline: runs the detectors.
-        recorder: records what comes and what is said; None if the machine file does not ask for it.
+        recorder: records the samples and the statements; None if the machine file does not ask for it.
         live: tells who looks on.
 
     Raises:

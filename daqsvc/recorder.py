@@ -1,4 +1,4 @@
-"""The recorder of a machine: what came and what was said recently, and snapshots of it on the disk.
+"""The recorder of a machine: recent samples and statements, and snapshots of it on the disk.
 
 The event loop only puts references to what passes into a history; a thread writes them when there is a cause.
 A disk that is full, slow or gone costs the snapshot and nothing else.
@@ -99,7 +99,7 @@ MOST_ASKED = 16
 PATIENCE_NS = 5 * NS_PER_S
 """How much longer a snapshot lasts, at most, for detectors to state what they find in its samples."""
 HOLD_NS = 2 * MEMORY_EVERY_NS + SPARE_NS
-"""How long the change to the next file waits for detectors to say what they remember."""
+"""How long the change to the next file waits for detectors to hand over what they remember."""
 AGAIN_NS = 10 * NS_PER_S
 """After so long continuous recording is tried again where the disk has refused it."""
 CONTINUOUS_SHARE = 0.25
@@ -427,7 +427,7 @@ class MachineRecorder:
         settings: its table ``[recorder]``.
         store: directory of the machine's part of the store.
         clock: the service's clock.
-        supervisor: of the machine; told once of each kind of trouble.
+        supervisor: of the machine; gets each kind of trouble once.
         is_judging: whether a detector has samples that it has not evaluated yet.
 
     Attributes:
@@ -546,7 +546,7 @@ class MachineRecorder:
 
     def read(self, detector: str, window: Window) -> None:
         """Samples were handed to a detector."""
-        told: SnapshotWindow = {
+        entry: SnapshotWindow = {
             "detector": detector,
             "first_index": window.first_index,
             "count": len(window.samples),
@@ -554,7 +554,7 @@ class MachineRecorder:
             "snapshot": window.snapshot,
             "breaks": list(window.breaks),
         }
-        self._note(_Read(detector, told))
+        self._note(_Read(detector, entry))
 
     def diagnosis(self, diagnosis: Diagnosis) -> None:
         """A detector has made a statement."""
@@ -808,9 +808,9 @@ class MachineRecorder:
             await self._write_on(one, one.hand_out(), is_over=False)
             return
         self._memory_wanted_ns = one.until_ns
-        if (found := self._next_begin(one, now_ns)) is None:
+        if (next_begin := self._next_begin(one, now_ns)) is None:
             return
-        end, memories = found
+        end, memories = next_begin
         history = list(self._history)
         begin = one.waiting[end] if end < len(one.waiting) else None
         first = next((k for k, item in enumerate(history) if item is begin), len(history))

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 RESTART = "restart the service for that, or take it back"
 MOST_PLACES, LONGEST_VALUE = 6, 60
-"""Places below a key that are said each; and how much of a value."""
+"""Most places below a key that are named one by one; and the longest value."""
 
 _OF_ALARMS = frozenset({"alarms", "alarm_handling"})
 _OF_BOX = frozenset({"schema_version", "site", "box", "buses", "store"})
@@ -161,11 +161,11 @@ def _json(value: object) -> str:
 
 def _differ(old: MachineFile, new: MachineFile, keys: frozenset[str]) -> list[str]:
     """What is different below these keys: each place with both values, or the key alone if that is much."""
-    found: list[str] = []
+    differences: list[str] = []
     for key in sorted(keys):
         places = [*_places(getattr(old, key), getattr(new, key), key)]
-        found += places if len(places) <= MOST_PLACES else [key]
-    return found
+        differences += places if len(places) <= MOST_PLACES else [key]
+    return differences
 
 
 def _places(old: Any, new: Any, path: str) -> Iterator[str]:
@@ -250,9 +250,9 @@ def _outputs(before: Box, after: Box) -> Iterator[str]:
         if getattr(before.own, key) != getattr(after.own, key):
             yield f"[{key}]"
     speaks = any(getattr(after.own, key) is not None for key in _output_tables(after.own))
-    if speaks and _told(before) != _told(after):
+    if speaks and _shown(before) != _shown(after):
         yield "names and figures that they show"
 
 
-def _told(box: Box) -> Any:
+def _shown(box: Box) -> Any:
     return {name: watched(machine) for name, machine in box.machines.items()}, sorted(box.own.buses)

@@ -1,4 +1,4 @@
-"""What the service has to say about itself: a full disk, dropped telemetry, buses that fail it.
+"""What the service reports about itself: a full disk, dropped telemetry, buses that fail it.
 
 Each is a condition of the alarm manager: active while it stands, returned when it is over, like any alarm.
 """
@@ -87,7 +87,7 @@ class Vitals:
 
 
 def conditions(buses: Mapping[str, Collection[str]] = MappingProxyType({})) -> list[str]:
-    """The names of all that can be said, so that people may act on it before it is.
+    """The names of all that can be reported, so that people may prepare for it.
 
     Args:
         buses: by name, what can be watched of each bus; see `BusTable.self_checks`.
@@ -105,7 +105,7 @@ def conditions(buses: Mapping[str, Collection[str]] = MappingProxyType({})) -> l
 class SelfCheck:
     """Remembers what was seen before, and states the present state.
 
-    What is not known yet is not said to be normal: an alarm that was active before a restart would return,
+    What is not known yet is not reported as normal: an alarm that was active before a restart would return,
     and come again. What happens now and then is known once it was watched for `QUIET_NS`.
 
     Args:
@@ -128,7 +128,7 @@ class SelfCheck:
         self._unwritable = False
         self._begun_ns: dict[str, int] = {}
         """By condition of what happens now and then, since when it is watched."""
-        self._said: set[str] = set()
+        self._not_normal: set[str] = set()
         """Of these, those that were other than normal in this run."""
 
     def free_bytes(self) -> int:
@@ -167,8 +167,8 @@ class SelfCheck:
         """A condition of what happens now and then, unless it is not known yet whether it still does."""
         name = condition.name
         if condition.level is not Level.NORMAL:
-            self._said.add(name)
-        elif name not in self._said and name in vitals.conditions_reported:
+            self._not_normal.add(name)
+        elif name not in self._not_normal and name in vitals.conditions_reported:
             # It was active before a restart.
             if not watched:
                 return

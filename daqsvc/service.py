@@ -125,7 +125,7 @@ class LoopLag:
 
 
 class Service:
-    """Acquires, diagnoses and tells, as the machine files of a box say.
+    """Acquires, diagnoses and reports, as the machine files of a box state.
 
     Args:
         box: the machine files.
@@ -313,7 +313,7 @@ class Service:
         try:
             await self.control.open()
         except ControlError as error:
-            # Watching the machine matters more than being told what to do.
+            # Watching the machine matters more than taking commands.
             logger.error(  # noqa: TRY400 - the message is enough
                 "no commands on this box until this is corrected: %s", error, extra=coded(CONTROL_SOCKET)
             )
@@ -417,7 +417,7 @@ class Service:
         samples go on being counted, its detectors know what they knew. Alarms stand as they did.
 
         Args:
-            dry_run: only say what would be done.
+            dry_run: only state what would be done.
 
         Returns:
             What was done, a line each; nothing if nothing is different.
@@ -430,10 +430,10 @@ class Service:
         async with self._reloading:
             try:
                 box = await asyncio.to_thread(self._read_again)
-                found = await asyncio.to_thread(changes, self.box, box)
-                if dry_run or not found:
-                    return found.lines()
-                made = await self._make(box, found)
+                diff = await asyncio.to_thread(changes, self.box, box)
+                if dry_run or not diff:
+                    return diff.lines()
+                made = await self._make(box, diff)
                 if self._is_ending:
                     raise ReloadTooLateError
             except MachineFileError as error:
@@ -442,7 +442,7 @@ class Service:
                 raise ReloadRefusedError([f"{error}"]) from error
             # Its own task: whoever has asked for it may go away, the service may not stay in between.
             going_on = self._parts.reload = asyncio.create_task(
-                self._go_on_with(box, found, made), name="reload"
+                self._go_on_with(box, diff, made), name="reload"
             )
             self._on_reload(True)
             try:
@@ -452,36 +452,36 @@ class Service:
             if going_on.cancelled():
                 raise ReloadTooLateError
             going_on.result()
-            for line in found.lines():
+            for line in diff.lines():
                 notice(logger, "reloaded: %s", line)
-            return found.lines()
+            return diff.lines()
 
-    async def _make(self, box: Box, found: Changes) -> Made:
+    async def _make(self, box: Box, diff: Changes) -> Made:
         """Make all that is new, before anything of what runs is touched.
 
         Raises:
             AssemblyError, LayoutError: that cannot be done.
         """
-        names = (*found.machines_anew, *found.machines_new)
+        names = (*diff.machines_anew, *diff.machines_new)
         watches = {name: await asyncio.to_thread(self._watch, box, name) for name in names}
         drivers = {
             name: bus_driver(box.own, name, self.clock, self._deliver, self._stand, at_start=False)
-            for name in (*found.buses_anew, *found.buses_new)
+            for name in (*diff.buses_anew, *diff.buses_new)
         }
         for watch in watches.values():
             await self._prepare(watch)
         return Made(watches, drivers)
 
-    async def _go_on_with(self, box: Box, found: Changes, made: Made) -> None:
+    async def _go_on_with(self, box: Box, diff: Changes, made: Made) -> None:
         before, parts = self.watches, self._parts
-        ending = [parts.drivers.pop(name) for name in (*found.buses_gone, *found.buses_anew)]
+        ending = [parts.drivers.pop(name) for name in (*diff.buses_gone, *diff.buses_anew)]
         await stop_all(ending, RELEASE_S)
         # From here to the next await samples change over from the old to the new.
         self.box = box
         self.watches = {name: made.watches.get(name) or before[name] for name in box.machines}
         for name, watch in made.watches.items():
             if name in before:
-                watch.take_over(before[name], box.own.buses.keys() - {*found.buses_new, *found.buses_anew})
+                watch.take_over(before[name], box.own.buses.keys() - {*diff.buses_new, *diff.buses_anew})
         self._join_streams()
         drivers = dict(zip((one.name for one in self.driver_reports), self.drivers, strict=True))
         reports = {one.name: one for one in self.driver_reports}
@@ -489,21 +489,21 @@ class Service:
         reports |= {name: self._reports_of(box, name, driver) for name, driver in made.drivers.items()}
         self.drivers[:] = [drivers[name] for name in box.own.buses]
         self.driver_reports[:] = [reports[name] for name in box.own.buses]
-        replaced = [before[name] for name in (*found.machines_gone, *found.machines_anew)]
-        pipelines = [parts.pipelines.pop(name) for name in (*found.machines_gone, *found.machines_anew)]
+        replaced = [before[name] for name in (*diff.machines_gone, *diff.machines_anew)]
+        pipelines = [parts.pipelines.pop(name) for name in (*diff.machines_gone, *diff.machines_anew)]
         for part in pipelines:
             part.leave()
         for watch in replaced:
             watch.close()
         await over(pipelines, DRAIN_S)
         await stop_all(pipelines, DRAIN_S)
-        gone = (*found.machines_gone, *found.machines_anew)
+        gone = (*diff.machines_gone, *diff.machines_anew)
         recorders = [parts.recorders.pop(name) for name in gone if name in parts.recorders]
         await stop_all(recorders, DRAIN_S)
         for watch, part in zip(replaced, pipelines, strict=True):
             if part.over.done():
                 watch.let_go()
-        await self._change_alarms(box, found)
+        await self._change_alarms(box, diff)
         self.reports = {
             name: self._status_report(name) if name in made.watches else self.reports[name]
             for name in self.watches
@@ -515,28 +515,28 @@ class Service:
         for name, driver in made.drivers.items():
             self._start_driver(driver, reports[name])
 
-    async def _change_alarms(self, box: Box, found: Changes) -> None:
+    async def _change_alarms(self, box: Box, diff: Changes) -> None:
         """Go on with the alarms of the new files, which stand as they did."""
-        for name in found.alarms_anew:
+        for name in diff.alarms_anew:
             self.watches[name].change_alarms(box.machines[name])
-        telling = [*self._parts.outputs.values()] if found.outputs else []
-        if found.outputs:
+        telling = [*self._parts.outputs.values()] if diff.outputs else []
+        if diff.outputs:
             for part in telling:
                 part.leave()
             await self.alarms.stop(GOODBYE_S)
             await stop_all(telling, DRAIN_S)
             self._parts.outputs.clear()
-        anew = {*found.machines_anew, *found.machines_new, *found.alarms_anew}
+        anew = {*diff.machines_anew, *diff.machines_new, *diff.alarms_anew}
         # In a thread, for what outputs are made of may have to be imported.
-        outputs = await asyncio.to_thread(self.alarms.made_by, _output_set(box)) if found.outputs else None
+        outputs = await asyncio.to_thread(self.alarms.made_by, _output_set(box)) if diff.outputs else None
         self.alarms.change(
             [self._alarms_of(box.machines[name]) for name in box.machines if name in anew],
-            gone=found.machines_gone,
+            gone=diff.machines_gone,
             buses=bus_self_checks(box.own),
             active_detectors={name: watch.active_detectors() for name, watch in self.watches.items()},
             outputs=outputs,
         )
-        if found.outputs:
+        if diff.outputs:
             self._start_outputs()
 
     async def _until_stopped(self, stop: asyncio.Event, first: asyncio.Task[None] | None = None) -> None:

@@ -79,7 +79,7 @@ class _Seen(NamedTuple):
 
 
 class StatusReport:
-    """Keeps what the detectors have said last, and tells the state of everything.
+    """Keeps the last statements of the detectors, and reports the state of everything.
 
     Args:
         watch: of the machine.
@@ -119,7 +119,7 @@ class StatusReport:
 
     @property
     def latest(self) -> list[Diagnosis]:
-        """What each detector has said last."""
+        """The last statement of each detector."""
         return [*self._latest.values()]
 
     def remember(self, diagnosis: Diagnosis) -> None:
@@ -279,14 +279,14 @@ def _at_fault(link: Link) -> str:
 
 
 def _sensor_states(
-    said: Iterable[Diagnosis], alarms: Mapping[str, AlarmStatus]
+    statements: Iterable[Diagnosis], alarms: Mapping[str, AlarmStatus]
 ) -> dict[str, tuple[SensorState, str]]:
-    """By sensor, how it is, and why it is not OK: the worst of what is said of it alone, and of its alarm.
+    """By sensor, how it is, and why it is not OK: the worst of the statements on it alone, and of its alarm.
 
     Of one that is only judged together with others it is known when it is OK, but not which of them is not.
     """
     states: dict[str, tuple[SensorState, str]] = {}
-    for statement in said:
+    for statement in statements:
         alone = len(statement.sensors) == 1
         state: SensorState = (
             "ok" if statement.quality == "good" else statement.quality if alone else "unknown"

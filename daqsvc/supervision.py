@@ -1,4 +1,4 @@
-"""Supervision: no part of the service ends another; what ends is said, counted and started again.
+"""Supervision: no part of the service ends another; what ends is logged, counted and started again.
 
 A part is a task of the event loop under a name. It is watched by a callback and not by another task, so
 nothing that ends a task ends its supervision. ``docs/architecture.md`` has who restarts what.
@@ -53,7 +53,7 @@ class Supervisor:
     def __init__(self) -> None:
         self.failures: Counter[str] = Counter()
         self._lock = threading.Lock()
-        self._said = SaidOnce()
+        self._logged = SaidOnce()
         self._lost: asyncio.Future[None] | None = None
 
     def keep(
@@ -64,7 +64,7 @@ class Supervisor:
         may_end: Callable[[], bool] = lambda: False,
         fatal: tuple[type[Exception], ...] = (),
     ) -> Part:
-        """Run a part, and start it again, with growing waits, whenever it ends without being told to.
+        """Run a part, and start it again, with growing waits, whenever it ends unasked.
 
         Args:
             name: of the part, in words, e.g. ``"driver can0"``.
@@ -85,7 +85,7 @@ class Supervisor:
         return name
 
     def failed(self, name: str, error: BaseException | str, then: str) -> None:
-        """Count a failure, and say it in one line, but the same one once an hour only; from any thread.
+        """Count a failure, and log it in one line, but the same one once an hour only; from any thread.
 
         Args:
             name: whose.
@@ -95,7 +95,7 @@ class Supervisor:
         with self._lock:
             self.failures[name] += 1
             count = self.failures[name]
-            if not self._said.may_say((name, error if isinstance(error, str) else cause_of(error))):
+            if not self._logged.may_say((name, error if isinstance(error, str) else cause_of(error))):
                 return
         what = error if isinstance(error, str) else in_words(error)
         times = "" if count == 1 else f" (failure {count} of it)"
@@ -108,7 +108,7 @@ class Supervisor:
         """Let no exception out of a piece of work, on which others depend that have nothing to do with it."""
         try:
             yield
-        except (Exception, SystemExit) as error:  # noqa: BLE001 - said and counted there
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - logged and counted there
             self.failed(name, error, then)
 
     @property
@@ -289,7 +289,7 @@ class _Standstill:
     step: object
     still_s: float = 0.0
     waited_s: float = 0.0
-    said: bool = False
+    is_reported: bool = False
 
 
 class StallWatch:
@@ -326,7 +326,7 @@ class StallWatch:
             waited_s = 0.0 if thread is None else kept_waiting_s(thread)
             before = self._parts.get(name)
             if before is None or step is None or step != before.step:
-                if before is not None and before.said:
+                if before is not None and before.is_reported:
                     notice(logger, "%s works again", name)
                 self._parts[name] = _Standstill(step, waited_s=waited_s)
                 continue
@@ -335,8 +335,8 @@ class StallWatch:
             if before.still_s < limit_s:
                 continue
             stalled.append(name)
-            if not before.said:
-                before.said = True
+            if not before.is_reported:
+                before.is_reported = True
                 then = "; after ".join(f"{limit:g} s: {then}" for limit, then in self._limits)
                 where = "" if thread is None else f"; its thread is in {where_is(thread.ident)}"
                 logger.critical(
@@ -346,7 +346,7 @@ class StallWatch:
 
 
 async def stop_all(parts: Iterable[Part], patience_s: float) -> None:
-    """Stop parts, and wait for their end at most so long; say which ones hang."""
+    """Stop parts, and wait for their end at most so long; log which ones hang."""
     parts = list(parts)
     for part in parts:
         part.stop()
