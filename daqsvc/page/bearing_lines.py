@@ -29,8 +29,10 @@ def bearing_lines(live: MachineLive, sensor: str) -> Iterator[tuple[str, float]]
 
 
 def _orders(bearing: dict[str, Any]) -> BearingOrders:
-    if (told := bearing.get("orders")) is not None:
-        return BearingOrders(inner=told["bpfi"], outer=told["bpfo"], ball=told["bsf"], cage=told["ftf"])
+    if (orders := bearing.get("orders")) is not None:
+        return BearingOrders(
+            inner=orders["bpfi"], outer=orders["bpfo"], ball=orders["bsf"], cage=orders["ftf"]
+        )
     if (size := bearing.get("geometry")) is not None:
         diameters = size["ball_diameter_mm"], size["pitch_diameter_mm"]
         return BearingGeometry(size["balls"], *diameters, size.get("contact_deg", 0.0)).orders()

@@ -62,7 +62,7 @@ class BoxSnapshots:
         Raises:
             OSError: the folder cannot be read.
         """
-        found = []
+        snapshots = []
         for path in self._paths(machine):
             named = NAME.fullmatch(path.stem)
             if named is None:
@@ -71,8 +71,10 @@ class BoxSnapshots:
                 size = path.stat().st_size
                 d, t = named["date"], named["time"]
                 time_utc = f"{d[:4]}-{d[4:6]}-{d[6:]}T{t[:2]}:{t[2:4]}:{t[4:]}Z"
-                found.append(KeptSnapshot(f"{machine}{AT}{path.stem}", time_utc, named["kind"], size / 1e6))
-        return sorted(found, key=lambda one: one.name, reverse=True)[:MOST_LISTED]
+                snapshots.append(
+                    KeptSnapshot(f"{machine}{AT}{path.stem}", time_utc, named["kind"], size / 1e6)
+                )
+        return sorted(snapshots, key=lambda one: one.name, reverse=True)[:MOST_LISTED]
 
     def _paths(self, machine: str) -> list[Path]:
         if "/" in machine or machine in {"", ".", ".."}:

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-"""Colours of lines that are told apart by who sees colours otherwise, too (Okabe and Ito 2008)."""
+"""Colours of lines that people with colour blindness can distinguish, too (Okabe and Ito 2008)."""
 
 
 class Theme(NamedTuple):

@@ -1,4 +1,4 @@
-"""What can be told apart on a machine, computed by a separate process: that takes seconds, and memory."""
+"""Which faults can be distinguished on a machine, by a separate process: it takes seconds, and memory."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ NOT_HERE = "it needs files of the box: open the box's own page"
 
 
 class Detectable(NamedTuple):
-    """What can be told apart.
+    """Which faults can be distinguished.
 
     Attributes:
         text: as `daqsvc detectability` prints it; empty if it cannot be computed.
@@ -40,7 +40,7 @@ class Detectable(NamedTuple):
 
 
 def why_no_detector(live: MachineLive) -> str:
-    """Why nothing can be told apart on a machine, as far as its tables show; "" if something can be."""
+    """Why no fault can be distinguished on a machine, as far as its tables show; "" if something can be."""
     tables = detector_tables()
     known = [key for key, table in tables.items() if cast("DetectorPlugin[Any]", table).predictable]
     if any(key in live.values.get("pipeline", {}) for key in known):
@@ -49,7 +49,7 @@ def why_no_detector(live: MachineLive) -> str:
 
 
 class Detectabilities:
-    """What can be told apart on each machine that was asked for, computed once for each machine file."""
+    """Which faults can be distinguished on each machine asked for, computed once for each machine file."""
 
     def __init__(self) -> None:
         self._made: OrderedDict[tuple[str, int], asyncio.Task[Detectable]] = OrderedDict()
@@ -65,10 +65,10 @@ class Detectabilities:
         task = self._made[key]
         if not task.done() or task.cancelled():
             return None
-        told = Detectable("", "it has failed: try again later") if task.exception() else task.result()
-        if told.why_not:
+        answer = Detectable("", "it has failed: try again later") if task.exception() else task.result()
+        if answer.why_not:
             del self._made[key]  # whoever looks again has it computed again
-        return told
+        return answer
 
     async def close(self) -> None:
         """Compute no more."""
@@ -119,7 +119,7 @@ async def _asked(values: Path, folder: str, *, is_here: bool) -> Detectable:
             await process.wait()
     if process.returncode == 0:
         return Detectable(out.decode(), "")
-    said = err.decode(errors="replace").strip().splitlines() or ["it has failed without a message"]
+    lines = err.decode(errors="replace").strip().splitlines() or ["it has failed without a message"]
     # No path goes out, but units such as mm/s do.
-    why = _PATH.sub("", said[-1].replace(f"{values}: ", "").replace(f"{folder}/", ""))
+    why = _PATH.sub("", lines[-1].replace(f"{values}: ", "").replace(f"{folder}/", ""))
     return Detectable("", why if is_here else f"{why}; {NOT_HERE}")

@@ -63,6 +63,6 @@ def probabilities_before(live: MachineLive, detector: str, modes: Sequence[str],
                 place = points.t_s - since_s
                 there = (place >= 0) & (place < LONGEST_S)
                 values[place[there], modes.index(one.key)] = points.mean[there]
-    told = np.isfinite(values).any(axis=1)
-    t_s = since_s + np.flatnonzero(told)
-    return Earlier(t_s * NS_PER_S - live.wall_ns_at_0, values[told])
+    is_known = np.isfinite(values).any(axis=1)
+    t_s = since_s + np.flatnonzero(is_known)
+    return Earlier(t_s * NS_PER_S - live.wall_ns_at_0, values[is_known])

@@ -1,6 +1,6 @@
 """What is wrong with a machine, how sure that is, since when, and what to do: in sentences.
 
-The next steps are those of trade practice (ISO 13373-3:2015, guidelines for vibration diagnosis). They say
+The next steps are those of trade practice (ISO 13373-3:2015, guidelines for vibration diagnosis). They state
 what to look at, and never that it is safe to go on: that decides a person who knows the machine.
 """
 
@@ -83,7 +83,7 @@ FAULTS = {
         "Decide now whether the machine may go on; look at {views} for what it is.",
     ),
 }
-"""By what detectors say, in their words."""
+"""By what detectors state, in their words."""
 MOST_NAMED = 5
 """Sensors that a sentence names at most."""
 SOUND = {"normal", "undetermined"}
@@ -91,10 +91,10 @@ SOUND = {"normal", "undetermined"}
 
 def finding_rows(live: MachineLive) -> str:
     """What each detector finds that is not as it should be, as rows of a table; the worst first."""
-    found = [one for one in [*live.latest.values()] if _is_found(live, one)]
+    findings = [one for one in [*live.latest.values()] if _is_finding(live, one)]
     worst = {"danger": 0, "alert": 1}
-    found.sort(key=lambda one: (worst.get(one["severity"], 2), str(one["detector"])))
-    rows = [_row_of(live, one) for one in found]
+    findings.sort(key=lambda one: (worst.get(one["severity"], 2), str(one["detector"])))
+    rows = [_row_of(live, one) for one in findings]
     if rows:
         return "".join(rows)
     heard = len(live.latest)
@@ -129,8 +129,8 @@ def sentence(live: MachineLive, statement: Document) -> str:
         text += f", p {in_words(probabilities[decision])}"
         if others:
             text += f" (all of these {in_words(sum(probabilities.get(one, 0.0) for one in group))})"
-    if said := _evidence(statement, group):
-        text += f"; {said}"
+    if evidence := _evidence(statement, group):
+        text += f"; {evidence}"
     if statement["quality"] != "good":
         text += f". That is held from before: {statement['reason'] or statement['quality']}"
     return f"{text}."
@@ -163,7 +163,7 @@ def _evidence(statement: Document, group: set[str]) -> str:
     return ", ".join(beyond)
 
 
-def _is_found(live: MachineLive, statement: Document) -> bool:
+def _is_finding(live: MachineLive, statement: Document) -> bool:
     fault = live.fault_of(str(statement["detector"]), str(statement["decision"]))
     return bool(statement["severity"] != "normal") or (fault not in SOUND and fault in FAULTS)
 

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 MOST_EVENTS = 200
 """Of the journal that are shown."""
-MOST_SAID = 200
+MOST_OUTCOMES = 200
 NOT_AN_OPERATOR = "the page lets operators handle alarms, and this person is a viewer"
 TIMES = {"1": "1 hour", "4": "4 hours", "8": "8 hours", "24": "1 day"}
 """How long an alarm may be shelved for by the page, h."""
@@ -78,27 +78,32 @@ def offered(alarm: Document | None) -> list[Verb]:
     return verbs
 
 
-class Said:
+class FormOutcomes:
     """What came of forms, for the page that follows; each is known by a secret, and kept for a while."""
 
     def __init__(self) -> None:
-        self._said: OrderedDict[str, tuple[str, bool]] = OrderedDict()
+        self._outcomes: OrderedDict[str, tuple[str, bool]] = OrderedDict()
 
     def keep(self, text: str, *, is_good: bool) -> str:
         """Keep what came of one; the secret."""
         secret = secrets.token_urlsafe(12)
-        self._said[secret] = text, is_good
-        while len(self._said) > MOST_SAID:
-            self._said.popitem(last=False)
+        self._outcomes[secret] = text, is_good
+        while len(self._outcomes) > MOST_OUTCOMES:
+            self._outcomes.popitem(last=False)
         return secret
 
     def of(self, secret: str) -> tuple[str, bool]:
         """What came of it, and whether that is good; empty if that is not known."""
-        return self._said.get(secret, ("", True))
+        return self._outcomes.get(secret, ("", True))
 
 
 async def alarms_page(
-    source: MachineSource, live: MachineLive, machine: str, request: Request, forms: Forms, said: Said
+    source: MachineSource,
+    live: MachineLive,
+    machine: str,
+    request: Request,
+    forms: Forms,
+    outcomes: FormOutcomes,
 ) -> Document:
     """What the template ``alarms.html`` needs.
 
@@ -108,13 +113,13 @@ async def alarms_page(
         machine: its name in addresses.
         request: what was asked.
         forms: makes tokens.
-        said: what came of forms.
+        outcomes: what came of forms.
     """
     asked = request.query_params.get("alarm", "")
     person: Person = request.state.person
     known = live.all_alarms()
     chosen = asked if asked in known else ""
-    text, is_good = said.of(request.query_params.get("said", ""))
+    text, is_good = outcomes.of(request.query_params.get("outcome", ""))
     try:
         events, why = await source.journal(machine, chosen, MOST_EVENTS), ""
     except OSError:
@@ -135,12 +140,14 @@ async def alarms_page(
         "token": forms.token(person),
         "may_act": person.role is Role.OPERATOR,
         "how_to_act": "" if person.session else HOW_TO_ACT,
-        "said": text,
+        "outcome": text,
         "is_good": is_good,
     }
 
 
-async def handle(source: MachineSource, machine: str, request: Request, forms: Forms, said: Said) -> Response:
+async def handle(
+    source: MachineSource, machine: str, request: Request, forms: Forms, outcomes: FormOutcomes
+) -> Response:
     """Do with an alarm what a form asks for, and show what came of it."""
     person: Person = request.state.person
     try:
@@ -151,7 +158,7 @@ async def handle(source: MachineSource, machine: str, request: Request, forms: F
         command = _command(fields, machine, person)
     except FormError as error:
         alarm = fields.get("alarm", "")
-        return _shown(request, machine, alarm, said.keep(f"Nothing was done: {error}.", is_good=False))
+        return _shown(request, machine, alarm, outcomes.keep(f"Nothing was done: {error}.", is_good=False))
     denied = "" if person.role is Role.OPERATOR else NOT_AN_OPERATOR
     via = f"page {peer_of(request)} {person.name}"
     handling = asyncio.ensure_future(source.handle(machine, command, denied, via))
@@ -162,7 +169,7 @@ async def handle(source: MachineSource, machine: str, request: Request, forms: F
         text = f"{command.alarm} is {DONE[command.verb]} by {person.name}{then}."
     else:
         text = f"Nothing was done: {with_code(outcome.reason, outcome.code)}."
-    return _shown(request, machine, command.alarm, said.keep(text, is_good=outcome.accepted))
+    return _shown(request, machine, command.alarm, outcomes.keep(text, is_good=outcome.accepted))
 
 
 def _times(live: MachineLive) -> Document:
@@ -200,5 +207,5 @@ def _command(fields: Mapping[str, str], machine: str, person: Person) -> AlarmCo
 
 
 def _shown(request: Request, machine: str, alarm: str, secret: str) -> Response:
-    there = request.url_for("alarms", machine=machine).include_query_params(alarm=alarm, said=secret)
+    there = request.url_for("alarms", machine=machine).include_query_params(alarm=alarm, outcome=secret)
     return RedirectResponse(f"{there.path}?{there.query}", 303)

@@ -37,14 +37,14 @@ KEEP_S = 20.0
 """Of the waveforms."""
 MOST_VALUES = 4_000_000
 """Of one stream that are kept, at most."""
-MOST_SAID = 3600
+MOST_STATEMENTS = 3600
 """Statements of one detector that are kept."""
 MOST_JOURNAL = 500
 """Alarm events that are kept."""
 LEAST_WAVEFORM_HZ = 20.0
 """What is sampled more slowly is a trend value, and has no spectrum to look at."""
 HYSTERESIS_V = 0.5
-"""Of a keyphasor of which the machine file does not say it."""
+"""Of a keyphasor of which the machine file does not state it."""
 PAIR = 2
 SQUARE_DEG = (60.0, 120.0)
 LATE_S = 3.0
@@ -74,7 +74,7 @@ class Sensor(NamedTuple):
     hysteresis: float
 
 
-class Said(NamedTuple):
+class ShortStatement(NamedTuple):
     """A statement, in short.
 
     Attributes:
@@ -104,7 +104,7 @@ class Decided(NamedTuple):
 
     Attributes:
         decision: the same.
-        since_ns: when it has said so first, by the box's monotonic clock.
+        since_ns: when it decided so first, by the box's monotonic clock.
         is_seen: whether it came while somebody looked; else it may be older.
     """
 
@@ -151,10 +151,10 @@ class MachineLive:
         self.latest: dict[str, Document] = {one["detector"]: one for one in about["statements"]}
         self.probable = {name: one for name, one in self.latest.items() if one["probabilities"]}
         """By detector the last statement with probabilities: while data are missing there are none."""
-        self.said: dict[str, deque[Said]] = {}
+        self.statements: dict[str, deque[ShortStatement]] = {}
         self.alarms: dict[str, Document] = {one["alarm"]: one for one in about["alarms"]}
         self.journal: deque[Document] = deque(sorted(about["alarms"], key=_when), MOST_JOURNAL)
-        self._found = {
+        self._finding_messages = {
             name: str(one["message"]) for name, one in self.alarms.items() if one.get("kind") in FINDINGS
         }
         self.standings: dict[str, Document] = dict(about["standings"])
@@ -169,7 +169,7 @@ class MachineLive:
         self.token = zlib.crc32(json.dumps([self.values, about["streams"]], sort_keys=True).encode())
         """Different where the machine file is different."""
         self._came: dict[str, _Came] = {}
-        self._places = self._found_places()
+        self._places = self._sensor_places()
         self.decided: dict[str, Decided] = {
             name: Decided(str(one["decision"]), int(one["monotonic_ns"]), is_seen=False)
             for name, one in self.latest.items()
@@ -219,22 +219,22 @@ class MachineLive:
         elif (alarm := line.get("alarm")) is not None:
             self.alarms[alarm["alarm"]] = alarm
             if alarm.get("kind") in FINDINGS:
-                self._found[alarm["alarm"]] = str(alarm["message"])
+                self._finding_messages[alarm["alarm"]] = str(alarm["message"])
             self.journal.append(alarm)
         elif (standing := line.get("standing")) is not None:
             self.standings[standing["stream"]] = standing
         self.left_out += line.get("left_out", 0)
 
-    def told_of(self, alarm: Document) -> str:
-        """What was found last of an alarm, as far as it was received, and what was done about it since."""
-        found = str(alarm.get("found_message") or self._found.get(alarm["alarm"], ""))
+    def message_of(self, alarm: Document) -> str:
+        """The last finding of an alarm, as far as it was received, and what was done about it since."""
+        finding = str(alarm.get("found_message") or self._finding_messages.get(alarm["alarm"], ""))
         message = str(alarm["message"])
-        return message if not found or found == message else f"{found}; {message}"
+        return message if not finding or finding == message else f"{finding}; {message}"
 
     def go_on_from(self, before: MachineLive) -> None:
         """Keep what is known of the time before the connection was made again."""
-        self.said = before.said
-        self._found = before._found | self._found
+        self.statements = before.statements
+        self._finding_messages = before._finding_messages | self._finding_messages
         self.probable = before.probable | self.probable
         for detector, now in self.decided.items():
             if (known := before.decided.get(detector)) is not None and known.decision == now.decision:
@@ -281,8 +281,8 @@ class MachineLive:
         places = self.place_of([sensor, key]) if key else None
         if key is None or places is None:
             return self._runs.vectors(sensor, None, 0, EdgeFinder(0.0, 0.0, "rising"))
-        told = self.sensors[key]
-        finder = EdgeFinder(told.threshold or 0.0, told.hysteresis, told.edge)
+        keyphasor = self.sensors[key]
+        finder = EdgeFinder(keyphasor.threshold or 0.0, keyphasor.hysteresis, keyphasor.edge)
         return self._runs.vectors(sensor, self._column(places[0]), places[1].column, finder)
 
     def spectra_of(self, sensor: str, window_s: float) -> list[SpectrumThen]:
@@ -320,8 +320,8 @@ class MachineLive:
         Those that a detector takes as a pair; of the others each with the one of the most similar name that
         is 60 to 120 degrees from it.
         """
-        told = [table["probes"] for table in self._tables() if len(table.get("probes", ())) == PAIR]
-        pairs = [(str(x), str(y)) for x, y in told if self.place_of([x, y])]
+        declared = [table["probes"] for table in self._tables() if len(table.get("probes", ())) == PAIR]
+        pairs = [(str(x), str(y)) for x, y in declared if self.place_of([x, y])]
         pairs = list(dict.fromkeys(pairs))
         left = [
             one
@@ -350,14 +350,14 @@ class MachineLive:
 
     def waveform_sensors(self) -> list[str]:
         """Those sensors of vibration that are sampled fast enough for a spectrum, by their names."""
-        found = []
+        names = []
         for name in self.vibration_sensors():
             places = self.place_of([name])
             if places and self.rate_hz(places[0].stream) >= LEAST_WAVEFORM_HZ:
-                found.append(name)
-        return found
+                names.append(name)
+        return names
 
-    def _found_places(self) -> dict[str, dict[str, SensorPlace]]:
+    def _sensor_places(self) -> dict[str, dict[str, SensorPlace]]:
         """By stream and grid, where each sensor's samples are in it."""
         places: dict[str, dict[str, SensorPlace]] = {}
         named: dict[str, str] = {}
@@ -384,9 +384,9 @@ class MachineLive:
         self.latest[detector] = statement
         if statement["probabilities"]:
             self.probable[detector] = statement
-        said = self.said.setdefault(detector, deque(maxlen=MOST_SAID))
-        said.append(
-            Said(
+        statements = self.statements.setdefault(detector, deque(maxlen=MOST_STATEMENTS))
+        statements.append(
+            ShortStatement(
                 statement["monotonic_ns"],
                 statement["decision"],
                 statement["probabilities"],
@@ -395,15 +395,15 @@ class MachineLive:
             )
         )
 
-    def _write(self, told: Document) -> None:
+    def _write(self, samples: Document) -> None:
         self.place(
             SampleBlock(
-                told["stream"],
-                told["first_index"],
-                np.frombuffer(base64.b64decode(told["values"]), "<f4").reshape(told["shape"]),
-                told["t_first_ns"],
-                told["period_ns"],
-                quality=Quality(told["quality"]),
+                samples["stream"],
+                samples["first_index"],
+                np.frombuffer(base64.b64decode(samples["values"]), "<f4").reshape(samples["shape"]),
+                samples["t_first_ns"],
+                samples["period_ns"],
+                quality=Quality(samples["quality"]),
             )
         )
 
@@ -454,10 +454,10 @@ def _when(event: Document) -> int:
     return int(event["monotonic_ns"])
 
 
-def _sensor(told: Document) -> Sensor:
-    angle, threshold = told.get("angle_deg"), told.get("threshold_v")
-    edge: Literal["rising", "falling"] = "falling" if told.get("edge") == "falling" else "rising"
-    hysteresis = float(told.get("hysteresis_v", HYSTERESIS_V))
+def _sensor(entry: Document) -> Sensor:
+    angle, threshold = entry.get("angle_deg"), entry.get("threshold_v")
+    edge: Literal["rising", "falling"] = "falling" if entry.get("edge") == "falling" else "rising"
+    hysteresis = float(entry.get("hysteresis_v", HYSTERESIS_V))
     return Sensor(
-        told["name"], told.get("type", ""), told.get("unit", ""), angle, threshold, edge, hysteresis
+        entry["name"], entry.get("type", ""), entry.get("unit", ""), angle, threshold, edge, hysteresis
     )

@@ -110,9 +110,9 @@ class Picture:
                     if streams != wanted:
                         wanting.enter_context(listening.wanting(streams))
                         wanted = streams
-                    told = await asyncio.to_thread(self._whatever, listening)
+                    content = await asyncio.to_thread(self._whatever, listening)
                     async with self._made:
-                        self._newest = b"data: " + told + b"\n\n"
+                        self._newest = b"data: " + content + b"\n\n"
                         self._made.notify_all()
                     await asyncio.sleep(max(every_s - (time.monotonic() - begun_s), 0.01))
 
@@ -130,9 +130,9 @@ class Picture:
         return ""
 
     def _whatever(self, listening: Heard) -> bytes:
-        """See `_told`; a mistake in this program is reported to browsers, too."""
+        """See `_encoded`; a mistake in this program is reported to browsers, too."""
         try:
-            return self._told(listening)
+            return self._encoded(listening)
         except Exception:
             if not self._has_failed:
                 self._has_failed = True
@@ -143,20 +143,20 @@ class Picture:
                 {"age_s": 0.0, "why": "the page has failed to make it: its log has the reason"}
             ).encode()
 
-    def _told(self, listening: Heard) -> bytes:
+    def _encoded(self, listening: Heard) -> bytes:
         """What browsers get now, as JSON; on a thread."""
         live = listening.live
         silent_s = time.monotonic() - listening.heard_s
         why = listening.why_not or ("the service sends nothing" if silent_s > STALE_S else "")
-        told: dict[str, Any] = {"age_s": round(silent_s, 1), "why": why}
+        content: dict[str, Any] = {"age_s": round(silent_s, 1), "why": why}
         if live is not None:
-            told["token"] = live.token
+            content["token"] = live.token
             stream, away_s = live.silence(self._streams(listening))
             if stream and not why:
-                told |= {"age_s": round(away_s, 1), "why": f"nothing comes from {stream} any more"}
-            told["html"] = {"head": head(live), "alarms": alarm_rows(live)}
+                content |= {"age_s": round(away_s, 1), "why": f"nothing comes from {stream} any more"}
+            content["html"] = {"head": head(live), "alarms": alarm_rows(live)}
             if self._as_a_whole:
-                told["html"] |= {
+                content["html"] |= {
                     "findings": finding_rows(live),
                     "values": value_rows(live),
                     "machine": machine_rows(live),
@@ -164,8 +164,8 @@ class Picture:
                     "alarm-list": alarm_list(live.all_alarms(), self._machine),
                 }
             if self._view is not None:
-                told |= self._view_of(self._view, live)
-        return json.dumps(told).encode()
+                content |= self._view_of(self._view, live)
+        return json.dumps(content).encode()
 
     def _view_of(self, view: MachineView, live: MachineLive) -> dict[str, Any]:
         if why_not := view.why_not(live):

@@ -65,7 +65,7 @@ class Playing:
             self._values = json.loads(snapshot.files[MACHINE_JSON])
             self._begin_ns = int(snapshot.about["begin_ns"])
             self._cause = "; ".join(map(str, snapshot.about.get("causes", ())))
-            self._cause_s = self._found_cause_s()
+            self._cause_s = self._cause_in_name_s()
             self.live = self._begun()
         except (LookupError, TypeError, ValueError) as error:
             raise NoPictureError(
@@ -73,8 +73,8 @@ class Playing:
                 "show one that this version has made"
             ) from None
 
-    def _found_cause_s(self) -> float | None:
-        """How long after its begin the cause came, by the name of the file; None if that does not say it."""
+    def _cause_in_name_s(self) -> float | None:
+        """How long after its begin the cause came, by the name of the file; None without a time in it."""
         about = self._snapshot.about
         if (named := NAME.search(self._name)) is None:
             return None

@@ -44,7 +44,7 @@ from daqsvc.page.charts import THEMES
 from daqsvc.page.detectable import Detectabilities, why_no_detector
 from daqsvc.page.documentation import WHY_NOT, Documentation
 from daqsvc.page.guard import FRAMING, Admitted, FormError, Forms, Guarded
-from daqsvc.page.handling import MOST_EVENTS, Said, alarms_page, handle
+from daqsvc.page.handling import MOST_EVENTS, FormOutcomes, alarms_page, handle
 from daqsvc.page.listening import NOT_OURS
 from daqsvc.page.presence import Picture
 from daqsvc.page.recorded import NoPictureError
@@ -134,7 +134,7 @@ class _Page:
         self._tls = tls
         self._has_documentation = has_documentation
         self._forms = Forms()
-        self._said = Said()
+        self._outcomes = FormOutcomes()
         self._detectabilities = Detectabilities()
         self._pictures: dict[tuple[str, ...], Picture] = {}
         self._templates = Environment(
@@ -202,14 +202,21 @@ class _Page:
         live, why = await self._first(name)
         if live is None:
             return self._absent(request, name, why)
-        told = await alarms_page(self._source, live, name, request, self._forms, self._said)
+        context = await alarms_page(self._source, live, name, request, self._forms, self._outcomes)
         return self._html(
-            request, "alarms.html", **self._of_machine(live, name), title=f"Alarms: {name}", view=None, **told
+            request,
+            "alarms.html",
+            **self._of_machine(live, name),
+            title=f"Alarms: {name}",
+            view=None,
+            **context,
         )
 
     async def handle(self, request: Request) -> Response:
         """Do with an alarm what a form asks for."""
-        return await handle(self._source, request.path_params["machine"], request, self._forms, self._said)
+        return await handle(
+            self._source, request.path_params["machine"], request, self._forms, self._outcomes
+        )
 
     async def snapshots(self, request: Request) -> Response:
         """The recorder's snapshots of a machine, and two of them beside each other."""
@@ -236,16 +243,16 @@ class _Page:
         return next((one.name for one in kept if one.kind != "alarm" and not _stood(events, one)), "")
 
     async def detectability(self, request: Request) -> Response:
-        """What can be told apart on a machine."""
+        """Which faults can be distinguished on a machine."""
         name = request.path_params["machine"]
         live, why = await self._first(name)
         if live is None:
             return self._absent(request, name, why)
-        told = self._detectabilities.of(live)
+        result = self._detectabilities.of(live)
         about = self._of_machine(live, name) | {
-            "waits": told is None,
-            "text": told.text if told else "",
-            "why_not": told.why_not.rstrip(".") if told else "",
+            "waits": result is None,
+            "text": result.text if result else "",
+            "why_not": result.why_not.rstrip(".") if result else "",
         }
         return self._html(request, "detectability.html", title=f"Detectability: {name}", view=None, **about)
 
@@ -333,8 +340,8 @@ class _Page:
         live, why = await self._first(name)
         if live is None:
             # A browser asks again after an answer that ends well, and never after an error.
-            told = json.dumps({"age_s": 0.0, "why": why})
-            return Response(f"retry: 2000\ndata: {told}\n\n", media_type="text/event-stream")
+            message = json.dumps({"age_s": 0.0, "why": why})
+            return Response(f"retry: 2000\ndata: {message}\n\n", media_type="text/event-stream")
         _, chosen = _chosen(view, live, request.query_params)
         key = (name, asked or "", *(f"{a}={b}" for a, b in sorted(chosen.items())))
         picture = Picture(self._source, name, view, chosen, as_a_whole=asked is None)
@@ -417,15 +424,15 @@ def _chosen(
 def _figures(view: MachineView, live: MachineLive, chosen: Mapping[str, str], theme: Theme) -> str:
     """The figures of a view with what is to be seen now, as JSON."""
     shown = view.shown(live, chosen)
-    told = []
+    figures = []
     for one in view.figures(live, chosen, theme):
         for source in one.made.select({"type": ColumnDataSource}):
             if source.name in shown.sources:
-                told_now = shown.sources[source.name]
-                source.data = {column: np.asarray(values) for column, values in told_now.items()}
+                columns = shown.sources[source.name]
+                source.data = {column: np.asarray(values) for column, values in columns.items()}
         item = json_item(one.made, ID(f"figure-{one.name}"))
-        told.append({"name": one.name, "label": one.label, "item": item})
-    return json.dumps(told)
+        figures.append({"name": one.name, "label": one.label, "item": item})
+    return json.dumps(figures)
 
 
 def _stood(events: Sequence[Mapping[str, Any]], snapshot: KeptSnapshot) -> bool:

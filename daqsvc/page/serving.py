@@ -69,7 +69,7 @@ class _Server(uvicorn.Server):
                 signal.signal(number, handler)
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Start to answer, and say so."""
+        """Start to answer, and log it."""
         await super().startup(sockets)
         if self.started:
             for line in self._where:

@@ -117,9 +117,9 @@ def _turning(seen: Whirl) -> tuple[float, float]:
     Marks may be missing, and there may be some too many: each counts as many revolutions on as it comes
     behind the last one, by the usual distance.
     """
-    told = seen.rate_hz / seen.speed_hz
+    expected = seen.rate_hz / seen.speed_hz
     if len(seen.marks) < 2:
-        return (float(seen.marks[0]) if len(seen.marks) else 0.0), told
+        return (float(seen.marks[0]) if len(seen.marks) else 0.0), expected
     usual = float(np.median(np.diff(seen.marks)))
     kept, number = [float(seen.marks[0])], [0]
     for mark in seen.marks[1:]:
@@ -128,6 +128,6 @@ def _turning(seen: Whirl) -> tuple[float, float]:
             kept.append(float(mark))
             number.append(number[-1] + round(turns))
     if len(kept) < 2:
-        return kept[0], told
+        return kept[0], expected
     period, first = np.polyfit(number, kept, 1)
     return float(first), float(period)

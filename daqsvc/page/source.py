@@ -124,14 +124,14 @@ class BoxSource:
 
             async def answer(question: bytes) -> Document:
                 writer.write(question + b"\n")
-                told: Document = json.loads(await reader.readuntil())
-                return told
+                reply: Document = json.loads(await reader.readuntil())
+                return reply
 
             try:
                 first = await answer(STATUS_QUESTION)
                 if "machines" not in first:
                     return [first]
-                # Of several it has to be said which one is meant: the answer names them.
+                # If there are several, the question has to name one: the answer lists them.
                 return [
                     await answer(STATUS_QUESTION[:-1] + f', "machine": {json.dumps(name)}}}'.encode())
                     for name in first["machines"]

@@ -50,7 +50,7 @@ def level_of(standing_alarms: Iterable[Document]) -> str:
 def tile(status: Document) -> Document:
     """A machine in short, by its `daqsvc.publish.service_status`."""
     alarms = status["alarms"]["standing"]
-    told = [
+    entries = [
         {"alarm": one["alarm"], "first": one.get("first_out", False), "why": one["message"]} for one in alarms
     ]
     level, away = level_of(alarms), status.get("away", "")
@@ -59,7 +59,7 @@ def tile(status: Document) -> Document:
     name = str(status["machine"])
     title = name.rpartition(BETWEEN)[2] or status.get("place", "")
     place = status.get("place", "") if name else ""
-    return {"name": name, "title": title, "place": place, "level": level, "alarms": told, "away": away}
+    return {"name": name, "title": title, "place": place, "level": level, "alarms": entries, "away": away}
 
 
 def head(live: MachineLive) -> str:
@@ -81,7 +81,7 @@ def alarm_rows(live: MachineLive) -> str:
             escape(one["alarm"]) + (' <span class="first">first</span>' if one["first_out"] else ""),
             escape(STATES.get(str(one["state"]), str(one["state"]))),
             time_mark(one["wall_ns"]),
-            escape(live.told_of(one)),
+            escape(live.message_of(one)),
         )
         for one in standing(live)
     ]
@@ -128,8 +128,8 @@ def _first(alarm: Document | None) -> str:
 
 def _stands(latest: Document) -> str:
     """What was found last, and what was done about it since, by the last event of an alarm."""
-    found = str(latest.get("found_message", ""))
-    return f"{escape(found)}; {_what(latest)}" if found else _what(latest)
+    finding = str(latest.get("found_message", ""))
+    return f"{escape(finding)}; {_what(latest)}" if finding else _what(latest)
 
 
 def _what(event: Document) -> str:
@@ -181,7 +181,7 @@ def event_rows(events: Iterable[Document]) -> str:
 def machine_rows(live: MachineLive) -> str:
     """What each detector reports, and what each channel measures."""
     rows = []
-    for one in sorted([*live.latest.values()], key=lambda said: str(said["detector"])):
+    for one in sorted([*live.latest.values()], key=lambda statement: str(statement["detector"])):
         figures = ", ".join(
             f"{name} {with_unit(value, one['units'].get(name, ''))}"
             for name, value in one["statistics"].items()
@@ -189,11 +189,11 @@ def machine_rows(live: MachineLive) -> str:
         )
         likely = sorted(one["probabilities"].items(), key=lambda mode: -(mode[1] or 0.0))[:3]
         odds = ", ".join(f"p({mode}) {in_words(p)}" for mode, p in likely)
-        said = one["decision"] if not one["reason"] else f"{one['decision']}: {one['reason']}"
+        decision = one["decision"] if not one["reason"] else f"{one['decision']}: {one['reason']}"
         rows.append(
             row(
                 escape(str(one["detector"])),
-                f'<span class="level {escape(one["severity"])}">{escape(said)}</span>',
+                f'<span class="level {escape(one["severity"])}">{escape(decision)}</span>',
                 escape("; ".join(filter(None, (odds, figures)))),
                 time_mark(live.wall_ns_at_0 + int(one["monotonic_ns"])),
                 escape(one["quality"]),

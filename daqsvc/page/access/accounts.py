@@ -62,11 +62,11 @@ class Account(NamedTuple):
 
     def has_password(self, password: str) -> bool:
         """Whether that is its password; takes a tenth of a second."""
-        found = _LINE.fullmatch(self.line)
-        assert found is not None  # noqa: S101 - it was read so
-        cost = int(found["n"]), int(found["r"]), int(found["p"])
-        made = _hashed(password, base64.b64decode(found["salt"]), *cost)
-        return hmac.compare_digest(made, base64.b64decode(found["hash"]))
+        match = _LINE.fullmatch(self.line)
+        assert match is not None  # noqa: S101 - it was read so
+        cost = int(match["n"]), int(match["r"]), int(match["p"])
+        made = _hashed(password, base64.b64decode(match["salt"]), *cost)
+        return hmac.compare_digest(made, base64.b64decode(match["hash"]))
 
 
 class AccountsFile:
@@ -144,26 +144,26 @@ def read_accounts(path: Path) -> dict[str, Account]:
 
 
 def _account(line: str) -> Account | None:
-    found = _LINE.fullmatch(line)
-    if found is None or NAME.fullmatch(found["name"]) is None or found["role"] not in {*Role}:
+    match = _LINE.fullmatch(line)
+    if match is None or NAME.fullmatch(match["name"]) is None or match["role"] not in {*Role}:
         return None
-    n, r, p = (int(found[one]) for one in "nrp")
+    n, r, p = (int(match[one]) for one in "nrp")
     if not (0 < n <= MOST_LOG2_N and 0 < r <= MOST_R and 0 < p <= MOST_P):
         return None
     try:
-        base64.b64decode(found["salt"], validate=True)
-        base64.b64decode(found["hash"], validate=True)
+        base64.b64decode(match["salt"], validate=True)
+        base64.b64decode(match["hash"], validate=True)
     except ValueError:
         return None
-    return Account(found["name"], Role(found["role"]), line)
+    return Account(match["name"], Role(match["role"]), line)
 
 
 def account_line(name: str, role: Role, password: str) -> str:
     """An account as a line of the file."""
     salt = secrets.token_bytes(SALT_BYTES)
     made = _hashed(password, salt, LOG2_N, R, P)
-    told = (base64.b64encode(one).decode() for one in (salt, made))
-    return f"{name}:{role}:$scrypt$ln={LOG2_N},r={R},p={P}${'$'.join(told)}"
+    encoded = (base64.b64encode(one).decode() for one in (salt, made))
+    return f"{name}:{role}:$scrypt$ln={LOG2_N},r={R},p={P}${'$'.join(encoded)}"
 
 
 def write_account(path: Path, name: str, line: str | None) -> bool:

@@ -99,7 +99,7 @@ class KnownBox:
         why: the reason that it gives.
         since: when that was so, ISO 8601.
         known_s: when something of it was heard first, which may be old, by `time.monotonic`.
-        heard_s: when it said something that was not kept at the broker, by `time.monotonic`.
+        heard_s: when it sent something that was not kept at the broker, by `time.monotonic`.
         heard_utc: the same, ISO 8601.
         machines: by their names.
     """
@@ -143,8 +143,8 @@ class KnownPlant:
         site, _, rest = name.partition(BETWEEN)
         box, _, machine = rest.partition(BETWEEN)
         known = self.boxes.get((site, box))
-        found = None if known is None else known.machines.get(machine)
-        return None if known is None or found is None else (known, found)
+        known_machine = None if known is None else known.machines.get(machine)
+        return None if known is None or known_machine is None else (known, known_machine)
 
     def take(self, message: Incoming) -> None:
         """Take in a message; what is none of a box, or not as it should be, is left out."""
@@ -217,13 +217,13 @@ class KnownPlant:
 
 
 def _note_availability(box: KnownBox, payload: bytes) -> None:
-    told = AvailabilityPayload.model_validate_json(payload)
-    box.state, box.why, box.since = told.state, told.reason, told.time
+    availability = AvailabilityPayload.model_validate_json(payload)
+    box.state, box.why, box.since = availability.state, availability.reason, availability.time
 
 
 def _note_machines(box: KnownBox, payload: bytes) -> None:
-    told = json.loads(payload)
-    names = told.get("machines", ()) if isinstance(told, dict) else ()
+    document = json.loads(payload)
+    names = document.get("machines", ()) if isinstance(document, dict) else ()
     for name in names if isinstance(names, list) else ():
         if isinstance(name, str) and is_one_part(name):
             _machine_of(box, name)
@@ -247,5 +247,5 @@ def _statement(payload: bytes) -> Document | None:
         DiagnosisPayload.model_validate_json(payload)
     except ValueError:
         return None
-    told: Document = json.loads(payload)
-    return told
+    statement: Document = json.loads(payload)
+    return statement

@@ -30,7 +30,7 @@ LOOK_S = 1.0
 PATIENCE_S = 2.0
 """After so long without an answer it is shown what the box publishes for all, until there is one."""
 SILENT_S = 10.0
-"""A feed that has said nothing for so long is asked for again; it states each second that it is alive."""
+"""A feed that has sent nothing for so long is asked for again; it states each second that it is alive."""
 NO_WAVEFORMS = (
     "This box sends alarms and diagnoses but no waveforms: add [mqtt.live] to its machine file, and allow "
     "this page to publish below live/ at the broker."

@@ -182,12 +182,12 @@ class BrokerLink:
 
     def _take_answer(self, message: Incoming) -> None:
         try:
-            told = json.loads(message.payload)
-            waiting = self._answers.get(told["id"])
+            answer = json.loads(message.payload)
+            waiting = self._answers.get(answer["id"])
         except (ValueError, LookupError, TypeError, RecursionError):
             return
         if waiting is not None and not waiting.done():
-            waiting.set_result(told)
+            waiting.set_result(answer)
 
     async def hear_diagnoses(self, machine: KnownMachine) -> None:
         """Have the diagnoses of a machine come: they are many, and of few machines somebody looks at them."""
@@ -250,8 +250,8 @@ class BrokerLink:
         try:
             await self.say(topic, json.dumps(payload).encode())
             async with asyncio.timeout(ANSWER_S):
-                told: dict[str, Any] = await answer
-                return told
+                reply: dict[str, Any] = await answer
+                return reply
         except TimeoutError:
             return None
         finally:

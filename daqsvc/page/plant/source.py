@@ -67,16 +67,16 @@ class PlantSource:
         await self._begun("")
         if self._link.why_not:
             raise NotToldError(self._link.why_not)
-        told = []
+        statuses = []
         for box in [*self._known.boxes.values()]:
             about = {"place": f"{box.site}, {box.box}", "away": box.away}
             for machine in [*box.machines.values()]:
                 standing = [one for one in machine.alarms.values() if one["state"] != "normal"]
-                told.append({"machine": machine.name, "alarms": {"standing": standing}, **about})
+                statuses.append({"machine": machine.name, "alarms": {"standing": standing}, **about})
             if not box.machines:
                 away = box.away or "no machine of this box has sent anything yet"
-                told.append({"machine": "", "alarms": {"standing": []}, **about, "away": away})
-        return told
+                statuses.append({"machine": "", "alarms": {"standing": []}, **about, "away": away})
+        return statuses
 
     async def _begun(self, machine: str) -> None:
         """Wait, soon after the start, until the broker has sent something about a machine, or about any."""
@@ -100,16 +100,20 @@ class PlantSource:
         """
         if machine not in self._listenings:
             await self._begun(machine)
-        found = self._known.machine(machine)
-        if found is None:
+        box_and_machine = self._known.machine(machine)
+        if box_and_machine is None:
             raise KeyError(machine)
-        with self._listenings.looking(machine, partial(LeasedListening, self._link, *found)) as listening:
+        with self._listenings.looking(
+            machine, partial(LeasedListening, self._link, *box_and_machine)
+        ) as listening:
             yield listening
 
     async def journal(self, machine: str, alarm: str, most: int) -> list[Document]:
         """See `daqsvc.page.sources.MachineSource.journal`; what the broker keeps, and what came since."""
-        found = self._known.machine(machine)
-        events: list[Document] = [] if found is None else [*map(json.loads, reversed(found[1].events))]
+        box_and_machine = self._known.machine(machine)
+        events: list[Document] = (
+            [] if box_and_machine is None else [*map(json.loads, reversed(box_and_machine[1].events))]
+        )
         events.sort(key=lambda one: -int(one["wall_ns"]))
         return [one for one in events if alarm in {"", one["alarm"]}][:most]
 
@@ -124,10 +128,10 @@ class PlantSource:
 
     async def handle(self, machine: str, command: AlarmCommand, denied: str, via: str) -> CommandOutcome:
         """See `daqsvc.page.sources.MachineSource.handle`: as a command over the broker."""
-        found = self._known.machine(machine)
-        if found is None:
+        box_and_machine = self._known.machine(machine)
+        if box_and_machine is None:
             return _refused(f"there is no {machine!r} here", NO_SUCH_MACHINE)
-        box, known = found
+        box, known = box_and_machine
         asked: Document = {"alarm": command.alarm, "by": command.by, "reason": command.reason}
         if command.duration_s is not None:
             asked["duration_s"] = command.duration_s

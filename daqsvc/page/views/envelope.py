@@ -95,9 +95,9 @@ class EnvelopeSpectrumView:
             at_hz = order * speed_hz
             near = (np.abs(frequency - at_hz) <= max(SLIP * at_hz, 1.5 * frequency[1])) & own
             if at_hz < SHOWN_HZ and near.any():
-                found = np.flatnonzero(near)[swell[near].argmax()]
+                peak = np.flatnonzero(near)[swell[near].argmax()]
                 what = f"{name}, {at_hz:.1f} Hz"
-                rows.append((what, f"{swell[found]:.3f}", f"of the mean, at {frequency[found]:.1f} Hz"))
+                rows.append((what, f"{swell[peak]:.3f}", f"of the mean, at {frequency[peak]:.1f} Hz"))
                 lines["x"].append(at_hz)
                 lines["name"].append(name)
         highest = int(swell[1:].argmax()) + 1
@@ -127,9 +127,9 @@ def envelope_spectrum(values: Any, rate_hz: float) -> tuple[Any, Any]:
 
 def _accelerometers(live: MachineLive) -> list[str]:
     """The accelerometers that are sampled fast enough."""
-    found = []
+    names = []
     for sensor in live.sensors.values():
         places = live.place_of([sensor.name])
         if sensor.kind == "accelerometer" and places and live.rate_hz(places[0].stream) >= LEAST_RATE_HZ:
-            found.append(sensor.name)
-    return found
+            names.append(sensor.name)
+    return names

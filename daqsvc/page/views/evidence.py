@@ -1,4 +1,4 @@
-"""What the innovations of the observers say for and against each mode, over time."""
+"""The evidence of the observers' innovations for and against each mode, over time."""
 
 from __future__ import annotations
 
@@ -66,8 +66,8 @@ class EvidenceView:
                 *((mode, f"@m{number}{{0.0}} nats") for number, mode in enumerate(modes)),
             ],
         )
-        told = source("evidence", ["t", "decision", *(f"m{number}" for number in range(len(modes)))])
-        step_lines(made, told, modes, theme)
+        data = source("evidence", ["t", "decision", *(f"m{number}" for number in range(len(modes)))])
+        step_lines(made, data, modes, theme)
         made.hspan(y="y", source=source("limits", ["y"]), line_color=theme.quiet, line_dash="dashed")
         legend(made, theme)
         return [Figure("evidence", f"Evidence of each mode of {detector} against the declared one", made)]
@@ -78,7 +78,9 @@ class EvidenceView:
         latest = live.latest[detector]
         now_ns = int(latest["monotonic_ns"])
         since_ns = now_ns - float(chosen["length"]) * NS_PER_S
-        wanted = [one for one in [*live.said.get(detector, ())] if one.t_ns >= since_ns and one.evidence]
+        wanted = [
+            one for one in [*live.statements.get(detector, ())] if one.t_ns >= since_ns and one.evidence
+        ]
         columns: dict[str, Any] = {
             "t": np.array([(one.t_ns - now_ns) / NS_PER_S for one in wanted]),
             "decision": [one.decision for one in wanted],
@@ -95,8 +97,8 @@ class EvidenceView:
                     rows.append((words.format(mode), f"{nats:.1f}", "nats"))
         limits = {words: latest["thresholds"].get(name) for name, words in LIMITS.items()}
         rows += [(words, f"{nats:.3g}", "nats") for words, nats in limits.items() if nats is not None]
-        told = [nats for nats in limits.values() if nats is not None]
-        return Shown({"evidence": columns, "limits": {"y": told}}, rows, latest["reason"])
+        levels = [nats for nats in limits.values() if nats is not None]
+        return Shown({"evidence": columns, "limits": {"y": levels}}, rows, latest["reason"])
 
 
 def _modes(statement: Document) -> list[str]:

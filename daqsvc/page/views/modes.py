@@ -59,20 +59,20 @@ class ModesView:
             ],
         )
         columns = ["t", *(f"m{number}" for number in range(len(modes)))]
-        told = source("modes", columns)
-        step_lines(made, told, modes, theme)
+        data = source("modes", columns)
+        step_lines(made, data, modes, theme)
         legend(made, theme)
         return [Figure("modes", f"Probabilities of the modes of {detector} over time", made)]
 
     def shown(self, live: MachineLive, chosen: Mapping[str, str]) -> Shown:
         """See `daqsvc.page.views.view.MachineView.shown`."""
         detector = chosen["detector"]
-        said = [*live.said.get(detector, ())]
+        statements = [*live.statements.get(detector, ())]
         latest = live.latest[detector]
         now_ns = int(latest["monotonic_ns"])
         since_ns = now_ns - float(chosen["length"]) * NS_PER_S
         modes = list(live.probable[detector]["probabilities"])
-        wanted = [one for one in said if one.probabilities]
+        wanted = [one for one in statements if one.probabilities]
         first_ns = min((one.t_ns for one in wanted), default=now_ns)
         if detector not in live.earlier:
             live.earlier[detector] = probabilities_before(live, detector, modes, first_ns)

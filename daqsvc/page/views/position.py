@@ -179,15 +179,15 @@ class PoincareView:
 
 def _means(live: MachineLive, probes: tuple[str, str]) -> tuple[Any, Any]:
     """When, ns ``[n]``, and the means of both probes in their units ``[n, 2]``, as they were sent."""
-    said = [
+    means = [
         [
             (one.t_ns, one.statistics["mean"])
-            for one in [*live.said.get(f"levels/{name}", ())]
+            for one in [*live.statements.get(f"levels/{name}", ())]
             if "mean" in one.statistics
         ]
         for name in probes
     ]
-    first, second = (np.array(one, np.float64).reshape(-1, 2) for one in said)
+    first, second = (np.array(one, np.float64).reshape(-1, 2) for one in means)
     if not len(first) or not len(second):
         return np.empty(0), np.empty((0, 2))
     near = np.searchsorted(second[:, 0], first[:, 0]).clip(0, len(second) - 1)

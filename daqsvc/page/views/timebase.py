@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 LENGTHS = {"1": "1 s", "0.2": "0.2 s", "5": "5 s", "15": "15 s"}
 MOST_POINTS = 2000
-"""Of a line that are sent: more cannot be told apart on a screen."""
+"""Of a line that are sent: a screen cannot show more."""
 
 
 class TimebaseView:

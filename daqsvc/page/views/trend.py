@@ -35,7 +35,7 @@ MINUTES_TO_H = 1.0
 DAYS_FROM_H = 48.0
 """What is longer is shown in days."""
 MOST_POINTS = 1500
-"""Of a line: more cannot be told apart on a screen."""
+"""Of a line: a screen cannot show more."""
 NONE = "no history of this machine is stored yet; that needs [history] in its machine file"
 
 
@@ -82,9 +82,9 @@ class TrendView:
                 ("greatest", "@high"),
             ],
         )
-        told = source("trend", ["t", "low", "mean", "high"])
-        made.varea("t", "low", "high", source=told, fill_color=theme.series[0], fill_alpha=0.25)
-        made.line("t", "mean", source=told, line_color=theme.series[0], legend_label=reading)
+        data = source("trend", ["t", "low", "mean", "high"])
+        made.varea("t", "low", "high", source=data, fill_color=theme.series[0], fill_alpha=0.25)
+        made.line("t", "mean", source=data, line_color=theme.series[0], legend_label=reading)
         for key, limit in _limits(live, reading):
             colour = theme.series[1] if key.startswith("danger") else theme.quiet
             made.line(
