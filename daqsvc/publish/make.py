@@ -105,7 +105,7 @@ def watched(machine: MachineFile, conditions: Iterable[str] = (), *, spared: boo
     Args:
         machine: the machine file.
         conditions: names of what the service may report about itself.
-        spared: whether a detector's plugin that fails is said and left out, and the others are asked.
+        spared: whether a detector's plugin that fails is logged and left out, and the others are asked.
 
     Raises:
         AssemblyError: one fails, and is not spared.
@@ -128,7 +128,7 @@ def watched(machine: MachineFile, conditions: Iterable[str] = (), *, spared: boo
 
 
 def _rests_on(alarm: Alarm) -> Iterator[str]:
-    """The alarms about sensors and detectors without which nobody can say that this one is not raised."""
+    """The alarms about sensors and detectors without which nobody can state that this one is not raised."""
     if isinstance(alarm, DiagnosisAlarm):
         yield f"detector-ok/{alarm.detector}"
     else:
@@ -137,7 +137,7 @@ def _rests_on(alarm: Alarm) -> Iterator[str]:
 
 
 def _asked(machine: MachineFile, hook: str, *, spared: bool) -> Iterator[Any]:
-    """What the plugins of a machine's detectors say at a hook."""
+    """What the plugins of a machine's detectors answer at a hook."""
     for plugin, settings in plugins(machine):
         try:
             yield from getattr(plugin, hook)(machine, settings)

@@ -38,7 +38,7 @@ class Watched:
         services: alarms about sensors, detectors and the service, rather than the machine.
         readings: the figures to show.
         findings: the detectors whose decision is shown.
-        rests_on: by alarm, the alarms about sensors and detectors that say whether it can be judged at all.
+        rests_on: by alarm, the alarms about sensors and detectors that state whether it can be judged.
         buses: names of the buses that it is watched over.
         rates_hz: by the name that a stream has in the status, what its machine file states.
     """
@@ -62,13 +62,13 @@ class EarlierState:
         topic: where it is retained, if it is.
         take: takes its payload.
         is_asked: whether the broker was asked.
-        is_told: whether it has answered.
+        is_answered: whether it has answered.
     """
 
     topic: str
     take: Callable[[bytes], None]
     is_asked: bool = False
-    is_told: bool = False
+    is_answered: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

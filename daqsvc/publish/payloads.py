@@ -254,7 +254,7 @@ def _code(event: AlarmEvent) -> str | None:
 
 
 def alarm_event(payload: bytes) -> AlarmEvent:
-    """The event that an alarm payload reports; what JSON could not say is NaN.
+    """The event that an alarm payload reports; what JSON could not express is NaN.
 
     Raises:
         ValueError: it is no alarm payload of this version, or one that no event of this program has.
@@ -312,13 +312,13 @@ def statement_document(diagnosis: Diagnosis) -> dict[str, Any]:
 
 
 def recorded_statement(document: Mapping[str, Any]) -> Diagnosis:
-    """The diagnosis that `statement_document` has written; what JSON could not say is NaN.
+    """The diagnosis that `statement_document` has written; what JSON could not express is NaN.
 
     Raises:
         ValueError: it has none.
     """
-    told = {key: one for key, one in document.items() if key != "machine"}
-    return _diagnosis(str(document.get("machine")), CausePayload.model_validate_json(json.dumps(told)))
+    statement = {key: one for key, one in document.items() if key != "machine"}
+    return _diagnosis(str(document.get("machine")), CausePayload.model_validate_json(json.dumps(statement)))
 
 
 def diagnosis_payload(identity: Identity, diagnosis: Diagnosis, clock: Clock) -> DiagnosisPayload:

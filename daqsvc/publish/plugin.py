@@ -27,7 +27,7 @@ class OutputPlugin(OutputTable[SettingsT]):
 
     Attributes:
         status_key: where its figures are in the status; empty for nowhere.
-        outdated: by how the names of its conditions begin, what is said of those of an earlier run once the
+        outdated: by how the names of its conditions begin, the message for those of an earlier run once the
             machine file has no such table any more.
     """
 
@@ -35,7 +35,7 @@ class OutputPlugin(OutputTable[SettingsT]):
     outdated: ClassVar[Mapping[str, str]] = MappingProxyType({})
 
     def conditions(self, settings: SettingsT) -> Iterable[str]:
-        """Names of all that `Output.conditions` may say, so that people may act on it before it is said."""
+        """Names of all that `Output.conditions` may report, so that people may prepare for it."""
         del settings
         return ()
 

@@ -69,7 +69,7 @@ class MeasurePayload(JsonPayload):
 
 
 class StatementPayload(JsonPayload):
-    """What a detector has said last."""
+    """The last statement of a detector."""
 
     detector: str = Field(description="name of the detector")
     sensors: tuple[str, ...] = Field(description="names of the sensors that the statement rests on")

@@ -133,7 +133,7 @@ class BrokerLink:
         self._heard_boxes.clear()
         self._new_boxes.set()
         self.why_not = ""
-        if self._outage.is_told:
+        if self._outage.is_reported:
             self._outage.end()
             notice(log, "MQTT broker %s is back", self.name)
 

@@ -1,4 +1,4 @@
-"""Takes in what detectors say, a second at a time, and writes it down every few seconds.
+"""Takes in the statements of detectors, a second at a time, and writes it down every few seconds.
 
 Whatever the disk does, nothing else waits for it: what cannot be written waits in memory, within bounds, and
 what exceeds them is counted.
@@ -74,7 +74,7 @@ class _Second(NamedTuple):
 
 
 class _Figures:
-    """The figures of one detector, and what it has said of them within the present second.
+    """The figures of one detector, and their values within the present second.
 
     Args:
         machine: name of the machine.
@@ -87,7 +87,7 @@ class _Figures:
             for r in readings
         ]
         self._t_s = 0
-        self._said: dict[Series, list[float]] = {}
+        self._by_series: dict[Series, list[float]] = {}
 
     def add(self, diagnosis: Diagnosis, t_s: int) -> list[_Second]:
         """Take in a statement; returns the second before, if that is over."""
@@ -96,19 +96,19 @@ class _Figures:
         for is_probability, key, series in self._known:
             value = (diagnosis.probabilities if is_probability else diagnosis.statistics).get(key)
             if value is not None and math.isfinite(value) and abs(value) < MOST:
-                self._said.setdefault(series, []).append(value)
+                self._by_series.setdefault(series, []).append(value)
         return over
 
     def is_over(self, now_s: float) -> bool:
         """Whether the present second is over by the wall clock, which may have been set back."""
-        return bool(self._said) and abs(now_s - self._t_s) > OVER_S
+        return bool(self._by_series) and abs(now_s - self._t_s) > OVER_S
 
     def finish(self) -> list[_Second]:
-        """What was said within the present second, which is over."""
-        said, self._said = self._said, {}
+        """The values of the present second, which is over."""
+        by_series, self._by_series = self._by_series, {}
         return [
             _Second(series, self._t_s, len(values), min(values), math.fsum(values) / len(values), max(values))
-            for series, values in said.items()
+            for series, values in by_series.items()
         ]
 
 

@@ -123,7 +123,7 @@ class Discovery:
         removals: dict[str, dict[str, str]] = {}
         for name, entity in entities.items():
             platform = entity.get("platform") if isinstance(entity, dict) else None
-            # Whoever may write there may have retained anything: only what a box can have said is repeated.
+            # Whoever may write there may have retained anything: only what a box can have sent is repeated.
             if name in now or not (isinstance(platform, str) and _PLATFORM.fullmatch(platform)):
                 continue
             if _ENTITY.fullmatch(name) and len(removals) < MOST_REMOVED:

@@ -1,4 +1,4 @@
-"""Keeps Home Assistant told: at every connection, at its birth, and when an alarm has changed."""
+"""Keeps Home Assistant up to date: at every connection, at its birth, and when an alarm has changed."""
 
 from __future__ import annotations
 

@@ -105,12 +105,12 @@ class Readings:
             shown.latest = diagnosis
 
     def forget(self) -> None:
-        """Nothing counts as told any more: there is a new connection, or Home Assistant has started again."""
+        """Nothing counts as published: there is a new connection, or Home Assistant has started again."""
         for shown in self._shown.values():
             shown.published_ns = None
 
     def due(self) -> list[tuple[str, bytes]]:
-        """Topics and payloads to send now; they count as told."""
+        """Topics and payloads to send now; they count as published."""
         messages = []
         for detector, shown in self._shown.items():
             if shown.latest is not None and self._is_due(shown):

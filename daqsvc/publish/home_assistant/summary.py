@@ -54,10 +54,10 @@ class Summary:
 
     Args:
         machine: name of the machine.
-        alarms: those that are normal until something else is said.
+        alarms: those that are normal until something else is reported.
         topics: the box.
         rests_on: by alarm, the alarms about sensors and detectors; while one of them is active, nobody can
-            say that there is no problem.
+            state that there is no problem.
     """
 
     def __init__(

@@ -85,7 +85,7 @@ class LiveLink(MqttLink):
             return True  # one of long ago, or a flood
         try:
             if len(message.payload) > MOST_BYTES:
-                raise ValueError(f"it has more than {MOST_BYTES} bytes")  # noqa: TRY301 - told as others are
+                raise ValueError(f"it has more than {MOST_BYTES} bytes")  # noqa: TRY301 - reported as others are
             request = LiveRequestPayload.read(message.payload)
         except (ValueError, RecursionError) as error:
             fault = faults_of(error, "payload")[0] if isinstance(error, ValidationError) else f"{error}"

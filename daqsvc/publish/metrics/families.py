@@ -111,17 +111,17 @@ def service_metrics(machine: str, figures: Figures, oldest_age_s: float | None) 
 
 
 def reading_metrics(
-    machine: str, readings: Sequence[Reading], said: Mapping[str, tuple[Diagnosis, float] | None]
+    machine: str, readings: Sequence[Reading], statements: Mapping[str, tuple[Diagnosis, float] | None]
 ) -> Iterator[Metric]:
-    """The metrics of what detectors have said last.
+    """The metrics of the last statements of detectors.
 
     Args:
         machine: name of the machine.
         readings: the figures that are metrics.
-        said: by detector, its last statement, and when, s since the Unix epoch; None before the first one.
+        statements: by detector the last one, and when, s since the Unix epoch; None before the first one.
     """
     make = _Maker(machine)
-    spoken = {name: pair for name, pair in said.items() if pair is not None}
+    spoken = {name: pair for name, pair in statements.items() if pair is not None}
     words = "Whether the last statement of the detector rests on good samples of sensors that are OK."
     good = {(name,): float(statement.quality == "good") for name, (statement, _) in spoken.items()}
     yield make.gauge("detector_good", words, good, "detector")

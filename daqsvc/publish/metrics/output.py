@@ -67,7 +67,7 @@ class MetricsOutput(Output, Collector):
         self._figures: Mapping[str, Any] | None = None
         self._oldest_age_s: float | None = None
         # All there will ever be: the threads that read it never see it grow.
-        self._said: dict[str, dict[str, tuple[Diagnosis, float] | None]] = {
+        self._statements: dict[str, dict[str, tuple[Diagnosis, float] | None]] = {
             name: dict.fromkeys(sorted({*(r.detector for r in watched.readings), *watched.findings}))
             for name, watched in port.machines.items()
         }
@@ -107,9 +107,9 @@ class MetricsOutput(Output, Collector):
 
     def report(self, diagnosis: Diagnosis) -> None:
         """See `Output.report`."""
-        said = self._said[diagnosis.machine]
-        if diagnosis.detector in said:
-            said[diagnosis.detector] = (diagnosis, time.time())
+        statements = self._statements[diagnosis.machine]
+        if diagnosis.detector in statements:
+            statements[diagnosis.detector] = (diagnosis, time.time())
 
     def status(self, figures: Mapping[str, Any]) -> None:
         """See `Output.status`."""
@@ -130,7 +130,7 @@ class MetricsOutput(Output, Collector):
         yield from merged(
             metric
             for name, watched in machines
-            for metric in reading_metrics(name, watched.readings, self._said[name])
+            for metric in reading_metrics(name, watched.readings, self._statements[name])
         )
         yield health_metric(self._own, is_healthy=not self.unhealthy())
 

@@ -61,7 +61,7 @@ class MetricsServer(ThreadingHTTPServer):
             self.address_family = socket.AF_INET6
         self._until_s: dict[socket.socket, float] = {}
         self._lock = threading.Lock()
-        self._said = SaidOnce()
+        self._logged = SaidOnce()
         self._ended = False
         super().__init__((address.host, address.port), _handler(registry, unhealthy))
 
@@ -111,7 +111,7 @@ class MetricsServer(ThreadingHTTPServer):
         error = sys.exc_info()[1]
         if isinstance(error, OSError) or error is None:
             return
-        if self._said.may_say(f"{error!r}"):
+        if self._logged.may_say(f"{error!r}"):
             log.error(
                 "metrics: a request has failed: %r; the others are answered",
                 error,

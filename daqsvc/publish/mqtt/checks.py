@@ -1,4 +1,4 @@
-"""What can be said of ``[mqtt]`` before anybody connects."""
+"""What can be checked of ``[mqtt]`` before anybody connects."""
 
 from __future__ import annotations
 

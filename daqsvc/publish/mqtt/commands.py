@@ -410,5 +410,5 @@ def _id_of(asked: bytes) -> str | None:
     identifier = message.get("id") if isinstance(message, dict) else None
     if not isinstance(identifier, str):
         return None
-    # JSON can say what no UTF-8 can: halves of surrogate pairs.
+    # JSON can express what no UTF-8 can: halves of surrogate pairs.
     return re.sub(r"[\ud800-\udfff]", "?", identifier[:_SHOWN_ID])

@@ -1,4 +1,4 @@
-"""What there is to say of the broker: certificates that end, and messages that it will not take."""
+"""What there is to report of the broker: certificates that end, and messages that it will not take."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class BrokerVitals:
 class BrokerCheck:
     """Remembers which certificates are about to end, and states the present state with the broker.
 
-    What is not known yet is not said to be normal: an alarm that was active before a restart would return,
+    What is not known yet is not reported as normal: an alarm that was active before a restart would return,
     and come again.
     """
 

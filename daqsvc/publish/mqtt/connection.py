@@ -214,11 +214,11 @@ class Connection:
         self._client.on_connect = lambda _client, _data, _flags, code, properties: self._answered(
             code, properties
         )
-        self._client.on_disconnect = lambda _client, _data, _flags, code, _told: self._disconnected(code)
+        self._client.on_disconnect = lambda _client, _data, _flags, code, _: self._disconnected(code)
         self._client.on_message = lambda _client, _data, message: self._arrived(message)
-        self._client.on_publish = lambda _client, _data, mid, code, _told: self._acknowledged(mid, code)
-        self._client.on_subscribe = lambda _client, _data, mid, codes, _told: self._granted(mid, codes)
-        self._client.on_unsubscribe = lambda _client, _data, mid, codes, _told: self._granted(mid, codes)
+        self._client.on_publish = lambda _client, _data, mid, code, _: self._acknowledged(mid, code)
+        self._client.on_subscribe = lambda _client, _data, mid, codes, _: self._granted(mid, codes)
+        self._client.on_unsubscribe = lambda _client, _data, mid, codes, _: self._granted(mid, codes)
         self._client.on_socket_register_write = lambda *_: self._write_later()
         self._client.on_socket_close = lambda *_: self._detach()
 
@@ -278,7 +278,9 @@ class Connection:
                 raise self._loss()
             self._check(topic, len(payload) + len(correlation or b""))
             try:
-                info = self._client.publish(topic, payload, 1, retain, self._told(expiry_s, correlation))
+                info = self._client.publish(
+                    topic, payload, 1, retain, self._properties_of(expiry_s, correlation)
+                )
             except ValueError as error:
                 raise PublishRefusedError(f"nothing can be sent on {topic[:200]!r}: {error}") from error
             if info.rc != 0:
@@ -657,8 +659,8 @@ class Connection:
             raise self._loss()
         return granted.result()
 
-    def _told(self, expiry_s: float | None, correlation: bytes | None) -> Properties | None:
-        """What MQTT 5 can say about a message."""
+    def _properties_of(self, expiry_s: float | None, correlation: bytes | None) -> Properties | None:
+        """The MQTT 5 properties of a message."""
         if not self.is_mqtt5 or (expiry_s is None and correlation is None):
             return None
         statements: dict[str, Any] = {}

@@ -231,7 +231,7 @@ def _password(settings: Mqtt) -> str | None:
 
 
 def _check_regular(path: Path) -> None:
-    """Refuse what might never end, such as a pipe; what is not there is said by whoever reads it."""
+    """Refuse what might never end, such as a pipe; what is not there is reported by whoever reads it."""
     try:
         mode = path.stat().st_mode
     except OSError:
@@ -251,7 +251,7 @@ def _secrets(settings: Mqtt) -> list[Path]:
     """The files of password and key, as far as there are any."""
     secrets = []
     for wanted in (_password_file, _key_file) if settings.tls else (_password_file,):
-        with contextlib.suppress(FileNotFoundError):  # said when it is read
+        with contextlib.suppress(FileNotFoundError):  # reported when it is read
             path = wanted(settings)
             if path is not None:
                 secrets.append(path)

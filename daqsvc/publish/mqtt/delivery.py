@@ -240,7 +240,7 @@ class TelemetryDelivery:
         self._stopping = stopping
         self._on_sent = on_sent
         self._on_refused = on_refused
-        self._said_refused = False
+        self._has_logged_refusal = False
 
     async def run(self) -> None:
         """Deliver until `stopping` is set and nothing is left.
@@ -281,8 +281,8 @@ class TelemetryDelivery:
                 await self._connection.deliver(message.topic, message.payload, retain=False, expiry_s=left_s)
             except PublishRefusedError as error:
                 self._on_refused()
-                if not self._said_refused:
-                    self._said_refused = True
+                if not self._has_logged_refusal:
+                    self._has_logged_refusal = True
                     log.warning(
                         "telemetry on %s is dropped and counted: %s",
                         message.topic,

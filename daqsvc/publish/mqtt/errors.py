@@ -1,4 +1,4 @@
-"""What goes wrong between the box and a broker: its names, its words for a person, each said once."""
+"""What goes wrong between the box and a broker: its names, its words for a person, each logged once."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ _CODES = {
 """Reason codes of MQTT 5 (2.4) that have better words than their name; paho makes them of those of 3.1.1."""
 
 MOST_CAUSES: Final = 32
-"""Causes that are remembered as said; after these nothing more is said, only counted."""
+"""Causes that are remembered as logged; after these nothing more is logged, only counted."""
 
 
 class MqttError(Exception):
@@ -75,7 +75,7 @@ class MqttCodeError(MqttError):
 
 
 class NoConsentError(MqttError):
-    """The broker was reached, but did not say whether it accepts the connection."""
+    """The broker was reached, but did not answer whether it accepts the connection."""
 
 
 class PublishRefusedError(MqttError):
@@ -91,23 +91,23 @@ class TakenOverError(MqttError):
 
 
 class Outage:
-    """What has been said of a broker that is away.
+    """What has been logged of a broker that is away.
 
     Args:
-        log: where it is said.
+        log: where it is reported.
     """
 
     def __init__(self, log: logging.Logger) -> None:
         self._log = log
-        self._told: list[tuple[str, str]] = []
+        self._reported: list[tuple[str, str]] = []
 
     @property
-    def is_told(self) -> bool:
-        """Whether it has been said that the broker is away."""
-        return bool(self._told)
+    def is_reported(self) -> bool:
+        """Whether it has been logged that the broker is away."""
+        return bool(self._reported)
 
     def tell(self, broker: str, error: Exception, until: str) -> None:
-        """Say why a broker is away, unless that has been said.
+        """Log why a broker is away, unless that has been logged.
 
         Args:
             broker: which one, e.g. ``"MQTT broker 10.0.0.1:8883"``.
@@ -115,28 +115,28 @@ class Outage:
             until: what is going on about it.
         """
         reason = in_words(error)
-        still = "still " if any(sentence == broker for sentence, _ in self._told) else ""
+        still = "still " if any(sentence == broker for sentence, _ in self._reported) else ""
         if self.note(broker, reason):
             self._log.warning(
                 "%s is %saway: %s; %s", broker, still, reason, until, extra=coded(kind_of(error))
             )
 
     def tell_lost(self, broker: str, error: Exception) -> None:
-        """Say why a connection has ended, unless that has been said; the broker may be there all the same."""
+        """Log why a connection has ended, once; the broker may be there all the same."""
         reason = in_words(error)
         if self.note(broker, reason):
             self._log.warning("%s: %s; connecting again", broker, reason, extra=coded(kind_of(error)))
 
     def note(self, broker: str, reason: str) -> bool:
-        """Take a reason as told; whether it is a new one that may be said."""
-        if (broker, reason) in self._told or len(self._told) >= MOST_REASONS:
+        """Take a reason as reported; whether it is a new one that may be logged."""
+        if (broker, reason) in self._reported or len(self._reported) >= MOST_REASONS:
             return False
-        self._told.append((broker, reason))
+        self._reported.append((broker, reason))
         return True
 
     def end(self) -> None:
         """The broker is there: what comes next is another outage."""
-        self._told.clear()
+        self._reported.clear()
 
 
 def has_expired(error: Exception) -> bool:
@@ -205,10 +205,10 @@ class Faults:
 
     def __init__(self) -> None:
         self.count = 0
-        self._said: set[tuple[str, str]] = set()
+        self._logged: set[tuple[str, str]] = set()
 
     def note(self, what: str, error: Exception) -> None:
-        """Count an error, and say each cause once, in one line that names where it came from.
+        """Count an error, and log each cause once, in one line that names where it came from.
 
         Args:
             what: what could not be done, and what follows.
@@ -218,9 +218,9 @@ class Faults:
         frames = traceback.extract_tb(error.__traceback__)
         where = f"{frames[-1].filename.rpartition('/')[2]}:{frames[-1].lineno}" if frames else "?"
         cause = (what, f"{type(error).__name__} at {where}")
-        if cause in self._said or len(self._said) >= MOST_CAUSES:
+        if cause in self._logged or len(self._logged) >= MOST_CAUSES:
             return
-        self._said.add(cause)
+        self._logged.add(cause)
         log.error(
             "%s: %s (%.200s); please report this",
             what,

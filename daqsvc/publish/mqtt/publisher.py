@@ -248,7 +248,7 @@ class MqttPublisher(Output):
             connection.abandon()
 
     async def stop(self, deadline_s: float = 1.0) -> None:
-        """Hand over what is left, say that the box goes offline, and end `run`.
+        """Hand over what is left, report that the box goes offline, and end `run`.
 
         Without a connection this takes no time; otherwise at most ``deadline_s``. What the broker has
         not acknowledged by then stays in the outbox.
@@ -297,8 +297,8 @@ class MqttPublisher(Output):
         if self._quick_losses >= SUSPICIOUS_LOSSES or self._suspects.careful:
             log.info(
                 "connected to MQTT broker %s once more", self._name
-            )  # it has been said that this goes on
-        elif self._outage.is_told:
+            )  # it has been logged that this goes on
+        elif self._outage.is_reported:
             self._outage.end()
             notice(log, "MQTT broker %s is back", self._name)
         else:
@@ -448,7 +448,7 @@ class MqttPublisher(Output):
         """A connection has been of use for a while."""
         self._suspects.settled()
         self._has_ever_lasted = True
-        if self._outage.is_told:  # `_connected` did not believe that it would last
+        if self._outage.is_reported:  # `_connected` did not believe that it would last
             self._outage.end()
             notice(log, "MQTT broker %s is back", self._name)
         connection.widen(IN_FLIGHT)

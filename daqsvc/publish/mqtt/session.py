@@ -39,7 +39,7 @@ LOOK_AGAIN_S = 86_400.0
 soon."""
 
 EARLIER_S = 3.0
-"""How long delivery waits for the broker to say what it has kept of an earlier run."""
+"""How long delivery waits for the broker to send what it has kept of an earlier run."""
 
 MOST_LASTING = 64
 """Commands of which the answer takes a while, at a time."""
@@ -149,7 +149,7 @@ class Session:
         self._ends_soon = ends_soon
         self._stopping = stopping
         self._earlier = earlier
-        self._said_refused: set[str] = set()
+        self._refusals_logged: set[str] = set()
         self._lasting: set[asyncio.Task[None]] = set()
         """Answers to commands that take a while."""
 
@@ -252,8 +252,8 @@ class Session:
 
     def _refused(self, topic: str, reason: str) -> None:
         self._counters.refused += 1
-        if topic not in self._said_refused:
-            self._said_refused.add(topic)
+        if topic not in self._refusals_logged:
+            self._refusals_logged.add(topic)
             log.error(
                 "MQTT broker %s:%d refuses an alarm message on %s: %s; it is kept on disk and tried again "
                 "now and then, and all others go on",
@@ -284,7 +284,7 @@ class Session:
         await delivery.run()
 
     async def _listen(self) -> None:
-        """Take what the broker sends: commands, and what others say to the links."""
+        """Take what the broker sends: commands, and what others send to the links."""
         if self._intake is not None and await self._connection.watch(self._topics.commands, fresh_only=True):
             log.warning(
                 "MQTT broker %s:%d does not let this client listen to %s: no commands come over it",
@@ -308,8 +308,8 @@ class Session:
         if any(link.take(message) for link in self._links):
             return
         if self._earlier is not None and message.topic == self._earlier.topic:
-            if message.retain and not self._earlier.is_told:
-                self._earlier.is_told = True
+            if message.retain and not self._earlier.is_answered:
+                self._earlier.is_answered = True
                 self._earlier.take(message.payload)
             return
         if self._topics.command_of(message.topic) is None or self._intake is None:

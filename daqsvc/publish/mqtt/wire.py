@@ -125,7 +125,7 @@ class Wire:
             return
         except OSError as error:
             self._failure = error
-            with contextlib.suppress(OSError):  # perhaps the broker has said why it ends the connection
+            with contextlib.suppress(OSError):  # perhaps the broker has sent why it ends the connection
                 self._read, self._at = self._read[self._at :] + self._inner.recv(_READ_BYTES), 0
             raise
 

@@ -31,7 +31,7 @@ MOST_LINES = 20
 """Of what one page's process states that go into the log."""
 LONGEST_LINE = 500
 END_S = 0.2
-"""How long it is waited for when the service does not say how long it may take; then it is killed."""
+"""How long it is waited for when the service does not state how long it may take; then it is killed."""
 
 
 class PageOutput(Output):
@@ -57,7 +57,7 @@ class PageOutput(Output):
         self._starts = 0
         self._is_up = False
         self._process: asyncio.subprocess.Process | None = None
-        self._said_before: frozenset[str] = frozenset()
+        self._logged_before: frozenset[str] = frozenset()
         self._stopping = asyncio.Event()
         self._end_s = END_S
         self._ended = asyncio.Event()
@@ -85,7 +85,7 @@ class PageOutput(Output):
         return {"up": int(self._is_up), "starts": self._starts}
 
     async def _keep_going(self) -> None:
-        backoff, said = Backoff(), ""
+        backoff, logged = Backoff(), ""
         loop = asyncio.get_running_loop()
         while True:
             begun_s = loop.time()
@@ -96,14 +96,14 @@ class PageOutput(Output):
             if self._stopping.is_set():
                 return
             self.reason, self.code = why, PAGE_ENDED
-            if why != said:
+            if why != logged:
                 log.warning(
                     "the page at %s has ended, and is started again: %s",
                     self._listen,
                     why,
                     extra=coded(PAGE_ENDED),
                 )
-                said = why
+                logged = why
             if loop.time() - begun_s > WELL_S:
                 backoff.reset()
             with contextlib.suppress(TimeoutError):
@@ -151,7 +151,7 @@ class PageOutput(Output):
                 log.info("%s", line)
 
     async def _log_what_it_says(self, stderr: asyncio.StreamReader, last: deque[str]) -> None:
-        """Log it, but for why it ends, which is logged once, and what a start that failed has said before."""
+        """Log it, but for why it ends, which is logged once, and what a failed start has logged before."""
         lines: list[str] = []
         async for line in _lines(stderr):
             level, text = _of_log(line)
@@ -159,11 +159,11 @@ class PageOutput(Output):
             last.append(why)
             if why == text and len(lines) < MOST_LINES:
                 lines.append(text)
-                if text not in self._said_before:
+                if text not in self._logged_before:
                     log.log(
                         level, "page: %s", text, extra=coded(PAGE_SAYS if level >= logging.WARNING else None)
                     )
-        self._said_before = frozenset() if self._is_up else frozenset(lines)
+        self._logged_before = frozenset() if self._is_up else frozenset(lines)
 
 
 _LOG_LINE = re.compile(r"(?:[-0-9]{10} [:,0-9]{8,12} )?(?P<level>[A-Z]+) (?P<text>.*)")
@@ -172,11 +172,11 @@ _LOG_LINE = re.compile(r"(?:[-0-9]{10} [:,0-9]{8,12} )?(?P<level>[A-Z]+) (?P<tex
 
 def _of_log(line: str) -> tuple[int, str]:
     """The level and the message of a line of its log; of any other a warning, and all of it."""
-    found = _LOG_LINE.fullmatch(line)
-    level = None if found is None else logging.getLevelNamesMapping().get(found["level"])
-    if found is None or level is None:
+    match = _LOG_LINE.fullmatch(line)
+    level = None if match is None else logging.getLevelNamesMapping().get(match["level"])
+    if match is None or level is None:
         return logging.WARNING, line
-    return level, found["text"]
+    return level, match["text"]
 
 
 async def _lines(stream: asyncio.StreamReader) -> AsyncIterator[str]:

@@ -56,18 +56,18 @@ def _who(settings: Page) -> str:
 
 def _arguments(machine: MachineFile, settings: Page) -> list[str]:
     """The arguments of `daqsvc page`."""
-    told = [f"--listen={settings.listen}"]
+    arguments = [f"--listen={settings.listen}"]
     files = {
         "certificate": settings.certificate_file,
         "private-key": settings.private_key_file,
         "accounts": settings.accounts_file,
     }
-    told += [f"--{name}={machine.resolve(file)}" for name, file in files.items() if file is not None]
+    arguments += [f"--{name}={machine.resolve(file)}" for name, file in files.items() if file is not None]
     if settings.user_header is not None:
-        told.append(f"--user-header={settings.user_header}")
+        arguments.append(f"--user-header={settings.user_header}")
     lists = {"host-name": settings.host_names, "proxy": settings.proxies, "operator": settings.operators}
-    told += [f"--{name}={one}" for name, ones in lists.items() for one in ones]
-    return told
+    arguments += [f"--{name}={one}" for name, ones in lists.items() for one in ones]
+    return arguments
 
 
 def _pairs(settings: Page) -> Iterator[Finding]:

@@ -32,7 +32,7 @@ WRITABLE = {Verb.ACKNOWLEDGE: "Acknowledge", Verb.RESET: "Reset"}
 """The verbs that need nothing but the alarm, and their metrics."""
 
 BY = "Sparkplug host"
-"""Who asks: Sparkplug does not say which host it was."""
+"""Who asks: Sparkplug does not state which host it was."""
 
 MOST_AT_A_TIME = 64
 """Metrics in one message, and commands that wait, at most."""
@@ -45,7 +45,7 @@ class HostCommand(NamedTuple):
         topic: the Sparkplug topic it came on.
         verb: what is asked.
         alarm: of which alarm.
-        sent_ms: when, UTC, ms since 1970; None if the host does not say.
+        sent_ms: when, UTC, ms since 1970; None if the host does not state it.
     """
 
     topic: str

@@ -215,7 +215,7 @@ def _value(message: messages.Metric | messages.PropertyValue) -> Value:
 
 
 def _signed(value: Value, datatype: DataType | None) -> Value:
-    """An integer with its sign: the fields are unsigned, the datatype may say otherwise."""
+    """An integer with its sign: the fields are unsigned, the datatype may state otherwise."""
     if datatype is DataType.INT32 and isinstance(value, int):
         value &= _U32
         return value - 2**32 if value >= 2**31 else value

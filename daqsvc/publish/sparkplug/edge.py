@@ -217,7 +217,7 @@ class SparkplugEdge(Output):
             raise
         self.counters.connections += 1
         self.counters.connected = True
-        if self._outage.is_told:
+        if self._outage.is_reported:
             notice(log, "Sparkplug is connected to broker %s:%d", server.host, server.port)
         self._outage.end()
         session = EdgeSession(

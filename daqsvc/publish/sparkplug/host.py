@@ -22,7 +22,7 @@ _WORDS = {b"ONLINE": True, b"OFFLINE": False}
 
 @dataclass(slots=True)
 class PrimaryHost:
-    """What the STATE messages of one host at one broker say.
+    """What the STATE messages of one host at one broker state.
 
     Attributes:
         host_id: id of the host application.
@@ -80,16 +80,16 @@ class HostReports:
     """What the log shows about the primary host over all sessions: that it is missing, or there."""
 
     def __init__(self) -> None:
-        self._said: set[str] = set()
+        self._reported: set[str] = set()
 
     def missing(self, sentence: str) -> None:
-        """Say that the host is missing, each sentence once until it is there."""
-        if sentence not in self._said:
-            self._said.add(sentence)
+        """Log that the host is missing, each sentence once until it is there."""
+        if sentence not in self._reported:
+            self._reported.add(sentence)
             log.warning("%s", sentence, extra=coded(HOST_MISSING))
 
     def there(self, host_id: str) -> None:
-        """Say that the host is there, if it was said to be missing."""
-        if self._said:
-            self._said.clear()
+        """Log that the host is there, if it was logged as missing."""
+        if self._reported:
+            self._reported.clear()
             notice(log, "Sparkplug: primary host %s is online; births, alarms and figures go out", host_id)

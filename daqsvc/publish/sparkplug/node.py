@@ -25,7 +25,7 @@ _FORBIDDEN = re.compile(r"[+/#]")
 
 
 class OrderError(RuntimeError):
-    """Something was to be said before its birth, or a metric that no birth has named."""
+    """Something was to be sent before its birth, or a metric that no birth has named."""
 
 
 class Publication(NamedTuple):
@@ -89,7 +89,7 @@ class EdgeNode:
         return device in self._born
 
     def will(self, bd_seq: int, sent_ms: int) -> Publication:
-        """The death certificate of the session to come: the last will, and what is said before leaving.
+        """The death certificate of the session to come: the last will, and what is sent before leaving.
 
         Args:
             bd_seq: number of the session, 0 to 255.

@@ -41,8 +41,8 @@ HOST_S = 5.0
 """How long a broker's word about the primary host is waited for where there are other brokers."""
 
 
-HOST_SAID_S = 30.0
-"""After so long it is said that the primary host has not come, and which hosts there are."""
+HOST_REPORT_S = 30.0
+"""After so long it is logged that the primary host has not come, and which hosts there are."""
 
 LOOK_S = 1.0
 """How long the broker may take to tell which hosts there are."""
@@ -70,7 +70,7 @@ class SparkplugCounters:
         commands_refused: commands that ask for what cannot be had, or were refused.
         states_refused: STATE messages of the host that cannot be read, or are older than one before.
         unreadable: messages of the outbox that are no alarm of this version.
-        waiting_for_host: whether it has waited for the primary host for longer than `HOST_SAID_S`.
+        waiting_for_host: whether it has waited for the primary host for longer than 30 s.
     """
 
     connected: bool = False
@@ -87,7 +87,7 @@ class SparkplugCounters:
 
 
 class EdgeSession:
-    """What is said and heard over one connection.
+    """What is sent and received over one connection.
 
     One task does all the talking, so that sequence numbers follow each other on the wire.
 
@@ -102,7 +102,7 @@ class EdgeSession:
         port: the alarms, and the machines.
         memory: where to go on in the outbox.
         counters: what is counted here.
-        reports: what is said of the primary host; goes on over sessions.
+        reports: what is logged of the primary host; goes on over sessions.
         commands: by machine, what takes what hosts write to its alarms; empty if they may not.
     """
 
@@ -139,7 +139,7 @@ class EdgeSession:
         self._commands = commands
         self._wishes: asyncio.Queue[tuple[AlarmCommands, HostCommand]] = asyncio.Queue(MOST_AT_A_TIME)
         self._ungranted: list[str] = []
-        self._told: dict[str, dict[str, Any]] = {}
+        self._sent: dict[str, dict[str, Any]] = {}
         """By device, what it has sent."""
         self._there: Mapping[str, bool] = dict.fromkeys(devices, True)
         self.was_born = False
@@ -222,9 +222,9 @@ class EdgeSession:
         """
         assert self._host is not None  # noqa: S101 - asked for only with a host
         loop = asyncio.get_running_loop()
-        said_at_s = loop.time() + HOST_SAID_S
+        report_at_s = loop.time() + HOST_REPORT_S
         while not self._host.online and not stopped.done():
-            alone_s = None if self._counters.waiting_for_host else max(said_at_s - loop.time(), 0.0)
+            alone_s = None if self._counters.waiting_for_host else max(report_at_s - loop.time(), 0.0)
             patience_s = alone_s if self._alone else HOST_S
             message = await self._first(heard.get(), listening, stopped, patience_s)
             if message is not None:
@@ -244,7 +244,7 @@ class EdgeSession:
         listening: asyncio.Task[None],
         stopped: asyncio.Task[Any],
     ) -> None:
-        """Say that the primary host has not come, what it has said, and which hosts there are instead."""
+        """Log that the primary host has not come, its last state, and which hosts there are instead."""
         assert self._host is not None  # noqa: S101 - asked for only with a host
         wanted = self._host.topics
         everybody = [f"{begin}+" for begin in STATES]
@@ -313,7 +313,7 @@ class EdgeSession:
             for machine, device in self._devices.items()
             if self._there[machine]
         }
-        self._told = {device: _values(metrics) for device, metrics in devices.items()}
+        self._sent = {device: _values(metrics) for device, metrics in devices.items()}
         for publication in self._node.births(self._bd_seq, self._now_ms, node, devices):
             self._publish(publication)
         self._counters.births += 1
@@ -322,7 +322,7 @@ class EdgeSession:
     async def _tell_history(self, newest: int) -> None:
         """Tell, as history, the alarm events up to ``newest`` that no broker has taken yet.
 
-        The births told the latest of each alarm only.
+        The births reported the latest of each alarm only.
         """
         while self._cursor < newest:
             messages = await self._outbox.following(self._cursor, READ_AHEAD)
@@ -395,14 +395,14 @@ class EdgeSession:
             if self._node.lives(device):
                 self._publish(self._node.device_death(device, self._now_ms))
             return
-        present, told = self._board.of(device, self._now_ms), self._told.get(device, {})
-        changed = [m for m in present if m.name not in told or told[m.name] != m.value]
+        present, sent = self._board.of(device, self._now_ms), self._sent.get(device, {})
+        changed = [m for m in present if m.name not in sent or sent[m.name] != m.value]
         if not self._node.lives(device) or not self._node.knows(device, changed):
             self._publish(self._node.device_birth(device, self._now_ms, present))
         elif changed:
             self._publish(self._node.data(device, self._now_ms, changed))
             self._counters.data += 1
-        self._told[device] = _values(present)
+        self._sent[device] = _values(present)
 
     def _hear(self, message: Incoming) -> bool:
         """Take in what a host states; whether it asks for new births."""

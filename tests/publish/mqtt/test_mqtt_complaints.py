@@ -160,9 +160,9 @@ async def test_the_last_word_of_a_broker_that_flapped_is_that_it_is_back(
             await eventually(lambda: publisher.counters.connected, "connected")
             if connections <= SUSPICIOUS_LOSSES:
                 wire.cut()
-        assert publisher._outage.is_told
+        assert publisher._outage.is_reported
         assert "because of another client" in caplog.text
-        await eventually(lambda: not publisher._outage.is_told, "it has lasted")
+        await eventually(lambda: not publisher._outage.is_reported, "it has lasted")
         assert caplog.messages[-1] == f"MQTT broker 127.0.0.1:{wire.port} is back"
         caplog.clear()
         wire.cut()

@@ -138,7 +138,7 @@ async def test_a_host_of_sparkplug_2_2_is_waited_for_and_followed(mosquitto, out
 async def test_a_host_that_never_comes_is_said_with_those_that_are_there(
     mosquitto, outbox, tmp_path, monkeypatch, caplog
 ) -> None:
-    monkeypatch.setattr(session, "HOST_SAID_S", 0.3)
+    monkeypatch.setattr(session, "HOST_REPORT_S", 0.3)
     monkeypatch.setattr(session, "LOOK_S", 0.3)
     async with Host(mosquitto.port, "scada-1") as host, Host(mosquitto.port, "old") as old:
         host.say_state(online=True, timestamp=1000)
