@@ -31,7 +31,7 @@ MOST_EVENTS = 500
 """Events of one alarm that are looked through for how it began."""
 
 _FINDINGS = {"raised", "escalated", "lowered", "changed", "recurred", "latched", "returned"}
-"""Events that say what was found, rather than what somebody did about it."""
+"""Events that state a finding, rather than what somebody did about it."""
 
 
 class AlarmView(NamedTuple):

@@ -76,9 +76,9 @@ def meant(store: Path, words: Sequence[str], verb: Verb, machine: str | None) ->
     """
     events = current(store)
     targets: list[Target] = []
-    for found in (one for word in words for one in _of_word(events, word, verb, machine)):
-        if not any(one.alarm == found.alarm and one.is_of(found.machine) for one in targets):
-            targets.append(found)
+    for target in (one for word in words for one in _of_word(events, word, verb, machine)):
+        if not any(one.alarm == target.alarm and one.is_of(target.machine) for one in targets):
+            targets.append(target)
     return targets
 
 
@@ -89,13 +89,13 @@ def _of_word(
         yield from _of_pattern(events, word, verb, machine)
     elif any(event["alarm"] == word for event in events):
         yield Target(word, machine=machine)
-    elif found := _begun_by(events, word):
-        if len(found) > 1:
+    elif matches := _begun_by(events, word):
+        if len(matches) > 1:
             raise NoSuchAlarmError(
-                f"{word!r} begins the ids of {', '.join(event['alarm'] for event in found)}: "
+                f"{word!r} begins the ids of {', '.join(event['alarm'] for event in matches)}: "
                 "write more of the id, or the alarm's name"
             )
-        yield Target(found[0]["alarm"], found[0]["occurrence"], machine or found[0]["machine"])
+        yield Target(matches[0]["alarm"], matches[0]["occurrence"], machine or matches[0]["machine"])
     else:
         # An alarm that was never raised has no event yet: the service knows whether there is one.
         yield Target(word, machine=machine)
@@ -106,12 +106,12 @@ def _of_pattern(
 ) -> Iterator[Target]:
     """Alarms that are not normal. Of these only what a person has seen is meant: the occurrence of now."""
     there = [one for one in events if one["state"] != "normal" and machine in {None, one["machine"]}]
-    found = [
+    matches = [
         Target(one["alarm"], one["occurrence"], one["machine"])
         for one in there
         if fnmatchcase(one["alarm"], pattern) and one["state"] in _OF_PATTERN[verb]
     ]
-    if not found:
+    if not matches:
         names = [f"{one['alarm']} ({one['state'].replace('_', ' ')})" for one in there]
         more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
         those = f"these are not normal: {', '.join(names[:MOST_NAMED])}{more}" if names else "all are normal"
@@ -119,7 +119,7 @@ def _of_pattern(
             f"no alarm that {pattern!r} matches waits for {verb}; {those}. A pattern means alarms that "
             "daqsvc alarms shows; write the name of any other"
         )
-    yield from found
+    yield from matches
 
 
 def _begun_by(events: Sequence[Mapping[str, Any]], words: str) -> list[Mapping[str, Any]]:

@@ -295,7 +295,7 @@ class AlarmVerb:
         return code
 
     def _ask(self, store: Path, target: Target, arguments: argparse.Namespace, *, several: bool) -> int:
-        """Have the service do it to one alarm, and say what came of it; the exit code.
+        """Have the service do it to one alarm, and print what came of it; the exit code.
 
         Raises:
             ControlError: the service cannot be asked.
@@ -332,8 +332,8 @@ class AlarmVerb:
             print(json.dumps(answer), flush=True)  # noqa: T201 - this is what the verb is for
         elif outcome.accepted:
             which = f"{alarm} of {machine}" if several and machine else alarm
-            said = harmless(f"{which}: {outcome.reason or _DONE[self._verb]}")
-            print(with_code(said, outcome.code), flush=True)  # noqa: T201
+            line = harmless(f"{which}: {outcome.reason or _DONE[self._verb]}")
+            print(with_code(line, outcome.code), flush=True)  # noqa: T201
         else:
             of = f" {machine}:" if several and machine else ""
             _complain(arguments.verb, f"refused:{of} {outcome.reason}", outcome.code or COMMAND_REFUSED)

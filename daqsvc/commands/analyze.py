@@ -116,7 +116,7 @@ def _by_file(machine: Path, loaded: MachineFile | None, arguments: argparse.Name
 
 
 def _by_options(arguments: argparse.Namespace) -> Runner:
-    """Judges by what the options say.
+    """Judges by what the options state.
 
     Raises:
         ValueError: they contradict each other.

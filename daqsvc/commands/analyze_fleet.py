@@ -66,9 +66,11 @@ def fleet_misuse(arguments: argparse.Namespace) -> str:
         return (
             f"{', '.join(without)}: only with --cluster; leave it out, or name a cluster" if without else ""
         )
-    given = [name for name in _OPTIONS if getattr(arguments, name[2:].replace("-", "_")) not in _LEFT_OUT]
-    if given:
-        return f"{', '.join(given)}: the machine files of the archive state this; leave it out with --cluster"
+    options = [name for name in _OPTIONS if getattr(arguments, name[2:].replace("-", "_")) not in _LEFT_OUT]
+    if options:
+        return (
+            f"{', '.join(options)}: the machine files of the archive state this; leave it out with --cluster"
+        )
     if len(arguments.files) > 1:
         places = len(arguments.files)
         return f"--cluster takes one archive, and {places} places are named; give the folder of all"
@@ -81,7 +83,7 @@ _LEFT_OUT: tuple[Any, ...] = (None, False, {}, ())
 
 
 def default_results(archive: str) -> str:
-    """Where the results of an archive go, unless something else is said: beside it."""
+    """Where the results of an archive go, unless another place is named: beside it."""
     place = archive.rstrip("/")
     if place.rpartition("/")[2] in {"", ".", ".."}:
         place = os.path.abspath(archive)  # noqa: PTH100 - what a place is called, wherever links lead

@@ -1,6 +1,6 @@
 """What all verbs of the command line share: parser, exit codes, values of options, signals that end one.
 
-What is wrong is said in one line, the usage only where it is asked for.
+What is wrong is reported in one line, the usage only where it is asked for.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ LEAST_MEMORY_GB = 0.05
 MOST_MEMORY_GB = 1000.0
 
 LONGEST_S = 366 * 86_400
-"""Longest time that a duration can say."""
+"""Longest time that a duration can state."""
 
 
 @dataclass(frozen=True, slots=True)

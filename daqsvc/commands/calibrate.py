@@ -145,7 +145,7 @@ class CalibrateCommand(VerbWithKernels):
         rotor = next(one for one in runner.detectors.values() if isinstance(one, RecordedRotor))
         loaded = [runner.load(path, only=rotor.sensors) for path in recordings]
         return calibrate_recordings(
-            _with_notes_said(loaded),
+            _with_notes_printed(loaded),
             rotor.setup,
             rotor_given=machine is not None or arguments.natural_frequency_hz is not None,
             sweep_rpm=arguments.sweep_rpm,
@@ -162,7 +162,7 @@ class CalibrateCommand(VerbWithKernels):
 
         runner = self._runner(bearing_machine, machine, arguments)
         (bearings,) = (one for one in runner.detectors.values() if isinstance(one, RecordedBearings))
-        (loaded,) = _with_notes_said([runner.load(recording, only=bearings.sensors)])
+        (loaded,) = _with_notes_printed([runner.load(recording, only=bearings.sensors)])
         try:
             return calibrate_bearings(runner.machine, bearings.settings, loaded, together=machine is None)
         except (RefusedError, NotIdentifiableError):
@@ -183,8 +183,8 @@ def _uncalibrated(machine: MachineFile) -> MachineFile:
     return machine.model_copy(update={"pipeline": machine.pipeline.model_copy(update=update)})
 
 
-def _with_notes_said(loaded: Sequence[Recording]) -> Sequence[Recording]:
-    """Recordings, once what was wrong with them in reading has been said."""
+def _with_notes_printed(loaded: Sequence[Recording]) -> Sequence[Recording]:
+    """Recordings, after the problems in reading them were printed."""
     for recording in loaded:
         for note in recording.notes:
             print(f"daqsvc calibrate: warning: {recording.source}: {note}", file=sys.stderr)  # noqa: T201

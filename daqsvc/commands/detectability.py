@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 LEAST_FALSE_ALARMS = 1e-9
 MOST_FALSE_ALARMS = 10.0
-"""Per 1000 revolutions: what a machine file may say."""
+"""Per 1000 revolutions: what a machine file may state."""
 
 
 class DetectabilityCommand(VerbWithKernels):
@@ -113,7 +113,7 @@ class DetectabilityCommand(VerbWithKernels):
 
 
 def _of_values(file: Path, folder: Path) -> MachineFile | None:
-    """The machine file of values in JSON, as if it lay in a folder; None after its errors were said."""
+    """The machine file of values in JSON, as if it lay in a folder; None after its errors were printed."""
     from daqsvc.settings.load import machine_file_of  # noqa: PLC0415 - brings pydantic
     from daqsvc.settings.problems import MachineFileError  # noqa: PLC0415 - as above
 

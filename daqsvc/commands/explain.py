@@ -56,7 +56,7 @@ class ExplainCommand:
         unknown = [text for text in wanted if text not in known]
         if unknown:
             return complain("daqsvc explain", _unknown(unknown[0], arguments.codes), NOT_KNOWN, EXIT_USAGE)
-        print("\n\n".join(_told(known[text]) for text in wanted) or _listed(known.values()))  # noqa: T201 - what the verb is for
+        print("\n\n".join(_explanation(known[text]) for text in wanted) or _listed(known.values()))  # noqa: T201 - what the verb is for
         return EXIT_OK
 
 
@@ -92,7 +92,7 @@ def _where(code: Code) -> str:
     return f"the pages {code.page} and reference/errors.md{anchor} of the documentation"
 
 
-def _told(code: Code) -> str:
+def _explanation(code: Code) -> str:
     more = _where(code)
     parts = {
         "Example": code.example,

@@ -1,4 +1,4 @@
-"""``daqsvc fleet report RESULTS``: what the recordings of a fleet say, of each machine and of all."""
+"""``daqsvc fleet report RESULTS``: what the recordings of a fleet show, of each machine and of all."""
 
 from __future__ import annotations
 
@@ -102,10 +102,10 @@ def _machines(report: FleetReport) -> str:
     has_cost = report.false_alarm_cost is not None
     if has_cost:
         titles.append("cost")
-    # A machine of which there is something to say first, so that a fleet of thousands fits.
-    told = sorted(report.machines, key=lambda one: not _is_remarkable(one))
+    # A machine of which there is something to report first, so that a fleet of thousands fits.
+    machines = sorted(report.machines, key=lambda one: not _is_remarkable(one))
     rows = []
-    for one in told[:_MOST_SHOWN]:
+    for one in machines[:_MOST_SHOWN]:
         row = [
             _short(one.machine, _SHORTER_NAME if has_cost else _LONGEST_NAME),
             f"{one.judged} of {one.recordings}",
@@ -117,7 +117,7 @@ def _machines(report: FleetReport) -> str:
         if has_cost:
             row.append(_money(one.cost))
         rows.append(row)
-    return aligned(titles, rows) + _more(len(told), "machines")
+    return aligned(titles, rows) + _more(len(machines), "machines")
 
 
 def _is_remarkable(one: MachineReport) -> bool:
@@ -217,15 +217,17 @@ def _cost(report: FleetReport) -> str:
     """How many false alarms there were and what they cost, first what is certain and then a year of it."""
     from daqsvc.rounding import counted  # noqa: PLC0415 - each verb imports what it needs
 
-    said = counted(report.false_alarms, "false alarm")
+    sentence = counted(report.false_alarms, "false alarm")
     if report.false_alarm_cost is not None:
-        said += f" cost{'s' * (report.false_alarms == 1)} {_money(report.false_alarm_cost)}"
+        sentence += f" cost{'s' * (report.false_alarms == 1)} {_money(report.false_alarm_cost)}"
     rate = report.false_alarms_per_year
     if rate is None:
-        return f"{said}; how many that is a year is not known: dates in the names, or --interval, would tell"
+        return (
+            f"{sentence}; how many that is a year is not known: dates in the names, or --interval, would tell"
+        )
     where = "of the machines whose times are known " if report.without_times else ""
     cost = "" if report.cost_per_year is None else f", or {report.cost_per_year:,.0f},"
-    return f"{said}; {where}that is {rate:,.3g}{cost} a machine and year"
+    return f"{sentence}; {where}that is {rate:,.3g}{cost} a machine and year"
 
 
 def _money(cost: float | None) -> str:

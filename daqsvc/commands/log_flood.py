@@ -1,4 +1,4 @@
-"""A limit for whatever is logged again and again: by what is said, and of which thing."""
+"""A limit for whatever is logged again and again: by the message, and by the thing it is about."""
 
 from __future__ import annotations
 

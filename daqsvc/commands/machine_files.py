@@ -79,9 +79,9 @@ def _files(paths: Sequence[Path]) -> list[Path]:
     from daqsvc.settings import MachineFileError, Problem  # noqa: PLC0415 - as above
 
     files: list[Path] = []
-    for given in paths:
+    for named in paths:
         # So the unit of systemd, which names a file, runs a directory of the same name as well.
-        path = given.with_suffix("") if not given.exists() and given.with_suffix("").is_dir() else given
+        path = named.with_suffix("") if not named.exists() and named.with_suffix("").is_dir() else named
         # Names that begin with a dot are those of editors and of copies under way, such as `.#pump.toml`.
         inside = sorted(path.glob("[!.]*.toml")) if path.is_dir() else [path]
         if not inside:

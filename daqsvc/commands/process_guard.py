@@ -80,7 +80,7 @@ class ProcessGuard:
         self._heard, self._tell = os.pipe()
         self._turns_stopping: int | None = None
         self._turns_still: int | None = None
-        self._turns_said: int | None = None
+        self._turns_to_report: int | None = None
         self._answered = True
         self._over = False
         self._outlives_terminal = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
@@ -148,7 +148,7 @@ class ProcessGuard:
             say_after_s: after so long it is logged, since a supervisor outside may end the process
                 before the guard does.
         """
-        self._turns_said = None if say_after_s is None else max(1, round(say_after_s / TURN_S))
+        self._turns_to_report = None if say_after_s is None else max(1, round(say_after_s / TURN_S))
         self._turns_still = 0
 
     def stopping(self) -> None:
@@ -191,8 +191,8 @@ class ProcessGuard:
                 loop.call_soon_threadsafe(self._answer)
             return
         self._turns_still = (self._turns_still or 0) + 1
-        if self._turns_still == self._turns_said:
-            still_s = self._turns_said * TURN_S
+        if self._turns_still == self._turns_to_report:
+            still_s = self._turns_to_report * TURN_S
             self._say(f"the event loop has been blocked for {still_s:g} s: {self._where_loop_is()}")
         if self._turns_still > STUCK_TURNS:
             still_s = STUCK_TURNS * TURN_S
@@ -286,5 +286,5 @@ def _is_terminal(fd: int) -> bool:
 def _is_gone(fd: int) -> bool:
     """Whether a terminal has hung up."""
     poll = select.poll()
-    poll.register(fd, 0)  # hang-ups are always told
+    poll.register(fd, 0)  # hang-ups are always reported
     return any(event & (select.POLLHUP | select.POLLERR | select.POLLNVAL) for _, event in poll.poll(0))

@@ -148,11 +148,11 @@ def analyze_misuse(arguments: argparse.Namespace, machine: Path | None, recordin
 
 def _take_dimensions(arguments: argparse.Namespace) -> str:
     """Make orders of the dimensions of a bearing, if those are given; what is wrong with them, or empty."""
-    given = _given(arguments, (*_DIMENSIONS, "--contact-deg"))
-    if not given:
+    dimensions = _options_in_use(arguments, (*_DIMENSIONS, "--contact-deg"))
+    if not dimensions:
         return ""
     if missing := _missing(arguments, _DIMENSIONS):
-        return f"{given[0]} is one of a bearing's dimensions: {', '.join(missing)} must be given too"
+        return f"{dimensions[0]} is one of a bearing's dimensions: {', '.join(missing)} must be given too"
     if arguments.bearing is not None or arguments.orders is not None:
         return "--balls, --bearing and --orders all define the bearing; leave out all but one of them"
     from daqsvc.bearing.geometry import BearingGeometry  # noqa: PLC0415 - each verb imports only what it needs
@@ -162,8 +162,8 @@ def _take_dimensions(arguments: argparse.Namespace) -> str:
         orders = BearingGeometry(*sizes, arguments.contact_deg or 0.0).orders()
     except ValueError as error:
         return f"--balls: {error}"
-    told = (orders.inner, orders.outer, orders.ball, orders.cage)
-    arguments.orders = dict(zip(_ORDER_KEYS, told, strict=True))
+    values = (orders.inner, orders.outer, orders.ball, orders.cage)
+    arguments.orders = dict(zip(_ORDER_KEYS, values, strict=True))
     return ""
 
 
@@ -177,9 +177,9 @@ def _probe_misuse(arguments: argparse.Namespace, machine: Path | None, recording
     if arguments.unit in ACCELERATION_UNITS:
         return f"--unit {arguments.unit}: proximity probes measure in {', '.join(LENGTH_UNITS)}"
     if machine is not None:
-        extra = _given(arguments, ("--probes", "--speed-rpm", *_PROBES_ONLY[1:]))
+        extra = _options_in_use(arguments, ("--probes", "--speed-rpm", *_PROBES_ONLY[1:]))
         return f"{', '.join(extra)}: the machine file states this; leave it out" if extra else ""
-    known = _given(arguments, ("--natural-frequency-hz", "--damping-ratio", "--static-sag-um"))
+    known = _options_in_use(arguments, ("--natural-frequency-hz", "--damping-ratio", "--static-sag-um"))
     if known and arguments.calibration is not None:
         return f"{', '.join(known)}: the calibration states this; leave it out, or leave out --calibration"
     return _lacking(arguments) or _unknown_channels(arguments)
@@ -216,7 +216,7 @@ def _calibrate_misuse(arguments: argparse.Namespace, machine: Path | None, recor
     if arguments.out is None and not arguments.json:
         return "nothing would be kept: give --out FILE, --json or both"
     rotor = ("--probes", "--speed-rpm", *_ROTOR, "--ac-coupled")
-    if machine is not None and (options := _given(arguments, rotor)):
+    if machine is not None and (options := _options_in_use(arguments, rotor)):
         return f"{', '.join(options)}: the machine file states this; leave it out"
     if arguments.live:
         return _live_misuse(arguments, machine, recordings)
@@ -508,7 +508,7 @@ def _add_rotor(add: Callable[..., argparse.Action], *, speed_help: str, help_mor
     Args:
         add: ``add_argument`` of the group that takes the options.
         speed_help: what the speed is.
-        help_more: what is said beside the rotor's figures, where something else can tell them.
+        help_more: help beside the rotor's figures, where something else can state them.
     """
     add(
         "--probes", type=probe_pair, metavar="X,Y", help="channels of the two probes; y is 90 degrees after x"
@@ -548,8 +548,8 @@ def _add_rotor(add: Callable[..., argparse.Action], *, speed_help: str, help_mor
     add("--ac-coupled", action="store_true", help="the probes are AC-coupled: do not use their mean position")
 
 
-def _given(arguments: argparse.Namespace, options: Iterable[str]) -> list[str]:
-    """Those of the options that say something else than by default."""
+def _options_in_use(arguments: argparse.Namespace, options: Iterable[str]) -> list[str]:
+    """Those of the options whose value is not the default."""
     return [
         option
         for option in options
@@ -586,7 +586,7 @@ def _order_misuse(arguments: argparse.Namespace, machine: Path | None) -> str:
     """What is wrong with the options of accelerometers together; empty if nothing is."""
     if machine is not None:
         return "--channels, --baseline: the machine file states what is measured; leave them out"
-    if extra := _given(arguments, (*_PROBES_ONLY, "--calibration", "--plot")):
+    if extra := _options_in_use(arguments, (*_PROBES_ONLY, "--calibration", "--plot")):
         return f"{', '.join(extra)}: not with --channels and --baseline; leave it out"
     if missing := ", ".join(_missing(arguments, ("--channels", "--baseline", "--speed-rpm"))):
         bearing = "to judge a bearing, --bearing or --orders; " if arguments.baseline is None else ""
@@ -615,7 +615,7 @@ def _bearing_misuse(arguments: argparse.Namespace, machine: Path | None) -> Iter
         yield _SAID_TWICE
     if arguments.calibration is not None and arguments.baseline is not None:
         yield "--calibration and --baseline both define the healthy machine; leave out one of them"
-    if extra := _given(arguments, _PROBES_ONLY):
+    if extra := _options_in_use(arguments, _PROBES_ONLY):
         yield f"{', '.join(extra)}: not with --bearing or --orders; leave it out"
     if missing := _missing(arguments, ("--channels", "--speed-rpm")):
         yield f"to judge a bearing, {', '.join(missing)} must be given too"
@@ -635,7 +635,7 @@ def _healthy_bearing_misuse(
     if machine is not None:
         return "--channels, --bearing, --orders: the machine file states this; leave them out"
     rotor = ("--probes", "--keyphasor", "--natural-frequency-hz", "--damping-ratio", "--clearance-um")
-    if extra := _given(arguments, (*rotor, "--sweep-rpm")):
+    if extra := _options_in_use(arguments, (*rotor, "--sweep-rpm")):
         return f"{extra[0]}: not with --channels; a bearing is calibrated by itself"
     missing = _missing(arguments, ("--channels", "--speed-rpm"))
     if arguments.bearing is None and arguments.orders is None:

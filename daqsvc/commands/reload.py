@@ -77,13 +77,13 @@ class ReloadCommand:
                 where = f"; if {moved} were changed, the service must be restarted"
             return complain("daqsvc reload", f"{error}{where}", error.code)
         if arguments.json:
-            told: Reloaded = {
+            report: Reloaded = {
                 "accepted": answer.accepted,
                 "dry_run": arguments.dry_run,
                 "code": answer.code,
                 "lines": list(answer.lines),
             }
-            print(json.dumps(told))  # noqa: T201 - this is what the verb is for
+            print(json.dumps(report))  # noqa: T201 - this is what the verb is for
         elif answer.accepted:
             print("\n".join(answer.lines) or "nothing is different")  # noqa: T201 - as above
         else:

@@ -194,7 +194,7 @@ def _document(replayed: Replayed) -> ReplayReport:
 
     from daqsvc.publish.payloads import alarm_document, statement_document  # noqa: PLC0415 - only what is needed
 
-    said, alarmed = replayed.said, replayed.alarmed
+    statements, alarms = replayed.said, replayed.alarmed
     report: ReplayReport = {
         "causes": replayed.causes,
         "is_equal": replayed.is_equal,
@@ -204,8 +204,12 @@ def _document(replayed: Replayed) -> ReplayReport:
         "alarms": [alarm_document(event) for event in replayed.alarms],
         "statements": [statement_document(one) for one in replayed.statements],
         "compared": {
-            "statements": {"equal": said.equal, "only_then": said.changed, "only_now": said.added},
-            "alarms": {"equal": alarmed.equal, "only_then": alarmed.changed, "only_now": alarmed.added},
+            "statements": {
+                "equal": statements.equal,
+                "only_then": statements.changed,
+                "only_now": statements.added,
+            },
+            "alarms": {"equal": alarms.equal, "only_then": alarms.changed, "only_now": alarms.added},
         },
     }
     finite: ReplayReport = json.loads(to_json(report, inf_nan_mode="null"))

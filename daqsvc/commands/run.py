@@ -193,7 +193,7 @@ def _run(
 
 
 def _watched(store: Path) -> set[str]:
-    """The machines that the service on a store watches; empty if it does not say."""
+    """The machines that the service on a store watches; empty if it does not answer."""
     from daqsvc.control import ControlError, ask_status  # noqa: PLC0415 - only what a verb needs
 
     try:

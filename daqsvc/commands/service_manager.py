@@ -61,7 +61,7 @@ class ServiceManager:
     Attributes:
         is_ready: whether it knows that the service is ready.
         begun_s: when `starting` was called, by the monotonic clock; None if it was not.
-        is_overtold: whether other words are shown in place of what the service waits for.
+        is_overwritten: whether other words are shown in place of what the service waits for.
     """
 
     def __init__(self, address: str = "", watchdog_s: float | None = None) -> None:
@@ -69,7 +69,7 @@ class ServiceManager:
         self._address = f"\0{address[1:]}" if address.startswith("@") else address
         self.is_ready = False
         self.begun_s: float | None = None
-        self.is_overtold = False
+        self.is_overwritten = False
         self._stopping = False
         self._says_reloading = False
         self._starting: threading.Thread | None = None
@@ -154,7 +154,7 @@ class ServiceManager:
             self.tell(READY=1, STATUS="reloaded")
         else:
             self.tell(STATUS="reloading" if begins else "reloaded")
-            self.is_overtold = True
+            self.is_overwritten = True
 
     def stopping(self) -> None:
         """The service stops; from any thread."""
@@ -188,8 +188,8 @@ class _Follower:
             self._stalled = service.stalls.hold_to(max(manager.watchdog_s, LEAST_WATCH_S), then)
         self._begun_s = manager.begun_s
         self._serving_since_s = 0.0
-        self._alive_s = self._extended_s = self._told_s = self._refreshed_s = float("-inf")
-        self._told = ""
+        self._alive_s = self._extended_s = self._sent_s = self._refreshed_s = float("-inf")
+        self._sent = ""
 
     def look(self, now_s: float) -> None:
         if self._begun_s is None:
@@ -223,13 +223,13 @@ class _Follower:
 
     def _status(self, standing: str, figures: str, now_s: float) -> None:
         """Send ``standing`` with ``figures`` if it has changed, or was sent long ago."""
-        if self._manager.is_overtold:
-            self._told, self._manager.is_overtold = "", False
-        is_new = standing != self._told and now_s - self._told_s >= CHANGE_S
+        if self._manager.is_overwritten:
+            self._sent, self._manager.is_overwritten = "", False
+        is_new = standing != self._sent and now_s - self._sent_s >= CHANGE_S
         if not is_new and now_s - self._refreshed_s < REFRESH_S:
             return
         if self._manager.tell(STATUS=standing if figures in {standing, ""} else f"{standing}; {figures}"):
-            self._told, self._told_s, self._refreshed_s = standing, now_s, now_s
+            self._sent, self._sent_s, self._refreshed_s = standing, now_s, now_s
 
 
 def _in_short(service: Service) -> tuple[str, str]:
@@ -244,18 +244,18 @@ def _in_short(service: Service) -> tuple[str, str]:
     for manager in service.alarms.managers.values():
         shown.update(manager.shown)
     alarms = ", ".join(f"{number} {state.in_words}" for state, number in shown.items() if number)
-    said = [up, f"alarms: {alarms or 'none'}"]
+    parts = [up, f"alarms: {alarms or 'none'}"]
     outbox = service.alarms.outbox.counters
     if outbox.shut or outbox.unbacked:
-        said.append("the journal cannot be written")
+        parts.append("the journal cannot be written")
     for output in service.alarms.outputs.values():
         figures = output.figures()
         if "connected" in figures:
             why = f" ({output.reason[:LONGEST_REASON]})" * bool(output.reason)
-            said.append("broker connected" if figures["connected"] else f"broker not connected{why}")
+            parts.append("broker connected" if figures["connected"] else f"broker not connected{why}")
     messages = outbox.depth + outbox.waiting
     what = "1 alarm message" if messages == 1 else f"{messages} alarm messages"
     if "mqtt" in service.alarms.outputs:
-        return "; ".join(said), f"{what} wait{'s' * (messages == 1)} for the broker"
+        return "; ".join(parts), f"{what} wait{'s' * (messages == 1)} for the broker"
     # Without one they are kept for a broker that a later machine file may name.
-    return "; ".join(said), f"{what} kept for a broker" if messages else ""
+    return "; ".join(parts), f"{what} kept for a broker" if messages else ""

@@ -74,13 +74,13 @@ class SnapshotCommand:
         except (OtherFileError, StoreNotFoundError, ControlError) as error:
             return complain("daqsvc snapshot", error, error.code)
         if arguments.json:
-            told: SnapshotTaken = {
+            report: SnapshotTaken = {
                 "accepted": answer.accepted,
                 "reason": answer.reason,
                 "code": answer.code,
                 "path": answer.path,
             }
-            print(json.dumps(told))  # noqa: T201 - this is what the verb is for
+            print(json.dumps(report))  # noqa: T201 - this is what the verb is for
         elif answer.accepted:
             print(answer.path)  # noqa: T201 - as above
         else:

@@ -60,17 +60,17 @@ class SniffCommand:
         sniffer: Sniffer = arguments.sniffer
         try:
             with stopping() as stop:
-                found = sniffer.sniff(arguments, stop, _tell)
+                sniffed = sniffer.sniff(arguments, stop, _tell)
         except SniffError as error:
             return complain("daqsvc", error, error.code, EXIT_USAGE if error.usage else EXIT_FAILED)
         except Exception as error:
             if (words := foreign_words(error)) is None:
                 raise
             return complain("daqsvc", words, PLUGIN_FAILED)
-        print(_as_json(found) if arguments.json else _as_text(found))  # noqa: T201 - what the verb is for
-        if found.problem:
+        print(_as_json(sniffed) if arguments.json else _as_text(sniffed))  # noqa: T201 - what the verb is for
+        if sniffed.problem:
             sys.stdout.flush()
-            return complain("daqsvc", found.problem, NOTHING_ON_BUS)
+            return complain("daqsvc", sniffed.problem, NOTHING_ON_BUS)
         return EXIT_OK
 
 
@@ -80,15 +80,15 @@ def sniffers() -> dict[str, Sniffer]:
     return ours | plugged(SNIFFERS, Sniffer, "sniff")  # type: ignore[type-abstract]
 
 
-def _as_json(found: Sniffed) -> str:
-    end: SniffEnd = {"machine_file": found.fragment, "problem": found.problem}
-    return json.dumps({**found.figures, **end})
+def _as_json(sniffed: Sniffed) -> str:
+    end: SniffEnd = {"machine_file": sniffed.fragment, "problem": sniffed.problem}
+    return json.dumps({**sniffed.figures, **end})
 
 
-def _as_text(found: Sniffed) -> str:
-    parts = [part if isinstance(part, str) else _drawn(part) for part in found.parts]
-    if found.fragment:
-        parts.append(f"To begin a machine file with (daqsvc new asks for the rest):\n\n{found.fragment}")
+def _as_text(sniffed: Sniffed) -> str:
+    parts = [part if isinstance(part, str) else _drawn(part) for part in sniffed.parts]
+    if sniffed.fragment:
+        parts.append(f"To begin a machine file with (daqsvc new asks for the rest):\n\n{sniffed.fragment}")
     return "\n\n".join(part.rstrip() for part in parts if part)
 
 

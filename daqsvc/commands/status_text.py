@@ -74,22 +74,22 @@ def _standing(alarms: Sequence[Document], width: int) -> str:
     """A line for each alarm, and what it reports below."""
     rows = [[one["level"], _alarm_state(one), one["alarm"], _ago(one["age_s"])] for one in alarms]
     title, *lines = aligned(["LEVEL", "STATE", "ALARM", "CHANGED"], rows).splitlines()
-    told = [title]
+    shown = [title]
     for line, one in zip(lines, alarms, strict=True):
         message = one["message"].removeprefix(f"{one['alarm']} {one['level']}: ")
-        told += [line, *(f"    {part}" for part in wrapped(harmless(message), width - 4))]
-    return "\n".join(told)
+        shown += [line, *(f"    {part}" for part in wrapped(harmless(message), width - 4))]
+    return "\n".join(shown)
 
 
 def _alarm_state(alarm: Document) -> str:
     words = str(alarm["state"]).replace("_", " ")
-    # Services of earlier versions do not say it.
+    # Services of earlier versions do not report it.
     until_ns = alarm.get("shelved_until_wall_ns")
     return f"{words} until {local_time(until_ns)}" if until_ns and alarm["state"] == "shelved" else words
 
 
 def _by_sensor(statements: Iterable[Document]) -> dict[str, list[Document]]:
-    """By sensor, what is said of it alone."""
+    """By sensor, the statements on it alone."""
     alone: dict[str, list[Document]] = {}
     for one in statements:
         if len(one["sensors"]) == 1:
@@ -99,8 +99,8 @@ def _by_sensor(statements: Iterable[Document]) -> dict[str, list[Document]]:
 
 def _channel(channel: Document, alone: Mapping[str, Sequence[Document]]) -> list[str]:
     statements = alone.get(channel["sensor"] or "", ())
-    said = [_measures(one) for one in statements if one["measures"]]
-    said += [f"[{channel['reason']}]"] if channel["reason"] else []
+    words = [_measures(one) for one in statements if one["measures"]]
+    words += [f"[{channel['reason']}]"] if channel["reason"] else []
     state = STATES[channel["state"]]
     severities = [one["severity"] for one in statements if one["severity"] != "normal"]
     return [
@@ -108,7 +108,7 @@ def _channel(channel: Document, alone: Mapping[str, Sequence[Document]]) -> list
         f"{state}, {'danger' if 'danger' in severities else 'alert'}" if severities else state,
         _figure(channel["value"], channel["unit"]) + _named(channel),
         _age(channel["age_s"]),
-        " ".join(said),
+        " ".join(words),
     ]
 
 
@@ -173,12 +173,12 @@ def _outbox(status: Document) -> str:
     waits = "waits" if events == 1 else "wait"
     # Without a broker they wait for one that a later machine file may have.
     what = f"{waits} for the broker" if "mqtt" in status["outputs"] else "kept for a broker"
-    said = "outbox: " + (f"{counted(events, 'alarm event')} {what}" if events else "nothing waits")
+    text = "outbox: " + (f"{counted(events, 'alarm event')} {what}" if events else "nothing waits")
     if outbox["oldest_age_s"] is not None:
-        said += f", the oldest for {_age(outbox['oldest_age_s'])}"
+        text += f", the oldest for {_age(outbox['oldest_age_s'])}"
     if outbox["waiting"]:
-        said += f"; {outbox['waiting']:,} of them only in memory"
-    return said if outbox["journal"] == "written" else f"{said}; the journal is {outbox['journal']}"
+        text += f"; {outbox['waiting']:,} of them only in memory"
+    return text if outbox["journal"] == "written" else f"{text}; the journal is {outbox['journal']}"
 
 
 def _outputs(status: Document) -> Iterator[str]:
@@ -186,7 +186,7 @@ def _outputs(status: Document) -> Iterator[str]:
         yield "broker: none is configured"
     for path, output in status["outputs"].items():
         name = "broker" if path == "mqtt" else path
-        # Services of earlier versions give no reason, and say not for how long.
+        # Services of earlier versions give no reason, and no duration.
         reason, away_s = _why(output), output.get("away_s")
         lasting = "" if away_s is None else f" for {_age(away_s)}"
         if output["connected"]:

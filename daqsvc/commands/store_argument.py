@@ -155,8 +155,8 @@ def store_doubts(machine: MachineFile) -> Iterator[str]:
     except (NewerOutboxError, StorePathError) as error:
         raise AssemblyError(f"{at}: {harmless(f'{error}')}", code=UNUSABLE_STORE) from None
     if why and is_read_only(store):
-        said = f"daqsvc run would keep the alarms in memory only, and lose them at its end: {why}"
-        yield with_code(f"{at}: {said}", UNUSABLE_STORE)
+        what = f"daqsvc run would keep the alarms in memory only, and lose them at its end: {why}"
+        yield with_code(f"{at}: {what}", UNUSABLE_STORE)
     elif why:
         yield with_code(f"{at}: daqsvc run could not start as {who}: {why}", UNUSABLE_STORE)
 
@@ -166,7 +166,7 @@ def _refuse_newer(store: Path) -> bool:
     from daqsvc.outbox.messages import StoreRefusedError  # noqa: PLC0415 - only what a verb needs
     from daqsvc.outbox.reading import refuse_newer  # noqa: PLC0415
 
-    # That is said more kindly: it is only this account that may not use it.
+    # A separate message covers that: it is only this account that may not use it.
     with contextlib.suppress(StoreRefusedError):
         refuse_newer(store / JOURNAL)
         return os.access(store / JOURNAL, os.R_OK, effective_ids=True)
@@ -312,10 +312,10 @@ def _of_sound(path: Path, sound: Sequence[MachineFile]) -> Path:
     Raises:
         BadFileError: they do not tell one store.
     """
-    told = {one.resolve(one.store.directory) for one in sound if one.store is not None}
-    stores = told or {_default_directory(one) for one in sound}
+    named = {one.resolve(one.store.directory) for one in sound if one.store is not None}
+    stores = named or {_default_directory(one) for one in sound}
     # Without [store] in any, one of those with errors may have it.
-    if len(stores) != 1 or not (told or all(map(_is_used, stores))):
+    if len(stores) != 1 or not (named or all(map(_is_used, stores))):
         raise BadFileError
     [store] = stores
     what = f"the store is taken from the other machine files: {store}"

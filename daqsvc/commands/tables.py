@@ -28,14 +28,14 @@ def aligned(titles: Sequence[str], rows: Sequence[Sequence[str]], width: int | N
     lines = [list(titles), *([harmless(cell) for cell in row] for row in rows)]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     indent = sum(widths[:-1]) + len(_GAP) * (len(widths) - 1)
-    told: list[str] = []
+    rendered: list[str] = []
     for line in lines:
         *cells, last = line
         parts = [last] if width is None else wrapped(last, max(width - indent, LEAST_WIDTH))
         first = [cell.ljust(width) for cell, width in zip(cells, widths, strict=False)]
-        told.append(_GAP.join([*first, parts[0]]).rstrip())
-        told += [" " * indent + part for part in parts[1:]]
-    return "\n".join(told)
+        rendered.append(_GAP.join([*first, parts[0]]).rstrip())
+        rendered += [" " * indent + part for part in parts[1:]]
+    return "\n".join(rendered)
 
 
 def wrapped(text: str, width: int) -> list[str]:

@@ -178,7 +178,7 @@ class TrendCommand:
         except sqlite3.Error as error:
             return complain("daqsvc trend", f"the history in {store} cannot be read: {error}", CANNOT_READ)
         except OSError as error:
-            # Of a target all is said already (`_put_whole`): without a name it is standard output.
+            # A target is reported already (`_put_whole`): without a name it is standard output.
             if error.filename is None and error.errno in OF_STDOUT:
                 raise
             where = "standard output" if error.filename is None else error.filename
@@ -218,7 +218,7 @@ def _unusable(arguments: argparse.Namespace, since_s: float, until_s: float) -> 
 
 
 def _taken(arguments: argparse.Namespace) -> tuple[str, Code] | None:
-    """Why nothing may be written where the options say; None if it may."""
+    """Why nothing may be written where the options state; None if it may."""
     target: Path | None = arguments.csv or arguments.parquet or arguments.plot
     if target is None or str(target) == "-":
         return None
@@ -439,7 +439,7 @@ def _put(path: Path, place: Path, *, force: bool) -> None:
 
 @contextmanager
 def _named(target: Path) -> Iterator[None]:
-    """What goes wrong here is said of the target, as the option names it: libraries have their own words.
+    """What goes wrong here is reported with the target, as the option names it: libraries do not name it so.
 
     Raises:
         NoTrendError: instead of an OSError.

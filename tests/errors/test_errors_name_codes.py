@@ -43,7 +43,7 @@ NO_FAULT = {
     "daqsvc/cli.py": {"_check", "load", "main"},  # what they print has its codes
     "daqsvc/commands/account.py": {"_password"},  # asks again
     "daqsvc/commands/analyze_fleet.py": {"_say"},  # progress
-    "daqsvc/commands/calibrate.py": {"_with_notes_said"},  # warnings, and all goes on
+    "daqsvc/commands/calibrate.py": {"_with_notes_printed"},  # warnings, and all goes on
     "daqsvc/commands/export.py": {"_export"},  # likewise
     "daqsvc/commands/complaint.py": {"complain"},
     "daqsvc/commands/detectability.py": {"_of_values"},  # has its code

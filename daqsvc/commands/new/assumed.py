@@ -50,17 +50,17 @@ def marked(lines: Iterable[str], answers: Answers) -> tuple[list[str], list[str]
         answers: to all questions, with those at `ASSUMED`.
     """
     assumed: Collection[str] = answers.get(ASSUMED, ())
-    found = [*lines]
+    marked_lines = [*lines]
     keys: dict[str, None] = {}
     if not assumed:
-        return found, []
+        return marked_lines, []
     bus, table, channel = bus_of(answers), "", ""
     stream = f"streams.{bus.stream_name(answers)}"
     tables = {f"buses.{bus.bus_name(answers)}", stream, f"{stream}.layout"}
-    for place, line in enumerate(found):
+    for place, line in enumerate(marked_lines):
         if line.startswith("["):
             table = line.partition("#")[0].strip().strip("[]")
-            rest = (one for one in found[place:] if one.startswith("channel = "))
+            rest = (one for one in marked_lines[place:] if one.startswith("channel = "))
             channel = tomllib.loads(next(rest, 'channel = ""'))["channel"] if table == "sensors" else ""
             continue
         if (name := _CHANNEL.match(line)) is not None and table.startswith("streams."):
@@ -75,9 +75,9 @@ def marked(lines: Iterable[str], answers: Answers) -> tuple[list[str], list[str]
         if line.endswith("[") or line == _ONLY_TYPE:
             continue
         if not _NEVER.issuperset(one) and any(each in assumed for each in one):
-            found[place] = _with_comment(line)
+            marked_lines[place] = _with_comment(line)
             keys[key] = None
-    return found, [*keys]
+    return marked_lines, [*keys]
 
 
 def _questions(table: str, key: str, channel: str, tables: Collection[str]) -> list[str]:

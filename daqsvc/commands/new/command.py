@@ -91,13 +91,13 @@ class NewCommand:
         ask = _ask if person and not arguments.yes else None
         target = _Target(arguments.file, ask, overwrite=arguments.overwrite)
         try:
-            given = Given(_given(arguments), arguments.yes)
+            beforehand = Given(_answers_beforehand(arguments), arguments.yes)
             target.see()
             if ask is not None:
                 _say(_HOW_TO_ANSWER)
             listen = partial(_heard, target.folder, person=ask is not None) if arguments.listen else None
             answers = conduct(
-                target.file, given, ask, lambda reason: _say(f"  {reason}"), listen, target.named
+                target.file, beforehand, ask, lambda reason: _say(f"  {reason}"), listen, target.named
             )
             text = machine_text(answers, shlex.quote(target.file.name))
             _write(target.file, text)
@@ -124,7 +124,7 @@ class _Target:
     """
 
     def __init__(self, file: Path | None, ask: Callable[[Question], str] | None, *, overwrite: bool) -> None:
-        self._given = file
+        self._file_named = file
         self.file = file or Path("machine.toml")
         self._overwrite = overwrite
         self._person = ask is not None
@@ -142,15 +142,15 @@ class _Target:
         """
         from daqsvc.commands.new.interview import AnswerError  # noqa: PLC0415 - slow to import
 
-        if self._given is None:
+        if self._file_named is None:
             return
-        if self._given.is_dir():
+        if self._file_named.is_dir():
             raise AnswerError(
-                f"{self._given} is a directory; name a file in it, e.g. {self._given / 'pump.toml'}"
+                f"{self._file_named} is a directory; name a file in it, e.g. {self._file_named / 'pump.toml'}"
             )
         if not self.folder.is_dir():
             raise AnswerError(f"there is no directory {self.folder}; make it first: mkdir -p {self.folder}")
-        self.file = self._free(self._given)
+        self.file = self._free(self._file_named)
 
     def named(self, question: Question, answers: Answers) -> None:
         """Take the name of the machine for the file, where the command line names none.
@@ -163,7 +163,7 @@ class _Target:
         short = short_name(answers["name"])
         if self._person and short != answers["name"]:
             _say(f'  It is called "{short}" in topics and names of files.')
-        if self._given is None:
+        if self._file_named is None:
             self.file = self._free(Path(f"{short}.toml"))
 
     def _free(self, file: Path) -> Path:
@@ -183,21 +183,21 @@ class _Target:
         return file
 
 
-def _given(arguments: argparse.Namespace) -> dict[str, str]:
+def _answers_beforehand(arguments: argparse.Namespace) -> dict[str, str]:
     """The answers of the command line and of the file of answers, by key; the command line wins."""
     from daqsvc.commands.new.interview import AnswerError  # noqa: PLC0415 - slow to import
 
-    given = {} if arguments.answers is None else _of_file(arguments.answers)
+    answers = {} if arguments.answers is None else _of_file(arguments.answers)
     for key in all_topics():
         answer = getattr(arguments, f"answer {key}")
         if answer is not None:
-            given[key] = answer
+            answers[key] = answer
     for text in arguments.sensor:
         key, equals, answer = text.partition("=")
         if not equals or "." not in key:
             raise AnswerError(f"--{SENSOR} {text}: write CHANNEL.TOPIC=ANSWER, e.g. x.type=accelerometer")
-        given[f"{SENSOR}.{key}"] = answer
-    return given
+        answers[f"{SENSOR}.{key}"] = answer
+    return answers
 
 
 def _of_file(path: Path) -> dict[str, str]:

@@ -46,7 +46,7 @@ class Given:
 
 def conduct(
     file: Path,
-    given: Given,
+    beforehand: Given,
     ask: Callable[[Question], str] | None,
     say: Callable[[str], None],
     listen: Callable[[BusQuestions, Answers], Heard | SniffError | None] | None = None,
@@ -56,7 +56,7 @@ def conduct(
 
     Args:
         file: the machine file that will be written.
-        given: what was answered beforehand.
+        beforehand: what was answered beforehand.
         ask: asks a person; None where there is none.
         say: tells that person why an answer is asked for again.
         listen: reads the bus as soon as it is known where it is, and returns what was heard, or why nothing
@@ -68,11 +68,11 @@ def conduct(
         NothingFoundError: what was looked for was not heard, and nobody can be asked.
     """
     if listen is None:
-        _refuse_for_listening(given)
-    interview = _Interview(file, given, ask, say, listen, answered)
+        _refuse_for_listening(beforehand)
+    interview = _Interview(file, beforehand, ask, say, listen, answered)
     while not interview.is_over():
         pass
-    _refuse_others(given, interview)
+    _refuse_others(beforehand, interview)
     answers = interview.answers | {ASSUMED: interview.assumed()}
     # What is assumed comes last: it lists keys, and the sentences before it are about what was heard.
     return answers | {NOTES: [*interview.notes(), *limits_words(answers), *assumed_words(answers)]}
@@ -88,7 +88,7 @@ class _Interview:
     def __init__(
         self,
         file: Path,
-        given: Given,
+        beforehand: Given,
         ask: Callable[[Question], str] | None,
         say: Callable[[str], None],
         listen: Callable[[BusQuestions, Answers], Heard | SniffError | None] | None,
@@ -96,7 +96,7 @@ class _Interview:
     ) -> None:
         self.answers: Answers = {}
         self.asked: list[str] = []
-        self._file, self._given = file, given
+        self._file, self._beforehand = file, beforehand
         self._ask, self._say, self._listen, self._answered = ask, say, listen, answered
         self._typed: list[str] = []
         """Keys of what a person has answered, the last one last."""
@@ -162,19 +162,19 @@ class _Interview:
     def _take(self, plain: Question) -> None:
         question, is_entered = self._as_heard(plain), False
         is_heard = self._is_heard(question)
-        key, texts = question.key, self._given.texts
-        given = self._given_key(key)
-        if given in texts:
-            reason = take(question, texts[given], self.answers, self._file)
+        key, texts = question.key, self._beforehand.texts
+        key_beforehand = self._key_beforehand(key)
+        if key_beforehand in texts:
+            reason = take(question, texts[key_beforehand], self.answers, self._file)
             if reason is not None:
-                refused = f"{given_as(given, texts[given])}: {reason}"
+                refused = f"{given_as(key_beforehand, texts[key_beforehand])}: {reason}"
                 if self._ask is None:
                     raise AnswerError(refused)
                 # What a person has typed by now is not lost for that.
                 self._say(refused)
                 is_entered = _answer(question, self._ask, self._say, self.answers, self._file)
                 self._typed.append(key)
-        elif question.default is not None and (self._given.defaults or self._is_quiet(question)):
+        elif question.default is not None and (self._beforehand.defaults or self._is_quiet(question)):
             reason, is_entered = take(question, question.default, self.answers, self._file), True
             if reason is not None:
                 raise AnswerError(f"{option(key)} must be given: {question.default} cannot be used: {reason}")
@@ -206,9 +206,9 @@ class _Interview:
         proposed = None if self._heard is None else self._heard.proposals(self.answers).get(question.key)
         return proposed is not None and proposed == question.default
 
-    def _given_key(self, key: str) -> str:
+    def _key_beforehand(self, key: str) -> str:
         """The key itself, or that of an answer given beforehand to which listening is narrowed."""
-        if key == "bus" or key in self._given.texts or self._listen is None or "bus" not in self.answers:
+        if key == "bus" or key in self._beforehand.texts or self._listen is None or "bus" not in self.answers:
             return key
         return bus_of(self.answers).narrowed_by.get(key, key)
 
@@ -223,15 +223,15 @@ class _Interview:
             AnswerError: it cannot, and nobody can be asked.
         """
         rate = heard.proposals(self.answers).get(question.key) if question.key == "rate" else None
-        if rate is None or question.key in self._given.texts:
+        if rate is None or question.key in self._beforehand.texts:
             return
         reason = take(question, rate, dict(self.answers), self._file)
         if reason is None:
             return
-        said = f"{rate} samples a second were heard, which cannot be used: {reason}"
+        message = f"{rate} samples a second were heard, which cannot be used: {reason}"
         if self._ask is None:
-            raise AnswerError(f"{option(question.key)}: {said}")
-        self._say(said)
+            raise AnswerError(f"{option(question.key)}: {message}")
+        self._say(message)
 
     def _see_unheard(self) -> None:
         """Say that what the answers state was not heard.
@@ -265,7 +265,7 @@ class _Interview:
     def _behind(self, key: str) -> None:
         """What follows the answer to a question."""
         if key == "bus":
-            _refuse_of_other_buses(self._given, self.answers)
+            _refuse_of_other_buses(self._beforehand, self.answers)
         if self._listen is not None:
             self._listen_behind(key, self._listen)
 
@@ -277,7 +277,7 @@ class _Interview:
         if key == "bus" and not bus.listens_behind:
             self._say("--listen is left out: on a bus of this kind there is nothing to listen to")
         if key == bus.listens_behind:
-            heard = listen(bus, self.answers | {BEFOREHAND: self._given.texts})
+            heard = listen(bus, self.answers | {BEFOREHAND: self._beforehand.texts})
             self._deaf = heard if isinstance(heard, SniffError) else None
             self._heard = None if isinstance(heard, SniffError) else heard
             self._has_listened = True
@@ -306,9 +306,9 @@ class _Interview:
 
 
 _OF_CHANNELS = {"channels", "columns", "signals"}
-"""Questions that say what is measured."""
+"""Questions on what is measured."""
 _COUNTERS = {"counter", "counter-byte"}
-"""Questions that say by what samples are counted."""
+"""Questions on how samples are counted."""
 
 
 def _answer(
@@ -366,7 +366,7 @@ def take(question: Question, text: str, answers: Answers, file: Path) -> str | N
 
 
 def refusal(answers: Answers, file: Path) -> str | None:
-    """What ``daqsvc check`` would say if all other answers were the defaults; None if it would be content."""
+    """What ``daqsvc check`` would report if all other answers were the defaults; None if nothing."""
     complete = dict(answers)
     for question in questions(complete, file.parent):
         if question.key not in complete:
@@ -427,18 +427,18 @@ def _missing(question: Question) -> str:
     return f"{words}{more}; there is no terminal to ask at"
 
 
-def _refuse_for_listening(given: Given) -> None:
+def _refuse_for_listening(beforehand: Given) -> None:
     """What tells where to look is of no use to who does not look."""
     for key in {"seconds", *(key for bus in buses().values() for key in bus.for_listening)}:
-        if key in given.texts:
+        if key in beforehand.texts:
             raise AnswerError(
-                f"{given_as(key, given.texts[key])} is for --listen only; add --listen, or leave it out"
+                f"{given_as(key, beforehand.texts[key])} is for --listen only; add --listen, or leave it out"
             )
 
 
-def _refuse_of_other_buses(given: Given, answers: Answers) -> None:
+def _refuse_of_other_buses(beforehand: Given, answers: Answers) -> None:
     """The same as `_refuse_others`, as soon as the bus is known and before a person has answered more."""
-    for key in given.texts:
+    for key in beforehand.texts:
         if _buses_of(key, answers):
             raise AnswerError(
                 f"{option(key)} is not asked for with these answers; {_why_not_asked(key, (), answers)}"
@@ -452,13 +452,13 @@ def _buses_of(key: str, answers: Answers) -> list[str]:
     return [word for word, bus in buses().items() if key in bus.topics]
 
 
-def _refuse_others(given: Given, interview: _Interview) -> None:
+def _refuse_others(beforehand: Given, interview: _Interview) -> None:
     """An answer to no question is a slip of the pen, or is of another bus."""
     asked = interview.asked
-    for key in given.texts:
+    for key in beforehand.texts:
         if key not in asked:
             if key == "class":
-                _refuse_class(given.texts[key])
+                _refuse_class(beforehand.texts[key])
             hint = _why_not_asked(key, asked, interview.answers)
             raise AnswerError(f"{option(key)} is not asked for with these answers; {hint}")
 

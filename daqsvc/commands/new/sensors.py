@@ -126,7 +126,7 @@ class Sensor(NamedTuple):
 
 def sensors(answers: Answers) -> list[Sensor]:
     """The sensors as far as they have been answered."""
-    found = []
+    answered = []
     band_hz = _band_hz(answers)
     shows_speed = band_hz is not None and band_hz[0] <= abs(answers.get("speed", math.inf)) / 60.0
     for channel in bus_of(answers).channels(answers):
@@ -134,10 +134,10 @@ def sensors(answers: Answers) -> list[Sensor]:
         if kind != NONE and sensor_key(channel, "name") in answers:
             unit = _FIXED_UNITS.get(kind) or answers.get(sensor_key(channel, "unit"), "")
             bearing = answers.get(sensor_key(channel, "bearing"))
-            found.append(
+            answered.append(
                 Sensor(channel, answers[sensor_key(channel, "name")], kind, unit, bearing, shows_speed)
             )
-    return found
+    return answered
 
 
 def _lowest_hz(answers: Answers) -> float:
@@ -282,8 +282,8 @@ def _bearing(text: str) -> Any:
     try:
         bearing_orders(q.line(text))
     except KeyError as error:
-        found = f"{error.args[0]}".partition(". ")[0]
-        raise ValueError(f"{found}. Or give balls, ball and pitch diameter in mm: 9, 7.94, 39.04") from None
+        problem = f"{error.args[0]}".partition(". ")[0]
+        raise ValueError(f"{problem}. Or give balls, ball and pitch diameter in mm: 9, 7.94, 39.04") from None
     return text.strip()
 
 
