@@ -236,7 +236,7 @@ class _FailedError(Exception):
 
 
 def _keep(record: CalibrationRecord, arguments: argparse.Namespace) -> int:
-    """Write the file first, then say what was found."""
+    """Write the file first, then print what was found."""
     from daqsvc.acquisition.clock import SystemClock, iso_utc  # noqa: PLC0415
     from daqsvc.commands.calibrate_report import as_json, as_text  # noqa: PLC0415
     from daqsvc.rotor.calibration.file import CalibrationFileError, save_record  # noqa: PLC0415
@@ -262,7 +262,7 @@ def _keep(record: CalibrationRecord, arguments: argparse.Namespace) -> int:
 
 
 def _keep_bearings(baseline: BearingBaseline, arguments: argparse.Namespace) -> int:
-    """Write the file first, then say what was found."""
+    """Write the file first, then print what was found."""
     from daqsvc.acquisition.clock import SystemClock, iso_utc  # noqa: PLC0415
     from daqsvc.bearing.baseline import BaselineFileError, save_bearing_baseline  # noqa: PLC0415
     from daqsvc.commands.calibrate_report import bearings_as_json, bearings_as_text  # noqa: PLC0415

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 ENDINGS = (".blf", ".asc", ".log")
-LIVE_S, TOLD_S = 1.0, 10.0
+LIVE_S, LOGGED_S = 1.0, 10.0
 """How often progress is shown: in a terminal, and elsewhere."""
 WIDTH = 79
 """Of that line in a terminal."""
@@ -177,7 +177,7 @@ class _Progress:
         _tell(f"recording {self._driver.link.name} in {self._log}; Ctrl-C ends it\n")
         try:
             while True:
-                await asyncio.sleep(LIVE_S if self._is_live else TOLD_S)
+                await asyncio.sleep(LIVE_S if self._is_live else LOGGED_S)
                 # Blanks go over the end of a longer line.
                 _tell(f"{self._words():<{WIDTH}}\r" if self._is_live else f"{self._words()}\n")
         finally:

@@ -57,7 +57,7 @@ _PROBES_ONLY = (
     *("--ac-coupled", "--natural-frequency-tolerance", "--damping-tolerance"),
 )
 """Options of `analyze` that accelerometers have not."""
-_SAID_TWICE = "--bearing and --orders both define the bearing; leave out one of them"
+_DEFINED_TWICE = "--bearing and --orders both define the bearing; leave out one of them"
 _WITHOUT = "without a machine file, "
 """Begins what asks for options."""
 _DIMENSIONS = ("--balls", "--ball-diameter-mm", "--pitch-diameter-mm")
@@ -612,7 +612,7 @@ def _bearing_misuse(arguments: argparse.Namespace, machine: Path | None) -> Iter
     if machine is not None:
         yield "--bearing, --orders: the machine file lists the bearings; leave them out"
     if arguments.bearing is not None and arguments.orders is not None:
-        yield _SAID_TWICE
+        yield _DEFINED_TWICE
     if arguments.calibration is not None and arguments.baseline is not None:
         yield "--calibration and --baseline both define the healthy machine; leave out one of them"
     if extra := _options_in_use(arguments, _PROBES_ONLY):
@@ -643,7 +643,7 @@ def _healthy_bearing_misuse(
     if missing:
         return f"to calibrate a bearing, {', '.join(missing)} must be given too"
     if arguments.bearing is not None and arguments.orders is not None:
-        return _SAID_TWICE
+        return _DEFINED_TWICE
     if len(arguments.channels) > MOST_CHANNELS:
         return f"--channels names {len(arguments.channels)} accelerometers; give one or two"
     return bearing_recording_misuse(arguments, recordings)

@@ -79,7 +79,7 @@ class Summary:
                 self._resting.setdefault(service, []).append(alarm)
         self._not_ok: set[str] = set()
         for name in alarms:
-            self._put(name, _UNTOLD)
+            self._put(name, _UNREPORTED)
 
     def note(self, message: OutboxMessage) -> bool:
         """Take in a message of the outbox; whether it is about an alarm of the machine.
@@ -121,6 +121,6 @@ class Summary:
         self._alarms[name] = to_json(name) + b":" + to_json(standing)
 
 
-_UNTOLD: dict[str, Any] = StandingPayload(
+_UNREPORTED: dict[str, Any] = StandingPayload(
     problem="OFF", state=AlarmState.NORMAL, level="normal", occurrence=None, time=None, message=""
 ).model_dump()

@@ -152,7 +152,7 @@ async def test_how_a_recording_gets_on_is_said_meanwhile(
     where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     is_terminal = where == "terminal"
-    monkeypatch.setattr(record, "LIVE_S" if is_terminal else "TOLD_S", 0.01)
+    monkeypatch.setattr(record, "LIVE_S" if is_terminal else "LOGGED_S", 0.01)
     monkeypatch.setattr("sys.stderr.isatty", lambda: is_terminal)
     driver: Any = SimpleNamespace(link=Link("the bus"), counters=CanCounters(frames_recorded=12_345))
     telling = asyncio.create_task(record._Progress(driver, tmp_path / "run.blf").tell())
