@@ -61,7 +61,7 @@ class _Steps:
         self._constant &= (steps == self._step).all(axis=0)
 
     @property
-    def found(self) -> dict[int, int]:
+    def steps(self) -> dict[int, int]:
         """The step by place, of those that have one."""
         if self._step is None or self._constant is None:
             return {}
@@ -96,11 +96,11 @@ class CounterSearch:
         self._frames += len(payloads)
 
     @property
-    def found(self) -> FrameCounter | None:
+    def counter(self) -> FrameCounter | None:
         """What looks like a counter; None if nothing does."""
         if self._frames <= LEAST_COUNTS or self._changed is None:
             return None
-        return _widest(self._bytes.found, self._little.found, self._big.found, self._changed)
+        return _widest(self._bytes.steps, self._little.steps, self._big.steps, self._changed)
 
 
 def counter_between(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> FrameCounter | None:

@@ -312,10 +312,10 @@ class FrameLayout:
             payloads: uint8 ``[n, length]``, of a layout with `selectors`.
         """
         values = np.stack([group.read(payloads)[:, 0] for group, _ in self._selector_groups], axis=1)
-        found: Counter[str] = Counter()
+        pages: Counter[str] = Counter()
         for row, count in zip(*np.unique(values, axis=0, return_counts=True), strict=True):
-            found[self._page_in_words(row.tolist())] += int(count)
-        return found
+            pages[self._page_in_words(row.tolist())] += int(count)
+        return pages
 
     def _page_in_words(self, values: Sequence[float]) -> str:
         parts = []

@@ -232,10 +232,10 @@ def whole(text: str) -> int:
 
 def bit_rate(text: str) -> int:
     """A bit rate in bit/s; ``500k`` and ``1M`` are those that everybody states."""
-    found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([kM]?)(?:bit/s|bps|bit|bd|baud)?", text.strip(), re.IGNORECASE)
-    if found is None:
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([kM]?)(?:bit/s|bps|bit|bd|baud)?", text.strip(), re.IGNORECASE)
+    if match is None:
         raise ValueError(f'"{text}" is not a bit rate; write it in bit/s, e.g. 500000 or 500k')
-    value = float(found[1]) * {"": 1, "k": 1e3, "m": 1e6}[found[2].lower()]
+    value = float(match[1]) * {"": 1, "k": 1e3, "m": 1e6}[match[2].lower()]
     if not value.is_integer():
         raise ValueError(f'"{text}" is not a whole number of bit/s; write e.g. 500000 or 500k')
     return int(value)

@@ -255,12 +255,12 @@ def sensor_lines(
         is_guess = guess and text == "1" and rate_hz < math.inf and waveform
         is_guess = is_guess and by_name(channel) in {None, "accelerometer"}
         by = _GUESS.format(_ABOUT_0 if swings else "the rate")
-        given = "g" if is_guess else text
-        known = unit_of(given)
-        unit = given.strip() if known is None else known.name
+        unit_text = "g" if is_guess else text
+        known = unit_of(unit_text)
+        unit = unit_text.strip() if known is None else known.name
         known_values = (values or {}).get(channel, UNKNOWN_VALUES)
         by_unit = type_by_unit(channel, unit, waveform=waveform, values=known_values)
-        kind = "trend" if is_of_peak(given) else by_unit or "trend"
+        kind = "trend" if is_of_peak(unit_text) else by_unit or "trend"
         if kind in {"trend", "proximity"}:  # a probe needs more keys than can be known here
             kind = "trend"
             unit = text.strip()
@@ -319,10 +319,10 @@ def sniffed(
     """
     parser = _Words(add_help=False)
     sniffer.add_arguments(parser)
-    found = sniffer.sniff(parser.parse_args(words), stop, tell)
-    if found.problem:
-        raise NothingFoundError(found.problem, found.figures)
-    return found.figures
+    result = sniffer.sniff(parser.parse_args(words), stop, tell)
+    if result.problem:
+        raise NothingFoundError(result.problem, result.figures)
+    return result.figures
 
 
 def unit_of_suffix(suffix: str) -> str:

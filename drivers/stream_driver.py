@@ -91,9 +91,9 @@ class StreamDriver(ABC):
         """
         if getattr(spec, "name", None) not in self._assemblers:
             raise ValueError(f"take() is given the stream {spec!r:.60}; give it one of self.port.streams")
-        given = payloads if isinstance(cast("object", payloads), np.ndarray) else None
-        if given is None or given.dtype != np.uint8 or given.shape[1:] != (spec.layout.length,):
-            what = short(payloads) if given is None else f"{given.dtype} {list(given.shape)}"
+        array = payloads if isinstance(cast("object", payloads), np.ndarray) else None
+        if array is None or array.dtype != np.uint8 or array.shape[1:] != (spec.layout.length,):
+            what = short(payloads) if array is None else f"{array.dtype} {list(array.shape)}"
             raise ValueError(
                 f"take() is given {what}; give it an array of uint8 [n, {spec.layout.length}] of {spec.name}"
             )

@@ -50,7 +50,7 @@ class CharacterFormat:
     def __init__(self, link: str, asked: Character) -> None:
         self._link = link
         self._asked = asked
-        self._said = False
+        self._is_logged = False
 
     def on(self, port: str | Path) -> Character:
         """The characters with which to open a port; what is left out is logged once, as a warning.
@@ -61,8 +61,8 @@ class CharacterFormat:
         if not is_pseudo_terminal(port):
             return self._asked
         carried = Character(8, "none")
-        if carried != self._asked and not self._said:
-            self._said = True
+        if carried != self._asked and not self._is_logged:
+            self._is_logged = True
             logger.warning(
                 "%s is a pseudo-terminal, which passes whole bytes only: it is opened without parity and "
                 "with 8 data bits, instead of parity %r and %d data bits; correct the port if a real device "

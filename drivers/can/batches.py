@@ -121,8 +121,8 @@ class IdMatch:
         """The ids of a layout: one of 11 or 29 bits, of any priority if it has one, in frames with data."""
         # Not `ERROR`: in a filter of the kernel this bit asks for error frames.
         if layout.extended:
-            told_apart = EXTENDED_ID & ~PRIORITY if layout.any_priority else EXTENDED_ID
-            return cls(layout.frame_id | EXTENDED, told_apart | EXTENDED | REMOTE)
+            id_mask = EXTENDED_ID & ~PRIORITY if layout.any_priority else EXTENDED_ID
+            return cls(layout.frame_id | EXTENDED, id_mask | EXTENDED | REMOTE)
         return cls(layout.frame_id, STANDARD_ID | EXTENDED | REMOTE)
 
     def __contains__(self, frame_id: int) -> bool:

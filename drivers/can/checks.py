@@ -56,7 +56,7 @@ class FrameFacts(NamedTuple):
     pages: Mapping[str, frozenset[int]] = MappingProxyType({})
 
     @property
-    def told_apart(self) -> tuple[bool, int]:
+    def compared_id(self) -> tuple[bool, int]:
         """What no other frames on the bus have: the id, less its priority where that does not count."""
         return self.extended, self.frame_id & ~PRIORITY if self.any_priority else self.frame_id
 
@@ -266,7 +266,7 @@ def _clash(a: FrameFacts, b: FrameFacts) -> bool:
     """Whether some frame would be one of both streams."""
     if a.any_priority != b.any_priority:
         a, b = a._replace(any_priority=True), b._replace(any_priority=True)
-    if a.told_apart != b.told_apart:
+    if a.compared_id != b.compared_id:
         return False
     return not any(a.pages[name].isdisjoint(b.pages[name]) for name in a.pages.keys() & b.pages.keys())
 

@@ -23,7 +23,7 @@ class HeardMessages(HeardOnCan):
 
     def __init__(
         self,
-        found: Mapping[str, Any],
+        figures: Mapping[str, Any],
         dbc: str,
         messages: Mapping[str, Message],
         samples_in_frame: Callable[[Answers], int],
@@ -31,16 +31,16 @@ class HeardMessages(HeardOnCan):
         *,
         rate_is_stated: bool,
     ) -> None:
-        self._decoded = decoded_signals(found)
-        strangers = [one["id"] for one in found["ids"] if one["message"] is None and one.get("extended")]
-        silent = set(messages) - {one["message"] for one in found["ids"]}
+        self._decoded = decoded_signals(figures)
+        strangers = [one["id"] for one in figures["ids"] if one["message"] is None and one.get("extended")]
+        silent = set(messages) - {one["message"] for one in figures["ids"]}
         extended = {name: messages[name].frame_id for name in silent if messages[name].is_extended_frame}
         self._other_sources = list(other_sources(strangers, extended))
         missed = ". ".join(self._other_sources) or (
             f"No frame is as {dbc} describes: it is most likely the file of another device. Remedy: give the "
             "file of the device that sends"
         )
-        super().__init__(found, "" if self._decoded else missed)
+        super().__init__(figures, "" if self._decoded else missed)
         self._rate_is_stated = rate_is_stated
         self._messages, self._samples_in_frame, self._types = messages, samples_in_frame, types
 
@@ -75,7 +75,7 @@ class HeardMessages(HeardOnCan):
             proposed["counter-counts"] = counts
         if signals := self._without_clocks(answers | {"message": chosen["message"]}):
             proposed["signals"] = ", ".join(signals)
-        rates = [one["rate_hz"] for one in self.found["ids"] if one["message"] == chosen["message"]]
+        rates = [one["rate_hz"] for one in self.figures["ids"] if one["message"] == chosen["message"]]
         if len(rates) == 1 and rates[0]:
             measured = [one for one in chosen["signals"] if one["signal"] in answers.get("signals", ())]
             share = _simple_share(
@@ -131,7 +131,9 @@ class HeardMessages(HeardOnCan):
 
     def _shorter(self, message: str) -> str:
         length = self._messages[message].length
-        lengths = {many for one in self.found["ids"] if one["message"] == message for many in one["lengths"]}
+        lengths = {
+            many for one in self.figures["ids"] if one["message"] == message for many in one["lengths"]
+        }
         if not lengths or max(lengths) >= length:
             return ""
         come = " and ".join(f"{many}" for many in sorted(lengths))
@@ -262,7 +264,7 @@ class HeardMessages(HeardOnCan):
         """See `Heard.not_read`: the file reads one message, and of that no states if nobody names them."""
         others = [
             f"{one['message']} ({one['id']:#x})"
-            for one in self.found["ids"]
+            for one in self.figures["ids"]
             if one["message"] not in {None, answers["message"]}
         ]
         if others:

@@ -68,8 +68,8 @@ def samples_of_one(signals: Sequence[str]) -> dict[str, list[str]]:
 
     Others may be beside them: these come once a frame, and a stream of their own reads them.
     """
-    found = numbered(signals)
-    return found if len({len(names) for names in found.values()}) == 1 else {}
+    by_stem = numbered(signals)
+    return by_stem if len({len(names) for names in by_stem.values()}) == 1 else {}
 
 
 def beside_samples(signals: Sequence[str]) -> list[str]:
@@ -81,12 +81,12 @@ def beside_samples(signals: Sequence[str]) -> list[str]:
 def most_likely_samples(signals: Iterable[Any], names: Sequence[str]) -> list[str]:
     """Those of the names that count from 0, and are of vibration: hardly of separate sensors."""
     units = unit_names(signals, names)
-    found = {
+    by_stem = {
         stem: of_one
         for stem, of_one in numbered(names).items()
         if number_of(of_one[0]) == 0 and all(units.get(name) in TYPE_OF_UNIT for name in of_one)
     }
-    return [name for name in names if any(name in of_one for of_one in found.values())]
+    return [name for name in names if any(name in of_one for of_one in by_stem.values())]
 
 
 def unit_names(signals: Iterable[Any], names: Iterable[str]) -> dict[str, str]:
@@ -155,6 +155,6 @@ def likely_measured(signals: Sequence[Any]) -> list[str]:
         if come_together(known, [*(other.name for other in page), one.name]):
             page.append(one)
     for likely in (always, page):
-        if found := [one.name for one in likely if one.unit]:
-            return most_likely_samples(signals, found) or found
+        if with_unit := [one.name for one in likely if one.unit]:
+            return most_likely_samples(signals, with_unit) or with_unit
     return [one.name for one in (always or page)[:1]]

@@ -116,10 +116,10 @@ class DbcQuestions(CanQuestions):
 
     listens_behind = "dbc"
 
-    def heard(self, found: Mapping[str, Any], answers: Answers) -> HeardOnCan:
+    def heard(self, figures: Mapping[str, Any], answers: Answers) -> HeardOnCan:
         """See `CanQuestions.heard`."""
         return HeardMessages(
-            found,
+            figures,
             answers["dbc"],
             self._messages(answers),
             self._samples_in_frame,
@@ -192,11 +192,11 @@ class DbcQuestions(CanQuestions):
         signals = {one.name: one for one in self._messages(answers)[answers["message"]].signals}
 
         def kind_of(channel: str, names: Sequence[str]) -> str:
-            found = [heard[name] for name in names if name in heard]
+            of_names = [heard[name] for name in names if name in heard]
             values = Values(
                 all(never_negative(signals[name]) for name in names),
-                min((one["min"] for one in found), default=math.nan),
-                max((one["max"] for one in found), default=math.nan),
+                min((one["min"] for one in of_names), default=math.nan),
+                max((one["max"] for one in of_names), default=math.nan),
             )
             kind = type_by_unit(channel, units.get(channel), waveform=waveform, values=values)
             return kind or by_name(channel) or "trend"

@@ -233,9 +233,9 @@ class MessageTraffic:
         self._cycle_s = float(message.cycle_time or 0.0) / 1000.0 / max(len(signals_by_page(message)), 1)
         self.signals: list[SignalTraffic] = []
         self.unusable: list[str] = []
-        self._told_apart = EXTENDED | EXTENDED_ID
+        self._id_mask = EXTENDED | EXTENDED_ID
         if message.protocol == "j1939":
-            self._told_apart &= ~PRIORITY
+            self._id_mask &= ~PRIORITY
         for signal in message.signals:
             try:
                 self.signals.append(SignalTraffic(message, signal))
@@ -282,7 +282,7 @@ class MessageTraffic:
     def has(self, frame_id: int) -> bool:
         """Whether an id, with its flags, is the message's."""
         own = self.frame_id | (EXTENDED if self.extended else 0)
-        return (frame_id & self._told_apart) == (own & self._told_apart)
+        return (frame_id & self._id_mask) == (own & self._id_mask)
 
     def take(self, frame_id: int, data: NDArray[np.uint8], lengths: NDArray[np.int64]) -> None:
         """The next frames: data ``[n, 64]`` and their lengths ``[n]``."""
@@ -321,8 +321,8 @@ class DbcTraffic:
     def message_of(self, frame_id: int) -> MessageTraffic | None:
         """The message that an id, with its flags, belongs to; None of remote frames."""
         if frame_id not in self._of_id:
-            found = (message for message in self.messages if message.has(frame_id))
-            self._of_id[frame_id] = None if frame_id & REMOTE else next(found, None)
+            matches = (message for message in self.messages if message.has(frame_id))
+            self._of_id[frame_id] = None if frame_id & REMOTE else next(matches, None)
         return self._of_id[frame_id]
 
     def take(self, batch: CanBatch) -> None:

@@ -216,7 +216,7 @@ class CanDriver:
         # SocketCAN may leave out frames of other ids, so that they are not known to come.
         if bus.interface != "socketcan" or bus.filter is False:
             self.link.quiet = self._faults.quiet
-        self._said: set[str] = set()
+        self._logged: set[str] = set()
         self._is_fresh = False
         """Whether nothing has come since the bus was opened: its controller's state is then not known."""
         self._recorder: CanRecorder | None = None
@@ -393,9 +393,9 @@ class CanDriver:
 
     def _say_once(self, key: str, code: Code | None, message: str, *arguments: object) -> None:
         """Log a fault once, by its code; None is for good news."""
-        if key in self._said:
+        if key in self._logged:
             return
-        self._said.add(key)
+        self._logged.add(key)
         if code is None:
             notice(logger, message, *arguments)
         else:

@@ -168,12 +168,12 @@ class ErrorCounts:
 
 def _state(classes: NDArray[np.uint32], status: NDArray[np.uint8]) -> ControllerState | None:
     """The state that the last frame which tells one leaves the controller in."""
-    tells = np.flatnonzero(
+    stating = np.flatnonzero(
         ((classes & (BUS_OFF | RESTARTED)) != 0) | ((status & (_WARNING | _PASSIVE | _ACTIVE)) != 0)
     )
-    if not len(tells):
+    if not len(stating):
         return None
-    last_class, last_status = int(classes[tells[-1]]), int(status[tells[-1]])
+    last_class, last_status = int(classes[stating[-1]]), int(status[stating[-1]])
     if last_class & BUS_OFF:
         return "bus-off"
     if last_status & _PASSIVE:

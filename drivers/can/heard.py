@@ -32,18 +32,18 @@ class HeardOnCan(Heard):
     """Frames of a CAN bus, whatever is in them.
 
     Attributes:
-        found: figures of `drivers.can.sniff.CanSniffer`.
+        figures: those of `drivers.can.sniff.CanSniffer`.
     """
 
-    def __init__(self, found: Mapping[str, Any], missed: str = "") -> None:
-        super().__init__(list(in_words(found)), missed)
-        self.found = found
+    def __init__(self, figures: Mapping[str, Any], missed: str = "") -> None:
+        super().__init__(list(in_words(figures)), missed)
+        self.figures = figures
 
     def proposals(self, answers: Answers) -> dict[str, str]:
         """See `Heard.proposals`: the bit rates, and whether there are CAN FD frames."""
         del answers
-        fd = any(one["fd"] for one in self.found["ids"])
-        rates = {"bitrate": self.found["bitrate"], "data-bitrate": self.found["data_bitrate"]}
+        fd = any(one["fd"] for one in self.figures["ids"])
+        rates = {"bitrate": self.figures["bitrate"], "data-bitrate": self.figures["data_bitrate"]}
         heard = {key: f"{rate}" for key, rate in rates.items() if rate is not None}
         return {"fd": "yes" if fd else "no", **heard}
 
@@ -51,8 +51,8 @@ class HeardOnCan(Heard):
 class HeardFrames(HeardOnCan):
     """Frames with samples side by side."""
 
-    def __init__(self, found: Mapping[str, Any], channels: Callable[[Answers], Sequence[str]]) -> None:
-        super().__init__(found)
+    def __init__(self, figures: Mapping[str, Any], channels: Callable[[Answers], Sequence[str]]) -> None:
+        super().__init__(figures)
         self._channels = channels
 
     def proposals(self, answers: Answers) -> dict[str, str]:
@@ -60,7 +60,7 @@ class HeardFrames(HeardOnCan):
         proposed = super().proposals(answers)
         ids = [
             one
-            for one in self.found["ids"]
+            for one in self.figures["ids"]
             if one["rate_hz"] and not one["remote"] and one["extended"] == (one["id"] > LAST_SHORT_ID)
         ]
         if not ids:
@@ -78,7 +78,7 @@ class HeardFrames(HeardOnCan):
 
     def unheard(self, answers: Answers) -> str:
         """See `Heard.unheard`."""
-        heard = [one["id"] for one in self.found["ids"]]
+        heard = [one["id"] for one in self.figures["ids"]]
         if answers.get("id", heard[0]) in heard:
             return ""
         others = ", ".join(f"{one:#x}" for one in heard[:SHOWN])
@@ -89,8 +89,8 @@ class HeardFrames(HeardOnCan):
         del answers
         if not OF_BYTES.intersection(assumed):
             return ""
-        heard = [line.strip() for line in _of_ids(self.found)]
-        more = len(self.found["ids"]) - len(heard)
+        heard = [line.strip() for line in _of_ids(self.figures)]
+        more = len(self.figures["ids"]) - len(heard)
         return (
             f"no frame states which of its bytes are which value. Heard: {'; '.join(heard)}"
             f"{f'; and {more} more' if more else ''}. Remedy: give the DBC file of the device, with --bus "
@@ -119,9 +119,9 @@ class HeardFrames(HeardOnCan):
         return places
 
 
-def decoded_signals(found: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+def decoded_signals(figures: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     """Messages of the DBC file whose signals were heard."""
-    return [one for one in found["dbc"]["messages"] if one["signals"]]
+    return [one for one in figures["dbc"]["messages"] if one["signals"]]
 
 
 def values_heard(signals: Sequence[Mapping[str, Any]]) -> str:
@@ -133,25 +133,27 @@ def values_heard(signals: Sequence[Mapping[str, Any]]) -> str:
     return "; ".join(shown) + (f"; and {len(signals) - SHOWN} more" if len(signals) > SHOWN else "")
 
 
-def in_words(found: Mapping[str, Any]) -> Iterator[str]:
+def in_words(figures: Mapping[str, Any]) -> Iterator[str]:
     """What was heard, in a few lines: the ids that come most often."""
-    ids = sorted(found["ids"], key=lambda one: -(one["rate_hz"] or 0.0))
-    yield f"{counted(found['frames'], 'frame')} of {counted(len(ids), 'id')}:"
-    yield from _of_ids(found, values=True)
+    ids = sorted(figures["ids"], key=lambda one: -(one["rate_hz"] or 0.0))
+    yield f"{counted(figures['frames'], 'frame')} of {counted(len(ids), 'id')}:"
+    yield from _of_ids(figures, values=True)
     if len(ids) > SHOWN:
         yield f"  ... and {len(ids) - SHOWN} more: daqsvc sniff can shows them"
 
 
-def _of_ids(found: Mapping[str, Any], *, values: bool = False) -> Iterator[str]:
+def _of_ids(figures: Mapping[str, Any], *, values: bool = False) -> Iterator[str]:
     """The ids that come most often: how long their frames are, how often they come, with which values."""
-    by_message = {one["message"]: one for one in decoded_signals(found)} if values and "dbc" in found else {}
-    ids = sorted(found["ids"], key=lambda one: -(one["rate_hz"] or 0.0))
+    by_message = (
+        {one["message"]: one for one in decoded_signals(figures)} if values and "dbc" in figures else {}
+    )
+    ids = sorted(figures["ids"], key=lambda one: -(one["rate_hz"] or 0.0))
     for one in ids[:SHOWN]:
         lengths = ", ".join(map(str, one["lengths"]))
         rate = "once" if one["rate_hz"] is None else f"{one['rate_hz']:.4g} a second"
         counter, message = one["counter"], one["message"]
         counts = f", byte {counter['byte']} counts" if counter else ""
-        if message is None and "dbc" in found:
+        if message is None and "dbc" in figures:
             message = "not in the DBC file"
         yield f"  {one['id']:#x}: {lengths} bytes, {rate}{counts}{f', {message}' if message else ''}"
         if (heard := by_message.pop(message, None)) is None:

@@ -80,21 +80,21 @@ class CanQuestions(BusQuestions):
         try:
             # An interface of the kernel takes CAN FD frames anyway.
             fd = ["--fd"] if answers["interface"] != "socketcan" else []
-            found = sniffed(CanSniffer(_LISTEN_S), [*words, *fd, *line], stop, tell)
+            figures = sniffed(CanSniffer(_LISTEN_S), [*words, *fd, *line], stop, tell)
         except NothingFoundError:
             raise
         except SniffError:
             if answers["interface"] == "socketcan":
                 raise
-            found = sniffed(CanSniffer(_LISTEN_S), [*words, *line], stop, tell)
-        return self.heard(found, answers)
+            figures = sniffed(CanSniffer(_LISTEN_S), [*words, *line], stop, tell)
+        return self.heard(figures, answers)
 
     @abstractmethod
-    def heard(self, found: Mapping[str, Any], answers: Answers) -> HeardOnCan:
+    def heard(self, figures: Mapping[str, Any], answers: Answers) -> HeardOnCan:
         """What the frames that were heard show of the answers behind `listens_behind`.
 
         Args:
-            found: figures of `CanSniffer`.
+            figures: figures of `CanSniffer`.
             answers: those before.
         """
 
@@ -173,10 +173,10 @@ class PackedQuestions(CanQuestions):
         del channel
         return packed.in_volts(answers)
 
-    def heard(self, found: Mapping[str, Any], answers: Answers) -> HeardOnCan:
+    def heard(self, figures: Mapping[str, Any], answers: Answers) -> HeardOnCan:
         """See `CanQuestions.heard`."""
         del answers
-        return HeardFrames(found, self.channels)
+        return HeardFrames(figures, self.channels)
 
     def example(self, answers: Answers, assumed: Collection[str]) -> str:
         """See `BusQuestions.example`."""

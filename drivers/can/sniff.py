@@ -237,9 +237,9 @@ def _opened(bus: CanBus, clock: Any) -> CanSource:
     try:
         return open_adapter(opened, clock)
     except Exception as error:
-        said = f"{error}" or type(error).__name__
+        reason = f"{error}" or type(error).__name__
         raise SniffError(
-            f"{bus.interface} {bus.channel} cannot be opened: {said}. Remedy: see what is plugged in and "
+            f"{bus.interface} {bus.channel} cannot be opened: {reason}. Remedy: see what is plugged in and "
             "whether its driver is installed"
         ) from error
 
@@ -647,8 +647,8 @@ class _Report(NamedTuple):
 def _counter_of_samples(message: MessageTraffic) -> SignalTraffic | None:
     """A signal that counts the samples: it grows by as many as there are numbered signals of one channel."""
     many = {len(names) for names in numbered([one.name for one in message.signals if one.frames]).values()}
-    found = (one for one in message.signals if not one.multiplexed and one.step in many)
-    return next(found, None)
+    candidates = (one for one in message.signals if not one.multiplexed and one.step in many)
+    return next(candidates, None)
 
 
 def _as_counter(step: int | None) -> str:

@@ -116,7 +116,7 @@ class IdTraffic:
     @property
     def counter(self) -> FrameCounter | None:
         """What looks like a counter; None if nothing does."""
-        return self._counters.found
+        return self._counters.counter
 
     def take(
         self,

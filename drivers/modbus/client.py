@@ -353,7 +353,7 @@ class ModbusClient:
         self._wire = ModbusWire(bus, clock, counters)
         self._idle_ns: deque[int] = deque(maxlen=_SAME_IDLE)
         """How long nothing had been asked when the device closed the connection, the last times."""
-        self._told = False
+        self._idle_limit_logged = False
         """Whether it was stated that the device closes idle connections."""
 
     @property
@@ -448,8 +448,8 @@ class ModbusClient:
                 closed.idle_ns / NS_PER_S,
             )
         # A device that restarts closes it, too, at any time: only about the same time again is a limit.
-        if not self._told and len(self._idle_ns) == _SAME_IDLE and _alike(self._idle_ns):
-            self._told = True
+        if not self._idle_limit_logged and len(self._idle_ns) == _SAME_IDLE and _alike(self._idle_ns):
+            self._idle_limit_logged = True
             notice(
                 logger,
                 "%s closes a connection over which nothing is asked (%d times after about %.3g s); it is "

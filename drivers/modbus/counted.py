@@ -98,7 +98,7 @@ class CountedRows:
         self._still = ""
         self._count: int | None = None
         self._count_since_ns = self._looked_ns = 0
-        self._anew_said_ns: int | None = None
+        self._new_base_logged_ns: int | None = None
 
     @property
     def time_base(self) -> TimeBaseState:
@@ -142,8 +142,8 @@ class CountedRows:
         index = first + np.arange(len(samples), dtype=np.int64)
         anew = self._time.learn(index, np.full(len(samples), seen_ns, np.int64), restarted=restarted)
         self._stand(seen_ns)
-        if anew and (self._anew_said_ns is None or seen_ns - self._anew_said_ns >= QUIET_NS):
-            self._anew_said_ns = seen_ns
+        if anew and (self._new_base_logged_ns is None or seen_ns - self._new_base_logged_ns >= QUIET_NS):
+            self._new_base_logged_ns = seen_ns
             logger.warning(
                 "stream %r: its samples do not arrive at the times that its clock predicts; its "
                 "time base begins again",
@@ -195,7 +195,7 @@ class CountedReader(PollingReader, Generic[CountedT]):
         self._next: int | None = None
         self._index = 0
         self._restarted = False
-        self._restart_said_ns: int | None = None
+        self._restart_logged_ns: int | None = None
 
     @property
     def streams(self) -> Mapping[str, tuple[StreamCounters, TimeBaseState]]:
@@ -212,8 +212,8 @@ class CountedReader(PollingReader, Generic[CountedT]):
     def _begin_again(self, index: int) -> None:
         """Go on at an index that is estimated from the clock, since the count does not show it any more."""
         now_ns = self._clock.monotonic_ns()
-        if self._restart_said_ns is None or now_ns - self._restart_said_ns >= QUIET_NS:
-            self._restart_said_ns = now_ns
+        if self._restart_logged_ns is None or now_ns - self._restart_logged_ns >= QUIET_NS:
+            self._restart_logged_ns = now_ns
             logger.warning(
                 "stream %r: the device has restarted its count, or has not counted for a while; how many "
                 "samples are missing is estimated from the clock",

@@ -23,14 +23,14 @@ def register_count(raw_type: str) -> int:
     return int(raw_type[-2:]) // 16
 
 
-def in_words(found: Mapping[str, Any], timeout_ms: float) -> Iterator[str]:
+def in_words(figures: Mapping[str, Any], timeout_ms: float) -> Iterator[str]:
     """What was found, in a few lines: which units answer, and the registers that are worth reading."""
     from drivers.modbus.scan_report import NO_VALUE, late_words  # noqa: PLC0415 - brings the settings
 
-    yield from _units_in_words(found)
-    if found["replies_late"]:
-        yield f"{late_words(found['replies_late'], timeout_ms)} to find what is missing"
-    for table in found["tables"]:
+    yield from _units_in_words(figures)
+    if figures["replies_late"]:
+        yield f"{late_words(figures['replies_late'], timeout_ms)} to find what is missing"
+    for table in figures["tables"]:
         if not table["registers"]:
             continue
         name = f"unit {table['unit']} has {TABLES[table['function']]} registers {_runs_in_words(table)}"
@@ -77,18 +77,18 @@ class HeardUnits(Heard):
     """Units that have registers.
 
     Attributes:
-        found: figures of `drivers.modbus.sniff.ModbusSniffer`.
+        figures: those of `drivers.modbus.sniff.ModbusSniffer`.
     """
 
     def __init__(
         self,
-        found: Mapping[str, Any],
+        figures: Mapping[str, Any],
         lines: Sequence[str],
         registers: str,
         next_address: Callable[[Answers, str], int],
     ) -> None:
-        super().__init__(lines, _only_0(found, registers))
-        self.found, self._next_address = found, next_address
+        super().__init__(lines, _only_0(figures, registers))
+        self.figures, self._next_address = figures, next_address
 
     def proposals(self, answers: Answers) -> dict[str, str]:
         """See `Heard.proposals`."""
@@ -100,29 +100,29 @@ class HeardUnits(Heard):
             return proposed
         if tables[0]["max_count"] is not None:
             proposed["max-count"] = f"{tables[0]['max_count']}"
-        found_channels = {one["address"]: one for one in tables[0]["channels"]}
+        scanned_channels = {one["address"]: one for one in tables[0]["channels"]}
         values = {one["address"]: one["int16"] for one in tables[0]["registers"]}
         marks = {
             one["address"]: one["uint16"]
             for one in tables[0]["registers"]
             if one["uint16"] in NO_VALUE and one["address"] not in tables[0]["moved"]
         }
-        proposed["channels"] = ", ".join(one["name"] for one in found_channels.values())
+        proposed["channels"] = ", ".join(one["name"] for one in scanned_channels.values())
         for channel in answers.get("channels", ()):
             if sensor_key(channel, "register-type") not in answers:
                 address = answers.get(sensor_key(channel, "address"))
                 if address is None:
-                    address = self._heard_address(answers, channel, found_channels, values)
+                    address = self._heard_address(answers, channel, scanned_channels, values)
                     proposed[sensor_key(channel, "address")] = f"{address}"
-                kind = found_channels.get(address, {"type": "uint16", "order": "ABCD"})
-                negative = address not in found_channels and is_signed([values.get(address, 0) & 0xFFFF])
+                kind = scanned_channels.get(address, {"type": "uint16", "order": "ABCD"})
+                negative = address not in scanned_channels and is_signed([values.get(address, 0) & 0xFFFF])
                 if kind["type"] != "uint16" or negative:
                     proposed[sensor_key(channel, "register-type")] = "int16" if negative else kind["type"]
                 proposed[sensor_key(channel, "order")] = kind["order"]
                 break
             address = answers[sensor_key(channel, "address")]
-            if address in found_channels:
-                proposed[sensor_key(channel, "order")] = found_channels[address]["order"]
+            if address in scanned_channels:
+                proposed[sensor_key(channel, "order")] = scanned_channels[address]["order"]
             if address in marks and register_count(answers[sensor_key(channel, "register-type")]) == 1:
                 proposed[sensor_key(channel, "no-value")] = f"0x{marks[address]:04X}"
         return proposed
@@ -152,7 +152,7 @@ class HeardUnits(Heard):
 
     def _place(self, answers: Answers) -> tuple[dict[str, str], list[Mapping[str, Any]]]:
         """The unit and the table to propose, and what was found of those that are answered."""
-        tables = [one for one in self.found["tables"] if one["registers"]]
+        tables = [one for one in self.figures["tables"] if one["registers"]]
         # Where all is 0, or stands still, nothing shows that the values are there.
         likely = min(tables, key=lambda one: (_is_0(one), not one["moved"]))
         proposed = {"unit": f"{likely['unit']}"}
@@ -165,24 +165,24 @@ class HeardUnits(Heard):
 
     def unheard(self, answers: Answers) -> str:
         """See `Heard.unheard`: the unit that was answered has sent nothing."""
-        found = self.found
-        if found["units_alike"] or answers.get("unit", found["units"][0]) in found["units"]:
+        figures = self.figures
+        if figures["units_alike"] or answers.get("unit", figures["units"][0]) in figures["units"]:
             return ""
-        unit, others = answers["unit"], ", ".join(map(str, found["units"]))
-        first, last = found["units_asked"]
+        unit, others = answers["unit"], ", ".join(map(str, figures["units"]))
+        first, last = figures["units_asked"]
         if not first <= unit <= last:
             return (
                 f"Unit {unit} was not asked. Remedy: write --units {unit}, too; those that answer: {others}"
             )
-        said = "has refused, like most units" if unit in found["units_left_out"] else "has not answered"
-        return f"Unit {unit} {said}. Remedy: correct --unit; those that answer: {others}"
+        outcome = "has refused, like most units" if unit in figures["units_left_out"] else "has not answered"
+        return f"Unit {unit} {outcome}. Remedy: correct --unit; those that answer: {others}"
 
     def notes(self, answers: Answers, assumed: Collection[str], taken: Collection[str]) -> Iterable[str]:
         """See `Heard.notes`: what was read of the channels, and what the values of registers do not show."""
         del assumed
         if answers["way"] != "values":
             return
-        table = _table_read(self.found, answers)
+        table = _table_read(self.figures, answers)
         if table is not None:
             yield from values_heard(table, answers)
         guessed = [name for name in answers["channels"] if sensor_key(name, "register-type") in taken]
@@ -198,14 +198,14 @@ class HeardUnits(Heard):
 
     def not_read(self, answers: Answers) -> Iterable[str]:
         """See `Heard.not_read`: the other table of the unit, if it has values, and the other units."""
-        found = self.found
+        figures = self.figures
         if answers["way"] == "values":
             yield from self._not_read_of_unit(answers)
-        units = [unit for unit in found["units"] if unit != answers["unit"]]
-        named = "; ".join(f"unit {unit} ({_has(found, unit)})" for unit in units[:SHOWN])
+        units = [unit for unit in figures["units"] if unit != answers["unit"]]
+        named = "; ".join(f"unit {unit} ({_has(figures, unit)})" for unit in units[:SHOWN])
         more = f"; and {len(units) - SHOWN} more" if len(units) > SHOWN else ""
-        if units and not found["units_alike"]:
-            with_registers = [unit for unit in units if _has(found, unit) != _NO_REGISTERS]
+        if units and not figures["units_alike"]:
+            with_registers = [unit for unit in units if _has(figures, unit) != _NO_REGISTERS]
             which = "each" if with_registers == units else "each that has registers"
             proposes = f" daqsvc sniff modbus --function both proposes a stream for {which}."
             yield f"Not read: {named}{more}.{proposes if with_registers else ''}"
@@ -213,7 +213,7 @@ class HeardUnits(Heard):
     def _not_read_of_unit(self, answers: Answers) -> Iterator[str]:
         """What else the unit has: its other table, and registers that stand still."""
         unit, read = answers["unit"], answers["table"]
-        mine = [one for one in self.found["tables"] if one["unit"] == unit and one["registers"]]
+        mine = [one for one in self.figures["tables"] if one["unit"] == unit and one["registers"]]
         still = (
             " None of both moved: see the device's register map for which are measured."
             if not any(one["moved"] for one in mine)
@@ -232,17 +232,17 @@ class HeardUnits(Heard):
 class HeardNoRegisters(Heard):
     """Units that answer, although none of the registers that were asked for is there."""
 
-    def __init__(self, found: Mapping[str, Any], registers: str) -> None:
+    def __init__(self, figures: Mapping[str, Any], registers: str) -> None:
         note = "" if registers == AUTO else manual_note(registers_of(registers))
         remedy = "Remedy: write the addresses of its manual, counted from 0, as --registers, e.g. 4000-4100"
-        unsure = found["units_alike"] or found["units_left_out"]
+        unsure = figures["units_alike"] or figures["units_left_out"]
         others = "; or name other units with --units" if unsure else ""
         missed = note or f"No register that was asked for is there. {remedy}{others}"
-        super().__init__([*_units_in_words(found), *_tables_in_words(found)], missed)
-        self._unit: int = found["units"][0]
+        super().__init__([*_units_in_words(figures), *_tables_in_words(figures)], missed)
+        self._unit: int = figures["units"][0]
         self._tables = {
             table["unit"]: TABLES[table["function"]]
-            for table in reversed(found["tables"])
+            for table in reversed(figures["tables"])
             if table["asked"] and _has_function(table)
         }
 
@@ -259,9 +259,9 @@ def _has_function(table: Mapping[str, Any]) -> bool:
     return all(code != ILLEGAL_FUNCTION for _, code in table["refused"])
 
 
-def _tables_in_words(found: Mapping[str, Any]) -> Iterator[str]:
+def _tables_in_words(figures: Mapping[str, Any]) -> Iterator[str]:
     """Which tables units have of which no register was found."""
-    for table in found["tables"]:
+    for table in figures["tables"]:
         name, unit = TABLES[table["function"]], table["unit"]
         if not _has_function(table):
             yield f"unit {unit} has no {name} registers: it refuses function {table['function']}"
@@ -321,14 +321,14 @@ def _is_0(table: Mapping[str, Any]) -> bool:
     return not table["moved"] and not any(one["uint16"] for one in table["registers"])
 
 
-def _is_only_0(found: Mapping[str, Any]) -> bool:
+def _is_only_0(figures: Mapping[str, Any]) -> bool:
     """Whether all registers that were read are 0."""
-    return all(map(_is_0, found["tables"]))
+    return all(map(_is_0, figures["tables"]))
 
 
-def _only_0(found: Mapping[str, Any], registers: str) -> str:
+def _only_0(figures: Mapping[str, Any], registers: str) -> str:
     """See `Heard.missed`: all registers are 0, and nobody has stated which of them are the values."""
-    if not _is_only_0(found) or (registers != AUTO and not registers_of(registers).reason):
+    if not _is_only_0(figures) or (registers != AUTO and not registers_of(registers).reason):
         return ""
     manual = "give --registers (and --table, holding or input) from its manual"
     meant = (
@@ -376,9 +376,9 @@ def _guessed_words(answers: Answers, guessed: Sequence[str], taken: Collection[s
 _NO_REGISTERS = "no registers were found"
 
 
-def _has(found: Mapping[str, Any], unit: int) -> str:
+def _has(figures: Mapping[str, Any], unit: int) -> str:
     """Which registers were found of a unit."""
-    tables = [one for one in found["tables"] if one["unit"] == unit and one["registers"]]
+    tables = [one for one in figures["tables"] if one["unit"] == unit and one["registers"]]
     return (
         ", ".join(
             f"{TABLES[one['function']]} registers {_runs_in_words(one)}{', all 0' if _is_0(one) else ''}"
@@ -394,12 +394,12 @@ def _runs_in_words(table: Mapping[str, Any]) -> str:
     return ", ".join([*runs[:SHOWN], *([f"and {len(runs) - SHOWN} more"] if len(runs) > SHOWN else [])])
 
 
-def _table_read(found: Mapping[str, Any], answers: Answers) -> Mapping[str, Any] | None:
+def _table_read(figures: Mapping[str, Any], answers: Answers) -> Mapping[str, Any] | None:
     """The table that the file reads, as it was found; None if it was not."""
     return next(
         (
             one
-            for one in found["tables"]
+            for one in figures["tables"]
             if one["unit"] == answers["unit"] and TABLES[one["function"]] == answers["table"]
         ),
         None,
@@ -411,14 +411,14 @@ def _asked(table: Mapping[str, Any]) -> str:
     return " to ".join(map(str, dict.fromkeys(table["asked"])))
 
 
-def _units_in_words(found: Mapping[str, Any]) -> Iterator[str]:
+def _units_in_words(figures: Mapping[str, Any]) -> Iterator[str]:
     """Which units answer, of those that were asked, and which of these were not read."""
-    first, last = found["units_asked"]
+    first, last = figures["units_asked"]
     asked = f"unit {first} was" if first == last else f"units {first} to {last} were"
-    yield f"units that answer: {', '.join(map(str, found['units']))} ({asked} asked)"
-    if found["units_alike"]:
-        yield f"all answer alike, so only unit {found['units'][0]} was read: --units N reads unit N"
-    elif left_out := found["units_left_out"]:
+    yield f"units that answer: {', '.join(map(str, figures['units']))} ({asked} asked)"
+    if figures["units_alike"]:
+        yield f"all answer alike, so only unit {figures['units'][0]} was read: --units N reads unit N"
+    elif left_out := figures["units_left_out"]:
         yield (
             f"the others from {left_out[0]} to {left_out[-1]} all refuse with one exception, as if they were "
             "not there: --units N reads unit N"

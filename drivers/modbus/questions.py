@@ -143,7 +143,7 @@ class _ModbusQuestions(BusQuestions):
         words = [*timeout, *seconds_of(answers), *registers, *self._sniffed_as(answers)]
         try:
             first = _UNITS[0] if chosen == AUTO else chosen
-            found = sniffed(ModbusSniffer(), ["--units", first, *words], stop, tell)
+            figures = sniffed(ModbusSniffer(), ["--units", first, *words], stop, tell)
         except NothingFoundError as error:
             # A server that answers for units that it does not have answers alike for all of these.
             alike = error.figures.get("units_alike", False) and error.figures["units_asked"] == _first_units()
@@ -159,23 +159,23 @@ class _ModbusQuestions(BusQuestions):
             why = "has such registers" if alike else "answers"
             tell(f"none of units {_UNITS[0]} {why}: {_UNITS[1]} are asked, too; Ctrl-C ends that")
             try:
-                found = sniffed(ModbusSniffer(), ["--units", _UNITS[1], *words], stop, tell)
+                figures = sniffed(ModbusSniffer(), ["--units", _UNITS[1], *words], stop, tell)
             except NothingFoundError as other:
                 if other.figures.get("units"):
                     return heard.HeardNoRegisters(other.figures, answers["registers"])
                 raise
         except SniffError as error:
             raise SniffError(f"{error}".replace("TARGET", "its address")) from error
-        if not any(one["registers"] for one in found["tables"]):
-            units = ", ".join(f"{unit}" for unit in found["units"])
+        if not any(one["registers"] for one in figures["tables"]):
+            units = ", ".join(f"{unit}" for unit in figures["units"])
             raise NothingFoundError(
                 f"the registers of unit {units} were not read yet when it was ended. Remedy: let it go on, "
                 "or write --units N if the unit is known"
             )
-        lines = list(heard.in_words(found, answers["timeout-ms"]))
-        if chosen == AUTO and found["units_asked"][0] == int(_UNITS[0].partition("-")[0]):
+        lines = list(heard.in_words(figures, answers["timeout-ms"]))
+        if chosen == AUTO and figures["units_asked"][0] == int(_UNITS[0].partition("-")[0]):
             lines.append(f"units {_UNITS[1]} were not asked: daqsvc new --listen --units {_WHOLE} asks all")
-        return heard.HeardUnits(found, lines, answers["registers"], self._next_address)
+        return heard.HeardUnits(figures, lines, answers["registers"], self._next_address)
 
     def _ask_timeout(self) -> Question:
         return self.ask("timeout-ms", q.number_in("ms"), f"{_TIMEOUT_MS:g}")

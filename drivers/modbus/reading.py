@@ -59,7 +59,7 @@ class PollingReader(ABC):
         self._who = streams_in_words(streams)
         self._clock = clock
         self.faults: dict[str, str] = {}
-        self._said: set[str] = set()
+        self._logged: set[str] = set()
 
     async def run(self, line: ModbusLine) -> None:
         """See `Reader.run`."""
@@ -76,9 +76,11 @@ class PollingReader(ABC):
 
     def _faults_of(self, error: NoReplyError | RequestRefusedError) -> dict[str, str]:
         """By stream, why it gets no sample; a refusal is logged once."""
-        return self._told(error, self._names)
+        return self._faults_by_stream(error, self._names)
 
-    def _told(self, error: NoReplyError | RequestRefusedError, streams: Sequence[str]) -> dict[str, str]:
+    def _faults_by_stream(
+        self, error: NoReplyError | RequestRefusedError, streams: Sequence[str]
+    ) -> dict[str, str]:
         """The same, of streams that one request was for."""
         fault = f"{error}"
         if isinstance(error, RequestRefusedError):
@@ -93,8 +95,8 @@ class PollingReader(ABC):
 
     def _tell(self, streams: Sequence[str], refusal: str, remedy: str) -> None:
         """Log each refusal once; the counters of the bus have how often there were such."""
-        if (message := f"{streams_in_words(streams)}: {refusal}") not in self._said:
-            self._said.add(message)
+        if (message := f"{streams_in_words(streams)}: {refusal}") not in self._logged:
+            self._logged.add(message)
             logger.warning(
                 "%s, which is counted from now on; %s", message, remedy, extra=coded(REGISTER_REFUSED)
             )

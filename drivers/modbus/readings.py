@@ -94,7 +94,7 @@ def readings(rounds: Sequence[Registers], address: int) -> list[Reading]:
         rounds: registers by address, as they were read first, again, and so on; later ones may lack some.
         address: of the first register of the number.
     """
-    found: list[Reading] = []
+    wide: list[Reading] = []
     for kind, code, count in _WIDE:
         places = range(address, address + count)
         if not rounds or not all(place in rounds[0] for place in places):
@@ -106,8 +106,8 @@ def readings(rounds: Sequence[Registers], address: int) -> list[Reading]:
             evidence = numbers.evidence()
             change = numbers.change if evidence else math.inf
             value, may_move = numbers.values[0], numbers.may_move()
-            found.append(Reading(address, count, kind, order, value, evidence, change, may_move))
-    return found
+            wide.append(Reading(address, count, kind, order, value, evidence, change, may_move))
+    return wide
 
 
 def arranged(words: Sequence[int], order: Order) -> bytes:
@@ -300,9 +300,9 @@ def chosen(rounds: Sequence[Registers]) -> list[Reading]:
     if not rounds:
         return []
     every = [one for address in sorted(rounds[0]) for one in readings(rounds, address)]
-    found = [one for one in every if one.evidence]
-    sure = {one.order for one in found if one.evidence == SURE} | _agreed(found)
-    likely = [one for one in found if one.plausible or one.order in sure]
+    evident = [one for one in every if one.evidence]
+    sure = {one.order for one in evident if one.evidence == SURE} | _agreed(evident)
+    likely = [one for one in evident if one.plausible or one.order in sure]
     doubles = _apart([one for one in likely if one.type == "float64" and one.evidence == SURE], [])
     kept = doubles + _apart(likely, doubles)
     floats = [one for one in every if one.type == "float32" and (one.evidence or one.may_move)]
@@ -356,9 +356,9 @@ def _paired(run: Sequence[Reading], kept: Sequence[Reading], floats: Sequence[Re
     return [*(one for one in kept if one not in here), *best]
 
 
-def _agreed(found: Sequence[Reading]) -> set[Order]:
+def _agreed(evident: Sequence[Reading]) -> set[Order]:
     """The order in which several float32 that stand still have few digits: chance makes hardly one so."""
-    apart = _apart([one for one in found if _stands_still(one)], [])
+    apart = _apart([one for one in evident if _stands_still(one)], [])
     agreeing = Counter(one.order for one in apart)
     return {order for order, count in agreeing.items() if count >= _AGREE}
 
@@ -377,11 +377,11 @@ def undecided(rounds: Sequence[Registers], numbers: Sequence[Reading]) -> list[R
         numbers: what is chosen of them.
     """
     taken = {place for one in numbers for place in one.places}
-    found = [one for address in sorted(rounds[0] if rounds else ()) for one in readings(rounds, address)]
+    candidates = [one for address in sorted(rounds[0] if rounds else ()) for one in readings(rounds, address)]
     moved = {place for these in rounds for place in these if these[place] != rounds[0].get(place)}
     possible = [
         one
-        for one in found
+        for one in candidates
         if one.type == "float32"
         and not taken & set(one.places)
         and (one.evidence or (_is_usual(one) and not moved & set(one.places)))
@@ -400,7 +400,9 @@ def undecided(rounds: Sequence[Registers], numbers: Sequence[Reading]) -> list[R
     for order, these in by_order.items():
         kept += [one for one in these if order != best and not places & set(one.places)]
         places |= {place for one in kept for place in one.places}
-    zeros = [one for one in found if one.address in _zeros_beside(rounds, numbers) and one.order == "ABCD"]
+    zeros = [
+        one for one in candidates if one.address in _zeros_beside(rounds, numbers) and one.order == "ABCD"
+    ]
     kept += [one._replace(order=numbers[0].order) for one in zeros if one.type == "float32"]
     return sorted(kept, key=lambda one: one.address)
 
@@ -418,11 +420,11 @@ def _beside_large(registers: Registers, possible: Sequence[Reading]) -> list[Rea
 
 def _chained(possible: Iterable[Reading], begun: AbstractSet[int]) -> set[int]:
     """First registers of pairs side by side with one before, in the order in which they are given."""
-    found = set(begun)
+    chain = set(begun)
     for one in possible:
-        if {one.address - 2, one.address + 2} & found:
-            found.add(one.address)
-    return found
+        if {one.address - 2, one.address + 2} & chain:
+            chain.add(one.address)
+    return chain
 
 
 def _zeros_beside(rounds: Sequence[Registers], numbers: Sequence[Reading]) -> set[int]:
@@ -433,7 +435,7 @@ def _zeros_beside(rounds: Sequence[Registers], numbers: Sequence[Reading]) -> se
         for address in (rounds[0] if rounds else ())
         if not any(these.get(address) for these in rounds) and address not in taken
     }
-    found: set[int] = set()
+    pairs: set[int] = set()
     for first in sorted(zeros):
         if first - 1 in zeros:
             continue
@@ -442,8 +444,8 @@ def _zeros_beside(rounds: Sequence[Registers], numbers: Sequence[Reading]) -> se
             end += 1
         beside = first - 1 in taken or end in taken
         if beside and (end - first) % 2 == 0 and end - first <= _MOST_ZEROS:
-            found |= set(range(first, end, 2))
-    return found
+            pairs |= set(range(first, end, 2))
+    return pairs
 
 
 def _side_by_side(possible: Sequence[Reading]) -> list[Reading]:

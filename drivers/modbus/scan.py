@@ -184,7 +184,7 @@ class Scan:
     lost: str = ""
     counters: ModbusCounters = field(default_factory=ModbusCounters)
     _client: ModbusClient | None = None
-    _told_ns: int = 0
+    _reported_ns: int = 0
     _begun_ns: int = 0
     """When the first register of a table was asked for."""
     _end: int = 0
@@ -220,7 +220,7 @@ class Scan:
         Raises:
             LineLostError: the line cannot be opened.
         """
-        self._told_ns = self.clock.monotonic_ns()
+        self._reported_ns = self.clock.monotonic_ns()
         most = min(end + READ_ON, LAST_REGISTER) if read_on else end
         await self._connect()
         try:
@@ -323,8 +323,8 @@ class Scan:
 
     def _progress(self, words: str) -> None:
         now_ns = self.clock.monotonic_ns()
-        if now_ns - self._told_ns >= TELL_S * NS_PER_S:
-            self._told_ns = now_ns
+        if now_ns - self._reported_ns >= TELL_S * NS_PER_S:
+            self._reported_ns = now_ns
             self.tell(words)
 
     async def _read_table(self, table: FoundTable, end: int, most: int) -> None:
@@ -403,15 +403,15 @@ class Scan:
         self, functions: Sequence[int], end: int, most: int, seconds: float | None
     ) -> None:
         """The next function of each unit whose registers all stand still: they may be only settings."""
-        found: list[FoundTable] = []
+        added: list[FoundTable] = []
         for still in [one for one in self.tables if one.complete and one.first and not one.moved]:
             for function in functions[functions.index(still.function) + 1 :]:
                 if self.stop.is_set():
                     return
-                found.append(FoundTable(still.unit, function, still.begin))
-                self.tables.insert(self.tables.index(still) + 1, found[-1])
-                await self._read_table(found[-1], end, most)
-        await self._read_again(found, seconds)
+                added.append(FoundTable(still.unit, function, still.begin))
+                self.tables.insert(self.tables.index(still) + 1, added[-1])
+                await self._read_table(added[-1], end, most)
+        await self._read_again(added, seconds)
 
     async def _wait_for_moves(self) -> None:
         """Read the registers of units that all stand still some more times: a value may change slowly."""

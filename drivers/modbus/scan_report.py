@@ -124,10 +124,10 @@ class ScanReport:
 
     def _parts(self) -> Iterator[str | SniffTable]:
         scan = self._scan
-        found = ", ".join(map(str, scan.units)) or "none"
+        answering = ", ".join(map(str, scan.units)) or "none"
         early = "" if scan.searched else ", then it was ended"
         asked = f"{self._asked}{early}"
-        yield f"{self._bus.where}: {scan.requests} requests; units that answer: {found} ({asked})"
+        yield f"{self._bus.where}: {scan.requests} requests; units that answer: {answering} ({asked})"
         if scan.alike:
             yield (
                 "It answers in the name of every unit, and alike, so it is taken for one device: only unit "

@@ -142,11 +142,11 @@ class ModbusSniffer(Sniffer):
             )
             asyncio.run(scanning)
         except LineLostError as error:
-            said = f"{error}".replace("correct host and tcp_port", "correct TARGET").replace(
+            message = f"{error}".replace("correct host and tcp_port", "correct TARGET").replace(
                 "correct host", "correct TARGET"
             )
             raise SniffError(
-                f"{bus.where}: {said.replace('correct serial_port', 'correct TARGET')}"
+                f"{bus.where}: {message.replace('correct serial_port', 'correct TARGET')}"
             ) from error
         return ScanReport(bus, scan, functions, note, all_orders=arguments.all_orders).sniffed()
 
@@ -281,5 +281,5 @@ def _bus(arguments: argparse.Namespace) -> ModbusBus:
         option = {"timeout_ms": "--timeout-ms", "baud": "--baud"}.get(key)
         subject = f"TARGET {target!r}" if option is None else f"{option} {wrong['input']:g}"
         what = {"tcp_port": "the TCP port "}.get(key, "")
-        said, _, _ = ErrorFormatter(model, table).say(wrong, wrong["loc"])
-        raise SniffError(f"{subject}: {what}{said}", usage=True) from error
+        message, _, _ = ErrorFormatter(model, table).say(wrong, wrong["loc"])
+        raise SniffError(f"{subject}: {what}{message}", usage=True) from error

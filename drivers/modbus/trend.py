@@ -297,7 +297,7 @@ class TrendReader(PollingReader):
         """What has been asked for since the plan was another."""
         self._slow_polls = 0
         """Polls in a row that took longer than there is time for one."""
-        self._is_slow_said = False
+        self._slowness_logged = False
         self._together_at_ns: int | None = None
         """When what is read apart now is tried together again."""
         self._read_together()
@@ -337,8 +337,8 @@ class TrendReader(PollingReader):
         """State once that polls take longer than there is time for them."""
         took_ns = self._clock.monotonic_ns() - begun_ns
         self._slow_polls = self._slow_polls + 1 if undisturbed and took_ns > self._late_ns else 0
-        if self._slow_polls == SLOW_POLLS and not self._is_slow_said:
-            self._is_slow_said = True
+        if self._slow_polls == SLOW_POLLS and not self._slowness_logged:
+            self._slowness_logged = True
             logger.warning(
                 "%s: a poll takes %s ms, and at rate_hz = %s there are %s ms for it, so samples are "
                 "lost. Write rate_hz = %s or less, or have fewer requests on this line (max_gap, other "
@@ -414,8 +414,8 @@ class TrendReader(PollingReader):
             self._bare |= failure.takers
             what = "the registers between those of the channels are left out"
         self._read_apart()
-        if (message := f"{failure.error} ({failure.run.in_words})") not in self._said:
-            self._said.add(message)
+        if (message := f"{failure.error} ({failure.run.in_words})") not in self._logged:
+            self._logged.add(message)
             logger.warning(
                 "%s: %s; from now on %s, and the whole request is tried only now and then. A smaller "
                 "max_gap, or forbidden, avoids it from the start",
@@ -447,9 +447,9 @@ class TrendReader(PollingReader):
         self._bare.add(stream)
         self._read_apart()
         for name, run in refused.items():
-            said = f"{failure.error} ({run.in_words}): channel {name!r}"
-            if (message := f"stream {stream.name!r}: {said}") not in self._said:
-                self._said.add(message)
+            refusal = f"{failure.error} ({run.in_words}): channel {name!r}"
+            if (message := f"stream {stream.name!r}: {refusal}") not in self._logged:
+                self._logged.add(message)
                 logger.warning(
                     "%s has no value, and is asked for again only now and then; %s",
                     message,
@@ -473,8 +473,8 @@ class TrendReader(PollingReader):
         if self._shared is not None:
             self._shared = shared_runs([stream.layout for stream in self._streams])
         self._read_together()
-        if (message := f"{failure.error} ({failure.run.in_words})") not in self._said:
-            self._said.add(message)
+        if (message := f"{failure.error} ({failure.run.in_words})") not in self._logged:
+            self._logged.add(message)
             logger.warning(
                 "%s: %s; it answers for %d at once, and is asked for no more by one request from now on. "
                 "max_count = %d avoids the refusal",
@@ -493,7 +493,9 @@ class TrendReader(PollingReader):
         del error  # the last one of these
         faults: dict[str, str] = {}
         for failure in self._failures:
-            faults |= self._told(failure.in_words, sorted(stream.name for stream in failure.takers))
+            faults |= self._faults_by_stream(
+                failure.in_words, sorted(stream.name for stream in failure.takers)
+            )
         return faults
 
     async def _pause_after_failure(self) -> None:

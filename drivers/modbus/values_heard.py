@@ -40,8 +40,8 @@ def values_heard(table: Mapping[str, Any], answers: Answers) -> list[str]:
     for channel in answers["channels"]:
         text = _heard(table, answers, channel)
         (heard if text else silent).append(text or channel)
-    said = [f"Heard: {'; '.join(_few(heard))}."] if heard else []
-    return said + ([f"No value was read of {', '.join(_few(silent))}."] if silent else [])
+    lines = [f"Heard: {'; '.join(_few(heard))}."] if heard else []
+    return lines + ([f"No value was read of {', '.join(_few(silent))}."] if silent else [])
 
 
 def _few(texts: Sequence[str]) -> list[str]:

@@ -136,7 +136,7 @@ class WaveformReader(PollingReader):
         self._torn_in_a_row = 0
         self._never_whole = ""
         """Why no block is read whole, in a clause; empty as long as one is now and then."""
-        self._is_said = False
+        self._is_logged = False
 
     @property
     def streams(self) -> Mapping[str, tuple[StreamCounters, TimeBaseState]]:
@@ -171,7 +171,7 @@ class WaveformReader(PollingReader):
     def _watch_pace(self, torn: _Torn | None, begun_ns: int) -> None:
         """State once that blocks are replaced before they are read; ``torn`` is one that was."""
         if torn is None:
-            if self._never_whole and self._is_said:
+            if self._never_whole and self._is_logged:
                 notice(logger, "%s: a block was read whole again", self._who)
             self._torn, self._torn_in_a_row, self._never_whole = None, 0, ""
             return
@@ -187,8 +187,8 @@ class WaveformReader(PollingReader):
             f"device replaces it after about {readable(stands_s, 2)} s"
         )
         self._never_whole = f"{fault}; {self._remedy}"
-        if not self._is_said:
-            self._is_said = True
+        if not self._is_logged:
+            self._is_logged = True
             logger.warning(
                 "%s: %s, so all of them are lost; %s",
                 self._who,

@@ -67,13 +67,13 @@ class ChannelChoice:
         self._link_name = link_name
         self._wanted = wanted
         self._chosen = wanted
-        self._found = False
+        self._is_there = False
         self._others: list[str] = []
 
     @property
     def missed(self) -> str:
         """What to tell a person of a log that has no frame of the wanted channel; empty if it has some."""
-        if self._wanted is None or self._found or not self._others:
+        if self._wanted is None or self._is_there or not self._others:
             return ""
         return (
             f"it has no frame of channel {self._wanted!r}; write another of its channels as channel: "
@@ -89,7 +89,7 @@ class ChannelChoice:
         named = dict.fromkeys(name for name in names if name is not None)
         if self._chosen is None:
             self._chosen = next(iter(named), None)
-        self._found = self._found or self._chosen in named
+        self._is_there = self._is_there or self._chosen in named
         for name in named:
             if name != self._chosen and name not in self._others:
                 self._tell_of(name)
@@ -191,7 +191,7 @@ class ReplayDriver:
         self._shift_ns: int | None = None
         self._newest_ns: int | None = None
         self._at_end_ns: int | None = None
-        self._said: set[str] = set()
+        self._logged: set[str] = set()
 
     @property
     def streams(self) -> Mapping[str, tuple[StreamCounters, TimeBaseState]]:
@@ -292,8 +292,8 @@ class ReplayDriver:
             await in_thread(self._close, recording)
 
     def _say_once(self, what: str) -> None:
-        if what not in self._said:
-            self._said.add(what)
+        if what not in self._logged:
+            self._logged.add(what)
             logger.warning("replayed bus %r: %s", self.name, what, extra=coded(PLAYED_OTHERWISE))
 
     def _begin_anew(self, recording: RecordedLog) -> None:

@@ -247,7 +247,7 @@ class SyncFraming(_BinaryFraming):
         if not sync:
             raise LayoutError("the sync word is empty; give the bytes that each frame begins with")
         super().__init__(codec)
-        self._told = False
+        self._is_reported = False
         self._sync = np.frombuffer(sync, np.uint8).copy()
         self.restart()
 
@@ -276,9 +276,9 @@ class SyncFraming(_BinaryFraming):
         batch.note("resyncs", hunted.resyncs)
         # Before the first frame nothing is malformed: what a device sends may be in no frame at all.
         nothing_else = bool(hunted.garbage_bytes) and not len(hunted.ends)
-        if nothing_else or (hunted.malformed and not self._told):
+        if nothing_else or (hunted.malformed and not self._is_reported):
             batch.malformed, batch.remedy = self._no_frame(buffer, hunted, before)
-            self._told = True
+            self._is_reported = True
         step = hunted.step
         start = min(step.taken, step.tried)
         self._rest = buffer[start:].copy()

@@ -101,7 +101,7 @@ class SerialDriver:
         self._port = port
         self._framing = framing_of(bus, port.streams)
         self._assemblers = {s.name: _assembler(s, port, self._unread) for s in port.streams}
-        self._said: set[str] = set()
+        self._logged: set[str] = set()
         self._faults: dict[str, str] = {}
         self.link.faults = self._faults
         self._no_frame = ""
@@ -245,8 +245,8 @@ class SerialDriver:
         )
 
     def _say_once(self, key: str, code: Code, message: str, *arguments: object) -> None:
-        if key not in self._said:
-            self._said.add(key)
+        if key not in self._logged:
+            self._logged.add(key)
             logger.warning(message, *arguments, extra=coded(code))
 
 

@@ -151,7 +151,7 @@ class DelimitedFraming(ABC):
         self._longest = longest
         self._padding = padding
         self._whole = whole
-        self._told = False
+        self._is_reported = False
         self.restart()
 
     def restart(self) -> None:
@@ -167,9 +167,9 @@ class DelimitedFraming(ABC):
         kept = self._rest
         pieces, cut_off = self._split(data, batch)
         overlong = batch.notes["frames_malformed"] > 0
-        if overlong and not self._told:
+        if overlong and not self._is_reported:
             batch.malformed, batch.remedy = self._why_no_end((kept.tobytes() + data)[: self._longest])
-            self._told = True
+            self._is_reported = True
         if cut_off and not self._whole:
             batch.note("bytes_garbage", int((pieces.lengths[:1] + 1).sum()))
             pieces, cut_off = pieces.keep(slice(1, None)), False
@@ -184,13 +184,13 @@ class DelimitedFraming(ABC):
             skipped = int(cut_off and not in_step[0])
             self._astray = count_steps(batch, in_step[skipped:], astray=self._astray)
             strange = np.flatnonzero(~in_step[skipped:])
-            if len(strange) and not self._told:
+            if len(strange) and not self._is_reported:
                 first = int(strange[0]) + skipped
                 # As they came: who sorts pieces may change the buffer.
                 came = kept.tobytes() + data
                 piece = came[pieces.starts[first] : pieces.stops[first]]
                 batch.malformed, batch.remedy = self._why_no_frame(piece)
-                self._told = True
+                self._is_reported = True
         self._astray |= overlong
         return batch
 

@@ -49,41 +49,41 @@ class HeardOnSerial(Heard):
     """Lines of text or binary frames.
 
     Attributes:
-        found: figures of `drivers.serial.sniff.SerialSniffer`.
+        figures: those of `drivers.serial.sniff.SerialSniffer`.
     """
 
-    def __init__(self, found: Mapping[str, Any], questions: BusQuestions) -> None:
-        super().__init__(list(_in_words(found)), _missed(found))
-        self.found, self._questions = found, questions
+    def __init__(self, figures: Mapping[str, Any], questions: BusQuestions) -> None:
+        super().__init__(list(_in_words(figures)), _missed(figures))
+        self.figures, self._questions = figures, questions
 
     def proposals(self, answers: Answers) -> dict[str, str]:
         """See `Heard.proposals`."""
-        proposed = {"baud": f"{self.found['baud']}", "character": self.found["character"]}
-        proposed["framing"] = self.found["framing"]
-        of_framing = self._of_lines if self.found["framing"] == "lines" else self._of_frames
+        proposed = {"baud": f"{self.figures['baud']}", "character": self.figures["character"]}
+        proposed["framing"] = self.figures["framing"]
+        of_framing = self._of_lines if self.figures["framing"] == "lines" else self._of_frames
         return proposed | of_framing(answers) | self._no_limits(answers)
 
     def _of_lines(self, answers: Answers) -> dict[str, str]:
         """Proposals for lines of text."""
         taken: set[str] = set()
-        named = {unused(table_name(one["name"], "column"), taken): one for one in self.found["columns"]}
+        named = {unused(table_name(one["name"], "column"), taken): one for one in self.figures["columns"]}
         proposed = {
-            "prefix": self.found["prefix"] or NONE,
-            "line-end": next(name for name, end in DELIMITERS.items() if end == self.found["delimiter"]),
-            "separator": {"\t": r"\t"}.get(self.found["separator"], self.found["separator"] or ","),
-            "decimal": self.found["decimal"],
-            "checksum": self.found["checksum"],
+            "prefix": self.figures["prefix"] or NONE,
+            "line-end": next(name for name, end in DELIMITERS.items() if end == self.figures["delimiter"]),
+            "separator": {"\t": r"\t"}.get(self.figures["separator"], self.figures["separator"] or ","),
+            "decimal": self.figures["decimal"],
+            "checksum": self.figures["checksum"],
             "columns": ", ".join(named),
         }
-        if self.found["rate_hz"] is not None:
-            proposed["rate"] = f"{usual_rate(self.found['rate_hz']):g}"
+        if self.figures["rate_hz"] is not None:
+            proposed["rate"] = f"{usual_rate(self.figures['rate_hz']):g}"
         # Most engineers name the columns themselves: what is known of each is known by its place.
         for name, one in zip(answers.get("columns", named), named.values(), strict=False):
             if one["numeric"] and one["prefix"]:
                 proposed[sensor_key(name, "prefix")] = one["prefix"]
             if one["numeric"] and one["unit"]:
                 proposed[sensor_key(name, "suffix")] = one["unit"]
-            if kind := _swinging_type(one, name, answers.get("rate", self.found["rate_hz"])):
+            if kind := _swinging_type(one, name, answers.get("rate", self.figures["rate_hz"])):
                 proposed[sensor_key(name, "type")] = kind
             if (chosen := answers.get(sensor_key(name, "type"))) and self._is_of_several(answers):
                 named_after = sensor_name(name, chosen, lines_stream(answers["prefix"]))
@@ -99,28 +99,31 @@ class HeardOnSerial(Heard):
 
     def _is_of_several(self, answers: Answers) -> bool:
         """Whether the stream is of one kind of lines out of several: columns may have the same names."""
-        return bool(answers.get("prefix") and self.found["other_prefixes"])
+        return bool(answers.get("prefix") and self.figures["other_prefixes"])
 
     def _of_frames(self, answers: Answers) -> dict[str, str]:
         """Proposals for binary frames."""
-        found = self.found
-        known = _is_known_crc(found)
-        proposed = {"crc": found["crc"] if known else "none", "payload-length": f"{_payload_length(found)}"}
-        if found["sync_word"]:
-            proposed["sync-word"] = found["sync_word"]
+        figures = self.figures
+        known = _is_known_crc(figures)
+        proposed = {
+            "crc": figures["crc"] if known else "none",
+            "payload-length": f"{_payload_length(figures)}",
+        }
+        if figures["sync_word"]:
+            proposed["sync-word"] = figures["sync_word"]
         if known:
-            proposed["crc-order"] = found["crc_order"]
+            proposed["crc-order"] = figures["crc_order"]
         # As the sniffer proposes it: what a count is worth is not known, and volts of a probe are not heard.
         proposed["scale"] = "1"
-        if found["counter"] is not None:
-            counter = found["counter"]
-            if found["counter_bits"] is not None:
-                counter = {**counter, **{key: found[f"counter_{key}"] for key in ("byte", "bits", "order")}}
-            proposed |= packed.frame_proposals(found["payload_length"], counter, answers)
+        if figures["counter"] is not None:
+            counter = figures["counter"]
+            if figures["counter_bits"] is not None:
+                counter = {**counter, **{key: figures[f"counter_{key}"] for key in ("byte", "bits", "order")}}
+            proposed |= packed.frame_proposals(figures["payload_length"], counter, answers)
         # Where more channels fit than are worth proposing, the names of an example would seem to be known.
         proposed.setdefault("channels", _UNKNOWN_CHANNELS)
-        if "samples-per-frame" in answers and found["rate_hz"] is not None:
-            proposed["rate"] = f"{usual_rate(found['rate_hz'] * answers['samples-per-frame']):g}"
+        if "samples-per-frame" in answers and figures["rate_hz"] is not None:
+            proposed["rate"] = f"{usual_rate(figures['rate_hz'] * answers['samples-per-frame']):g}"
         return proposed
 
     def _no_limits(self, answers: Answers) -> dict[str, str]:
@@ -142,7 +145,7 @@ class HeardOnSerial(Heard):
     def notes(self, answers: Answers, assumed: Collection[str], taken: Collection[str]) -> Iterable[str]:
         """See `Heard.notes`."""
         del assumed
-        if self.found["any_baud"]:
+        if self.figures["any_baud"]:
             yield f"baud = {answers['baud']} is {ANY_BAUD}."
         channels = self._questions.channels(answers)
         if answers["framing"] != "lines":
@@ -151,9 +154,9 @@ class HeardOnSerial(Heard):
                     "What is behind the counter of a frame is a guess: channels, type, byte order and scale. "
                     "See the device's manual."
                 )
-            if "sync-word" in taken and self.found["sync_word"] and not self.found["crc"]:
-                yield sync_words(self.found["sync_word"])
-            if "counter-bits" in taken and (guess := _width(self.found)):
+            if "sync-word" in taken and self.figures["sync_word"] and not self.figures["crc"]:
+                yield sync_words(self.figures["sync_word"])
+            if "counter-bits" in taken and (guess := _width(self.figures)):
                 yield guess
             yield from guessed_sensors(answers, channels, taken)
             return
@@ -194,42 +197,44 @@ class HeardOnSerial(Heard):
 
     def _swinging(self, answers: Answers) -> list[str]:
         """The columns that swing about 0 and have a sensor, by the names that were answered."""
-        found = self.found
-        if found["framing"] != "lines" or len(answers["columns"]) != len(found["columns"]):
+        figures = self.figures
+        if figures["framing"] != "lines" or len(answers["columns"]) != len(figures["columns"]):
             return []
-        pairs = zip(answers["columns"], found["columns"], strict=True)
+        pairs = zip(answers["columns"], figures["columns"], strict=True)
         return [name for name, one in pairs if one["swings"] and sensor_key(name, "type") in answers]
 
     def not_read(self, answers: Answers) -> Iterable[str]:
         """See `Heard.not_read`."""
-        found = self.found
-        if found["framing"] != answers["framing"]:
+        figures = self.figures
+        if figures["framing"] != answers["framing"]:
             return
-        if found["framing"] == "lines":
+        if figures["framing"] == "lines":
             yield from self._not_read_of_lines(answers)
-        elif found["crc"] and not _is_known_crc(found):
-            yield unchecked_words(found["crc"])
+        elif figures["crc"] and not _is_known_crc(figures):
+            yield unchecked_words(figures["crc"])
 
     def _not_read_of_lines(self, answers: Answers) -> Iterator[str]:
         """What of the lines is not in the file."""
-        found = self.found
+        figures = self.figures
         if self.missed:
             yield f"What was heard does not fit this file: {self.missed}."
             return
-        if found["lines_damaged"]:
-            words = other_lines_words(found["lines_damaged"], found["lines_heard"], found["damaged_line"])
+        if figures["lines_damaged"]:
+            words = other_lines_words(
+                figures["lines_damaged"], figures["lines_heard"], figures["damaged_line"]
+            )
             yield f"{words}."
-        kinds = [found["prefix"], *found["other_prefixes"]]
-        if found["other_prefixes"] and answers["prefix"] in kinds:
+        kinds = [figures["prefix"], *figures["other_prefixes"]]
+        if figures["other_prefixes"] and answers["prefix"] in kinds:
             yield other_kinds_words([one for one in kinds if one != answers["prefix"]])
-        if len(answers["columns"]) == len(found["columns"]):
+        if len(answers["columns"]) == len(figures["columns"]):
             yield from self._columns_not_read(answers)
 
     def _columns_not_read(self, answers: Answers) -> Iterator[str]:
         """What of the columns is not in the file, or not always."""
-        found = self.found
-        heard, texts = found["lines_heard"] - found["lines_damaged"], {}
-        for name, one in zip(answers["columns"], found["columns"], strict=True):
+        figures = self.figures
+        heard, texts = figures["lines_heard"] - figures["lines_damaged"], {}
+        for name, one in zip(answers["columns"], figures["columns"], strict=True):
             measured = answers.get(sensor_key(name, "type")) not in {None, NONE}
             if not one["numeric"] and (measured or name == answers["counter"]):
                 yield (
@@ -253,42 +258,43 @@ def _swinging_type(one: Mapping[str, Any], name: str, rate_hz: float | None) -> 
     return TYPE_OF_UNIT.get(unit_of_suffix(one["unit"])) if one["unit"] else "accelerometer"
 
 
-def _in_words(found: Mapping[str, Any]) -> Iterator[str]:
+def _in_words(figures: Mapping[str, Any]) -> Iterator[str]:
     """What was heard, in a few lines."""
-    rate = "" if found["rate_hz"] is None else f", {found['rate_hz']:.4g} a second"
-    baud = "any baud rate" if found["any_baud"] else f"{found['baud']} bit/s"
-    line = f"{baud}, {found['character']}"
-    if found["overrun_baud"] is not None:
-        yield overrun_words(found["overrun_baud"], found["baud"])
-    if found["framing"] != "lines":
-        kind = "COBS frames" if found["framing"] == "cobs" else f"frames behind {found['sync_word']}"
-        counter = found["counter"]
+    rate = "" if figures["rate_hz"] is None else f", {figures['rate_hz']:.4g} a second"
+    baud = "any baud rate" if figures["any_baud"] else f"{figures['baud']} bit/s"
+    line = f"{baud}, {figures['character']}"
+    if figures["overrun_baud"] is not None:
+        yield overrun_words(figures["overrun_baud"], figures["baud"])
+    if figures["framing"] != "lines":
+        kind = "COBS frames" if figures["framing"] == "cobs" else f"frames behind {figures['sync_word']}"
+        counter = figures["counter"]
         counts = f"byte {counter['byte']} of the payload counts" if counter else "nothing counts"
-        check = f"CRC {found['crc'] or 'unknown'}"
-        if found["frames_passing"] < 1:
-            check += f" (passes in {100 * found['frames_passing']:.0f} % of the frames)"
-        yield f"{line}: {kind} of {found['frame_length']} bytes{rate}, {check}, {counts}"
-        if found["sync_word"] and not found["crc"]:
-            yield f"  {sync_words(found['sync_word'])}"
-        if guess := _width(found):
+        check = f"CRC {figures['crc'] or 'unknown'}"
+        if figures["frames_passing"] < 1:
+            check += f" (passes in {100 * figures['frames_passing']:.0f} % of the frames)"
+        yield f"{line}: {kind} of {figures['frame_length']} bytes{rate}, {check}, {counts}"
+        if figures["sync_word"] and not figures["crc"]:
+            yield f"  {sync_words(figures['sync_word'])}"
+        if guess := _width(figures):
             yield f"  {guess}"
         return
-    prefix = f", each begins with {found['prefix']}" if found["prefix"] else ""
-    comma = ", numbers with a decimal comma" if found["decimal"] == "," else ""
-    yield f"{line}: lines of text{rate}, {counted(len(found['columns']), 'column')}{prefix}{comma}"
-    if found["lines_damaged"]:
-        yield f"  {other_lines_words(found['lines_damaged'], found['lines_heard'], found['damaged_line'])}"
-    yield from (f"  {one}" for one in found["lines"][:_SHOWN_LINES])
-    yield from (f"  {words}" for one in found["columns"] for words in _column_words(one))
-    if found["other_prefixes"]:
-        yield f"  {other_kinds_words(found['other_prefixes'])}"
+    prefix = f", each begins with {figures['prefix']}" if figures["prefix"] else ""
+    comma = ", numbers with a decimal comma" if figures["decimal"] == "," else ""
+    yield f"{line}: lines of text{rate}, {counted(len(figures['columns']), 'column')}{prefix}{comma}"
+    if figures["lines_damaged"]:
+        damaged, heard = figures["lines_damaged"], figures["lines_heard"]
+        yield f"  {other_lines_words(damaged, heard, figures['damaged_line'])}"
+    yield from (f"  {one}" for one in figures["lines"][:_SHOWN_LINES])
+    yield from (f"  {words}" for one in figures["columns"] for words in _column_words(one))
+    if figures["other_prefixes"]:
+        yield f"  {other_kinds_words(figures['other_prefixes'])}"
 
 
-def _width(found: Mapping[str, Any]) -> str:
+def _width(figures: Mapping[str, Any]) -> str:
     """That the width of the counter is a guess; empty if it is none."""
-    if not found["counter_guess"]:
+    if not figures["counter_guess"]:
         return ""
-    return width_words(found["counter_bits"], found["counter"]["step"], found["rate_hz"])
+    return width_words(figures["counter_bits"], figures["counter"]["step"], figures["rate_hz"])
 
 
 def _column_words(one: Mapping[str, Any]) -> Iterator[str]:
@@ -303,25 +309,25 @@ def _column_words(one: Mapping[str, Any]) -> Iterator[str]:
         yield f"{one['name']} is the number behind {one['prefix']}"
 
 
-def _missed(found: Mapping[str, Any]) -> str:
+def _missed(figures: Mapping[str, Any]) -> str:
     """See `Heard.missed`: what a stream needs, and the device does not send."""
-    if found["framing"] != "lines":
-        if found["counter"] is not None and found["counter_bits"] is not None:
+    if figures["framing"] != "lines":
+        if figures["counter"] is not None and figures["counter_bits"] is not None:
             return ""
-        return f"{frames_need(_payload_length(found))}. Remedy: see the manual of the device"
-    numbers = [one for one in found["columns"] if one["numeric"]]
+        return f"{frames_need(_payload_length(figures))}. Remedy: see the manual of the device"
+    numbers = [one for one in figures["columns"] if one["numeric"]]
     if any(not (one["counts"] or one["time_unit"] or one["turns_at"]) for one in numbers):
         return ""
     begin = "" if numbers else f"{NO_NUMBERS} "
     return f"{begin}{LINES_NEED}. Remedy: have the device send them"
 
 
-def _is_known_crc(found: Mapping[str, Any]) -> bool:
+def _is_known_crc(figures: Mapping[str, Any]) -> bool:
     """Whether it is one of the two that the driver knows, which leave out the sync word."""
-    return found["crc"] in CRCS and found["crc_from"] == len(found["sync_word"]) // 2
+    return figures["crc"] in CRCS and figures["crc_from"] == len(figures["sync_word"]) // 2
 
 
-def _payload_length(found: Mapping[str, Any]) -> int:
+def _payload_length(figures: Mapping[str, Any]) -> int:
     """Bytes of the payload for the driver; a check that it does not know is a part of it."""
-    length: int = found["payload_length"]
-    return length + (0 if _is_known_crc(found) else found["crc_bytes"])
+    length: int = figures["payload_length"]
+    return length + (0 if _is_known_crc(figures) else figures["crc_bytes"])

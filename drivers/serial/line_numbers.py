@@ -92,11 +92,11 @@ def parts_of(text: str, decimal: str) -> tuple[str, str] | None:
 
 def name_before(text: str) -> str:
     """What looks like a name in front of the number of a field, with its sign; empty if nothing does."""
-    found = _NAMED.match(text)
-    return "" if found is None else found[1]
+    match = _NAMED.match(text)
+    return "" if match is None else match[1]
 
 
 def unit_behind(text: str, decimal: str) -> str:
     """What looks like a unit behind the number of a field, with that decimal mark; empty if nothing does."""
-    found = _WITH_UNIT[decimal].fullmatch(text)
-    return "" if found is None else found[found.re.groups]
+    match = _WITH_UNIT[decimal].fullmatch(text)
+    return "" if match is None else match[match.re.groups]

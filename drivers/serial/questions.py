@@ -113,8 +113,8 @@ class SerialQuestions(BusQuestions):
         del folder
         baud = answers.get(BEFOREHAND, {}).get("baud", "")
         words = [*(["--baud", baud] if baud.isdecimal() else []), *seconds_of(answers)]
-        found = sniffed(SerialSniffer(_LISTEN_S), [*words, "--", answers["port"]], stop, tell)
-        return HeardOnSerial(found, self)
+        figures = sniffed(SerialSniffer(_LISTEN_S), [*words, "--", answers["port"]], stop, tell)
+        return HeardOnSerial(figures, self)
 
     def questions(self, answers: Answers, folder: Path) -> Iterator[Question]:
         """See `BusQuestions.questions`."""

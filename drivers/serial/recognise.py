@@ -120,18 +120,18 @@ def _printable(data: bytes) -> float:
     return 1 - sum(byte not in _TEXT for byte in plain) / len(data)
 
 
-def _unless_letter(found: re.Match[bytes]) -> bytes:
+def _unless_letter(match: re.Match[bytes]) -> bytes:
     """Nothing in place of a letter in UTF-8; what is none stays."""
     try:
-        return b"" if found[0].decode().isprintable() else found[0]
+        return b"" if match[0].decode().isprintable() else match[0]
     except UnicodeDecodeError:
-        return found[0]
+        return match[0]
 
 
 def _is_enclosed(data: bytes) -> bool:
     """Whether nearly all bytes are text between STX and ETX; check bytes may follow each."""
-    found = _ENCLOSED.findall(data)
-    return len(found) >= _LEAST_ENCLOSED and sum(map(len, found)) >= _MOSTLY * len(data)
+    enclosed = _ENCLOSED.findall(data)
+    return len(enclosed) >= _LEAST_ENCLOSED and sum(map(len, enclosed)) >= _MOSTLY * len(data)
 
 
 def seven_bits(data: bytes) -> Parity | None:

@@ -172,16 +172,16 @@ def sync_frames(data: bytes) -> BinaryFrames | None:
     numbers = np.frombuffer(data, np.uint8)
     best: BinaryFrames | None = None
     for length in _Periods(numbers).likely():
-        found = _behind_sync(numbers, length)
-        if found is not None and (best is None or found.score > best.score + 0.01):
-            best = found
+        candidate = _behind_sync(numbers, length)
+        if candidate is not None and (best is None or candidate.score > best.score + 0.01):
+            best = candidate
     if best is None:
         return None
     # Two frames in a row are as regular as one.
     for length in (part for part in range(3, best.length) if best.length % part == 0):
-        found = _behind_sync(numbers, length)
-        if found is not None and found.score >= best.score:
-            return found
+        candidate = _behind_sync(numbers, length)
+        if candidate is not None and candidate.score >= best.score:
+            return candidate
     return best
 
 
@@ -200,9 +200,9 @@ def _behind_sync(numbers: NDArray[np.uint8], length: int) -> BinaryFrames | None
             if sync in tried:
                 continue
             tried.add(sync)
-            found = _with_sync(numbers, length, sync)
-            if found is not None and (best is None or found.score > best.score):
-                best = found
+            candidate = _with_sync(numbers, length, sync)
+            if candidate is not None and (best is None or candidate.score > best.score):
+                best = candidate
             if best is not None and best.crc_bytes == 2:
                 return best
     return best
@@ -248,8 +248,8 @@ def _sync_words(modes: NDArray[np.uint8], constant: NDArray[np.bool_]) -> list[b
 
 def _with_sync(numbers: NDArray[np.uint8], length: int, sync: bytes) -> BinaryFrames | None:
     """Frames of that length behind that sync word; None if they are too few."""
-    found = _places(numbers, length, sync)
-    chained = found[_chained(found, length)]
+    places = _places(numbers, length, sync)
+    chained = places[_chained(places, length)]
     frames = _rows(numbers, chained, length)
     if len(frames) < LEAST_FRAMES:
         return None
@@ -259,23 +259,23 @@ def _with_sync(numbers: NDArray[np.uint8], length: int, sync: bytes) -> BinaryFr
         check = _check_of(frames, shorter)
         if check is not None:
             sync = sync[:shorter]
-            found = _places(numbers, length, sync)
+            places = _places(numbers, length, sync)
             break
     checked = check is not None
     check = check or _Check()
-    frames = _rows(numbers, found, length)
+    frames = _rows(numbers, places, length)
     passed = check.passed(frames)
     # A frame between two stretches of noise passes its check; else another one must be beside it.
-    there = _chained(found, length) | passed if checked else _chained(found, length)
-    found, frames, passed = found[there], frames[there], passed[there]
-    gaps = np.diff(found)
+    there = _chained(places, length) | passed if checked else _chained(places, length)
+    places, frames, passed = places[there], frames[there], passed[there]
+    gaps = np.diff(places)
     count = 1 + int(np.maximum(gaps // length, 1).sum())
-    span = int(found[-1] - found[0]) + length
+    span = int(places[-1] - places[0]) + length
     counter = None
     whole = frames[passed]
     if len(whole) > 1:
         payloads = whole[:, len(sync) : length - check.size]
-        near = np.diff(found[passed]) < 2 * length
+        near = np.diff(places[passed]) < 2 * length
         counter = counter_between(payloads[:-1][near], payloads[1:][near])
     return BinaryFrames(
         "sync",
@@ -284,7 +284,7 @@ def _with_sync(numbers: NDArray[np.uint8], length: int, sync: bytes) -> BinaryFr
         whole,
         int((~passed).sum()),
         span / count,
-        min(1.0, len(found) * length / span),
+        min(1.0, len(places) * length / span),
         check.name,
         check.order,
         check.size,
@@ -322,10 +322,10 @@ def cobs_frames(data: bytes) -> BinaryFrames | None:
         return None
     of_length = np.array([len(body) == length for body in bodies])
     frames = np.array([list(body) for body in bodies if len(body) == length], np.uint8)
-    found = _check_of(frames, 0)
-    if found is None and times < 0.9 * len(bodies):
+    known_check = _check_of(frames, 0)
+    if known_check is None and times < 0.9 * len(bodies):
         return None
-    check = found or _Check()
+    check = known_check or _Check()
     passed = check.passed(frames)
     whole = np.flatnonzero(of_length)[passed]
     payloads = frames[passed][:, : length - check.size]

@@ -315,11 +315,11 @@ def _columns_of(lines: Sequence[str], behind: Sequence[int], delimiter: str) -> 
     for at, row in enumerate(rows):
         if not sound[at] and not (header and at == 0):
             turns[at] = not _is_other(plain[at], row, around, words, decimal)
-    found = np.flatnonzero(sound)
-    places = (np.cumsum(turns) - 1)[found]
+    sound_rows = np.flatnonzero(sound)
+    places = (np.cumsum(turns) - 1)[sound_rows]
     columns = [
         _column(
-            [rows[at][first + k] for at in found.tolist()],
+            [rows[at][first + k] for at in sound_rows.tolist()],
             places,
             names[first + k] if names else texts[0].strip("=:") if texts and texts[0] else f"c{k + 1}",
             decimal if texts is not None else "",
@@ -379,8 +379,8 @@ def _texts_of(texts: Sequence[str], decimal: str) -> tuple[str, str] | None:
     A word that is always the same, such as 0A, is none: the numbers before a unit change, have decimals, or a
     blank behind them. Lines without a value are left out of it, also where most have none.
     """
-    found = [parts_of(text, decimal) for text in texts]
-    known = Counter(one for one in found if one is not None)
+    parts = [parts_of(text, decimal) for text in texts]
+    known = Counter(one for one in parts if one is not None)
     around = max(known, key=lambda one: known[one], default=None)
     if around is None:
         return None
@@ -390,7 +390,7 @@ def _texts_of(texts: Sequence[str], decimal: str) -> tuple[str, str] | None:
     name, unit = around
     numbers = {
         text.removeprefix(name).removesuffix(unit)
-        for text, one in zip(texts, found, strict=True)
+        for text, one in zip(texts, parts, strict=True)
         if one == around
     }
     alone = unit and not name and len(numbers) == 1
@@ -534,10 +534,10 @@ def _sum_fits(line: str, checksum: str) -> bool:
 
 
 def _checksum_of(lines: Sequence[str]) -> str:
-    found = [line for line in lines if _CHECKSUM.search(line) is not None]
-    if len(found) < MAJORITY * len(lines):
+    with_checksum = [line for line in lines if _CHECKSUM.search(line) is not None]
+    if len(with_checksum) < MAJORITY * len(lines):
         return "none"
     for name, _ in _SUMS.values():
-        if sum(_sum_fits(line, name) for line in found) >= MAJORITY * len(found):
+        if sum(_sum_fits(line, name) for line in with_checksum) >= MAJORITY * len(with_checksum):
             return name
     return "unknown"

@@ -119,7 +119,7 @@ def _try_all(
                 return tried
             tell(f"trying {port} at {baud} bit/s{'' if parity == 'none' else f', {parity} parity'}")
             tried.append(one := _try(port, baud, parity, TRY_S, TRY_BYTES, stop))
-            if one.found.score >= CONCLUSIVE or one.heard.lost:
+            if one.recognised.score >= CONCLUSIVE or one.heard.lost:
                 return tried
         if not any(one.heard.errors for one in tried):
             break  # parity that is not expected shows as missing stop bits
@@ -138,7 +138,7 @@ def _likeliest(tried: Sequence[Tried]) -> Tried | None:
     if all_alike(tried):
         return tried[0]
     texts = [one for one in tried if one.may_be_text] if too_few(tried) else []
-    return max(texts or tried, key=lambda one: (one.found.score, one.heard.received), default=None)
+    return max(texts or tried, key=lambda one: (one.recognised.score, one.heard.received), default=None)
 
 
 def _try_again(
@@ -163,7 +163,7 @@ def _try_again(
             break
         one = tried[at]
         result[at] = new = _try(port, one.baud, one.parity, each_s, TRY_BYTES, stop)
-        if new.may_be_text or new.found.sure or new.heard.lost:
+        if new.may_be_text or new.recognised.sure or new.heard.lost:
             break
     return result
 

@@ -104,19 +104,19 @@ class Tried(NamedTuple):
     baud: int
     parity: str
     heard: Heard
-    found: Recognised
+    recognised: Recognised
 
     @property
     def may_be_text(self) -> bool:
         """Whether the bytes may be text, although they may be too few to judge."""
         from drivers.serial.recognise import LEAST_PRINTABLE  # noqa: PLC0415 - only for who listens
 
-        return self.heard.received >= LEAST_TEXT and self.found.printable >= LEAST_PRINTABLE
+        return self.heard.received >= LEAST_TEXT and self.recognised.printable >= LEAST_PRINTABLE
 
 
 def too_few(tried: Sequence[Tried]) -> bool:
     """Whether so few bytes came at each of the baud rates that they cannot be judged."""
-    return all(one.heard.received < _FEW and not one.found.sure for one in tried)
+    return all(one.heard.received < _FEW and not one.recognised.sure for one in tried)
 
 
 def all_alike(tried: Sequence[Tried]) -> bool:
@@ -125,7 +125,7 @@ def all_alike(tried: Sequence[Tried]) -> bool:
     A pseudo-terminal does not, nor do many devices that are the USB port themselves. Where a device sends
     little, the bytes are text at all of them.
     """
-    if len(tried) > 1 and all(one.found.sure for one in tried):
+    if len(tried) > 1 and all(one.recognised.sure for one in tried):
         return True
     came = [one for one in tried if one.heard.received]
     return len(came) >= _LEAST_ALIKE and all(one.may_be_text for one in came)
@@ -156,7 +156,7 @@ class Report(NamedTuple):
     @property
     def _what(self) -> TextLines | BinaryFrames | None:
         """What was found; a guess is none of it."""
-        return self.best.found.what if self.best.found.sure else None
+        return self.best.recognised.what if self.best.recognised.sure else None
 
     @property
     def _any_baud(self) -> bool:
@@ -167,7 +167,7 @@ class Report(NamedTuple):
     def _bits_per_s(self) -> float:
         """What comes; what had been waiting in the port is left out."""
         heard = self.best.heard
-        bits = 2 + (7 if self.best.found.parity else 8) + (self._parity != "none")
+        bits = 2 + (7 if self.best.recognised.parity else 8) + (self._parity != "none")
         seconds = heard.last_s - heard.first_s - WAITING_S
         return bits * (heard.received - heard.waiting) / seconds if seconds > 0 else 0.0
 
@@ -187,11 +187,11 @@ class Report(NamedTuple):
 
     @property
     def _parity(self) -> str:
-        return self.best.found.parity or self.best.parity
+        return self.best.recognised.parity or self.best.parity
 
     @property
     def _character(self) -> str:
-        bits = 7 if self.best.found.parity else 8
+        bits = 7 if self.best.recognised.parity else 8
         return f"{bits}{self._parity[0].upper()}1"
 
     def _rate_hz(self, what: TextLines | BinaryFrames | None) -> float | None:
@@ -227,7 +227,7 @@ class Report(NamedTuple):
             )
         if self._what is None and (few := self._too_few()):
             return few
-        if self.best.found.is_enclosed:
+        if self.best.recognised.is_enclosed:
             return (
                 f"{self.port}: text comes between the bytes 02 (STX) and 03 (ETX), which daqsvc does not "
                 "read. Remedy: set the device to lines that end with a line feed or a carriage return; else "
@@ -264,7 +264,7 @@ class Report(NamedTuple):
         """What the bytes are most likely, in words; empty if they are like nothing."""
         from drivers.serial.recognise_lines import TextLines  # noqa: PLC0415 - only for who listens
 
-        what, score = self.best.found.what, self.best.found.score
+        what, score = self.best.recognised.what, self.best.recognised.score
         if what is None:
             return ""
         if isinstance(what, TextLines):
@@ -405,8 +405,8 @@ class Report(NamedTuple):
             "character": self._character,
             "bytes": heard.received,
             "framing_errors": heard.errors,
-            "score": round(self.best.found.score, 3),
-            "tried": [{"baud": one.baud, "score": round(one.found.score, 3)} for one in self.tried],
+            "score": round(self.best.recognised.score, 3),
+            "tried": [{"baud": one.baud, "score": round(one.recognised.score, 3)} for one in self.tried],
             "first_bytes": heard.data[: _ROW * _SHOWN_ROWS].hex(),
             "rate_hz": self._sampling_hz(what) if isinstance(what, TextLines) else self._rate_hz(what),
             "framing": None,
@@ -477,7 +477,7 @@ class Report(NamedTuple):
             f"port = {quoted(lasting_name(self.port))}",
             f"baud = {self._baud:_}{f'    # {ANY_BAUD}' if self._any_baud else ''}",
         ]
-        head += ["data_bits = 7"] * (self.best.found.parity is not None)
+        head += ["data_bits = 7"] * (self.best.recognised.parity is not None)
         head += [f"parity = {quoted(self._parity)}"] * (self._parity != "none")
         if isinstance(what, TextLines):
             return "\n".join([*head, *self._lines_tables(what, name)])
@@ -667,13 +667,13 @@ def _lines_hz(heard: Heard, what: TextLines) -> float | None:
 
 
 def _tried_row(one: Tried) -> Sequence[str]:
-    heard, found = one.heard, one.found
+    heard, recognised = one.heard, one.recognised
     return (
         f"{one.baud}{'' if one.parity == 'none' else f', {one.parity} parity'}",
         f"{heard.received}",
         f"{heard.errors}",
-        f"{100 * found.printable:.0f} %",
-        f"{found.score:.2f}",
+        f"{100 * recognised.printable:.0f} %",
+        f"{recognised.score:.2f}",
     )
 
 
