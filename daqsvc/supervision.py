@@ -16,7 +16,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.acquisition.link import Backoff, SaidOnce
+from daqsvc.acquisition.link import Backoff, LoggedOnce
 from daqsvc.errors.code import coded
 from daqsvc.errors.service import ESSENTIAL_LOST, PART_FAILED, PART_STALLED, STOPPED_HARD
 from daqsvc.notice import notice
@@ -53,7 +53,7 @@ class Supervisor:
     def __init__(self) -> None:
         self.failures: Counter[str] = Counter()
         self._lock = threading.Lock()
-        self._logged = SaidOnce()
+        self._logged = LoggedOnce()
         self._lost: asyncio.Future[None] | None = None
 
     def keep(

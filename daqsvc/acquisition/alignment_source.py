@@ -189,7 +189,7 @@ class Follower:
         self._first = 0
         self._line: Line | None = None
         self._place: tuple[int, float] | None = None
-        self._told: News | None = None
+        self._reported: News | None = None
         memory_s = STALL_S + 4.0 * max_wait_ns / NS_PER_S
         self._capacity = round(memory_s * source.rate_hz) + 8 * self._delay.reach
 
@@ -323,14 +323,14 @@ class Follower:
         Args:
             patience: rows in which it should have found its place.
         """
-        before = self._told
+        before = self._reported
         if self.trusted:
-            self._told = "placed"
+            self._reported = "placed"
         elif before == "placed":
-            self._told = "out of place"
+            self._reported = "out of place"
         elif before is None and self.counters.rows_withheld > patience:
-            self._told = "never placed"
-        return None if self._told == before else self._told
+            self._reported = "never placed"
+        return None if self._reported == before else self._reported
 
     def _target(self, index: int, grid: Line) -> tuple[int, float]:
         """Where the time bases see a row of the grid among our samples: whole index and fraction."""

@@ -137,7 +137,7 @@ class StreamAssembler:
         self._rate_hz = rate_hz
         self._unread = unread
         self._standing = StreamStanding(stream, tell)
-        self._said: dict[str, int] = {}
+        self._logged_ns: dict[str, int] = {}
 
     @property
     def time_base(self) -> TimeBaseState:
@@ -323,8 +323,8 @@ class StreamAssembler:
 
     def _say(self, message: str, now_ns: int) -> None:
         """Log what may happen again and again, but not as often."""
-        if message not in self._said or now_ns - self._said[message] >= QUIET_NS:
-            self._said[message] = now_ns
+        if message not in self._logged_ns or now_ns - self._logged_ns[message] >= QUIET_NS:
+            self._logged_ns[message] = now_ns
             logger.warning(message, self.stream, extra=coded(TIME_UNSURE))
 
     def _merge(self, index: NDArray[np.int64], samples: Samples, arrival_ns: int) -> None:

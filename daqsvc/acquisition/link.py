@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-SAID_AT_MOST, SAID_WITHIN_NS = 3, 60 * NS_PER_S
+LOGGED_AT_MOST, LOGGED_WITHIN_NS = 3, 60 * NS_PER_S
 
 OFTEN = "; if this repeats, it is logged three times a minute at most"
 """To be added to what is said for the third time."""
@@ -32,13 +32,13 @@ class Sparing:
     """Lets a trouble be said three times a minute at most, and its end only if the trouble was said."""
 
     def __init__(self) -> None:
-        self._said_ns: deque[int] = deque(maxlen=SAID_AT_MOST)
+        self._logged_ns: deque[int] = deque(maxlen=LOGGED_AT_MOST)
         self._standing = False
 
     @property
     def often(self) -> bool:
         """Whether nothing more is said for now."""
-        return len(self._said_ns) == SAID_AT_MOST
+        return len(self._logged_ns) == LOGGED_AT_MOST
 
     def may_say(self) -> bool:
         """Whether the trouble that there is now is to be said; if so, it counts as said.
@@ -49,11 +49,11 @@ class Sparing:
             return False
         # Real time, whatever the service's clock is: this is about how much goes into the log.
         now_ns = time.monotonic_ns()
-        if self.often and now_ns - self._said_ns[0] < SAID_WITHIN_NS:
+        if self.often and now_ns - self._logged_ns[0] < LOGGED_WITHIN_NS:
             return False
-        while self._said_ns and now_ns - self._said_ns[0] >= SAID_WITHIN_NS:
-            self._said_ns.popleft()
-        self._said_ns.append(now_ns)
+        while self._logged_ns and now_ns - self._logged_ns[0] >= LOGGED_WITHIN_NS:
+            self._logged_ns.popleft()
+        self._logged_ns.append(now_ns)
         self._standing = True
         return True
 
@@ -63,23 +63,23 @@ class Sparing:
         return was
 
 
-SAY_AGAIN_S = 3600.0
+LOG_AGAIN_S = 3600.0
 """The same failure is said again after so long."""
 
 
-class SaidOnce:
+class LoggedOnce:
     """Lets each failure be said once an hour, by what caused it."""
 
     def __init__(self) -> None:
-        self._said_s: dict[Hashable, float] = {}
+        self._logged_s: dict[Hashable, float] = {}
 
     def may_say(self, cause: Hashable) -> bool:
         """Whether a failure is to be said; if so, it counts as said."""
         now_s = time.monotonic()
-        said_s = self._said_s.get(cause)
-        if said_s is not None and now_s - said_s < SAY_AGAIN_S:
+        logged_s = self._logged_s.get(cause)
+        if logged_s is not None and now_s - logged_s < LOG_AGAIN_S:
             return False
-        self._said_s[cause] = now_s
+        self._logged_s[cause] = now_s
         return True
 
 
@@ -152,9 +152,9 @@ class Link:
     quiet: Callable[[], str] = field(default=str, repr=False)
     preparing: bool = False
     _ever_up: bool = field(default=False, repr=False)
-    _said_down: bool = field(default=False, repr=False)
+    _logged_down: bool = field(default=False, repr=False)
     _sparing: Sparing = field(default_factory=Sparing, repr=False)
-    _failures: SaidOnce = field(default_factory=SaidOnce, repr=False)
+    _failures: LoggedOnce = field(default_factory=LoggedOnce, repr=False)
 
     @property
     def ever_up(self) -> bool:
@@ -163,12 +163,12 @@ class Link:
 
     def up(self) -> None:
         """The link works."""
-        if self._said_down:
+        if self._logged_down:
             notice(logger, "%s is back" if self._ever_up else "%s is there now", self.name)
         elif self.state == "down":
             logger.info("%s is up", self.name)
         self._sparing.may_take_back()
-        self.state, self.reason, self._said_down, self._ever_up = "up", "", False, True
+        self.state, self.reason, self._logged_down, self._ever_up = "up", "", False, True
         self.code = None
         self.over = ""
 
@@ -176,13 +176,13 @@ class Link:
         """The link does not work, because of ``reason``, and is tried again; repeated calls are silent."""
         if self.state == "up":
             self.losses += 1
-        if not self._said_down and self._sparing.may_say():
+        if not self._logged_down and self._sparing.may_say():
             lost = " is lost" if self._ever_up else ""
             often = OFTEN if self._sparing.often else ""
             logger.warning(
                 "%s%s: %s; it is being tried again%s", self.name, lost, reason, often, extra=coded(LINK_LOST)
             )
-            self._said_down = True
+            self._logged_down = True
         self.state, self.reason, self.code = "down", reason, LINK_LOST
 
     def fail(self, reason: str, error: BaseException) -> None:
@@ -194,21 +194,21 @@ class Link:
                 "%s: %s; it is being tried again", self.name, in_words(error), extra=coded(DRIVER_FAILED)
             )
             logger.info("traceback of that failure", exc_info=error)
-            self._said_down = True
+            self._logged_down = True
         self.state, self.reason, self.code = "down", reason, DRIVER_FAILED
 
     def leave_out(self, reason: str) -> None:
         """The link does not work at start, because of ``reason``, and is not tried again."""
         left_out = f"{self.name}: {reason}; it is left out until the service starts again"
         logger.warning("%s, as start = 'ignore' asks for", left_out, extra=coded(LEFT_OUT_AT_START))
-        self.state, self.reason, self._said_down, self.over = "down", reason, False, left_out
+        self.state, self.reason, self._logged_down, self.over = "down", reason, False, left_out
         self.code = LEFT_OUT_AT_START
 
     def end(self, reason: str) -> None:
         """There is nothing more to come over the link, because of ``reason``; it is not tried again."""
         ended = f"{self.name} has ended: {reason}"
         logger.info("%s", ended)
-        self.state, self.reason, self._said_down, self.over = "down", reason, False, ended
+        self.state, self.reason, self._logged_down, self.over = "down", reason, False, ended
         self.code = None
 
     def why_silent(self, stream: str) -> str:

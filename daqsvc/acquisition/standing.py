@@ -74,8 +74,8 @@ class StreamStanding:
         self._tell = tell
         self._now: StreamState | None = None
         self._begun_ns: int | None = None
-        self._told_ns = 0
-        self._said_ns: dict[str, int] = {}
+        self._reported_ns = 0
+        self._logged_ns: dict[str, int] = {}
         self._logged = False
 
     def update(self, doubt: str, now_ns: int, *, known: bool) -> None:
@@ -92,10 +92,10 @@ class StreamStanding:
         if self._now is not None:
             proven = proven or self._now.proven
         standing = StreamState(doubt, proven)
-        if standing == self._now and not (doubt and abs(now_ns - self._told_ns) >= AGAIN_NS):
+        if standing == self._now and not (doubt and abs(now_ns - self._reported_ns) >= AGAIN_NS):
             return
         before, self._now = self._now, standing
-        self._told_ns = now_ns
+        self._reported_ns = now_ns
         if cause_of(doubt) != cause_of(before.doubt if before else ""):
             self._log(doubt, now_ns)
         self._tell(self._stream, standing)
@@ -109,9 +109,9 @@ class StreamStanding:
     def _log(self, doubt: str, now_ns: int) -> None:
         if doubt:
             cause = cause_of(doubt)
-            if now_ns - self._said_ns.get(cause, now_ns - QUIET_NS) >= QUIET_NS:
+            if now_ns - self._logged_ns.get(cause, now_ns - QUIET_NS) >= QUIET_NS:
                 self._logged = True
-                self._said_ns[cause] = now_ns
+                self._logged_ns[cause] = now_ns
                 logger.warning(
                     "stream %r: %s. Nothing is judged by it meanwhile",
                     self._stream,

@@ -469,9 +469,9 @@ class TimeBase:
             period_ns: of the rate that they are not of.
         """
         x = buckets[:, 0]
-        found_ns = self._nominal_ns + line.slope_ns
-        late = buckets[:, 1] - x * found_ns - line.offset_ns
-        return float(np.percentile(late, 90)) <= STRAIGHT * abs(found_ns - period_ns) * float(np.ptp(x))
+        measured_ns = self._nominal_ns + line.slope_ns
+        late = buckets[:, 1] - x * measured_ns - line.offset_ns
+        return float(np.percentile(late, 90)) <= STRAIGHT * abs(measured_ns - period_ns) * float(np.ptp(x))
 
 
 _LIKE_SAMPLES = 0.02

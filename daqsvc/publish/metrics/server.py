@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from prometheus_client import MetricsHandler
 
-from daqsvc.acquisition.link import SaidOnce
+from daqsvc.acquisition.link import LoggedOnce
 from daqsvc.errors.code import coded
 from daqsvc.errors.outputs import OUTPUT_FAILED
 
@@ -61,7 +61,7 @@ class MetricsServer(ThreadingHTTPServer):
             self.address_family = socket.AF_INET6
         self._until_s: dict[socket.socket, float] = {}
         self._lock = threading.Lock()
-        self._logged = SaidOnce()
+        self._logged = LoggedOnce()
         self._ended = False
         super().__init__((address.host, address.port), _handler(registry, unhealthy))
 
