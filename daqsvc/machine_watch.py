@@ -11,7 +11,7 @@ from daqsvc.acquisition.standing import StreamState
 from daqsvc.detectors.make import change_setpoints, detectors
 from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.diagnosis.snapshots import alignment, at_once, patience
-from daqsvc.diagnosis.statements import said_of_silence
+from daqsvc.diagnosis.statements import silence_statements
 from daqsvc.live_feed import LiveFeed
 from daqsvc.recorder import MachineRecorder
 from daqsvc.settings.streams import Grid
@@ -175,7 +175,7 @@ class MachineWatch:
         active: dict[str, Sequence[str]] = {}
         for detector in self.pipeline.detectors:
             with self.supervisor.sparing_others(f"detector {detector.name}", "its alarms begin again"):
-                active.update({s.detector: s.sensors for s in said_of_silence(detector, 0.0, now_ns)})
+                active.update({s.detector: s.sensors for s in silence_statements(detector, 0.0, now_ns)})
         return active
 
     def progress(self) -> dict[str, Progress]:

@@ -274,14 +274,14 @@ class _Putter:
             ValueError: there is none, or none that may be made.
         """
         module, _, qualname = name.partition(":")
-        found: Any = sys.modules.get(module) if _is_of(module, self._packages) else None
+        resolved: Any = sys.modules.get(module) if _is_of(module, self._packages) else None
         for part in qualname.split("."):
-            found = getattr(found, part, None)
-        if not isinstance(found, type) or not issubclass(found, base) or _name(found) != name:
+            resolved = getattr(resolved, part, None)
+        if not isinstance(resolved, type) or not issubclass(resolved, base) or _name(resolved) != name:
             raise ValueError(f"there is no class {name}")
-        if base is object and (not _may_be_made(found) or issubclass(found, BaseModel)):
+        if base is object and (not _may_be_made(resolved) or issubclass(resolved, BaseModel)):
             raise ValueError(f"nothing of class {name} can be made")
-        return found
+        return resolved
 
 
 def _is_taken(value: object, packages: frozenset[str]) -> bool:

@@ -22,7 +22,7 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.ring import RingClosed, RingReader
 from daqsvc.acquisition.standing import StreamState, wording_of
 from daqsvc.diagnosis.record import silence_reason
-from daqsvc.diagnosis.statements import asked, said_of_silence, said_of_window
+from daqsvc.diagnosis.statements import asked, silence_statements, window_statements
 from daqsvc.dsp.quality.missing import Patience
 from daqsvc.errors.code import coded
 from daqsvc.errors.detectors import NO_DETECTOR
@@ -274,11 +274,11 @@ class _Cause:
 
     Attributes:
         why: in a clause; empty if it is not known.
-        as_said_ns: when that was last so.
+        last_ns: when that was last so.
     """
 
     why: str
-    as_said_ns: int
+    last_ns: int
 
     def is_another(self, why: str, now_ns: int, patience_ns: int) -> bool:
         """Whether something else is the reason, and has been for long enough to say so.
@@ -287,8 +287,8 @@ class _Cause:
         """
         was, now = wording_of(self.why), wording_of(why)
         if was == now or (was and now and (was in now or now in was)):
-            self.as_said_ns = now_ns
-        return now_ns - self.as_said_ns >= max(_SETTLED_NS, patience_ns)
+            self.last_ns = now_ns
+        return now_ns - self.last_ns >= max(_SETTLED_NS, patience_ns)
 
 
 class Pipeline:
@@ -352,7 +352,7 @@ class Pipeline:
         self._why_silent = why_silent
         self._bus_quiet = bus_quiet
         self._is_prepared_for = is_prepared_for
-        self._doubts_told = dict.fromkeys(rings, 0)
+        self._doubts_reported = dict.fromkeys(rings, 0)
         self._changes = dict.fromkeys(rings, 0)
         self._held: dict[str, deque[Diagnosis]] = {name: deque(maxlen=MOST_HELD) for name in rings}
         self._seen_changes = dict.fromkeys(self.counters, 0)
@@ -392,7 +392,7 @@ class Pipeline:
         What is said before its rate is known waits for that.
         """
         before, self._standings[stream] = self._standings[stream], standing
-        self._doubts_told[stream] += bool(standing.doubt) and not standing.silent
+        self._doubts_reported[stream] += bool(standing.doubt) and not standing.silent
         if standing.doubt != before.doubt:
             self._changes[stream] += 1
             self._held[stream].clear()
@@ -422,7 +422,7 @@ class Pipeline:
                 with self._supervisor.sparing_others(
                     _part(detector), "the others report that nothing is judged"
                 ):
-                    for diagnosis in said_of_silence(detector, 0.0, now_ns):
+                    for diagnosis in silence_statements(detector, 0.0, now_ns):
                         self._report(replace(diagnosis, quality="missing", reason=doubt))
 
     def _let_go(self, stream: str) -> None:
@@ -483,7 +483,7 @@ class Pipeline:
 
         A process that was suspended has not listened: what came meanwhile still waits to be read.
         """
-        heard = {name: (ring.end_index, self._doubts_told[name]) for name, ring in self._rings.items()}
+        heard = {name: (ring.end_index, self._doubts_reported[name]) for name, ring in self._rings.items()}
         begun_ns = looked_ns = self._clock.monotonic_ns()
         since_ns = {name: looked_ns + self._settling_ns.get(name, 0) for name in self._rings}
         silent: set[str] = set()
@@ -499,7 +499,7 @@ class Pipeline:
                 if now_ns - begun_ns < _LONGEST_PREPARATION_NS and self._is_prepared_for(name):
                     since_ns[name] = now_ns + self._settling_ns.get(name, 0)
                 has_doubt = bool(self._standings[name].doubt)
-                come = (heard[name][0] if has_doubt else ring.end_index, self._doubts_told[name])
+                come = (heard[name][0] if has_doubt else ring.end_index, self._doubts_reported[name])
                 if come != heard[name]:
                     if name not in silent and not has_doubt:
                         self._patience[name].heard_after(now_ns - since_ns[name])
@@ -541,7 +541,7 @@ class Pipeline:
                 with self._supervisor.sparing_others(
                     _part(detector), "the other detectors report that nothing comes"
                 ):
-                    for diagnosis in said_of_silence(detector, silence_s, now_ns):
+                    for diagnosis in silence_statements(detector, silence_s, now_ns):
                         self._report(
                             replace(diagnosis, reason=reason) if over or why or beside else diagnosis
                         )
@@ -615,19 +615,19 @@ class Pipeline:
                 hangs = f"it has computed on one window for {HANG_S:g} s"
                 self._supervisor.failed(_part(detector), hangs, "the other detectors go on without it")
 
-    def _see_names(self, detector: Detector, said: Sequence[Diagnosis], t_ns: int) -> None:
+    def _see_names(self, detector: Detector, statements: Sequence[Diagnosis], t_ns: int) -> None:
         """See that a detector makes statements in its own name only, or in those of its `silent`.
 
         Raises:
             BrokenContractError: it speaks under another name, which an alarm of another detector may follow.
         """
-        if all(one.detector == detector.name for one in said):
+        if all(one.detector == detector.name for one in statements):
             return
         if detector.name not in self._names:
-            names = (one.detector for one in said_of_silence(detector, 0.0, t_ns))
+            names = (one.detector for one in silence_statements(detector, 0.0, t_ns))
             self._names[detector.name] = frozenset({detector.name, *names})
         known = self._names[detector.name]
-        for one in said:
+        for one in statements:
             if one.detector not in known:
                 words = (
                     f"it returns a statement of {one.detector!r:.60}; name it {' or '.join(sorted(known))}"
@@ -643,8 +643,8 @@ class Pipeline:
         # The kernels' load on the host is a matter of the host's clock, whatever clock the samples have.
         begun_ns = time.perf_counter_ns()
         try:
-            said = said_of_window(detector, window)
-            self._see_names(detector, said, window.t_end_ns)
+            statements = window_statements(detector, window)
+            self._see_names(detector, statements, window.t_end_ns)
         except Exception as error:  # noqa: BLE001 - said and counted
             counters.failures += 1
             self._supervisor.failed(_part(detector), error, "it goes on with the next window")
@@ -654,11 +654,11 @@ class Pipeline:
                     # It blames itself, also if it makes statements for each of its sensors: they have done
                     # nothing.
                     replace(held, quality="missing", reason=reason, sensors=())
-                    for held in said_of_silence(detector, 0.0, window.t_end_ns)
+                    for held in silence_statements(detector, 0.0, window.t_end_ns)
                 ]
             return []
         else:
-            return said
+            return statements
         finally:
             counters.windows += 1
             counters.samples += len(window.samples)

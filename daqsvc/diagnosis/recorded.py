@@ -21,7 +21,7 @@ import numpy as np
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.confined.spilled import let_go
 from daqsvc.diagnosis.detector import Window
-from daqsvc.diagnosis.statements import said_of_window
+from daqsvc.diagnosis.statements import window_statements
 from daqsvc.dsp.quality.unit import UM_PER_UNIT
 from daqsvc.errors.code import with_code
 from daqsvc.errors.recordings import NOT_JUDGED
@@ -523,13 +523,13 @@ def listen(
         whole = len(part) // detector.block * detector.block
         if whole:
             end_ns = round((begin + whole - 1) * period_ns)
-            yield from said_of_window(detector, Window(begin, part[:whole], end_ns, period_ns))
+            yield from window_statements(detector, Window(begin, part[:whole], end_ns, period_ns))
 
 
 def finite(document: FiniteT) -> FiniteT:
     """The same with every NaN and infinity as None, and NumPy's numbers as Python's."""
-    told: FiniteT = _finite(document)
-    return told
+    cleaned: FiniteT = _finite(document)
+    return cleaned
 
 
 def _finite(value: Any) -> Any:

@@ -36,7 +36,7 @@ _BEHIND_NS = 3600 * NS_PER_S
 """How old the last sample of what is said of a window may be."""
 
 
-def said_of_window(detector: Detector, window: Window) -> Sequence[Diagnosis]:
+def window_statements(detector: Detector, window: Window) -> Sequence[Diagnosis]:
     """What a detector states about a window.
 
     Raises:
@@ -44,32 +44,32 @@ def said_of_window(detector: Detector, window: Window) -> Sequence[Diagnosis]:
         Exception: it has failed.
     """
     latest_ns = window.t_end_ns
-    return _said(detector.process, latest_ns - _BEHIND_NS, latest_ns, window)
+    return _checked(detector.process, latest_ns - _BEHIND_NS, latest_ns, window)
 
 
-def said_of_silence(detector: Detector, silence_s: float, t_ns: int) -> Sequence[Diagnosis]:
+def silence_statements(detector: Detector, silence_s: float, t_ns: int) -> Sequence[Diagnosis]:
     """What a detector states about a silence.
 
     Raises:
         BrokenContractError: these are no statements, or they cannot be sent.
         Exception: it has failed.
     """
-    return _said(detector.silent, min(0, t_ns), t_ns, silence_s, t_ns)
+    return _checked(detector.silent, min(0, t_ns), t_ns, silence_s, t_ns)
 
 
-def _said(
+def _checked(
     say: Callable[..., Sequence[Diagnosis]], earliest_ns: int, latest_ns: int, *of: Any
 ) -> Sequence[Diagnosis]:
-    said = asked(say, *of)
-    if not isinstance(said, Sequence) or not all(isinstance(one, Diagnosis) for one in said):
-        raise BrokenContractError(say, f"it returns {said!r:.60}, not Sequence[Diagnosis]")
+    statements = asked(say, *of)
+    if not isinstance(statements, Sequence) or not all(isinstance(one, Diagnosis) for one in statements):
+        raise BrokenContractError(say, f"it returns {statements!r:.60}, not Sequence[Diagnosis]")
     if not is_ours(getattr(say, "__module__", None) or ""):
         try:
-            for one in said:
+            for one in statements:
                 see_statement(one, earliest_ns, latest_ns)
         except ValueError as error:
             raise BrokenContractError(say, f"it returns a statement that cannot be sent: {error}") from None
-    return said
+    return statements
 
 
 def asked(hook: Callable[..., T], *of: Any) -> T:
@@ -85,8 +85,8 @@ def asked(hook: Callable[..., T], *of: Any) -> T:
         if isinstance(error, Exception) and words is not None:
             raise
         kind = type(error).__name__
-        told = "" if words is None else f": {words}" if words else ""
-        raise RuntimeError(f"it raises {kind}{told}").with_traceback(error.__traceback__) from None
+        detail = "" if words is None else f": {words}" if words else ""
+        raise RuntimeError(f"it raises {kind}{detail}").with_traceback(error.__traceback__) from None
 
 
 def _words(error: BaseException) -> str | None:

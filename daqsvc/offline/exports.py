@@ -111,8 +111,8 @@ def _read(
         except SnapshotError as error:
             raise RecordingError(f"{error}", error.code) from None
         about = snapshot.about
-        said = {key: str(about[key]) for key in ABOUT_MACHINE if key in about}
-        return Exported(_of_snapshot(path, snapshot), said, list(snapshot.notes))
+        of_snapshot = {key: str(about[key]) for key in ABOUT_MACHINE if key in about}
+        return Exported(_of_snapshot(path, snapshot), of_snapshot, list(snapshot.notes))
     streams, notes = _of_table(recording, machine, channels, rate_hz)
     return Exported(streams, of_machine, notes)
 

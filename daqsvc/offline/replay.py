@@ -30,7 +30,7 @@ from daqsvc.alarms.manager import AlarmManager
 from daqsvc.alarms.quality import Lacking
 from daqsvc.diagnosis.memory import DetectorMemory, MemoryNotFittingError, put
 from daqsvc.diagnosis.pipeline import THREADS, KernelThreads, kernel_failed
-from daqsvc.diagnosis.statements import said_of_silence
+from daqsvc.diagnosis.statements import silence_statements
 from daqsvc.errors.recordings import NOT_REPLAYABLE
 from daqsvc.machine_facts import files_named, machine_values, with_paths
 from daqsvc.machine_watch import MachineWatch
@@ -136,20 +136,20 @@ class GivenWindows(RingReader):
 
     def __init__(self, ring: SampleRing) -> None:
         super().__init__(ring)
-        self._given: asyncio.Queue[Window | None] = asyncio.Queue()
+        self._windows: asyncio.Queue[Window | None] = asyncio.Queue()
         self.asks = asyncio.Event()
         """Whether the detector has done with the last one."""
 
     def give(self, window: Window | None) -> None:
         """Hand it on; None if no more will come."""
         self.asks.clear()
-        self._given.put_nowait(window)
+        self._windows.put_nowait(window)
 
     async def read(self, block: int, most_blocks: int) -> Window:
         """See `RingReader.read`."""
         del block, most_blocks
         self.asks.set()
-        window = await self._given.get()
+        window = await self._windows.get()
         if window is None:
             raise RingClosed(f"the snapshot of {self.ring.stream!r} has ended")
         return window
@@ -297,7 +297,7 @@ class Replay:
         except _NOT_OURS as error:
             _refuse(error)
         self._is_same = not self._why_anew
-        self._memories = self._found_memories() if self._is_same else {}
+        self._memories = self._stored_memories() if self._is_same else {}
         self._clock = DrivenClock(self._begin_ns, self._begin_ns + self._wall_ns)
         self._supervisor = Supervisor()
         self._readers: dict[str, GivenWindows] = {}
@@ -317,7 +317,7 @@ class Replay:
             for name in _names(detector, self._begin_ns)
         }
         """By detector of a statement, the one that makes it."""
-        self._earlier = self._found_earlier()
+        self._earlier = self._earlier_statements()
         self._ticked_ns = self._begin_ns
 
     def _under_its_name(self, machine: MachineFile) -> MachineFile:
@@ -341,7 +341,7 @@ class Replay:
             ReplayError: there is nothing for any of them.
         """
         try:
-            given = {
+            recorded = {
                 str(entry.what.document["detector"])
                 for entry in self._snapshot.entries
                 if not isinstance(entry.what, SampleBlock) and entry.what.topic == WINDOWS
@@ -355,12 +355,12 @@ class Replay:
                 f"has samples of {_listed(then)}, and the detectors of {self._machine.path} judge "
                 f"{_listed(streams.values()) or 'nothing'}: give a machine file of this machine"
             )
-        if given and not given & streams.keys():
+        if recorded and not recorded & streams.keys():
             raise ReplayError(
-                f"has samples for the detectors {_listed(given)}, of which {self._machine.path} has none, "
+                f"has samples for the detectors {_listed(recorded)}, of which {self._machine.path} has none, "
                 f"but {_listed(streams) or 'no detector'}: give a machine file of this machine"
             )
-        if given and (idle := streams.keys() - given):
+        if recorded and (idle := streams.keys() - recorded):
             self._result.notes.append(
                 f"{_listed(idle)} not judged: the snapshot does not state which samples they were given"
             )
@@ -443,16 +443,19 @@ class Replay:
                 self._result.anew[detector.name] = self._why_anew or _NOT_REMEMBERED
         return ""
 
-    def _found_memories(self) -> dict[str, tuple[int, DetectorMemory]]:
-        found: dict[str, tuple[int, DetectorMemory]] = {}
+    def _stored_memories(self) -> dict[str, tuple[int, DetectorMemory]]:
+        memories: dict[str, tuple[int, DetectorMemory]] = {}
         for entry in self._snapshot.entries:
             if not isinstance(entry.what, SampleBlock) and entry.what.topic == STATES:
                 document = entry.what.document
                 try:
-                    found[str(document["detector"])] = int(document["end_index"]), DetectorMemory.of(document)
+                    memories[str(document["detector"])] = (
+                        int(document["end_index"]),
+                        DetectorMemory.of(document),
+                    )
                 except (*_NOT_OURS, MemoryNotFittingError) as error:
                     _refuse(error)
-        return found
+        return memories
 
     def _see_gap(self, at_ns: int) -> None:
         if at_ns - self._clock.monotonic_ns() > LONGEST_GAP_NS:
@@ -487,8 +490,8 @@ class Replay:
         document = noted.document
         try:
             if noted.topic == STANDING and document["stream"] in self._watch.standings:
-                told = {key: value for key, value in document.items() if key != "stream"}
-                self._watch.stand(document["stream"], StreamState(**told))
+                values = {key: value for key, value in document.items() if key != "stream"}
+                self._watch.stand(document["stream"], StreamState(**values))
             elif noted.topic in (DIAGNOSES, ALARMS):
                 self._follow(noted)
             elif noted.topic == WINDOWS and document["detector"] in self._readers:
@@ -496,7 +499,7 @@ class Replay:
         except _NOT_OURS as error:
             _refuse(error)
 
-    def _found_earlier(self) -> dict[str, deque[Noted]]:
+    def _earlier_statements(self) -> dict[str, deque[Noted]]:
         """By detector that remembers, what was said by samples that it had judged by the begin, in order.
 
         It may have come late, when the detector had got further samples already.
@@ -597,9 +600,9 @@ class Replay:
         for event in events:
             self._heard(event)
 
-    def _said_then(self) -> tuple[list[Document], list[Document]]:
+    def _recorded_results(self) -> tuple[list[Document], list[Document]]:
         """The statements and alarm events of then that are to be said now."""
-        said: list[Document] = []
+        statements: list[Document] = []
         alarmed: list[Document] = []
         others: dict[str, Counter[str]] = {DIAGNOSES: Counter(), ALARMS: Counter()}
         """By topic and detector, what is of no detector of the machine file."""
@@ -609,7 +612,7 @@ class Replay:
             topic, document = entry.what.topic, entry.what.document
             if topic == DIAGNOSES:
                 if self._is_replayed(document) or self._is_heard(document):
-                    said.append(document)
+                    statements.append(document)
                 elif document.get("detector") not in self._names:
                     others[topic][str(document.get("detector"))] += 1
             elif self._is_judged(document):
@@ -618,7 +621,7 @@ class Replay:
             elif not document.get("by"):
                 others[topic][_judge(document)] += 1
         self._tell_of_others(others)
-        return said, alarmed
+        return statements, alarmed
 
     def _tell_of_others(self, others: dict[str, Counter[str]]) -> None:
         if of_service := others[ALARMS].pop(SERVICE, 0):
@@ -632,10 +635,10 @@ class Replay:
 
     def _compare(self) -> None:
         """Hold what was said then against what is said now."""
-        said, alarmed = self._said_then()
-        _hold(self._result.said, said, [statement_document(one) for one in self._result.statements])
+        statements, alarmed = self._recorded_results()
+        _hold(self._result.said, statements, [statement_document(one) for one in self._result.statements])
         # What follows of statements that came after the end of the file came after it, too.
-        ends = _ends(said)
+        ends = _ends(statements)
         of_later = [one for one in self._result.said.added if _end_of(one) > ends.get(one["detector"], -1)]
         later = {_comparable(one) for one in of_later}
         self._result.said.added = [one for one in self._result.said.added if _comparable(one) not in later]
@@ -683,7 +686,7 @@ def _listed(names: Iterable[str]) -> str:
 
 
 def _names(detector: Detector, t_ns: int) -> set[str]:
-    return {detector.name, *(one.detector for one in said_of_silence(detector, 0.0, t_ns))}
+    return {detector.name, *(one.detector for one in silence_statements(detector, 0.0, t_ns))}
 
 
 def _is_silence(statement: Document) -> bool:
@@ -712,16 +715,16 @@ def _ends(statements: list[Document]) -> dict[str, int]:
 
 
 def _hold(comparison: Comparison, then: list[Document], now: list[Document]) -> None:
-    told_now = [_comparable(one) for one in now]
-    told_then = [_comparable(one) for one in then]
-    left = Counter(told_now)
-    for text, document in zip(told_then, then, strict=True):
+    texts_now = [_comparable(one) for one in now]
+    texts_then = [_comparable(one) for one in then]
+    left = Counter(texts_now)
+    for text, document in zip(texts_then, then, strict=True):
         if left[text]:
             left[text] -= 1
             comparison.equal += 1
         else:
             comparison.changed.append(document)
-    for text, document in zip(told_now, now, strict=True):
+    for text, document in zip(texts_now, now, strict=True):
         if left[text]:
             left[text] -= 1
             comparison.added.append(document)
@@ -729,8 +732,8 @@ def _hold(comparison: Comparison, then: list[Document], now: list[Document]) -> 
 
 def _comparable(document: Document) -> str:
     """The same text for what is the same to the last bit."""
-    told = json.loads(to_json(document, inf_nan_mode="null"))
-    return json.dumps({key: one for key, one in told.items() if key not in _NOT_COMPARED}, sort_keys=True)
+    content = json.loads(to_json(document, inf_nan_mode="null"))
+    return json.dumps({key: one for key, one in content.items() if key not in _NOT_COMPARED}, sort_keys=True)
 
 
 def _refuse(error: Exception) -> NoReturn:

@@ -180,7 +180,7 @@ class Runner:
         for key, one, judges in self._judging(recordings, homes):
             present[key] = self.detectors[key]
             try:
-                found = judges(progress)
+                judged = judges(progress)
             except (ValueError, AssemblyError) as error:
                 why = one_line(str(error))
                 if one is loaded or self.detectors[key].part:
@@ -188,9 +188,9 @@ class Runner:
                 else:
                     notes.append(f"{key} has not judged {', '.join(one.names)}: {why}")
                 continue
-            evaluated[key] = _joined(evaluated[key], found) if key in evaluated else found
-            if figures is not None and found.draw is not None:
-                found.draw(figures)
+            evaluated[key] = _joined(evaluated[key], judged) if key in evaluated else judged
+            if figures is not None and judged.draw is not None:
+                judged.draw(figures)
         if wrong:
             return self._outcome(_not_judged(present, recording, wrong), evaluated, notes)
         heads = _heads({key: one for key, one in present.items() if key in evaluated})

@@ -64,11 +64,11 @@ def bearing_checks(draft: MachineFile, settings: Bearing) -> Iterator[Iterator[F
 
 def _kinematics(bearing: WatchedBearing, at: KeyPath) -> Iterator[Finding]:
     """The orders come from one place, and are in an order that a bearing can have."""
-    told = [key for key in ("type", "orders", "geometry") if getattr(bearing, key) is not None]
-    if len(told) != 1:
+    sources = [key for key in ("type", "orders", "geometry") if getattr(bearing, key) is not None]
+    if len(sources) != 1:
         yield Finding(
             at,
-            f"has both {' and '.join(told)}" if told else "has neither type nor orders",
+            f"has both {' and '.join(sources)}" if sources else "has neither type nor orders",
             'write type = "6205-2RS", or orders = { bpfi = .., bpfo = .., bsf = .., ftf = .. }, or '
             "geometry = { balls = .., ball_diameter_mm = .., pitch_diameter_mm = .. }",
             code=BEARING_FIGURES,

@@ -239,11 +239,11 @@ class _Looks:
         self.last = look
         if look.finding is None:
             return
-        found = look.finding.verdict, look.finding.where
+        key = look.finding.verdict, look.finding.where
         for strongest, size in ((self._severe, _severity), (self._departed, _departure)):
-            before = strongest.get(found)
+            before = strongest.get(key)
             if before is None or size(look) > size(before):
-                strongest[found] = look
+                strongest[key] = look
 
     def decisive(self, standing: ConfirmedState) -> Evaluation | None:
         """The strongest that found what stands, or else the last."""

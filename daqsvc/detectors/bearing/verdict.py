@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from daqsvc.dsp.drive_lines import DriveLines
     from daqsvc.dsp.quality.unit import AccelerationUnit
 
-_TOLD_LINES = 4
+_LISTED_LINES = 4
 
 
 class RaceEvidenceJson(TypedDict):
@@ -403,7 +403,7 @@ class BearingVerdict(Verdict):
                 for part, e in ((part, race.evidence[part]) for part in PARTS)
             )
         )
-        shown_lines = [line for line in race.lines if line.part in finding.group][:_TOLD_LINES]
+        shown_lines = [line for line in race.lines if line.part in finding.group][:_LISTED_LINES]
         lines += [
             f"{_line_name(line)} at {line.frequency_hz:.2f} Hz ({line.order:.3f} per revolution), modulation "
             f"{line.depth:.2f}"

@@ -358,23 +358,23 @@ class LevelDetector:
             if self._turns_per_sample is None:
                 return {}, f"1X of {sensor} is not known: the speed of the shaft is not stated"
             angle_rad = steady_angle(samples, self._turns_per_sample)
-        found = window_orders(samples, angle_rad)
-        if found is None and by_pulses and self._shaft is not None and not np.isfinite(angle_rad[-1]):
+        orders = window_orders(samples, angle_rad)
+        if orders is None and by_pulses and self._shaft is not None and not np.isfinite(angle_rad[-1]):
             return {}, (
                 f"1X of {sensor} is not known: {self._shaft.name} has no pulses that tell the angle of the "
                 "shaft; it stands still, or check keyphasor and threshold_v"
             )
-        if found is None:
+        if orders is None:
             return {}, (
                 f"1X of {sensor} is not known: no whole revolution of the window has enough samples; "
                 "sample faster, or write a longer window_s"
             )
         phases: dict[str, float] = {}
         if by_pulses:
-            lags = [phase_lag_deg(one, found.deviation) for one in (found.first, found.second)]
+            lags = [phase_lag_deg(one, orders.deviation) for one in (orders.first, orders.second)]
             phases = {name: lag for name, lag in zip(PHASES, lags, strict=True) if lag is not None}
-        sizes = dict(zip(AMPLITUDES, (abs(found.first), abs(found.second)), strict=True))
-        rest = dict(zip(NOT_1X, (found.rest_rms, found.rest_peak_to_peak), strict=True))
+        sizes = dict(zip(AMPLITUDES, (abs(orders.first), abs(orders.second)), strict=True))
+        rest = dict(zip(NOT_1X, (orders.rest_rms, orders.rest_peak_to_peak), strict=True))
         weak = f"1X or 2X of {sensor} does not stand out of its noise, so that it has no phase"
         return sizes | phases | rest, weak
 

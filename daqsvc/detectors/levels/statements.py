@@ -131,12 +131,12 @@ class LevelStatements:
         if quality == "good" or bounds:
             for limit in limits:
                 if limit.measure not in unknown:
-                    found = limit.severity(*_span(limit.measure, statistics, bounds))
+                    of_limit = limit.severity(*_span(limit.measure, statistics, bounds))
                     if limit.measure in bounds:
-                        found = max(
-                            found, self._by_limits.get((sensor, limit), "normal"), key=_DECISIONS.index
+                        of_limit = max(
+                            of_limit, self._by_limits.get((sensor, limit), "normal"), key=_DECISIONS.index
                         )
-                    self._by_limits[sensor, limit] = found
+                    self._by_limits[sensor, limit] = of_limit
             each = (self._by_limits.get((sensor, limit), "normal") for limit in limits)
             worst: Severity = max(each, key=_DECISIONS.index, default="normal")
             better = _DECISIONS.index(worst) < _DECISIONS.index(severity)

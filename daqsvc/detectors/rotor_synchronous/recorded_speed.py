@@ -278,12 +278,12 @@ def _keyphasor_speed(
             f"between {low:.4g} and {high:.4g}: correct --keyphasor-threshold, or name another channel"
         )
     places = np.array([sample + fraction for sample, fraction in edges])
-    found_rpm = 60.0 * recording.rate_hz / float(np.median(np.diff(places)))
-    rpm = found_rpm if setup.speed_rpm is None else math.copysign(found_rpm, setup.speed_rpm)
+    measured_rpm = 60.0 * recording.rate_hz / float(np.median(np.diff(places)))
+    rpm = measured_rpm if setup.speed_rpm is None else math.copysign(measured_rpm, setup.speed_rpm)
     calibrating = setup.rules.calibrate_revolutions
     needed = LEAST_JUDGED + (0 if setup.calibrations else calibrating)
     # Pulses may be missing, whose revolutions are there all the same.
-    revolutions = (places[-1] - places[0]) * found_rpm / 60.0 / recording.rate_hz
+    revolutions = (places[-1] - places[0]) * measured_rpm / 60.0 / recording.rate_hz
     if revolutions < needed - _ROUNDING:
         raise RefusedError(too_short(revolutions, needed, setup))
     if calibrating:

@@ -117,7 +117,7 @@ class Stater:
         self._group: tuple[str, ...] = ()
         self._large = False
         self._quality: Quality = "good"
-        self._said_index: int | None = None
+        self._stated_index: int | None = None
 
     def maybe(
         self, standing: Standing, verdict: RevolutionQuality, end_index: int, t_ns: int
@@ -137,7 +137,7 @@ class Stater:
             or verdict.quality != self._quality
             or (report is not None and (report.departed or report.looked))
         )
-        due = self._said_index is None or end_index - self._said_index >= self._steady_samples
+        due = self._stated_index is None or end_index - self._stated_index >= self._steady_samples
         return self.state(standing, verdict, end_index, t_ns) if news or due else None
 
     def state(self, standing: Standing, verdict: RevolutionQuality, end_index: int, t_ns: int) -> Diagnosis:
@@ -146,13 +146,13 @@ class Stater:
         changed = decision != self._decision or set(group) != set(self._group)
         first_index = standing.onset_index
         if first_index is None:
-            first_index = end_index if self._said_index is None else self._said_index
+            first_index = end_index if self._stated_index is None else self._stated_index
         self._decision, self._group = decision, group
         identification = None if standing.report is None else standing.report.identification
         self._large = identification is not None and identification.severity > (
             _NO_LONGER_LARGE if self._large else _LARGE
         )
-        self._quality, self._said_index = verdict.quality, end_index
+        self._quality, self._stated_index = verdict.quality, end_index
         return self._diagnosis(
             standing, verdict, first_index=min(first_index, end_index), end_index=end_index, t_ns=t_ns,
             changed=changed,

@@ -210,9 +210,9 @@ class RotorAlarm:
         named = (
             "not named" if self.declaration is None else f"named at revolution {self.declaration.revolution}"
         )
-        after = "" if self.returned is None else f"; healthy again at {told(self.returned)}"
+        after = "" if self.returned is None else f"; healthy again at {place_of(self.returned)}"
         return (
-            f"alarm at {told(self.departure)}: {what}, changed at revolution {self.onset.revolution}, "
+            f"alarm at {place_of(self.departure)}: {what}, changed at revolution {self.onset.revolution}, "
             f"{named}{after}"
         )
 
@@ -356,7 +356,9 @@ class RotorVerdict(Verdict):
         """A few lines for a person."""
         lines = [f"{self.recording}: {self._headline()}"]
         if self.departure is not None and self.onset is not None:
-            lines.append(f"changed at {told(self.onset)}; alarm at {told(self.departure)}" + self._named())
+            lines.append(
+                f"changed at {place_of(self.onset)}; alarm at {place_of(self.departure)}" + self._named()
+            )
         if len(self.alarms) > 1 or any(alarm.returned is not None for alarm in self.alarms):
             lines += [alarm.describe() for alarm in self.alarms]
         if self.identification is not None and self.calibration is not None:
@@ -413,7 +415,7 @@ class RotorVerdict(Verdict):
         return modes
 
     def _named(self) -> str:
-        return f"; named at {told(self.declaration)}" if self.declaration is not None else "; not named"
+        return f"; named at {place_of(self.declaration)}" if self.declaration is not None else "; not named"
 
     def _change(self) -> str:
         assert self.identification is not None  # noqa: S101 - asked before
@@ -457,7 +459,7 @@ def _json_of(instant: Instant | None) -> InstantJson | None:
     return None if instant is None else instant.as_json()
 
 
-def told(instant: Instant) -> str:
+def place_of(instant: Instant) -> str:
     """A place in words."""
     return f"revolution {instant.revolution} (sample {instant.sample}, {instant.seconds:.3f} s)"
 
