@@ -59,7 +59,7 @@ RATE_NAMES = frozenset(
     {"fs", "fs_hz", "sr", "rate_hz", "samplerate", "sample_rate", "sample_rate_hz", "sampling_rate"}
 )
 """Names under which a file may state its sampling rate in Hz."""
-_SAID = {*RATE_NAMES, STATED_START}
+_STATED_ELSEWHERE = {*RATE_NAMES, STATED_START}
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,16 +143,16 @@ class Contents:
     def listing(self) -> str:
         """What the file holds, in words, but for what it states of its rate and begin."""
         lines = [
-            _told(name, values)
+            _in_words(name, values)
             for name, values in self.entries.items()
-            if values.ndim or last_part(name).lower() not in _SAID
+            if values.ndim or last_part(name).lower() not in _STATED_ELSEWHERE
         ]
         if len(lines) > MOST_LISTED:
             lines[MOST_LISTED:] = [f"and {len(lines) - MOST_LISTED} more"]
         return ", ".join(lines) or "nothing"
 
 
-def _told(name: str, values: NDArray[np.generic]) -> str:
+def _in_words(name: str, values: NDArray[np.generic]) -> str:
     if not name.isprintable():
         name = ascii(name)
     if len(name) > LONGEST_NAME:
@@ -195,8 +195,10 @@ def names_of_groups(names: Sequence[tuple[str, str]]) -> list[str]:
         names: of the group and the channel, for each channel.
     """
     count = Counter(channel for _, channel in names)
-    told = [channel if channel and count[channel] == 1 else f"{group}/{channel}" for group, channel in names]
-    return column_names(told)
+    labels = [
+        channel if channel and count[channel] == 1 else f"{group}/{channel}" for group, channel in names
+    ]
+    return column_names(labels)
 
 
 def flattened(name: str, value: object) -> Iterator[tuple[str, NDArray[np.generic]]]:

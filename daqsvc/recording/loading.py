@@ -165,18 +165,20 @@ def _called(path: Path, contents: Contents, channels: Mapping[str, str]) -> dict
 def _groups(path: Path, contents: Contents) -> dict[str, list[str]]:
     """Channels that have one time and begin, by the name of their group; the longest group first."""
     lengths = _lengths(contents)
-    found: dict[tuple[str, float, int | None, int], list[str]] = {}
+    by_timing: dict[tuple[str, float, int | None, int], list[str]] = {}
     for name, length in lengths.items():
         rate_hz, start_ns = contents.rates_hz.get(name, 0.0), contents.starts_ns.get(name)
-        found.setdefault((contents.times.get(name, ""), rate_hz, start_ns, length), []).append(name)
+        by_timing.setdefault((contents.times.get(name, ""), rate_hz, start_ns, length), []).append(name)
     groups: dict[str, list[str]] = {}
-    for (times, rate_hz, _, length), members in sorted(found.items(), key=lambda one: -one[0][3]):
+    for (times, rate_hz, _, length), members in sorted(by_timing.items(), key=lambda one: -one[0][3]):
         time = None if times else time_column(contents, length)
         there = [name for name in members if name != time]
         if not there:
             continue
         label = times.removeprefix(GROUP_TIME) if times.startswith(GROUP_TIME) else ""
-        label = label or (f"{rate_hz:g}-hz" if rate_hz else f"{length}-samples") if len(found) > 1 else label
+        label = (
+            label or (f"{rate_hz:g}-hz" if rate_hz else f"{length}-samples") if len(by_timing) > 1 else label
+        )
         groups[label if label not in groups else f"{label}-{len(groups) + 1}"] = there
     if not groups:
         _longest(path, contents)  # states what there is instead

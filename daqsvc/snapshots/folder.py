@@ -117,8 +117,8 @@ class SnapshotFolder:
         """
         kept: list[tuple[bool, str, int]] = []
         total = 0
-        with os.scandir(self.directory) as found:
-            for one in found:
+        with os.scandir(self.directory) as entries:
+            for one in entries:
                 if not one.name.endswith(SUFFIX) or not one.is_file(follow_symlinks=False):
                     continue
                 status = one.stat()

@@ -161,9 +161,9 @@ class McapWriter:
             self._declare(_record(_SCHEMA, content + struct.pack("<I", len(schema.data)) + schema.data))
         number = self._topics[topic] = len(self._topics)
         self._counts[number] = 0
-        told = b"".join(_text(key) + _text(value) for key, value in about.items())
+        metadata = b"".join(_text(key) + _text(value) for key, value in about.items())
         content = struct.pack("<HH", number, self._schemas[schema]) + _text(topic) + _text(encoding)
-        self._declare(_record(_CHANNEL, content + struct.pack("<I", len(told)) + told))
+        self._declare(_record(_CHANNEL, content + struct.pack("<I", len(metadata)) + metadata))
 
     def write(self, topic: str, log_ns: int, publish_ns: int, data: bytes) -> None:
         """Add a message to the chunk that `flush` writes."""

@@ -68,8 +68,8 @@ class SnapshotWriter:
                 self._mcap.open_channel(topic, "json", _JSON, {})
             samples = samples_schema()
             for stream, facts in about["streams"].items():
-                told = {key: json.dumps(value) for key, value in facts.items()}
-                self._mcap.open_channel(f"{SAMPLES}{stream}", "protobuf", samples, told)
+                metadata = {key: json.dumps(value) for key, value in facts.items()}
+                self._mcap.open_channel(f"{SAMPLES}{stream}", "protobuf", samples, metadata)
             self._note(ABOUT, int(about["begin_ns"]), about)
             self._mcap.flush()
             for name, data in files.items():

@@ -63,8 +63,8 @@ class TimeUnit(NamedTuple):
 
 def time_unit(text: str) -> TimeUnit | None:
     """The unit of time that a text means, in English or German; None if it is none."""
-    found = _SECONDS_EACH.get(_one_micro(text).lower().replace("µ", "u"))
-    return None if found is None else TimeUnit(*found)
+    unit = _SECONDS_EACH.get(_one_micro(text).lower().replace("µ", "u"))
+    return None if unit is None else TimeUnit(*unit)
 
 
 def without_brackets(cell: str) -> str:

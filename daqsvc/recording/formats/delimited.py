@@ -133,16 +133,16 @@ class _DelimitedTable:
         """
         units: dict[str, str] = {}
         for i, name in enumerate(names):
-            said = {
+            stated = {
                 "its name": unit_in_name(name)[1] if self._layout.has_header else "",
                 "the row of units": self._layout.units.get(i, ""),
                 "a comment": self._units.get(name, ""),
             }
-            told = {where: unit for where, unit in said.items() if unit and i not in self._layout.times}
-            first = next(iter(told.items()), None)
+            by_place = {where: unit for where, unit in stated.items() if unit and i not in self._layout.times}
+            first = next(iter(by_place.items()), None)
             if first is None:
                 continue
-            for where, unit in told.items():
+            for where, unit in by_place.items():
                 if not spelt_alike(unit, first[1]):
                     raise RecordingError(
                         f"column {i + 1} ({name:.{LONGEST_NAME}}) of {self._path} is in "

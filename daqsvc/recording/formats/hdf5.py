@@ -82,10 +82,10 @@ class _Tree:
             if name not in sets:
                 entries[name] = np.empty(1, dtype=object)
                 continue
-            said = _attributes(data)
-            rate_hz = self._rate_hz(data, said)
+            attributes = _attributes(data)
+            rate_hz = self._rate_hz(data, attributes)
             time = self._time(name, data)
-            unit = next((value for key, value in said.items() if key.lower() in UNITS), None)
+            unit = next((value for key, value in attributes.items() if key.lower() in UNITS), None)
             if name in unread:
                 values = np.broadcast_to(np.zeros((), data.dtype), data.shape)
             else:
@@ -122,9 +122,9 @@ class _Tree:
             unread.add(name)
         return unread
 
-    def _rate_hz(self, data: Any, said: Mapping[str, float | str]) -> float | None:
+    def _rate_hz(self, data: Any, own: Mapping[str, float | str]) -> float | None:
         """What a data set, or the groups that it lies in, states of its rate; the root is valid for all."""
-        for attributes in (said, *map(_attributes, self._groups(data))):
+        for attributes in (own, *map(_attributes, self._groups(data))):
             for key, value in attributes.items():
                 if isinstance(value, float) and key.lower() in RATE_NAMES:
                     return value
@@ -186,7 +186,7 @@ def _columns(name: str, values: NDArray[Any]) -> Iterator[tuple[str, NDArray[np.
 
 def _attributes(item: Any) -> dict[str, float | str]:
     """Single numbers and texts among the attributes of a group or data set."""
-    found: dict[str, float | str] = {}
+    attributes: dict[str, float | str] = {}
     for key in item.attrs:
         try:
             value = item.attrs[key]
@@ -194,7 +194,7 @@ def _attributes(item: Any) -> dict[str, float | str]:
             continue
         array = np.squeeze(np.asarray(value))
         if array.ndim == 0 and array.dtype.kind in NUMERIC:
-            found[key] = float(array)
+            attributes[key] = float(array)
         elif isinstance(value, str | bytes):
-            found[key] = value if isinstance(value, str) else value.decode("utf-8", "replace")
-    return found
+            attributes[key] = value if isinstance(value, str) else value.decode("utf-8", "replace")
+    return attributes

@@ -226,11 +226,7 @@ def _heading(rows: Sequence[Sequence[str]], first: int, width: int) -> _Heading:
         if _is_units_below(lower, upper[:width]):
             return _Heading(above - 1, above)
         # What is below names of the time describes the columns in other words.
-        if (
-            all(upper[:width])
-            and any(map(_tells_time, upper[:width]))
-            and not any(map(_tells_time, lower[:width]))
-        ):
+        if all(upper[:width]) and any(map(_is_time, upper[:width])) and not any(map(_is_time, lower[:width])):
             return _Heading(above - 1)
     if len(lower) < width:
         return _Heading()
@@ -240,7 +236,7 @@ def _heading(rows: Sequence[Sequence[str]], first: int, width: int) -> _Heading:
     is_both = (
         all(map(is_unit, lower[:width]))
         and any(map(is_surely_unit, lower[:width]))
-        and not any(map(_tells_time, lower[:width]))
+        and not any(map(_is_time, lower[:width]))
     )
     return _Heading(above, above if is_both else None)
 
@@ -248,7 +244,7 @@ def _heading(rows: Sequence[Sequence[str]], first: int, width: int) -> _Heading:
 def _is_units_below(cells: Sequence[str], names: Sequence[str]) -> bool:
     """Whether a line holds the units of the columns that the line above names."""
     if len(cells) < min(2, len(names)) or (
-        any(map(_tells_time, cells[: len(names)])) and not any(map(_tells_time, names))
+        any(map(_is_time, cells[: len(names)])) and not any(map(_is_time, names))
     ):
         return False
     cells = [*cells, *[""] * (len(names) - len(cells))][: len(names)]
@@ -263,12 +259,12 @@ def _is_units_below(cells: Sequence[str], names: Sequence[str]) -> bool:
 def _is_timed(units: Sequence[str], names: Sequence[str]) -> bool:
     """Whether a unit of time stands with the name of a time."""
     return any(
-        _tells_time(name) and time_unit(without_brackets(unit)) is not None
+        _is_time(name) and time_unit(without_brackets(unit)) is not None
         for unit, name in zip(units, names, strict=False)
     )
 
 
-def _tells_time(name: str) -> bool:
+def _is_time(name: str) -> bool:
     """Whether a column of this name is one of time, whatever its unit."""
     bare, unit = unit_in_name(name)
     return is_time_name(name) or (is_time_name(bare) and time_unit(unit) is not None)

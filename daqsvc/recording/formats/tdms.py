@@ -51,12 +51,12 @@ def read_tdms(path: Path, budget: Budget) -> Contents:
         start: Any = tdms.properties.get("DateTime")
         for name, (_, channel) in zip(names, channels, strict=True):
             entries[name] = _samples(channel, budget)
-            said: Mapping[str, Any] = channel.properties
-            if isinstance(said.get(STEP), float) and said[STEP] > 0.0:
-                rates_hz[name] = rate_of_step(said[STEP])
-            if isinstance(said.get(UNIT), str):
-                units[name] = said[UNIT]
-            start = said.get(START, start)
+            properties: Mapping[str, Any] = channel.properties
+            if isinstance(properties.get(STEP), float) and properties[STEP] > 0.0:
+                rates_hz[name] = rate_of_step(properties[STEP])
+            if isinstance(properties.get(UNIT), str):
+                units[name] = properties[UNIT]
+            start = properties.get(START, start)
     for name, value in tdms.properties.items():
         if isinstance(value, int | float | str):
             entries.setdefault(name, np.array(value))

@@ -64,24 +64,26 @@ def read_wav(path: Path, budget: Budget) -> Contents:
     check_columns(channels)
     budget.check_declared(len(data) * 64.0 / bits)
     samples = _decoded(data, encoding, bits).reshape(-1, channels)
-    names, units, start = _said(chunks.get("LIST", memoryview(b"")), channels)
+    names, units, start = _of_comment(chunks.get("LIST", memoryview(b"")), channels)
     entries: dict[str, NDArray[np.generic]] = {name: samples[:, i] for i, name in enumerate(names)}
     entries |= {"rate_hz": np.array(rate_hz)} | ({STATED_START: np.array(start)} if start else {})
     return Contents(entries, is_table=True, units=units)
 
 
-def _said(info: memoryview, channels: int) -> tuple[list[str], dict[str, str], str]:
+def _of_comment(info: memoryview, channels: int) -> tuple[list[str], dict[str, str], str]:
     """Names and units of the channels and the begin, where `daqsvc export` has written a comment of them."""
     names = [str(i) for i in range(channels)]
     body = bytes(info)
     if body[:4] != b"INFO" or body[4:8] != b"ICMT":
         return names, {}, ""
     try:
-        said: dict[str, Any] = json.loads(body[12:].split(b"\0", 1)[0])
-        stated = [str(name)[:LONGEST_TEXT] for name in said["channels"]]
-        units = [str(unit)[:LONGEST_NAME] for unit in said["units"]]
-        start = str(said["start_time"] or "")[:LONGEST_TEXT]
-        is_ours = said["schema"] == WAV_SCHEMA and len(stated) == len(set(stated)) == len(units) == channels
+        comment: dict[str, Any] = json.loads(body[12:].split(b"\0", 1)[0])
+        stated = [str(name)[:LONGEST_TEXT] for name in comment["channels"]]
+        units = [str(unit)[:LONGEST_NAME] for unit in comment["units"]]
+        start = str(comment["start_time"] or "")[:LONGEST_TEXT]
+        is_ours = (
+            comment["schema"] == WAV_SCHEMA and len(stated) == len(set(stated)) == len(units) == channels
+        )
     except (ValueError, KeyError, TypeError, RecursionError):
         return names, {}, ""
     if not is_ours or {"rate_hz", STATED_START} & set(stated):

@@ -57,10 +57,10 @@ class TimeFormat:
 
     def fits(self, cell: str) -> bool:
         """Whether a cell is such a time."""
-        found = self.pattern.fullmatch(cell)
-        return found is not None and all(
+        match = self.pattern.fullmatch(cell)
+        return match is not None and all(
             int(digits) <= _LARGEST[name]
-            for name, digits in found.groupdict().items()
+            for name, digits in match.groupdict().items()
             if name in _LARGEST and digits
         )
 
@@ -80,8 +80,8 @@ def format_of(cells: Sequence[str]) -> TimeFormat | None:
     fitting = [one for one in FORMATS if all(map(one.fits, written))]
     if not fitting:
         return None
-    found = fitting[0].pattern.fullmatch(written[0])
-    halves = found is not None and bool(found.groupdict().get("half"))
+    match = fitting[0].pattern.fullmatch(written[0])
+    halves = match is not None and bool(match.groupdict().get("half"))
     return replace(fitting[0], either=len(fitting) > 1, halves=halves)
 
 

@@ -35,12 +35,12 @@ def write_csv(path: Path, streams: Sequence[RecordedStream], about: Mapping[str,
     times = "time" if dated else "time_s"
     names, notes = beside_times(path, stream, times)
     with path.open("w", encoding="utf-8", newline="") as file:
-        said = {**about, "stream": stream.name, STATED_RATE: f"{stream.rate_hz!r}"}
+        header = {**about, "stream": stream.name, STATED_RATE: f"{stream.rate_hz!r}"}
         if stream.measured_hz is not None:
-            said[MEASURED_RATE] = f"{stream.measured_hz!r}"
+            header[MEASURED_RATE] = f"{stream.measured_hz!r}"
         if stream.start:
-            said[STATED_START] = stream.start
-        for key, text in said.items():
+            header[STATED_START] = stream.start
+        for key, text in header.items():
             file.write(f"# {key} = {' '.join(text.split())}\n")
         for name, unit in zip(names, stream.units, strict=True):
             if unit:

@@ -31,11 +31,11 @@ def write_parquet(path: Path, streams: Sequence[RecordedStream], about: Mapping[
     import pyarrow.parquet as pq  # noqa: PLC0415
 
     (stream,) = streams
-    said = {**about, "stream": stream.name, STATED_RATE: repr(stream.rate_hz)}
+    metadata = {**about, "stream": stream.name, STATED_RATE: repr(stream.rate_hz)}
     if stream.measured_hz is not None:
-        said[MEASURED_RATE] = repr(stream.measured_hz)
+        metadata[MEASURED_RATE] = repr(stream.measured_hz)
     if stream.start:
-        said[STATED_START] = stream.start
+        metadata[STATED_START] = stream.start
     dated = stream.start_ns is not None
     kind = pa.from_numpy_dtype(stream.samples.dtype)
     time = pa.field("time", pa.timestamp("ns", tz="UTC")) if dated else pa.field("time_s", pa.float64())
@@ -44,7 +44,7 @@ def write_parquet(path: Path, streams: Sequence[RecordedStream], about: Mapping[
         pa.field(name, kind, metadata={STATED_UNIT: unit} if unit else None)
         for name, unit in zip(names, stream.units, strict=True)
     ]
-    schema = pa.schema([time, *fields], metadata=said)
+    schema = pa.schema([time, *fields], metadata=metadata)
     with pq.ParquetWriter(
         path,
         schema,
