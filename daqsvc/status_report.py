@@ -297,7 +297,7 @@ def _sensor_states(
     for sensor, (state, _) in states.items():
         alarm = alarms.get(f"sensor-ok/{sensor}")
         if state == "ok" and alarm is not None and alarm.own_state.is_active:
-            states[sensor] = ("not_ok", alarm.told)
+            states[sensor] = ("not_ok", alarm.summary)
     return states
 
 
@@ -354,7 +354,7 @@ def _standing(
                 if status.shelved_until_ns is None
                 else status.shelved_until_ns + wall_of_ns,
                 "first_out": status.first_out,
-                "message": status.told,
+                "message": status.summary,
                 "code": _id(code_of_alarm(name, qualities.get(name, "")) if status.level else None),
             }
             for name, status in standing

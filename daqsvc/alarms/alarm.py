@@ -139,7 +139,7 @@ class Alarm:
     ) -> None:
         self.name = name
         self.doubts: tuple[Doubt, ...] = ()
-        self._told_doubts: tuple[Doubt, ...] = ()
+        self._reported_doubts: tuple[Doubt, ...] = ()
         self._seen_doubts: tuple[Doubt, ...] = ()
         """Those of the last event, or of a change since that a person could not tell from it."""
         self._last_message = ""
@@ -197,15 +197,15 @@ class Alarm:
     def resume(
         self, event: AlarmEvent, finding: str, since: ClockReading, now: ClockReading, sentence: str = ""
     ) -> None:
-        """Stand as the last event before a restart said.
+        """Stand as the last event before a restart stated.
 
         Args:
             event: that event.
             finding: `RuleFinding.identity` of what was active; empty if not known.
             since: when it was, by the clocks as they are now.
             now: the time now. Shelving goes on by the wall clock, which may have been set since: what was
-                left of it at ``told`` is never exceeded.
-            sentence: what was active, in words, where ``told`` does not have it; empty if not known.
+                left of it at ``event`` is never exceeded.
+            sentence: what was active, in words, where ``event`` does not have it; empty if not known.
         """
         self._state, self._level = event.own_state, event.to_level
         self._holds = {Hold(state) for state in event.holds}
@@ -214,7 +214,7 @@ class Alarm:
             self._shelved_until_ns = now.t_ns + max(left_ns, 0)
         self._occurrence = None if self._state is AlarmState.NORMAL else event.occurrence
         self._finding, self._cause = finding, event.cause
-        self.doubts = self._told_doubts = self._seen_doubts = event.doubts
+        self.doubts = self._reported_doubts = self._seen_doubts = event.doubts
         if event.kind in FINDINGS:
             self._last_message = event.message
         elif event.found:
@@ -234,18 +234,18 @@ class Alarm:
         """Of the measures of its cause that have one."""
         return {} if self._cause is None else self._cause.units
 
-    def change_limits(self, limits: str, found: str, at: ClockReading) -> AlarmEvent:
+    def change_limits(self, limits: str, earlier: str, at: ClockReading) -> AlarmEvent:
         """Say that other limits hold from now on; the next good diagnosis is judged by them.
 
         Args:
             limits: in words.
-            found: what was found by the earlier ones, as `found`; empty if that is not known.
+            earlier: the finding by the earlier ones, as `found`; empty if that is not known.
             at: now.
         """
         assert self._cause is not None  # noqa: S101 - one that stands has a cause
-        found = (found or self._last_message).partition(LIMITS_NOW)[0]
-        found = found or f"{self.name} is {self._state.in_words}"
-        self._last_message = f"{found}{LIMITS_NOW}{limits}"
+        earlier = (earlier or self._last_message).partition(LIMITS_NOW)[0]
+        earlier = earlier or f"{self.name} is {self._state.in_words}"
+        self._last_message = f"{earlier}{LIMITS_NOW}{limits}"
         return self._event(EventKind.CHANGED, self._cause, HandlingRequest("", at), self._last_message)
 
     def withdraw(self, reason: str, cause: Diagnosis, at: ClockReading) -> AlarmEvent:
@@ -273,7 +273,7 @@ class Alarm:
                 events.append(self._event(EventKind.QUIET, cause, HandlingRequest("", at), message))
             elif finding.level < self._level:
                 return self._held_back(finding, cause, at)
-        event = self._found_normal(finding, cause, at) or self._found_bad(finding, cause, at)
+        event = self._return_event(finding, cause, at) or self._worsening_event(finding, cause, at)
         if event is None:
             return events
         events.append(event)
@@ -300,19 +300,19 @@ class Alarm:
         """Whether something else is found at the same level."""
         if finding.identity != self._finding:
             return True
-        return finding.told_by_words and wording_of(finding.sentence) not in wording_of(self._last_message)
+        return finding.differs_by_words and wording_of(finding.sentence) not in wording_of(self._last_message)
 
     def _held_back(self, finding: RuleFinding, cause: Diagnosis, at: ClockReading) -> list[AlarmEvent]:
         """A return while the alarm chatters; after a restart somebody must know who still doubts a sensor."""
-        not_ok, told_not_ok = (
-            {d.detector for d in those if d.not_ok} for those in (self.doubts, self._told_doubts)
+        not_ok, reported_not_ok = (
+            {d.detector for d in those if d.not_ok} for those in (self.doubts, self._reported_doubts)
         )
         # The next good statement after a restart also states that no detector lacks samples any more.
-        if not_ok == told_not_ok:
+        if not_ok == reported_not_ok:
             return []
         # A sensor that flickers must not be an event each time; that it was not OK is on the safe side.
         if (
-            not_ok < told_not_ok
+            not_ok < reported_not_ok
             and self._changed_ns is not None
             and 0 <= at.t_ns - self._changed_ns < CHANGES_NS
         ):
@@ -326,7 +326,7 @@ class Alarm:
         """Data are missing: everything stays, and no time counts."""
         self._chatter.hold()
 
-    def _found_normal(self, finding: RuleFinding, cause: Diagnosis, at: ClockReading) -> AlarmEvent | None:
+    def _return_event(self, finding: RuleFinding, cause: Diagnosis, at: ClockReading) -> AlarmEvent | None:
         if finding.level is not Level.NORMAL or not self._state.is_active:
             return None
         state = transition(self._state, Stimulus.CLEAR, latching=self._latching)
@@ -339,7 +339,7 @@ class Alarm:
         message = self._last_message = f"{self.name} returned to normal: {finding.sentence}"
         return self._change(EventKind.RETURNED, state, Level.NORMAL, cause, HandlingRequest("", at), message)
 
-    def _found_bad(self, finding: RuleFinding, cause: Diagnosis, at: ClockReading) -> AlarmEvent | None:
+    def _worsening_event(self, finding: RuleFinding, cause: Diagnosis, at: ClockReading) -> AlarmEvent | None:
         kind, level = self._worsening(finding)
         if kind is None:
             return None
@@ -523,7 +523,7 @@ class Alarm:
         if kind is EventKind.CHANGED:
             self._changed_ns = at.t_ns
         self._since, self._message = at, message
-        self._told_doubts = self._seen_doubts = self.doubts
+        self._reported_doubts = self._seen_doubts = self.doubts
         until_ns = self._shelved_until_ns
         return AlarmEvent(
             identity=self._identity,

@@ -76,7 +76,7 @@ class Lacking(NamedTuple):
     blind_ns: int | None
 
     @classmethod
-    def of(cls, told: Mapping[str, Any]) -> Self:
+    def of(cls, document: Mapping[str, Any]) -> Self:
         """What a file states.
 
         Raises:
@@ -84,12 +84,12 @@ class Lacking(NamedTuple):
             TypeError: something is of another type.
             ValueError: something cannot be.
         """
-        blind_ns = told["blind_ns"]
+        blind_ns = document["blind_ns"]
         made = cls(
-            int(told["weight"]),
-            bool(told["lasts"]),
-            [int(one) for one in told["times_ns"]],
-            [float(one) for one in told["shares"]],
+            int(document["weight"]),
+            bool(document["lasts"]),
+            [int(one) for one in document["times_ns"]],
+            [float(one) for one in document["shares"]],
             None if blind_ns is None else int(blind_ns),
         )
         in_range = 0 <= made.weight <= LASTING and all(0.0 <= share <= 1.0 for share in made.shares)
@@ -309,15 +309,15 @@ class SensorHealth:
 
     def lacking(self) -> dict[str, Lacking]:
         """What each detector has lacked in the last seconds, by its name; for `remember`."""
-        found: dict[str, Lacking] = {}
+        lacking: dict[str, Lacking] = {}
         for detector in sorted(self._patience.keys() | self._shortage.keys()):
             patience = self._patience.get(detector) or _Patience(lasting=False)
             shortage = self._shortage.get(detector) or _Shortage()
             times_ns, shares = [t_ns for t_ns, _ in shortage.shares], [share for _, share in shortage.shares]
-            found[detector] = Lacking(
+            lacking[detector] = Lacking(
                 patience.weight, patience.is_lasting, times_ns, shares, shortage.blind_ns
             )
-        return found
+        return lacking
 
     def remember(self, lacking: Mapping[str, Lacking]) -> None:
         """Go on from what detectors have lacked until now, by the same clock; after `resume`."""
@@ -398,8 +398,10 @@ class SensorHealth:
             f"{d.detector}={d.quality}{self._cause(d)}{'+not_ok' if d.not_ok else ''}" for d in doubts
         )
         # What samples lack, and for how long, is other words each time; what a sensor has is not.
-        by_words = _worst(doubts).quality == "not_ok"
-        return RuleFinding(Level.ALERT, parts, lambda: in_words(name, doubts), told_by_words=by_words)
+        differs_by_words = _worst(doubts).quality == "not_ok"
+        return RuleFinding(
+            Level.ALERT, parts, lambda: in_words(name, doubts), differs_by_words=differs_by_words
+        )
 
     def silences(self, rule: Rule, sensors: frozenset[str]) -> str | None:
         """Why the alarm of ``rule`` is suppressed while it rests on ``sensors``; None if it is not.

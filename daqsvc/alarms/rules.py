@@ -67,13 +67,13 @@ class RuleFinding(NamedTuple):
         level: the level by now.
         identity: what is found, where a level can have several causes, e.g. ``"F1L2"``.
         say: puts the finding into words. Few findings become an event; what is not asked for is not made.
-        told_by_words: whether other words, apart from figures, are another finding, too.
+        differs_by_words: whether other words, apart from figures, are another finding, too.
     """
 
     level: Level
     identity: str
     say: Callable[[], str]
-    told_by_words: bool = False
+    differs_by_words: bool = False
 
     @property
     def sentence(self) -> str:
@@ -112,7 +112,7 @@ class Watch(Protocol):
             event: the last event.
 
         Returns:
-            `RuleFinding.identity` of what was active; empty if ``told`` does not have it.
+            `RuleFinding.identity` of what was active; empty if ``event`` does not have it.
         """
         ...
 
@@ -400,8 +400,8 @@ class MeasureWatch:
         if limit is not None:
             side = "lower " if limit.lower else ""
             multiplied = f" times {self._factor:g} at start-up" if self._factor > 1.0 and not side else ""
-            said = f"{measured}, {side}{limit.level.label} limit {readable(limit.at)}{unit}{multiplied}"
-            return f"{said}{self._until_it_ends(limit, value, unit)}"
+            comparison = f"{measured}, {side}{limit.level.label} limit {readable(limit.at)}{unit}{multiplied}"
+            return f"{comparison}{self._until_it_ends(limit, value, unit)}"
         low, high = self.setpoint.highest_low, self.setpoint.lowest
         if low is not None and high is not None:
             return f"{measured}, between its limits of {readable(low)} and {readable(high)}{unit}"

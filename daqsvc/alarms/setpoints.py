@@ -106,8 +106,10 @@ class Setpoint:
         """All limits for a person, e.g. ``"alert 15 um and danger 25 um"``."""
         upwards = sorted(self.limits, key=lambda limit: limit.at)
         words = [f"{'lower ' * one.lower}{one.level.label} {with_unit(one.at, unit)}" for one in upwards]
-        said = " and ".join([", ".join(words[:-1]), words[-1]] if words[1:] else words)
-        return said if self.reference_deg is None else f"{said} from {self.reference_deg:g} {unit}".rstrip()
+        limits = " and ".join([", ".join(words[:-1]), words[-1]] if words[1:] else words)
+        return (
+            limits if self.reference_deg is None else f"{limits} from {self.reference_deg:g} {unit}".rstrip()
+        )
 
     @property
     def lowest(self) -> float | None:

@@ -52,7 +52,7 @@ class AlarmStatus(NamedTuple):
     found: str = ""
 
     @property
-    def told(self) -> str:
+    def summary(self) -> str:
         """What was found last, and what has been done about it since."""
         if not self.found or self.found == self.message:
             return self.message

@@ -65,8 +65,8 @@ def test_other_limits_of_a_returned_alarm_say_that_it_has_returned():
 def test_the_cause_is_told_beside_what_was_done_about_it():
     rig = AlarmRig(rule(BY_STEPS))
     rig.rms(50.0)
-    raised = rig.status("vibration-x").told
+    raised = rig.status("vibration-x").summary
     rig.acknowledge("vibration-x", reason="seen")
-    assert rig.status("vibration-x").told == f"{raised}; vibration-x acknowledged by ann: seen"
+    assert rig.status("vibration-x").summary == f"{raised}; vibration-x acknowledged by ann: seen"
     rig.shelve("vibration-x", 60.0)
-    assert rig.status("vibration-x").told == f"{raised}; vibration-x shelved by ann for 1 min"
+    assert rig.status("vibration-x").summary == f"{raised}; vibration-x shelved by ann for 1 min"

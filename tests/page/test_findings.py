@@ -193,10 +193,10 @@ def test_after_a_restart_of_the_service_it_still_says_what_was_found(verb: Verb)
     rig.rms(50.0)
     rig.ask(verb, "v", duration_s=60.0 if verb is Verb.SHELVE else None)
     found = "v alert: rms of probe-x is 50 um, alert limit 40 um"
-    before = rig.status("v").told
+    before = rig.status("v").summary
     assert before.startswith(f"{found}; v ")
     after = rig.restarted({"levels/probe-x": ("probe-x",)})
-    assert after.status("v").told == before
+    assert after.status("v").summary == before
     latest = alarm_document(after.events[-1])
     live = MachineLive(about() | {"alarms": [latest]})
     assert before in alarm_rows(live)

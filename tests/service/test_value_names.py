@@ -100,7 +100,7 @@ def test_the_message_of_an_alarm_has_the_name_of_the_state(
             sensors=("drive-state",),
         )
     level = "danger limit 1.5" if state > 1.5 else "alert limit 0.5"
-    assert f"value of drive-state is {shown}, {level}" in rig.status("drive-state").told
+    assert f"value of drive-state is {shown}, {level}" in rig.status("drive-state").summary
 
 
 @pytest.mark.integration
