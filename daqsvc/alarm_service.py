@@ -365,7 +365,7 @@ class AlarmService:
             outcomes = await asyncio.gather(*committed, return_exceptions=True)
             if not any(isinstance(outcome, BaseException) for outcome in outcomes):
                 with contextlib.suppress(OutboxError):  # it is being closed; then it is reported once more
-                    self.outbox.damage_is_told()
+                    self.outbox.damage_is_reported()
 
         self._watch(asyncio.create_task(confirm(), name="damage is reported"))
 

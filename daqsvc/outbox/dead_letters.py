@@ -242,8 +242,10 @@ def _make(connection: sqlite3.Connection) -> None:
 
 def _is_row_sound(row: tuple[Any, ...]) -> bool:
     sequence, topic, payload, retain, reason, wall_ns, check = row
-    told_rightly = isinstance(check, int) and is_sound(sequence, topic, payload, check)
-    return told_rightly and isinstance(retain, int) and isinstance(reason, str) and isinstance(wall_ns, int)
+    is_payload_sound = isinstance(check, int) and is_sound(sequence, topic, payload, check)
+    return (
+        is_payload_sound and isinstance(retain, int) and isinstance(reason, str) and isinstance(wall_ns, int)
+    )
 
 
 def _nothing(_connection: sqlite3.Connection) -> None:

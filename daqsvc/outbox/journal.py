@@ -178,7 +178,7 @@ class Journal:
     def was_ahead(self) -> bool:
         """Whether an earlier run may have sent to the broker what the journal does not have.
 
-        So it is until `damage_is_told`.
+        So it is until `damage_is_reported`.
         """
         return self._was_ahead
 
@@ -377,12 +377,12 @@ class Journal:
         self._connect()
         self._tidy()
 
-    def damage_is_told(self) -> None:
+    def damage_is_reported(self) -> None:
         """The alarms have reported the damage of the journal: not again after a crash."""
         self._was_ahead = False
         self._mark.drift(ahead=self._shows)
         try:
-            self._renewal.is_told()
+            self._renewal.is_reported()
             if self._known_topics.topics is None:
                 self._look_up_topics(is_whole=True)
         except OSError as error:

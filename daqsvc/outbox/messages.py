@@ -117,7 +117,7 @@ def event_id(series: str, sequence: int) -> str:
 
 
 def is_sound(number: object, topic: object, payload: object, check: object) -> bool:
-    """Whether a row is what was written: ``told`` is its checksum, None in files of the first version."""
+    """Whether a row is what was written: ``check`` is its checksum, None in files of the first version."""
     if not (isinstance(number, int) and isinstance(topic, str) and isinstance(payload, bytes)):
         return False
     return check is None or check == checksum(number, topic, payload)

@@ -187,7 +187,7 @@ class Renewal:
             log.info("the record of damage in %s cannot be read: %s", self._note, error)
             return JournalDamage(quarantined=1)
 
-    def is_told(self) -> None:
+    def is_reported(self) -> None:
         """It was sent."""
         with contextlib.suppress(FileNotFoundError):
             self._note.unlink()

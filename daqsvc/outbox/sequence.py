@@ -91,7 +91,7 @@ class SequenceMark:
 
     def __init__(self, path: Path) -> None:
         self._sides = (_Side(path), _Side(path.with_name(path.name + ".twin")))
-        self._told = _NOTHING
+        self._mark = _NOTHING
         self._here = _NOTHING
         self._damaged = False
         self._ended = False
@@ -124,15 +124,15 @@ class SequenceMark:
                 extra=coded(JOURNAL_DAMAGED),
             )
         newest = max(sound, key=lambda mark: (mark.ceiling, mark.used), default=_NOTHING)
-        self._told = replace(
+        self._mark = replace(
             newest,
             used=max((mark.used for mark in sound), default=0),
             ended=newest.ended and all(mark.ceiling == newest.ceiling for mark in sound),
             ahead=any(mark.ahead for mark in sound),
         )
-        self._ended = not self._damaged and (self._told.ended or self._told.boot != self._here.boot)
-        self._is_unsure = bool(self._told.ceiling) and not self._told.ended
-        self._is_copy = bool(self._told.place) and self._told.place != place
+        self._ended = not self._damaged and (self._mark.ended or self._mark.boot != self._here.boot)
+        self._is_unsure = bool(self._mark.ceiling) and not self._mark.ended
+        self._is_copy = bool(self._mark.place) and self._mark.place != place
         self._has_begun = False
 
     @property
@@ -143,7 +143,7 @@ class SequenceMark:
     @property
     def is_ahead(self) -> bool:
         """Whether the broker may have received what the journal does not have."""
-        return self._told.ahead
+        return self._mark.ahead
 
     @property
     def is_damaged(self) -> bool:
@@ -153,7 +153,7 @@ class SequenceMark:
     @property
     def used(self) -> int:
         """The highest number that is known to have been used."""
-        return self._told.used
+        return self._mark.used
 
     def first_free(self, stored: int | None, wall_ns: int) -> int:
         """The number to go on with.
@@ -162,9 +162,9 @@ class SequenceMark:
             stored: the highest number that the journal knows; None for a new file.
             wall_ns: the wall clock, ns since the Unix epoch.
         """
-        known = max(stored or 0, self._told.ceiling, self._told.used)
+        known = max(stored or 0, self._mark.ceiling, self._mark.used)
         wall_ms = wall_ns // NS_PER_MS
-        if self._damaged or (stored is not None and not self._told.ceiling):
+        if self._damaged or (stored is not None and not self._mark.ceiling):
             return max(known, wall_ms) + LEAP + 1
         if stored is not None and self._has_begun:
             return known + 1
@@ -181,7 +181,7 @@ class SequenceMark:
             wall_ns: the wall clock, ns since the Unix epoch.
             is_new: whether there is no journal yet.
         """
-        known = max(self._told.ceiling, self._told.used)
+        known = max(self._mark.ceiling, self._mark.used)
         wall_ms = wall_ns // NS_PER_MS
         if self._damaged or not (known or is_new):
             return max(known, wall_ms) + LEAP + 1
@@ -197,9 +197,9 @@ class SequenceMark:
         Args:
             stored: the highest number that it knows; None for a new file.
         """
-        if not self._told.used:
+        if not self._mark.used:
             return 0
-        return max(self._told.used - max(stored or 0, self._told.first - 1), 0)
+        return max(self._mark.used - max(stored or 0, self._mark.first - 1), 0)
 
     def begin(self, first: int, waiting: int | None = None) -> None:
         """All numbers below ``first`` are taken for used; durable with the next `advance`.
@@ -212,12 +212,12 @@ class SequenceMark:
         self._is_unsure = self._is_copy = False
         self._has_begun = True
         here = self._here
-        ceiling = max(self._told.ceiling, first - 1)
-        self._told = replace(self._told, ceiling=ceiling, boot=here.boot, place=here.place, ended=False)
+        ceiling = max(self._mark.ceiling, first - 1)
+        self._mark = replace(self._mark, ceiling=ceiling, boot=here.boot, place=here.place, ended=False)
 
     def can_be_used(self, number: int) -> bool:
         """Whether ``number`` may have been given, as far as the side files tell."""
-        return not self._told.ceiling or self._damaged or 0 <= number <= self._told.ceiling
+        return not self._mark.ceiling or self._damaged or 0 <= number <= self._mark.ceiling
 
     def advance(self, last: int) -> None:
         """Have the ceiling above ``last`` before that number is used.
@@ -225,8 +225,8 @@ class SequenceMark:
         Raises:
             OSError: neither side file can be written; no number may be used.
         """
-        if last >= self._told.ceiling or not any(side.is_open for side in self._sides):
-            self._write(replace(self._told, ceiling=max(last + STEP, self._told.ceiling)))
+        if last >= self._mark.ceiling or not any(side.is_open for side in self._sides):
+            self._write(replace(self._mark, ceiling=max(last + STEP, self._mark.ceiling)))
 
     def give(self, last: int) -> None:
         """Have numbers up to ``last`` for messages in memory, on a disk that takes no writes, too.
@@ -237,16 +237,16 @@ class SequenceMark:
         try:
             self.advance(last)
         except OSError:
-            if last > self._told.ceiling + UNRECORDED:
+            if last > self._mark.ceiling + UNRECORDED:
                 raise
 
     def drift(self, *, ahead: bool) -> None:
         """Tell, durably if the disk takes it, whether the broker may be ahead of the journal."""
-        if ahead == self._told.ahead:
+        if ahead == self._mark.ahead:
             return
-        self._told = replace(self._told, ahead=ahead)
+        self._mark = replace(self._mark, ahead=ahead)
         try:
-            self._write(self._told)
+            self._write(self._mark)
         except OSError as error:
             log.warning(
                 "outbox mark %s cannot be written: %s; if the service is killed before it can, the broker "
@@ -262,8 +262,8 @@ class SequenceMark:
         Raises:
             OSError: the disk takes no writes any more; what it confirmed last may be lost, too.
         """
-        first = self._first if self._told.used < self._first else self._told.first
-        mark = replace(self._told, used=used, first=first)
+        first = self._first if self._mark.used < self._first else self._mark.first
+        mark = replace(self._mark, used=used, first=first)
         errors: list[OSError] = []
         for side in self._sides:
             try:
@@ -280,7 +280,7 @@ class SequenceMark:
                 extra=coded(DISK_REFUSES),
             )
         self._noted = not errors
-        self._told = mark
+        self._mark = mark
 
     def settle(self, last: int) -> None:
         """Write to disk that ``last`` is the highest number in use, as it stays for now.
@@ -288,7 +288,7 @@ class SequenceMark:
         Raises:
             OSError: a side file cannot be written; the next run goes on above the ceiling.
         """
-        self._write(replace(self._told, ceiling=last, ended=True), both=True)
+        self._write(replace(self._mark, ceiling=last, ended=True), both=True)
 
     def close(self) -> None:
         """Close the side files as they are."""
@@ -312,7 +312,7 @@ class SequenceMark:
                 failure,
                 extra=coded(DISK_REFUSES),
             )
-        self._told = mark
+        self._mark = mark
 
 
 def _is_unset(wall_ms: int, known: int) -> bool:

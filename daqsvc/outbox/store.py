@@ -137,13 +137,15 @@ class Outbox:
     def broker_is_ahead(self) -> bool:
         """Whether an earlier run may have sent to the broker what the journal never got.
 
-        Until `damage_is_told`, which states that the broker has received the state of everything by now.
+        Until `damage_is_reported`, which states that the broker has received the state of everything by now.
         """
         return self._journal.was_ahead
 
-    def damage_is_told(self) -> None:
+    def damage_is_reported(self) -> None:
         """The damage of the journal is reported: not again after a restart."""
-        self._put(Batch(reads=[(self._journal.damage_is_told, asyncio.get_running_loop().create_future())]))
+        self._put(
+            Batch(reads=[(self._journal.damage_is_reported, asyncio.get_running_loop().create_future())])
+        )
 
     async def append(self, topic: str, payload_of_sequence: Callable[[int], bytes], *, retain: bool) -> int:
         """Append a message and wait until it is on disk.

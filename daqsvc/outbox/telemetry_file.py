@@ -381,8 +381,8 @@ class TelemetryFile:
 
 def _is_row_sound(row: tuple[Any, ...]) -> bool:
     number, topic, payload, *times, check = row
-    told_rightly = isinstance(check, int) and is_sound(number, topic, payload, check)
-    return told_rightly and all(isinstance(time_ns, int) for time_ns in times)
+    is_payload_sound = isinstance(check, int) and is_sound(number, topic, payload, check)
+    return is_payload_sound and all(isinstance(time_ns, int) for time_ns in times)
 
 
 def _create(connection: sqlite3.Connection) -> None:

@@ -151,7 +151,7 @@ class Reports(Protocol):
     def abandoned(
         self, lost: Sequence[asyncio.Future[int]], accepted: Sequence[asyncio.Future[int]], error: OutboxError
     ) -> None:
-        """Messages that will not reach the disk any more: ``lost``, or ``told`` to the broker."""
+        """Messages that will not reach the disk any more: ``lost``, or ``accepted`` by the broker."""
 
     def stopped(self, reason: str) -> None:
         """The writer has ended through a mistake in this program."""

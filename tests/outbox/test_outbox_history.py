@@ -178,7 +178,7 @@ def test_a_journal_that_is_an_older_copy_is_told_and_gives_no_number_again(tmp_p
     journal.close()
     journal = opened(path, wall)
     assert journal.vanished == 5, "nobody has told the broker yet"
-    journal.damage_is_told()
+    journal.damage_is_reported()
     journal.close()
     journal = opened(path, wall)
     assert journal.vanished == 0, "it is told once"

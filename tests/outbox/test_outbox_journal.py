@@ -153,7 +153,7 @@ class Restarts(RuleBasedStateMachine):
         """After a loss that nobody could prevent, what is there must be of what was written."""
         there = {m.sequence: m.topic for m in self.journal.pending(0, 10**6)}
         assert set(there) <= self.used
-        self.journal.damage_is_told()
+        self.journal.damage_is_reported()
         self.unsent = there
         self.latest = {m.topic: m.sequence for m in self.journal.latest()}
         self.sent = {m.sequence for m in self.journal.retained()}
@@ -166,7 +166,7 @@ class Restarts(RuleBasedStateMachine):
         self.jumped = True
         self.journal = self.opened()
         assert self.journal.quarantined == 1
-        self.journal.damage_is_told()
+        self.journal.damage_is_reported()
         self.unsent.clear()
         self.latest.clear()
         self.sent.clear()

@@ -138,7 +138,7 @@ def test_the_damage_is_told_until_somebody_has_told_it(damaged, tmp_path):
     opened(path).close()
     again = opened(path)
     assert again.quarantined == 1
-    again.damage_is_told()
+    again.damage_is_reported()
     again.close()
     last = opened(path)
     assert last.quarantined == 0
@@ -161,12 +161,12 @@ def test_what_an_earlier_version_left_half_done_is_finished(damaged, tmp_path, c
         new._renewal.finish = lambda: None
         new._adopt = lambda: None
         new.open()
-        new.damage_is_told()
+        new.damage_is_reported()
         new.close()
     left = check(path, unsent, latest, highest)
     assert aside.name in left
     journal = opened(path)
-    journal.damage_is_told()
+    journal.damage_is_reported()
     journal.close()
     journal = opened(path)
     assert journal.quarantined == 0, "it is counted once"
