@@ -91,8 +91,8 @@ def row_of(payload: bytes | bytearray) -> tuple[str, tuple[Any, ...]]:
         machine, detector = _texts(document, "site", "box", "machine"), _text(document, "detector")
         _check_key(*machine, detector)
         place = (_time(document), *machine, detector, _whole(document, "monotonic_ns"))
-        said = _texts(document, "decision", "severity", "quality")
-        return DIAGNOSIS, (*place, *said, json.dumps(document["statistics"]), text)
+        judgement = _texts(document, "decision", "severity", "quality")
+        return DIAGNOSIS, (*place, *judgement, json.dumps(document["statistics"]), text)
     raise ValueError(f"schema {document['schema']!r:.60} is not known here")
 
 

@@ -194,8 +194,8 @@ def drive_lines(levels: LineLevels, shaft_hz: float, *, sharp: bool) -> tuple[Dr
         sharp: whether the harmonics of the shaft tell them sharply; a gear is looked for only then.
     """
     gear = _gear(levels, shaft_hz) if sharp else None
-    found = (gear, motor_lines(levels, shaft_hz, _SHARP if sharp else _VAGUE))
-    return tuple(each for each in found if each is not None)
+    sources = (gear, motor_lines(levels, shaft_hz, _SHARP if sharp else _VAGUE))
+    return tuple(each for each in sources if each is not None)
 
 
 def _gear(lines: LineLevels, shaft_hz: float) -> DriveLines | None:

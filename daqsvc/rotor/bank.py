@@ -295,6 +295,6 @@ class ModelBank:
         else:
             evidence = steady_evidence(self.observers, self._duration)
         self._look_alike = within(evidence, self.rules.alike_nats_per_rev)
-        told = np.logical_or.outer(self._excluded, self._excluded)
-        self._alike = (self._look_alike & ~told) | self._close
+        separated = np.logical_or.outer(self._excluded, self._excluded)
+        self._alike = (self._look_alike & ~separated) | self._close
         self._memory.set_thresholds(np.where(self._alike, math.inf, self.rules.thresholds(len(self.modes))))

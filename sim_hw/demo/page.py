@@ -39,7 +39,7 @@ async def page_of(store: Path) -> AsyncIterator[PageAddress]:
         DemoError: it does not start.
     """
     with tempfile.TemporaryFile() as wrong:  # a pipe would have to be read meanwhile
-        process, said = None, ""
+        process, line = None, ""
         for port in PORTS:
             process = await asyncio.create_subprocess_exec(
                 *(sys.executable, "-m", "daqsvc", "page", "--store", f"{store}", "--port", f"{port}"),
@@ -48,16 +48,16 @@ async def page_of(store: Path) -> AsyncIterator[PageAddress]:
                 stderr=wrong,
                 start_new_session=True,  # Ctrl-C is for the demo, which ends it
             )
-            said = await _first_line(process, wrong)
-            if " is at http://" in said:
+            line = await _first_line(process, wrong)
+            if " is at http://" in line:
                 break
         assert process is not None  # noqa: S101 - there are ports
         try:
-            if " is at http://" not in said:
-                raise DemoError(f"--page: {said}")
+            if " is at http://" not in line:
+                raise DemoError(f"--page: {line}")
             assert process.stdout is not None  # noqa: S101 - a pipe was asked for
             acting = (await process.stdout.readline()).decode()
-            look = said.partition(" is at ")[2].partition(";")[0]
+            look = line.partition(" is at ")[2].partition(";")[0]
             yield PageAddress(look, acting.removeprefix("who opens ").partition(" ")[0])
         finally:
             if process.returncode is None:
@@ -70,12 +70,12 @@ async def _first_line(process: asyncio.subprocess.Process, wrong: IO[bytes]) -> 
     assert process.stdout is not None  # noqa: S101 - a pipe was asked for
     try:
         async with asyncio.timeout(START_S):
-            said = (await process.stdout.readline()).decode()
+            line = (await process.stdout.readline()).decode()
     except TimeoutError:
         process.kill()
-        said = ""
-    if said:
-        return said.strip()
+        line = ""
+    if line:
+        return line.strip()
     await process.communicate()
     wrong.seek(0)
     lines = wrong.read().decode(errors="replace").split("\n")

@@ -162,7 +162,7 @@ class FifoStore:
     def __init__(self, unit: ModbusUnit, layout: FifoLayout, depth: int = 1024) -> None:
         self._layout = layout
         self._queue: deque[tuple[int, bytes]] = deque(maxlen=depth)
-        self._told: dict[int, int] = {}
+        self._acknowledged: dict[int, int] = {}
         self._handed_out = 0
         unit.add_queue(layout.address, self._read)
         if layout.acknowledge is not None:
@@ -196,11 +196,11 @@ class FifoStore:
         return self._layout.count.encode(first) + b"".join(together)
 
     def _acknowledge(self, word: int, value: int) -> None:
-        self._told[word] = value
-        if len(self._told) < self._layout.count.registers:
+        self._acknowledged[word] = value
+        if len(self._acknowledged) < self._layout.count.registers:
             return
-        raw = b"".join(self._told[k].to_bytes(2, "big") for k in sorted(self._told))
-        self._told.clear()
+        raw = b"".join(self._acknowledged[k].to_bytes(2, "big") for k in sorted(self._acknowledged))
+        self._acknowledged.clear()
         following = self._layout.count.decode(raw)
         modulus = self._layout.count.modulus
         # Only what has been handed out: behind it the count may have begun again.

@@ -288,7 +288,7 @@ def _measured(
     refuse_rivals(evidence, bearing, shaft, rules.slip)
     return RaceFeatures(
         evidence=evidence,
-        lines=_found(evidence, square, bearing, shaft.rate_hz),
+        lines=_race_lines(evidence, square, bearing, shaft.rate_hz),
         levels=levels,
         speed_rpm=60.0 * shaft.rate_hz,
         speed_unconfirmed=shaft.doubt,
@@ -340,7 +340,7 @@ def _wander_note(track: SpeedTrack) -> str:
     )
 
 
-def _found(
+def _race_lines(
     evidence: Mapping[Part, PartEvidence], view: EnvelopeView, bearing: BearingOrders, shaft_hz: float
 ) -> tuple[RaceLine, ...]:
     """The lines of all parts; one that the foremost part explains is no other part's."""

@@ -172,7 +172,7 @@ STEADY_REVOLUTIONS = 5
 """What begins and ends within so many revolutions is vibration, or a single event."""
 MIDDLE_OF = 50
 """One sample of so many gives the spread of all."""
-TOLD = 3
+_LISTED = 3
 EMPTY_SHARE = 1e-8
 """Share of a channel's power in the analysed band below which it holds nothing: that of 14 bits rounded."""
 
@@ -244,13 +244,13 @@ def repaired(samples: Real, rate_hz: float, revolution: int, band_hz: tuple[floa
         raise UnfitError("channel", f"has {wrong}", "check cable and converter")
     repairs = []
     if spikes:
-        repairs.append(_told_spikes(sorted(spikes), rate_hz))
+        repairs.append(_spikes_in_words(sorted(spikes), rate_hz))
     if steps:
-        repairs.append(_told_steps(sorted(steps), rate_hz))
+        repairs.append(_steps_in_words(sorted(steps), rate_hz))
     if wandered:
         repairs.append(wandered)
     if stretches:
-        repairs.append(_told_knocks(stretches, rate_hz))
+        repairs.append(_knocks_in_words(stretches, rate_hz))
     return Repaired(values, tuple(repairs), tuple(stretches))
 
 
@@ -296,22 +296,22 @@ def _unit(samples: Real) -> Real:
     return np.asarray((samples - middle) / max(0.5 * (high - low), np.finfo(np.float64).tiny))
 
 
-def _told_spikes(spikes: list[int], rate_hz: float) -> str:
+def _spikes_in_words(spikes: list[int], rate_hz: float) -> str:
     return (
         f"{_count(len(spikes), 'sample', 'samples')} that no housing can follow, {_at(spikes, rate_hz)}: "
         "replaced by what the neighbours predict; check cable and converter"
     )
 
 
-def _told_steps(steps: list[tuple[int, float]], rate_hz: float) -> str:
-    heights = ", ".join(f"{height:+.4g}" for _, height in steps[:TOLD]) + _more(len(steps))
+def _steps_in_words(steps: list[tuple[int, float]], rate_hz: float) -> str:
+    heights = ", ".join(f"{height:+.4g}" for _, height in steps[:_LISTED]) + _more(len(steps))
     return (
         f"the channel's mean moves in {_count(len(steps), 'step', 'steps')} ({heights}), "
         f"{_at([place for place, _ in steps], rate_hz)}: taken out; check the sensor's supply"
     )
 
 
-def _told_knocks(stretches: list[Stretch], rate_hz: float) -> str:
+def _knocks_in_words(stretches: list[Stretch], rate_hz: float) -> str:
     lost_s = sum(last - first for first, last in stretches) / rate_hz
     return (
         f"{_count(len(stretches), 'knock', 'knocks')} much louder than the machine, "
@@ -325,9 +325,9 @@ def _count(number: int, one: str, many: str) -> str:
 
 
 def _more(number: int) -> str:
-    return ", ..." if number > TOLD else ""
+    return ", ..." if number > _LISTED else ""
 
 
 def _at(places: list[int], rate_hz: float) -> str:
     """``at 1.204 s``, ``at 0.31, 0.422, 0.518, ... s``."""
-    return f"at {', '.join(f'{place / rate_hz:.4g}' for place in places[:TOLD])}{_more(len(places))} s"
+    return f"at {', '.join(f'{place / rate_hz:.4g}' for place in places[:_LISTED])}{_more(len(places))} s"

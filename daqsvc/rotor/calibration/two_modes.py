@@ -222,13 +222,13 @@ def fit_two_modes(
             forcing = complex(np.vdot(response, orbit[0]) / np.vdot(response, response))
             begin[8:10] = forcing.real, forcing.imag
             begin = np.clip(begin, low + 1e-6, high - 1e-6)
-            found = least_squares(left, begin, bounds=(low, high), x_scale=_PRIORS, max_nfev=40)
-            if nearest is None or found.cost < nearest.cost:
-                nearest = found
+            fit = least_squares(left, begin, bounds=(low, high), x_scale=_PRIORS, max_nfev=40)
+            if nearest is None or fit.cost < nearest.cost:
+                nearest = fit
         assert nearest is not None  # noqa: S101 - there is at least one start
-        found = least_squares(left_late, nearest.x, bounds=(low, high), x_scale=_PRIORS, max_nfev=40)
-        if best is None or found.cost < best.cost:
-            best = found
+        fit = least_squares(left_late, nearest.x, bounds=(low, high), x_scale=_PRIORS, max_nfev=40)
+        if best is None or fit.cost < best.cost:
+            best = fit
     assert best is not None  # noqa: S101 - as above
     residual = _orbits(best.x, w, w_rate, late) - orbit
     energy = float(np.mean((np.abs(residual) ** 2).sum(axis=0))) - 2.0 * (noise / whirl) ** 2

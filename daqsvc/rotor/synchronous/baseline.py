@@ -174,12 +174,12 @@ class Calibration:
                 if self.implausible
                 else f"backward over forward 1X is {100.0 * self.ellipticity:.0f} %"
             )
-            told = (
+            consequence = (
                 "the two modes of its run-up show how faults move it"
                 if self.rotor.two_modes is not None
                 else "generic mode, in which rub and unmodelled changes stay one group"
             )
-            sentences.append(f"is no Laval rotor ({why}): {told}")
+            sentences.append(f"is no Laval rotor ({why}): {consequence}")
         smallest_um = self.smallest_change_um
         sentences.append(
             f"after {self.revolutions} revolutions the smallest change that can be seen is "

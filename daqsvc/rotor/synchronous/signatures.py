@@ -184,9 +184,9 @@ def _unbalance(change: Complexes, variance: Floats, healthy: Healthy) -> float:
     return float(score.sum())
 
 
-def _besides(told: float, free: float) -> float:
+def _besides(predicted: float, free: float) -> float:
     """Log likelihood of what the two modes predict, and of a shape that leaves open what they do not."""
-    return float(np.logaddexp(told + math.log1p(-_BESIDES), free + math.log(_BESIDES)))
+    return float(np.logaddexp(predicted + math.log1p(-_BESIDES), free + math.log(_BESIDES)))
 
 
 def _damping_loss(change: Complexes, variance: Floats, healthy: Healthy) -> float:
@@ -240,8 +240,8 @@ def _static_load(change: Complexes, variance: Floats, healthy: Healthy) -> float
     if rotor is None or not on_film(healthy.rotor):
         return free
     rest = _still(change, variance, abs(change[DC]))
-    told = float(rest[BEYOND_1X].sum()) + _free(change[DC], variance[DC], healthy.amplitude_um)
-    return _besides(told + loaded(change, variance, healthy, rotor), free)
+    predicted = float(rest[BEYOND_1X].sum()) + _free(change[DC], variance[DC], healthy.amplitude_um)
+    return _besides(predicted + loaded(change, variance, healthy, rotor), free)
 
 
 def _free_static_load(change: Complexes, variance: Floats, healthy: Healthy) -> float:
