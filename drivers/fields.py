@@ -144,7 +144,7 @@ class RawValues:
             raw[(raw < low) | (raw > high)] = np.nan
 
     def fit(self, raw: NDArray[np.float64], columns: NDArray[np.intp], kind: Kind, *, clip: bool) -> Fitted:
-        """Round what is to go on the wire, and say so where there is no value (NaN).
+        """Round what is to go on the wire, and report where there is no value (NaN).
 
         Args:
             raw: float64 ``[n, cells]`` of all cells.

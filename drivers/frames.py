@@ -78,7 +78,7 @@ class DecodedBatch:
         malformed: what the first piece was that should have been a frame, and why it is none; empty if there
             was none, or it was reported before.
         remedy: what to do if all pieces are like that one; empty if nothing special.
-        errors: what error frames say, of a bus that has such; see `drivers.can.errors.ErrorCounts`.
+        errors: what error frames report, of a bus that has such; see `drivers.can.errors.ErrorCounts`.
         data_frames: frames that carry data, of any stream or none.
         drained_ns: when the bus was last known to hold no frame that was sent before; None if there may be
             more.

@@ -87,7 +87,7 @@ def one_of(choices: Mapping[str, str]) -> Callable[[str], str]:
 
 
 def _no_choice(text: str, choices: Mapping[str, str], begun: Sequence[str] = ()) -> ValueError:
-    """What to say of a text that is none of the choices, with those that may be meant."""
+    """The message about a text that is none of the choices, with those that may be meant."""
     near = begun or get_close_matches(text.lower(), choices, n=1)
     meant = f"; did you mean {' or '.join(near)}?" if near else ""
     return ValueError(f'"{text}" is not one of {", ".join(choices)}{meant}')

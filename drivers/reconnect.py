@@ -71,7 +71,7 @@ async def run_with_reconnect(
         link: its state; `attempt` states when it is up.
         port: what to do if the device is absent at first, and the clock.
         attempt: opens the link and uses it until it is lost; None if there is nothing more to come. It may
-            raise `CannotOpenError`, but must not put the link down: that is said here, where it is known
+            raise `CannotOpenError`, but must not put the link down: that is reported here, where it is known
             whether it is tried again.
 
     Raises:
@@ -100,7 +100,7 @@ async def _outcome(attempt: Callable[[], Awaitable[Attempt | None]]) -> Attempt 
         outcome = await attempt()
     except CannotOpenError as error:
         return Attempt(present=False, useful=False, reason=f"{error}")
-    except (Exception, SystemExit) as error:  # noqa: BLE001 - said by the link
+    except (Exception, SystemExit) as error:  # noqa: BLE001 - reported by the link
         return _failed(error)
     if outcome is None or isinstance(outcome, Attempt):
         return outcome
@@ -115,7 +115,7 @@ def _failed(error: BaseException) -> Attempt:
 async def ended(reason: asyncio.Future[str], *threads: Thread) -> str:
     """Wait for the reason with which the threads of a reader end, or for the end of one that gives none."""
     while not reason.done():
-        # Checked before the wait: what a thread has said last is on its way to the loop when it ends.
+        # Checked before the wait: what a thread has reported last is on its way to the loop when it ends.
         alive = all(thread.is_alive() for thread in threads)
         await asyncio.wait({reason}, timeout=LOOK_S)
         if not alive and not reason.done():
@@ -125,7 +125,7 @@ async def ended(reason: asyncio.Future[str], *threads: Thread) -> str:
 
 @contextlib.contextmanager
 def sparing_others(link: Link, stream: str, counters: BusCounters) -> Iterator[None]:
-    """What goes wrong with one stream is counted and said once, and costs the others of its bus nothing."""
+    """What goes wrong with one stream is counted and reported once, at no cost to the others of its bus."""
     try:
         yield
     except Exception:

@@ -191,7 +191,7 @@ UNKNOWN_VALUES = Values()
 def type_by_unit(
     channel: str, unit: str | None, *, waveform: bool, values: Values = UNKNOWN_VALUES
 ) -> str | None:
-    """The type of the sensor on a channel, by the unit of its samples; None if the unit tells none.
+    """The type of the sensor on a channel, by the unit of its samples; None if the unit shows none.
 
     A value that the device has computed, such as an RMS, may come as often as a waveform. An alarm on the RMS
     of it would never come, as it hardly changes.

@@ -142,7 +142,7 @@ def unpack_lost(packet: bytes) -> int:
 
 
 def overflow_message(timestamp_s: float, channel: str) -> can.Message:
-    """The error frame with which a CAN controller tells that its receive buffer ran over."""
+    """The error frame with which a CAN controller reports that its receive buffer ran over."""
     return can.Message(
         timestamp=timestamp_s,
         arbitration_id=_ERROR_CONTROLLER,
@@ -261,7 +261,7 @@ class Hub:
     Args:
         path: of the Unix socket that clients connect to.
         queue_frames: frames kept for a client that does not read.
-        until_empty: end when the last client has left, rather than only when told to.
+        until_empty: end when the last client has left, rather than only when stopped.
 
     Raises:
         HubTakenError: there is one already.
@@ -294,7 +294,7 @@ class Hub:
         self._selector.register(self._woken, selectors.EVENT_READ)
 
     def run(self) -> None:
-        """Hand frames on until told to stop."""
+        """Hand frames on until stopped."""
         try:
             while not self._stopping.is_set():
                 for key, events in self._selector.select():

@@ -149,7 +149,7 @@ FaultTable: TypeAlias = Annotated[
 def planned_faults(
     tables: Sequence[FaultTable], always: LinkFaultRates | None, seed: int
 ) -> NodeFaults | None:
-    """What the tables of a scenario say goes wrong; None if nothing does.
+    """What goes wrong by the tables of a scenario; None if nothing does.
 
     Args:
         tables: its ``[[fault]]`` tables.
@@ -294,7 +294,7 @@ class BearingScenario(ScenarioTable):
 
 @dataclass(frozen=True, slots=True)
 class ScenarioRun:
-    """What accelerometers on the rotor and on the housing said: float64 ``[n]`` each, in m/s^2."""
+    """What accelerometers on the rotor and on the housing measured: float64 ``[n]`` each, in m/s^2."""
 
     rotor_m_s2: Floats
     housing_m_s2: Floats
@@ -326,7 +326,7 @@ class Onset(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class SimulatedMachine:
-    """What the sensors of a simulated machine said, and what really happened to it.
+    """What the sensors of a simulated machine measured, and what really happened to it.
 
     Attributes:
         channels: float64 ``[n]`` each: ``x_um`` and ``y_um``, displacement of the shaft at two proximity

@@ -96,7 +96,7 @@ class SimCommand:
 
         start_logging(verbose=False)
         kernel_cache.prepare()
-        # What python-can has to say of a bus is raised too; of a lost one it would say so at each attempt.
+        # What python-can reports of a bus is raised too; a lost one it would report at each attempt.
         logging.getLogger("can").setLevel(logging.CRITICAL)
         if arguments.what is None:
             from sim_hw.bus_socket import run_hub  # noqa: PLC0415
@@ -196,7 +196,7 @@ async def _simulate(arguments: argparse.Namespace) -> int:
 
 
 async def _until_played(nodes: Sequence[SimNode], pacer: Pacer, stop: asyncio.Event) -> bool:
-    """Play all nodes to their end, or until told to stop; whether it came to the end.
+    """Play all nodes to their end, or until stopped; whether it came to the end.
 
     Raises:
         TimeoutError: a bus has taken nothing for too long.

@@ -322,7 +322,7 @@ class ModbusNodes:
         return cls(address, server, nodes, replies)
 
     async def ready(self) -> None:
-        """See `SimNode.ready`: the first request tells."""
+        """See `SimNode.ready`: the first request shows it."""
         while not self._replies.injected["requests"]:  # noqa: ASYNC110 - counted where nothing waits
             await asyncio.sleep(LOOK_S)
 
@@ -401,7 +401,7 @@ class SerialNodes:
 
     async def ready(self) -> None:
         """See `SimNode.ready`: whether the port is open can be known."""
-        while not self._cable.listening:  # noqa: ASYNC110 - a pseudo-terminal does not tell
+        while not self._cable.listening:  # noqa: ASYNC110 - a pseudo-terminal does not report it
             await asyncio.sleep(LOOK_S)
 
     async def play(self, pacer: Pacer) -> None:

@@ -1,7 +1,7 @@
 """Frames of a CAN bus as arrays: what every source of them yields, and how they are sorted to streams.
 
 Ids are written as the Linux kernel writes them (``linux/can.h``): 11 or 29 bits of arbitration id under
-three flags that say what kind of frame it is.
+three flags that state what kind of frame it is.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ ERROR_PASSIVE_SENDER = 0x02
 FD = 0x04
 """Flags of CAN FD frames (``CANFD_BRS``, ``CANFD_ESI`` and ``CANFD_FDF``)."""
 PRIORITY = 0x1C00_0000
-"""Bits of a 29-bit id that say how urgent it is, and nothing else (SAE J1939-21, 5.2)."""
+"""Bits of a 29-bit id that state how urgent it is, and nothing else (SAE J1939-21, 5.2)."""
 
 LONGEST = 64
 

@@ -40,7 +40,7 @@ LEAST_COUNTER_BITS = 4
 """A narrower counter wraps within a few frames."""
 
 PRIORITY = 0x1C00_0000
-"""Bits of a J1939 id that say how urgent it is, and nothing else (SAE J1939-21, 5.2)."""
+"""Bits of a J1939 id that state how urgent it is, and nothing else (SAE J1939-21, 5.2)."""
 
 
 class FrameFacts(NamedTuple):
@@ -201,7 +201,7 @@ def check_bus_load(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> It
 
 
 def check_counter(stream: Stream, message: DbcMessage | None, at: KeyPath) -> Iterator[Finding]:
-    """There is a counter, unless the file denies it, and it tells how much is missing after a gap."""
+    """There is a counter, unless the file denies it, and it shows how much is missing after a gap."""
     layout, facts = stream.layout, frame_facts(stream, message)
     if isinstance(layout, PlainLayout | DbcLayout):
         yield from counted(layout, (*at, "layout"))
@@ -295,7 +295,7 @@ def check_interfaces(draft: MachineFile) -> Iterator[Finding]:
 
 
 def check_can_keys(draft: MachineFile) -> Iterator[Finding]:
-    """What is said of a CAN bus has an effect, and goes together."""
+    """What is stated of a CAN bus has an effect, and goes together."""
     for name, bus in draft.buses.items():
         with suppress(UnusableValueError):
             if not isinstance(bus, CanBus):

@@ -63,7 +63,7 @@ SHUTDOWN_S = 0.5
 
 
 class CanReader(threading.Thread):
-    """Drains one open bus until told to stop or the bus fails; `ended` then holds the reason.
+    """Drains one open bus until stopped or the bus fails; `ended` then holds the reason.
 
     Args:
         link_name: what a person calls the bus.
@@ -98,7 +98,7 @@ class CanReader(threading.Thread):
         self._under_way = threading.BoundedSemaphore(BATCHES_UNDER_WAY)
 
     def run(self) -> None:
-        """Read until told to stop or the bus fails; see `threading.Thread.run`."""
+        """Read until stopped or the bus fails; see `threading.Thread.run`."""
         try:
             while not self._stopping.is_set():
                 self._turn()
@@ -306,7 +306,7 @@ class CanDriver:
             self.counters.controller_state == "bus-off"
             or (self._is_fresh and self.counters.controller_state != "error-active")
         ):
-            # Whoever receives is on the bus again, even if the frame that said so was missed.
+            # Whoever receives is on the bus again, even if the frame that reported it was missed.
             self._count_errors(ErrorCounts(state="error-active"))
         self._is_fresh &= not (batch.errors or batch.data_frames)
         for name, count in batch.unknown.items():
@@ -323,7 +323,7 @@ class CanDriver:
                     assembler.tick(batch.drained_ns)
 
     def _count_errors(self, errors: ErrorCounts) -> None:
-        """Count what error frames said; the link goes down with the controller and comes back with it."""
+        """Count what error frames reported; the link goes down with the controller and comes back with it."""
         before = self.counters.controller_state
         self.counters.add(errors)
         state = self.counters.controller_state

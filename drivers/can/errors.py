@@ -109,7 +109,7 @@ class CanCounters(BusCounters):
         return self.frames_overrun + self.rx_overflows
 
     def add(self, errors: ErrorCounts) -> None:
-        """Add what error frames said."""
+        """Add what error frames reported."""
         for name, count in errors.counts.items():
             setattr(self, name, getattr(self, name) + count)
         if errors.state is not None:
@@ -124,8 +124,8 @@ class ErrorCounts:
 
     Attributes:
         counts: what to add to which counter of `CanCounters`.
-        state: the controller's state at the end; None if no frame told it.
-        error_counters: its transmit and receive error counters; None if no frame told them.
+        state: the controller's state at the end; None if no frame stated it.
+        error_counters: its transmit and receive error counters; None if no frame stated them.
     """
 
     counts: dict[str, int] = field(default_factory=dict)
@@ -134,7 +134,7 @@ class ErrorCounts:
 
     @property
     def bus_off(self) -> bool:
-        """Whether one of the frames said bus-off."""
+        """Whether one of the frames reported bus-off."""
         return self.counts.get("bus_off", 0) > 0
 
     @classmethod
@@ -167,7 +167,7 @@ class ErrorCounts:
 
 
 def _state(classes: NDArray[np.uint32], status: NDArray[np.uint8]) -> ControllerState | None:
-    """The state that the last frame which tells one leaves the controller in."""
+    """The state that the last frame which states one leaves the controller in."""
     stating = np.flatnonzero(
         ((classes & (BUS_OFF | RESTARTED)) != 0) | ((status & (_WARNING | _PASSIVE | _ACTIVE)) != 0)
     )

@@ -19,13 +19,13 @@ SHOWN = 8
 LAST_SHORT_ID = 0x7FF
 """Of 11 bits; a higher id has 29."""
 OF_BYTES = frozenset({"channels", "raw-type", "scale"})
-"""Questions that say what the bytes of a frame mean, which no frame shows."""
+"""Questions about what the bytes of a frame mean, which no frame shows."""
 _PLACES = {
     "first-byte": "the byte where samples begin, {} (--first-byte)",
     "byte-order": "the byte order, {} (--byte-order)",
     "samples-per-frame": "how many samples of a channel a frame has, {} (--samples-per-frame)",
 }
-"""Questions that say where samples lie; their defaults are the usual ones."""
+"""Questions about where samples lie; their defaults are the usual ones."""
 
 
 class HeardOnCan(Heard):

@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
 _GROUP = 0x03FF_FF00
-"""Bits of a 29-bit id that say what is in a frame (SAE J1939-21, 5.2): not the priority, not the source."""
+"""Bits of a 29-bit id that state what is in a frame (SAE J1939-21, 5.2): not the priority, not the source."""
 _EXTENDED_IN_DBC = 0x8000_0000
 """How a DBC file marks an id of 29 bits."""
 

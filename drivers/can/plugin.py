@@ -71,7 +71,7 @@ class CanPlugin(DriverPlugin[CanBus]):
     def stream_checks(
         self, draft: MachineFile, stream: Stream, facts: Any, at: KeyPath
     ) -> Iterator[Iterator[Finding]]:
-        """See `BusTable.stream_checks`; other drivers say of their layouts that they are not for CAN."""
+        """See `BusTable.stream_checks`; other drivers report that their layouts are not for CAN."""
         yield check_frame_length(draft, stream, facts, at)
         yield check_counter(stream, facts, at)
         with suppress(UnusableValueError):

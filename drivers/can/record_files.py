@@ -185,7 +185,7 @@ class BlfEncoder(can.BLFWriter):
         return taken
 
     def head(self) -> bytes:
-        """See `LogEncoder.head`: the header tells the time that the others count from, and the size."""
+        """See `LogEncoder.head`: the header states the time that the others count from, and the size."""
         self._write_header(self._size)
         return self._emptied()[:FILE_HEADER_SIZE]
 
@@ -341,7 +341,7 @@ class LogFile:
     def add(self, frames: CanBatch) -> None:
         """Add frames to what is flushed next."""
         t_us = (frames.arrival_ns + self._offset_ns) // 1000
-        # Formats that count from their first frame cannot say that one came before it.
+        # Formats that count from their first frame cannot state that one came before it.
         t_us = np.maximum(np.maximum.accumulate(t_us), self._last_us)
         self._last_us = int(t_us[-1])
         self._encoder.add(frames, t_us.tolist())

@@ -313,7 +313,7 @@ def _listen(
 
 
 def _are_few(traffic: Traffic) -> bool:
-    """Whether frames came, and none often enough to tell its rate."""
+    """Whether frames came, and none often enough to show its rate."""
     return bool(traffic.ids) and all(one.frames < _FEW for one in traffic.ids.values())
 
 

@@ -318,7 +318,7 @@ class Stamps(NamedTuple):
         hardware_ns: int64 ``[n]``, when the controller took each in, on its own clock; 0 where it does
             not say.
         dropped: how many datagrams the kernel had dropped on this socket before the last one, modulo 2^32;
-            None if it does not say, which means none as long as it never said.
+            None if it does not state it, which means none as long as it never did.
     """
 
     software_ns: NDArray[np.int64]
@@ -398,7 +398,7 @@ class DatagramBuffer:
         return self._used
 
     def stamps(self) -> Stamps:
-        """What the kernel said about the datagrams of the last `receive`.
+        """What the kernel reported about the datagrams of the last `receive`.
 
         The socket may ask for ``SO_TIMESTAMPNS``, with that ``SO_TIMESTAMPING`` for hardware stamps only, and
         ``SO_RXQ_OVFL``; they come in this order (``__sock_recv_timestamp``, ``sock_recv_drops``).

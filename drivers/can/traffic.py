@@ -181,7 +181,7 @@ class Traffic:
     Attributes:
         ids: by id with its flags, in the order of their first frames.
         error_frames: how many error frames came; they are from this computer's controller.
-        errors: what they say.
+        errors: what they report.
         dropped: frames that this computer was too slow for.
     """
 

@@ -342,7 +342,7 @@ def _clash(
     other: RegisterChannel | SampleChannel,
     at: KeyPath,
 ) -> Iterator[Finding]:
-    """What there is to say of two numbers, of which the other one does not begin before the first."""
+    """What there is to report of two numbers, of which the other one does not begin before the first."""
     end = begin + one.registers
     if first >= end:
         return
@@ -368,7 +368,7 @@ def _apart(one: tuple[int, int], other: tuple[int, int]) -> bool:
 
 
 def check_writes_and_samples(draft: MachineFile) -> Iterator[Finding]:
-    """What is written, and what tells that there is something new, lies beside the samples."""
+    """What is written, and what shows that there is something new, lies beside the samples."""
     taken: dict[_Place, list[tuple[str, _Block]]] = {}
     controls: list[tuple[_Place, str, _Block]] = []
     for name, stream in draft.streams.items():

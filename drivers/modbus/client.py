@@ -58,7 +58,7 @@ logger = logging.getLogger(__name__)
 
 logging.getLogger("pymodbus.logging").setLevel(
     logging.CRITICAL
-)  # every fault is counted, and told once, here
+)  # every fault is counted, and reported once, here
 
 LEAST_CONNECT_S = 1.0
 MS_PER_S = 1000.0

@@ -45,7 +45,7 @@ class _Emptied(NamedTuple):
 class FifoReader(CountedReader[FifoLayout]):
     """Empties a queue, and acknowledges what it has taken if the device waits for that.
 
-    The count at the head of a reply tells what is missing before it, and what has come before. A count that
+    The count at the head of a reply shows what is missing before it, and what has come before. A count that
     does not go on from the last reply is believed when the next ones go on from it; until then nothing is
     acknowledged, and the samples are held back. Where each reply has a checksum, what the clock can explain
     is believed at once.
@@ -165,7 +165,7 @@ class FifoReader(CountedReader[FifoLayout]):
         return (reply.first - held.first - kept) % self._modulus
 
     def _place_held(self, reply: _Reply) -> None:
-        """Hand on a reply of which only the count was damaged: the replies around it tell its place."""
+        """Hand on a reply of which only the count was damaged: the replies around it show its place."""
         if self._drops and len(self._held) == 1:
             (held,) = self._held
             if (reply.first - self._following) % self._modulus == held.taken:

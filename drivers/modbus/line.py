@@ -1,6 +1,6 @@
 """One Modbus line and its units: one request at a time, quiet after a failure, silent units set aside.
 
-A reply on a serial line carries no number that tells which request it answers. One that comes after its
+A reply on a serial line carries no number that shows which request it answers. One that comes after its
 request was given up would be taken for the reply to the next request. So after every failure the line is
 kept quiet, and bytes that arrive in this time are thrown away and counted. The same goes for a line that
 has just been opened: whoever had it before may have asked for what is still to come.
@@ -164,7 +164,7 @@ class RequestHealth:
 
 
 SparingByRequest: TypeAlias = dict[tuple[int, RequestKey], Sparing]
-"""How often it has been said of a unit, or of what it is asked, that there is no reply."""
+"""How often it was reported that a unit, or one of its requests, gets no reply."""
 
 
 class UnitHealth:
@@ -174,7 +174,7 @@ class UnitHealth:
         unit: its address.
         patience: how long to wait for it.
         counters: of the bus.
-        sparing: what has been said of it, also while the line was open before.
+        sparing: what has been logged of it, also while the line was open before.
     """
 
     def __init__(
@@ -369,7 +369,7 @@ class ModbusLine:
         units: the units that are asked.
         may_write: whether registers may be written: unit, first register, how many.
         heard: called when a unit has answered.
-        sparing: what has been said of its units, also while it was open before.
+        sparing: what has been logged of its units, also while it was open before.
     """
 
     def __init__(
@@ -408,7 +408,7 @@ class ModbusLine:
             asked.forget(RequestKey(function, what))
 
     async def poll(self, unit: int, function: int, run: RegisterRun, what: str = "") -> RegisterValues:
-        """Read registers, and tell when that was; see `read`."""
+        """Read registers, and state when that was; see `read`."""
         key = RequestKey(function, what)
         return RegisterValues(
             *await self._ask(

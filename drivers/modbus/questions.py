@@ -189,7 +189,7 @@ class _ModbusQuestions(BusQuestions):
         return self.ask("registers", _registers, AUTO, doubt=partial(doubt_of_registers, answers))
 
     def _sniffed_as(self, answers: Answers) -> Sequence[str]:
-        """Arguments of the sniffer that say where the units are."""
+        """Arguments of the sniffer that state where the units are."""
         raise NotImplementedError
 
     def questions(self, answers: Answers, folder: Path) -> Iterator[Question]:
@@ -409,7 +409,7 @@ class _ModbusQuestions(BusQuestions):
         raise NotImplementedError
 
     def _line_keys(self, answers: Answers) -> Iterator[str]:
-        """Lines of the table of the bus that say where that is."""
+        """Lines of the table of the bus that state where that is."""
         raise NotImplementedError
 
 

@@ -164,7 +164,7 @@ def judge_tcp(data: bytes, expected: ExpectedReply | None) -> ReplyVerdict:  # n
         return ReplyVerdict()
     transaction, protocol, length, unit = _MBAP.unpack_from(data)
     if protocol != 0:
-        # No length can be believed any more: nothing tells where the next frame begins.
+        # No length can be believed any more: nothing shows where the next frame begins.
         return ReplyVerdict(len(data), fault="wrong_protocol", final=True)
     if length < 2:
         return ReplyVerdict(len(data), fault="truncated", final=True)

@@ -35,7 +35,7 @@ class _Look(NamedTuple):
 class DeviceRingReader(CountedReader[RingLayout]):
     """Follows the write counter of a ring.
 
-    What was written between two readings of the counter is read, and the reading after that tells
+    What was written between two readings of the counter is read, and the reading after that shows
     whether any of it may have been overwritten meanwhile. A request that fails is repeated at the next
     reading: only what the device has overwritten is lost, and the counter states how much that is.
 

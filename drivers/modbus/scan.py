@@ -154,7 +154,7 @@ class Scan:
         first_unit: the first unit that is asked.
         to_ask: all of them.
         asked: the last one that was; None if none was.
-        searched: whether all were asked, or the answers tell that the others need not be.
+        searched: whether all were asked, or the answers show that the others need not be.
         units: those that answered, in order, without those that are left out.
         gateway: addresses of which a gateway reported that no unit is behind them.
         alike: whether every address answered alike, so that only the first is taken for a unit.

@@ -35,7 +35,7 @@ class ScanReport:
         bus: the line.
         scan: of it, at its end.
         functions: that were asked for.
-        note: what is to be said of the registers that were asked for; may be empty.
+        note: what is to be reported of the registers that were asked for; may be empty.
         all_orders: whether registers are shown in all orders.
     """
 

@@ -186,7 +186,7 @@ class _TrendStream:
         )
 
     def read_from(self, runs: Sequence[RegisterRun], places: Sequence[int]) -> None:
-        """Say which runs are read from now on, and which of them are for this stream."""
+        """State which runs are read from now on, and which of them are for this stream."""
         self.flush()
         self._places = tuple(places)
         channels = tuple(self._channels[k] for k in self._columns)

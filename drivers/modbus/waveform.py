@@ -95,7 +95,7 @@ class WaveformReader(PollingReader):
     A trigger is written when it is due, never more often: it may cost a sensor a part of its battery. So it
     is not written again when its reply is lost, for the device may have heard it.
 
-    Nothing in a block tells when it was taken. But the last reading of the id that found another one was
+    Nothing in a block shows when it was taken. But the last reading of the id that found another one was
     before its end, and the first that found its own was after it. So it ended midway, give or take half of
     that time.
 

@@ -72,7 +72,7 @@ class ChannelChoice:
 
     @property
     def missed(self) -> str:
-        """What to tell a person of a log that has no frame of the wanted channel; empty if it has some."""
+        """The message about a log that has no frame of the wanted channel; empty if it has some."""
         if self._wanted is None or self._is_there or not self._others:
             return ""
         return (

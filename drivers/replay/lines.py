@@ -36,7 +36,7 @@ _IN_HEADER: Final[dict[type[TextIOMessageReader], re.Pattern[str]]] = {
     ASCReader: re.compile(""),
     TRCReader: re.compile(";"),
 }
-"""Of the lines that a reader takes before its first frame, those that say how to read the others."""
+"""Of the lines that a reader takes before its first frame, those that state how to read the others."""
 
 
 class TextLog:

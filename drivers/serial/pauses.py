@@ -40,7 +40,7 @@ def longest_pause_s(bits_per_character: int, baud: int, wraps_s: Iterable[float]
 
 
 class Pauses:
-    """Tells the reader of one port when to pause, and for how long.
+    """Decides when the reader of one port pauses, and for how long.
 
     A port that is filled faster than its baud states, as a pseudo-terminal or a USB device may be, is read at
     once: pauses become shorter, and longer again.

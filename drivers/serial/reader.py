@@ -86,7 +86,7 @@ class _HungUpError(Exception):
 
 
 class SerialReader(threading.Thread):
-    """Reads one open port until told to stop or the port fails; `ended` then holds the reason.
+    """Reads one open port until stopped or the port fails; `ended` then holds the reason.
 
     It brings the thread that cuts what it has read. All calls to the event loop go through that thread, so
     they arrive in order.
@@ -184,7 +184,7 @@ class SerialReader(threading.Thread):
             self._post(self._end, self._failed(error))
 
     def _failed(self, error: BaseException) -> str:
-        """Count a failure of one of the threads, and say it in words."""
+        """Count a failure of one of the threads, and put it into words."""
         self._post(self._receiver.note, "reader_failures")
         return f"its reader failed: {error or type(error).__name__}"
 

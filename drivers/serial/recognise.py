@@ -1,7 +1,7 @@
 """What a stream of bytes is: lines of text, frames behind a sync word, or COBS frames.
 
 Pure functions of bytes. Bytes that were sampled at a wrong baud rate are none of these, so that the score
-tells the right rate, too.
+shows the right rate, too.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from drivers.serial.recognise_frames import BinaryFrames, cobs_frames, sync_fram
 from drivers.serial.recognise_lines import TextLines, text_lines
 
 LEAST_BYTES = 24
-"""Of fewer nothing is said."""
+"""Of fewer nothing is reported."""
 CONCLUSIVE = 0.9
 """No other baud rate need be tried."""
 SURE = 0.6

@@ -136,7 +136,7 @@ def _check_of(frames: NDArray[np.uint8], sync: int) -> _Check | None:
             expected = checksum.of(frames[:, begin:-size])
             for order in _ORDERS[:size]:
                 passed = expected == _numbers(frames[:, -size:], order)
-                # Frames that are all alike say nothing: what they end with may be a constant.
+                # Frames that are all alike show nothing: what they end with may be a constant.
                 if passed.mean() >= _LEAST_PASSING[size] and _kinds(frames[passed]) >= 3:
                     return _Check(name, order, begin)
     return None
@@ -195,7 +195,7 @@ def _behind_sync(numbers: NDArray[np.uint8], length: int) -> BinaryFrames | None
         constant = (grid == modes).mean(axis=0) >= _CONSTANT
         if constant.all() or not constant.any():
             continue
-        # A value that stands still may tell more than the sync word does: a check shows which is which.
+        # A value that stands still may show more than the sync word does: a check shows which is which.
         for sync in _sync_words(modes, constant):
             if sync in tried:
                 continue
@@ -229,7 +229,7 @@ def _rows(numbers: NDArray[np.uint8], places: NDArray[np.int64], length: int) ->
 
 
 def _sync_words(modes: NDArray[np.uint8], constant: NDArray[np.bool_]) -> list[bytes]:
-    """Bytes in a row that are the same in all frames, those that tell most first; a few of them.
+    """Bytes in a row that are the same in all frames, those that show most first; a few of them.
 
     Args:
         modes: uint8 ``[length]``, what each place of a frame holds most often.

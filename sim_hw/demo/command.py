@@ -141,7 +141,7 @@ def _run(arguments: argparse.Namespace) -> int:
     from daqsvc.cli import start_logging  # noqa: PLC0415
 
     start_logging(verbose=False)
-    # Every alarm comes back from the broker and is shown; the service's log would say it twice.
+    # Every alarm comes back from the broker and is shown; the service's log would repeat it.
     logging.getLogger("daqsvc.alarm_log").setLevel(logging.ERROR)
     kernel_cache.prepare()
     try:

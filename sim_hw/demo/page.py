@@ -66,7 +66,7 @@ async def page_of(store: Path) -> AsyncIterator[PageAddress]:
 
 
 async def _first_line(process: asyncio.subprocess.Process, wrong: IO[bytes]) -> str:
-    """Where it is; or why it is not, by the end of what it has said, when it has ended."""
+    """Where it is; or why it is not, by the end of its output, when it has ended."""
     assert process.stdout is not None  # noqa: S101 - a pipe was asked for
     try:
         async with asyncio.timeout(START_S):

@@ -440,7 +440,7 @@ class DemoSession:
 
 
 def _node(bus: can.BusABC, layout: FrameLayout, script: Script) -> CanNode:
-    """The device; a value beyond what its frames can hold is saturated, as by a converter, and said so."""
+    """The device; a value beyond what its frames can hold is saturated, as by a converter, and reported."""
     try:
         return CanNode(bus, layout, script.samples, script.rate_hz, faults=script.faults)
     except LayoutError as error:

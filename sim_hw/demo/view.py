@@ -87,7 +87,7 @@ class View:
                 self._console.print(self.picture())
 
     def show_page(self, address: PageAddress) -> None:
-        """Say where the page is."""
+        """State where the page is."""
         self._console.print(f"in a browser: {address.look}", soft_wrap=True)
         self._console.print(f"  to handle its alarms, too: {address.act}", soft_wrap=True)
 

@@ -215,7 +215,7 @@ class SerialNode(PlannedNode):
     async def play(self, pacer: Pacer) -> None:
         """See `PlannedNode.play`; returns when all that was sent has gone, or the port is not open."""
         await super().play(pacer)
-        # A pseudo-terminal does not tell when it has room again.
+        # A pseudo-terminal does not report when it has room again.
         while self._cable.listening and not self._cable.flush():  # noqa: ASYNC110
             await asyncio.sleep(RETRY_S)
 

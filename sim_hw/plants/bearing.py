@@ -144,7 +144,7 @@ class FaultSignal:
 
 @dataclass(frozen=True, slots=True)
 class BearingRun:
-    """What the sensors of a machine said.
+    """What the sensors of a machine measured.
 
     Attributes:
         y: float64 ``[n, 2]``, accelerations of rotor and housing in m/s^2.

@@ -2,7 +2,7 @@
 
 The paper's gain L and ours are for its full observer x^' = (A + LC) x^ + B v - L y. What y injects holds
 L D u as well, so that the error obeys e' = (A + LC) e + (F + L D) u. The paper's error equation has no L D u,
-and its gain does not separate the races on measured y. ``docs/bearing.md`` tells the story.
+and its gain does not separate the races on measured y. ``docs/bearing.md`` has the details.
 
 `check` asks whether a bearing's two sensors can show its faults at all, and answers in words. The paper asks
 for observability, for independent fault spaces under C, and for a stable filter. Two more things decide in
